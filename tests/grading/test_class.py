@@ -43,7 +43,7 @@ def test_little_damping_accuses_nobody(seed):
 
 
 def test_a_damping_that_the_fit_puts_at_zero_is_told_by_the_decay():
-    """If the fit puts a damping at zero, the decays still show a reported one that is too large.
+    """If the fit puts a damping at zero, a reported damping is judged by the decays.
 
     A fit at its bound has measured nothing.
     """
@@ -66,10 +66,7 @@ def test_coarse_encoders_cost_no_points(seed):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_table_of_three_carts_without_a_gain_is_none_of_two():
-    """A table without one of its gains is not taken for a table of fewer carts.
-
-    Here the gain is the negative one of three carts.
-    """
+    """If a table of three carts lacks a gain, no carts are computed from it."""
     team = make_team(2)
     table = {x: float(v) for x, v in team.reported.final.items()}
     assert own_chain(table, n=3) is not None
@@ -106,7 +103,7 @@ def test_a_model_made_of_a_vague_table_is_no_wrong_one(seed, digits):
     ],
 )
 def test_what_makes_the_whole_table_likeliest_is_named(seed, turn, slips, codes):
-    """If several mistakes overlap, those that make the whole table likeliest are named."""
+    """If several mistakes overlap, the flags are those that explain the whole table best."""
     team = replace(make_team(seed), rng=np.random.default_rng([9, seed, turn]))
     for slip in slips:
         team = SLIPS[slip](team)
@@ -116,7 +113,7 @@ def test_what_makes_the_whole_table_likeliest_is_named(seed, turn, slips, codes)
 def test_a_gain_that_two_mistakes_make_is_told_with_both():
     """If two mistakes explain a gain equally well, the flag names both.
 
-    With little damping, the peak of a step is twice its level.
+    With little damping, the peak of a step is twice its level, so a doubled gain may be either.
     """
     team = scaled(make_team(72003), ["K"], 2.0, ["initial"])
     (flag,) = team.grade().flags
@@ -137,7 +134,7 @@ def tied(seed: int) -> tuple[Team, Grade]:
 
 
 def test_springs_that_the_rubric_does_not_have_accuse_nobody():
-    """If the fit needs a spring that the rubric lacks, the grader uses it and flags nobody."""
+    """If the recordings need a spring that the rubric lacks, it is used and nobody is flagged."""
     team, grade = tied(1)
     assert grade.springs == ("wall-1",)
     assert [flag.code for flag in grade.flags] == []
@@ -149,9 +146,9 @@ def test_springs_that_the_rubric_does_not_have_accuse_nobody():
 
 
 def test_a_decay_with_friction_is_no_wrong_logarithm(tmp_path):
-    """If friction makes a decay's damping vague, no logarithm slip is flagged.
+    """If friction makes the decays' damping uncertain, no wrong logarithm is flagged.
 
-    The team's own final value contradicts the slip.
+    The team's own final value contradicts such a mistake.
     """
     bench = prepare_bench(preset="throne-1dof", hide=("coulomb_friction:cart=1,force=0.003",))
     write_submission(tmp_path / "team", bench, seed=3, reported=True)

@@ -1,4 +1,4 @@
-"""A class is everything graded so far; grading one submission alone keeps the others."""
+"""A class is everything graded so far; grading one more submission keeps the others."""
 
 import csv
 import json
@@ -34,7 +34,7 @@ RUBRIC = two_cart_rubric()
 
 @pytest.fixture(scope="module")
 def school(tmp_path_factory) -> Path:
-    """Write two sections with a team-1 each, and a team-2 that copied a step of the first."""
+    """Write two sections with one team-1 each, and a team-2 that copied one of their steps."""
     folder = tmp_path_factory.mktemp("school")
     for seed, name in enumerate(("A/team-1", "B/team-1", "B/team-2")):
         write_submission(
@@ -106,7 +106,7 @@ def test_a_late_hand_in_by_itself_keeps_the_class(school, tmp_path):
 
 
 def test_a_renamed_folder_is_the_same_submission(school, tmp_path):
-    """If a folder is renamed, its submission keeps its row, points by hand and requests.
+    """A submission in a renamed folder keeps its row, its points by hand and its requests.
 
     A message gives the new name.
     """
@@ -131,11 +131,10 @@ def test_a_renamed_folder_is_the_same_submission(school, tmp_path):
 
 @pytest.mark.parametrize("author", ["s0", "s1"])
 def test_a_folder_in_a_strangers_zip_takes_nothing_from_a_team(school, tmp_path, author):
-    """A folder of the same name in a stranger's zip file changes no row of an earlier team.
+    """If a stranger's zip file has a folder named like a team, the team keeps its row.
 
-    It only gets a longer id; points given by hand stay.
-
-    The same holds if it has the team's id, or if a submission cannot be read.
+    Points given by hand stay, and the stranger's submission gets a longer id. The same holds if it
+    has the team's id, or if a submission cannot be read.
     """
     out, folder = tmp_path / "out", tmp_path / "class"
     shutil.copytree(school / "B" / "team-1", folder / "team-1")
@@ -163,7 +162,7 @@ def test_a_folder_in_a_strangers_zip_takes_nothing_from_a_team(school, tmp_path,
 
 
 def test_a_rubric_of_another_name_replaces_no_class(school, tmp_path):
-    """If a rubric file has another name than the class's rubric, the run is refused.
+    """A run is refused if its rubric's file name differs from that of the existing class.
 
     Files and points given by hand would be lost otherwise.
     """
@@ -181,9 +180,9 @@ def test_a_rubric_of_another_name_replaces_no_class(school, tmp_path):
 
 
 def test_a_mended_id_and_another_folder_accuse_nobody(school, tmp_path):
-    """A corrected id in another folder is the same submission by the platform's number.
+    """The platform's number identifies a submission even if its id and folder have changed.
 
-    Nobody is flagged, in later runs either.
+    So nobody is flagged for sharing data with themselves, in later runs either.
     """
     out, folder = tmp_path / "out", tmp_path / "class"
     for inside, id_ in (("lab", "s 1"), ("lab-final", "s1")):
@@ -229,7 +228,7 @@ def test_who_exchanges_folders_keeps_what_was_given(tmp_path):
 
 
 def test_what_makes_two_the_same_submission(tmp_path):
-    """Two submissions are the same by the platform's number, else by files, else by authors."""
+    """Two submissions count as one if the platform's number, else files, else authors agree."""
     old = make_outcome(make_grade("old", authors=("ann",)), key="k-files", owner="A (canvas 7)")
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         book.put(old)
@@ -254,7 +253,7 @@ def test_what_makes_two_the_same_submission(tmp_path):
 
 
 def test_two_that_hand_in_nothing_are_not_the_same(tmp_path):
-    """Two empty submissions are not the same; without authors their folders decide."""
+    """Two empty submissions without authors are the same only if they are in the same folder."""
     old = make_outcome(failed_grade("team-3", "empty"), key="k-none", fingerprints=b"")
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         book.put(old)
@@ -296,7 +295,7 @@ def test_the_rubric_of_those_kept_is_told(tmp_path):
 
 
 def test_who_is_removed_is_off_every_list_but_history(tmp_path):
-    """A removed submission is on no page, but in the history; graded again, it is back."""
+    """A removed submission is only in the history; it is listed again when it is graded again."""
     outcomes = [make_outcome(make_grade(name)) for name in ("a", "b", "c")]
     everybody = Batch(keys=tuple(o.key for o in outcomes), shared={})
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
@@ -325,7 +324,10 @@ def test_who_is_removed_is_off_every_list_but_history(tmp_path):
 
 
 def test_a_failed_second_try_hides_no_recordings(tmp_path):
-    """If a second grading fails, the fingerprints of the first one and of all versions remain."""
+    """If a second grading fails, fingerprints of the first grading are still compared.
+
+    Fingerprints of replaced versions are compared too.
+    """
     grade_ = make_grade("team")
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         for key, prints in (("1", b"first"), ("2", b""), ("3", b"second"), ("4", b"first")):
@@ -337,9 +339,9 @@ def test_a_failed_second_try_hides_no_recordings(tmp_path):
 
 
 def test_an_override_stays_with_the_same_person(tmp_path):
-    """An override stays if the author's id differs only in capitals and blanks.
+    """An override stays if the author's id changes only in capitals and blanks.
 
-    Under another id it belongs to another person.
+    Another id means another person, who does not get it.
     """
     grades = [make_grade("team", authors=(who,)) for who in ("ada 1", " Ada  1", "bob")]
     with Gradebook(tmp_path, assignment="lab", create=True) as book:

@@ -1,4 +1,4 @@
-"""The commands that follow grading are run as typed."""
+"""The commands for use after grading are run as typed."""
 
 import csv
 import io
@@ -46,7 +46,10 @@ def points_of(folder: Path, team: str) -> float:
 
 
 def test_an_override_reaches_the_pages_at_once(run, tmp_path):
-    """An override shows on the pages at once, `auto` removes it, and the history lists both."""
+    """An override appears on the pages at once, and `auto` removes it.
+
+    The history lists both.
+    """
     grades = write_class(tmp_path)
     before = points_of(grades, "team-03")
 
@@ -163,7 +166,7 @@ def test_an_export_lies_beside_the_grades(run, grades, tmp_path, lms):
 
 @pytest.mark.parametrize("lms", ["canvas", "moodle", "gradescope"])
 def test_an_export_into_a_file_writes_that_file(run, grades, tmp_path, lms):
-    """With `--out gs.csv` an export writes only that file; another file type is refused."""
+    """With `--out gs.csv` an export writes only that file; other endings are refused."""
     folder = tmp_path / "exported"
     status, _, err = run("export", grades, "--lms", lms, "--out", folder / "gs.csv")
     assert status == 0

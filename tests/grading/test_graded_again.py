@@ -1,4 +1,4 @@
-"""A submission is graded or compared again if anything has changed that its outcome depends on."""
+"""A submission is graded again if anything that its outcome depends on has changed."""
 
 import shutil
 import sys
@@ -74,7 +74,7 @@ def test_what_cannot_be_read_is_still_somebodys(school, tmp_path, slip, typed):
 
 
 def test_what_changed_meanwhile_is_not_graded_under_the_old_key(task, tmp_path, school):
-    """A file written between the hash and the copy causes a retry, not a grade."""
+    """If a file changes between the hash and the copy, the submission is not graded but retried."""
     own = shutil.copytree(school / "team-0", tmp_path / "team-0")
     if sys.platform == "linux":  # only Linux allows this file name
         (own / "n\udcff").write_text("no name in any encoding", encoding="utf-8")

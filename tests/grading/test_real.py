@@ -1,4 +1,7 @@
-"""Students on a real ECP 210 bench, with dry friction and a reversed motor, are judged fairly."""
+"""Students on a real ECP 210 bench are judged fairly.
+
+The bench has dry friction and a reversed motor sign.
+"""
 
 import math
 from dataclasses import dataclass
@@ -46,7 +49,7 @@ def bench(real_data, tmp_path_factory):
 
 
 def viscous_fit() -> Chain:
-    """Return the parameters of a simulation matched to the two-cart steps, without friction."""
+    """Return the parameters of a frictionless simulation matched to the two-cart steps."""
     m, k = np.array([5.5e-6, 3.7e-6]), np.array([1.79e-3, 1.03e-3, 0.0])
     return Chain(m=m, c=2 * np.array([0.15 * 22.6, 0.074 * 16.6]) * m, k=k)
 
@@ -76,7 +79,7 @@ def test_textbook_numbers_get_no_flag(bench, sign, digits):
 
 
 def test_a_student_of_every_single_repeat_is_honest(bench):
-    """A student may take any single run for the damping of a cart without a flag."""
+    """Whichever single run a student uses for the damping of a cart, there is no flag."""
     first = first_estimates(bench)
     for record in bench.analysis.records:
         if record.kind in ("decay", "step") and len(record.free) == 1:

@@ -124,7 +124,7 @@ def test_a_pattern_is_written_out(tmp_path):
     ],
 )
 def test_a_mistake_is_named_with_its_line(tmp_path, old, new, line, what):
-    """An error in a rubric gives file, line and key, and the expected value or nearest key."""
+    """An error gives the rubric's file, line and key, and the expected value or the nearest key."""
     assert old in GOOD
     path = write(tmp_path, GOOD.replace(old, new, 1))
     with pytest.raises(ConfigError, match=rf"lab\.toml line {line}: .*{what}"):
@@ -142,7 +142,7 @@ def test_every_mistake_has_its_own_line(tmp_path):
 
 
 def test_a_slip_in_a_line_hides_no_other_mistake(tmp_path):
-    """A line that is not TOML hides no other mistake: all are reported together."""
+    """If one line is not TOML, all other mistakes of the rubric are reported too."""
     text = GOOD.replace("version = 1", "vresion = 1").replace("points = 2", "points = two")
     text = text.replace('kind = "step"', "kind = stpe").replace('unit = "V"', 'unti = "V"')
     text = text.replace('check = "state_space"', 'chek = "state_spaec"\nfull_percent = 30')
@@ -155,7 +155,7 @@ def test_a_slip_in_a_line_hides_no_other_mistake(tmp_path):
 
 
 def test_a_table_without_its_bracket_is_one_mistake(tmp_path):
-    """A heading without its bracket is reported as one mistake; its keys are not called missing."""
+    """A heading without its bracket is one mistake; keys below it are not called missing."""
     text = GOOD.replace("[[criteria]]", "[[criteria]", 1).replace("[required]", "[required")
     with pytest.raises(ConfigError) as caught:
         load_rubric(write(tmp_path, text))

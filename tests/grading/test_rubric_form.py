@@ -24,7 +24,7 @@ SHIPPED = {path.stem: path.read_text(encoding="utf-8") for path in sorted(RUBRIC
 
 
 def typed_into(text: str, **typed: str) -> str:
-    """Return the text of a rubric after a form with these values was saved."""
+    """Return the text of a rubric after a form with these values has been saved."""
     form = rubric_form(parse_rubric(text, where=""))
     return with_values(
         text, changed_fields(form, {k.replace("__", "."): v for k, v in typed.items()})
@@ -104,7 +104,7 @@ def test_late_work_at_half_and_a_point_for_hertz():
 
 
 def test_a_table_that_is_not_there_is_made_before_the_criteria():
-    """A missing table is added before the criteria and before the comment above them."""
+    """A missing table is added before the criteria and before any comment above them."""
     text = SHIPPED["throne-1dof"]
     start, end = text.index("[late]"), text.index("[[criteria]]")
     bare = f"{text[:start]}# what is judged\n{text[end:]}"
@@ -124,7 +124,7 @@ def test_what_stands_in_no_line_of_its_own_is_left_to_a_person():
 
 
 def test_a_value_within_a_longer_text_is_not_taken_for_the_key():
-    """Text within a message that looks like a line of TOML is not changed."""
+    """A line of a longer text is not changed, even if it looks like a key with its value."""
     text = SHIPPED["throne-1dof"].replace(
         'title = "everything the lab asks for"\npoints = 1',
         'title = """the pieces\npoints = 7\n"""\npoints = 1',
@@ -134,7 +134,7 @@ def test_a_value_within_a_longer_text_is_not_taken_for_the_key():
 
 
 def test_what_students_see_is_chosen_in_a_table_of_its_own_or_in_its_line():
-    """The choice of what students see is saved in its table, and a comment after it stays."""
+    """The choice of what students see is saved in its own table; a comment after it stays."""
     text = SHIPPED["throne-1dof"]
     new = typed_into(text, students__see="check")
     assert '[students]\nsee = "check"\n' in new

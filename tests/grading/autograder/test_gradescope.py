@@ -1,7 +1,4 @@
-"""The autograder's zip sets up and grades in Gradescope's folders.
-
-The tests look at what students then read.
-"""
+"""The autograder's zip runs in Gradescope's folders, and its results are what students read."""
 
 import json
 import os
@@ -62,7 +59,7 @@ def team(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory) -> Path:
-    """Return Gradescope's folders after `setup.sh`; the packages are those installed here."""
+    """Return Gradescope's folders after `setup.sh` was run, with the packages installed here."""
     root = tmp_path_factory.mktemp("autograder")
     write_autograder(RUBRIC, root / "autograder.zip")
     source = root / "source"
@@ -288,9 +285,9 @@ def test_a_grader_that_is_killed_leaves_a_result(root, team):
 
 
 def test_a_grading_that_takes_too_long_is_stopped(root, team, monkeypatch):
-    """If grading exceeds its time limit, the result says so.
+    """If grading exceeds cartlab's time limit, the result says so.
 
-    The limit is shorter than Gradescope's own, after which there would be no result.
+    Gradescope's own limit is longer; beyond it there would be no result.
     """
     put(root, team)
     (root / "results").mkdir()
@@ -304,9 +301,9 @@ def test_a_grading_that_takes_too_long_is_stopped(root, team, monkeypatch):
 
 
 def test_the_zip_is_made_for_gradescope_and_always_the_same(tmp_path):
-    """Two zips of one rubric are equal byte by byte, with both scripts executable at their top.
+    """Two zip files for one rubric are equal byte by byte, and both scripts in them are executable.
 
-    The rubric may be given by the name of one that ships with cartlab.
+    A rubric that ships with cartlab may be given by its name.
     """
     done = cartlab_here("export", "--autograder", "throne-1dof", cwd=tmp_path)
     assert done.returncode == 0
@@ -352,7 +349,7 @@ def test_all_that_grading_needs_is_pinned_to_what_is_installed():
     ],
 )
 def test_export_says_what_it_needs(tmp_path, arguments, said):
-    """`export` takes grades and a platform, or a rubric for a zip; it refuses any other mixture."""
+    """`export` takes either grades and a platform, or a rubric for a zip file, and nothing else."""
     done = cartlab_here("export", *arguments, cwd=tmp_path)
     assert done.returncode == 2
     assert said in done.stderr

@@ -21,7 +21,7 @@ RUBRIC = load_rubric(Path("throne-1dof"))
 
 
 def _dask(*arguments):
-    """Start one part of a cluster, without a dashboard and a supervisor."""
+    """Start one process of a cluster, without a dashboard and without a supervisor."""
     return subprocess.Popen(
         [sys.executable, "-m", *map(str, arguments), "--no-dashboard"],
         stdout=subprocess.DEVNULL,
@@ -100,7 +100,7 @@ def test_a_cluster_grades_as_this_machine_does_though_a_worker_dies(cluster, tmp
 
 
 def test_an_address_that_is_no_schedulers_is_refused():
-    """An address is refused unless it is a scheduler's, and encrypted if on another machine."""
+    """The address must be a scheduler's, and for another machine it must be encrypted."""
     with pytest.raises(ConfigError, match="expected a scheduler's address"):
         run_on("http://localhost:8786")
     with pytest.raises(ConfigError, match=r"tls://"):

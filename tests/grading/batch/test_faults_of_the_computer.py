@@ -96,9 +96,9 @@ def test_a_full_disk_costs_nobody_a_grade(zips, tmp_path):
 
 
 def test_a_name_that_cannot_be_is_still_the_archives_own(tmp_path):
-    """If the file system cannot hold a member's name, the member is refused for good.
+    """If the file system cannot store a file of an archive, this file is refused for good.
 
-    The name is too long, or a file has the name that a folder needs. A retry cannot help.
+    Its name is too long, or it needs a folder where another file is. A retry cannot help.
     """
     archive = tmp_path / "odd.zip"
     with zipfile.ZipFile(archive, "w") as packed:
@@ -138,7 +138,7 @@ print(json.dumps(told))
 def starved(source: Path, scratch: Path, limit: str, soft: range) -> list[list]:
     """Grade once without a limit, then once with each limit.
 
-    Return whether settled, short of space, reason and grade.
+    Return for each: whether the outcome is final, whether space was short, the reason, the grade.
     """
     scratch.mkdir()
     words = [sys.executable, "-c", _STARVED, source, scratch, limit, *soft]
@@ -150,9 +150,9 @@ def starved(source: Path, scratch: Path, limit: str, soft: range) -> list[list]:
 
 @POSIX
 def test_a_file_that_may_not_grow_costs_nobody_a_grade(zips, teams, tmp_path):
-    """If a file cannot grow beyond a size limit, the submission is graded in the next run.
+    """If the system limits the size of files, the submission is graded in the next run.
 
-    The limit is reached while a zip is unpacked or a folder is copied.
+    The limit is reached while a zip file is unpacked or a folder is copied.
     """
     for number, source in enumerate((zips / "team-0.zip", teams / "team-0")):
         size = range(_MEMBER // 2, _MEMBER // 2 + 1)
@@ -166,7 +166,7 @@ def test_a_file_that_may_not_grow_costs_nobody_a_grade(zips, teams, tmp_path):
 @POSIX
 @pytest.mark.parametrize("packed", [True, False])
 def test_too_few_files_at_a_time_cost_nobody_a_point(zips, teams, tmp_path, packed):
-    """If few files may be open at a time, the grade is either the same or still missing."""
+    """If the system allows few open files, a submission gets its usual grade or none yet."""
     source = zips / "team-0.zip" if packed else teams / "team-0"
     few = range(3, 12)  # three files are open at the start, and a few more belong to libraries
     (_, _, _, whole), *others = starved(source, tmp_path / "s", "RLIMIT_NOFILE", few)
@@ -177,7 +177,7 @@ def test_too_few_files_at_a_time_cost_nobody_a_point(zips, teams, tmp_path, pack
 def test_the_faults_of_a_decoder_are_the_archives(tmp_path):
     """If an archive's content cannot be decoded, the submission is refused for good.
 
-    The operating system gives no error number then, so the archive itself is at fault.
+    The operating system reports no error then, so the archive itself is at fault.
     """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_BZIP2) as packed:

@@ -1,4 +1,4 @@
-"""A batch makes one row for every submission, in any order, and grades nothing twice."""
+"""A batch gives every submission one row, in any order of work, and grades none twice."""
 
 import json
 import random
@@ -81,7 +81,7 @@ def graded(school, tmp_path_factory):
 
 
 def test_a_class_is_graded_and_sharing_is_flagged(graded):
-    """Every submission gets a row, and both owners of a copied step are flagged."""
+    """Every submission gets a row, and both teams that have a copied step are flagged."""
     _, batch, rows, seen = graded
     assert list(rows) == ["team-0", "team-1", "team-2", "team-3"]
     assert [outcome.status for outcome, _ in rows.values()] == ["graded"] * 3 + ["failed"]
@@ -218,7 +218,7 @@ def test_a_hang_is_stopped_and_tried_again(school, tmp_path):
 def killed_within(rng, book, command):
     """Run a command and kill it, with its children, at a random point of its work.
 
-    The point is measured in work done, since a machine's speed varies.
+    The point is a share of the work done, since machines differ in speed.
     """
     enough = n_graded(book) + rng.randrange(3)
     with started(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
@@ -270,7 +270,7 @@ HOSTILE = {
 
 
 def test_hostile_submissions_are_rows(tmp_path):
-    """Every hostile submission gets a row with a printable reason; no file outside is written."""
+    """Every hostile submission gets a row with a printable reason, and writes no file outside."""
     for name, text in HOSTILE.items():
         folder = tmp_path / "class" / name.replace("/", "_")
         folder.mkdir(parents=True)

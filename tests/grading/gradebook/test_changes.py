@@ -22,7 +22,7 @@ RUBRIC = two_cart_rubric()
 def test_a_rubric_is_compared_by_its_criteria():
     """A new, removed or reordered criterion is named, and so is each changed number.
 
-    Beside the criteria, changes of the rubric are named by their keys.
+    Other changes of the rubric are named by their keys.
     """
     first, second, *rest = RUBRIC.criteria
     dearer = first.model_copy(update={"points": first.points + 1})

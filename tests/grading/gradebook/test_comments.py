@@ -74,7 +74,7 @@ def test_points_by_hand_stay_by_hand_with_a_comment(book, say):
 
 
 def test_a_comment_is_undone_and_given_back(book):
-    """Undo removes a comment, or restores the comment that was there before."""
+    """Undo removes a comment; if it replaced an earlier comment, that one is back."""
 
     def undo():
         book.undo("team-1", "pieces", by="Ada", seen=book.team("team-1").versions["pieces"])
@@ -94,7 +94,7 @@ def test_a_comment_is_undone_and_given_back(book):
 
 
 def test_what_a_comment_would_change_is_shown_first(book):
-    """The preview of a comment shows the new message and unchanged points."""
+    """Before a comment is saved, its preview shows the new message and unchanged points."""
     wish = WantedPoints(submission="team-1", criterion="pieces", points=None, why="x", comment=True)
     (tried,) = book.try_all([wish])
     assert tried.after.points == tried.now.points

@@ -84,7 +84,7 @@ def test_in_a_folder_no_file_keeps_a_trace(tmp_path):
 
 
 def test_in_postgresql_no_row_keeps_a_trace(server, place_in_postgresql):
-    """After erasing, neither a dump of the database nor its table files show the student."""
+    """After erasing, the student is neither in a dump of the database nor in its table files."""
     url = place_in_postgresql
     _fill(url)
     assert set(_found(_dump(url))) == {"zebra", "s-zebra", "31.41592", "quagga"}

@@ -1,4 +1,4 @@
-"""The gradebook, on a real SQLite file and on a real PostgreSQL server."""
+"""The gradebook works on a real SQLite file and on a real PostgreSQL server."""
 
 import json
 import os
@@ -39,7 +39,7 @@ RUBRIC = two_cart_rubric()
 
 @pytest.fixture
 def open_book(place):
-    """Open the gradebook with a clock that advances at each call."""
+    """Open the gradebook with a clock that advances by one step at each call."""
     opened, tick = [], count()
 
     def opener(assignment="lab", create=True):
@@ -68,7 +68,7 @@ def finish(book, *outcomes, shared=None):
 
 
 def test_what_is_put_in_comes_back(open_book):
-    """An outcome is unchanged after the gradebook is closed and reopened, Unicode included."""
+    """An outcome, Unicode included, is the same after the gradebook was closed and reopened."""
     grade = make_grade("tëam 学 '\"; DROP TABLE gradings; --", share=0.5, flags=(hertz_flag(),))
     outcome = make_outcome(
         grade,
@@ -107,7 +107,7 @@ def test_a_folder_may_be_called_like_a_database(tmp_path):
 
 
 def test_the_newest_of_a_key_counts(open_book):
-    """If a submission was graded again under the same key, the second outcome counts."""
+    """If a submission is graded twice under the same key, the second outcome counts."""
     book = open_book()
     book.put(make_outcome(failed_grade("team-1", "too slow"), key="k", settled=False))
     second = make_outcome(make_grade("team-1"), key="k")
@@ -165,7 +165,7 @@ def test_the_class_list_is_the_last_batch_that_ended(open_book):
 
 
 def test_shared_data_is_flagged_in_the_class_list(open_book):
-    """The flag for shared data is in its batch's class list and gone after the next batch."""
+    """The class list has the flag for shared data until a later batch no longer finds it."""
     book = open_book()
     outcomes = [make_outcome(make_grade(name, flags=(hertz_flag(),))) for name in "ab"]
     finish(book, *outcomes, shared={"a": shared_flag("b"), "b": shared_flag("a")})
@@ -178,7 +178,10 @@ def test_shared_data_is_flagged_in_the_class_list(open_book):
 
 
 def test_points_given_by_hand_survive_regrading(open_book):
-    """Points given by hand survive a regrade until they are removed; lateness is computed again."""
+    """Points given by hand stay after a regrade, until they are removed.
+
+    The deduction for lateness is computed again.
+    """
     book = open_book()
     # Lateness costs a tenth, rounded to the rubric's quarter of a point: 1.1 → 1 and 0.65 → 0.75.
     first = make_grade("team-1", share=0.5, days_late=1.0)
@@ -247,7 +250,7 @@ def test_assignments_in_one_database_stay_apart(open_book):
 def test_one_hand_in_under_one_rubric_is_graded_in_each_assignment(open_book):
     """If two assignments grade the same submission, each has its own grade and overrides.
 
-    The key is the same, since the second assignment uses a copy of the rubric.
+    This holds even if both use the same rubric, so that the submission's key is the same.
     """
     one, two = open_book("lab 1"), open_book("lab 2")
     for book in (one, two):
@@ -261,7 +264,7 @@ def test_one_hand_in_under_one_rubric_is_graded_in_each_assignment(open_book):
 
 
 def test_no_override_is_above_what_the_rubric_has_now(open_book):
-    """If the rubric now gives fewer points for a criterion, an override gives at most those."""
+    """If a changed rubric gives fewer points for a criterion, an override cannot exceed them."""
     book = open_book()
     outcome = make_outcome(make_grade("team-1", share=0.0))
     finish(book, outcome)
@@ -344,7 +347,7 @@ def test_the_history_says_who_did_what_when_and_why(open_book):
 
 
 def test_the_history_tells_under_which_name_a_team_goes_on(open_book):
-    """If a team's folder has a new name in the next run, the histories of both names say so."""
+    """If a team's folder has a new name in the next run, the history says so under both names."""
     book = open_book()
     finish(
         book, make_outcome(make_grade("team-1", authors=("ann",))), make_outcome(make_grade("b"))
@@ -403,14 +406,14 @@ def test_a_kill_at_any_moment_loses_nothing_that_was_put_in(tmp_path):
 @pytest.mark.sample
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
 def test_a_dozen_kills_lose_nothing(place):
-    """If a process is killed twelve times while it writes, each stored outcome is whole."""
+    """After twelve kills of the writing process, each outcome is stored whole or not at all."""
     assert_nothing_lost(place, kills=12)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
 def test_three_hundred_kills_lose_nothing(place):
-    """If a process is killed three hundred times while it writes, each stored outcome is whole."""
+    """After 300 kills of the writing process, each outcome is stored whole or not at all."""
     assert_nothing_lost(place, kills=300)
 
 
@@ -446,7 +449,7 @@ def test_a_place_without_a_gradebook_is_an_error(tmp_path):
 def test_an_address_that_leads_nowhere_is_one_line_without_the_password(url, message):
     """An address that cannot be used gives an error of one line without the password.
 
-    A driver is missing, no server answers, or the text is not a URL.
+    For example, a driver is missing, no server answers, or the text is not a URL.
     """
     with pytest.raises(ConfigError, match=message) as error:
         Gradebook(url, create=True)
@@ -457,7 +460,7 @@ def test_an_address_that_leads_nowhere_is_one_line_without_the_password(url, mes
 def test_a_file_that_is_no_gradebook_is_an_error(tmp_path):
     """A file that is not a gradebook of this version is an error and stays as it is.
 
-    Such files are text, another program's database, and a gradebook of a later version.
+    The file is a text, another program's database, or a gradebook of a later version.
     """
     file = tmp_path / FILE
     file.write_text("name,points\n" * 100, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Students can ask for another look, with a SQLite file and with a PostgreSQL server."""
+"""Students can ask for another look at their points, in SQLite and in PostgreSQL."""
 
 import os
 import re
@@ -297,7 +297,7 @@ def test_a_criterion_that_is_gone_can_still_be_answered(book):
 
 
 def test_an_anonymous_history_does_not_say_who_asked(book):
-    """An anonymous history hides who asked, even if the student's own text contains a name."""
+    """In an anonymous class the history hides who asked, even if the student's text has a name."""
     anonymous = RUBRIC.model_copy(update={"anonymous": True})
     finish(book, make_grade("team-1", share=0.5), rubric=anonymous)
     book.ask("team-1", "laws", why="I, u42 of team-1 (S-team-1), see page 3", by="u42")
@@ -309,7 +309,10 @@ def test_an_anonymous_history_does_not_say_who_asked(book):
 
 
 def test_a_gradebook_made_before_opens(tmp_path):
-    """A gradebook of a version without requests gets the missing tables and keeps its content."""
+    """If a gradebook was made before requests existed, it gets the missing tables.
+
+    Its content stays.
+    """
     with OpenBook(tmp_path, assignment="lab", create=True) as book:
         finish(book, make_grade("team-1", share=0.5))
     with closing(sqlite3.connect(tmp_path / FILE)) as old:
@@ -333,7 +336,7 @@ def test_a_kill_leaves_an_answer_with_its_points_or_neither(place):
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
 def test_a_hundred_kills_leave_no_half_of_an_answer(place):
-    """After a hundred kills, every stored answer still has its points."""
+    """After a hundred kills of the answering process, every stored answer has its points."""
     assert_whole(place, kills=100)
 
 

@@ -46,13 +46,16 @@ def hand_ins(tmp_path, *paths):
 
 
 def opened(tmp_path, hand_in):
-    """Return the files of the submission found, relative to it."""
+    """Return the files of the submission found, as paths within its folder."""
     folder = open_submission(hand_in.sources, tmp_path / "opened" / hand_in.id)
     return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
 
 
 def test_a_tree_gives_a_row_for_every_team(tmp_path):
-    """Each team of a class gets a row: in a section, a zip file, or without a submission."""
+    """Each team of a class gets a row, whether in a section's folder or in a zip file.
+
+    A team without a submission gets a row too.
+    """
     tree(
         tmp_path / "class",
         {
@@ -191,9 +194,9 @@ def test_a_folder_keeps_its_name_whatever_platform_it_looks_like(tmp_path):
 
 @pytest.mark.parametrize("wrapped", ["", "class/", "term/class/"])
 def test_what_is_refused_costs_the_hand_in_it_is_in(tmp_path, wrapped):
-    """A refused file in a class archive marks only its own submission, at any depth.
+    """If a file in a class archive is refused, only its own submission is marked.
 
-    It adds no row, except for a submission that has no other files.
+    There is no extra row, unless the submission has no other files.
     """
     members = {f"{wrapped}team-{n}/submission.toml": TOML for n in range(3)}
     class_ = archive(tmp_path / "all.zip", members)
@@ -268,9 +271,9 @@ def test_a_class_that_was_cut_short_is_refused_by_its_name(tmp_path, packed):
 
 @pytest.mark.parametrize("how", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 def test_a_class_cut_within_its_first_packed_hand_in_is_refused(tmp_path, how):
-    """A class archive that ends within its first zip file is refused.
+    """If a class archive ends within its first submission, it is refused.
 
-    It is not read as one submission.
+    It is not read as a single submission.
     """
     own = zip_bytes(tmp_path, {"submission.toml": TOML, "data/a.csv": "1,2\n" * 99})
     download = tmp_path / "class.zip"
@@ -283,7 +286,10 @@ def test_a_class_cut_within_its_first_packed_hand_in_is_refused(tmp_path, how):
 
 
 def test_a_zip_out_of_which_a_file_was_taken_is_whole(tmp_path):
-    """A zip file from which a member was deleted is complete if its table of contents is valid."""
+    """A zip file from which a member was deleted is still accepted.
+
+    Its table of contents is valid, although the member's bytes are still in the file.
+    """
     taken = archive(tmp_path / "team-1.zip", {"draft.txt": "x", "submission.toml": TOML})
     with zipfile.ZipFile(taken, "a") as opened_again:
         del opened_again.filelist[0]
@@ -295,7 +301,7 @@ def test_a_zip_out_of_which_a_file_was_taken_is_whole(tmp_path):
 def test_one_bad_hand_in_of_a_download_costs_its_own_row(tmp_path):
     """A hostile submission in a class download fails alone; all others are graded.
 
-    The faults are paths that lead out, too deep folders, a password and broken bytes.
+    The faults are paths that lead out, folders that are too deep, a password and broken bytes.
     """
     download = archive(
         tmp_path / "class.zip",
@@ -336,9 +342,9 @@ def test_what_is_hidden_counts_only_with_a_submission(tmp_path):
 
 
 def test_results_of_a_grading_are_no_hand_ins(tmp_path):
-    """Folders of earlier results are not submissions, and a message names them.
+    """Folders of earlier results are not graded as submissions, and a message names them.
 
-    A team may still have such a folder's name.
+    A team's folder may still have the name of such a folder.
     """
     made = ("class.html", "feedback/.made.json", "feedback/a/feedback.html", "gradescope/a/x")
     tree(tmp_path / "c", dict.fromkeys(("a/submission.toml", *made), TOML))
@@ -353,9 +359,9 @@ def test_results_of_a_grading_are_no_hand_ins(tmp_path):
 
 @pytest.mark.parametrize("name", ["t.tar.gz", "t.tgz", "t.7z", "t.rar", "t.tar"])
 def test_an_archive_that_is_not_opened_is_a_row(tmp_path, name):
-    """An archive in a format that is not opened gets a row, except inside a team's own folder.
+    """An archive of a format other than zip gets a row that says so.
 
-    There it is taken for the team's backup.
+    Inside a team's own folder it is taken for the team's backup and ignored.
     """
     tree(tmp_path / "c", {"a/submission.toml": TOML, "b/lab/submission.toml": TOML, name: "packed"})
     tree(tmp_path / "c" / "b", {name: "packed"})
@@ -377,16 +383,16 @@ def test_a_team_without_its_file_keeps_its_name(tmp_path, beside):
 
 
 def test_a_name_of_many_numbers_is_read_at_once():
-    """A long name with many numbers is read at once, not in a time that grows with its square.
+    """A very long name with many numbers is read in a short time.
 
-    A member's name has at most 65,535 letters.
+    A name in an archive has at most 65,535 letters.
     """
     for part in ("_1", "_LATE_1", "_assignsubmission_", "anon_", "-1.a"):
         parse_name(part * (1_000_000 // len(part)) + "\n")
 
 
 def test_archives_in_archives_are_opened_to_a_depth(tmp_path):
-    """A zip file in a zip file is opened, but not one ten levels deep."""
+    """A zip file inside a zip file is opened, but not one that is ten levels deep."""
     content = zip_bytes(tmp_path, {"submission.toml": TOML})
     nested = zip_bytes(tmp_path, {"inner.zip": content})
     (found,) = hand_ins(tmp_path, archive(tmp_path / "a.zip", {"b.zip": nested}))
@@ -399,7 +405,7 @@ def test_archives_in_archives_are_opened_to_a_depth(tmp_path):
 
 
 def test_many_nested_archives_share_one_limit(tmp_path):
-    """All archives in one submission together share the limit on the number of files."""
+    """The limit on the number of files applies to all archives of a submission together."""
     part = zip_bytes(tmp_path, {str(i): "" for i in range(HAND_IN.members // 5)})
     whole = archive(tmp_path / "a.zip", {f"{i}.zip": part for i in range(10)})
     with pytest.raises(SubmissionError, match="files"):
@@ -407,7 +413,10 @@ def test_many_nested_archives_share_one_limit(tmp_path):
 
 
 def test_two_submissions_in_one_hand_in_are_a_question(tmp_path):
-    """Two submissions at the same depth are refused; one at a higher level is graded."""
+    """If a folder has two submissions at the same depth, it is refused.
+
+    One at a higher level is graded.
+    """
     files = {"a/submission.toml": TOML, "b/submission.toml": TOML}
     folder = tree(tmp_path / "t", files)
     with pytest.raises(SubmissionError, match=r"which one.*'a/submission\.toml' and 'b/"):
@@ -454,7 +463,7 @@ def test_too_many_files_are_said_to_be_too_many(tmp_path):
 
 
 def test_a_hand_in_travels_whole(tmp_path):
-    """A submission sent to another machine has the same files and hash there."""
+    """A submission sent to another machine has the same files and the same hash there."""
     folder = tree(tmp_path / "t", {"submission.toml": TOML, "data/ü.csv": "1", ".DS_Store": "x"})
     unpacked(packed([folder]), tmp_path / "there")
     assert digest([tmp_path / "there"]) == digest([folder])

@@ -29,9 +29,9 @@ def settle(tmp_path, *hand_ins: HandIn, text: str | None = None, due: datetime |
 
 
 def test_the_deadline_counts_where_it_is_said_when_something_was_handed_in(tmp_path):
-    """If the time of submission is known, the deadline decides, in any time zone.
+    """If the time of submission is known, lateness is computed from the deadline.
 
-    Otherwise the platform's late mark counts.
+    Any time zone is understood. Otherwise the platform's late mark counts.
     """
     days, _ = settle(
         tmp_path,
@@ -44,9 +44,9 @@ def test_the_deadline_counts_where_it_is_said_when_something_was_handed_in(tmp_p
 
 
 def test_a_table_of_ones_own_goes_first(tmp_path):
-    """A table of days overrides the deadline.
+    """The instructor's table of days late overrides the deadline.
 
-    A 0 is an extension, and an unknown name gives a warning.
+    Zero days are an extension, and an unknown name gives a warning.
     """
     days, remarks = settle(
         tmp_path,
@@ -71,7 +71,7 @@ def test_a_table_of_ones_own_goes_first(tmp_path):
     ],
 )
 def test_what_cannot_be_understood_is_said(tmp_path, text, message):
-    """If the table cannot be read, the error names the line."""
+    """If the table of days late cannot be read, the error names the line."""
     with pytest.raises(ConfigError) as error:
         settle(tmp_path, hand_in("x"), text=text)
     assert message in str(error.value)

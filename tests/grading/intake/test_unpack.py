@@ -1,4 +1,4 @@
-"""A hostile archive writes nothing outside its folder or beyond the limits, and gets one reason."""
+"""A hostile archive writes nothing outside its folder and is refused with one reason."""
 
 import struct
 import zipfile
@@ -86,7 +86,7 @@ def test_links_pipes_and_devices_are_refused(tmp_path, mode, reason):
     ],
 )
 def test_bombs_do_not_go_off(tmp_path, members, reason):
-    """Limits on size, ratio and number of files are checked while a zip bomb is unpacked."""
+    """While a zip bomb is unpacked, limits on size, ratio and number of files stop it."""
     archive = zipped(tmp_path / "bomb.zip", members)
     with pytest.raises(SubmissionError, match=reason):
         unpack(archive, tmp_path / "out", limits=SMALL)
@@ -94,7 +94,7 @@ def test_bombs_do_not_go_off(tmp_path, members, reason):
 
 
 def test_the_contents_that_count_are_those_that_are_read(tmp_path):
-    """If two records state the length of the table of contents, the 64-bit record counts."""
+    """The length of the table of contents is taken from the 64-bit record if there is one."""
     archive = zipped(tmp_path / "a.zip", {"y" * 4_000 + str(i): "" for i in range(19)})
     with pytest.raises(SubmissionError, match="table of contents"):
         unpack(archive, tmp_path / "plain", limits=BRIEF)
@@ -140,7 +140,10 @@ def test_an_encrypted_archive_says_so(tmp_path):
 
 
 def test_names_are_read_as_they_were_meant(tmp_path):
-    """UTF-8 names are recognised without their flag, and combining accents join their letters."""
+    """Names in UTF-8 are recognised even if the archive does not mark them as UTF-8.
+
+    A letter and its accent become one character.
+    """
     path = tmp_path / "a.zip"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("mu\u0308ller/x.txt", "1")  # u and a combining diaeresis

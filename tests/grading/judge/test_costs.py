@@ -1,4 +1,4 @@
-"""Points follow consequences: a harmful model, the least cost of a flag, the rubric's step."""
+"""Points follow consequences: a harmful model, a flag's least cost, the rubric's step."""
 
 from dataclasses import replace
 from decimal import Decimal
@@ -24,7 +24,7 @@ def model(one: Student) -> tuple[np.ndarray, np.ndarray]:
 
 
 def with_model(one: Student, A: np.ndarray, B: np.ndarray) -> Student:
-    """Return the student with another model, typed to three digits."""
+    """Return the student with another state model, typed to three digits."""
     return one.reporting(state_space=space_of(A, B))
 
 
@@ -102,7 +102,7 @@ def test_another_order_of_the_states_is_no_harm(carts, first):
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
 def test_an_honest_model_does_no_harm(preset):
-    """A model with entries up to 10 % off is not judged as harmful, even if it is unstable."""
+    """A state model with entries up to 10 % off is not judged as harmful, even if unstable."""
     chain, rng = PRESETS[preset], np.random.default_rng(5)
     A, B, _, _ = chain.state_space()
     right = np.hstack([A, B])
@@ -136,7 +136,7 @@ def test_gains_that_only_work_on_paper_keep_a_quarter_at_most():
 
 
 def test_an_error_in_the_model_costs_half_where_the_rubric_says_nothing():
-    """If the rubric states no cost, a wrong state model costs at least half of the criterion.
+    """If the rubric states no cost, a wrong state model costs at least half of its criterion.
 
     Here one coupling is too weak.
     """
@@ -152,7 +152,7 @@ def test_an_error_in_the_model_costs_half_where_the_rubric_says_nothing():
 
 
 def test_a_remark_on_a_table_costs_the_criteria_of_its_numbers():
-    """A flag on a table costs points only in the criteria of the numbers that it names."""
+    """A flag costs points only in the criteria that judge the numbers it names."""
     one = student(2)
     hertz = {
         name: one.value("final", name) / (2 * np.pi)

@@ -91,7 +91,7 @@ def test_a_right_first_estimate_may_be_found_again(digits):
 
 @pytest.mark.parametrize("carts", [2, 3])
 def test_the_order_in_which_numbers_are_listed_does_not_matter(carts):
-    """The order in which a student lists the numbers does not matter."""
+    """A student may list the numbers in any order, for example the last cart first."""
     one = student(carts)
     reported = one.reported.model_copy(
         update={
@@ -130,7 +130,10 @@ def test_frequencies_in_hz(carts, table):
 
 
 def test_a_named_mistake_is_told_once_and_nothing_else_is_advised():
-    """Frequencies in Hz in both tables give one flag that names them, without other advice."""
+    """If the frequencies of both tables are in Hz, one flag names them all.
+
+    Other messages give no further advice.
+    """
     one = student(2)
     names = [n for n in one.reported.final if n.startswith("omega")]
     hertz = scaled(scaled(one, "initial", names, 1 / TURN), "final", names, 1 / TURN).grade()
@@ -145,7 +148,7 @@ def test_a_named_mistake_is_told_once_and_nothing_else_is_advised():
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_numbers_beside_a_slip_are_as_far_off_as_honest_ones(carts):
-    """Gains in counts give one flag, even if one of the gains is also 7 % off."""
+    """If all gains are in counts, there is one flag, even if one gain is also 7 % off."""
     one, names = student(carts), own("K", carts)
     counted = {n: one.value("initial", n) / 0.00227 for n in names}
     counted[names[-1]] *= 1.07
@@ -155,7 +158,10 @@ def test_numbers_beside_a_slip_are_as_far_off_as_honest_ones(carts):
 
 @pytest.mark.parametrize("carts", [2, 3])
 def test_a_mistake_that_is_made_everywhere_shows_everywhere(carts):
-    """A single damping that is 2.3 times too small is not called a logarithm slip."""
+    """A single damping that is 2.3 times too small is not flagged as log10 instead of ln.
+
+    That mistake would show in all dampings.
+    """
     one = student(carts)
     flag = only_flag(scaled(one, "initial", ["zeta_1"], np.log10(np.e)))
     assert (flag.code, flag.parameters) == ("initial_off", ("zeta_1",))
@@ -164,7 +170,10 @@ def test_a_mistake_that_is_made_everywhere_shows_everywhere(carts):
 @pytest.mark.parametrize("carts", [1, 2, 3])
 @pytest.mark.parametrize("k", [1, 2, 3])
 def test_one_period_counted_too_many(carts, k):
-    """A peak too many is recognised: ω is (k + 1)/k of its value, and ζ smaller in proportion."""
+    """If one period too many was counted, a flag says so.
+
+    Then ω is (k + 1)/k of its true value, and ζ is smaller by the same factor.
+    """
     one = student(carts)
     omegas, zetas = own("omega", carts), own("zeta", carts)
     wrong = scaled(one, "initial", omegas, (k + 1) / k)
@@ -185,7 +194,7 @@ def test_a_decrement_with_log10(carts):
 @pytest.mark.parametrize("carts", [1, 2, 3])
 @pytest.mark.parametrize("table", ["initial", "final"])
 def test_gains_from_peak_to_peak_and_in_counts(carts, table):
-    """Gains twice too large are flagged as peak to peak.
+    """Gains that are twice too large are flagged as read from peak to peak.
 
     Gains divided by the encoder step are flagged as counts; a gain can have both flags.
     """
@@ -199,7 +208,7 @@ def test_gains_from_peak_to_peak_and_in_counts(carts, table):
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_the_peak_of_the_step(carts):
-    """A gain read at the peak of the step, not at its settled level, is recognised."""
+    """A gain read at the peak of the step instead of its settled level is flagged as such."""
     one = student(carts)
     record = next(r for r in one.analysis.records if r.kind == "step")
     assert record.u is not None
@@ -250,7 +259,7 @@ def test_the_peak_of_one_edge_of_both_carts(hide):
 @pytest.mark.parametrize("carts", [2, 3])
 @pytest.mark.parametrize("table", ["initial", "final"])
 def test_carts_swapped(carts, table):
-    """Numbers of the first and the last cart in each other's place are recognised."""
+    """If the numbers of the first and the last cart are swapped, a flag says so."""
     one = student(carts)
     swapped = {}
     for symbol in ("K", "omega", "zeta"):
@@ -262,7 +271,7 @@ def test_carts_swapped(carts, table):
 
 
 def test_two_mistakes_in_one_number():
-    """Swapped frequencies in Hz get both flags, since one mistake alone explains neither number."""
+    """Swapped frequencies in Hz get both flags, since neither mistake alone explains them."""
     one = student(2)
     wrong = {
         "omega_1": one.value("initial", "omega_2") / TURN,
@@ -275,7 +284,7 @@ def test_two_mistakes_in_one_number():
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_a_final_table_copied_from_the_first(carts):
-    """A final table equal to the initial one in every digit is flagged only as not fitted."""
+    """If the final table equals the initial one in every digit, the only flag is "no fit done"."""
     one = student(carts)
     flag = only_flag(one.reporting(final=one.reported.initial))
     assert flag.code == "no_fit_done"
@@ -292,7 +301,7 @@ def test_tables_of_single_digits_agree_anyway(carts):
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_a_number_that_no_mistake_explains_is_only_off(carts):
-    """A wrong number that no named mistake explains is only flagged as off."""
+    """If no named mistake explains a wrong number, the flag only says that it is off."""
     one = student(carts)
     omega, gain = own("omega", carts)[0], own("K", carts)[-1]
     flag = only_flag(scaled(one, "final", [omega], 1.33))
@@ -302,7 +311,7 @@ def test_a_number_that_no_mistake_explains_is_only_off(carts):
 
 
 def test_a_frequency_out_of_order_is_told_by_the_recordings():
-    """A wrong null frequency that also breaks the order is only flagged as off.
+    """A wrong frequency of a null gets one flag, even if it also breaks the order of the nulls.
 
     The message gives the value from the recordings.
     """
@@ -352,7 +361,7 @@ def exchanged(A: list, n: int) -> list:
     ],
 )
 def test_a_wrong_state_model_says_which_slip_made_it(carts, slip: Callable, said):
-    """If a wrong state model follows from one known slip, the message names the slip."""
+    """If a single known mistake explains a wrong state model, the message names it."""
     one = student(carts)
     space = one.reported.state_space
     assert space is not None
@@ -364,7 +373,7 @@ def test_a_wrong_state_model_says_which_slip_made_it(carts, slip: Callable, said
 
 
 def test_a_state_model_that_follows_from_a_wrong_table_is_right():
-    """A state model that was built correctly from frequencies in Hz gets no flag of its own."""
+    """A state model built correctly from frequencies in Hz gets no flag besides that for Hz."""
     one = student(1)
     hertz = one.value("final", "omega_n") / TURN
     space = one.reported.state_space
@@ -396,7 +405,10 @@ def test_wrong_gains_and_wrong_prefilters_are_told_apart(carts):
 
 
 def test_claims_of_other_gains_are_not_these_gains():
-    """Gains 2.5 times too large are flagged if the loop settles later than the student reported."""
+    """If the gains cannot give the settling time that the student reported, they are flagged.
+
+    Here they are 2.5 times too large.
+    """
     one = student(1)
     feedback = one.reported.feedback
     assert feedback is not None
@@ -417,7 +429,7 @@ def test_what_is_missing_is_named():
 
 
 def test_gains_that_cancel_all_stiffness_are_judged():
-    """Gains that cancel all stiffness are judged, although no prefilter exists for them."""
+    """Gains that cancel all stiffness are judged wrong, although no prefilter exists for them."""
     one = student(1)
     feedback = one.reported.feedback
     assert feedback is not None

@@ -1,4 +1,4 @@
-"""One submission is graded from its folder: points, dependencies, lateness, planted results."""
+"""A submission is graded from its folder alone, and results planted in it are ignored."""
 
 import json
 import shutil
@@ -125,7 +125,7 @@ def test_a_record_s_own_scale_does_not_win_over_the_rubric_s(folder):
 def test_between_a_record_s_own_sign_and_the_rubric_s_the_data_decide(
     folder, honest, tmp_path, turned
 ):
-    """If a step's own sign differs from the rubric's, the sign that the data show is used."""
+    """If a step states another sign than the rubric, the sign that fits the data is used."""
     other = tmp_path / "team-07"
     shutil.copytree(folder, other)
     for path in (other / "data").glob("step-*.csv") if turned else ():
@@ -178,9 +178,9 @@ def test_the_rubric_s_system_wins(folder, honest, tmp_path):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_delay_is_not_read_as_a_spring(tmp_path):
-    """A spring that the fit puts at zero is not added, even if the fit is better with it.
+    """A spring that the fit puts at zero is not added, even if the fit then seems better.
 
-    Here a delay makes it look better.
+    Here a hidden delay makes the fit seem better.
     """
     bench = prepare_bench(preset="throne-2dof", model=None, hide=["input_delay"])
     write_submission(tmp_path, bench, seed=304)
@@ -191,7 +191,7 @@ def test_a_delay_is_not_read_as_a_spring(tmp_path):
 
 
 def test_two_first_and_final_numbers_of_one_sign_agree(folder):
-    """First and final numbers agree if both have the reversed sign, but not if the signs differ."""
+    """Two gains that both have the reversed sign agree; gains of different signs do not."""
     assert between(Decimal("-24.4"), Decimal("-24.3")) == between(Decimal("24.4"), Decimal("24.3"))
     assert between(Decimal("-24.4"), Decimal("24.3")) == between(Decimal("0"), Decimal("24.3"))
 
@@ -220,7 +220,7 @@ def test_a_cut_file_costs_its_own_run_only(folder, tmp_path):
 
 
 def test_a_missing_file_costs_what_was_to_be_in_it(folder, honest, tmp_path):
-    """A missing file costs its own run, and also a criterion that depends only on this file."""
+    """If a file is missing, its run is flagged; a criterion that needs this file is missing too."""
     less = tmp_path / "team-07"
     shutil.copytree(folder, less)
     (less / "data" / "decay-1a.csv").unlink()
@@ -294,7 +294,7 @@ def test_a_broken_law_is_told_in_words():
 
 
 def test_lateness_takes_its_share_for_every_day_begun():
-    """Each day late costs 10 %, after an hour of grace and at most half of the points."""
+    """Each day begun costs 10 %, after an hour of grace, up to half of the points."""
     one = student(1)
     full = one.grade().points
     for days, share in ((0.0, 0), (0.04, 0), (0.5, 0.1), (1.04, 0.1), (2.0, 0.2), (30.0, 0.5)):
@@ -324,7 +324,7 @@ def test_further_flags_keep_the_order_of_the_codes():
 
 @pytest.mark.parametrize(("hide", "loosely"), [((), False), (("dead_zone",), True)])
 def test_numbers_that_are_judged_loosely_are_said_to_be(hide, loosely):
-    """If no linear carts fit the recordings, the message asks a person to look at the numbers."""
+    """If no linear carts fit the recordings, the message asks a person to check the numbers."""
     criteria = {c.id: c for c in student(1, hide=hide).grade().criteria}
     for name in ("final-gains", "final-frequencies", "final-dampings"):
         message = criteria[name].message

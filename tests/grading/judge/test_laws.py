@@ -47,7 +47,7 @@ def test_table_3_of_the_paper_fails_where_it_is_known_to():
 
 
 def test_one_digit_excuses_no_more_than_two():
-    """Numbers typed with one digit are not rounded so coarsely that every law holds."""
+    """A table typed with one digit is not excused so much rounding that every law holds."""
     vague = {name: f"{float(value):.0e}" for name, value in TABLE_2.items()}
     assert broken(vague, n=2) == {"recomputed.omega_1", "recomputed.zeta_1"}
     assert "positive.K_1" in broken({**TABLE_2, "K_1": "0e2"}, n=2)
@@ -79,7 +79,7 @@ def test_an_incomplete_table_is_not_judged():
     ("n", "name"), [*((2, x) for x in ("K_1", "omega_a", "omega_2", "zeta_2")), (3, "omega_2")]
 )
 def test_the_worse_a_number_the_less_its_table_earns(n, name):
-    """The larger one number's error, the more the tolerances must widen for all laws to hold."""
+    """The larger the error of one number, the more the laws' tolerances must be widened."""
     table = PRESETS[f"throne-{n}dof"].parameters()
 
     def needed(factor: float) -> Fraction:

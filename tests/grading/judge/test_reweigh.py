@@ -1,4 +1,4 @@
-"""Stored findings give the same points under another rubric as grading again."""
+"""From stored findings, another rubric gives the same points as grading again."""
 
 from dataclasses import replace
 from decimal import Decimal
@@ -21,7 +21,7 @@ from tests.helpers.grading_students import Student, student
 
 @cache
 def _erring(carts: int) -> Student:
-    """Return a team whose numbers are partly right, partly near, and otherwise wrong."""
+    """Return a team with some numbers right, some slightly off and the others wrong."""
     honest = student(carts)
     names = honest.rubric.names
     off = {name: honest.value("final", name) * (1 + 0.03 * i) for i, name in enumerate(names)}
@@ -92,7 +92,7 @@ def test_points_are_those_of_grading_again(carts, data):
 
 
 def test_the_same_rubric_gives_the_same_points():
-    """Stored findings give the same points under the same rubric, for a team that loses some."""
+    """Points computed from stored findings equal those of the grading that stored them."""
     team, before = _erring(2), _graded(2)
     weighed = reweigh(before.grade, before.verdicts, rubric=team.rubric)
     assert weighed.points == before.grade.points
@@ -100,7 +100,7 @@ def test_the_same_rubric_gives_the_same_points():
 
 
 def test_what_needs_the_recordings_is_named():
-    """Changed rubric keys that need the recordings are named."""
+    """If a changed key of the rubric needs the recordings, the key is named."""
     rubric = student(2).rubric
     plain = rubric.model_dump(mode="json")
     plain["required"]["final"] = ["K_*"]

@@ -1,4 +1,4 @@
-"""Recordings whose unit is stated wrongly: counts stated as cm, or mV stated as V."""
+"""Recordings may have a wrong unit: counts stated as cm, or mV stated as V."""
 
 import csv
 from pathlib import Path
@@ -45,9 +45,9 @@ def in_counts(tmp_path_factory):
 
 
 def test_counts_said_to_be_centimetres_fail_a_check(in_counts):
-    """Counts that are stated as centimetres fail a check, although all recordings agree.
+    """Recordings in counts that are stated as centimetres fail a check.
 
-    Every gain is then hundreds of times too large.
+    Every gain is then hundreds of times too large, and everything else agrees.
     """
     failed = [c.id.split(".")[0] for c in analyse(load_submission(in_counts)).checks
               if c.outcome == "fail"]  # fmt: skip
@@ -65,7 +65,7 @@ def test_the_right_gain_is_not_accused_where_the_recordings_are_in_counts(in_cou
 
 
 def test_a_stated_length_of_a_count_makes_the_gain_known(in_counts):
-    """If the rubric states the length of a count, gains are judged by the scaled recordings."""
+    """If the rubric states the length of a count, gains are judged by recordings in that length."""
     outcomes = {c.id: c.outcome for c in grade(in_counts, per_count=COUNT).criteria}
     assert outcomes["initial-gains"] == outcomes["final-gains"] == "pass"
     off = {c.id: c.outcome for c in grade(in_counts, per_count=2 * COUNT).criteria}

@@ -261,7 +261,7 @@ def test_grading_says_what_the_stated_frequencies_are_in(bench, tmp_path):
 
 
 def test_a_held_cart_that_nobody_called_free_is_told_with_its_cure(bench, tmp_path):
-    """If a held cart is not declared, the message gives the line that declares the free carts.
+    """If a recording with a held cart lacks `carts`, the message gives the line to add.
 
     Without `carts`, all carts count as free.
     """
@@ -289,9 +289,9 @@ def test_a_loop_that_is_left_out_is_held_against_nothing(bench, tmp_path):
 
 
 def test_the_sound_repeats_stay_where_most_are_exchanged(bench, tmp_path):
-    """If three of four steps have swapped columns, only those three are left out.
+    """If three of four steps have swapped columns, only these three are left out.
 
-    No sign is advised.
+    The report does not advise another sign.
     """
     folder = shutil.copytree(bench, tmp_path / "most")
     steps = files(folder, "step")
@@ -304,7 +304,7 @@ def test_the_sound_repeats_stay_where_most_are_exchanged(bench, tmp_path):
 
 
 def test_one_clock_in_milliseconds_throughout_fails_the_dwells(bench, tmp_path):
-    """If all clocks are in milliseconds, the dwells fail against their stated frequencies."""
+    """If all times are in milliseconds, a check finds the dwells' frequencies off by 1000."""
     folder = shutil.copytree(bench, tmp_path / "slow")
     for path in files(folder, ""):
         spoil(path, in_milliseconds)
@@ -320,7 +320,7 @@ def test_one_clock_in_milliseconds_throughout_fails_the_dwells(bench, tmp_path):
 
 
 def test_one_recording_in_two_experiments_counts_once(bench, tmp_path):
-    """If a repeat names the same file as another recording, the repeat is left out and flagged."""
+    """If two repeats name the same file, the second is left out and flagged."""
     folder = shutil.copytree(bench, tmp_path / "copied")
     _change(folder, "data/step-2.csv", "data/step-1.csv")
     graded = grade_submission(
@@ -334,7 +334,7 @@ def test_one_recording_in_two_experiments_counts_once(bench, tmp_path):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_columns_exchanged_in_every_recording_are_named(bench, tmp_path):
-    """If all driven recordings fit only with columns swapped, the reason says so.
+    """If the columns of all driven recordings are swapped, the reason says so.
 
     Then nothing is identified.
     """
@@ -350,7 +350,7 @@ def test_columns_exchanged_in_every_recording_are_named(bench, tmp_path):
 
 
 def test_dwells_and_steps_that_contradict_one_another_identify_nothing(bench, tmp_path):
-    """If dwells and steps differ in scale by ten, nothing is identified.
+    """If the inputs of all dwells are ten times off those of all steps, nothing is identified.
 
     The report gives both explanations: wrong dwells or wrong steps.
     """
@@ -435,7 +435,7 @@ def test_fewer_decimals_in_some_files_are_no_other_unit(bench, tmp_path):
 
 
 def test_carts_that_stick_and_creep_are_in_no_other_unit_of_time(bench):
-    """A record of sticking, creeping carts is not taken for one in another unit of time."""
+    """If carts stick and creep, the recording is not said to be in another unit of time."""
     chain = PRESETS[PRESET]
     dwell = next(
         r for r in analyse(load_submission(bench), design=False).records if r.kind == "sine"

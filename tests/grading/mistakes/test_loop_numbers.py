@@ -1,4 +1,4 @@
-"""Reported gains are judged by their loop on a chain, however fast the controller samples."""
+"""Reported gains are judged by simulating their loop, however fast the controller samples."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ GAINS = np.array(
 
 @pytest.mark.parametrize("sample_time", [1e-2, 1e-3, 5e-4, 1e-4])
 def test_a_fast_controller_is_seen_to_settle(sample_time):
-    """Overshoot and settling time match the textbook within one sample and the delay."""
+    """Overshoot and settling time equal the textbook's to within one sample and the delay."""
     numbers = loop_numbers(CHAIN, GAINS, cart=1, settling=1.0, sample_time=sample_time)
     assert numbers is not None
     assert numbers.stable

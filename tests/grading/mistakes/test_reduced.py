@@ -1,4 +1,4 @@
-"""A table that students reduced themselves is compared with their own dwells."""
+"""A student's own table of amplitude ratios is compared with the student's dwells."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ TURN = 2 * np.pi
 
 
 def reduced(analysis: Analysis) -> tuple[FrequencyResponse, ...]:
-    """Return an honest table: half the swing of the last three cycles, with a percent of error."""
+    """Return an honest table, read as half the swing of the last three cycles with 1 % error."""
     runs = {record.id: record for record in analysis.records}
     rng = np.random.default_rng(5)
     tables = []
@@ -49,7 +49,7 @@ def changed(analysis: Analysis, *, ratio=lambda x: x, stretch: float = 1.0) -> A
 
 @pytest.mark.parametrize(("carts", "hide"), [(1, ()), (2, ()), (3, ()), (2, ("coulomb_friction",))])
 def test_an_honest_table_gets_no_flag(carts, hide):
-    """An honest table gets no flag, even if it uses half the swing instead of a sine fit."""
+    """An honest table gets no flag, although half the swing differs from a sine fit."""
     analysis = student(carts, hide=hide).analysis
     assert diagnose_reduced(changed(analysis)) == []
 
@@ -67,7 +67,7 @@ def test_an_honest_table_gets_no_flag(carts, hide):
     ],
 )
 def test_a_slip_in_the_table_is_named(carts, code, change):
-    """If every row of a table is off in the same way from the dwells, the mistake is named."""
+    """If all rows of a table differ from the dwells by the same mistake, a flag names it."""
     (flag,) = diagnose_reduced(changed(student(carts).analysis, **change))
     assert flag.code == code
     assert "reduced table" in flag.message
@@ -76,7 +76,10 @@ def test_a_slip_in_the_table_is_named(carts, code, change):
 
 @pytest.mark.parametrize(("code", "factor"), [("peak_to_peak", 2.0), ("hz_for_rad_s", TURN)])
 def test_without_dwells_steps_and_decays_tell(code, factor):
-    """Without dwells, a mistake shows as one factor between the table's fit and steps or decays."""
+    """Without dwells, the table's fit is compared with steps and decays.
+
+    If they differ by one factor for all carts, a flag names the mistake.
+    """
     analysis = student(2).analysis
     symbol = "K" if code == "peak_to_peak" else "omega"
     rows = tuple(

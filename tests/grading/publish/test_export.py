@@ -1,4 +1,4 @@
-"""Each platform's importer, as its rules are written, accepts the exported files."""
+"""Exported files follow the rules of each platform's importer."""
 
 import csv
 import io
@@ -44,7 +44,7 @@ def write(tmp_path: Path, *outcomes, platform, roster: str = "", overrides=(), *
 
 
 def test_a_grade_is_better_than_none(tmp_path):
-    """An author of an ungraded submission and one without points gets the points."""
+    """If an author has an ungraded submission and one with 0 points, the 0 points count."""
     unread = failed_grade("a", "too slow")
     unread = unread.model_copy(update={"authors": ("bob",)})
     nothing = make_grade("b", share=0.0, authors=("bob",))
@@ -59,7 +59,10 @@ def test_a_grade_is_better_than_none(tmp_path):
 
 
 def canvas_import(rows: list[list[str]]) -> dict[str, dict[str, str]]:
-    """Read grades as `gradebook_importer.rb` does; return them by assignment and student."""
+    """Read grades by the rules of `gradebook_importer.rb`.
+
+    Return them by assignment and student.
+    """
     head = rows[0]
     assert len(head) > 3
     assert "Student" in head[0]
@@ -82,7 +85,10 @@ def canvas_import(rows: list[list[str]]) -> dict[str, dict[str, str]]:
 
 
 def moodle_import(rows: list[list[str]]) -> dict[str, tuple[str, str]]:
-    """Read a worksheet as `importgradeslib.php` does; return grade and feedback by participant."""
+    """Read a worksheet by the rules of `importgradeslib.php`.
+
+    Return grade and feedback by participant.
+    """
     head = rows[0]
     at = {name: head.index(name) for name in ("Identifier", "Grade", "Feedback comments")}
     assert "Last modified (grade)" in head
@@ -101,7 +107,10 @@ BROKEN = make_outcome(failed_grade("team-3", "<b>broken</b>"), owner="roeric (10
 
 
 def test_canvas_takes_the_grades(tmp_path):
-    """For Canvas, each author has a row, blank with a message if the submission is not graded."""
+    """The table for Canvas has a row for each author; an ungraded author's cell is blank.
+
+    A message names the ungraded submissions.
+    """
     rows, remarks = write(tmp_path, HALF, FULL, BROKEN, platform="canvas", title="Lab 3 (77)")
 
     assert canvas_import(rows) == {
@@ -130,7 +139,7 @@ def test_a_submission_that_names_nobody_is_said(tmp_path):
 
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 def test_a_number_of_another_platform_is_nobodys(tmp_path, platform):
-    """A student number of another platform is not used, since it means another student there."""
+    """A student's number on another platform is not used, since it means somebody else here."""
     others = {"canvas", "moodle", "gradescope"} - {platform}
     entries = [
         make_outcome(make_grade(f"team-{of}"), owner=f"Jane Doe ({of} 1024)") for of in others
@@ -211,7 +220,7 @@ def test_moodle_own_worksheet_is_filled_in(tmp_path):
 
 
 def test_a_worksheet_with_another_maximum_is_refused(tmp_path):
-    """A worksheet with another maximum grade is refused, since Moodle keeps its own maximum."""
+    """A Moodle worksheet with another maximum is refused, since Moodle would keep its own."""
     roster = "Identifier,Full name,Grade,Maximum Grade\nParticipant 1024,Jane Doe,,{}\n"
     write(tmp_path, HALF, platform="moodle", roster=roster.format('"20,00"'))
     with pytest.raises(ConfigError, match=r"maximum grade 18\.00, the rubric 20"):
@@ -219,7 +228,7 @@ def test_a_worksheet_with_another_maximum_is_refused(tmp_path):
 
 
 def test_a_gradebook_with_other_points_possible_is_refused(tmp_path):
-    """A Canvas gradebook with other points possible is refused, since Canvas keeps its own."""
+    """A Canvas gradebook with another maximum is refused, since Canvas would keep its own."""
     roster = (
         "Student,ID,Section,Lab 3 (77),Lab 4 (78)\n"
         "    Points Possible,,,{},40\n"
@@ -231,7 +240,7 @@ def test_a_gradebook_with_other_points_possible_is_refused(tmp_path):
 
 
 def test_moodle_is_told_why_points_were_given_by_hand(tmp_path):
-    """The comment for Moodle says why points were given by hand, even if all were."""
+    """The comment for Moodle says why points were given by hand, even for full points."""
     first = RUBRIC.criteria[0]
     given = [("team-b", first.id, first.points)]
     outcome = make_outcome(make_grade("team-b", share=0.0, authors=("bo",)))
@@ -302,7 +311,7 @@ def test_two_submissions_with_the_same_points_leave_nothing_to_decide(tmp_path):
 
 
 def test_a_row_that_two_submissions_lead_to_stays_as_it_was(tmp_path):
-    """If two submissions match one row, by author and by uploader, the row stays unchanged."""
+    """If one submission matches a row by author and another by uploader, the row is unchanged."""
     roster = 'Student,ID,SIS User ID,SIS Login ID,Section,Lab 3\n"Doe, Jane",1001,S1,jane,A,3\n'
     by_id = make_outcome(make_grade("team-1", share=0.5, authors=("s1",)))
     by_number = make_outcome(make_grade("o", authors=("x", "y")), owner="doejane (canvas 1001)")
@@ -317,9 +326,9 @@ def test_a_row_that_two_submissions_lead_to_stays_as_it_was(tmp_path):
 
 
 def test_the_number_of_who_handed_in_decides_nothing(tmp_path):
-    """If an author of two submissions uploaded one of them, the points stay open.
+    """If an author of two submissions uploaded one of them, the points still stay open.
 
-    One message says so.
+    The message about this appears once.
     """
     roster = 'Student,ID,SIS User ID,SIS Login ID,Section,Lab 3\n"Doe, Jane",1001,s1,jane,A,3\n'
     one = make_outcome(make_grade("a", share=0.5, authors=("s1", "x")), owner="doejane (1001)")
@@ -335,9 +344,8 @@ def test_the_number_of_who_handed_in_decides_nothing(tmp_path):
 def test_an_author_whose_points_another_account_got_is_named(tmp_path, own):
     """If an author's points go to the uploader's row, a message names the author.
 
-    The uploader's number counts before the authors' ids.
-
-    An author with an ungraded submission of their `own` is in two submissions.
+    The uploader's number counts before the authors' ids. With an ungraded submission of their
+    `own`, the author is in two submissions.
     """
     roster = 'Student,ID,SIS User ID,Section,Lab 3\n"Doe, Jane",1001,s1,A,\n"Roe, Jo",1002,s2,A,\n'
     broken = failed_grade("a", "no TOML").model_copy(update={"authors": ("s1",)})
@@ -361,9 +369,9 @@ def test_an_author_whose_points_another_account_got_is_named(tmp_path, own):
 
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 def test_points_by_hand_of_a_submission_without_names_are_exported(tmp_path, platform):
-    """Points given by hand to a submission without names are exported under its folder's name.
+    """If a submission names nobody, points given by hand are exported under its folder's name.
 
-    If an earlier version named its authors, those get the points.
+    If an earlier version named its authors, they get the points.
     """
     broken = make_outcome(failed_grade("team-8", "no TOML"))
     rows, remarks = write(
@@ -440,7 +448,7 @@ def test_gradescope_must_have_a_score(tmp_path):
 
 @pytest.mark.parametrize("platform", ["moodle", "gradescope"])
 def test_no_comment_names_the_other_team(tmp_path, platform):
-    """The comment says that a recording is also in another submission, but not in whose."""
+    """A comment on a shared recording says that another submission has it, but not which one."""
     shared = make_outcome(make_grade("a", flags=(shared_flag("b-team"),)), owner="Ann (1024)")
     write(tmp_path, shared, platform=platform)
     texts = [path.read_text("utf-8") for path in (tmp_path / "out").rglob("*.*")]

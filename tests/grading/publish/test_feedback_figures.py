@@ -45,7 +45,7 @@ def test_a_table_that_is_not_complete_has_no_curve(left):
 
 
 def test_a_table_without_damping_has_a_curve():
-    """A table without damping has a curve, although its peaks are infinite."""
+    """The curve of a table without damping is drawn, although its peaks are infinite."""
     zetas = {name: 0.0 for name in ("zeta_a", "zeta_b", "zeta_1", "zeta_2")}
     two = student(2).reporting(final=zetas)
     assert all("your numbers" in svg for _, svg in draw_figures(two.analysis, two.reported))
@@ -53,7 +53,7 @@ def test_a_table_without_damping_has_a_curve():
 
 @pytest.mark.parametrize("value", [0.0, 1e300, 1e-300])
 def test_numbers_that_stand_for_no_response_have_no_curve(value):
-    """A frequency of zero or infinity gives no reported curve."""
+    """If a reported frequency is zero or infinite, no curve is drawn."""
     two = student(2).reporting(final={"omega_a": value})
     assert not any("your numbers" in svg for _, svg in draw_figures(two.analysis, two.reported))
 
@@ -83,7 +83,7 @@ def test_a_number_that_lost_points_is_shown_on_its_record():
 
 @pytest.mark.parametrize(("omega", "zeta"), [(-3.0, 0.1), (1e9, 0.1), (20.0, 1.5), (20.0, -1.0)])
 def test_numbers_of_no_swing_are_told_and_not_drawn(omega, zeta):
-    """If reported numbers cannot be drawn as a swing, they are written beside the recording."""
+    """If the reported numbers are no damped swing, they are only written beside the recording."""
     two = student(2)
     criterion = Criterion(
         id="decays", title="", outcome="fail", points=0.0, out_of=1.0, message="",

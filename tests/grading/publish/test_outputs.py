@@ -43,9 +43,9 @@ RUBRIC = two_cart_rubric()
 
 
 def test_a_remark_s_evidence_keeps_its_words():
-    """A flag's evidence is shown with the name of its table and the slip that explains it.
+    """A flag's evidence shows which table is meant and which mistake explains it.
 
-    Truth values appear as yes or no.
+    True and false appear as yes and no.
     """
     evidence = {
         "parameter": "A[2,1]", "table": "initial", "reported": 3.0, "stable": False,
@@ -123,7 +123,7 @@ def test_a_criterion_may_be_called_like_a_column():
 
 
 def test_the_same_class_gives_the_same_bytes(graded, tmp_path):
-    """The same class gives the same bytes in another folder and after other gradings in between."""
+    """The same class gives the same bytes in another folder, even after other gradings."""
     again = write_class(tmp_path)
     assert tree(again) == tree(graded)
 
@@ -159,7 +159,7 @@ def test_grade_json_says_what_was_given_by_hand(graded):
 
 
 def test_only_what_changed_is_written_again(tmp_path):
-    """Only feedback that changed is written again, missing files are made, stale ones removed."""
+    """Only changed feedback is written again; missing files are made and outdated ones removed."""
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         outcomes = [make_outcome(make_grade(name, share=0.5)) for name in "abc"]
         for outcome in outcomes:
@@ -240,7 +240,7 @@ def test_without_names_nothing_tells_who_it_was(tmp_path):
 
 
 def test_a_name_that_is_a_number_or_a_word_garbles_nothing():
-    """If teams are named 3 or step, hiding their names changes no number or experiment."""
+    """Hiding teams named 3 or step leaves numbers and experiments in their feedback as they are."""
     grade = make_grade("3", share=0.5, flags=(hertz_flag(), shared_flag("step")))
     hidden = anonymise(grade, {"3": "anon-a", "step": "anon-b"})
     assert [c.message for c in hidden.criteria] == [c.message for c in grade.criteria]
@@ -295,7 +295,7 @@ def test_the_feedback_puts_their_numbers_beside_ours():
 
 
 def test_feedback_on_shared_data_names_nobody_and_does_not_praise():
-    """If data are shared, the feedback neither names the other team nor praises."""
+    """If data are shared, the feedback neither names the other team nor says "Well done"."""
     grade = make_grade("team-1", flags=(shared_flag("b-team"),))
     html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
 
@@ -313,9 +313,9 @@ def test_a_submission_that_could_not_be_graded_hears_why():
 
 
 def test_a_broken_submission_hears_every_reason(tmp_path):
-    """If a submission's file has three mistakes, the feedback lists all three in separate lines.
+    """If a submission's file has three mistakes, the feedback lists them in three lines.
 
-    In the table they are one cell.
+    In the table they are in one cell.
     """
     folder = tmp_path / "class" / "team-1"
     (folder / "data").mkdir(parents=True)
@@ -336,7 +336,7 @@ def test_a_broken_submission_hears_every_reason(tmp_path):
 
 
 def test_numbers_of_a_criterion_have_words_and_units():
-    """Numbers of a criterion are shown with words and units; tiny numbers equal zero."""
+    """Numbers of a criterion have words and units, and an overshoot of 10⁻⁷ % is shown as 0."""
     units = Units(position="cm", input="V")
     claims = Criterion(
         id="c", title="claims", outcome="partial", points=1, out_of=2, message="",
@@ -407,7 +407,7 @@ def test_only_all_points_are_100_percent(points, percent):
 
 
 def test_the_class_page_counts_what_there_is():
-    """The class page shows mean and median, outcomes by criterion, and teams by mistake."""
+    """The class page shows mean and median, outcomes per criterion, and teams per mistake."""
     grades = [make_grade("a"), make_grade("b", share=0.5, flags=(hertz_flag(),)),
               make_grade("c", share=0.0, flags=(hertz_flag(), missing_flag()))]  # fmt: skip
     lines = [Line.of(grade) for grade in grades]
@@ -423,7 +423,7 @@ def test_the_class_page_counts_what_there_is():
 
 
 def shares(*found: tuple[str, str, str]) -> Flag:
-    """Return the flag for tuples of own recording, other submission and its recording."""
+    """Return the flag for triples of own recording, other submission and its recording."""
     keys = ("experiment", "submission", "other_experiment")
     recordings = [{**dict(zip(keys, one, strict=True)), "sigmas": 9.5} for one in found]
     evidence = {"submissions": [], "recordings": recordings}
@@ -467,7 +467,10 @@ def test_the_class_page_groups_who_shares_with_whom(tmp_path):
 
 
 def test_the_class_is_a_frame(tmp_path):
-    """The class frame has a row per submission and criterion, without points if never judged."""
+    """The data frame of a class has one row for each submission and criterion.
+
+    A criterion that was never judged has no points.
+    """
     outcomes = [make_outcome(make_grade("a", authors=("ann", "bo"), flags=(hertz_flag(),))),
                 make_outcome(make_grade("b", share=0.5, days_late=1.0, deducted=1.0, points=9.0)),
                 make_outcome(failed_grade("c", "broken"))]  # fmt: skip
@@ -501,7 +504,7 @@ def missing_flag() -> Flag:
 
 
 def test_points_by_hand_are_not_asked_for_again():
-    """If points were given by hand, neither page nor Gradescope asks for a new submission."""
+    """If points were given by hand, neither the page nor Gradescope asks for a new submission."""
     grade = failed_grade("team-7", "no submission.toml in it")
     given = HandPoints(criterion=RUBRIC.criteria[0].id, points=1.0, why="x", by="y", at="")
     given = {given.criterion: given}
@@ -518,7 +521,7 @@ def test_points_by_hand_are_not_asked_for_again():
 
 @pytest.mark.parametrize("grades", [[], [failed_grade("a", "broken")]])
 def test_a_class_without_grades_has_a_page(grades):
-    """A class with no submission, or no graded one, has a page."""
+    """A class has a page even if nobody submitted or nothing could be graded."""
     html = class_page([Line.of(grade) for grade in grades], rubric=RUBRIC)
     assert "Submissions" in html
 

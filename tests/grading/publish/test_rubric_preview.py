@@ -1,4 +1,4 @@
-"""The preview of a class under another rubric equals grading again."""
+"""The preview of a class under another rubric gives the same points as grading again."""
 
 import re
 from dataclasses import replace
@@ -98,7 +98,7 @@ def test_the_preview_is_what_grading_again_gives(school, tmp_path):
 
 
 def test_who_was_graded_before_findings_were_kept_is_named(tmp_path):
-    """If grades were made before findings were stored, the preview names them without points."""
+    """If a grade has no stored findings, the preview names the team and shows no points."""
     fill_book(tmp_path)
     with Gradebook(tmp_path) as book:
         graded = [e.submission for e in book.entries() if e.grade.status == "graded"]
@@ -107,7 +107,7 @@ def test_who_was_graded_before_findings_were_kept_is_named(tmp_path):
 
 
 def test_who_was_graded_by_another_rubric_is_named(school, tmp_path):
-    """If a team was graded with another rubric, the preview names it without points."""
+    """If a team was graded by another rubric, the preview names the team and shows no points."""
     plain = RUBRIC.model_dump(mode="json")
     plain["required"]["final"] = []
     other = Rubric.model_validate(plain)

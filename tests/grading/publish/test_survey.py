@@ -1,4 +1,4 @@
-"""Answers made to fit the paper's Tables 4 and 5 give these tables again."""
+"""Answers that were made to fit the paper's Tables 4 and 5 give these tables."""
 
 import json
 import re
@@ -35,7 +35,7 @@ def answers(average: str) -> list[int]:
 
 
 def write_paper(path, *, heading="{level}: {concept}"):
-    """Write the answers of the paper's class: twelve of thirteen students answered."""
+    """Write the answers of the paper's class; twelve of the thirteen students answered."""
     columns: dict[str, list[str]] = {"Timestamp": [f"2003-11-{d:02d}" for d in range(1, 14)]}
     for question, counts in COUNTS.items():
         given = [word for word, n in zip(SCALE, counts, strict=True) for _ in range(n)]

@@ -1,4 +1,4 @@
-"""Errors and credit are exact at a tolerance's edge; rounding is subtracted first."""
+"""Rounding is subtracted before an error is judged, and limits of a tolerance are exact."""
 
 from decimal import Decimal
 from fractions import Fraction
@@ -28,7 +28,7 @@ def at(value: float, *, std: float = 0.0) -> Reference:
     [("0.10", "0.005"), ("29", "0.5"), ("2.90e1", "0.05"), ("-3.5", "0.05"), ("0", "0.5")],
 )
 def test_half_a_digit_is_that_of_the_typed_number(typed, half):
-    """Half a digit is half of the last digit as typed: hundredths for 0.10, units for 29."""
+    """Half a digit is half a unit of the last typed digit: 0.005 for 0.10 and 0.5 for 29."""
     assert half_digit(Decimal(typed)) == Fraction(half)
 
 
@@ -70,9 +70,9 @@ def test_the_error_grows_with_the_distance(value, steps, sign):
 
 
 def test_rounding_and_standard_errors_come_off_first():
-    """The error is what remains after rounding and then the standard error are subtracted.
+    """Rounding and then the standard errors are subtracted from the difference.
 
-    105, typed to units, is 4.5 off 100; with a standard error of 1 and 3 sigmas 1.5/103 remains.
+    A typed 105 is 4.5 off 100; with a standard error of 1 and 3 sigmas, 1.5/103 remains.
     """
     assert percent_off(Decimal("105"), at(100.0), sigmas=3.0) == Fraction(9, 2)
     error = percent_off(Decimal("105"), at(100.0, std=1.0), sigmas=3.0)
@@ -80,7 +80,7 @@ def test_rounding_and_standard_errors_come_off_first():
 
 
 def test_five_percent_is_the_same_factor_either_way():
-    """A number too small by a factor has the same error as one too large by this factor."""
+    """A number too small by some factor has the same error as one too large by that factor."""
     high = percent_off(Decimal("120.0000"), at(100.0), sigmas=0.0)
     low = percent_off(Decimal("83.33333"), at(100.0), sigmas=0.0)
     # The digits typed differ: half of a unit in 1e-4 and 1e-5 is 1e-4 percent.
@@ -101,7 +101,7 @@ def test_a_zero_is_no_number_that_fits_everything(vague):
 
 
 def test_one_digit_is_excused_as_little_as_two():
-    """A number typed with one digit is excused only as much rounding as with two digits.
+    """A number typed with one digit is excused no more rounding than one with two digits.
 
     3e1 may mean 28.5 to 31.5, not 25 to 35.
     """

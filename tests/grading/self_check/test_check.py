@@ -22,7 +22,7 @@ team = cache(make_team)
 
 
 def slipped(slip: str, seed: int) -> Team:
-    """Return a seed's team with a slip, or unchanged if the slip is impossible for its carts."""
+    """Return the team of a seed with a mistake, or unchanged if its carts do not allow it."""
     one = team(seed)
     alone = one.bench.chain.n == 1 and slip in OF_SEVERAL_CARTS
     return one if alone else SLIPS[slip](one)
@@ -38,7 +38,7 @@ def asked_twice(found: JudgedNumbers) -> tuple[CheckAnswer, CheckAnswer]:
 
 
 def stripped(text: str, one: Team) -> str:
-    """Return a text without names of numbers, recordings and carts, and without counts."""
+    """Return a text without the names of numbers, recordings and carts, and without counts."""
     for run in sorted((e.id for e in one.submission.experiments), key=len, reverse=True):
         text = text.replace(run, "")
     text = re.sub(r"(initial|final)\.\w+|state_space\.[AB]\([\d, ]+\)", "", text)
@@ -50,7 +50,7 @@ def stripped(text: str, one: Team) -> str:
 @pytest.mark.parametrize("slip", sorted(SLIPS))
 @pytest.mark.parametrize("seed", SEEDS)
 def test_no_answer_holds_anything_numeric_of_a_value(seed, slip):
-    """No answer contains a digit, apart from names and counts, in words or in JSON."""
+    """In words and in JSON, answers contain no digits besides those in names and counts."""
     one = slipped(slip, seed)
     for answer in asked_twice(judge(one)):
         said = stripped("\n".join(answer_lines(answer)), one)
@@ -62,7 +62,7 @@ def test_no_answer_holds_anything_numeric_of_a_value(seed, slip):
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_answer_tells_neither_side_nor_size(seed):
-    """The answer is the same for a gain that is a third too large, half too large or too small."""
+    """The answer does not reveal whether a gain is too large or too small, nor by how much."""
     one = team(seed)
     name = next(iter(one.reported.final))
     answers = set()
@@ -77,7 +77,7 @@ def test_the_answer_tells_neither_side_nor_size(seed):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_honest_numbers_agree(seed):
-    """For careful students the check reports agreement and at most one number that disagrees."""
+    """For a careful student, at most one number disagrees, and the result is that all agree."""
     one = team(seed)
     found = judge(one)
     assert found.agree

@@ -1,4 +1,4 @@
-"""`cartlab check` is run as typed: exit status, its file, and changed folders."""
+"""`cartlab check` is run as typed, and its exit status and its file of answers are tested."""
 
 import json
 import re
@@ -46,7 +46,7 @@ def in_hertz(honest):
 
 
 def test_right_numbers_are_status_0(honest):
-    """If all numbers agree, the exit status is 0, and the folder records the one question."""
+    """If all numbers agree, the exit status is 0, and the folder records this one check."""
     done = check(honest, "--rubric", RUBRIC)
     assert done.returncode == 0
     assert re.match(r"All \d+ numbers that were checked agree", done.stdout)
@@ -116,7 +116,10 @@ def test_nothing_reported_cannot_be_checked(honest):
     "text", ["", "\n", "{}\n", "no json\n", '{"ask": 1}\n', "[" * 100_000, "\x00", "\u2028\n"]
 )
 def test_a_file_of_asks_that_is_not_as_it_was_is_refused(honest, text):
-    """A changed file of answers is refused by one line and stays; an empty file is accepted."""
+    """If the file of answers was edited, the check is refused and the file stays.
+
+    An empty file is accepted.
+    """
     (honest / FILE).write_text(text, encoding="utf-8")
     done = check(honest)
     if text:

@@ -60,7 +60,7 @@ def test_a_copy_with_the_victims_id_is_told(recordings, tmp_path):
 
 
 def test_without_names_nobody_is_named(recordings, tmp_path):
-    """In anonymous grading, the message has pseudonyms of the submissions and no person."""
+    """In anonymous grading, the message has the submissions' pseudonyms and names no person."""
     (double,) = told(tmp_path, recordings, anonymous=True)
     assert re.fullmatch(
         r"One person is in anon-\w+ and anon-\w+, and these share \d+ recordings", str(double)
@@ -68,7 +68,7 @@ def test_without_names_nobody_is_named(recordings, tmp_path):
 
 
 def test_recordings_are_counted_not_pairs_of_submissions(recordings):
-    """Four submissions with the same recordings share only that number, not six times as many."""
+    """If four submissions have the same recordings, each recording is counted once."""
     prints = [
         Member(submission=f"t{i}", authors=("s1",), fingerprints=recordings[0]) for i in range(4)
     ]
@@ -80,7 +80,7 @@ def test_recordings_are_counted_not_pairs_of_submissions(recordings):
 
 
 def test_what_could_not_be_read_was_not_compared(recordings):
-    """If a submission has no fingerprints, common recordings are not counted."""
+    """If a submission has no fingerprints, the number of common recordings is left open."""
     for left, compared in ((b"", False), (recordings[1], True)):
         prints = [
             Member(submission=name, authors=("s1",), fingerprints=kept)
@@ -92,9 +92,9 @@ def test_what_could_not_be_read_was_not_compared(recordings):
 
 
 def test_partners_in_the_same_two_submissions_are_told_of_once():
-    """Partners who are in the same two submissions are reported once, as one pair.
+    """Two partners who are both in the same two submissions are reported once.
 
-    The author of another pair is reported apart.
+    An author of two other submissions is reported apart.
     """
     teams = {"a": ("x", "y"), "b": ("Y", "x"), "c": ("z",), "d": ("z", "x2")}
     both, alone = find_doubles(teams)

@@ -1,4 +1,4 @@
-"""A shared recording is found however disguised, but not between teams on one bench."""
+"""A shared recording is found however disguised, and teams on one bench are not flagged."""
 
 import json
 import zlib
@@ -72,9 +72,9 @@ def quiet_teams(tmp_path_factory):
 
 
 def rounded(records, *, count, seed):
-    """Return recordings by an encoder with the given step, with any zero and without noise.
+    """Return recordings as read by an encoder with this step, with any zero, without noise.
 
-    Only open-loop runs: a controller would have read the coarse encoder too.
+    Only open-loop runs are returned, since a controller would also have read this encoder.
     """
     rng = np.random.default_rng(seed)
     zeros = [rng.uniform(-2, 2, size=(record.y.shape[0], 1)) for record in records]
@@ -94,13 +94,16 @@ def of_kind(records, kind):
 
 
 def test_honest_teams_on_one_bench_share_nothing(teams):
-    """Teams that drive the same bench with the same inputs share nothing: their noise differs."""
+    """Teams that drive the same bench with the same inputs are not flagged.
+
+    Their noise differs.
+    """
     assert find_shared([prints(str(i), records) for i, records in enumerate(teams)]) == {}
 
 
 @pytest.mark.parametrize("per_cm", [5, 20, 37, 100, 500])
 def test_rounding_of_one_motion_is_nobodys(quiet_teams, per_cm):
-    """If a motion without noise is rounded to equal counts by chance, nobody is flagged."""
+    """If two recordings without noise are equal only by rounding, nobody is flagged."""
     honest = [
         rounded(records, count=1 / per_cm, seed=seed) for seed, records in enumerate(quiet_teams)
     ]
@@ -156,11 +159,10 @@ def test_one_copied_recording_is_found_however_disguised(teams, others, kind, di
 
 
 def test_under_feedback_the_input_gives_a_copy_away(teams, others):
-    """Under feedback, the input reveals a copy, even with added noise.
+    """Under feedback, a copy is recognised by its input, even if noise was added.
 
-    The controller turned the carts' own noise into input.
-
-    The start, where the reference steps, is cut off as well.
+    The controller turned the carts' own noise into input. The start, where the reference steps, is
+    cut off as well.
     """
     rng = np.random.default_rng(9)
     record = of_kind(teams[0], "closed_loop")
@@ -261,7 +263,7 @@ def test_a_recording_under_many_names_is_compared_once(teams, compared):
 
 @pytest.mark.parametrize("alike", ["cuts of one run", "one hum in all"])
 def test_the_cost_grows_with_the_recordings_not_their_square(teams, alike, compared):
-    """Submissions made to look equal everywhere cost only time in proportion to their size."""
+    """Submissions made to look alike everywhere take time in proportion to their size."""
     rng = np.random.default_rng(5)
     record = of_kind(teams[0], "decay")
     if alike == "cuts of one run":
@@ -306,9 +308,9 @@ def test_the_knocks_of_a_bench_are_nobodys(knocking):
 
 @pytest.mark.parametrize("members", [2, 3])
 def test_a_small_class_is_told_of_equal_rows_only(teams, members):
-    """In a class of two or three teams, only a copy with equal rows is flagged.
+    """In a class of two or three teams, a copy is flagged only if its rows are equal.
 
-    Few teams cannot show whether equal noise comes from the bench.
+    Equal noise could come from the bench, and so few teams cannot rule that out.
     """
     rng = np.random.default_rng(2)
     record = of_kind(teams[0], "step")
@@ -322,7 +324,7 @@ def test_a_small_class_is_told_of_equal_rows_only(teams, members):
 def test_three_of_six_may_have_the_same_copy(teams):
     """If three of six teams have the same copy, all three are flagged.
 
-    Copies are not taken as evidence of the bench's own noise.
+    The copies do not count as evidence that the noise comes from the bench.
     """
     record = of_kind(teams[0], "step")
     rest = [prints(str(number), teams[number]) for number in range(3, 6)]
@@ -364,7 +366,7 @@ def test_fingerprints_of_an_older_version_are_not_compared(teams):
 
 
 def test_still_or_short_recordings_have_no_fingerprint(teams):
-    """A recording that is too short or without motion has no fingerprint; others keep theirs."""
+    """A recording that is too short or has no motion gets no fingerprint."""
     record = of_kind(teams[0], "step")
     still = replace(record, y=np.zeros_like(record.y))
     short = replace(record, t=record.t[:50], u=record.u[:50], y=record.y[:, :50])
