@@ -1,4 +1,4 @@
-"""The bench's pages work through plain forms: a plan, a session, its buttons, its end."""
+"""Without scripts, the bench's pages make a plan, record a session and stop it."""
 
 import http.client
 import json
@@ -37,7 +37,7 @@ def begun(visitor: Visitor, work: Path, name: str, room: str = "acquire", **fiel
 
 
 def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
-    """Ticked recordings are made and watched; without scripts, a Stop button ends the session."""
+    """Ticked recordings are made and can be watched; a Stop without scripts ends the session."""
     work = write_work(tmp_path / "team", [sine("short", seconds=1), sine("long", seconds=300)])
     with DeskServer(folder=work) as server:
         visitor = Visitor.of(server.url)
@@ -75,7 +75,7 @@ def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
 
 
 def test_many_viewers_stop_nobody(tmp_path, real):
-    """Of sixty viewers of a session eight are connected; the others are refused at once.
+    """If sixty viewers watch a session, eight are connected and the others refused at once.
 
     Other pages still open.
     """
@@ -160,7 +160,7 @@ def test_a_plan_is_made_and_what_is_wrong_is_said(tmp_path):
 
 
 def test_exploring_has_a_form_of_its_own(tmp_path):
-    """Exploring has a form with its own port; Enter in one of its fields starts exploring.
+    """Exploring has its own form with its own port, and Enter in a field starts exploring.
 
     Numbers may have a decimal comma as elsewhere, and an error names its field.
     """
@@ -192,9 +192,10 @@ def test_exploring_has_a_form_of_its_own(tmp_path):
 
 
 def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
-    """A proposed experiment shows the standard error now and after it, then is added to the plan.
+    """For a proposed experiment the page shows the standard errors before and after it.
 
-    The program's own choice is shown too, and bad input gets a message.
+    The experiment can be added to the plan. The program's own choice is shown too, and bad input
+    gets a message.
     """
     work = a_recorded_cart(tmp_path / "team")
     mine = {"kind": "sweep", "amplitude": "0,01", "frequency": "0.5", "frequency_end": "5",
@@ -231,9 +232,9 @@ def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
 
 
 def test_ports_are_listed_and_the_one_used_is_remembered(tmp_path, real):
-    """The list of ports has each virtual bench that runs here.
+    """The list of ports has each virtual bench that runs on this computer.
 
-    A port that was used and is gone stays in the list, marked as gone.
+    A port that was used and has gone stays in the list with a mark.
     """
     work = write_work(tmp_path / "team", [sine("long", seconds=300)])
     with DeskServer(folder=work) as server:

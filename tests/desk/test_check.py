@@ -1,4 +1,4 @@
-"""The desk offers the check to students who must find the numbers themselves."""
+"""Students who must find the numbers themselves can ask the desk's check, not its report."""
 
 import io
 import re
@@ -51,7 +51,7 @@ def retype(folder, old, new):
 
 @pytest.fixture
 def root(tmp_path):
-    """Write the folders of a lab server: one team has a number in Hz, and a report exists."""
+    """Write a lab server's folders: one team has a frequency in Hz, and a report exists."""
     for name in ("team", "other"):
         retype(a_submission(tmp_path / name), "omega_n = 13.1", "omega_n = 2.085")
         (tmp_path / name / "report").mkdir()
@@ -71,7 +71,7 @@ def lab(root):
 
 
 def ask_check(visitor: Visitor, **fields: str) -> Answer:
-    """Ask the check, wait for it, and return its page."""
+    """Ask the check, wait for its answer, and return the page."""
     assert visitor.post(f"{HERE}check", **fields).status == 303
     until(lambda: "data-events" not in visitor.get(f"{HERE}check").text)
     return visitor.get(f"{HERE}check")
@@ -116,7 +116,10 @@ def test_their_room_offers_the_check_in_place_of_the_report(lab):
 
 
 def test_nobody_elses_work_tells_them_a_number(lab):
-    """If an instructor makes a report in the students' folder, they see only that work goes on."""
+    """If an instructor makes a report in a student's folder, the student sees no number of it.
+
+    The page only says that work goes on.
+    """
     student, instructor = lab("s1"), lab("i")
     assert instructor.post(f"{HERE}make-report").status == 303
     assert "The report" not in words_of(student.get(f"{HERE}hand-in"))
@@ -127,7 +130,10 @@ def test_nobody_elses_work_tells_them_a_number(lab):
 
 
 def test_first_which_then_where_and_the_count_is_shown(lab, root):
-    """First the check names the wrong number, then it gives a hint; no page shows the value."""
+    """First the check names the wrong number, then it says where to look.
+
+    No page shows the value.
+    """
     student = lab("s1")
     assert "not checked yet" in words_of(student.get(f"{HERE}check"))
     which = ask_check(student)
@@ -165,7 +171,10 @@ def test_the_zip_has_the_asks_and_no_report(lab, root):
 
 
 def test_what_is_computed_goes_into_no_zip_as_a_recording(lab, root):
-    """A submission that names a result file as its data is refused, and the zip lacks that file."""
+    """If a submission names a result file as a recording, the zip leaves this file out.
+
+    The student is told that the file is computed.
+    """
     team = root / "team"
     first = load_submission(team).experiments[0].file
     retype(team, f'"{first}"', '"report/results.json"')
@@ -187,7 +196,7 @@ def test_no_upload_replaces_the_asks(lab, root):
 
 
 def test_on_ones_own_computer_the_submission_says_it(tmp_path):
-    """On one's own computer, a line in the submission hides the report.
+    """On a student's own computer, a line in the submission hides the report.
 
     Anyone with the folder can remove the line.
     """
@@ -209,7 +218,7 @@ def test_on_ones_own_computer_the_submission_says_it(tmp_path):
     ],
 )
 def test_what_is_wrong_with_a_rubric_of_the_list_is_one_line(root, entry, said):
-    """A wrong rubric in the list of users is an error of one line, and no desk starts."""
+    """If the file of users names a wrong rubric, the error is one line and no desk starts."""
     with pytest.raises(ConfigError, match=said):
         read_users(write_users(root, f'[[users]]\nname = "x"\n{entry}\n'))
 

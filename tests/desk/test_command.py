@@ -1,4 +1,4 @@
-"""`cartlab desk` reports an error in one line, and sees by itself what kind of folder it opens."""
+"""`cartlab desk` gives an error in one line, and recognises the kind of folder it opens."""
 
 from urllib.parse import urlsplit
 
@@ -64,7 +64,7 @@ ADDRESSES = (
 
 
 def test_no_address_is_a_fault_of_the_desk(tmp_path, monkeypatch):
-    """A wrong database address is refused with the right form and leaves no file."""
+    """If a database address is wrong, the error shows the right form, and no file is made."""
     monkeypatch.chdir(tmp_path)
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
@@ -77,7 +77,7 @@ def test_no_address_is_a_fault_of_the_desk(tmp_path, monkeypatch):
 
 
 def test_a_listed_address_that_makes_no_sense_shows_the_other_rooms(tmp_path):
-    """If a TA's list has a bad gradebook address, the other gradebooks are still shown.
+    """If one of a TA's gradebooks has a bad address, the others are still shown.
 
     The page of the bad one says what is wrong.
     """

@@ -1,4 +1,4 @@
-"""The desk opens only by a secret that works once, or through a proxy."""
+"""A visitor enters the desk with a secret that works once, or through a proxy."""
 
 import re
 import socket
@@ -41,11 +41,10 @@ def visitor(server):
 
 
 def test_the_secret_opens_once_and_leaves_the_address(server, visitor):
-    """The secret address works once; then a cookie takes its place.
+    """The secret address works once and sets a cookie.
 
-    No script can read the cookie, and no other site sends it.
-
-    A second visitor with the same address is refused.
+    No script can read the cookie, and no other site can send it. A second visitor with the same
+    address is refused.
     """
     assert visitor.get("/").status == 200
     assert Visitor(port=visitor.port).get(urlsplit(server.url).path).status == 403
@@ -113,7 +112,7 @@ def test_every_answer_has_its_policy(visitor, path):
     "length", [f"Content-Length: {MOST_FORM + 1}", "Transfer-Encoding: chunked"]
 )
 def test_nobody_sends_more_than_is_read(visitor, length):
-    """A request that is too long is refused, by its stated length or by its bytes.
+    """A request that is too long is refused, whether it states its length or not.
 
     The desk goes on serving.
     """
@@ -133,7 +132,10 @@ def test_nobody_sends_more_than_is_read(visitor, length):
 
 
 def test_strangers_are_few_and_leave(visitor, monkeypatch):
-    """Of 300 idle strangers only some are held, and not for long; the visitor is still served."""
+    """Of 300 connections without a request the desk holds only some, for a short time.
+
+    A visitor with the cookie is still served.
+    """
 
     def held() -> int:
         mine = psutil.Process().net_connections("tcp")
@@ -221,7 +223,7 @@ def test_a_name_may_come_in_utf_8_or_in_latin_1(name, tmp_path):
 
 
 def test_everybody_sees_their_own(lab):
-    """The same address shows each student their own folder; other folders have no address."""
+    """Students who open the same address each see their own folder and no other."""
     assert "one" in lab("s1").get("/student/0/").text
     assert "two" in lab("s2").get("/student/0/").text
     assert lab("s1").get("/student/1/").status == 404
@@ -235,7 +237,10 @@ def test_everybody_sees_their_own(lab):
 
 
 def test_a_form_outlasts_what_a_class_saves_meanwhile(lab, root):
-    """A form saves only what was typed into it, even if many other states were saved since."""
+    """A form can still be saved after others have saved many times.
+
+    It saves only what was typed into it.
+    """
     page = lab("s1").get("/student/0/")
     shown, seen = {name: page.value(name) for name in ("title", "section")}, page.value("seen")
     saved = lab("s1").post("/student/0/save", seen=seen, **shown | {"section": "07"})
@@ -251,9 +256,9 @@ def test_a_form_outlasts_what_a_class_saves_meanwhile(lab, root):
 
 
 def test_students_and_tas_are_told_no_folder_of_the_server(lab, root):
-    """Students and TAs see no folder of the server on pages, in refusals or in progress messages.
+    """Students and TAs never see the path of a folder on the server.
 
-    An instructor does see them.
+    This holds for pages, refusals and progress messages. An instructor sees the paths.
     """
     plain = (root / "three" / "submission.toml").read_bytes()
     (root / "three" / "report").symlink_to(root)  # a link as report folder is refused
@@ -278,7 +283,7 @@ def test_students_and_tas_are_told_no_folder_of_the_server(lab, root):
 
 
 def test_a_ta_sees_the_gradebooks_they_are_listed_for(lab):
-    """A TA sees the gradebooks that the list gives them, and no student's page."""
+    """A TA sees only the gradebooks in the file of users, and no student's page."""
     assert "team-07" in lab("t").get("/grades/0/").text
     assert lab("t").get("/grades/1/").status == 404
 
@@ -291,7 +296,7 @@ ENTER = {"": "s t i w", "static": "s t i w", "student": "s i w", "grades": "t i 
 
 @pytest.mark.parametrize("path", PATHS)
 def test_each_role_has_its_rooms(lab, path):
-    """Each role is refused at every address of other roles' rooms, whatever is sent."""
+    """Whoever asks for a page of another role is refused, whatever is sent."""
     for role, name in {"s": "s1", "t": "t", "i": "i", "w": "w"}.items():
         let_in = role in ENTER[path.split("/")[1]].split()
         if not let_in:
@@ -365,7 +370,7 @@ def test_an_instructor_makes_in_the_workshop_and_nowhere_else(lab, root):
 
 
 def test_forged_names_are_refused(lab):
-    """A request that does not come from the proxy with one known name is refused."""
+    """Only a request from the proxy with exactly one known name is accepted."""
     assert lab("").get("/").status == 403
     assert lab("root").get("/").status == 403
     assert lab("s1", source="127.0.0.2").get("/student/0/").status == 403

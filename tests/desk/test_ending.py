@@ -1,4 +1,4 @@
-"""A desk reports on stderr and in its log what ended it; its leftovers are removed later."""
+"""A desk reports what ended it, and the next desk removes what it left."""
 
 import os
 import signal
@@ -43,7 +43,8 @@ main()
 def a_desk(tmp_path: Path, *options: str) -> Iterator[tuple[subprocess.Popen, str, Callable]]:
     """Start a desk.
 
-    Yield the desk, its address, and a function that returns its further lines and its log.
+    Yield the desk's process, its address, and a function that returns its further lines and its
+    log.
     """
     log = tmp_path / "state" / "cartlab" / "desk.log"
     environment = {**os.environ, "XDG_STATE_HOME": str(tmp_path / "state")}
@@ -86,7 +87,7 @@ def test_a_signal_that_ends_the_desk_is_named(name, tmp_path):
     ],
 )
 def test_what_no_program_survives_is_told_all_the_same(number, told, tmp_path):
-    """If a signal kills the desk at once, a watching process reports it.
+    """If a signal kills the desk at once, a second process, which watches the desk, reports it.
 
     After a crash in a library, it also reports the lines of code that were running.
     """
@@ -110,7 +111,7 @@ def test_what_no_program_survives_is_told_all_the_same(number, told, tmp_path):
     ],
 )
 def test_an_exception_or_an_exit_within_is_told(sent, status, told, tmp_path):
-    """If an exception or exit ends the desk, it is reported, with its traceback in the log."""
+    """If an exception or an exit ends the desk, this is reported, with a traceback in the log."""
     with a_desk(tmp_path) as (desk, _, ended):
         assert desk.stdin is not None
         desk.stdin.write(f"{sent}\n")
@@ -125,9 +126,9 @@ def test_an_exception_or_an_exit_within_is_told(sent, status, told, tmp_path):
 
 
 def test_a_desk_outlives_its_terminal_and_an_exception_in_another_thread(tmp_path):
-    """A desk survives the end of its terminal and an exception in one of its other threads.
+    """A desk started with nohup survives the end of its terminal.
 
-    Its terminal is closed under nohup; the traceback is in the log.
+    It also survives an exception in one of its other threads, whose traceback is in the log.
     """
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the desk inherits this setting
     try:
@@ -150,7 +151,7 @@ def test_a_desk_outlives_its_terminal_and_an_exception_in_another_thread(tmp_pat
 
 
 def test_what_a_killed_desk_left_goes_with_the_next_start(tmp_path, monkeypatch):
-    """What a killed desk left is removed when the next one starts.
+    """The temporary folder of a killed desk is removed when the next desk starts.
 
     Folders of running desks, and folders that no desk made, stay.
     """

@@ -1,4 +1,4 @@
-"""The instructor's pages work through plain forms: exercises, pictures, solutions, rubrics."""
+"""Without scripts, the instructor's pages make exercises, pictures, solutions and rubrics."""
 
 import json
 import re
@@ -36,7 +36,7 @@ def shown(visitor: Visitor, **sent: str) -> str:
 
 
 def wait_for(visitor: Visitor, address: str) -> str:
-    """Return the page after the long task has ended."""
+    """Return the page after a long task has ended."""
     until(lambda: 'http-equiv="refresh"' not in visitor.get(address).text)
     return visitor.get(address).text
 
@@ -45,7 +45,7 @@ def wait_for(visitor: Visitor, address: str) -> str:
 
 
 def test_every_effect_has_its_sizes_and_slides_about_them():
-    """On each preset, the form's values for every effect are valid for `simulate --hide`."""
+    """For every effect on each preset, the form's values are accepted by `simulate --hide`."""
     for preset, chain in PRESETS.items():
         for effect in CATALOGUE:
             if chain.n < effect.fewest_carts or (effect.between_carts and chain.n < 2):
@@ -60,7 +60,7 @@ def test_every_effect_has_its_sizes_and_slides_about_them():
 
 
 def test_a_slider_counts_when_moved_and_a_number_when_typed():
-    """A size typed as a number counts, else the slider counts if it was moved."""
+    """A typed size is used; if none is typed, the slider counts if it was moved."""
 
     def force(preset: str, **size: str) -> dict[str, str]:
         chosen = [{"key": "coulomb_friction", "place": "1", "sizes": {"force": size}}]
@@ -80,7 +80,7 @@ def test_a_slider_counts_when_moved_and_a_number_when_typed():
 
 
 def test_a_class_is_what_simulate_writes(visitor, tmp_path):
-    """A class of two folders made by the form has the same bytes as with `cartlab simulate`.
+    """A class of two folders has the same bytes as the class that `cartlab simulate` writes.
 
     No folder names the hidden effect.
     """
@@ -133,7 +133,7 @@ def test_an_own_chain_and_what_is_wrong_with_it(visitor):
 
 
 def test_a_picture_is_inert(visitor):
-    """The picture of an effect is an SVG without scripts; a forged address is refused."""
+    """The picture of an effect is an SVG without scripts, and a forged address of it is refused."""
     (address,) = re.findall(r'src="(/exercises/picture[^"]+)"', shown(visitor, **FRICTION))
     drawn = visitor.get(address)
     assert drawn.headers["content-type"] == "image/svg+xml"
@@ -145,7 +145,7 @@ def test_a_picture_is_inert(visitor):
 
 
 def test_a_solution_is_what_the_command_writes(tmp_path):
-    """The desk makes the same solution as the command, with the expected values as JSON."""
+    """The desk makes the same solution as the command, and gives the expected values as JSON."""
     folder = a_submission(tmp_path / "reference")
     with DeskServer(folder=folder) as server:
         visitor = Visitor.of(server.url)
@@ -159,7 +159,7 @@ def test_a_solution_is_what_the_command_writes(tmp_path):
 
 @pytest.mark.parametrize("folders", ["00000000000199999", "0" * 11 + "1" * 5000, "0", "-1", "²"])
 def test_a_number_of_folders_is_read_whole(visitor, tmp_path, folders):
-    """A number of folders with other characters in it, or above the limit, is refused."""
+    """The number of folders must be a plain number up to the limit; anything else is refused."""
     out = tmp_path / "class"
     sent = {"preset": "throne-1dof", "out": str(out), "seed": "0", "folders": folders}
     assert visitor.post("/exercises/make", **sent).status == 422
@@ -168,7 +168,7 @@ def test_a_number_of_folders_is_read_whole(visitor, tmp_path, folders):
 
 @pytest.mark.parametrize("typed", ["~nosuch/x", "", "a\x00b", "a" * 300, "a/" * 5000])
 def test_a_place_that_is_none_is_said(visitor, typed):
-    """A path that cannot be is refused in every form, for example `~` of an unknown user."""
+    """If a path cannot exist, every form refuses it; an example is `~` of an unknown user."""
     sent = {"preset": "throne-1dof", "folders": "1", "seed": "0"}
     assert visitor.post("/open", folder=typed).status == 422
     assert visitor.post("/exercises/make", out=typed, **sent).status == 422

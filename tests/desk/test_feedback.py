@@ -1,4 +1,4 @@
-"""A student reads their own feedback through plain forms and asks; TAs answer."""
+"""Without scripts, students read their feedback and ask about it, and TAs answer."""
 
 import re
 from html import unescape
@@ -99,7 +99,7 @@ def fields(answer: Answer, at: int = 0) -> dict[str, str]:
 
 
 def test_students_see_nothing_before_the_release(lab):
-    """Students see no feedback before the release; only an instructor can release or hide it."""
+    """Students see no feedback before it is released; only an instructor can release or hide it."""
     student = lab("s4")
     for path in (HERE, HERE + "whole"):
         assert "points" not in student.get(path).text
@@ -119,7 +119,7 @@ def test_students_see_nothing_before_the_release(lab):
 
 
 def test_of_another_s_feedback_there_is_no_address(released):
-    """A student cannot reach another's feedback by number, path or role, nor ask about it."""
+    """No number, path or role gives a student another's feedback, or lets them ask about it."""
     student = released("s4")
     assert student.get("/").headers["location"] == HERE
     assert "team-04" in student.get(HERE).text
@@ -138,7 +138,10 @@ def test_of_another_s_feedback_there_is_no_address(released):
 
 
 def test_the_grade_is_the_one_that_the_list_names(released):
-    """A student sees the grade that the list names, by exact name, and nothing about the server."""
+    """A student sees the grade of exactly that submission which the file of users names.
+
+    No page shows anything about the server.
+    """
     six = released("s6")
     assert "team-06" in six.get(HERE).text
     assert "Your feedback is not published yet." in six.get("/feedback/1/").text
@@ -167,7 +170,7 @@ def test_the_grade_is_the_one_that_the_list_names(released):
     ],
 )
 def test_a_wrong_grade_on_the_list_is_one_line(users, why, tmp_path):
-    """A wrong grade in the file of users is an error of one line before anything is served."""
+    """If the file of users names a wrong grade, the error is one line and nothing is served."""
     (tmp_path / "g").mkdir()
     path = write_users(tmp_path, f'[[users]]\nname = "s"\n{users}\n')
     with pytest.raises(ConfigError, match=why):
@@ -214,7 +217,7 @@ def test_a_request_goes_from_the_student_to_the_ta_and_back(released, book):
 
 
 def test_what_cannot_be_is_said_beside_the_field(released, book):
-    """A request or answer that is not allowed gets a message at its field; the typed text stays."""
+    """If a request or answer is not allowed, a message is at its field and the typed text stays."""
     student, ta = released("s4"), released("Ada")
     long = "x" * (MOST_LETTERS + 1)
     refused = ask(student, why=long)
@@ -243,7 +246,7 @@ def test_what_cannot_be_is_said_beside_the_field(released, book):
 
 
 def test_few_requests_wait_at_once(released):
-    """A request beyond the limit of open ones is refused at its own field."""
+    """A team with too many open requests cannot send another; a message at the field says so."""
     criteria = [criterion.id for criterion in two_cart_rubric().criteria]
     for criterion in criteria[:MOST_OPEN]:
         assert ask(released("s4"), criterion).status == 303
@@ -253,7 +256,7 @@ def test_few_requests_wait_at_once(released):
 
 
 def test_the_second_of_two_answers_sees_both(released, book):
-    """If two TAs answer, the second is refused and sees the first answer beside their own."""
+    """If two TAs answer a request, the second is refused and sees both answers."""
     ask(released("s4"))
     seen = {name: fields(released(name).get(QUEUE)) for name in ("Ada", "Bob")}
     first = {"points": "0.5", "text": "ada's words"}
@@ -324,9 +327,9 @@ def test_a_gradebook_that_is_gone_says_nothing_of_the_server(released, tmp_path)
 
 @pytest.mark.parametrize("by_class", [False, True])
 def test_who_is_to_find_the_numbers_reads_none(tmp_path, by_class):
-    """A student who must find the numbers sees points, outcomes and flags, but no numbers.
+    """Students who must find the numbers see points, outcomes and flags, but no numbers.
 
-    The student's own rubric decides this, else the class's.
+    The rubric named for the student decides whether this holds, else the class's rubric.
     """
     write_class(tmp_path / "grades")
     a_submission(tmp_path / "five")

@@ -68,7 +68,7 @@ def test_what_was_typed_stands_in_the_file(initial, final, title):
 
 
 def test_every_kind_of_field_goes_there_and_back():
-    """Each kind of field is written, read again and still valid."""
+    """A value typed into a field of any kind is written, read again and still valid."""
     given = {
         "authors": "s1, Ann\ns2", "system.position.per_count": "0.00227",
         "system.columns": "x1 = Encoder 1 Pos\ntime = 2", "design.method": "poles",
@@ -113,7 +113,10 @@ def test_every_kind_of_field_goes_there_and_back():
     ],
 )
 def test_a_row_has_the_fields_of_its_kind_only(table, keys):
-    """A row has only the fields of its kind and controller, and those that the file states."""
+    """A recording's row has only the fields of its kind and controller.
+
+    A field that the file already states is shown too.
+    """
     shown = fill_experiment(read_document(f"[[experiments]]\n{table}\n"), 0)
     found = {field.path.removeprefix("experiments.0.") for field in shown}
     always = {"kind", "carts", "window", "note", "columns", "sample_rate"}

@@ -1,4 +1,4 @@
-"""The TA's pages work through plain forms: class, team, concurrent changes, import, export."""
+"""Without scripts, the TA's pages show the class and its teams, and change, import and export."""
 
 import io
 import re
@@ -58,7 +58,7 @@ def at(team: str, **more: str) -> str:
 
 
 def version(answer: Answer, criterion: str) -> str:
-    """Return the version of a criterion that this page shows."""
+    """Return the version that this page shows of a criterion."""
     found = re.search(rf'value="{criterion}"><input type="hidden" name="seen" value="(.*?)"',
                       answer.text)  # fmt: skip
     assert found
@@ -84,7 +84,7 @@ def upload(who: Visitor, path: str, name: str, content: str, **fields: str) -> A
 
 
 def test_the_class_is_filtered_by_what_a_team_has(ta, grades):
-    """Each filter lists the teams that the gradebook gives; several filters narrow the list."""
+    """Each filter shows the teams that meet it in the gradebook; filters can be combined."""
     with Gradebook(grades) as book:
         entries = {entry.submission: entry for entry in book.entries()}
     ta.post(at("team-03"), do="accept")
@@ -117,7 +117,7 @@ def test_the_class_is_filtered_by_what_a_team_has(ta, grades):
 
 
 def test_the_class_says_who_shares_recordings(ta):
-    """The class page counts the pairs that share recordings, links to them and describes each."""
+    """The class page gives the number of pairs that share recordings, and describes each pair."""
     page = ta.get(ROOM).text
     line = re.search(r'href="[^"]*\?flag=shared_data#class">(.*?)</a>.*?count">(\d+)<', page)
     assert line
@@ -150,7 +150,7 @@ def _batch(outcomes):
 
 
 def test_what_is_drawn_is_of_the_class_as_it_is_now(ta, grades):
-    """Histogram, class page and feedback are drawn from the gradebook as it is now."""
+    """Histogram, class page and feedback are drawn from the current gradebook, not from files."""
     before = ta.get(ROOM + "class.html").text
     picture = ta.get(ROOM + "distribution.svg")
     assert picture.headers["content-type"].startswith("image/svg+xml")
@@ -224,9 +224,9 @@ def test_a_record_stands_beside_its_criterion(tmp_path):
 
 
 def test_the_record_of_the_number_most_off_is_shown_first(tmp_path):
-    """If a criterion has two figures, that of the number furthest off is shown first.
+    """If a criterion has two figures, the first is that of the number with the largest error.
 
-    The other one is one click away, without scripts.
+    The other figure is one click away, without scripts.
     """
     drawn = tuple((f"response-{n}.svg", f"<svg><title>cart {n}</title></svg>") for n in (1, 2))
     grade = make_grade("team", share=0.5)
@@ -250,7 +250,7 @@ def test_the_record_of_the_number_most_off_is_shown_first(tmp_path):
 
 
 def test_what_lost_points_comes_first_and_is_shown(ta):
-    """Criteria are listed by points lost; those with all points take one line each.
+    """Criteria that lost the most points come first; those with all points take one line each.
 
     Any criterion can be chosen.
     """
@@ -293,7 +293,7 @@ def test_what_lost_points_comes_first_and_is_shown(ta):
     ],
 )
 def test_points_come_in_steps_of_the_rubric(out_of, step, steps):
-    """The keys offer points in the rubric's steps, or in rounded quarters if there are too many."""
+    """Keys on the keyboard give points in steps of the rubric, or in quarters if those are many."""
     assert point_steps(out_of, step=step) == steps
 
 
@@ -323,7 +323,7 @@ def test_points_are_changed_as_the_command_does(ta, grades):
      {"points": "nan", "why": "x"}, {"points": "many", "why": "x"}],
 )  # fmt: skip
 def test_what_cannot_be_is_said_beside_the_field(ta, grades, fields):
-    """If points are not allowed, a message appears at their field and nothing is written."""
+    """If points are not allowed, a message appears at their field, and nothing is written."""
     answer = change(ta, "team-01", **fields)
     assert answer.status == 422
     assert f'value="{fields["points"]}"' in answer.text
@@ -333,7 +333,7 @@ def test_what_cannot_be_is_said_beside_the_field(ta, grades, fields):
 
 
 def test_forged_forms_change_nothing(ta, grades):
-    """A form with an unknown button, another criterion or no version changes nothing."""
+    """A form with an unknown button, an unknown criterion or no version changes nothing."""
     seen = version(ta.get(at("team-01", criterion="laws")), "laws")
     for form in ({"do": "drop"}, {"do": "change", "criterion": "x", "seen": seen, "points": "1"},
                  {"do": "change", "criterion": "laws", "points": "1", "why": "x"},
@@ -344,9 +344,9 @@ def test_forged_forms_change_nothing(ta, grades):
 
 
 def test_accept_goes_on_to_the_next_of_the_filter(ta):
-    """Accepting a team leads to the next unreviewed one of the filter, and at last to the class.
+    """After a team is accepted, the next unreviewed team of the filter is shown.
 
-    The mark can be removed.
+    After the last one the class is shown. A mark can be removed.
     """
     query = {"flag": "hz_for_rad_s", "seen": "no"}
     expected = names(ta.get(f"{ROOM}?{urlencode(query)}"))
@@ -364,7 +364,7 @@ def test_accept_goes_on_to_the_next_of_the_filter(ta):
 
 
 def test_reasons_are_there_to_be_used_again(ta):
-    """Reasons given before for the same criterion are offered, the most common first."""
+    """The page offers reasons given before for the same criterion, the most common first."""
     for team, why in (("team-05", "b"), ("team-06", "a"), ("team-07", "b")):
         change(ta, team, points="1", why=why)
     page = ta.get(at("team-08", criterion="laws")).text
@@ -497,15 +497,15 @@ def test_the_export_is_that_of_the_command(ta, grades, tmp_path, platform):
 
 
 def test_a_roster_that_is_none_is_refused(ta):
-    """A table that is not the platform's roster is refused, as by the command."""
+    """Like the command, the desk refuses a table that is not the platform's roster."""
     assert upload(ta, ROOM + "export", "roster", "a,b\n1,2\n", lms="canvas").status == 422
     assert ta.post(ROOM + "export", lms="blackboard").status == 400
 
 
 def test_a_class_is_graded_again_from_the_desk(tmp_path):
-    """The desk can grade a class again: unchanged submissions are skipped, points by hand stay.
+    """If a class is graded again, unchanged submissions are skipped and points by hand stay.
 
-    Only the owner of the computer may type a folder.
+    Only the owner of the computer may type a folder's path.
     """
     team = a_submission(tmp_path / "class" / "team-05", "one-cart")
     grades = tmp_path / "grades"
@@ -575,7 +575,7 @@ def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
 
 
 def test_the_lines_of_a_class_are_those_of_its_grades(grades):
-    """The lines of the class page equal those of its grades, also when read from the cache."""
+    """Each line of the class page equals its grade, even if it comes from the cache."""
     from pipeline.grading.gradebook.class_lines import Line
 
     with OpenBook(grades) as book:
@@ -624,7 +624,7 @@ def listed(answer: Answer) -> dict[str, list[str]]:
 
 
 def together(**more: str) -> str:
-    """Return the address of the list of teams with Hz that lost points for the laws."""
+    """Return the address of the list of teams with frequencies in Hz that lost points for laws."""
     about = {"criterion": "laws", "flag": "hz_for_rad_s", "lost": "laws"}
     return f"{ROOM}together?{urlencode(about | more)}"
 
@@ -697,7 +697,7 @@ def test_a_comment_changes_no_points(ta, grades):
 
 
 def test_what_cannot_be_done_for_all_is_done_for_none(ta, grades):
-    """If a decision is not possible for one of the ticked teams, it changes no team."""
+    """If one decision for several teams is not possible for all of them, no team changes."""
     page = ta.get(together())
     names = list(listed(page))
     for wrong, fields in (
@@ -722,7 +722,7 @@ def test_what_cannot_be_done_for_all_is_done_for_none(ta, grades):
 
 
 def test_what_was_decided_keeps_its_place_in_the_list(ta):
-    """Going to the next criterion never skips one, whatever points were given."""
+    """Criteria keep their order while points are given, so that the next one is never skipped."""
 
     def titles() -> list[str]:
         found = re.findall(r'<span class="title">(.*?)</span>', ta.get(at("team-05")).text)
@@ -757,7 +757,7 @@ def test_the_recordings_of_a_team_are_one_click_away(tmp_path):
 
 
 def test_only_a_decision_of_this_class_is_undone(ta, grades):
-    """Undo needs the moment of a decision of this class."""
+    """Undo works only with the time of a decision that was made in this class."""
     change(ta, "team-01", points="0.5", why="alone")
     for moment in ("", "2026-01-01", "%"):
         assert ta.post(ROOM + "together", do="undo", set=moment).status == 404
@@ -766,7 +766,7 @@ def test_only_a_decision_of_this_class_is_undone(ta, grades):
 
 
 def test_to_undo_a_decision_leaves_what_came_after_it(ta, grades):
-    """Undoing a decision keeps the points of teams that were changed after it, and names them."""
+    """If a decision is undone, teams that were changed after it keep their points and are named."""
     page = ta.get(together())
     names = list(listed(page))
     apply(ta, together(), sent(page, *names, do="apply", points="0.5", why="one unit"))

@@ -1,4 +1,4 @@
-"""The first page, the line of links to rooms, and the list of folders to choose from."""
+"""Tests of the first page, of the line of links on each page, and of the list of folders."""
 
 import re
 from html import unescape
@@ -84,7 +84,7 @@ def test_a_lost_folder_is_named_on_its_page_and_breaks_no_other(tmp_path, instea
 def test_what_can_be_opened_comes_first_and_nothing_hidden_is_listed(root):
     """Folders that can be opened are listed first, each once, with their kind.
 
-    Hidden folders, and links that lead out, are left out.
+    Hidden folders are left out, and so are links that lead outside the root.
     """
     found = {one.inside: one.kind for one in list_folders(root, "").found}
     assert found == {"grades": "grading", "team": "submission", "empty": "empty", "years": "folder"}
@@ -100,7 +100,10 @@ def test_what_can_be_opened_comes_first_and_nothing_hidden_is_listed(root):
      "nowhere", "years/../..", "a\x00b", "loop"],
 )  # fmt: skip
 def test_no_folder_outside_of_the_root_is_listed(root, inside):
-    """A folder outside the root, a hidden folder or a file is not listed; one sentence says so."""
+    """No folder outside the root, no hidden folder and no file can be listed.
+
+    The desk answers with one sentence.
+    """
     with pytest.raises(ConfigError):
         list_folders(root, inside)
     with DeskServer() as server:
@@ -120,7 +123,7 @@ def test_a_large_folder_is_cut_and_says_so(root):
 
 
 def test_what_can_be_opened_is_never_cut_off(root):
-    """A submission is listed first, even if its name would put it after the cut."""
+    """In a long list, a submission comes first, whatever its name, so it is never cut off."""
     for number in range(MOST + 5):
         (root / "years" / f"team-{number:03d}").mkdir()
     (root / "years" / "zoe").mkdir()
@@ -135,7 +138,7 @@ def test_the_whole_disk_is_no_root(monkeypatch):
 
 
 def test_a_folder_is_chosen_for_what_one_wants_to_do(root):
-    """From a task on the first page, one choice of a folder leads to the page for that task."""
+    """The user chooses a task on the first page, then a folder, and gets the page for the task."""
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
         assert "Nothing is open yet." in visitor.get("/").text
@@ -158,9 +161,9 @@ def test_a_folder_is_chosen_for_what_one_wants_to_do(root):
 
 
 def test_the_line_of_rooms_stays_short(root):
-    """The line of links has only the current folder and those opened last.
+    """The line of links has only the current folder and the folders opened last.
 
-    A folder's bench is linked only while it is shown.
+    The link to a folder's bench is there only while the folder is shown.
     """
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
@@ -174,7 +177,7 @@ def test_the_line_of_rooms_stays_short(root):
 
 
 def test_a_student_sees_nothing_of_the_instructor_s(root):
-    """Students and TAs see no task, link or list of folders that is for instructors."""
+    """Students and TAs see none of the tasks, links and lists of folders for instructors."""
     users = """
     [[users]]
     name = "s"

@@ -14,7 +14,7 @@ _OURS = re.compile(r"\.turn|data/[^/]+|submission\.toml|notes\.md|\.lock")
 
 
 def visit(tmp_path, *, every: int, drawn: int, seed: int) -> int:
-    """Upload each hostile submission into a folder of its own and open it; return their number."""
+    """Upload and open each hostile submission in a folder of its own; return their number."""
     school, rooms = tmp_path / "school", tmp_path / "rooms"
     school.mkdir()
     good = {
@@ -63,11 +63,11 @@ def _quoted(name: str) -> str:
 
 
 def test_hostile_uploads_reach_nothing(tmp_path):
-    """A sample of hostile uploads, with some spoilt submissions, reaches nothing."""
+    """A sample of hostile and spoilt uploads changes nothing outside and runs nothing."""
     assert visit(tmp_path, every=12, drawn=6, seed=1) >= 50
 
 
 @pytest.mark.slow
 def test_two_hundred_hostile_uploads_reach_nothing(tmp_path):
-    """All hostile uploads, and a hundred spoilt submissions, reach nothing."""
+    """All hostile uploads and a hundred spoilt ones change nothing outside and run nothing."""
     assert visit(tmp_path, every=1, drawn=100, seed=2) >= 200

@@ -20,7 +20,7 @@ HERE = "/student/0/"
 
 @pytest.fixture
 def jobs():
-    """Return the long tasks of a desk, ended after the test."""
+    """Return the long tasks of a desk, which are ended after the test."""
     jobs = Jobs()
     yield jobs
     jobs.close()
@@ -54,7 +54,7 @@ def test_a_slow_folder_is_waited_for_by_who_looks_at_it_only(tmp_path):
 
 @pytest.mark.usefixtures("work_here")
 def test_a_stop_waits_for_no_thread(tmp_path):
-    """If all threads are busy, a Stop is still served at once."""
+    """Even if all threads are busy, a request to stop the bench is answered at once."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
         visitor, workers = Visitor.of(server.url), server._desk.workers
@@ -90,7 +90,10 @@ def test_a_fault_of_our_own_is_told(tmp_path, jobs):
 
 
 def test_one_thing_at_a_time_in_a_folder(tmp_path, jobs):
-    """In one folder only one task runs: the same one again is the same job, another is refused."""
+    """In each folder only one task runs at a time, and any other task is refused.
+
+    To ask for the running task again gives the same job.
+    """
     given = {"place": tmp_path, "folder": str(a_submission(tmp_path / "team"))}
     job = jobs.start("make_report", title="The report", **given)
     assert jobs.start("make_report", title="The report", **given) is job
@@ -141,7 +144,7 @@ def test_a_job_survives_a_reload_is_stopped_or_dies_and_tells_its_stages(tmp_pat
 
 
 def test_a_file_that_ends_the_process_costs_its_own_row(tmp_path):
-    """If a file makes the process that reads it die, only this file's row fails.
+    """If a file ends the process that reads it, only the row of this file fails.
 
     The other files are shown, and the next task gets a new process.
     """
@@ -187,7 +190,7 @@ def test_a_fault_costs_its_task_and_not_the_process(tmp_path):
 
 
 def test_a_process_that_was_used_up_is_replaced_before_the_next_task(tmp_path, monkeypatch):
-    """A process that has done its number of tasks is replaced before the next task arrives."""
+    """After its last allowed task, a process is replaced before the next task arrives."""
     monkeypatch.setattr("pipeline.processes._TASKS_EACH", 1)
     workers = WorkerPool()
     assert workers.do("list_files", folder=str(tmp_path)) == []
@@ -196,7 +199,7 @@ def test_a_process_that_was_used_up_is_replaced_before_the_next_task(tmp_path, m
 
 
 def test_a_lab_server_has_its_processes_before_students_ask(tmp_path):
-    """A lab server starts all its processes before students ask."""
+    """A lab server starts all its worker processes before a student asks for anything."""
     workers = WorkerPool()
     workers.start()
     until(lambda: [hand.runs for hand in list(workers._free.queue)] == [True] * _SHORT_WORKERS)
@@ -212,7 +215,7 @@ def test_a_lab_server_has_its_processes_before_students_ask(tmp_path):
     ],
 )
 def test_who_dies_of_an_exception_got_no_signal(module, line):
-    """If a process ends by an exception, the exception is reported, even while a thread waits."""
+    """If an exception ends a process, the exception is reported, even while a thread waits."""
     process = LineProcess(module)
     try:
         process.send(line)
@@ -225,7 +228,7 @@ def test_who_dies_of_an_exception_got_no_signal(module, line):
 
 
 def test_a_job_whose_thread_fails_is_over(jobs, monkeypatch, tmp_path):
-    """If a job cannot be started, for whatever cause, it counts as over."""
+    """If a job cannot be started for whatever reason, it is reported as over."""
 
     def no_more(module: str) -> LineProcess:
         raise MemoryError("no more")
@@ -239,7 +242,7 @@ def test_a_job_whose_thread_fails_is_over(jobs, monkeypatch, tmp_path):
 
 
 def test_who_serves_is_gone_and_so_is_the_work(tmp_path):
-    """A worker process ends by itself if its desk was killed."""
+    """If a desk is killed, its worker processes end by themselves."""
     workers = WorkerPool()
     workers.do("list_files", folder=str(tmp_path))
     worker = workers._free.get()

@@ -1,4 +1,4 @@
-"""A number that is too large or small to compute with does not lock a student out of the desk."""
+"""A number too large or too small to compute with does not keep a student from the page."""
 
 import pytest
 
@@ -12,7 +12,7 @@ HERE = "/student/0/"
 
 @pytest.mark.parametrize("number", ["1e1000000", "1e-99999999999999999999", "0x" + "f" * 5000])
 def test_a_student_can_still_open_the_page(tmp_path, number):
-    """The page opens and names the mistake, also after the file is uploaded again."""
+    """The student's page opens and names the wrong number, even after another upload."""
     folder = a_submission(tmp_path / "team")
     text = (folder / NAME).read_text(encoding="utf-8")
     assert "\nK = 28.7\n" in text

@@ -1,4 +1,4 @@
-"""A rubric is edited through plain forms: list, numbers, text, and preview on a class."""
+"""Without scripts, the rubric's pages list, edit and preview rubrics."""
 
 import json
 import re
@@ -105,7 +105,7 @@ def test_a_rubric_lies_where_it_can(visitor, file):
 
 
 def test_a_rubric_is_found_again_whatever_its_folder_is_called(visitor, tmp_path):
-    """A rubric is found even if its folder's name has special characters of addresses."""
+    """A rubric is found even if its folder's name has characters that are special in addresses."""
     folder = tmp_path / "R+D & co #2 100%"
     folder.mkdir()
     path = folder / "rubric.toml"
@@ -115,9 +115,9 @@ def test_a_rubric_is_found_again_whatever_its_folder_is_called(visitor, tmp_path
 
 
 def test_every_shipped_rubric_is_one_click_away(visitor, lab, tmp_path, monkeypatch):
-    """The page lists every shipped rubric and those of the folder, each one click away.
+    """The page lists all shipped rubrics and those in the folder, each one click away.
 
-    A new rubric gets a free name.
+    A new rubric gets a name that is not in use.
     """
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rubric.toml").write_text(ONE_CART.replace("points", "pionts"), encoding="utf-8")
@@ -135,7 +135,7 @@ def test_every_shipped_rubric_is_one_click_away(visitor, lab, tmp_path, monkeypa
 
 
 def test_a_workshop_shows_its_own_files_alone(tmp_path):
-    """An instructor sees the workshop's own rubrics, but none that a link points to."""
+    """An instructor sees the rubrics in the workshop, but none outside, even through a link."""
     shop = tmp_path / "shop"
     for path in (shop / "deep" / "a.toml", shop / ".hidden" / "b.toml", tmp_path / "c.toml"):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -188,7 +188,7 @@ def test_a_number_that_cannot_be_is_told_at_its_field_and_line(visitor, lab):
 
 
 def test_a_number_outlives_a_mistake_in_the_text(visitor, lab):
-    """If the text is wrong, the form's changed number waits until the text is right."""
+    """While the text is wrong, a number changed in the form waits and is inserted later."""
     page = editor(visitor, lab)
     wrong = ONE_CART.replace("version = 1", "version = one")
     fields = sent(page, lab, **{"late.percent_per_day": "50", "text": wrong})
@@ -201,7 +201,7 @@ def test_a_number_outlives_a_mistake_in_the_text(visitor, lab):
 
 @pytest.mark.parametrize("shown", ["", "no JSON", "[]", '{"criteria.none.points": "1"}', "7"])
 def test_a_form_of_nobody_s_page_is_no_fault(visitor, lab, shown):
-    """A field that the page never showed changes nothing and is no fault of the desk."""
+    """If a form has a field that its page never showed, nothing changes and no error occurs."""
     seen = editor(visitor, lab).value("seen")
     fields = {"file": str(lab), "text": ONE_CART, "seen": seen, "shown": shown}
     answer = visitor.post("/rubric/check", **fields, **{"criteria.none.points": "2"})
@@ -247,7 +247,7 @@ def test_a_preview_shows_each_team_before_anything_is_written(tmp_path, lab):
 
 
 def test_a_preview_tells_what_needs_the_recordings(tmp_path, lab):
-    """A change of the rubric that needs the recordings is named in the preview, not guessed."""
+    """If a change of the rubric needs the recordings, the preview says so and guesses no points."""
     write_class_of_two(tmp_path / "graded")
     with DeskServer() as server:
         visitor = Visitor.of(server.url)

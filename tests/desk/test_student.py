@@ -1,4 +1,4 @@
-"""The student's pages work through plain forms: files, form, report, answers, zip, safety."""
+"""Without scripts, the student's pages lead from uploaded files to the zip to hand in."""
 
 import io
 import json
@@ -59,7 +59,7 @@ def filled(tmp_path):
 
 @pytest.fixture(scope="module")
 def workers():
-    """Return the processes for short tasks, without a desk."""
+    """Return the worker processes for short tasks, without a desk."""
     workers = WorkerPool()
     yield workers
     workers.close()
@@ -73,7 +73,7 @@ def take_upload(name: str, content: io.BytesIO, folder: Path, *, workers: Worker
 
 
 def ask_for(folder: Path, *ids: str) -> tuple[str, ...]:
-    """Put a report that asks questions into the folder."""
+    """Put a report that asks questions into the folder of the submission."""
     (folder / "report").mkdir(exist_ok=True)
     (folder / "report" / "report.html").write_text("<p>the report</p>", encoding="utf-8")
     (folder / "report" / "report.pdf").write_bytes(b"%PDF")
@@ -214,7 +214,7 @@ def test_a_row_is_corrected_in_place(filled):
 
 
 def test_what_another_tab_saved_is_not_what_was_typed_here(filled):
-    """If another tab saved first, both versions of the fields touched in this tab are shown."""
+    """If another tab saved first, both versions of the fields changed in this tab are shown."""
     visitor, _ = filled
     page = visitor.get(HERE)
     shown = {"title": page.value("title"), "section": page.value("section")}
@@ -250,7 +250,7 @@ def test_a_recording_is_moved_aside_and_comes_back(filled):
 
 @pytest.mark.parametrize("packed", [True, False])
 def test_a_name_that_does_not_show_is_stored_under_one_that_does(room, packed):
-    """Spaces and invisible characters in a file's name are replaced, with a message."""
+    """Special spaces and invisible characters in a file's name are replaced, with a message."""
     visitor, folder = room
     raw, marks = some_files()[0][1], "\u00a0\u200b\u202f\ufeff"
     sent = [(f"a{mark}b.csv", raw + b"\n" * i) for i, mark in enumerate(marks)]
@@ -272,9 +272,9 @@ def test_a_name_that_does_not_show_is_stored_under_one_that_does(room, packed):
 
 @pytest.mark.parametrize("named", [True, False])
 def test_moving_aside_waits_its_turn_before_it_looks(filled, named):
-    """Moving a recording aside waits for other changes of the folder.
+    """A recording is moved aside only after other changes of the folder have ended.
 
-    If a table names the file by then, or it is gone, nothing moves.
+    If a table then names the file, or it is gone, nothing moves.
     """
     visitor, folder = filled
     recording = folder / "data" / "late.csv"
@@ -429,7 +429,7 @@ def test_an_essay_and_an_empty_file_are_no_recordings(filled):
 
 
 def test_a_recording_that_was_cut_short_is_not_green(filled):
-    """A truncated recording keeps its group open, and its row says that the report skips it."""
+    """If a recording is truncated, its row says so, and its group of rows is not folded."""
     visitor, folder = filled
     assert 'id="kind-decay" open' not in visitor.get(HERE).text
     file = folder / "data" / "decay-1b.csv"
@@ -440,7 +440,10 @@ def test_a_recording_that_was_cut_short_is_not_green(filled):
 
 
 def test_edits_from_outside_show_and_are_not_written_over(filled):
-    """A change from outside the desk is shown; a form or answer of an older state is refused."""
+    """If the file was changed outside the desk, the change is shown and not overwritten.
+
+    A form or an answer made before the change is refused.
+    """
     visitor, folder = filled
     seen = visitor.get(HERE).value("seen")
     text = (folder / NAME).read_text(encoding="utf-8")
@@ -463,7 +466,10 @@ def test_edits_from_outside_show_and_are_not_written_over(filled):
 
 
 def test_what_a_page_showed_is_known_a_hundred_states_later():
-    """A page can still save after a hundred others have saved; memory per person is limited."""
+    """A page can be saved even if others have saved a hundred times since it was opened.
+
+    The memory used for each person is limited.
+    """
     desk, seen = Desk(), "seen"
     desk.keep_shown("title = ''", digest=seen, to="")
     for i in range(100):
@@ -507,7 +513,7 @@ edit_submission(folder, change, seen=text_digest(submission_text(folder)))
 
 
 def test_another_process_waits_its_turn(filled):
-    """If a command in a terminal changes the file at the same time, the later change is refused."""
+    """If a terminal command and the desk change the file at the same time, the later is refused."""
     visitor, folder = filled
     seen = visitor.get(HERE).value("seen")
     command = [sys.executable, "-c", _SAVES, str(folder), "terminal"]
@@ -561,7 +567,7 @@ def test_an_answer_that_is_refused_stays_on_the_page(filled):
 
 
 def test_lines_of_a_note_stay_lines(filled):
-    """Line breaks in a note survive every change in its row; blank lines around it are dropped."""
+    """The lines of a note stay as they are when its row changes; blank lines around it go."""
     visitor, folder = filled
     note = "one\n\ntwo\n"
     edit_submission(folder, lambda d: d["experiments"][0].update(note=note))
@@ -680,7 +686,7 @@ def test_a_linked_data_folder_is_refused(tmp_path, workers):
 
 
 def test_an_archive_is_taken_by_the_limits_of_a_hand_in(tmp_path, workers):
-    """Recordings in an uploaded zip are taken; a bomb, a link and a path outside are refused."""
+    """Recordings in an uploaded zip file are stored; bombs, links and paths outside are refused."""
 
     def zipped(*members: tuple[str, bytes]) -> io.BytesIO:
         buffer = io.BytesIO()
@@ -702,7 +708,7 @@ def test_an_archive_is_taken_by_the_limits_of_a_hand_in(tmp_path, workers):
 
 
 def test_a_folder_has_room_for_a_hand_in(tmp_path, workers, monkeypatch):
-    """A folder accepts files up to a submission's limits in size and number."""
+    """A folder accepts files up to the limits on a submission's size and number of files."""
     monkeypatch.setattr(uploads, "MAX_DATA_BYTES", 10)
     (tmp_path / "whole").mkdir()
     (said,) = take_upload("a.csv", io.BytesIO(b"x" * 11), tmp_path, workers=workers)
@@ -718,7 +724,7 @@ def test_a_folder_has_room_for_a_hand_in(tmp_path, workers, monkeypatch):
 
 
 def test_what_is_no_part_of_a_hand_in_takes_no_room(tmp_path, workers, monkeypatch):
-    """Files that are not in the zip do not count towards the limits."""
+    """Files that will not be in the zip do not count towards the limits on a folder."""
     for name in ("set-aside/old.csv", "report/report.html", "gap/gap.json", "raw/session-1/a.bin"):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).write_bytes(bytes(100))
@@ -730,7 +736,7 @@ def test_what_is_no_part_of_a_hand_in_takes_no_room(tmp_path, workers, monkeypat
 
 
 def test_names_and_texts_of_files_are_never_markup(room):
-    """Names of files and headings appear as plain text, never as markup."""
+    """Names of files and their headings appear as plain text, never as markup."""
     visitor, folder = room
     evil = "<img src=x onerror=alert(1)>"
     (folder / "data").mkdir()
@@ -782,7 +788,7 @@ def test_the_gap_is_looked_for_as_a_job(filled):
 
 
 def test_a_task_says_why_it_came_to_nothing(tmp_path, workers):
-    """If a task cannot be done, its message is that of the command, and the process goes on."""
+    """If a task fails, the student reads the command's own message, and the process goes on."""
     with pytest.raises(Failed, match="contains no recordings"):
         workers.do("fill_tables", folder=str(tmp_path))
     with pytest.raises(Failed, match="outside"):
@@ -817,7 +823,7 @@ def test_files_that_are_not_read_are_named_with_what_to_do(filled):
 
 
 def answers(page: str) -> dict[str, str]:
-    """Return the buttons that answer a doubt: what each types, by its text."""
+    """Return the buttons that answer a doubt: their texts and what each one enters."""
     found = re.findall(r'<button name="answer" value="([^"]*)">([^<]*)</button>', page)
     return {unescape(label): unescape(value) for value, label in found}
 
@@ -837,7 +843,10 @@ def test_a_unit_is_set_by_one_click_with_what_was_typed_beside_it(room):
 
 @pytest.mark.parametrize(("label", "there"), [("No spring here", False), ("Spring present", True)])
 def test_a_spring_that_nothing_tells_is_answered_by_one_click(label, there, room):
-    """One click answers whether a spring exists; the doubt is gone, even if nothing changes."""
+    """One click answers whether a spring exists.
+
+    The doubt is then gone, even if the answer confirms the file.
+    """
     visitor, folder = room
     visitor.upload(HERE + "files", some_files("two-cart"))
     page = visitor.get(HERE)
@@ -910,9 +919,9 @@ def test_remarks_that_differ_in_a_number_are_said_once(room):
 
 
 def test_a_closed_loop_folds_what_controller_ran_until_it_is_filled(filled):
-    """A closed loop asks for its controller in one folded line until it is filled in.
+    """A closed loop's row asks for its controller in one folded line until the line is filled in.
 
-    Only dwells are asked for a frequency.
+    Only the row of a dwell asks for a frequency.
     """
     visitor, folder = filled
     runs = load_submission(folder).experiments
@@ -939,7 +948,7 @@ def test_a_closed_loop_folds_what_controller_ran_until_it_is_filled(filled):
 def test_a_file_in_doubt_leaves_the_next_action_where_the_way_is(filled):
     """If the report is up to date, the next step is to hand in, even if a file is in doubt.
 
-    The doubt stays in sight.
+    The doubt stays visible.
     """
     visitor, folder = filled
     (folder / "data" / "bad.csv").write_bytes(b"time,input,x1\n0,0,0\n")
@@ -968,9 +977,9 @@ def test_a_cart_that_hardly_moves_is_said_to_be_held_or_free(room):
 
 
 def test_one_click_answers_what_several_recordings_ask(room):
-    """If several recordings ask the same question, one click answers it for all of them.
+    """If several recordings raise the same question, one click answers it for all of them.
 
-    Wrong numbers of recordings are refused.
+    A click that names recordings which do not exist is refused.
     """
     visitor, folder = room
     for name, n in (("a", 400), ("b", 420), ("c", 440)):
@@ -998,7 +1007,7 @@ def test_one_click_answers_what_several_recordings_ask(room):
 
 
 def test_what_needs_a_person_comes_first_and_the_rest_is_folded(filled):
-    """In a group, recordings that need the student come first and the others are folded."""
+    """In each group, recordings that need the student come first, and the others are folded."""
     visitor, folder = filled
     assert "rest-decay" not in visitor.get(HERE).text
     file = folder / "data" / "decay-1b.csv"

@@ -1,4 +1,4 @@
-"""The steps from files to handing in follow from plain facts."""
+"""The student's steps, from files to handing in, are computed from a few facts."""
 
 import pytest
 
@@ -70,7 +70,7 @@ def test_each_step_follows_from_the_facts(facts, states, following):
 
 
 def test_a_zip_that_was_downloaded_as_it_is_now_ends_the_way():
-    """After the current zip was downloaded, all steps are done and the last one is shown."""
+    """Once the current zip has been downloaded, all steps are done and the last one is shown."""
     facts = Facts(recordings=1, sound=True, report="current", handed=True)
     assert {step.state for step in find_steps(facts)} == {"done"}
     assert next_step(find_steps(facts)).key == "hand-in"

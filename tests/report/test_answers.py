@@ -34,7 +34,7 @@ More.
 
 
 def test_an_answer_is_what_stands_under_its_heading():
-    """An answer includes deeper headings and code, but no comment."""
+    """An answer includes code and smaller headings under its heading, but no comment."""
     assert written_answer(NOTES, "friction-2").startswith("Because.\n\n### In detail")
     assert written_answer(NOTES, "friction-2").endswith("# no heading\n```")
     assert written_answer(NOTES, "zeta_b") == ""
@@ -52,7 +52,7 @@ def test_an_answer_is_replaced_added_and_taken_away():
 
 
 def test_a_heading_that_would_end_the_answer_is_refused():
-    """An answer with a heading that would end it is refused."""
+    """An answer that contains a heading as large as its own is refused."""
     with pytest.raises(SubmissionError, match="must start with ###"):
         with_answer(NOTES, "level", "So.\n\n# Aha\n\nMore.")
     assert "### Aha" in with_answer(NOTES, "level", "So.\n\n### Aha\n\nMore.")
@@ -63,7 +63,10 @@ OPEN = ["```\ncode", "~~~", "So <!-- why", "```\n<!-- x\n```", "So.\n\n### outlo
 
 @pytest.mark.parametrize("text", OPEN)
 def test_an_answer_that_would_swallow_another_is_refused(text):
-    """An answer with unclosed code or an unclosed comment is refused, as it would hide the next."""
+    """An answer with an unclosed comment or code block is refused.
+
+    It would hide the next answer.
+    """
     with pytest.raises(SubmissionError, match="close every"):
         with_answer(NOTES, "friction-2", text)
     for closed in ("```\n# code\n```", "So <!-- why --> it is.", "### In detail\n\nMore."):

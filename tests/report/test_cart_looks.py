@@ -1,4 +1,4 @@
-"""Each cart looks the same in figures, on the live page, and in the desk's thumbnails."""
+"""A cart has the same colour in figures, on the live page, and in the desk's thumbnails."""
 
 import re
 

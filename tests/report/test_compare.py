@@ -49,7 +49,10 @@ def test_a_draft_does_not_differ_from_itself():
 
 
 def test_a_number_that_moved_is_told_in_combined_standard_errors():
-    """A change is given in combined standard errors: 2 % with 1 % in each draft is 1.4 σ."""
+    """A change is given in combined standard errors of both drafts.
+
+    A change of 2 %, with a standard error of 1 % in each draft, is 1.4 σ.
+    """
     analysis = make_analysis(2)
     row = next(row for row in analysis.rows if row.name == "K_1")
     assert row.final is not None
@@ -75,7 +78,7 @@ def test_a_number_that_moved_is_told_in_combined_standard_errors():
 
 
 def test_checks_that_fail_now_are_named():
-    """Only checks that fail now and did not fail before are listed."""
+    """Of the checks, only those are listed that fail now and did not fail before."""
     analysis = make_analysis(2)
     passing = tuple(replace(check, outcome="pass") for check in analysis.checks)
     first, *others = passing
@@ -89,7 +92,7 @@ def test_checks_that_fail_now_are_named():
 
 
 def test_the_report_has_a_section_on_the_changes():
-    """The report has a section with both values of each changed number, if drafts are compared."""
+    """If an earlier draft is given, the report has a section with old and new numbers."""
     before, after = make_analysis(2), with_final(make_analysis(2), "omega_b", 1.1)
     changes = compare_drafts(draft_of(before), after)
     blocks = change_blocks(Page(after), changes)
@@ -136,7 +139,7 @@ def test_other_benches_are_not_compared():
     [("carts", 3), ("units", {"position": "mm", "input": "V"})],
 )
 def test_what_cannot_be_compared_is_refused_before_the_analysis(tmp_path, monkeypatch, key, other):
-    """Drafts with other units or carts are refused before the analysis starts."""
+    """If drafts have different units or carts, they are refused before the analysis starts."""
 
     def analysed_after_all(*_, **__):
         pytest.fail("the analysis ran")

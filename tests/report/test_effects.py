@@ -12,7 +12,7 @@ from tests.helpers.commandline import cartlab_here
 
 
 def test_the_list_has_every_effect_with_its_parameters():
-    """Each entry names its place, parameters with units, fingerprint, experiment and source."""
+    """Each effect is listed with place, parameters, units, fingerprint, experiment and source."""
     text = " ".join(catalogue_text(CATALOGUE).split())
 
     for effect in CATALOGUE:
@@ -36,7 +36,7 @@ def test_json_is_for_programs():
 
 
 def test_a_wrong_name_is_one_line_with_the_nearest():
-    """If an effect's name is misspelt, the exit status is 2 and the error gives the nearest."""
+    """If an effect's name is misspelt, the error gives the nearest name and the status is 2."""
     done = cartlab_here("effects", "back_lash")
 
     assert (done.returncode, done.stdout) == (2, "")

@@ -1,4 +1,4 @@
-"""The diary of an exploration shows its turns and marks the explanation in the model."""
+"""The diary of an exploration lists its turns and their explanations."""
 
 import json
 import re
@@ -18,7 +18,7 @@ from tests.report.test_gap import make_gap, two_cart_analysis
 
 
 def make_turn(*weights: float) -> Turn:
-    """Return a turn with explanations of these weights; the first one is in the model."""
+    """Return a turn with explanations of these weights, the first of which the model uses."""
     return Turn(
         seconds=30.0,
         recorded=("step-1",),
@@ -36,9 +36,9 @@ def make_turn(*weights: float) -> Turn:
 
 
 def test_the_explanation_in_the_model_is_told_from_what_the_criterion_prefers(tmp_path):
-    """The diary marks which explanation is in the model, and gives the weight of each.
+    """The diary marks the explanation that the model uses, and gives each one's weight.
 
-    A weight far below the best is under 1 %; a single explanation has no weight.
+    A weight far below the best is written as under 1 %; a single explanation has no weight.
     """
     turns = [make_turn(1e-7, 1.0), make_turn(1.0)]
     page = write_diary(turns, make_analysis(1), tmp_path, wanted=0.01).read_text(encoding="utf-8")

@@ -79,14 +79,14 @@ def test_the_same_data_give_the_same_bytes():
 
 
 def test_every_dwell_is_drawn_as_a_diamond():
-    """Each of the 24 dwells is a diamond in three panels, and the legend has one more."""
+    """Each of the 24 dwells is a diamond in all three panels; the legend has one more diamond."""
     root = ElementTree.fromstring(bode_svg())
     marks = [use for use in root.iter(f"{SVG}use")]
     assert len(marks) == 3 * 24 + 1
 
 
 def test_measured_phase_lies_on_the_branch_of_the_fit():
-    """A measured phase is drawn near the model's phase, even if it differs by full turns."""
+    """A measured phase is shifted by full turns so that it is drawn near the model's phase."""
     analysis = make_analysis(3)
     response = analysis.frequency_responses[2]  # cart 3 goes down to -540°
     with drawing():
@@ -143,7 +143,7 @@ def test_a_student_s_dollar_signs_are_no_formula():
 
 
 def test_an_unstable_model_does_not_hide_the_measurement():
-    """If a simulation grows without bound, it is cut at one span beyond the measurement."""
+    """If a simulation grows without bound, the axis ends one span beyond the measurement."""
     check = make_analysis(1).hardware[0]
     growth = np.append(np.exp(np.linspace(0, 700, check.t.size - 1)), np.inf)
     for model in (1e12 * check.model, growth):
@@ -232,7 +232,7 @@ def test_the_user_s_own_settings_do_not_matter(monkeypatch):
 
 
 def test_the_report_imports_only_what_it_needs():
-    """The report does not import pyplot, pandas or control, which would take a second."""
+    """The report imports neither pyplot nor pandas nor python-control, to save a second."""
     code = (
         "import sys, pipeline.report.render.write; "
         "print([m for m in ('matplotlib.pyplot', 'pandas', 'control', 'numba', 'scipy.signal') "
@@ -318,7 +318,7 @@ def test_no_text_of_a_figure_is_cut_or_covered(carts):
 
 
 def test_every_series_carries_all_its_data():
-    """On the page a figure carries all measured points, in files and print only those drawn."""
+    """On the page, a figure has all measured points; in files and print, only those drawn."""
     rng = np.random.default_rng(3)
     t = np.linspace(0.0, 9.0, 5001)
     y = rng.normal(size=t.size)

@@ -1,4 +1,4 @@
-"""The gap report covers all verdicts and effects, its file, and the quote in the report."""
+"""The gap report is right for all verdicts and effects, and so is what other files quote."""
 
 import json
 import re
@@ -90,7 +90,7 @@ RESIDUAL = Residual(
 
 
 def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
-    """Return a possible gap of the two-cart bench, with the runs of the first cart drawn."""
+    """Return a possible gap of the two-cart bench, with traces of the first cart's runs."""
     terms: list[EffectTerm] = []
     for key in keys:
         effect = find_effect(key)
@@ -200,7 +200,7 @@ def page_of(gap: Gap) -> Page:
 
 
 def test_a_name_stands_on_top_with_its_numbers():
-    """The first paragraph names the effect with place and size, the errors and the noise."""
+    """The first paragraph names the effect with its place, its size, the errors and the noise."""
     text = page_of(make_gap()).text
 
     assert "Dry (Coulomb) friction on cart 2 explains what the linear model leaves out" in text
@@ -209,7 +209,10 @@ def test_a_name_stands_on_top_with_its_numbers():
 
 
 def test_each_size_has_its_cart_and_each_sentence_is_said_once():
-    """If both carts have dry friction, each force has its cart, and the law is explained once."""
+    """If both carts have dry friction, each force is given with its cart.
+
+    The sentence on dry friction appears only once.
+    """
     gap = make_gap()
     (one,) = gap.effects
     said = terminal_verdict(replace(gap, effects=(replace(one, where={"cart": 1}), one)))
@@ -351,7 +354,7 @@ def test_a_part_of_the_gap_says_what_is_left_and_where():
 
 @pytest.mark.parametrize("verdict", ["partial", "unexplained"])
 def test_the_force_left_has_a_picture_and_its_formula(verdict):
-    """The unexplained force has a figure for each cart and a formula that is not an effect."""
+    """The unexplained force is drawn for each cart, with a formula outside the catalogue."""
     page = page_of(make_gap(verdict))
 
     assert "The unexplained force" in page.text
@@ -390,9 +393,9 @@ def test_every_effect_has_its_page(effect):
 
 
 def test_two_effects_share_the_equations():
-    """If two effects act, each has its own letter in the equations.
+    """If two effects act, each force has its own letter in the equations.
 
-    Here friction on cart 2 is the second and the drive's change the first.
+    Here the drive's change is the first and friction on cart 2 the second.
     """
     terms = make_gap("named", ("saturation", "coulomb_friction")).model.terms
 
@@ -560,7 +563,7 @@ def test_command_writes_everything_and_names_the_friction(bench):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_report_shows_the_verdict_and_the_better_simulation(bench):
-    """The report quotes a gap analysis of its own data and simulates with its effects."""
+    """The report quotes the gap analysis of its data and simulates with the effects found."""
     analysis, gap = with_gap(analyse(load_submission(bench.folder)), bench.folder)
     assert gap is not None
     assert analysis.warnings == analyse(load_submission(bench.folder)).warnings
@@ -580,7 +583,7 @@ def test_report_shows_the_verdict_and_the_better_simulation(bench):
 
 
 def test_gap_analysis_of_other_data_is_only_a_warning(bench, tmp_path):
-    """If the data have changed since the gap analysis, the report only warns."""
+    """If data have changed since the gap analysis, the report warns and does not quote it."""
     analysis = analyse(load_submission(bench.folder))
     changed = replace(analysis, files=analysis.files | {"data/step-a.csv": "0" * 64})
 

@@ -26,7 +26,10 @@ FOUR = Chain(
 
 
 def evaluate(term: Term, values: dict[str, complex]) -> complex:
-    """Return a formula's value; adjacent parts are multiplied, an unknown name is an error."""
+    """Return a formula's value.
+
+    Adjacent parts are multiplied; an unknown name is an error.
+    """
     if isinstance(term, str):
         return complex(values[term] if term in values else float(term))
     parts = term.parts
@@ -58,7 +61,7 @@ def kinds(term: Term, kind: str) -> list[Math]:
 
 
 def physical_values(chain: Chain) -> dict[str, complex]:
-    """Return m_1, c_1, k_1 … as in the formulas; the names for a single cart have no index."""
+    """Return m_1, c_1, k_1 … as named in the formulas, without an index for a single cart."""
     if chain.n == 1:
         return {"m": chain.m[0], "c": chain.c[0], "k": chain.k.sum()}
     named = {"m": chain.m, "c": chain.c, "k": chain.k}
@@ -89,7 +92,7 @@ def test_symbolic_matrices_are_those_of_the_chain(chain):
 
 @pytest.mark.parametrize("chain", CHAINS[:3], ids=lambda chain: f"{chain.n}-carts")
 def test_symbolic_transfer_functions_are_those_of_the_chain(chain):
-    """The printed transfer functions have the values of the chain's response at any s."""
+    """The printed transfer functions, evaluated at any s, give the chain's response."""
     formula = symbolic_transfer_functions(springs_of(chain))
     assert formula is not None
     names = {"zeta": "ζ", "omega": "ω", "K": "K"}
@@ -112,7 +115,7 @@ def test_numeric_transfer_functions_are_those_of_the_chain(chain):
 
 
 def assert_responses(math: Math, values, *, chain: Chain, rtol: float) -> None:
-    """Compare each printed line, gain over D(s) times the zeros, with the chain."""
+    """Compare each printed line, gain over D(s) times the zeros, with the chain's response."""
     omega = 11.0  # rad/s, between the resonances
     values = {**values, "s": 1j * omega}
     *lines, (_, _, *denominator) = [line.parts for line in math.parts if isinstance(line, Math)]

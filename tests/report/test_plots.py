@@ -51,7 +51,7 @@ def runs() -> tuple[ComparedRun, ...]:
 
 
 def test_every_recording_is_there_with_its_model(runs):
-    """Every recording is on the page with the model's line; the closed loop has one more line."""
+    """The page has every recording with its simulation; a closed loop has a second simulation."""
     records = analysed("two-cart").records
 
     assert [run.id for run in runs] == [record.id for record in records]
@@ -79,7 +79,7 @@ def test_the_loop_is_as_the_report_has_it(runs):
 
 
 def test_a_page_holds_what_was_measured_and_simulated(runs):
-    """Each number on the page is right to half a step of 16 bits."""
+    """The page stores each number with 16 bits, right to half a step."""
     for run in runs:
         packed = pack_run(run)
         for cart, held in zip(run.carts, packed["carts"], strict=True):
@@ -97,7 +97,7 @@ def test_a_page_holds_what_was_measured_and_simulated(runs):
 
 
 def test_a_decay_is_simulated_from_its_release(runs):
-    """A decay is simulated only from its release on; then the error is noise."""
+    """A decay is simulated from its release on, and the error of the simulation is only noise."""
     for run in runs:
         if run.kind == "decay":
             (cart,) = run.carts
@@ -114,7 +114,7 @@ def test_a_decay_is_simulated_from_its_release(runs):
 
 
 def test_thinning_keeps_every_peak():
-    """Thinning a line keeps single outlying samples and at least two thousand points."""
+    """A thinned line keeps every single outlier and has at least two thousand points."""
     t = np.linspace(0.0, 60.0, 36_000)
     y, residual = np.sin(t), np.full(t.size, np.nan)
     y[17_321], residual[20_000:] = 5.0, 0.0
@@ -138,7 +138,7 @@ def test_numbers_that_are_none_or_all_the_same_survive():
 
 
 def test_a_sine_has_its_amplitude_in_the_spectrum():
-    """A sine has its amplitude at its frequency in the spectrum, even if sampled with jitter."""
+    """The spectrum of a sine shows its amplitude at its frequency, even with jittered samples."""
     rng = np.random.default_rng(4)
     t = 0.002 * np.arange(8_000, dtype=np.float64)
     t[1:-1] += rng.uniform(-2e-5, 2e-5, t.size - 2)
@@ -191,7 +191,7 @@ def test_what_a_stranger_wrote_is_text():
 
 
 def test_without_carts_the_measured_motion_is_there():
-    """If no carts were identified, the page shows the measured motion and says why no model."""
+    """If no carts were identified, the page shows only the measured motion and gives the reason."""
     page = page_of(replace(make_analysis(1), fit=None, hardware=()))
 
     runs = data_of(page)["runs"]

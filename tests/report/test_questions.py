@@ -46,7 +46,7 @@ def well(carts: int = 2) -> Analysis:
 
 
 def off(name: str, percent: float, **initial) -> Analysis:
-    """Return an analysis in which one parameter changed from initial to final estimate."""
+    """Return an analysis in which one parameter differs between initial and final estimate."""
     analysis = well()
     rows = []
     for row in analysis.rows:
@@ -93,9 +93,9 @@ def test_other_parameters_ask_for_what_may_have_moved_them(name, expected):
 
 
 def test_a_guess_that_was_far_off_asks_where_the_data_show_it():
-    """If an assumed damping was far off, a question asks where the data show it.
+    """If an assumed damping was far off, a question asks where the data show this.
 
-    If it was too large, the peak is sharper than assumed; if too small, flatter.
+    The question says that the peak is sharper, or flatter, than assumed.
     """
     (question,) = ask(off("zeta_b", -67.0, source="assumed"))
     assert question.section == "frequency-response"
@@ -107,7 +107,7 @@ def test_a_guess_that_was_far_off_asks_where_the_data_show_it():
 
 
 def test_points_are_not_asked_for_where_the_fit_had_none():
-    """After a fit to time records, no question asks for points of a Bode plot."""
+    """If the fit used time records, no question asks for points of a Bode plot."""
     analysis = off("zeta_a", 148.0, source="assumed")
     rows = tuple(
         replace(row, final=row.final and replace(row.final, source="time_fit"))
@@ -117,7 +117,10 @@ def test_points_are_not_asked_for_where_the_fit_had_none():
 
 
 def test_bench_against_model_asks_level_overshoot_and_shape_apart():
-    """Differences in level, overshoot and shape each raise their own question with both numbers."""
+    """If level, overshoot and shape differ from the model, each raises its own question.
+
+    Each question has both numbers.
+    """
     analysis = well()
     first, *others = analysis.hardware
     assert first.steady_state_model is not None
@@ -147,7 +150,7 @@ def test_a_cart_that_sticks_is_asked_about_with_its_interval():
 
 
 def test_a_fit_that_leaves_more_than_noise_asks_at_its_worst_point():
-    """If a fit leaves more than noise, the question names its worst cart and frequency."""
+    """If a fit leaves more than noise, a question names the cart and frequency that fit worst."""
     analysis = well()
     assert analysis.fit is not None
     response = analysis.frequency_responses[1]
@@ -236,7 +239,10 @@ def test_an_empty_heading_is_no_answer():
 
 
 def test_page_and_print_mark_the_place_and_show_the_answer():
-    """Page and print name an open question's heading, and show the answer of an answered one."""
+    """For an open question, page and print name the heading to write under.
+
+    For an answered question they show the answer.
+    """
     analysis = off("zeta_b", 65.0)
     pages, prints = {}, {}
     for name, discussion in (("open", None), ("done", "## zeta_b\n\n<b>Ours</b> & *more*\n")):
@@ -296,7 +302,10 @@ def test_the_three_cart_example_answers_what_it_is_asked():
 
 
 def test_real_carts_raise_friction_and_damping(tmp_path, real_data):
-    """Real two-cart data raise at most six questions, on sign, damping, friction and the bench."""
+    """Real data of two carts raise at most six questions.
+
+    They are about the sign, dampings, dry friction and the bench.
+    """
     folder = write_two_cart_submission(tmp_path / "real", real_data, steps=(2, 3, 4, 5))
     ids = [question.id for question in ask(analyse(load_submission(folder)))]
     assert ids[:4] == ["sign", "zeta_2", "friction-1", "friction-2"]

@@ -75,7 +75,7 @@ def render(analysis: Analysis, out: Path, *, pdf: bool = True) -> tuple[Page, st
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory) -> dict[int, Path]:
-    """Write reports for 1, 2 and 3 carts once."""
+    """Write reports for 1, 2 and 3 carts once for all tests."""
     made = {}
     for carts in (1, 2, 3):
         made[carts] = tmp_path_factory.mktemp(f"report-{carts}")
@@ -148,7 +148,7 @@ def test_no_page_ends_the_print_with_one_row_of_hashes(folders):
 
 @pytest.mark.parametrize(("number", "tall", "pages"), [(6, 1.02, 4), (7, 0.66, 3), (2, 0.66, 1)])
 def test_figures_in_a_row_fill_pages(number, tall, pages):
-    """If one more figure fits a page when drawn slightly smaller, figures are made smaller."""
+    """Figures are drawn slightly smaller if one more then fits on a page."""
     svg = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 100 {100 * tall}"/>'
     row = tuple(
         Picture(number=n, name=f"p{n}", caption=spans("Two words"), alt="nothing", draw=lambda: svg)
@@ -179,7 +179,7 @@ def numbers(text: str) -> list[float]:
 
 
 def without_blanks(document: Document) -> Document:
-    """Return the document with figures that are still undrawn, so that pages can be laid out."""
+    """Return the document with figures that must be drawn before pages can be laid out."""
 
     def drawn(block: Block) -> Block:
         return replace(block, blank="") if isinstance(block, Picture) else block
@@ -212,7 +212,7 @@ def test_a_table_longer_than_a_page_breaks_and_stays_with_its_heading(rows):
 
 
 def test_the_list_of_files_does_not_stand_alone_on_a_page():
-    """The heading and sentence of the list of files stay with it, wherever a page ends."""
+    """The list of files is never on a page without its heading and sentence."""
     files = {f"data/run-{i:03d}.csv": f"{i:064x}" for i in range(40)}
     shown = Shown(replace(make_analysis(1), files=files))
     blocks = tuple(provenance_blocks(shown, "Made by the program."))
@@ -266,7 +266,7 @@ def test_the_page_can_be_found_and_heard(folders):
 
 
 def test_a_report_without_a_title_says_what_it_is_once():
-    """A report without a title uses its subject as title and does not repeat it."""
+    """If a report has no title, its subject becomes the title and is not repeated."""
     analysis = make_analysis(2)
     named = build_document(analysis)
     bare = build_document(replace(analysis, title=" "))
@@ -346,7 +346,7 @@ def test_hostile_text_stays_text(tmp_path):
 
 
 def test_names_that_the_fonts_lack_are_warned_of(tmp_path):
-    """If the PDF's fonts lack characters of a name, the PDF has boxes, and a warning says so."""
+    """If the PDF's fonts lack characters of a name, the PDF shows boxes, and a warning says so."""
     said = []
     analysis = replace(make_analysis(1), authors=(("s1", "李雷 😀"), ("s2", "Žofie Ελένη Иван")))
     render_report(analysis, tmp_path, progress=said.append)
@@ -449,7 +449,7 @@ def test_any_part_may_stand_alone(part, tmp_path):
 
 
 def test_a_table_of_ratios_has_no_phase(tmp_path):
-    """For a table of ratios, the Bode figure has no phase and names its source."""
+    """If a response comes from a table of ratios, its Bode figure has no phase and says why."""
     analysis = make_analysis(1)
     (response,) = analysis.frequency_responses
     table = replace(response, phase=None, phase_std=None, source="table")
@@ -528,7 +528,7 @@ def test_a_poor_result_is_called_so(tmp_path):
 
 
 def test_a_cart_that_a_step_set_swinging_was_not_let_go():
-    """Without a decay, the figure shows the ring-down of a step and calls it that."""
+    """If there is no decay, the figure shows the ring-down of a step and says so."""
     analysis = make_analysis(1)
     ringing = {decay.experiment for decay in analysis.log_decrements}
     records = tuple(replace(r, kind="step") if r.id in ringing else r for r in analysis.records)
@@ -543,7 +543,7 @@ def test_a_cart_that_a_step_set_swinging_was_not_let_go():
 
 
 def test_what_was_not_used_is_not_said_to_be():
-    """A record left out is not listed as a source of the model.
+    """The model's sources do not list a record that was left out.
 
     If a file is missing, the summary asks for it.
     """
@@ -635,7 +635,7 @@ def test_one_swing_shows_no_rise_of_the_damping():
 
 
 def test_what_may_be_either_of_two_values_is_said_with_both():
-    """If it is open whether a gain changed, the summary gives both values."""
+    """If the estimates are too uncertain to compare, the summary gives both values."""
     analysis = make_analysis(1)
     (first, *others) = analysis.rows
     initial, final = Estimate(value=29.0, std=0.1, source="step"), first.final
@@ -648,7 +648,7 @@ def test_what_may_be_either_of_two_values_is_said_with_both():
 
 
 def test_gains_that_the_fit_cannot_give_ask_for_the_springs():
-    """If steps contradict a fit with few springs, the summary asks for the springs.
+    """If steps contradict a fit with few springs, the summary says to check the springs.
 
     Dry friction is mentioned separately.
     """

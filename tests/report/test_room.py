@@ -1,4 +1,4 @@
-"""Pages are filled by trying several layouts and keeping the best."""
+"""Pages are filled by trying several layouts and keeping the best one."""
 
 from collections.abc import Callable
 
@@ -37,7 +37,7 @@ def test_no_figure_becomes_too_small_to_read():
 
 
 def test_full_pages_are_left_as_they_are():
-    """If all pages are full, the document is laid out once."""
+    """If all pages are full at first, no other layout is tried."""
     told = []
 
     def lay_out(choices: Choices) -> Pages:

@@ -82,7 +82,7 @@ class Truth:
         return sympy.expand(det / sympy.prod(self.m[first - 1 :]))
 
     def names(self) -> dict[str, Any]:
-        """Return each name of the derivation in terms of masses, dampings and springs."""
+        """Return each name in the derivation as an expression in masses, dampings and springs."""
         n, m, k = self.n, self.m, self.k
         found: dict[str, Any] = {"s": s, "U": sympy.Integer(1), "u": sympy.Integer(1)}
         for i in range(1, n + 1):
@@ -180,7 +180,7 @@ def test_coefficients_are_those_of_the_product_of_factors(n):
 
 
 def test_the_redundancies_are_as_many_as_the_checks():
-    """The number of redundancies is 1 for two carts and 5 for three, as in the checks."""
+    """The solution has one redundancy for two carts and five for three, like the checks."""
     assert [len(derivation.redundancies(n)) for n in (1, 2, 3)] == [0, 1, 5]
 
 
@@ -206,7 +206,7 @@ WRITTEN = {
 
 
 def read_back(term) -> str:
-    """Return a displayed formula as a reader takes it: adjacent parts are multiplied."""
+    """Return a displayed formula as a reader understands it: adjacent parts are multiplied."""
     if isinstance(term, str):
         return WRITTEN.get(term, term.replace("−", "-"))
     parts = [read_back(part) for part in term.parts]
@@ -260,7 +260,10 @@ def test_a_formula_reads_as_the_text_it_is_made_from(springs):
 
 
 def test_numbers_put_in_are_worked_out_as_written():
-    """A displayed line with numbers put in gives the result, whatever signs and powers it has."""
+    """A line with numbers in place of names gives the right result when read as displayed.
+
+    The numbers have signs and powers of ten.
+    """
     values = {"a": -2.0, "b": 3e-7, "c": 0.5}
     for text in ("a*b-c", "(a-b)/c", "c-a*(b+a)", "-a**2+c", "a-(b-c)", "a/b*c"):
         seen = parsed(read_back(shown_with(text, values)))
@@ -326,7 +329,7 @@ def test_the_reference_passes_its_own_tolerances_and_a_slip_does_not():
     ("carts", "hide"), [(1, ()), (3, ()), pytest.param(1, ("dead_zone",), id="not linear")]
 )
 def test_the_solution_accepts_what_the_rubric_gives_full_points_for(carts, hide):
-    """A student at a bound of the solution earns all points by the rubric, beyond it fewer."""
+    """A student's number at a bound in the solution earns all points, and beyond it fewer."""
     one = student(carts, hide=hide)
     expected = expected_parameters(one.analysis, one.rubric)
     assert len(expected) == len(one.rubric.names)
@@ -346,7 +349,7 @@ def test_the_solution_accepts_what_the_rubric_gives_full_points_for(carts, hide)
 
 
 def test_another_rubric_has_other_bounds(tmp_path):
-    """With `--rubric`, the bounds on page and in file are those of this rubric, which is named."""
+    """With `--rubric`, page and file have the bounds of this rubric and name it."""
     analysis = make_analysis(2)
     text = (RUBRICS / "throne-2dof.toml").read_text(encoding="utf-8")
     text = text.replace(
@@ -410,7 +413,7 @@ def test_the_document_works_everything_out(carts):
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_nothing_that_students_wrote_stands_in_the_solution(carts):
-    """The solution leaves out students' notes and answers every question of the data itself."""
+    """The solution has no students' notes, and a model answer for each question of the report."""
     analysis = make_analysis(carts)
     asked = ask(analysis)
     notes = "# Discussion\n\nOurs alone.\n" + "".join(
@@ -426,7 +429,7 @@ def test_nothing_that_students_wrote_stands_in_the_solution(carts):
 
 @pytest.mark.parametrize("kind", get_args(Kind))
 def test_every_kind_of_question_has_a_model_answer(kind):
-    """Each kind of question has a model answer that asks nothing."""
+    """Each kind of question has a model answer, which is a text without a question."""
     answer = model_answer(Asked(kind=kind, id="x", section="x", text="x"))
     assert len(plain(answer.text)) > 100
     assert "?" not in plain(answer.text)
@@ -454,7 +457,7 @@ def analyse_rigid():
 
 
 def test_solution_json_is_the_reference_for_programs():
-    """`solution.json` has parameters, A and B with tolerances, and gains, always the same bytes."""
+    """`solution.json` has parameters, A, B and gains with tolerances, and always the same bytes."""
     analysis = make_analysis(2)
     text = solution_text(analysis)
     assert text == solution_text(analysis)
@@ -466,7 +469,7 @@ def test_solution_json_is_the_reference_for_programs():
 
 
 def test_a_reference_that_failed_a_check_says_so_where_its_numbers_stand():
-    """If the reference failed a check, the page says so under its title and above the values."""
+    """If the reference failed a check, a warning is under the title and above the values."""
     doubtful = make_analysis(2)
     (failed,) = doubtful.failed_checks
     sound = replace(doubtful, checks=tuple(c for c in doubtful.checks if c != failed))

@@ -41,9 +41,9 @@ def every_failed_check_is_named(analysis: Analysis) -> bool:
 
 @needs_real
 def test_only_steps_are_no_two_ways_and_no_decays(tmp_path):
-    """With only steps, the summary does not claim two methods and does not mention friction.
+    """If there are only steps, the summary says that both estimates use the same recordings.
 
-    Both estimates come from the same steps.
+    It does not mention decays.
     """
     analysis = analyse(load_submission(write_one_cart_submission(tmp_path / "s", REAL_DATA)))
     text = terminal_summary(analysis)
@@ -67,7 +67,7 @@ def test_only_steps_are_no_two_ways_and_no_decays(tmp_path):
 
 @needs_real
 def test_the_steps_counted_are_those_of_the_fit(tmp_path):
-    """The summary counts only the steps that the fit used.
+    """The summary gives the number of steps that the fit used.
 
     Of ten steps one was left out, and five were of one cart alone.
     """
@@ -86,9 +86,9 @@ def test_the_steps_counted_are_those_of_the_fit(tmp_path):
 
 
 def test_an_independent_check_is_not_called_the_same():
-    """Initial estimates from decays and steps are called independent of dwells.
+    """The summary says which initial estimates are independent of the fit to the dwells.
 
-    Peaks read off the dwells are not.
+    Those from decays and steps are; peaks read off the dwells are not.
     """
     analysis = analysed("two-cart")
     said = {row.name: row.independent for row in analysis.rows if row.independent is not None}
@@ -115,7 +115,7 @@ def plain_of(blocks) -> str:
 
 
 def test_the_sources_of_the_table_are_those_there_are():
-    """If there is no decay, no sentence about the table mentions one."""
+    """The text on the table of parameters mentions decays only if there are some."""
     analysis = make_analysis(1)
     without = tuple(
         replace(row, initial=None) if row.initial and row.initial.source == "log_decrement" else row
@@ -128,7 +128,7 @@ def test_the_sources_of_the_table_are_those_there_are():
 
 
 def test_a_check_that_nobody_foresaw_is_named_too():
-    """An unknown failed check is named by id and message, before the fit's error."""
+    """A failed check of unknown kind is named by id and message, before the fit's error."""
     odd = Check(
         kind="order", run="run-1", outcome="fail", value=1.0, limit=0.5, message="run-1: odd."
     )
@@ -148,9 +148,9 @@ def test_a_check_that_nobody_foresaw_is_named_too():
 
 @pytest.mark.parametrize("drop", ["step", "step sine sweep"])
 def test_without_runs_of_all_carts_the_advice_is_what_to_record(drop, tmp_path):
-    """Without runs of all carts, the advice is what to record.
+    """If no run has all carts, the summary advises what to record.
 
-    It neither repeats the reason nor asks for a table.
+    It neither repeats the reason nor asks for an impossible table.
     """
     shutil.copytree(EXAMPLES / "two-cart", tmp_path / "s")
     toml = tmp_path / "s" / "submission.toml"
@@ -173,7 +173,7 @@ def test_without_runs_of_all_carts_the_advice_is_what_to_record(drop, tmp_path):
 
 
 def test_nothing_failed_is_named_in_no_list():
-    """If no check failed, neither the summary nor its section lists failed checks."""
+    """If no check failed, neither the summary nor the section on checks lists a failure."""
     analysis = analysed("one-cart")
     assert not any("Failed:" in line for line in next_part(analysis))
     blocks = check_blocks(Page(analysis))

@@ -26,7 +26,7 @@ def raw(html: str) -> list[str]:
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_reports_write_symbols(carts):
-    """Report, solution and terminal show symbols for parameters, never names of files."""
+    """Report, solution and terminal show parameters as symbols, not by their names in files."""
     analysis = make_analysis(carts)
     assert raw(render_html(build_document(analysis))) == []
     assert raw(render_html(build_solution(analysis))) == []
@@ -34,7 +34,7 @@ def test_reports_write_symbols(carts):
 
 
 def test_grades_write_symbols():
-    """The feedback to a student shows symbols, also in its form for a platform."""
+    """The feedback to a student shows parameters as symbols, also in its text for a platform."""
     one = student(2)
     off = {name: one.value("final", name) * 2 for name in ("zeta_b", "omega_1", "K_1")}
     feedback = one.reported.feedback

@@ -36,7 +36,7 @@ def test_a_number_of_ones_own_that_is_off_says_what_to_look_at():
 
 
 def test_what_was_assumed_says_nothing_of_a_number():
-    """An assumed value is not compared with the student's number."""
+    """A student's number is not compared with a value that the program assumed."""
     row = make_analysis(1).rows[0]
     assert row.initial
     assumed = replace(row, initial=replace(row.initial, source="assumed"))
@@ -45,7 +45,10 @@ def test_what_was_assumed_says_nothing_of_a_number():
 
 
 def test_nothing_found_and_no_known_slip_say_nothing():
-    """A number without an estimate has a dash beside it, and an unknown slip gets no hint."""
+    """A reported number without an estimate has a dash beside it.
+
+    A wrong mass gets no hint, since no known mistake explains it.
+    """
     row = make_analysis(1).rows[0]
     mine = {row.name: Decimal("3.0")}
     table = reported_table(page([replace(row, final=None)], {"final": mine}))
@@ -57,7 +60,7 @@ def test_nothing_found_and_no_known_slip_say_nothing():
 
 
 def test_agree_stands_beside_its_limit():
-    """The table gives the limit of agreement: 15 % for gains and frequencies, 50 % for damping."""
+    """Beside each verdict, the table gives its limit: 15 % for frequencies, 50 % for dampings."""
     rows = [row for row in make_analysis(1).rows if row.consistent is not None]
     table = parameter_table(page(rows))
     limits = {plain(row[0].text): plain(row[6].text) for row in table.rows}
