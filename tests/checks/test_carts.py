@@ -1,4 +1,4 @@
-"""The fitted carts are checked for masses, dampers and springs that may not exist."""
+"""The checks find fitted masses, dampers and springs that may not exist on the bench."""
 
 import shutil
 import tomllib
@@ -44,7 +44,7 @@ def fitted(
 
 
 def vanishing(checks: tuple[Check, ...]) -> dict[str, str]:
-    """Return the message for each parameter that may not exist."""
+    """Return the message for each parameter that may not exist, by its name."""
     return {check.about: check.message for check in checks if check.kind == "vanishing"}
 
 
@@ -60,9 +60,9 @@ def vanishing(checks: tuple[Check, ...]) -> dict[str, str]:
     ],
 )
 def test_what_may_as_well_not_be_there_fails_with_its_question(name, value, std, found):
-    """A parameter that is zero within its error, or tiny beside its neighbour, fails a check.
+    """A check fails if a parameter is zero within its error, or tiny beside its neighbour.
 
-    The message asks about it and gives the line to change.
+    The message asks whether it exists and gives the line to change.
     """
     plant = PRESETS["throne-2dof"]
     values = {"m": plant.m.copy(), "c": plant.c.copy(), "k": plant.k.copy()}
@@ -81,7 +81,7 @@ def test_what_may_as_well_not_be_there_fails_with_its_question(name, value, std,
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
 def test_a_spring_that_is_said_to_be_missing_is_not_asked_about(preset):
-    """A spring declared as missing is not asked about.
+    """If a spring is declared as missing, no check asks about it.
 
     The paper's plants have no spring wall-1.
     """
@@ -97,14 +97,14 @@ def test_a_spring_that_is_said_to_be_missing_is_not_asked_about(preset):
 
 
 def test_the_shipped_examples_pass():
-    """In the shipped examples no parameter is asked about."""
+    """In the shipped examples, the checks doubt no parameter."""
     for name in ("one-cart", "two-cart", "three-cart"):
         assert vanishing(analysed(name).checks) == {}
 
 
 @pytest.mark.parametrize("name", ["two-cart", "three-cart"])
 def test_a_spring_too_many_is_found_on_the_examples(name, tmp_path):
-    """If an example declares a spring too many, the message gives the right line of springs."""
+    """If an example declares one spring too many, the message gives the right `springs` line."""
     shutil.copytree(EXAMPLES / name, tmp_path / "s")
     toml = tmp_path / "s" / "submission.toml"
     text = toml.read_text(encoding="utf-8")
@@ -119,7 +119,7 @@ def test_a_spring_too_many_is_found_on_the_examples(name, tmp_path):
 
 @pytest.mark.skipif(not (REAL_DATA / "ecp210-ucsd").is_dir(), reason="the recordings are not here")
 def test_a_far_spring_that_the_real_rig_has_not_is_asked_about(tmp_path):
-    """A far spring that the real bench lacks is asked about if it is declared.
+    """If the real bench's missing far spring is declared, a check asks about it.
 
     The fit gives it 1 % of its neighbour, to explain dry friction.
     """

@@ -1,4 +1,4 @@
-"""Single estimates are checked for what they state about a number."""
+"""Checks of single estimates do not claim more than the recordings show."""
 
 from dataclasses import replace
 
@@ -14,10 +14,7 @@ from tests.helpers.examples import analysed
 
 
 def test_the_interval_of_a_cart_that_sticks_is_no_bound():
-    """If a cart sticks, two steps may give gain intervals that do not overlap.
-
-    The gain need not be in either.
-    """
+    """If a cart sticks, gain intervals of two steps need not overlap or contain the gain."""
     steps = [
         StepGain(
             experiment=f"step-{i}",
@@ -37,7 +34,7 @@ def test_the_interval_of_a_cart_that_sticks_is_no_bound():
 
 
 def test_a_step_that_friction_holds_off_does_not_pass_as_settled(tmp_path):
-    """A step stopped short by friction does not pass as settled.
+    """If friction stops a cart short at every edge, the step does not pass the check.
 
     One gain fits all edges, but other records show the friction.
     """
@@ -60,7 +57,10 @@ def test_a_step_that_friction_holds_off_does_not_pass_as_settled(tmp_path):
 
 
 def test_one_edge_does_not_tell_whether_a_cart_sticks():
-    """A step with one edge skips the check for sticking; a step on and off again is checked."""
+    """A step with one edge cannot show whether a cart sticks, so the check is skipped.
+
+    A step on and off again is checked.
+    """
     (gain, *_) = analysed("one-cart").step_gains
     both, one = check_steps(
         [gain, replace(gain, edges=gain.edges[:1], rest_shift=None)],
@@ -86,7 +86,7 @@ def row(name: str, source: str, final: str) -> ParameterRow:
 
 
 def test_advice_looks_only_at_what_there_is():
-    """Advice names dwells, decays or steps only if the estimates use them."""
+    """Advice mentions dwells, decays or steps only if the estimates come from them."""
     said = {
         (name, source, final): check_rows([row(name, source, final)])[0].message
         for name, source, final in (

@@ -1,4 +1,4 @@
-"""The designed loop is checked with python-control: its step, margins and gains."""
+"""The step, margins and gains of a designed loop are checked with python-control."""
 
 from dataclasses import replace
 
@@ -46,7 +46,7 @@ def designed(
 
 @pytest.mark.parametrize(("name", "method"), CASES)
 def test_the_closed_loop_makes_the_step_of_the_design(name, method):
-    """The closed loop as a python-control model has named states and the design's step response."""
+    """The closed loop, as a python-control model, has named states and the step of the design."""
     chain = PLANTS[name]
     design, controller = designed(chain, method)
 
@@ -76,7 +76,7 @@ def test_the_closed_loop_makes_the_step_of_the_design(name, method):
     ],
 )
 def test_margins_are_the_edge_of_stability(name, method, sample_time, settling_time):
-    """The loop is stable within its margins, on both sides, and unstable just beyond them.
+    """Within its margins the loop is stable, and just beyond them it is unstable.
 
     A change of phase is a gain of size one, so the loop's poles show both margins exactly. |1 + L|
     is never below the modulus margin, and reaches it.
@@ -127,7 +127,10 @@ def test_an_unstable_loop_has_no_margins():
 
 
 def test_undamped_carts_have_no_margins():
-    """If a fit put a damping at zero, no margins are given, since they would not be the bench's."""
+    """If a fit puts a damping at zero, no margins are given.
+
+    The largest stable gain would then say nothing about the bench.
+    """
     design, _ = designed(UNDAMPED, "lqr")
     with pytest.raises(DataError, match="a mode of the carts has no damping"):
         design_margins(UNDAMPED, design)
@@ -152,7 +155,7 @@ def test_the_gains_are_verified(name, method, sample_time):
 @pytest.mark.parametrize("sample_time", [None, 0.001])
 @pytest.mark.parametrize(("name", "method"), CASES)
 def test_python_control_finds_the_same_loop(name, method, sample_time):
-    """The gains of python-control's `dlqr` or `place` give the same closed-loop polynomial."""
+    """Gains of python-control's `dlqr` or `place` give the same characteristic polynomial."""
     chain = PLANTS[name]
     design, _ = designed(chain, method, sample_time=sample_time)
     sampled = control.sample_system(chain.to_control(), design.sample_time)

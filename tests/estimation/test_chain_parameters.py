@@ -1,4 +1,4 @@
-"""A chain is converted to the vector of a fit, and standard errors to named parameters."""
+"""A chain becomes the vector of a fit and back, and named parameters get standard errors."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from pipeline.set_up import Bench
 
 @st.composite
 def chains(draw: st.DrawFn) -> Chain:
-    """Draw chains of one to four carts, sizes over two decades, springs at both walls."""
+    """Draw chains of one to four carts with springs at both walls; sizes span two decades."""
     n = draw(st.integers(1, 4))
     size = st.floats(0.1, 10.0)
     m, c, k = (
@@ -66,7 +66,7 @@ def test_dp_dtheta_is_the_derivative_of_the_physical_parameters():
 
 
 def test_only_a_spring_that_may_be_missing_is_linear():
-    """Spring k_1 enters linearly if the far wall also holds the carts, else as a logarithm."""
+    """In the vector, k_1 is linear if the far wall holds the carts too, else a logarithm."""
     both = Parametrisation(bench=Bench(springs=(True, True, True)))
     near = Parametrisation(bench=Bench(springs=(True, True, False)))
 
@@ -76,7 +76,7 @@ def test_only_a_spring_that_may_be_missing_is_linear():
 
 
 def test_zero_parameters_leave_the_vector():
-    """A parameter held at zero has no entry in the vector and stays zero."""
+    """If a parameter is held at zero, the vector has no entry for it, and it stays zero."""
     P = Parametrisation(bench=Bench(springs=(True,) * 3)).holding_at_zero("c_2", "k_1")
 
     chain = P.unpack(P.pack(PRESETS["throne-2dof"]))
@@ -87,19 +87,19 @@ def test_zero_parameters_leave_the_vector():
 
 
 def test_one_cart_has_one_stiffness_whichever_springs_hold_it():
-    """One cart has the same vector whether its spring is at the near or the far wall."""
+    """The vector of one cart is the same whether its spring is at the near or the far wall."""
     assert Parametrisation(bench=Bench(springs=(False, True))).names == ("m_1", "c_1", "k_1")
     assert Parametrisation(bench=Bench(springs=(False, False))).names == ("m_1", "c_1")
 
 
 def test_carts_that_nothing_drives_are_refused():
-    """A missing spring between two carts is an error that names both."""
+    """If the spring between two carts is missing, the error names the two carts."""
     with pytest.raises(DataError, match="between carts 2 and 3, found none"):
         Parametrisation(bench=Bench(springs=(True, True, False, True)))
 
 
 def test_standard_errors_of_one_cart_follow_its_formulas():
-    """For one cart, the errors of K, ω_n and ζ equal those derived by hand."""
+    """The standard errors of one cart's K, ω_n and ζ equal those derived by hand."""
     m, c, k = 2e-4, 5e-4, 0.035
     relative = np.array([0.02, 0.05, 0.01])  # of m, c, k, independent
     covariance = np.diag((relative * [m, c, k]) ** 2)
@@ -119,7 +119,7 @@ def test_standard_errors_of_one_cart_follow_its_formulas():
 
 
 def test_standard_errors_agree_with_a_sample():
-    """Over a sample of chains the named parameters scatter as their standard errors state."""
+    """In a sample of chains, named parameters scatter as their standard errors state."""
     chain = PRESETS["throne-3dof"]
     P = Parametrisation(bench=Bench(springs=(True,) * 4))
     p = P.physical(chain)
@@ -138,9 +138,9 @@ def test_standard_errors_agree_with_a_sample():
 
 
 def test_a_start_is_a_possible_chain():
-    """A start for the fit has positive springs, the declared springs only, and usual dampings.
+    """A start for the fit keeps the masses and gets positive springs and a usual damping.
 
-    Its masses stay.
+    A spring declared as missing stays zero.
     """
     found = Chain(m=np.array([3e-4, 2e-4]), c=np.array([-1.0, 1.0]), k=np.array([-0.01, 0.1, 0.05]))
 
@@ -165,6 +165,6 @@ def test_an_even_chain_has_the_gain_it_is_asked_for(n, gain, omega):
 
 
 def test_an_even_chain_needs_something_to_go_by():
-    """An even chain cannot be made without a gain and a resonance, since its scale is unknown."""
+    """A chain of equal carts can be guessed only from a gain and a resonance."""
     with pytest.raises(DataError, match="gain of cart 1 and a resonance"):
         even_chain({"K_1": 1.0}, bench=Bench(springs=(True,) * 3))

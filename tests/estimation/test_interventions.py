@@ -1,4 +1,4 @@
-"""Touches by hand are found when they happened, and no effect is taken for one."""
+"""Touches by hand are found in recordings, and effects of the bench are not taken for them."""
 
 from dataclasses import replace
 
@@ -14,12 +14,12 @@ TO = 0.08  # s, half a window of 0.1 s and the time in which a pluck's grip fade
 
 
 def pulls(case: Case) -> list[tuple[str, Hand]]:
-    """Return the touches that pull or push, by record, without those that only hold."""
+    """Return the touches that pull or push, with their records, but not those that only hold."""
     return [(name, hand) for name, laid in case.hands.items() for hand in laid if hand.end < 1e9]
 
 
 def unmatched(case: Case) -> tuple[list[tuple[str, Hand]], list[Intervention]]:
-    """Return the touches that were missed, and the touches found that did not happen."""
+    """Return the touches that were not found, and the finds without a touch."""
     found = list(find_interventions(case.records))
     missed = []
     for name, hand in pulls(case):
@@ -41,7 +41,7 @@ def unmatched(case: Case) -> tuple[list[tuple[str, Hand]], list[Intervention]]:
     [(1, 113.1, ()), (2, 250.0, ()), (3, 1000.0, ()), (2, 250.0, ("coulomb_friction",))],
 )
 def test_hands_are_found_and_nothing_else(n, rate, effect):
-    """Plucks, a nudge and a push are found on every bench, and nothing else is.
+    """Plucks, a nudge and a push are found on benches with any effect, and nothing else is.
 
     On such benches 476 of 486 touches were found; a short pull may be missed.
     """
@@ -75,10 +75,7 @@ def test_hands_are_found_at_low_rates(rate):
 
 
 def test_a_recording_that_is_listed_twice_keeps_its_hands():
-    """A touch is still found if its recording is listed twice.
-
-    The exact repeat does not make it an effect.
-    """
+    """If a recording is listed twice, a touch in it is still not taken for an effect."""
     case = make_case(seed=71, n=1, rate=250.0, handled=True)
     found = find_interventions(case.records)
     driven = {r.id for r in case.records if r.u is not None and np.any(r.u)}
@@ -99,14 +96,14 @@ def test_a_recording_that_is_listed_twice_keeps_its_hands():
     ],
 )
 def test_no_effect_is_a_hand(effect):
-    """Large effects such as stops, play, sticking and resonances are not taken for touches."""
+    """Stops, play, sticking, resonances and late inputs are not taken for touches."""
     case = make_case(seed=80, n=2, rate=200.0, effects=effect, severity=1.5, dirt=True)
 
     assert find_interventions(case.records) == ()
 
 
 def test_a_record_is_cut_at_its_hands():
-    """A record is cut at its touches: no other sample is lost."""
+    """A record is cut at its touches, and no sample outside them is lost."""
     record = make_case(seed=71, n=1, rate=113.1).records[0]
     hands = [
         Intervention(experiment=record.id, cart=1, start=1.0, end=1.5),
@@ -124,7 +121,7 @@ def test_a_record_is_cut_at_its_hands():
 
 
 def test_what_is_not_understood_is_not_judged():
-    """Runs under feedback, and carts with an unmeasured neighbour, report no touch."""
+    """No touch is reported for runs under feedback, or beside a cart that was not measured."""
     case = make_case(seed=62, n=2, rate=250.0, handled=True)
     assert find_interventions(case.records) != ()
 
@@ -142,7 +139,7 @@ def test_what_is_not_understood_is_not_judged():
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(38))
 def test_no_effect_of_any_size_is_a_hand(seed):
-    """No effect of the second simulator, or pair of effects, of any size is taken for a touch."""
+    """Neither single effects nor pairs of them, small or large, are taken for touches."""
     effects = [EFFECTS[seed % len(EFFECTS)], *EFFECTS[(5 * seed) % 17 : (5 * seed) % 17 + seed % 2]]
     case = make_case(seed=300 + seed, n=2 + seed % 2, effects=effects, dirt=True, wide=True)
 

@@ -1,4 +1,4 @@
-"""A model is computed only once per point for its residual and derivatives."""
+"""At each point the model is computed only once for residual and derivatives."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The maximum within a window that slides along a series."""
+"""The largest value in a window that slides along a series is found."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from pipeline.estimation.sliding import most_around
 @pytest.mark.parametrize("width", [1, 3, 7, 61])
 @pytest.mark.parametrize("n", [1, 2, 30, 500])
 def test_it_is_the_maximum_filter_of_scipy(n, width):
-    """The sliding maximum equals scipy's, near the ends and for windows longer than the series."""
+    """The sliding maximum equals that of scipy, even near the ends or with a long window."""
     values = np.random.default_rng(n + width).standard_normal(n)
 
     assert np.array_equal(most_around(values, width), maximum_filter1d(values, width))

@@ -21,7 +21,7 @@ _RUN = "rules => axe.run({resultTypes: ['violations'], ...rules}).then(found => 
 
 
 class Violation(NamedTuple):
-    """A rule that a page breaks, in light or dark colours, and the first elements that break it."""
+    """A rule that a page breaks, in light or dark mode, and the first elements that break it."""
 
     scheme: str
     rule: str
@@ -30,7 +30,7 @@ class Violation(NamedTuple):
 
 
 def violations(page: Any) -> list[Violation]:
-    """Return the faults that axe finds in light mode, and faults of colours in dark mode."""
+    """Return the faults found by axe in light mode, and those of colours in dark mode."""
     page.evaluate(Axe().axe_script)
     page.evaluate(_THIN)
     found = []

@@ -1,4 +1,4 @@
-"""Whole classes on one bench, in memory; motion common to all teams is simulated once."""
+"""Simulate whole classes on one bench in memory; motion common to all teams only once."""
 
 import math
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ class Moved:
 def move_class(
     preset: str, hide: str = "", *, seeds: range, count: float = COUNT, dwells: int = 12
 ) -> Moved:
-    """Return the motion of the carts on one bench for a team per seed."""
+    """Return the motion of the carts on one bench, with one team for each seed."""
     bench = prepare_bench(preset=preset, hide=(hide,) if hide else ())
     bench = replace(bench, count=count)
     session = runs.SimulatedSession(bench=bench, repeats=2, n_dwells=dwells)

@@ -53,7 +53,7 @@ class Answer:
 
 @dataclass(kw_only=True)
 class Visitor:
-    """A visitor with a cookie or the headers of a proxy, from an address of this computer."""
+    """A visitor with a cookie or a proxy's headers, who sends from this computer."""
 
     port: int
     headers: dict[str, str] = field(default_factory=dict)
@@ -129,7 +129,7 @@ class WorkerHere:
         """Do nothing: there is no process to start."""
 
     def do(self, task: Any, *, tell: Progress = silent, **_: object) -> Any:
-        """Do a task that arrives and returns as JSON."""
+        """Do a task whose input and result pass through JSON."""
         with self._turn:
             plain = json.loads(json.dumps(task))
             return json.loads(json.dumps(attempt(lambda: do(plain, tell))))

@@ -1,4 +1,4 @@
-"""A size for every effect on `throne-2dof` that is clearly visible and safe to simulate."""
+"""For every effect, a size on `throne-2dof` that is clearly visible and safe to simulate."""
 
 from collections.abc import Mapping
 

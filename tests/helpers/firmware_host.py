@@ -1,4 +1,4 @@
-"""The firmware's core, compiled here: a controller like `pipeline.simulated.emulator.core`."""
+"""The firmware's core, compiled here, controls like `pipeline.simulated.emulator.core`."""
 
 import ctypes
 import shutil
@@ -85,7 +85,7 @@ class FirmwareCore:
 
 @contextmanager
 def kept_going(serve: Callable[[Callable[[], bool]], None]) -> Iterator[None]:
-    """Run `serve` beside the block until the block ends and its event is set."""
+    """Run `serve` beside the block; when the block ends, its event is set and it stops."""
     done = threading.Event()
     beside = threading.Thread(target=serve, args=(done.is_set,))
     beside.start()

@@ -42,7 +42,7 @@ def put_until_killed(place: str, first: int, pipe: int) -> None:
 
 
 def answer_until_killed(place: str, first: int, pipe: int) -> None:
-    """Ask, answer with other points, reopen: confirm each round by its number."""
+    """Ask, answer with other points and reopen again and again; confirm each round by number."""
     book, number = RequestBook(place), first
     while True:
         asked = book.queue().waiting

@@ -42,7 +42,7 @@ def in_this_process(tasks: Sequence[Task], setup: Setup) -> Iterator[Grading]:
 
 
 def make_grade(name: str, *, share: float = 1.0, days_late: float = 0.0, **changes: Any) -> Grade:
-    """Return a grade in which each criterion earned this share of its points."""
+    """Return a grade in which each criterion earned the given share of its points."""
     criteria = tuple(
         Criterion(
             id=asked.id,
@@ -186,7 +186,7 @@ def fill_book(place: str | Path, *, anonymous: bool = False) -> None:
 
 
 def _figure(name: str) -> tuple[tuple[str, str], ...]:
-    """Return a response with a fit and the curve of a wrong reported table."""
+    """Return a figure of a response with its fit and the curve of a wrong reported table."""
     chain = PRESETS["throne-2dof"]
     omega = np.geomspace(5.0, 60.0, 20)
     response = chain.frequency_response(omega)[0]

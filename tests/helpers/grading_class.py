@@ -88,7 +88,7 @@ class Bench:
 
 
 def make_bench(rng: np.random.Generator, *, carts: int) -> Bench:
-    """Draw a bench from the whole range; half of the benches have dry friction."""
+    """Draw a bench from the whole range; every second bench has dry friction."""
     preset = preset_bench(f"throne-{carts}dof").chain
     m = preset.m * rng.uniform(0.7, 1.4, carts)
     k = preset.k * rng.uniform(0.7, 1.4, carts + 1)
@@ -149,7 +149,7 @@ def make_team(seed: int, *, folder: Path | None = None, **bench: Any) -> Team:
 
 
 def with_spoilt_data(seed: int) -> Team:
-    """Return the team of a seed, one of whose files was spoilt before anything was read."""
+    """Return the team of a seed; one of its files was spoilt before anything was read."""
     rng = np.random.default_rng([2005, seed])
     bench = make_bench(rng, carts=1 + seed % 3)
     with tempfile.TemporaryDirectory() as folder:
@@ -233,7 +233,7 @@ def spoil_data(submission: Submission, rng: np.random.Generator) -> None:
 
 
 def _fewer_dwells(submission: Submission, count: int) -> Submission:
-    """Return the submission with this number of its dwells, evenly chosen."""
+    """Return the submission with only this many of its dwells, evenly chosen."""
     sines = [e.id for e in submission.experiments if e.kind == "sine"]
     chosen = {sines[i] for i in np.linspace(0, len(sines) - 1, count).round().astype(int)}
     kept = tuple(e for e in submission.experiments if e.kind != "sine" or e.id in chosen)
@@ -285,7 +285,7 @@ def _error(rng: np.random.Generator) -> float:
 
 
 def from_statics(p: Mapping[str, float], n: int) -> tuple[Array, Array]:
-    """Return A and B with couplings from rest positions instead of only from the polynomials."""
+    """Return A and B with couplings computed from rest positions."""
     if n == 1:
         return np.array([[0, 1], [-(p["omega_n"] ** 2), -2 * p["zeta"] * p["omega_n"]]]), np.array(
             [[0], [p["K"] * p["omega_n"] ** 2]]
@@ -313,12 +313,12 @@ def from_statics(p: Mapping[str, float], n: int) -> tuple[Array, Array]:
 
 
 def is_real(chain: Chain) -> bool:
-    """Return whether a chain of real carts could have these values."""
+    """Return whether real carts could form this chain."""
     return bool(np.all(chain.c > 0) and np.all(np.linalg.eigvalsh(chain.stiffness) > 0))
 
 
 def _first(team: Team, name: str, read: float, right: float) -> float:
-    """Return an initial estimate: as read if it is honest, else a careful student's."""
+    """Return an initial estimate: as read if that is near the truth, else more carefully read."""
     guessed = team.bench.chain.n > 1 and read_name(name).is_damping and not name[-1].isdigit()
     if guessed:
         return 0.1
@@ -331,7 +331,7 @@ def _first(team: Team, name: str, read: float, right: float) -> float:
 
 
 def _fitted(team: Team, first: Mapping[str, float]) -> dict[str, float] | None:
-    """Return the final table of a fit in dB, or None if it is far from the truth."""
+    """Return the final table of a fit in dB, or None if the fit is far from the truth."""
     n = team.bench.chain.n
     try:
         found = final_table(team.analysis.records, n, dict(first))

@@ -1,6 +1,6 @@
-"""Mistakes for tests: each code's mistake, made by an honest team with its own data.
+"""Plant the mistake of each code in an honest team's own data.
 
-They use the recordings and the true bench, but never the grader's own catalogue.
+The mistakes use the recordings and the true bench, but never the grader's own catalogue.
 """
 
 from collections.abc import Callable, Mapping
@@ -39,12 +39,12 @@ def reporting(team: Team, reported: Reported) -> Team:
 
 
 def scaled(team: Team, names: list[str], factor: float, tables: list[str]) -> Team:
-    """Return the team with some numbers of some tables multiplied."""
+    """Return the team with some numbers of some tables multiplied by a factor."""
     return change(team, **{t: {x: factor * team.value(t, x) for x in names} for t in tables})
 
 
 def own(team: Team, symbol: str) -> list[str]:
-    """Return the names of the carts' own parameters: K_1 …, or K."""
+    """Return the names of the carts' own parameters: K_1 …, or K for a single cart."""
     n = team.bench.chain.n
     if n == 1:
         return ["omega_n" if symbol == "omega" else symbol]
@@ -66,7 +66,7 @@ def hz(team: Team) -> Team:
 
 
 def hz_of_one(team: Team) -> Team:
-    """Divide one frequency by 2π, as if it alone was not converted."""
+    """Divide one frequency by 2π, as if only this one was not converted."""
     names = [n for n in team.reported.final if n.startswith("omega")]
     return scaled(team, [str(team.rng.choice(names))], 1 / TURN, some_tables(team))
 
@@ -144,17 +144,17 @@ def _one_off(team: Team, table: str) -> Team:
 
 
 def final_off(team: Team) -> Team:
-    """Change one gain or frequency of the final table by a factor without an explanation."""
+    """Make one gain or frequency of the final table wrong by no known mistake."""
     return _one_off(team, "final")
 
 
 def initial_off(team: Team) -> Team:
-    """Change one gain or frequency of a cart in the initial table without an explanation."""
+    """Make one gain or frequency of a cart in the initial table wrong by no known mistake."""
     return _one_off(team, "initial")
 
 
 def initial_final_disagree(team: Team) -> Team:
-    """Make the team's own tables disagree where no recording shows which one is wrong."""
+    """Make the two tables disagree, without recordings that show which one is wrong."""
     runs = tuple(e for e in team.submission.experiments if e.kind == "closed_loop")
     moved = scaled(team, own(team, "K")[:1], 1.6, ["initial"])
     analysis = replace(
@@ -181,7 +181,7 @@ def physically_impossible(team: Team) -> Team:
 
 
 def transient_used(team: Team) -> Team:
-    """Read amplitudes from the first cycles of every dwell, and fit them if possible."""
+    """Read amplitudes from the first cycles of every dwell, and fit them if that is possible."""
     if any(e.note for e in team.submission.experiments if e.kind == "sine"):
         return team  # the dwell was recorded after the transient, so nobody can use it
     truth = team.bench.chain.parameters()

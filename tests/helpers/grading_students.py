@@ -1,4 +1,4 @@
-"""Simulated students, honest until a test changes their report; each is analysed once."""
+"""Simulated students are honest until a test changes their report."""
 
 import tempfile
 from collections.abc import Mapping
@@ -79,7 +79,7 @@ class Student:
 
 
 def typed(value: float | Decimal) -> Decimal:
-    """Return a number as typed to three digits; a text stays as typed."""
+    """Return a number as typed to three digits; a text is returned as it is."""
     if isinstance(value, Decimal):
         return value
     return Decimal(f"{value:#.3g}".removesuffix("."))

@@ -1,4 +1,4 @@
-"""Honest teams on benches with one effect each, up to three times its usual size.
+"""Honest teams on benches with one effect of up to three times its usual size.
 
 They report what they read from their own recordings by textbook methods. Numbers that cannot be
 read that way are those of the pipeline.
@@ -39,7 +39,7 @@ _SHRINKS = {"saturation": "limit", "end_stop": "position"}
 
 
 def draw_effect(chain: Chain, seed: int) -> EffectTerm:
-    """Return the effect of a seed; nineteen seeds in a row use the whole catalogue."""
+    """Return the effect for a seed; nineteen seeds in a row give every effect once."""
     rng = np.random.default_rng([16, seed, chain.n])
     turn, place = divmod(seed, len(CATALOGUE))
     effect = CATALOGUE[int(np.random.default_rng([16, turn]).permutation(len(CATALOGUE))[place])]
@@ -87,7 +87,7 @@ def grade_honest_team(
 
 
 def textbook_report(submission: Submission, analysis: Analysis) -> Reported:
-    """Return what a student reads from these recordings, instead of the true numbers."""
+    """Return the numbers that a student reads from these recordings, not the true numbers."""
     claimed, n = submission.reported, analysis.bench.n
     assert claimed is not None
     rows = {row.name: row for row in analysis.rows}

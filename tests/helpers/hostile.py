@@ -1,4 +1,4 @@
-"""A class of a hundred submissions that are malicious or look so, each as one entry.
+"""A class of a hundred entries that are malicious submissions or look like them.
 
 Every entry is a folder or an archive in the class's folder. Sizes, depths and the spoilt file
 depend on the seed.
@@ -303,7 +303,7 @@ def _mat() -> bytes:
 
 
 def _mat_bomb() -> bytes:
-    """Return a variable that claims 10^18 numbers, followed by deflated zeros."""
+    """Return a MATLAB variable that claims 10^18 numbers, followed by compressed zeros."""
     size = struct.pack("<LL", 6, 8) + bytes([6]) + bytes(7)
     shape = struct.pack("<LLll", 5, 8, 2**30, 2**30)
     body = size + shape + struct.pack("<LL", 1, 1) + b"x" + bytes(7)
@@ -333,7 +333,7 @@ def _names(rng: random.Random) -> list[str]:
 
 
 def _places(outside: Path) -> dict[str, Callable[[Path], object]]:
-    """Return changes to a good submission after which a file is not what it seems."""
+    """Return changes after which a file of a good submission is not what it seems."""
 
     def instead(name: str, make: Callable[[Path], object]) -> Callable[[Path], None]:
         def build(folder: Path) -> None:

@@ -18,7 +18,7 @@ from tests.helpers.places import ROOT
 
 
 def order(**bench: Any) -> None:
-    """Request a bench that connects to `port`; the arguments are those of `be`."""
+    """Request a bench that connects to `port`; the other arguments are those of `be`."""
     if sys.platform == "win32":
         script = f"from tests.helpers.nursery import be; be(**{bench!r})"
         subprocess.Popen([sys.executable, "-c", script], cwd=ROOT)
@@ -47,7 +47,7 @@ def be(*, words: list[str], watchdog: float, port: int) -> None:
 
 @cache
 def _nursery() -> "subprocess.Popen[str]":
-    """Start the process; it ends when this process ends and so closes its stdin."""
+    """Start the process; it ends when this process ends, since its stdin is then closed."""
     script = "from tests.helpers.nursery import fork_benches; fork_benches()"
     return subprocess.Popen(
         [sys.executable, "-c", script], stdin=subprocess.PIPE, text=True, cwd=ROOT
@@ -65,7 +65,7 @@ def fork_benches() -> None:
 
 
 def load_bench() -> None:
-    """Import all that a bench needs, and compile its simulator if that is not done."""
+    """Import all that a bench needs, and compile its simulator unless that is done."""
     from pipeline.simulated.emulator.server import EmulatorOptions, Server
     from pipeline.simulated.hidden import prepare_bench
 

@@ -1,4 +1,4 @@
-"""Random damage to good files, for tests of readers that must not trust their input.
+"""Damage good files at random, for tests of readers that must not trust their input.
 
 All randomness comes from a `random.Random`, so a seed always gives the same case.
 """
@@ -41,7 +41,7 @@ def damaged(raw: bytes, rng: Random, *, hits: int = 3) -> bytes:
 
 
 def text(rng: Random) -> str:
-    """Return a text that is markup, a formula, control characters, or very long."""
+    """Return a text with markup, a formula or control characters, or a very long one."""
     return rng.choice(_MARKS) * rng.choice([1, 1, 1, 3, 50, 5_000])
 
 
@@ -56,7 +56,7 @@ def toml_value(rng: Random) -> str:
 
 
 def poisoned_toml(toml: str, rng: Random) -> str:
-    """Give a key another value, or remove, double or rename it."""
+    """Give a key of a TOML text another value, or remove, double or rename it."""
     lines = toml.split("\n")
     keys = [i for i, line in enumerate(lines) if re.match(r"\s*\w+ = ", line)]
     for i in rng.sample(keys, k=min(len(keys), rng.choice([1, 1, 2, 4]))):

@@ -67,7 +67,7 @@ def package(
 
 
 def sheet_xml(rows: Sequence[Sequence[str | float]]) -> str:
-    """Return the part of a sheet with texts in place and numbers unchanged."""
+    """Return the XML of a sheet, with texts in their cells and numbers unchanged."""
     cells = [
         "<row>"
         + "".join(
@@ -81,7 +81,10 @@ def sheet_xml(rows: Sequence[Sequence[str | float]]) -> str:
 
 
 def lvm(columns: Mapping[str, np.ndarray], *, separator: str = "\t", decimal: str = ".") -> bytes:
-    """Return LabVIEW's text format, version 2: the first column is X, each segment has a header."""
+    """Return a file in LabVIEW's text format, version 2.
+
+    Its first column is X, and each segment has a header.
+    """
     about = {
         "Writer_Version": "2", "Reader_Version": "2",
         "Separator": {"\t": "Tab", ",": "Comma"}[separator], "Decimal_Separator": decimal,

@@ -172,7 +172,7 @@ class RunawayBench(threading.Thread):
         self.ms += 1
 
     def _spoilt(self, readings: Sequence[Reading]) -> list[Reading]:
-        """Return the lines that the misbehaving bench sends; it sends some even without a run."""
+        """Return the lines that the misbehaving bench sends, even if there is no run."""
         if not readings and (self._duty is not None):
             readings = [Reading(counts=(0, 0), target=0, duty=0, ms=self.ms)]
         if readings and self.offence is None:

@@ -34,7 +34,7 @@ def gain(record: Record, cart: int) -> float | None:
 
 
 def decay(record: Record, cart: int) -> tuple[float, float] | None:
-    """Return (omega_n, zeta) from the first peaks after the release or the edge."""
+    """Return (omega_n, zeta) from the first peaks after the release or the edge of a step."""
     y = record.position(cart) - settled(record.position(cart))
     if record.u is not None and np.any(record.u):
         y = y[np.flatnonzero(np.diff(record.u))[-1] + 1 :]
@@ -90,7 +90,7 @@ def initial_table(records: Sequence[Record], n: int) -> dict[str, float]:
 
 
 def by_eye(records: Sequence[Record], n: int) -> dict[str, float]:
-    """Return resonances (of the last cart) and nulls (of the first) read at the nearest dwells."""
+    """Return resonances of the last cart and nulls of the first, read at the nearest dwells."""
     omega, last = bode(records, n)
     _, first = bode(records, 1)
     slope = np.log(np.concatenate([last[:1] * 0.9, last, last[-1:] * 0.5]))
@@ -127,7 +127,7 @@ def _fit(omega: Array, ratio: Array, start: list[float], shape) -> list[float]:
 
 
 def final_table(records: Sequence[Record], n: int, initial: dict[str, float]) -> dict[str, float]:
-    """Return the table fitted to the last cart first, with its denominator for all carts."""
+    """Return the fitted parameters; the last cart is fitted first and gives the denominator."""
     omega, last = bode(records, n)
     if n == 1:
         start = [initial.get("K", float(last[0])), initial["omega_n"], initial["zeta"]]
@@ -167,7 +167,7 @@ def final_table(records: Sequence[Record], n: int, initial: dict[str, float]) ->
 
 
 def _recomputed(p: dict[str, float], n: int) -> dict[str, float]:
-    """Return the numbers of the carts from the coefficients, or none if no carts fit."""
+    """Return the carts' numbers computed from the coefficients, or none if no carts fit."""
 
     def quadratic(x: str) -> Array:
         return np.array([1.0, 2 * p[f"zeta_{x}"] * p[f"omega_{x}"], p[f"omega_{x}"] ** 2])

@@ -67,7 +67,10 @@ def step_record(
 def decay_record(
     chain: Chain, *, free: tuple[int, ...], rng: np.random.Generator, id: str = "decay"
 ) -> Record:
-    """Return a decay: pulled aside in 0.5 s, held for 1 s, released; the encoder zero is off."""
+    """Return a record of carts pulled aside in 0.5 s, held for 1 s and released.
+
+    The encoder's zero is not the rest position.
+    """
     t = np.arange(int(7.0 * RATE)) / RATE
     x0 = np.zeros(2 * len(free))
     x0[0::2] = rng.uniform(1.0, 2.0, len(free))  # cm
@@ -85,7 +88,7 @@ def decay_record(
 
 
 def random_chain(n: int, rng: np.random.Generator) -> tuple[Chain, tuple[bool, ...]]:
-    """Return a random chain of n carts (cm, V), and which springs it has.
+    """Return a random chain of n carts in cm and V, and which springs it has.
 
     Each cart alone swings at about 6 to 60 rad/s with a damping ratio from 0.01 to 0.3. About half
     of the chains lack a spring to one of the walls.

@@ -1,4 +1,4 @@
-"""The real ECP 210 recordings, single or as whole submissions in a temporary folder."""
+"""The real ECP 210 recordings, as single records or as submissions in a temporary folder."""
 
 import shutil
 from pathlib import Path
@@ -29,7 +29,7 @@ def ecp_record(path: Path, *, column: int, kind: str) -> Record:
 
 
 def write_two_cart_submission(folder: Path, data: Path, *, steps: tuple[int, ...]) -> Path:
-    """Write a two-cart submission: runs of single carts, the given two-cart steps, the PID run."""
+    """Write a submission with runs of single carts, the given two-cart steps and the PID run."""
     experiments = [
         _experiment(f"alone-1-{i}", "step", f"DOF1_en1_input1_test{i}.csv", "carts = [1]")
         for i in range(1, 6)
@@ -60,7 +60,7 @@ input_limit = 4.884
 
 
 def write_one_cart_submission(folder: Path, data: Path) -> Path:
-    """Write a one-cart submission: the five steps of cart 1 with cart 2 held."""
+    """Write a submission with the five steps of cart 1, with cart 2 held."""
     experiments = [
         _experiment(f"step-{i}", "step", f"DOF1_en1_input1_test{i}.csv") for i in range(1, 6)
     ]

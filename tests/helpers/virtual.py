@@ -1,4 +1,4 @@
-"""Recordings on a virtual bench without line and clock, as fast as they can be computed."""
+"""Make recordings on a virtual bench as fast as they can be computed."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -37,7 +37,7 @@ _PULL_OUT = 1700  # ticks that a virtual hand takes
 
 
 class LimitPassed(AssertionError):
-    """A recording passed a limit of its plan, which no proposal may do."""
+    """A recording passed a limit of its plan, which a proposed recording must never do."""
 
 
 class VirtualBench:
@@ -84,7 +84,10 @@ class VirtualBench:
     def carry_out(
         self, recording: Recording, *, submission: Submission, limits: PlanLimits
     ) -> list[Reading]:
-        """Return the lines of one recording; raise LimitPassed if it passes a limit."""
+        """Return the lines of one recording.
+
+        Raise LimitPassed if the recording passes a limit.
+        """
         n = submission.system.carts
         order = make_order(
             recording,
@@ -163,12 +166,12 @@ def new_folder(folder: Path, bench: VirtualBench, *, springs: Sequence[bool]) ->
 
 
 class VirtualSession:
-    """A recorder for an exploration, with its bench and the folder that the first call makes."""
+    """A recorder for an exploration; its first call makes the bench's folder."""
 
     def __init__(
         self, folder: Path, bench: VirtualBench, *, springs: Sequence[bool] | None = None
     ) -> None:
-        """Assume that all springs exist, unless they are given."""
+        """Assume that all springs exist, unless `springs` is given."""
         self.folder, self.bench = folder, bench
         self.springs = springs or [True] * (bench.description.carts + 1)
 

@@ -1,4 +1,4 @@
-"""Wait for an event on a machine of any load; a deadline only ends a hang."""
+"""Wait for events on a machine of any load; the deadline only ends a hang."""
 
 import subprocess
 import time

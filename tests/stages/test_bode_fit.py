@@ -1,4 +1,4 @@
-"""One chain is fitted to all frequency responses: truth, coverage, starts, hard cases."""
+"""The fit of a chain to frequency responses is tested on known, noisy and difficult data."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ FOUR_CARTS = Chain(
 
 
 def exact(chain: Chain, omega: Array = BENCH_BAND) -> tuple[FrequencyResponse, ...]:
-    """Return magnitudes without error that are stated to be good to 1 %."""
+    """Return magnitudes without error that claim an error of 1 %."""
     size = np.abs(chain.frequency_response(omega))
     return tuple(
         FrequencyResponse(
@@ -62,7 +62,7 @@ def thinned(responses: tuple[FrequencyResponse, ...], points: slice) -> list[Fre
 
 @pytest.mark.parametrize("chain", [*PRESETS.values(), FOUR_CARTS], ids=lambda c: f"{c.n}-carts")
 def test_exact_magnitudes_give_the_chain_back_without_a_start(chain):
-    """From error-free magnitudes alone, without a start, every named parameter is right."""
+    """From exact magnitudes and without a start value, the fit finds every named parameter."""
     got = fit_bode(exact(chain), bench=Bench(springs=(True,) * (chain.n + 1)))
 
     assert got.converged
@@ -101,7 +101,7 @@ def test_any_bench_is_found(chain):
 
 @pytest.mark.parametrize("unit", [1.0, 440.0, 0.01], ids=["cm", "count", "m"])
 def test_the_position_unit_does_not_matter(unit):
-    """With positions in counts or metres, frequencies stay the same and gains are scaled."""
+    """In counts or metres, the fit finds the same frequencies, and gains scaled by the unit."""
     chain = PRESETS["throne-3dof"]
     scaled = Chain(m=chain.m / unit, c=chain.c / unit, k=chain.k / unit)
 
@@ -156,9 +156,9 @@ def test_intervals_cover_the_truth(preset, phases):
 
 
 def test_a_spring_that_is_not_there_is_held_at_zero():
-    """If k_1 is zero, about half of the noisy fits hold it at zero, with a note.
+    """If the true k_1 is zero, about half of the noisy fits hold it at zero, with a note.
 
-    The other half find it slightly positive.
+    The other half find a small positive value.
     """
     fits = [
         fit_bode(noisy("throne-2dof", seed=seed), bench=Bench(springs=(True,) * 3))
@@ -190,7 +190,10 @@ BESIDE = np.sqrt(300.0) * np.array([0.4, 0.6, 0.8, 1.25, 1.5, 2.0])
 
 
 def test_a_damping_at_its_bound_is_no_measurement():
-    """A damping held at zero is noted and has no standard error; gain and frequency have theirs."""
+    """If the fit holds a damping at zero, a note says so and it has no standard error.
+
+    Gain and frequency still have their standard errors.
+    """
     got = fit_bode(exact(SHARP, BESIDE), bench=Bench(springs=(True, True)))
 
     assert got.at_bound == ("c_1",)
@@ -201,9 +204,9 @@ def test_a_damping_at_its_bound_is_no_measurement():
 
 
 def test_what_rests_on_a_damping_at_its_bound_is_known_no_better_than_it():
-    """If one of two dampings is held at zero, the modes' standard errors allow for it.
+    """If one of two dampings is held at zero, the dampings of the modes have larger errors.
 
-    They allow for it on both sides.
+    The errors allow for a damping that is not zero.
     """
     chain = replace(PRESETS["throne-2dof"], c=np.array([6e-4, 0.0]))
     got = fit_bode(exact(chain), bench=Bench(springs=(False, True, True)))
@@ -219,7 +222,7 @@ def test_what_rests_on_a_damping_at_its_bound_is_known_no_better_than_it():
 
 
 def test_the_decay_tells_a_damping_that_the_response_leaves_open():
-    """If the points beside a sharp peak leave the damping open, the decay's value is used."""
+    """If points beside a sharp peak leave the damping open, the damping of the decay is used."""
     decay = Estimate(value=0.017, std=0.0005, source="log_decrement")
     got = fit_bode(exact(SHARP, BESIDE), bench=Bench(springs=(True, True)), decays={1: decay})
 
@@ -231,7 +234,7 @@ def test_the_decay_tells_a_damping_that_the_response_leaves_open():
 
 
 def test_where_one_damping_is_open_all_decays_are_fitted_along():
-    """If the response leaves one of two dampings open, both decays are used in the fit."""
+    """If the response leaves one of two dampings open, the fit also uses both carts' decays."""
     chain = PRESETS["throne-2dof"]
     decays = {
         cart: Estimate(value=float(zeta), std=0.02 * float(zeta), source="log_decrement")
@@ -250,7 +253,7 @@ def test_where_one_damping_is_open_all_decays_are_fitted_along():
 
 
 def test_a_decay_that_the_response_rules_out_is_not_used():
-    """A decay that contradicts a clearly measured peak is not used."""
+    """If a decay contradicts a clearly measured peak, the fit does not use the decay."""
     undamped = exact(SHARP, np.sqrt(300.0) * np.array([0.5, 0.9, 0.99, 0.998, 1.002, 1.01, 1.1]))
     decay = Estimate(value=0.05, std=0.001, source="log_decrement")
     got = fit_bode(undamped, bench=Bench(springs=(True, True)), decays={1: decay})
@@ -274,7 +277,7 @@ def test_a_decay_is_not_used_where_the_response_tells():
 
 
 def test_a_spring_known_to_be_missing_is_not_fitted():
-    """A spring stated as missing is not fitted, and the other errors do not grow."""
+    """A spring declared as missing is not fitted, and the other standard errors do not grow."""
     responses = noisy("throne-3dof")
 
     free = fit_bode(responses, bench=Bench(springs=(True,) * 4))
@@ -291,7 +294,7 @@ def test_a_spring_known_to_be_missing_is_not_fitted():
 
 @pytest.mark.parametrize("change", ["delay", "sign"])
 def test_phases_that_contradict_the_magnitudes_are_left_out(change):
-    """Phases that contradict the magnitudes, by a delay or a reversed sign, change no parameter."""
+    """If the phases have a delay or a reversed sign, they are left out and change no parameter."""
     responses = noisy("throne-2dof", phases=True)
     wrong = [
         replace(r, phase=r.phase - 0.00884 * r.omega if change == "delay" else r.phase + np.pi)
@@ -325,7 +328,7 @@ def test_good_phases_sharpen_the_dampings():
 
 
 def test_a_misfit_widens_the_errors():
-    """If points scatter by 5 % but state 0.01 %, the fit's errors are those of 5 %."""
+    """If points scatter by 5 % but claim 0.01 %, the standard errors are those of 5 %."""
     chain = PRESETS["throne-2dof"]
     rng = np.random.default_rng(4)
     scattered = [
@@ -357,7 +360,7 @@ def test_a_misfit_widens_the_errors():
 
 
 def test_a_table_is_judged_by_its_own_scatter():
-    """A table rounded to three digits, without stated errors, gets errors of that rounding."""
+    """If a table rounded to three digits states no errors, the fit finds the error of rounding."""
     chain = PRESETS["throne-3dof"]
     rounded = [
         replace(r, magnitude=np.array([float(f"{m:.3g}") for m in r.magnitude]), source="table")
@@ -374,7 +377,7 @@ def test_a_table_is_judged_by_its_own_scatter():
 
 
 def test_one_measured_cart_may_do():
-    """The response of cart 1 alone is enough for two carts if their near spring is missing."""
+    """If the near spring is missing, the response of cart 1 alone determines both carts."""
     got = fit_bode(
         noisy("throne-2dof")[:1], bench=Bench(springs=(False, True, True)), initial=PAPER_STARTS[2]
     )
@@ -389,14 +392,14 @@ def test_one_measured_cart_may_do():
 def test_the_last_cart_alone_does_not_determine_two():
     """The response of cart 2 alone cannot determine two carts, and the error says so.
 
-    It has five coefficients, but the carts have seven parameters.
+    The response has five coefficients, but the carts have seven parameters.
     """
     with pytest.raises(DataError, match="response of cart 2 does not determine all of m_1"):
         fit_bode(noisy("throne-2dof")[1:], bench=Bench(springs=(True,) * 3))
 
 
 def test_few_points_are_refused():
-    """Six points for seven parameters are refused, and the message gives both numbers."""
+    """Six points cannot determine seven parameters, and the error gives both numbers."""
     few = thinned(noisy("throne-2dof"), slice(0, 3))
     with pytest.raises(DataError, match=r"2 carts with 7 parameters .* found 6"):
         fit_bode(few, bench=Bench(springs=(True,) * 3))
@@ -411,7 +414,10 @@ def test_few_points_are_refused():
     ],
 )
 def test_impossible_responses_are_refused(change, message):
-    """Infinite values, negative frequencies and carts that do not exist are refused by name."""
+    """A response with an infinite value, a negative frequency or a missing cart is an error.
+
+    The error names the cause.
+    """
     (response,) = noisy("throne-1dof")
     with pytest.raises(DataError, match=message):
         fit_bode([replace(response, **change)], bench=Bench(springs=(True, True)))
@@ -424,7 +430,7 @@ def test_no_response_is_refused():
 
 
 def test_residuals_belong_to_their_points():
-    """If one magnitude is raised by ten standard errors, only its own residual is near ten."""
+    """If one magnitude is off by ten standard errors, only its own residual is near ten."""
     responses = list(noisy("throne-3dof"))
     raised = responses[1].magnitude.copy()
     raised[7] += 10 * responses[1].magnitude_std[7]
@@ -440,7 +446,7 @@ def test_residuals_belong_to_their_points():
 
 
 def test_the_same_data_give_the_same_fit():
-    """Two fits to the same data agree to the last bit, although starts are random."""
+    """Two fits to the same data agree to the last bit, even with random starts."""
     responses = thinned(noisy("throne-3dof"), slice(2, 30, 5))
 
     first, second = (fit_bode(responses, bench=Bench(springs=(True,) * 4)) for _ in range(2))

@@ -1,4 +1,4 @@
-"""Estimates are compared, and tables are checked against the laws of a real chain."""
+"""Two estimates of each parameter are compared, and tables are checked for physical laws."""
 
 from dataclasses import replace
 
@@ -49,7 +49,7 @@ def _fit(chain, parameters=None):
 
 
 def test_change_is_signed_and_in_percent_of_the_initial_value():
-    """The change is signed and in percent of the initial value: from 30.6 to 28.9 is −5.6 %."""
+    """The change has a sign and is in percent of the initial value: 30.6 to 28.9 is −5.6 %."""
     row = _row(30.6, 28.9)
     assert row.change_percent == pytest.approx(100 * (28.9 - 30.6) / 30.6)
     assert (row.unit, row.consistent) == ("cm/V", True)
@@ -66,7 +66,7 @@ def test_limits_are_tight_for_frequencies_and_loose_for_damping(name, limit):
 
 @pytest.mark.parametrize(("std", "outcome"), [(0.05, "fail"), (0.1, "skip")])
 def test_a_wide_error_makes_no_agreement(std, outcome):
-    """Numbers 30 % apart never agree; if their errors are wide, there is no verdict."""
+    """Two numbers 30 % apart never agree; if their errors are large, there is no verdict."""
     row = _row(1.0, 1.3, std=std)
     assert row.consistent is (False if outcome == "fail" else None)
     (check,) = check_rows([row])
@@ -74,7 +74,7 @@ def test_a_wide_error_makes_no_agreement(std, outcome):
 
 
 def test_a_final_value_at_its_bound_is_none():
-    """A final damping held at zero is not a number for the table, and there is no verdict."""
+    """If the fit holds a damping at zero, the table has no final value and no verdict."""
     final = Estimate(value=0.0, std=None, source="bode_fit", at_bound=True)
     (row,) = compare(
         {"zeta": _estimate(0.017, 1e-4, "log_decrement")},
@@ -90,7 +90,7 @@ def test_a_final_value_at_its_bound_is_none():
     ("name", "std", "there"), [("K", 0.19, True), ("K", 0.21, False), ("zeta", 0.6, True)]
 )
 def test_a_final_value_known_no_better_than_the_limit_is_none(name, std, there):
-    """A final value with an error as large as the limit is called not determined.
+    """If a final value's error is as large as its limit, the value is called not determined.
 
     The limit is 15 % for a gain and 50 % for a damping.
     """
@@ -101,7 +101,7 @@ def test_a_final_value_known_no_better_than_the_limit_is_none(name, std, there):
 
 
 def test_an_estimate_is_not_compared_with_itself():
-    """If the final damping also uses the decay, the two estimates are not compared."""
+    """If the final damping comes from the decay too, it is not compared with the decay's."""
     (row,) = compare(
         {"zeta": _estimate(0.017, 1e-4, "log_decrement")},
         final={"zeta": _estimate(0.017, 1e-4, "log_decrement")},
@@ -113,9 +113,9 @@ def test_an_estimate_is_not_compared_with_itself():
 
 
 def test_an_assumed_value_is_never_judged():
-    """An assumed initial value, such as the paper's ζ = 0.1, gets no verdict.
+    """If the initial value was only assumed, the change is shown without a verdict.
 
-    The change is shown.
+    An example is the paper's ζ = 0.1.
     """
     row = _row(0.1, 0.03, name="zeta_b", source="assumed")
     assert row.consistent is None
@@ -124,7 +124,7 @@ def test_an_assumed_value_is_never_judged():
 
 
 def test_a_disagreement_advises_what_to_look_at():
-    """The message of a failed check gives the change and a hint."""
+    """If two estimates disagree, the message gives the change and says what to look at."""
     (check,) = check_rows([_row(0.1, 0.3, name="zeta_2")])
     assert check.outcome == "fail"
     assert "+200.0 %" in check.message
@@ -144,7 +144,7 @@ def test_real_chains_pass_every_law(n, data):
 
 
 def test_a_negative_spring_is_named():
-    """A fitted spring that is negative by more than its standard error fails, by name."""
+    """If a fitted spring is negative by more than its standard error, a failed check names it."""
     chain = PRESETS["throne-3dof"]
     negative = replace(chain, k=np.array([-0.003, *chain.k[1:]]))
     checks = {c.id: c for c in check_carts(_fit(negative), bench=Bench(springs=(True,) * 4))}
@@ -153,7 +153,7 @@ def test_a_negative_spring_is_named():
 
 
 def test_the_papers_third_table_breaks_the_laws_it_is_known_to_break():
-    """The paper's printed Table 3 breaks R4 and R5, but no ordering."""
+    """The paper's Table 3 violates the redundancies R4 and R5, but every order holds."""
     gains = {"K_1": 39.4, "K_2": 30.6, "K_3": 16.0}
     modes = {"omega_a": 6.9, "omega_b": 24.1, "omega_c": 34.1}
     dampings = {"zeta_a": 0.25, "zeta_b": 0.03, "zeta_c": 0.03}

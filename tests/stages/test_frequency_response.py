@@ -1,4 +1,4 @@
-"""The frequency response is measured from dwells and records; its peaks and nulls are found."""
+"""The frequency response is measured from dwells and records, with its peaks and nulls."""
 
 import numpy as np
 import pytest
@@ -69,12 +69,12 @@ def pulse(t: Array) -> Array:
 
 
 def chirp(t: Array) -> Array:
-    """Sweep from 0.3 to 8 Hz over 20 s, cut off at full amplitude."""
+    """Return a sweep from 0.3 to 8 Hz over 20 s that stops at full amplitude."""
     return 0.2 * np.sin(2 * np.pi * (0.3 * t + 0.1925 * t**2))
 
 
 def errors(chain: Chain, response: FrequencyResponse) -> Array:
-    """Return real and imaginary parts of the errors in standard errors."""
+    """Return real and imaginary parts of the response's errors, divided by the standard errors."""
     assert response.phase is not None
     measured = response.magnitude * np.exp(1j * response.phase)
     off = measured - chain.frequency_response(response.omega)[response.cart - 1]
@@ -122,7 +122,10 @@ def test_repeats_around_half_a_turn_do_not_cancel():
 
 
 def test_a_dwell_that_did_not_settle_counts_little():
-    """A dwell that did not settle counts with an error of 5 %, so it hardly moves a settled one."""
+    """A dwell that did not settle gets an error of 5 %.
+
+    Beside a settled dwell of the same frequency it hardly counts.
+    """
     (alone,) = collect_dwells([dwell(omega=5.0, gain=2.0, settled=False)])
     (both,) = collect_dwells(
         [dwell(omega=5.0, gain=2.2, settled=False), dwell(omega=5.0, gain=2.0)]
@@ -157,7 +160,7 @@ def test_dwells_without_an_input_are_refused():
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_step_record_gives_the_response_exactly(preset):
-    """A step record without noise, between two rests, gives the exact response at every line."""
+    """A noise-free step record that begins and ends at rest gives the exact frequency response."""
     chain = PRESETS[preset]
     t = np.arange(0, 20, 1 / 113)
 
@@ -190,7 +193,7 @@ DRIVES = {
 @pytest.mark.parametrize("drive", DRIVES)
 @pytest.mark.parametrize("preset", PRESETS)
 def test_errors_of_a_record_are_honest(preset, drive):
-    """With noise of half a count, errors of the response are as large as their standard errors."""
+    """With noise of half a count, errors of a response are about as large as stated."""
     chain = PRESETS[preset]
     t, u, kind = DRIVES[drive]
 
@@ -207,7 +210,7 @@ def test_errors_of_a_record_are_honest(preset, drive):
 
 
 def test_records_combine():
-    """Four records together have half the error of one, if noise is the only error."""
+    """If noise is the only error, four records together have half the error of one."""
     chain = PRESETS["throne-2dof"]
     t = np.arange(0, 20, 1 / 113)
     runs = [record(chain, t, pulse(t), noise=COUNT_NOISE, seed=seed) for seed in range(4)]
@@ -278,7 +281,7 @@ def table(chain: Chain, omega: Array, *, noise: float = 0.0) -> tuple[FrequencyR
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_peaks_and_nulls_are_found(preset):
-    """Every resonance, null and gain is found near its true value in 40 points with 1 % noise."""
+    """From 40 points with 1 % noise, each resonance, null and gain is found near its true value."""
     chain = PRESETS[preset]
     omega = 2 * np.pi * np.geomspace(0.3, 7.0, 40)
 

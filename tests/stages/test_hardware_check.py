@@ -1,4 +1,4 @@
-"""The hardware check compares simulated benches with a known truth, and a real one."""
+"""The check of model against bench is tested on simulated benches and on a real one."""
 
 import re
 from dataclasses import replace
@@ -47,7 +47,7 @@ def encoder(x: Array, seed: int = 1) -> Array:
 
 
 def noise_floor(y: Array) -> float:
-    """Return the NRMSE of a perfect model: noise and rounding relative to the motion."""
+    """Return the NRMSE of a perfect model, which leaves only noise and rounding."""
     return float(np.sqrt((NOISE**2 + COUNT**2 / 12) / np.mean(y**2)))
 
 
@@ -113,9 +113,9 @@ def bench(
 
 @pytest.mark.parametrize(("name", "cart"), LAST_CART)
 def test_a_true_model_leaves_the_noise(name, cart):
-    """If the model is true, both simulations of a run leave only noise.
+    """If the model is true, the simulations with open and closed loop leave only noise.
 
-    They agree on overshoot, settling time and level.
+    Both give the same overshoot, settling time and level.
     """
     chain = PLANTS[name]
     design = designed(chain, cart)
@@ -149,7 +149,7 @@ def test_a_true_model_leaves_the_noise(name, cart):
 @pytest.mark.parametrize(("name", "cart"), LAST_CART)
 @pytest.mark.parametrize("factor", [-0.5, -1.0, 3.0])
 def test_a_log_of_another_sign_and_scale_is_found_out(name, cart, factor):
-    """If the log's input has another sign or scale, the factor is found, reported and used."""
+    """If the logged input has another sign or scale, its factor is found, reported and used."""
     chain = PLANTS[name]
     design = designed(chain, cart)
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=chain)
@@ -169,7 +169,7 @@ def test_a_log_of_another_sign_and_scale_is_found_out(name, cart, factor):
 
 
 def test_an_input_a_little_off_is_the_models_error():
-    """If the bench's gain is 20 % off the model's, the difference is reported and not corrected."""
+    """If the bench's gain is 20 % off that of the model, this is reported but not corrected."""
     y = encoder(1.2 * simulate_linear(TWO, CLOCK, 0.06 * STEPS))
 
     checks = check_hardware(record(y, u=0.06 * STEPS, kind="step"), TWO)
@@ -185,7 +185,7 @@ def test_an_input_a_little_off_is_the_models_error():
 
 
 def test_a_stated_sign_that_the_log_contradicts_is_said():
-    """If the log has the opposite sign of the stated law, the loop is simulated as logged.
+    """If the logged input has the opposite sign of the stated law, the log is followed.
 
     A note says so.
     """
@@ -201,7 +201,7 @@ def test_a_stated_sign_that_the_log_contradicts_is_said():
 
 
 def test_a_stated_scale_that_the_log_contradicts_is_said():
-    """If the stated PID lacks its scale, the loop is simulated with the factor found in the log."""
+    """If the scale of the PID was left out, the factor found in the log is used."""
     law = Pid(kp=2.0, kd=0.1, scale=0.009765625)
     run = simulate_loop(TWO, law, t=CLOCK, reference=STEPS)
     y = encoder(run.x)
@@ -220,7 +220,7 @@ def test_a_stated_scale_that_the_log_contradicts_is_said():
 
 @pytest.mark.parametrize("wrong", ["input", "reference", "gains", "controlled_cart", "counts"])
 def test_what_contradicts_the_run_fails_a_check(wrong):
-    """A column in another unit, swapped gains or another cart fail a check of the loop."""
+    """If a column's unit, the gains or the controlled cart are wrong, a check fails."""
     design = designed(TWO, 2)
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
     y, u = bench(TWO, law)
@@ -249,7 +249,7 @@ def test_what_contradicts_the_run_fails_a_check(wrong):
 
 
 def test_noise_at_a_fast_sample_is_no_scale_of_the_log():
-    """At 1 kHz, where velocities are mostly noise, the true controller is not called misscaled."""
+    """If velocities are mostly noise, as at 1 kHz, the true controller's scale is not doubted."""
     t = 0.001 * np.arange(4000, dtype=np.float64)
     steps = np.where((t > 0.2) & (t < 2.5), 1.0, 0.0)
     design = design_feedback(
@@ -299,7 +299,7 @@ def test_the_timing_of_the_bench_is_found(law, sample_time):
 
 
 def test_saturation_is_read_off_the_log():
-    """An input limit that nobody stated is seen as a plateau in the log and simulated."""
+    """If nobody stated the input limit, it is found as a plateau in the log and simulated."""
     law = Pid(kp=0.2, kd=0.01)
     y, u = bench(TWO, law, limit=0.06)
     assert np.sum(np.abs(u) >= 0.06) > 5
@@ -315,10 +315,7 @@ def test_saturation_is_read_off_the_log():
 
 
 def test_a_pid_is_closed_around_the_controlled_cart_unless_it_names_one():
-    """A PID without its own `cart` reads the cart given by `controlled_cart`.
-
-    Its own `cart` comes first.
-    """
+    """A PID controller that names no cart reads the one given as `controlled_cart`."""
     law = Pid(kp=0.008, kd=0.0008, cart=2)
     y, u = bench(TWO, law)
     run = record(y, u=u, reference=STEPS)
@@ -331,7 +328,10 @@ def test_a_pid_is_closed_around_the_controlled_cart_unless_it_names_one():
 
 
 def test_only_the_cart_that_is_steered_has_the_set_point():
-    """Only the controlled cart has a set point; if no cart is stated, none has one."""
+    """Only the controlled cart is compared with the set point.
+
+    If the controlled cart is not stated, no cart is.
+    """
     y, u = bench(TWO, Pid(kp=0.008, kd=0.0008, cart=2))
     run = record(y, u=u, reference=STEPS)
     unnamed = submission.PidController(type="pid", kp=0.008, kd=0.0008)
@@ -344,7 +344,7 @@ def test_only_the_cart_that_is_steered_has_the_set_point():
 
 
 def test_a_pid_acts_on_the_files_own_counts():
-    """A PID's gains act on the file's unit, so gains per count and per cm give the same loop."""
+    """A PID's gains refer to the unit of the file, so gains per count need no conversion."""
     law = Pid(kp=0.008, kd=0.0008, cart=2)
     y, u = bench(TWO, law)
     run = replace(record(y, u=u, reference=STEPS), position_scale=COUNT)
@@ -354,7 +354,7 @@ def test_a_pid_acts_on_the_files_own_counts():
 
 
 def test_a_displaced_rest_is_no_error_of_the_model():
-    """If encoders were zeroed away from rest, the open check still leaves only noise."""
+    """If encoders were not zeroed at rest, the open-loop simulation still leaves only noise."""
     y = encoder(simulate_linear(TWO, CLOCK, 0.06 * STEPS) + np.array([[3.0], [-2.0]]))
 
     checks = check_hardware(record(y, u=0.06 * STEPS, kind="step"), TWO)
@@ -367,7 +367,7 @@ def test_a_displaced_rest_is_no_error_of_the_model():
 
 
 def test_a_record_that_begins_in_motion_has_its_start_fitted():
-    """If a sweep was cut from a longer recording, its initial motion is fitted."""
+    """If a sweep was cut from a longer recording, the carts' motion at its start is fitted."""
     u = -0.05 * np.sin(2 * np.pi * (0.5 * CLOCK + 0.4 * CLOCK**2))
     x = simulate_linear(TWO, CLOCK, u) + 0.7
     cut = slice(200, None)
@@ -384,9 +384,9 @@ def test_a_record_that_begins_in_motion_has_its_start_fitted():
 
 @pytest.mark.parametrize("start", [0, 30, 57, 90, 240])
 def test_a_closed_loop_cut_anywhere_is_checked_from_there(start):
-    """A closed-loop run may be cut at rest, just after the step, or after settling.
+    """If a closed-loop run is cut, its motion at the cut is found and simulated from there.
 
-    Its initial motion is found in each case.
+    The cut may be at rest, just after the step, or after settling.
     """
     design = designed(TWO, 2)
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
@@ -402,7 +402,7 @@ def test_a_closed_loop_cut_anywhere_is_checked_from_there(start):
 
 
 def test_uneven_and_rounded_time_does_no_harm():
-    """Lost samples and time stamps rounded to a millisecond hardly change the check."""
+    """If samples are lost and times are rounded to a millisecond, the simulation still fits."""
     rng = np.random.default_rng(3)
     kept = np.sort(rng.permutation(CLOCK.size)[:600])
     t = np.round(CLOCK[kept], 3)
@@ -444,7 +444,7 @@ def test_without_an_input_the_loop_alone_is_checked():
     [None, submission.StateFeedbackController(type="state_feedback", gains=(), prefilter=1.0)],
 )
 def test_without_gains_the_measured_input_alone_is_checked(controller):
-    """If no gains are stated, only the open check is made."""
+    """If no gains are stated, only the simulation with the measured input is made."""
     law = Pid(kp=0.02, kd=0.001)
     y, u = bench(TWO, law)
 
@@ -457,7 +457,7 @@ def test_without_gains_the_measured_input_alone_is_checked(controller):
 def test_an_unstable_statement_is_said():
     """If the stated gains make the loop unstable, a note says so.
 
-    The open check is still made.
+    The simulation with the measured input is still made.
     """
     y, u = bench(TWO, Pid(kp=0.02, kd=0.001))
     wild = submission.StateFeedbackController(
@@ -474,9 +474,9 @@ def test_an_unstable_statement_is_said():
 
 
 def test_gains_that_do_not_fit_leave_the_open_check():
-    """If the number of gains does not fit the carts, the loop is not simulated.
+    """If the number of gains does not fit the carts, the closed loop is not simulated.
 
-    The open check says why.
+    The result of the simulation with the measured input gives the reason.
     """
     y, u = bench(TWO, Pid(kp=0.02, kd=0.001))
     short = submission.StateFeedbackController(
@@ -499,7 +499,7 @@ def test_gains_that_do_not_fit_leave_the_open_check():
     ],
 )
 def test_runs_that_cannot_be_checked_are_refused(run, message):
-    """A run without input and controller, without motion, or with cart 1 held is refused."""
+    """A run cannot be checked without motion, with cart 1 held, or without input and controller."""
     with pytest.raises(DataError, match=f"control: .*{message}"):
         check_hardware(run, TWO)
 
@@ -541,7 +541,7 @@ UCSD = Chain(  # V, count, s; damping of about a tenth
     ],
 )
 def test_the_ucsd_logs_differ_in_sign_and_scale(real_data, name, gains, closed_limit, sign):
-    """The real closed-loop logs need two to four times the logged input, with its sign reversed."""
+    """The real closed-loop logs fit if their input is reversed and two to four times as large."""
     run = ucsd(real_data / "ecp210-ucsd", name, sign=sign)
 
     checks = check_hardware(

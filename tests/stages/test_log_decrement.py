@@ -1,4 +1,4 @@
-"""A free decay gives damping, frequency, dry friction, and the start of the decay."""
+"""A free decay gives damping, frequency and dry friction, and its start is found."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ OMEGA, RELEASE = 20.0, 0.4  # rad/s, s
 
 
 def held_then_free(t, *, zeta, omega_n=OMEGA, start=1.2, release=RELEASE, d=0.0):
-    """Simulate a cart held at `start` and released, exactly, with friction band d = F/k.
+    """Return the exact motion of a cart held at `start` and released, with friction band d = F/k.
 
     In each half cycle the cart swings about a point d away from its rest position. It stops as soon
     as it turns within d of the rest position.
@@ -56,7 +56,7 @@ def record(t, y, *, u=None, kind: Kind = "decay", count=COUNT):
 
 
 def released(*, zeta, fs=FS, duration=None, count=COUNT, noise=0.0, rng=None, **motion):
-    """Return a record of a release by hand, long enough for 4.5 time constants."""
+    """Return a record of a release by hand that lasts 4.5 time constants or more."""
     t = np.arange(0, duration or RELEASE + min(4.5 / (zeta * OMEGA), 10.0), 1 / fs)
     y = held_then_free(t, zeta=zeta, **motion)
     if rng is not None:
@@ -77,7 +77,7 @@ def friction_of(got):
 @pytest.mark.parametrize("fs", [113.1, 333.0, 1000.0])
 @pytest.mark.parametrize("start", [1.2, -0.8])
 def test_recovers_the_damping_that_made_the_data(zeta, fs, start):
-    """Damping is found to 0.2 % and frequency to 0.02 %, at any usual damping, rate and side."""
+    """Damping is found to 0.2 % and frequency to 0.02 % at any usual damping and sampling rate."""
     got = fit_log_decrement(released(zeta=zeta, fs=fs, start=start), cart=1)
     assert_allclose(got.zeta, zeta, rtol=2e-3)
     assert_allclose(got.omega_n, OMEGA, rtol=2e-4)
@@ -91,7 +91,7 @@ def test_recovers_the_damping_that_made_the_data(zeta, fs, start):
 
 
 def test_an_exact_decay_comes_back_exactly():
-    """Without rounding the fit is exact, and the peaks are exact to the parabola's error."""
+    """Without rounding, the exponential fit is exact, and the peaks are nearly so."""
     got = fit_log_decrement(released(zeta=0.05, count=0.0), cart=1)
     assert_allclose([got.zeta, got.omega_n], [0.05, OMEGA], rtol=1e-9)
     assert_allclose(got.zeta_peaks, 0.05, rtol=2e-4)
@@ -120,7 +120,7 @@ def test_heavy_damping_still_gives_an_answer(zeta):
 
 
 def test_standard_errors_of_heavy_damping_are_those_of_the_fit():
-    """With fewer than four peaks, the decrement and its error come from the exponential fit."""
+    """If a decay has fewer than four peaks, the decrement comes from the exponential fit."""
     got = fit_log_decrement(released(zeta=0.6, duration=3.0), cart=1)
     assert got.peak_t.size < 4
     assert_allclose(got.zeta_peaks, got.zeta, rtol=1e-9)
@@ -128,7 +128,7 @@ def test_standard_errors_of_heavy_damping_are_those_of_the_fit():
 
 
 def test_the_figure_shows_the_fit_within_its_envelope():
-    """In the figure, fit and envelope have the same times, and the decay stays in the envelope."""
+    """In the figure, the decay stays within its envelope, and both have the same times."""
     got = fit_log_decrement(released(zeta=0.05), cart=1)
     assert got.fit_t.shape == got.fit_y.shape == got.envelope_upper.shape
     assert np.all(got.fit_y <= got.envelope_upper + 1e-9)
@@ -161,7 +161,7 @@ def test_a_record_may_begin_at_the_release():
 
 @pytest.mark.parametrize("hand", [12.0, 18.0, 20.0, 25.0])
 def test_a_hand_that_shakes_the_cart_is_told_from_the_decay(hand):
-    """If a hand swings the cart ever further before the release, only the decay is fitted."""
+    """If a hand swings the cart before the release, only the motion after it is fitted."""
     t, zeta, release = np.arange(0, 6, 1 / FS), 0.04, 1.9
     decay, omega_d = zeta * OMEGA, OMEGA * np.sqrt(1 - zeta**2)
     x0 = 0.8 * np.sin(hand * release)
@@ -175,7 +175,7 @@ def test_a_hand_that_shakes_the_cart_is_told_from_the_decay(hand):
 
 
 def test_a_touch_after_the_decay_is_left_out():
-    """If somebody takes the cart away after a while, the rest of the record is not used."""
+    """If somebody touches the cart after the decay, the record is used only up to the touch."""
     run = released(zeta=0.05, duration=5.0)
     y = run.position(1) + np.where(run.t > 2.5, np.sin(9 * (run.t - 2.5)), 0.0)
     got = fit_log_decrement(record(run.t, y), cart=1)
@@ -225,7 +225,7 @@ def test_a_drifting_rest_point_does_no_harm(drift):
 
 
 def test_an_uneven_clock_does_no_harm():
-    """If the samples are uneven and have gaps, the measured times are used."""
+    """Uneven samples and gaps do not change the damping, since measured times are used."""
     rng = np.random.default_rng(2)
     t = np.sort(np.arange(0, 4, 1 / FS) + rng.uniform(-0.3, 0.3, size=453) / FS)
     t = np.delete(t, np.arange(100, 120))
@@ -235,7 +235,7 @@ def test_an_uneven_clock_does_no_harm():
 
 @pytest.mark.parametrize("scale", [0.01, 1 / COUNT])
 def test_units_do_not_matter(scale):
-    """The damping is the same in metres, centimetres and counts."""
+    """The damping is the same for positions in metres, centimetres or counts."""
     run = released(zeta=0.05)
     scaled = replace(run, y=run.y * scale, resolution=run.resolution * scale)
     assert_allclose(
@@ -244,7 +244,7 @@ def test_units_do_not_matter(scale):
 
 
 def test_a_small_decay_is_measured_within_its_error():
-    """A release by thirty counts gives a damping within its standard error."""
+    """If a cart is released at only thirty counts, the damping is within its standard error."""
     got = fit_log_decrement(released(zeta=0.03, start=30 * COUNT), cart=1)
     assert abs(got.zeta - 0.03) < 4 * got.zeta_std
     assert got.zeta_std > 1e-3 * 0.03
@@ -256,7 +256,10 @@ def test_a_small_decay_is_measured_within_its_error():
 @pytest.mark.parametrize("d", [0.002, 0.01, 0.03])
 @pytest.mark.parametrize("zeta", [0.01, 0.05, 0.1])
 def test_dry_friction_is_found_and_taken_out(d, zeta):
-    """Dry friction and the viscous damping beside it are found, and the note says so."""
+    """If a decay has dry friction, both the friction and the viscous damping are found.
+
+    The note says so.
+    """
     got = fit_log_decrement(released(zeta=zeta, d=d, duration=4.0), cart=1)
     assert friction_of(got).present
     assert abs(friction_of(got).drop - d) < 4 * friction_of(got).drop_std + 1e-5
@@ -306,7 +309,7 @@ def flags(seeds, *, d):
 
 
 def test_friction_is_told_from_none():
-    """Of twenty decays each, none without friction and all with d = 0.01 cm are flagged."""
+    """Dry friction is found in all of twenty decays with d = 0.01 cm, and in none without it."""
     assert not flags(20, d=0.0).any()
     assert flags(20, d=0.01).all()
 
@@ -315,7 +318,7 @@ def test_friction_is_told_from_none():
 
 
 def standardised(seeds):
-    """Return errors of (ζ, ω_n, ζ by peaks) in standard errors.
+    """Return the errors of (ζ, ω_n, ζ by peaks), divided by their standard errors.
 
     The decays have noise and rounding.
     """
@@ -337,7 +340,7 @@ def standardised(seeds):
 
 
 def test_the_standard_errors_are_about_right():
-    """Over 60 noisy decays the errors are about as large as their standard errors."""
+    """Over 60 noisy decays, actual errors are about as large as the standard errors."""
     spread = np.sqrt(np.mean(standardised(60) ** 2, axis=0))
     assert np.all((0.65 < spread[:2]) & (spread[:2] < 1.35))  # 1 ± 4/sqrt(120)
     assert spread[2] < 1.35
@@ -347,7 +350,7 @@ def test_the_standard_errors_are_about_right():
 
 
 def test_a_cart_at_rest_is_refused():
-    """A record without motion is refused; the message says what is needed and what was found."""
+    """A record without motion is refused; the message gives what is needed and what was found."""
     t = np.arange(0, 4, 1 / FS)
     with pytest.raises(DataError, match=r"^decay: log decrement needs 3 turning points.*found 0$"):
         fit_log_decrement(record(t, np.zeros_like(t)), cart=1)
@@ -368,7 +371,7 @@ def test_a_motion_that_does_not_decay_is_refused():
 
 
 def test_a_hold_without_release_is_refused():
-    """If the hand never lets go, the record is refused."""
+    """If the hand never releases the cart, the record is refused."""
     run = released(zeta=0.05)
     held = run.t < RELEASE
     with pytest.raises(DataError, match="needs 3 turning points"):
@@ -377,7 +380,7 @@ def test_a_hold_without_release_is_refused():
 
 @pytest.mark.parametrize("n", [1, 2, 6, 7, 12])
 def test_a_handful_of_samples_is_refused(n):
-    """A record of a few samples is refused with the same message."""
+    """A record with only a few samples is refused, since it has too few turning points."""
     t = np.arange(n) / FS
     with pytest.raises(DataError, match="needs 3 turning points"):
         fit_log_decrement(record(t, np.cos(20 * t)), cart=1)
@@ -395,9 +398,9 @@ def real_records(real_data, tmp_path_factory):
 
 @pytest.mark.parametrize("repeat", range(1, 6))
 def test_the_real_first_cart(real_records, repeat):
-    """Both edges of the real cart 1's step give its damping.
+    """Both edges of a real step of cart 1 give its damping.
 
-    It is larger while the motor holds.
+    The damping is larger while the motor holds.
     """
     run = real_records[f"alone-1-{repeat}"]
     off = fit_log_decrement(run, cart=1)
@@ -410,7 +413,7 @@ def test_the_real_first_cart(real_records, repeat):
 
 @pytest.mark.parametrize("repeat", range(1, 6))
 def test_the_real_second_cart_pulled_by_hand(real_records, repeat):
-    """In each real decay of cart 2 dry friction is found, with little viscous damping beside it."""
+    """In each real decay of cart 2, dry friction and little viscous damping are found."""
     got = fit_log_decrement(real_records[f"alone-2-{repeat}"], cart=2)
     assert 15.6 <= got.omega_n <= 15.9
     assert friction_of(got).present
@@ -420,7 +423,7 @@ def test_the_real_second_cart_pulled_by_hand(real_records, repeat):
 
 
 def test_a_crest_of_equal_readings_turns_in_its_middle():
-    """If the encoder is so coarse that a peak is flat, its turning point is the middle."""
+    """If a coarse encoder makes a peak flat, the turning point is in the middle of the peak."""
     zeta = 0.05
     run = released(zeta=zeta, count=0.03)
     got = fit_log_decrement(run, cart=1)
@@ -434,7 +437,7 @@ def test_a_crest_of_equal_readings_turns_in_its_middle():
 
 
 def test_a_fit_of_spikes_is_finite_before_its_start():
-    """A fit to values of 1e12 stays finite when it is extended backwards."""
+    """A fit to huge spikes stays finite when it is evaluated before its start."""
     fit = Ringing(
         t0=1.25,
         level=0.0,

@@ -1,4 +1,4 @@
-"""A dwell gives amplitude, phase and frequency of its steady part, and where that begins."""
+"""Amplitude, phase and frequency of a dwell are found, and where its steady part begins."""
 
 from dataclasses import asdict, replace
 
@@ -18,7 +18,7 @@ FS = 113.1  # Hz, its usual sampling rate
 
 
 def dwell(t, *, hertz=3.0, amplitude=1.0, chain=CHAIN, noise=0.0, count=COUNT, rng=None):
-    """Return a dwell from rest that moves cart 1 to about `amplitude`, and the true response."""
+    """Return a dwell from rest that moves cart 1 by about `amplitude`, and the true response."""
     omega = 2 * np.pi * hertz
     truth = chain.frequency_response(np.array([omega]))[:, 0]
     half = omega * np.mean(np.diff(t)) / 2  # a held sine is smaller by sin(half)/half
@@ -83,7 +83,7 @@ def test_an_exact_steady_state_comes_back_exactly():
 
 
 def test_a_smooth_input_is_taken_as_sampled():
-    """If the input is band-limited, amplitudes are those of the samples, without a hold."""
+    """If the input is band-limited, its amplitude is that of the samples."""
     t, omega = sampled(4.0), 2 * np.pi * 5.0
     run = record(t, 0.5 * np.sin(omega * t), np.sin(omega * t - 1.0)[None], omega=omega, count=0.0)
     got = fit_sine(replace(run, hold="band_limited"), cart=1)
@@ -100,7 +100,7 @@ def test_every_cart_of_a_chain_has_its_own_amplitude_and_phase():
 
 
 def test_what_the_carts_of_a_dwell_share_changes_none_of_their_numbers():
-    """Carts fitted together, in any order, get the same numbers as a cart fitted alone."""
+    """A cart fitted together with others, in any order, has the same numbers as when alone."""
     run, _ = dwell(sampled(6.0), chain=PRESETS["throne-3dof"], hertz=3.0)
     together = Dwell(run)
     for cart in (3, 1, 2):
@@ -119,7 +119,7 @@ def test_the_transient_is_left_out():
 
 @pytest.mark.parametrize("clock", ["jittered", "rounded", "gap"])
 def test_the_measured_times_are_used_as_they_are(clock):
-    """If the samples are uneven or have gaps, the measured times are used."""
+    """Uneven samples and gaps do not change the amplitude, since measured times are used."""
     rng = np.random.default_rng(3)
     t = np.sort(sampled(9.0) + rng.uniform(-0.3, 0.3, size=sampled(9.0).size) / FS)
     if clock == "rounded":
@@ -195,7 +195,7 @@ def test_a_dwell_cut_short_is_said_not_to_be_settled():
 
 
 def test_two_cycles_of_steady_state_are_enough_for_an_estimate():
-    """Two cycles of steady state are enough for an estimate."""
+    """A record of two cycles that begins in steady state is enough for an estimate."""
     run, truth = dwell(sampled(12.0), hertz=3.0)
     late = slice(int(11.3 * FS), None)
     got = fit_sine(cut(run, late), cart=1)
@@ -212,10 +212,7 @@ def test_few_counts_are_mentioned():
 
 
 def test_a_motion_that_is_no_sine_is_mentioned():
-    """If the motion has a third harmonic, as with friction, a note gives its size.
-
-    The harmonic also enters the standard error.
-    """
+    """If friction adds a third harmonic, a note gives its size and the error includes it."""
     t, omega = sampled(6.0), 2 * np.pi * 3.0
     y = np.sin(omega * t) + 0.05 * np.sin(3 * omega * t)
     got = fit_sine(record(t, np.sin(omega * t), y[None], omega=omega), cart=1)
@@ -246,9 +243,9 @@ def test_less_than_a_cycle_is_refused():
 
 
 def coverage(seeds, *, from_rest):
-    """Return errors of gain and phase in standard errors, of random dwells.
+    """Return the errors of gain and phase, divided by their standard errors.
 
-    The dwells are of one to three carts.
+    They are those of random dwells of one to three carts.
     """
     errors = []
     for seed in range(seeds):
@@ -274,13 +271,13 @@ def coverage(seeds, *, from_rest):
 
 
 def test_the_standard_errors_are_about_right():
-    """Over 60 dwells the errors are about as large as their standard errors."""
+    """Over 60 dwells, actual errors are about as large as the standard errors."""
     spread = np.sqrt(np.mean(coverage(60, from_rest=False) ** 2, axis=0))
     assert np.all((0.75 < spread) & (spread < 1.35))  # 1 ± 4/sqrt(120)
 
 
 def test_another_signal_is_refused():
-    """A random input is refused, even if the experiment is declared as a dwell."""
+    """A recording with a random input is refused, even if it is declared as a dwell."""
     t = sampled(5.0)
     u = np.random.default_rng(0).normal(size=t.size)
     with pytest.raises(DataError, match="needs an input of one frequency"):
@@ -288,7 +285,7 @@ def test_another_signal_is_refused():
 
 
 def test_a_cart_that_does_not_move_is_refused():
-    """If a cart does not move, for example by an unplugged encoder, its dwell is refused."""
+    """If a cart does not move, as with an unplugged encoder, its dwell is refused."""
     run, _ = dwell(sampled(5.0))
     with pytest.raises(DataError, match="cart 1 does not move"):
         fit_sine(replace(run, y=np.zeros_like(run.y)), cart=1)

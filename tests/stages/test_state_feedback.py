@@ -1,4 +1,4 @@
-"""State-feedback gains agree with other programs, and the design meets its goal."""
+"""State-feedback gains agree with those of other programs, and designs meet their goals."""
 
 import control
 import numpy as np
@@ -62,7 +62,7 @@ def design(
 
 
 def off_by(chain: Chain, rng: np.random.Generator) -> Chain:
-    """Return the chain with masses and springs off by up to 3 %, dampings by up to 30 %."""
+    """Return the chain with errors of up to 3 % in masses and springs and 30 % in dampings."""
     return Chain(
         m=chain.m * (1 + 0.03 * rng.uniform(-1, 1, chain.n)),
         c=chain.c * (1 + 0.30 * rng.uniform(-1, 1, chain.n)),
@@ -89,7 +89,7 @@ def test_lqr_gains_agree_with_control(name, weight):
 
 
 def test_lqr_gains_of_many_weights_are_those_of_each():
-    """Gains for several weights computed at once equal those computed one by one."""
+    """Gains computed for several weights at once equal those computed one by one."""
     phi, gamma = discretise(PRESETS["throne-3dof"], T)
     weights = np.array([scale * np.eye(6) for scale in (1e-4, 1e-2, 1.0)])
 
@@ -119,7 +119,7 @@ def test_placed_poles_are_where_they_were_asked_for(name, sample_time):
 
 
 def test_placed_gains_agree_with_control():
-    """The placed gains equal those of python-control, since they are unique for one input."""
+    """Gains by pole placement equal those of python-control, since they are unique."""
     phi, gamma = discretise(PRESETS["throne-2dof"], T)
     gamma = gamma / np.abs(gamma).max()
     wanted = np.exp(T * np.array([-5 + 6j, -5 - 6j, -8 + 30j, -8 - 30j]))
@@ -131,7 +131,7 @@ def test_placed_gains_agree_with_control():
 
 @pytest.mark.parametrize("name", ["throne-2dof", "throne-3dof", "four"])
 def test_level_error_is_what_wrong_springs_do(name):
-    """The stated level error is the sum of the errors that each spring, 3 % off, causes."""
+    """The stated error of the level is the sum of the errors caused by 3 % in each spring."""
     chain, cart = PLANTS[name], 2
     gains = design(chain, cart=cart, method="poles").gains
 
@@ -149,7 +149,7 @@ def test_level_error_is_what_wrong_springs_do(name):
 
 
 def test_robust_stability_sees_a_loop_on_the_edge():
-    """The designed gains pass the test of robust stability; gains near the limit do not."""
+    """The designed gains count as robustly stable; gains at the edge of stability do not."""
     chain = PRESETS["throne-3dof"]
     gains = design(chain, cart=3).gains
     assert stays_stable(chain, StateFeedback(gains=gains, prefilter=1, model=chain), sample_time=T)
@@ -172,7 +172,7 @@ def test_robust_stability_sees_a_loop_on_the_edge():
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("name", "cart"), EVERY_CART)
 def test_the_design_meets_its_goal_on_the_true_plant(name, cart, method):
-    """The designed loop, simulated finely, meets overshoot and settling time."""
+    """Simulated finely, the designed loop keeps the overshoot and settling time of its goal."""
     chain = PLANTS[name]
     got = design(chain, cart=cart, method=method)
 
@@ -196,7 +196,10 @@ def test_the_design_meets_its_goal_on_the_true_plant(name, cart, method):
 
 @pytest.mark.parametrize(("name", "cart"), [(n, c) for n, c in EVERY_CART if n in PRESETS])
 def test_lqr_hardly_overshoots_the_presets_and_forgives_model_error(name, cart):
-    """LQR designs overshoot by at most 0.6 % and stay stable if the plant is a few percent off."""
+    """LQR designs overshoot by at most 0.6 %.
+
+    They stay stable on plants that are a few percent off.
+    """
     chain, rng = PRESETS[name], np.random.default_rng(7)
     got = design(chain, cart=cart)
 
@@ -254,7 +257,7 @@ def test_units_do_not_matter(position, force, method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_step_down_mirrors_the_step_up(method):
-    """A negative reference gives the same gains and the negative step."""
+    """A negative reference gives the same gains as a positive one, and the negative response."""
     up = design(PRESETS["throne-2dof"], cart=2, reference=0.5, method=method)
     down = design(PRESETS["throne-2dof"], cart=2, reference=-0.5, method=method)
 
@@ -277,7 +280,7 @@ def test_the_input_limit_is_kept(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_level_beyond_the_input_is_said_to_be_out_of_reach(method):
-    """If the input limit cannot hold the step, the message gives the level that it can hold."""
+    """If the input limit is too small to hold the step, the message gives the level it can hold."""
     chain = PRESETS["throne-2dof"]
     got = design(chain, cart=2, limit=0.05, method=method)
 
@@ -289,7 +292,7 @@ def test_a_level_beyond_the_input_is_said_to_be_out_of_reach(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_settling_time_beyond_the_input_names_what_is_reachable(method):
-    """If the input limit is too small for the settling time, the best design within it is given.
+    """If the input limit is too small for the settling time, the best possible design is given.
 
     The message names its overshoot and settling time.
     """
@@ -305,7 +308,10 @@ def test_a_settling_time_beyond_the_input_names_what_is_reachable(method):
 
 
 def test_cancelling_gains_are_warned_of():
-    """If poles are placed far from a soft plant's own, a warning says the level is sensitive."""
+    """If poles are far from a soft plant's own, a warning gives the level's error.
+
+    The level is then sensitive to errors in the springs.
+    """
     got = design(FOUR, cart=4, settling=0.5, method="poles")
 
     assert level_error_percent(FOUR, got.gains, cart=4) > 5.0
@@ -313,7 +319,7 @@ def test_cancelling_gains_are_warned_of():
 
 
 def test_a_fast_plant_is_sampled_faster():
-    """Without a stated sample time, the design takes one that suits the fastest mode."""
+    """If no sample time is stated, the design takes one that suits the fastest mode."""
     chain = PRESETS["throne-2dof"]
     fast = Chain(m=chain.m / 400, c=chain.c / 20, k=chain.k)  # twenty times as fast
     got = design(fast, cart=2, settling=0.05)
@@ -327,7 +333,7 @@ def test_a_fast_plant_is_sampled_faster():
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("speed", [0.1, 10.0])
 def test_goals_much_slower_or_faster_than_the_plant_are_judged_rightly(method, speed):
-    """At any time scale, the statement whether the goal is met agrees with the designed step."""
+    """Whether the goal is met is judged from the designed step, at any time scale."""
     chain = PRESETS["throne-2dof"]
     other = Chain(m=chain.m / speed**2, c=chain.c / speed, k=chain.k)
     got = design(other, cart=2, settling=3.0, method=method)

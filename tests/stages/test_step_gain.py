@@ -1,4 +1,4 @@
-"""Step runs give static gains, with levels, friction, and errors for unusable records."""
+"""Static gains are found from step runs, with friction, and unusable records are refused."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ FOUR = Chain(
 
 
 def staircase(t, *edges):
-    """Return an input that goes to a level at each (time, level)."""
+    """Return an input that changes to a given level at each given time."""
     u = np.zeros_like(t)
     for time, level in edges:
         u[t >= time] = level
@@ -63,7 +63,10 @@ def seconds(duration):
 @pytest.mark.parametrize("name", ["throne-1dof", "throne-2dof", "throne-3dof"])
 @pytest.mark.parametrize("size", [0.03, -0.02])
 def test_every_cart_has_its_static_gain(name, size):
-    """A step on and off gives the gain of each cart of one, two or three, with either sign."""
+    """A step on and off gives the static gain of each of one, two or three carts.
+
+    The step may have either sign.
+    """
     chain = PRESETS[name]
     t = seconds(14.0)
     run = run_of(chain, t, staircase(t, (0.5, size), (7.0, 0.0)), offset=0.3)
@@ -96,7 +99,7 @@ def test_an_exact_record_gives_the_exact_gain():
 
 
 def test_several_sizes_and_signs_in_one_record():
-    """If a record has steps of several sizes and signs, each edge gives a gain."""
+    """If a record has several steps of different size and sign, each of them gives a gain."""
     chain, t = PRESETS["throne-1dof"], seconds(24.0)
     u = staircase(t, (0.5, 0.02), (5.0, 0.04), (10.0, -0.03), (15.0, 0.0), (20.0, -0.01))
     got = fit_step_gain(run_of(chain, t, u), cart=1)
@@ -112,7 +115,7 @@ def test_several_sizes_and_signs_in_one_record():
 
 
 def test_the_windows_are_found():
-    """Levels are taken up to the edge and after the ringing."""
+    """A level is read where nothing moves: just before an edge, and after the ringing."""
     t = seconds(14.0)
     run = run_of(PRESETS["throne-1dof"], t, staircase(t, (2.0, 0.03), (8.0, 0.0)))
     on, off = fit_step_gain(run, cart=1).edges
@@ -129,9 +132,9 @@ def test_the_windows_are_found():
 @pytest.mark.parametrize("wait", [0.9, 1.5, 3.0])
 @pytest.mark.parametrize("name", ["throne-1dof", "throne-2dof", "throne-3dof"])
 def test_a_record_that_ends_before_the_carts_settle(name, wait):
-    """If a record ends before the carts settle, the level is fitted with damped sinusoids.
+    """If a record ends before the carts settle, a fit of damped sinusoids gives the level.
 
-    The gain has a fitting error and a note.
+    The gain then has the error of this fit, and a note.
     """
     chain, t = PRESETS[name], seconds(0.5 + wait)
     run = run_of(chain, t, staircase(t, (0.5, 0.03)), noise=0.2 * COUNT)
@@ -161,7 +164,7 @@ def test_a_cart_that_never_settles_is_refused():
 
 
 def test_an_input_that_is_on_from_the_first_sample():
-    """If the input is on from the first sample, the first position is taken as the rest."""
+    """If the input is on from the first sample, the first position counts as the rest position."""
     chain, t = PRESETS["throne-1dof"], seconds(6.0)
     got = fit_step_gain(run_of(chain, t, np.full_like(t, 0.03), offset=-0.2), cart=1)
     assert_allclose(got.gain, chain.static_gains()[0], atol=COUNT / 0.03)
@@ -170,7 +173,7 @@ def test_an_input_that_is_on_from_the_first_sample():
 
 
 def test_a_single_sample_of_rest_before_the_edge():
-    """A single sample before the edge, as in UCSD logs, is enough for the rest position."""
+    """One sample before the edge, as in the UCSD logs, is enough for the rest position."""
     chain, t = PRESETS["throne-1dof"], seconds(6.0)
     got = fit_step_gain(run_of(chain, t, staircase(t, (t[1], 0.03))), cart=1)
     assert_allclose(got.gain, chain.static_gains()[0], atol=COUNT / 0.03)
@@ -198,7 +201,7 @@ def test_a_noisy_input_still_has_its_edges():
 
 
 def test_a_slow_edge_is_one_edge():
-    """An input that takes ten samples to reach its level counts as one edge."""
+    """If the input takes ten samples to reach its level, this counts as one edge."""
     chain, t = PRESETS["throne-1dof"], seconds(7.0)
     u = 0.03 * np.clip((t - 0.5) / 0.09, 0, 1)
     got = fit_step_gain(run_of(chain, t, u), cart=1)
@@ -221,7 +224,7 @@ def test_a_drift_is_taken_out():
 
 
 def sticking(t, *, rests, levels=(0.0, 0.9, 0.0)):
-    """Return exponential moves between levels, each short by the friction band."""
+    """Return exponential moves between levels, each too short by the friction band."""
     y = np.full_like(t, rests[0])
     for edge, level, miss in zip((1.0, 6.0), levels[1:], rests[1:], strict=True):
         after = t >= edge
@@ -230,7 +233,7 @@ def sticking(t, *, rests, levels=(0.0, 0.9, 0.0)):
 
 
 def test_a_rest_point_that_does_not_return_is_reported():
-    """A cart that sticks gets an interval that contains the gain without friction."""
+    """If a cart sticks, its gain gets an interval, which contains the gain without friction."""
     t = seconds(11.0)
     u = staircase(t, (1.0, 0.03), (6.0, 0.0))
     got = fit_step_gain(record(t, u, sticking(t, rests=(0.0, -0.01, 0.03))[None]), cart=1)
@@ -246,7 +249,7 @@ def test_a_rest_point_that_does_not_return_is_reported():
 
 
 def test_a_step_too_small_to_move_the_cart():
-    """If friction holds the cart at an edge, the edge is named and not used."""
+    """If friction holds the cart during an edge, a note names the edge, and it is not used."""
     t = seconds(11.0)
     u = staircase(t, (1.0, 0.03), (6.0, 0.035))
     got = fit_step_gain(
@@ -298,7 +301,7 @@ def test_a_cart_that_does_not_move_is_refused():
 
 
 def test_real_steps_agree_within_their_spread(real_data, tmp_path):
-    """Gains of the real two-cart steps 2 to 5 agree within 5 %.
+    """The gains of the real two-cart steps 2 to 5 agree within 5 %.
 
     Friction still shifts the rest position.
     """
@@ -312,7 +315,10 @@ def test_real_steps_agree_within_their_spread(real_data, tmp_path):
 
 
 def test_a_real_repeat_that_sticks_far_off(real_data, tmp_path):
-    """In the first real repeat, cart 2 stops 32 counts off its rest, which its interval shows."""
+    """In the first real repeat, cart 2 stops 32 counts off its rest position.
+
+    The interval of its gain shows this.
+    """
     folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(1,))
     run = next(r for r in read_data(load_submission(folder)).records if r.id == "both-1")
     got = fit_step_gain(run, cart=2)

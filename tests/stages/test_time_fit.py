@@ -25,14 +25,14 @@ from tests.helpers.ucsd import write_two_cart_submission
 
 
 def std(fit: ChainFit, name: str) -> float:
-    """Return the standard error of a named parameter that must exist."""
+    """Return the standard error of a named parameter, which must have one."""
     found = fit.parameters[name].std
     assert found is not None
     return found
 
 
 def errors(fit: ChainFit, chain: Chain) -> np.ndarray:
-    """Return the error of each named parameter in standard errors."""
+    """Return the error of each named parameter, divided by its standard error."""
     return np.array(
         [
             (fit.parameters[name].value - v) / std(fit, name)
@@ -58,7 +58,10 @@ def misfit(record: Record, chain: Chain, parametrisation: Parametrisation, *, at
 @pytest.mark.parametrize("jitter", [0.0, 0.5])
 @pytest.mark.parametrize("free", [(1, 2, 3), (1, 3), (1,)])
 def test_modes_and_simulation_agree(free, jitter):
-    """The response by modes equals the simulated one, for any free carts and sample times."""
+    """The response computed by modes equals the simulated one.
+
+    This holds for any free carts and sample times.
+    """
     chain, rng = PRESETS["throne-3dof"], np.random.default_rng(0)
     x0 = rng.standard_normal(2 * len(free))
     record = step_record(chain, rng=rng, free=free, jitter=jitter, noise=0.0, count=0.0, x0=x0)
@@ -72,7 +75,7 @@ def test_modes_and_simulation_agree(free, jitter):
 @pytest.mark.parametrize("zeta", [0.1, 1.0, 1.5])
 @pytest.mark.parametrize("at_rest", [True, False])
 def test_the_jacobian_is_that_of_the_misfit(zeta, at_rest):
-    """The Jacobian gives the gradient of the cost, even if two poles of a cart coincide."""
+    """The Jacobian agrees with differences of the cost, even if two poles of a cart coincide."""
     m, k = np.array([2e-4, 1e-4]), np.array([0.03, 0.04, 0.02])
     chain = Chain(m=m, c=2 * zeta * np.sqrt(m * (k[:-1] + k[1:])), k=k)
     record = step_record(chain, rng=np.random.default_rng(1), noise=0.01)
@@ -95,7 +98,10 @@ def test_the_jacobian_is_that_of_the_misfit(zeta, at_rest):
 
 
 def test_a_band_limited_input_is_used_as_such():
-    """A band-limited input is simulated to 1e-4 of the motion, if it is not read as held."""
+    """If an input is declared band-limited, its response is computed to 1e-4 of the motion.
+
+    Read as held, it would not be.
+    """
     chain, rng = PRESETS["throne-2dof"], np.random.default_rng(2)
     t = np.arange(600) / 113.0
     u = 0.05 * np.sin(15 * t) * np.sin(np.pi * t / t[-1]) ** 2
@@ -135,7 +141,7 @@ def test_exact_records_give_the_chain_back(n):
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
 @pytest.mark.parametrize("all_springs", [False, True])
 def test_unseen_chains_are_found_from_noisy_records(n, all_springs):
-    """Three steps of a random chain determine it, even if a missing spring is not declared."""
+    """Three steps determine a random chain, even if a missing spring is declared as present."""
     rng = np.random.default_rng(10 + n)
     for _ in range(3):
         chain, springs = random_chain(n, rng)
@@ -156,7 +162,7 @@ def test_unseen_chains_are_found_from_noisy_records(n, all_springs):
 
 
 def test_held_carts_and_hand_releases_join_in():
-    """Steps with a held cart and decays of single carts are fitted with the other records."""
+    """Steps with a held cart and decays of single carts are fitted together with other steps."""
     rng = np.random.default_rng(3)
     chain = PRESETS["throne-3dof"]
     records = [
@@ -174,7 +180,7 @@ def test_held_carts_and_hand_releases_join_in():
 
 
 def test_a_record_that_starts_in_motion_is_told_from_one_at_rest():
-    """A record that begins in motion is recognised, with a note, and does not harm the fit."""
+    """If a record begins in motion, a note says so, and the fit is as good as with rest."""
     rng = np.random.default_rng(4)
     chain = PRESETS["throne-2dof"]
     x0 = np.array([0.3, -4.0, -0.2, 3.0])  # cm, cm/s
@@ -199,7 +205,7 @@ def test_a_cart_that_was_not_measured_is_still_found():
 
 
 def test_a_long_fast_sweep_is_fitted_whole():
-    """A sweep of 20 s at 1 kHz is fitted with all its samples from the first start."""
+    """All samples of a sweep of 20 s at 1 kHz are fitted, with one start value."""
     rng = np.random.default_rng(17)
     chain = PRESETS["throne-2dof"]
     t = np.arange(20_000) / 1000.0
@@ -228,7 +234,7 @@ def test_a_body_on_no_spring_has_mass_and_damping():
 
 
 def test_a_damping_at_its_bound_is_no_measurement():
-    """If an undamped cart's damping is held at zero, it has no standard error."""
+    """If the fit holds the damping of an undamped cart at zero, it has no standard error."""
     chain = Chain(m=np.array([2e-3]), c=np.array([0.0]), k=np.array([0.6, 0.0]))
     fits = [
         fit_records(
@@ -247,7 +253,7 @@ def test_a_damping_at_its_bound_is_no_measurement():
 
 
 def test_a_spring_that_is_not_there_is_held_at_zero():
-    """If the last spring is declared but missing, it is held at zero with a note."""
+    """If the last spring is declared but missing, the fit holds it at zero, with a note."""
     rng = np.random.default_rng(1)
     chain = Chain(m=np.array([3e-4, 2e-4]), c=np.array([6e-4, 4e-4]), k=np.array([0.1, 0.06, 0]))
     fit = fit_records([step_record(chain, rng=rng)], bench=Bench(springs=(True,) * 3))
@@ -272,7 +278,7 @@ def test_the_same_records_give_the_same_fit():
 
 
 def test_without_an_input_there_is_no_scale():
-    """Decays alone give no mass in input units, and the error says what is needed."""
+    """Decays alone cannot give a mass in units of the input, and the error says what is needed."""
     record = decay_record(PRESETS["throne-2dof"], free=(1, 2), rng=np.random.default_rng(8))
     with pytest.raises(DataError, match="needs a record that drives cart 1, found none"):
         fit_records([record], bench=Bench(springs=(True,) * 3))
@@ -317,7 +323,7 @@ def test_an_input_that_explains_nothing_is_not_called_a_fit():
 
 
 def test_a_search_that_nothing_ends_is_cut_short_with_the_best_so_far():
-    """A search that reaches its limit of comparisons ends with the best result so far."""
+    """If a search reaches its limit of comparisons, it returns the best result so far."""
     rng = np.random.default_rng(12)
     record = step_record(PRESETS["throne-1dof"], rng=rng)
     assert record.u is not None
@@ -346,7 +352,7 @@ def test_a_decay_is_used_from_its_release_on():
 
 
 def test_correlated_residuals_count_for_less():
-    """If residuals are correlated, errors of sums follow from their spectrum."""
+    """For correlated residuals, the error of a sum follows from their spectrum."""
     rng = np.random.default_rng(14)
     n, phi, runs = 1000, 0.8, 60
     slow, fast = np.ones((1, 1, n)), (-1.0) ** np.arange(n, dtype=np.float64)[None, None]
@@ -365,7 +371,7 @@ def test_correlated_residuals_count_for_less():
 
 
 def test_a_long_rest_before_the_step_is_one_reading():
-    """A long constant reading before the step does not make a gain more certain."""
+    """A long rest before the step does not make the gain more certain."""
     chain, rng, runs, rate = PRESETS["throne-1dof"], np.random.default_rng(18), 24, 500.0
     t = np.arange(int(10 * rate)) / rate
     u = np.where(t > 5.0, 1.0 / chain.static_gains()[0], 0.0)
@@ -388,7 +394,7 @@ def test_a_long_rest_before_the_step_is_one_reading():
 
 
 def test_readings_of_a_rest_share_an_error():
-    """All readings of the first rest count together as one mean with a common error."""
+    """All readings of the first rest count together as one reading with a common error."""
     chain, rng = PRESETS["throne-2dof"], np.random.default_rng(19)
     window = open_window(step_record(chain, rng=rng, noise=0.0))
     n = window.n_resting
@@ -404,7 +410,7 @@ def test_readings_of_a_rest_share_an_error():
 
 
 def test_real_repeats_give_the_masses_and_springs_found_before(real_data, tmp_path):
-    """Four real steps give the masses and springs that an independent viscous fit found."""
+    """Four real steps give the masses and springs that an independent fit also found."""
     folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(2, 3, 4, 5))
     records = [r for r in read_data(load_submission(folder)).records if r.free == (1, 2)]
     steps = [record for record in records if record.kind == "step"]
