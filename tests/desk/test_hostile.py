@@ -69,5 +69,5 @@ def test_hostile_uploads_reach_nothing(tmp_path):
 
 @pytest.mark.slow
 def test_two_hundred_hostile_uploads_reach_nothing(tmp_path):
-    """All hostile uploads and a hundred spoilt ones change nothing outside and run nothing."""
+    """All hostile and many spoilt uploads change nothing outside their folder and run nothing."""
     assert visit(tmp_path, every=1, drawn=100, seed=2) >= 200

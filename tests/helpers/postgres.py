@@ -31,7 +31,7 @@ def _binaries() -> Path | None:
 
 @contextmanager
 def running() -> Iterator[str]:
-    """Start a server, yield the URL of its database, and remove both afterwards."""
+    """Start a server and yield the URL of its database; remove the server afterwards."""
     binaries = _binaries()
     assert binaries is not None
     # Pytest's folder does not do: only its owner can enter it, and the server never runs as root.

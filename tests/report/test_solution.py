@@ -312,7 +312,10 @@ def test_ackermann_is_exact_in_symbols():
 
 
 def test_the_reference_passes_its_own_tolerances_and_a_slip_does_not():
-    """Every expected value is within its own tolerance; a value in Hz or a doubled gain is not."""
+    """Every expected value is within its own tolerance.
+
+    A frequency in Hz or a doubled gain is far outside.
+    """
     analysis = make_analysis(3)
     for p in expected_parameters(analysis, default_rubric(analysis)):
         assert p.tolerance is not None

@@ -113,7 +113,7 @@ def test_the_position_unit_does_not_matter(unit):
 
 
 def test_a_rigid_body_has_mass_and_damping():
-    """If the bench has no spring, the fit gives the cart's mass and damping."""
+    """If a single cart has no spring, the fit gives the cart's mass and damping."""
     cart = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.zeros(2))
 
     got = fit_bode(exact(cart), bench=Bench(springs=(False, False)))
@@ -414,7 +414,7 @@ def test_few_points_are_refused():
     ],
 )
 def test_impossible_responses_are_refused(change, message):
-    """A response with an infinite value, a negative frequency or a missing cart is an error.
+    """Infinite values, negative frequencies and numbers of carts that do not exist are errors.
 
     The error names the cause.
     """

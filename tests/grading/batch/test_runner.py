@@ -270,7 +270,10 @@ HOSTILE = {
 
 
 def test_hostile_submissions_are_rows(tmp_path):
-    """Every hostile submission gets a row with a printable reason, and writes no file outside."""
+    """Every hostile submission gets a row with a printable reason.
+
+    It writes no file outside the scratch folder.
+    """
     for name, text in HOSTILE.items():
         folder = tmp_path / "class" / name.replace("/", "_")
         folder.mkdir(parents=True)

@@ -25,7 +25,7 @@ TRACES = ("zebra", "s-zebra", "31.41592", "quagga")  # id, name, a reported numb
 def _fill(place: str, *, folder: Path | None = None) -> None:
     """Grade two teams that share a recording, and use every table of the gradebook.
 
-    One team asks a question, gets points by hand and is marked.
+    One team asks a question, gets points by hand and is marked as reviewed.
     """
     with RequestBook(place, create=True, assignment="lab") as book:
         gone = make_grade(GONE, share=0.5)

@@ -303,7 +303,7 @@ def test_an_override_that_makes_no_sense_is_refused(open_book, arguments, why, m
 
 
 def test_a_team_is_found_by_its_members(open_book):
-    """An author's name finds the team, unless the author is in several submissions."""
+    """A team can be named by one of its authors, unless the author is in several submissions."""
     book = open_book()
     finish(
         book,

@@ -185,7 +185,7 @@ def test_unpacked_canvas_archives_are_not_taken_for_one_student(tmp_path):
 
 
 def test_a_folder_keeps_its_name_whatever_platform_it_looks_like(tmp_path):
-    """A team's folder keeps its name, even if it looks like the name of a Canvas file."""
+    """A team's folder keeps its name, even if the name looks like that of a file from Canvas."""
     names = ("throne_2026_03_alpha", "throne_2026_03_beta", "sec_01_02_x", "ME405_03_07_team")
     tree(tmp_path / "c", {f"{name}/submission.toml": TOML for name in names})
     found = hand_ins(tmp_path, tmp_path / "c")

@@ -290,9 +290,9 @@ def test_gradescope_gets_a_result_for_each_submission(tmp_path):
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 @pytest.mark.parametrize("author", ["s-team-1", " S-Team-1"])
 def test_who_is_in_two_submissions_has_no_points_until_somebody_decides(tmp_path, platform, author):
-    """An author of two submissions with different points gets none until one is removed.
+    """If an author's two submissions have different points, the author's cell stays empty.
 
-    A message names both submissions.
+    A message names both submissions; the instructor removes the wrong one.
     """
     other = make_outcome(make_grade("team-9", share=0.25, authors=(author,)))
     rows, remarks = write(tmp_path, HALF, other, platform=platform)
@@ -304,7 +304,7 @@ def test_who_is_in_two_submissions_has_no_points_until_somebody_decides(tmp_path
 
 
 def test_two_submissions_with_the_same_points_leave_nothing_to_decide(tmp_path):
-    """An author of two submissions with the same points gets these points."""
+    """If an author's two submissions have the same points, the author gets these points."""
     other = make_outcome(make_grade("team-9", share=0.5, authors=("s-team-1",)))
     rows, remarks = write(tmp_path, HALF, other, platform="canvas")
     assert (canvas_import(rows), remarks) == ({RUBRIC.title: {"1024": "10"}}, ())
@@ -344,8 +344,8 @@ def test_the_number_of_who_handed_in_decides_nothing(tmp_path):
 def test_an_author_whose_points_another_account_got_is_named(tmp_path, own):
     """If an author's points go to the uploader's row, a message names the author.
 
-    The uploader's number counts before the authors' ids. With an ungraded submission of their
-    `own`, the author is in two submissions.
+    The uploader's number counts before the authors' ids. If `own` is true, the author also has an
+    ungraded submission and so is in two submissions.
     """
     roster = 'Student,ID,SIS User ID,Section,Lab 3\n"Doe, Jane",1001,s1,A,\n"Roe, Jo",1002,s2,A,\n'
     broken = failed_grade("a", "no TOML").model_copy(update={"authors": ("s1",)})

@@ -28,7 +28,7 @@ def at(value: float, *, std: float = 0.0) -> Reference:
     [("0.10", "0.005"), ("29", "0.5"), ("2.90e1", "0.05"), ("-3.5", "0.05"), ("0", "0.5")],
 )
 def test_half_a_digit_is_that_of_the_typed_number(typed, half):
-    """Half a digit is half a unit of the last typed digit: 0.005 for 0.10 and 0.5 for 29."""
+    """The rounding of a typed number is half of its last digit: 0.005 for 0.10, 0.5 for 29."""
     assert half_digit(Decimal(typed)) == Fraction(half)
 
 

@@ -82,9 +82,9 @@ def test_a_change_begins_again_with_which(in_hertz):
 
 
 def test_json_is_the_line_that_is_added(in_hertz):
-    """The line that `--json` prints is the line added to the file; it follows the schema.
+    """`--json` prints the same line that is added to the file of answers.
 
-    It contains no time.
+    The line follows the schema and contains no time.
     """
     schema = json.loads((ROOT / "docs" / "check.schema.json").read_text(encoding="utf-8"))
     lines = [check(in_hertz, "--json").stdout for _ in range(3)]
@@ -174,7 +174,7 @@ def test_the_grade_tells_how_often_it_was_asked(in_hertz, tmp_path):
 
 
 def test_what_students_see_is_report_or_check(honest, tmp_path):
-    """If `see` has an unknown value, in rubric or submission, one line gives the allowed values."""
+    """If the key `see` of a rubric or submission is wrong, one line gives the allowed values."""
     rubric = tmp_path / "lab.toml"
     text = RUBRIC.read_text(encoding="utf-8")
     rubric.write_text(text + '\n[students]\nsee = "chekc"\n', encoding="utf-8")

@@ -29,7 +29,7 @@ def recordings(tmp_path_factory) -> list[bytes]:
 
 
 def told(folder: Path, recordings, *, anonymous: bool = False) -> list[Double]:
-    """Write a class in which Eve submits Bob's recordings under both their ids."""
+    """Write a class in which Eve submits Bob's recordings and names Bob and herself as authors."""
     teams = {"team-1": ("bob",), "team-2": ("carl",), "team-9": ("eve", "Bob ")}
     prints = {"team-1": recordings[0], "team-2": recordings[1], "team-9": recordings[0]}
     outcomes = [
