@@ -54,7 +54,10 @@ NUMBER = st.from_regex(r"-?(0|[1-9][0-9]{0,5})(\.[0-9]{1,8})?", fullmatch=True)
 
 @given(NUMBER, NUMBER, st.text(st.characters(exclude_categories=["C", "Z"]), max_size=20))
 def test_what_was_typed_stands_in_the_file(initial, final, title):
-    """Digits as typed, also if the table must be made first; every other line is as it was."""
+    """Numbers are written with the digits typed, and every other line stays as it was.
+
+    If the table is missing, it is added first.
+    """
     values = {"title": title, "reported.initial.K_1": initial, "reported.final.K_1": final}
     new = changed(WHOLE, **values)
     after = tomllib.loads(new, parse_float=Decimal)

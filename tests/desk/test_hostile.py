@@ -63,11 +63,17 @@ def _quoted(name: str) -> str:
 
 
 def test_hostile_uploads_reach_nothing(tmp_path):
-    """A sample of hostile and spoilt uploads changes nothing outside and runs nothing."""
+    """A sample of hostile and spoilt uploads changes nothing outside its folder.
+
+    No code in them is run.
+    """
     assert visit(tmp_path, every=12, drawn=6, seed=1) >= 50
 
 
 @pytest.mark.slow
 def test_two_hundred_hostile_uploads_reach_nothing(tmp_path):
-    """All hostile and many spoilt uploads change nothing outside their folder and run nothing."""
+    """All hostile and many spoilt uploads change nothing outside their folder.
+
+    No code in them is run.
+    """
     assert visit(tmp_path, every=1, drawn=100, seed=2) >= 200

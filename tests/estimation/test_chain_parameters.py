@@ -33,7 +33,7 @@ def chains(draw: st.DrawFn) -> Chain:
 
 @given(chain=chains())
 def test_pack_and_unpack_are_inverse(chain):
-    """A chain survives the way to theta and back, to the rounding of log and exp."""
+    """A chain converted to the fit's vector and back is the same up to rounding."""
     P = Parametrisation(bench=Bench(springs=(True,) * (chain.n + 1)))
 
     back = P.unpack(P.pack(chain))
@@ -155,7 +155,7 @@ def test_a_start_is_a_possible_chain():
 @settings(max_examples=20)
 @given(n=st.integers(1, 4), gain=st.floats(0.1, 1e4), omega=st.floats(0.5, 300.0))
 def test_an_even_chain_has_the_gain_it_is_asked_for(n, gain, omega):
-    """The stand-in has cart 1's gain, and the given lowest mode."""
+    """The chain of equal carts has the given gain of cart 1 and the given lowest frequency."""
     got = even_chain({"K_1": gain, "omega_a": omega}, bench=Bench(springs=(True,) * (n + 1)))
 
     values = got.parameters()

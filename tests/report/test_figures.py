@@ -199,7 +199,10 @@ def test_thinning_keeps_the_envelope(n, seed):
 
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6), st.integers(2, 9))
 def test_ticks_are_round_numbers_inside_the_axis(low, span, most):
-    """At least two ticks, evenly spaced by 1, 2 or 5 times a power of ten, none outside."""
+    """An axis has at least two ticks, evenly spaced by 1, 2 or 5 times a power of ten.
+
+    No tick is outside the axis.
+    """
     high = low + span
     assume(span > 1e-9 * abs(low))
     ticks = linear_ticks(low, high, most=most)

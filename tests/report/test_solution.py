@@ -186,7 +186,7 @@ def test_the_redundancies_are_as_many_as_the_checks():
 
 @given(chains())
 def test_numbers_put_in_step_by_step_end_in_the_state_model(chain):
-    """Computed from the named parameters, the entries equal those of the chain's matrices."""
+    """A and B computed step by step from the named parameters equal the chain's matrices."""
     values = work_state_model(chain)
     n = chain.n
     A, B, _, _ = chain.state_space()
@@ -374,7 +374,7 @@ def test_another_rubric_has_other_bounds(tmp_path):
 @given(chains(min_carts=2, max_carts=3), st.integers(0, 2**32 - 1))
 @settings(max_examples=20)
 def test_entry_tolerances_cover_tables_that_are_off_as_accepted(chain, seed):
-    """A table off by a third of its tolerances, at random, keeps most entries within theirs."""
+    """If a table is off by a third of its tolerances, most entries of A and B are within theirs."""
     rng = np.random.default_rng(seed)
     table = derivation.given(chain)
     tolerances = {name: 1e-3 * value for name, value in table.items()}

@@ -89,7 +89,7 @@ def chains(draw: st.DrawFn) -> Chain:
 @settings(max_examples=25, deadline=None)
 @given(chain=chains())
 def test_any_bench_is_found(chain):
-    """Error-free magnitudes of random benches, without a start, give them back."""
+    """From exact magnitudes of a random bench, the fit finds the bench without a start value."""
     omega = 2 * np.pi * np.geomspace(0.5, 10.0, 40)
 
     got = fit_bode(exact(chain, omega), bench=Bench(springs=(True,) * (chain.n + 1)))

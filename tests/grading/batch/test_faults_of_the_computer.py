@@ -27,7 +27,7 @@ _MEMBER = 3_000_000  # length in bytes of a file that compresses to a tenth
 
 @pytest.fixture(scope="module")
 def teams(tmp_path_factory) -> Path:
-    """Return two teams that share a step recording; each zip is small, its content large."""
+    """Return two teams that share a step recording; as zip files they are small."""
     folder = tmp_path_factory.mktemp("teams")
     for number in (0, 2):
         write_submission(

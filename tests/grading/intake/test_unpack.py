@@ -159,7 +159,7 @@ def test_names_are_read_as_they_were_meant(tmp_path):
 
 @given(st.binary(max_size=400), st.integers(0, 300), st.binary(max_size=8))
 def test_any_bytes_are_unpacked_or_refused(tmp_path_factory, junk, at, patch):
-    """A broken archive ends in the error meant for the student, never in another."""
+    """Whatever its bytes are, an archive is unpacked or refused with an error for the student."""
     folder = tmp_path_factory.mktemp("zip")
     good = zipped(folder / "good.zip", {"a/b.txt": "hello" * 20, "c.txt": "x"}).read_bytes()
     for number, raw in enumerate((junk, good[:at] + patch + good[at + len(patch) :], good[:-at])):

@@ -57,7 +57,7 @@ def test_one_digit_excuses_no_more_than_two():
 @settings(max_examples=20)  # the rounding box of three carts has 2^15 corners
 @given(data=st.data())
 def test_a_rounded_table_of_a_real_chain_obeys_every_law(n, data):
-    """A real chain's table lies in its rounding box, however few digits are typed."""
+    """A rounded table of a real chain obeys every law, however few digits it has."""
     sizes = st.floats(0.5, 2.0)
     digits = data.draw(st.integers(2, 5))
     chain = Chain(

@@ -72,7 +72,7 @@ def _changes(draw, rubric: Rubric) -> Rubric:
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
 def test_points_are_those_of_grading_again(carts, data):
-    """For any points, tolerances, costs, lateness and step: every criterion, and the total."""
+    """Under any changed rubric, stored findings give the same points as grading again."""
     team, before = _erring(carts), _graded(carts)
     now = data.draw(_changes(team.rubric))
     kept = read_findings(findings_text(before.verdicts))

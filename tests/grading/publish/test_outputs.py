@@ -386,7 +386,10 @@ _VALUES = (
 @settings(max_examples=40)
 @given(st.dictionaries(st.text(max_size=8), _VALUES, max_size=4))
 def test_any_numbers_can_be_shown(values):
-    """Infinite, missing, text or nested: the page is written, without control characters."""
+    """Any numbers of a criterion give a page without control characters.
+
+    They may be infinite, missing, texts or nested.
+    """
     grade = make_grade("team-1", share=0.5)
     found = dict(reversed(values.items()))
     first = grade.criteria[0].model_copy(update={"expected": values, "found": found})

@@ -70,7 +70,7 @@ READERS = {
 @settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(table=_TABLE, separator=st.sampled_from(",;\t"), tail=st.binary(max_size=4))
 def test_a_hostile_table_is_read_or_refused(tmp_path, reader, table, separator, tail):
-    """With one clear line, whatever the content."""
+    """Whatever its content, a table is read or refused with one clear line."""
     head, rows = table
     buffer = io.StringIO(newline="")
     csv.writer(buffer, delimiter=separator, escapechar="\\").writerows([head, *rows])

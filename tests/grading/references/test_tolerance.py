@@ -34,9 +34,9 @@ def test_half_a_digit_is_that_of_the_typed_number(typed, half):
 
 @given(full=percents, width=percents)
 def test_the_edges_belong_to_the_tolerance(full, width):
-    """At exactly `full` all points are earned.
+    """An error of exactly `full` earns all points, and one of exactly `none` earns no points.
 
-    At exactly `none` no points, unless they are equal.
+    If both limits are equal, that error earns all points.
     """
     none = float(Decimal(str(full)) + Decimal(str(width)))
     assert credit(Fraction(str(full)), full=full, none=none) == 1
@@ -47,7 +47,7 @@ def test_the_edges_belong_to_the_tolerance(full, width):
 
 @given(first=st.fractions(0, 500), second=st.fractions(0, 500), full=percents, width=percents)
 def test_credit_never_rises_with_the_error(first, second, full, width):
-    """The larger of two errors never earns more, and every credit is between none and all."""
+    """A larger error never earns more than a smaller one, and any credit is between 0 and 1."""
     none = full + width
     small, large = sorted((first, second))
     assert 1 >= credit(small, full=full, none=none) >= credit(large, full=full, none=none) >= 0
@@ -59,7 +59,7 @@ def test_credit_never_rises_with_the_error(first, second, full, width):
     sign=st.sampled_from([-1, 1]),
 )
 def test_the_error_grows_with_the_distance(value, steps, sign):
-    """Further from the reference on one side is never a smaller error."""
+    """On one side of the reference, a number further from it never has a smaller error."""
     near, far = sorted(steps)
     typed = [Decimal(round(value, 4)).quantize(Decimal("0.0001")) for _ in range(2)]
     errors = [
