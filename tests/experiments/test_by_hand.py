@@ -1,4 +1,4 @@
-"""A recording described by a few numbers, as a person would."""
+"""A recording that a person adds to the plan by a few numbers."""
 
 import pytest
 
@@ -11,7 +11,7 @@ from tests.helpers.acquisitions import sine, write_work
 
 @pytest.fixture
 def work(tmp_path):
-    """A folder of two carts with a planned dwell, 0.5 V and 2.5 cm at most."""
+    """A folder of two carts with one planned dwell, limited to 0.5 V and 2.5 cm."""
     return write_work(tmp_path / "work", [sine("sine-1", seconds=5, settle=7.0)])
 
 
@@ -29,7 +29,7 @@ def work(tmp_path):
     ],
 )
 def test_what_is_wanted_stands_in_the_plan_after_what_is_there(work, kind, numbers, expected):
-    """For each kind, with an id of its own and the common settings of the plan."""
+    """A recording of any kind is added after those in the plan, with a new id and its settings."""
     submission = load_submission(work)
     plan = load_plan(submission)
     wanted = make_recording(
@@ -61,7 +61,7 @@ def test_what_is_wanted_stands_in_the_plan_after_what_is_there(work, kind, numbe
     ],
 )
 def test_a_number_outside_the_limits_is_refused_by_name(work, kind, numbers, words):
-    """The message has the allowed range; nothing is written."""
+    """A number outside the limits is refused with the allowed range, and nothing is written."""
     submission = load_submission(work)
     plan = load_plan(submission)
     given = {"seconds": 20.0, **numbers}
@@ -74,7 +74,7 @@ def test_a_number_outside_the_limits_is_refused_by_name(work, kind, numbers, wor
     ("seconds", "frequency", "cycles"), [(100.0, 0.07, 7), (101.0, 0.07, 8), (120.0, 0.07, 8)]
 )
 def test_whole_periods_last_as_long_as_typed(work, seconds, frequency, cycles):
-    """100 s at 0.07 Hz are 7 periods, in floating point 7.000000000000001; the limit is 120 s."""
+    """100 s at 0.07 Hz become exactly 7 periods, and the limit of 120 s is not exceeded."""
     submission = load_submission(work)
     made = make_recording(
         WantedRecording(kind="sine", seconds=seconds, amplitude=0.1, frequency=frequency),
@@ -85,7 +85,7 @@ def test_whole_periods_last_as_long_as_typed(work, seconds, frequency, cycles):
 
 
 def test_what_others_added_meanwhile_stays(work):
-    """A person may have considered the plan for minutes while others added to it."""
+    """Recordings that others added to the plan meanwhile are kept."""
     old = load_plan(load_submission(work))
     theirs = add_recording(work, sine("theirs", seconds=5))
     new = [sine(name, seconds=4) for name in ("sine-1", "theirs")]

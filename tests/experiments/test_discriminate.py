@@ -1,4 +1,4 @@
-"""The recording that distinguishes two explanations: where they differ most after fitting."""
+"""The proposed recording shows which of several explanations is right."""
 
 import json
 import shutil
@@ -59,7 +59,7 @@ STIFF = model("cubic_spring", place=2, coefficient=0.02)
 
 
 def disputed(*models: AugmentedChain) -> Gap:
-    """A gap that these models explain equally well."""
+    """Return a gap that all of these models explain equally well."""
     t = np.arange(0.0, 4.0, 0.01)
     y = simulate_augmented(models[0], t, np.full(t.size, 0.03))
     traces = tuple(
@@ -97,9 +97,9 @@ def proposed() -> Gap:
 
 
 def test_what_is_proposed_keeps_the_limits_and_sets_them_apart(proposed):
-    """In it the two laws of friction differ by many times the noise.
+    """The proposed recording separates the two laws of friction and stays within the limits.
 
-    Nothing passes the travel limit.
+    The laws differ by more than three times the noise, and no cart passes the travel limit.
     """
     found = proposed.proposal
     assert found is not None
@@ -113,7 +113,7 @@ def test_what_is_proposed_keeps_the_limits_and_sets_them_apart(proposed):
 
 
 def test_what_the_parameters_can_take_up_is_no_difference():
-    """A model against itself with other parameters: almost nothing of the difference remains."""
+    """A difference between explanations that a fit of the parameters removes does not count."""
     heavier = replace(DRY, chain=replace(CHAIN, m=CHAIN.m * 1.002, k=CHAIN.k * 0.999))
     gap = with_proposal(disputed(DRY, heavier), limits=LIMITS)
     other = with_proposal(disputed(DRY, DRAG), limits=LIMITS)
@@ -122,14 +122,14 @@ def test_what_the_parameters_can_take_up_is_no_difference():
     J = np.random.default_rng(0).standard_normal((3, 2, 50))
     difference = J[0].ravel() * 2 - J[2].ravel()
     assert _left(difference, J, np.full(2, np.inf)) == pytest.approx(0.0, abs=1e-20)
-    # Changing a parameter that the records determine costs its change over its error, squared.
+    # Changing a parameter that the records determine costs (change / standard error)².
     known = np.array([1e-6, np.inf])
     assert _left(difference, J, known) == pytest.approx(_left(2 * J[0].ravel(), J[1:], known[1:]))
     assert _left(difference, J, np.array([1e3, np.inf])) == pytest.approx((2 / 1e3) ** 2, rel=1e-3)
 
 
 def test_what_is_held_elsewhere_starts_there():
-    """A constant force only shifts the carts: another force or spring causes no transient."""
+    """Under a constant force the carts start at rest where it holds them, without a transient."""
     pushed = model("force_offset", place=1, force=0.004)
     recording = Recording(
         id="quiet", kind="step", carts=(1, 2), wave="square", amplitude=0.1, frequency=0.2, cycles=1
@@ -142,7 +142,7 @@ def test_what_is_held_elsewhere_starts_there():
 
 
 def test_another_dispute_gets_another_recording(proposed):
-    """Three explanations count by pairs; without a dispute nothing is proposed."""
+    """Three explanations are compared in pairs, and one explanation alone gives no proposal."""
     three = with_proposal(disputed(DRY, DRAG, STIFF), limits=LIMITS).proposal
     assert three is not None
     assert three.prediction is not None
@@ -151,7 +151,7 @@ def test_another_dispute_gets_another_recording(proposed):
 
 
 def test_a_hopeless_contender_decides_nothing():
-    """An explanation far behind the best has no say; the reported pair is the one that decides."""
+    """An explanation of almost no weight does not influence which recording is proposed."""
     gap = disputed(DRY, DRAG, STIFF)
     hopeless = replace(gap.contenders[2], weight=1e-12)
     two = with_proposal(replace(gap, contenders=(*gap.contenders[:2], hopeless)), limits=LIMITS)
@@ -175,7 +175,7 @@ def test_a_hopeless_contender_decides_nothing():
 
 
 def test_what_is_settled_has_little_say():
-    """With two nearly settled pairs and an open one, the recording is for the open one."""
+    """If two pairs of explanations are nearly decided, the recording serves the open pair."""
     late, lagged = (
         model("input_delay", place=0, delay=2e-3),
         model("actuator_lag", place=0, time_constant=2e-3),
@@ -190,7 +190,7 @@ def test_what_is_settled_has_little_say():
 
 
 def test_of_those_that_settle_a_pair_the_best_is_proposed(proposed):
-    """No other candidate separates the two further."""
+    """Of all candidates, the proposed recording separates the two explanations most."""
     assert proposed.proposal is not None
     known = np.full(6, np.inf)
     sigma = np.full(2, proposed.noise_floor * 0.1)
@@ -207,7 +207,7 @@ def test_of_those_that_settle_a_pair_the_best_is_proposed(proposed):
 
 
 def test_what_would_not_settle_it_is_recorded_for_longer(proposed):
-    """A lag and a delay of a tenth of a millisecond differ too little in twelve seconds."""
+    """If twelve seconds cannot separate a lag from a delay of 0.1 ms, a longer run is proposed."""
     late, lagged = (
         model("input_delay", place=0, delay=1e-4),
         model("actuator_lag", place=0, time_constant=1e-4),
@@ -223,7 +223,7 @@ def test_what_would_not_settle_it_is_recorded_for_longer(proposed):
 
 
 def test_what_acts_on_the_input_alone_shows_in_no_decay():
-    """A lag and a delay differ only where there is an input, whatever else bounces."""
+    """Explanations that differ only in their response to the input are not separated by a decay."""
     late, lagged = (
         model("input_delay", place=0, delay=2e-3),
         model("actuator_lag", place=0, time_constant=3e-3),
@@ -239,7 +239,7 @@ def test_what_acts_on_the_input_alone_shows_in_no_decay():
 
 
 def test_a_release_says_how_far_out_and_is_drawn_from_there():
-    """Each height is weighed by itself, and is stored in the entry."""
+    """Each release height is a candidate of its own, and the entry in the plan states it."""
     heights = set()
     for recording, height in _candidates(CHAIN, LIMITS):
         assert (height > 0) == (recording.kind == "decay")
@@ -258,7 +258,7 @@ def test_a_release_says_how_far_out_and_is_drawn_from_there():
 
 @pytest.fixture
 def swept(tmp_path) -> Callable[[list[str]], Callable[..., Gap]]:
-    """Return a function that makes a sweep of one cart with hidden effects and its search."""
+    """Return a function that makes a sweep of one cart with hidden effects, and its search."""
     folder = tmp_path / "work"
 
     def sweep(hide: list[str]) -> Callable[..., Gap]:
@@ -284,7 +284,7 @@ def swept(tmp_path) -> Callable[[list[str]], Callable[..., Gap]]:
 @pytest.mark.slow
 @pytest.mark.sample
 def test_an_effect_that_the_held_out_end_does_not_show_is_found_all_the_same(swept):
-    """The end of a sweep, far beyond the resonance, says nothing for or against a spring."""
+    """A slack spring is found even if the held-out end of the sweep does not show it."""
     slack = "slack_spring:spring=1,stiffness_change=0.0065,stretch=-0.55"
     gap = swept(["input_delay:delay=0.00167", slack])()
     found = {one.effect.key for one in gap.effects}
@@ -295,7 +295,7 @@ def test_an_effect_that_the_held_out_end_does_not_show_is_found_all_the_same(swe
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_fast_sweep_tells_a_lag_from_a_delay(swept):
-    """Beside a cubic spring they are in dispute until the cart is driven beyond its resonance."""
+    """Lag and delay are in dispute until a sweep drives the cart far above its resonance."""
     hide = ["actuator_lag:time_constant=0.0028", "cubic_spring:coefficient=0.00016"]
     look = swept(hide)
     gap = look()
@@ -309,7 +309,7 @@ def test_a_fast_sweep_tells_a_lag_from_a_delay(swept):
 
 
 def shipped(folder: Path) -> Submission:
-    """The shipped two carts in a new folder, with a plan of these limits."""
+    """Return the shipped two carts in a new folder, with a plan of these limits."""
     shutil.copytree(EXAMPLES / "two-cart", folder, dirs_exist_ok=True)
     submission = load_submission(folder)
     save_plan(Plan(limits=LIMITS), submission)
@@ -338,7 +338,7 @@ def write_gap(gap: Gap, submission: Submission, **other: object) -> str:
     ],
 )
 def test_a_proposal_of_other_data_or_limits_is_refused(proposed, tmp_path, other):
-    """The same for a broken gap.json: one line, exit 2, and the plan stays as it was."""
+    """A proposal for other data or limits, or a broken gap.json, is refused and not planned."""
     submission = shipped(tmp_path)
     write_gap(proposed, submission, **other)
     before = (tmp_path / "plan.toml").read_bytes()
@@ -350,7 +350,7 @@ def test_a_proposal_of_other_data_or_limits_is_refused(proposed, tmp_path, other
 
 
 def test_nothing_is_added_that_would_break_the_plan(proposed, tmp_path):
-    """A recording that passes a limit, or frees a missing cart, is not written."""
+    """A recording that passes a limit, or frees a cart that is not there, is not written."""
     submission = shipped(tmp_path)
     plan = load_plan(submission)
     entry = Recording.model_validate_json(json.dumps(proposed.proposal.recording))
@@ -364,7 +364,7 @@ def test_nothing_is_added_that_would_break_the_plan(proposed, tmp_path):
 
 
 def test_a_spoilt_plan_costs_the_proposal_only(tmp_path):
-    """The gap stays as it is, and a note says why nothing is proposed."""
+    """If the plan is broken, the gap is unchanged, and a note says why nothing is proposed."""
     submission = shipped(tmp_path)
     assert propose_for(disputed(DRY, DRAG), submission).proposal is not None
     (tmp_path / "plan.toml").write_text("version = [", encoding="utf-8")
@@ -374,7 +374,7 @@ def test_a_spoilt_plan_costs_the_proposal_only(tmp_path):
 
 
 def test_the_recording_is_a_plan_entry_that_can_be_recorded(proposed, tmp_path):
-    """From gap.json to plan.toml, once, however often it is requested; the page draws it."""
+    """The proposal in gap.json is added to plan.toml once, however often it is requested."""
     analysis = two_cart_analysis()
     submission = shipped(tmp_path)
     with pytest.raises(DataError, match="run `cartlab gap"):

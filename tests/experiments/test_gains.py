@@ -1,4 +1,4 @@
-"""Gains in counts do on a bench what they do in the submission's units, or are refused."""
+"""Gains in counts act on a bench as in the submission's units, or are refused."""
 
 from dataclasses import replace
 
@@ -48,7 +48,7 @@ SECONDS = 2.0
 
 @pytest.fixture(scope="module", params=["one-cart", "two-cart"])
 def identified(request) -> tuple[Submission, Analysis]:
-    """A shipped example with the carts identified from its decays, steps and sweep."""
+    """A shipped example with the carts identified from decays, steps and sweep."""
     submission = load_submission(EXAMPLES / request.param)
     kept = tuple(e for e in submission.experiments if e.kind in ("decay", "step", "sweep"))
     submission = submission.model_copy(update={"experiments": kept})
@@ -90,7 +90,7 @@ def state_gains_of(identified, loop) -> StateGains:
 
 
 def on_the_bench(chain: Chain | None, gains, *, encoder: int) -> tuple[Array, Array]:
-    """Drive the chain with the bench's own controller.
+    """Run the chain under the bench's own controller.
 
     Return positions (n_carts, n), inputs (n,).
     """
@@ -126,7 +126,7 @@ def simulated(chain: Chain | None, law, *, delay: int) -> tuple[Array, Array]:
 
 
 def test_the_designed_loop_runs_on_the_bench_as_simulated(identified):
-    """With counts in and duty out, the carts move as with the same gains in V and cm."""
+    """With gains in counts and duty, the carts move as with the design's gains in V and cm."""
     _, analysis = identified
     design, chain = design_of(analysis), analysis.chain
     gains = state_gains_of(identified, StateLoop(cart=analysis.bench.n))
@@ -136,8 +136,8 @@ def test_the_designed_loop_runs_on_the_bench_as_simulated(identified):
 
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter)
     expected_x, expected_u = simulated(chain, law, delay=1)
-    # Whole duty counts are off by half a count each, 0.06 mV at up to 29 cm/V. That may make an
-    # encoder flicker one tick earlier, which the velocity gain turns into a pulse of a tick.
+    # Whole duty counts are off by half a count each: 0.06 mV at up to 29 cm/V. An encoder may then
+    # change one tick earlier, which the velocity gain makes a pulse of one tick.
     assert_allclose(x, expected_x, atol=2 * COUNT)
     velocity_gain = np.abs(gains.gains[1::2]).max()
     assert_allclose(u, expected_u, atol=DUTY * (2 + velocity_gain * 2 / BENCH.period))
@@ -146,7 +146,7 @@ def test_the_designed_loop_runs_on_the_bench_as_simulated(identified):
 
 
 def test_a_pid_is_sent_as_typed_and_runs_as_simulated(identified):
-    """Duty counts per count: 0.05 is 2.7 mV/cm here; the model in V and cm agrees."""
+    """PID gains typed in duty counts per count act as the converted gains in V and cm."""
     _, analysis = identified
     loop = PidLoop(kp=0.05, ki=0.1, kd=0.005)
     gains = gains_of(identified, loop)
@@ -160,7 +160,7 @@ def test_a_pid_is_sent_as_typed_and_runs_as_simulated(identified):
 
 
 def test_the_submission_records_what_ran(identified):
-    """The table has the design again, in V and cm; a PID comes with the volts of a count."""
+    """After a run `submission.toml` has the controller that ran, in V and cm."""
     submission, analysis = identified
     scales = bench_scales(submission, bench=BENCH, analysis=analysis)
     assert scales == CountScales(input=DUTY, position=COUNT)
@@ -176,7 +176,7 @@ def test_the_submission_records_what_ran(identified):
 
 
 def test_an_input_that_pushes_the_other_way_turns_the_gains_round(identified):
-    """The design assumes a positive push; if the records show the opposite, duties change sign."""
+    """If positive duty pushes the carts backwards, the gains that are sent change their sign."""
     submission, analysis = identified
     turned = tuple(replace(r, input_scale=-r.input_scale) for r in analysis.records)
     reversed_ = replace(analysis, records=turned)
@@ -190,7 +190,7 @@ def test_an_input_that_pushes_the_other_way_turns_the_gains_round(identified):
 
 
 def test_what_the_submission_states_wins_over_what_the_bench_says(identified):
-    """`per_count` of the submission scales its records, and therefore its gains."""
+    """If the submission states `per_count`, the gains are scaled by it, not by the bench's."""
     submission, analysis = identified
     stated = submission.system.input.model_copy(update={"per_count": 2 * DUTY})
     system = submission.system.model_copy(update={"input": stated})
@@ -212,17 +212,17 @@ def test_what_the_submission_states_wins_over_what_the_bench_says(identified):
     ],
 )
 def test_a_loop_that_would_do_harm_is_refused(loop, limits, amplitude, message):
-    """Unstable, past a limit, or not the designed one: one clear line, and nothing is sent."""
+    """A loop that is unstable, passes a limit or is not the designed one is refused."""
     submission = load_submission(EXAMPLES / "one-cart")
     kept = tuple(e for e in submission.experiments if e.kind in ("step", "sweep"))
     submission = submission.model_copy(update={"experiments": kept})
     with pytest.raises(DataError, match=message) as caught:
         gains_of((submission, analyse(submission)), loop, limits=limits, amplitude=amplitude)
-    assert "control: " not in str(caught.value)  # the name in the message
+    assert "control: " not in str(caught.value)  # the name that the message gives
 
 
 def test_a_slow_bench_that_misses_the_goal_is_refused(identified):
-    """At a tenth of the rate the delay ruins the design; the message says what to set."""
+    """At a tenth of the rate the delay spoils the design; the message says what to change."""
     submission, analysis = identified
     slow = replace(BENCH, period=0.05)
     with pytest.raises(DataError, match=r"set design.sample_time = 0\.05 in submission.toml"):
@@ -239,7 +239,7 @@ def test_a_slow_bench_that_misses_the_goal_is_refused(identified):
     ("kd", "stable"), [(-0.02, False), (-0.005, True), (0.0, True), (20.0, False)]
 )
 def test_a_pid_is_refused_where_it_swings_up(identified, kd, stable):
-    """A PID that is sent settles from a step within 40 s; one that is refused grows."""
+    """A PID that would swing up is refused; one that is sent settles within 40 s."""
     _, analysis = identified
     assert analysis.chain is not None
     loop = PidLoop(kp=0.02, kd=kd)
@@ -260,7 +260,7 @@ def test_a_pid_is_refused_where_it_swings_up(identified, kd, stable):
 
 @pytest.mark.parametrize("example", ["one-cart", "two-cart", "three-cart"])
 def test_a_proposed_pid_brings_cart_1_to_the_level(example):
-    """On its own carts: within 2 % of 1 cm after 5 s, and never above 1.1 cm."""
+    """On its own carts, the proposed PID brings cart 1 within 2 % of 1 cm in 5 s."""
     submission = load_submission(EXAMPLES / example)
     kept = tuple(e for e in submission.experiments if e.kind in ("step", "sweep"))
     submission = submission.model_copy(update={"experiments": kept})
@@ -288,7 +288,7 @@ def test_a_proposed_pid_brings_cart_1_to_the_level(example):
 
 
 def test_an_unstated_scale_is_asked_for(identified):
-    """Centimetres of the submission and counts of the bench need a scale."""
+    """If nobody states how centimetres and the bench's counts are related, that is asked."""
     submission, analysis = identified
     with pytest.raises(DataError, match=r"state system\.position\.per_count in cm"):
         bench_scales(submission, bench=replace(BENCH, position_unit="count"), analysis=analysis)

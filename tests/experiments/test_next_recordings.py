@@ -1,4 +1,4 @@
-"""The next experiment: the information in a record, the choice, the promise and its result."""
+"""The next experiment: the information in a record, the choice, and the predicted errors."""
 
 import itertools
 import json
@@ -79,7 +79,7 @@ def multisine(known: Knowledge, goal: Goal) -> Recording:
 
 
 def test_what_is_known_is_what_the_fit_says(known, analysis):
-    """H and S reproduce the fit's standard error of every named parameter."""
+    """H and S give the fit's own standard error of every named parameter."""
     half = known.by_parameters() @ np.linalg.inv(known.information[0])
     std = np.sqrt(np.diag(half @ known.information[1] @ half.T))
     fitted = [e.std / e.value for e in analysis.fit.parameters.values()]
@@ -88,9 +88,9 @@ def test_what_is_known_is_what_the_fit_says(known, analysis):
 
 @pytest.mark.slow
 def test_fit_reaches_the_predicted_errors(tmp_path):
-    """On the emulator's carts the later fit has the promised errors, and the truth lies within.
+    """On simulated carts the fit after the chosen experiments has the predicted errors.
 
-    A stated error is itself uncertain by some 20 %, and the worst of ten by more.
+    A standard error is itself uncertain by some 20 %, and the worst of ten by more.
     """
     bench = VirtualBench(prepare_bench(preset="throne-2dof", model=None, hide=[]), seed=3)
     n = bench.description.carts
@@ -99,7 +99,7 @@ def test_fit_reaches_the_predicted_errors(tmp_path):
     sweep = [r for r in plan.recordings if r.kind == "sweep"]
     bench.record(folder, sweep, limits=plan.limits)
     before = analyse(load_submission(folder))
-    alone = Plan(limits=plan.limits)  # the plan's open steps are not recorded here
+    alone = Plan(limits=plan.limits)  # the plan's own open steps are not recorded here
     chosen = choose_next(before, alone, n=1, goal="worst", commands=EXTENSIONS)
     recordings = renamed(chosen.recordings, taken=["sweep", "sweep-1"])
     bench.record(folder, recordings, limits=plan.limits)
@@ -115,7 +115,7 @@ def test_fit_reaches_the_predicted_errors(tmp_path):
 
 
 def test_steady_sines_tell_what_a_long_record_does(known):
-    """Twice the time gives twice the information, also in a long record."""
+    """A record of a steady sine that is twice as long has twice the information."""
     omega = known.chain.omega_carts
     once = known.of_lines(omega, amplitude=np.full(2, 0.05), seconds=10.0)
     twice = known.of_lines(omega, amplitude=np.full(2, 0.05), seconds=20.0)
@@ -145,7 +145,7 @@ def test_steady_sines_tell_what_a_long_record_does(known):
 
 @pytest.mark.parametrize("mean", ["largest", "root mean square", "volume"])
 def test_the_exchange_finds_the_best_of_all_sets(mean):
-    """It equals the best of all 220 choices of three among ten, for every criterion."""
+    """The exchange finds the best of all 220 choices of three among ten, for every criterion."""
     rng = np.random.default_rng(5)
     J = rng.standard_normal((10, 3, 4))
     H = np.einsum("cjp,cjq->cpq", J, J)
@@ -158,7 +158,7 @@ def test_the_exchange_finds_the_best_of_all_sets(mean):
 
 
 def test_the_goals_are_errors_of_what_they_name(known, analysis):
-    """A parameter's goal is its standard error; the worst is the largest of them all."""
+    """The goal of a parameter is its relative error, and `worst` is the largest of all."""
     fitted = {name: e.std / e.value for name, e in analysis.fit.parameters.items()}
     for name in ("zeta_2", "K_1"):
         goal = find_goal(name, known, feedback=None)
@@ -173,7 +173,7 @@ def test_the_goals_are_errors_of_what_they_name(known, analysis):
 
 
 def test_the_design_goal_is_the_spread_of_the_peak(known, analysis):
-    """That many carts drawn from the covariance overshoot under the same controller."""
+    """The goal of the design is the spread of the overshoot over carts that the data allow."""
     feedback = analysis.feedback
     goal = find_goal("design", known, feedback=feedback)
     covariance = (
@@ -192,12 +192,12 @@ def test_the_design_goal_is_the_spread_of_the_peak(known, analysis):
             setup=LoopSetup(sample_time=feedback.sample_time),
         )
         peaks.append(loop.x[feedback.cart - 1].max() / feedback.reference)
-    # 300 draws determine a spread to 4 %; the rest is nonlinearity.
+    # 300 draws determine a spread to 4 %; nonlinearity explains the difference beyond that.
     assert np.std(peaks) / widened == pytest.approx(float(goal.of(known.information)), rel=0.2)
 
 
 def test_each_choice_serves_its_own_goal(analysis):
-    """A choice made for one parameter is at least as good for it as a choice for another."""
+    """A choice made for one parameter serves it at least as well as a choice for another."""
     plan = Plan(limits=LIMITS)
     left = {}
     for goal in ("K_1", "zeta_2"):
@@ -214,7 +214,7 @@ def test_each_choice_serves_its_own_goal(analysis):
 
 
 def test_no_choice_passes_a_limit(analysis):
-    """Simulated from rest on the identified carts, travel and input stay inside."""
+    """Simulated from rest on the identified carts, no choice passes a limit."""
     for commands in (frozenset(), frozenset("c"), COMMANDS):
         found = choose_next(analysis, Plan(limits=LIMITS), n=3, goal="mean", commands=commands)
         assert {r.wave for r in found.recordings} <= {"square", "chirp", "multisine"}
@@ -229,7 +229,7 @@ def test_no_choice_passes_a_limit(analysis):
 
 
 def test_what_somebody_proposes_is_weighed_beside_what_is_chosen(analysis, known):
-    """A user's alone, the program's alone; the latter equals the promise of `choose_next`."""
+    """A user's proposal is compared with the program's choice, each recorded alone."""
     mine = Recording(id="mine", kind="sweep", carts=(1, 2), wave="square", amplitude=0.02,
                      frequency=0.4, cycles=8)  # fmt: skip
     plan = Plan(limits=LIMITS)
@@ -244,7 +244,7 @@ def test_what_somebody_proposes_is_weighed_beside_what_is_chosen(analysis, known
 
 
 def test_a_proposal_that_makes_the_fit_worse_is_reported(analysis):
-    """Minutes of rest, whose rounding error does not average out, cost more than they give."""
+    """If a proposed recording would make the fit worse, the answer says so."""
     mine = Recording(id="mine", kind="step", carts=(1, 2), wave="square", amplitude=0.005,
                      frequency=2 / 120, cycles=4)  # fmt: skip
     found = weigh(analysis, mine, Plan(limits=LIMITS), goal="worst", commands=COMMANDS)
@@ -262,7 +262,7 @@ def test_a_proposal_that_makes_the_fit_worse_is_reported(analysis):
     ],
 )
 def test_a_useless_proposal_gets_a_reason(known, change, words):
-    """It is of a kind that the fit does not use, holds a cart, or goes too far."""
+    """If the fit cannot use a proposed recording, the answer says why."""
     mine = Recording(id="mine", kind="sweep", carts=(1, 2), wave="square", amplitude=0.02,
                      frequency=0.4, cycles=8)  # fmt: skip
     assert why_useless(mine, known, limits=LIMITS) == ""
@@ -270,7 +270,7 @@ def test_a_useless_proposal_gets_a_reason(known, change, words):
 
 
 def test_where_dwells_identify_dwells_are_chosen():
-    """The carts are then fitted to dwells alone, so another sweep would change nothing."""
+    """If carts are fitted to dwells alone, only dwells are chosen."""
     analysis = analysed("two-cart")
     found = choose_next(analysis, Plan(limits=LIMITS), n=2, goal="zeta_2", commands=COMMANDS)
     assert {r.kind for r in found.recordings} == {"sine"}
@@ -278,7 +278,7 @@ def test_where_dwells_identify_dwells_are_chosen():
 
 
 def test_a_new_dwell_lies_as_far_off_as_those_before():
-    """If friction puts every point off the carts, one more point is off as well."""
+    """If friction moves all dwells off the fitted curve, a new dwell counts with that error too."""
     known = Knowledge.of(analysed("two-cart"))
     dwell = Recording(
         id="sine-new", kind="sine", carts=(1, 2), wave="sine", amplitude=0.05, frequency=2.0,
@@ -291,7 +291,7 @@ def test_a_new_dwell_lies_as_far_off_as_those_before():
 
 
 def test_carts_that_hardly_settle_get_no_dwells():
-    """A slow transient would be taken for a steady state: a message says so, no dwell is chosen."""
+    """For carts that take too long to settle, no dwell is chosen, and a message says so."""
     known = Knowledge.of(analysed("two-cart"))
     slow = replace(known, chain=replace(known.chain, c=0.2 * known.chain.c))
     goal = find_goal("worst", slow, feedback=None)
@@ -300,7 +300,7 @@ def test_carts_that_hardly_settle_get_no_dwells():
 
 
 def test_a_predicted_error_below_calibration_is_reported(analysis):
-    """The worst parameter is named before and after, if it changes."""
+    """If the predicted error is below that of any calibration, the message says so."""
     found = choose_next(analysis, Plan(limits=LIMITS), n=1, goal="worst", commands=COMMANDS)
     assert (STATISTICAL in found.said) == (found.errors[-1] < CALIBRATION)
     assert (STATISTICAL in found.recordings[0].note) == (found.errors[-1] < CALIBRATION)
@@ -315,7 +315,7 @@ def test_a_predicted_error_below_calibration_is_reported(analysis):
 
 
 def test_clipped_phases_keep_the_swing_low():
-    """With twelve lines on three carts the motion peaks lower than for 500 random phases."""
+    """With clipped phases, twelve sines on three carts peak lower than with 500 random phases."""
     lines = np.arange(10, 70, 5)
     omega = np.asarray(2 * np.pi * 0.1 * lines, dtype=np.float64)
     G = PRESETS["throne-3dof"].frequency_response(omega)
@@ -331,7 +331,7 @@ def test_clipped_phases_keep_the_swing_low():
 
 
 def test_the_tones_of_a_multisine_peak_at_its_amplitude(known):
-    """Whatever the goal, the rounded shares add up to one."""
+    """The shares of a multisine's sines are scaled so that the input peaks at its amplitude."""
     for name in ("mean", "K_1"):
         recording = multisine(known, find_goal(name, known, feedback=None))
         h, share, phase = np.array(recording.tones).T[:, :, None]
@@ -340,7 +340,7 @@ def test_the_tones_of_a_multisine_peak_at_its_amplitude(known):
 
 
 def test_a_bench_adds_the_requested_tones():
-    """The sum of the tones last received; harmonic zero and a reset clear them."""
+    """A bench outputs the sum of the sines that it last received, until a reset."""
     core = ReferenceCore(Description(name="x", encoders=2, carts=2, commands=EXTENSIONS))
     tones = (Tone(harmonic=3, share=0.5, phase=0.25), Tone(harmonic=7, share=-0.25, phase=1.0))
     start = Start(wave=Wave.MULTISINE, frequency=2.0, amplitude=1000, cycles=2)
@@ -381,7 +381,7 @@ def work(tmp_path):
 
 
 def test_the_command_adds_what_it_chose_to_the_plan(work):
-    """The message, the plan and the JSON have the promise; a plan of choices gets no dwells."""
+    """The message, the plan and the JSON agree on the predicted errors of chosen recordings."""
     done = cartlab_here("plan", work, "--next", 2, "--for", "zeta", "--json")
     data = json.loads(done.stdout)
     assert data["next"]["errors"] == sorted(data["next"]["errors"], reverse=True)
@@ -396,15 +396,15 @@ def test_the_command_adds_what_it_chose_to_the_plan(work):
     again = json.loads(cartlab_here("plan", work, "--next", 1, "--for", "zeta", "--json").stdout)
     planned = again["next"]["planned"]
     assert set(planned) >= {r.id for r in chosen}
-    # The promise for the first of two is its benefit alone.
+    # The predicted error of the first chosen recording alone.
     assert planned[chosen[0].id] == pytest.approx(data["next"]["errors"][1], rel=1e-9)
-    # What is planned is not promised twice.
+    # What is planned already is counted in the next prediction.
     assert again["next"]["errors"][0] == pytest.approx(data["next"]["errors"][2], rel=1e-9)
     assert again["next"]["now"] == pytest.approx(data["next"]["now"], rel=1e-9)
 
 
 def test_what_is_written_is_counted(work):
-    """Including the recordings that every bench begins with, if there was no plan."""
+    """The message counts the recordings that were added, those of a new plan included."""
     done = cartlab_here("plan", work, "--next", 2, "--for", "zeta")
     usual = len(propose_plan(load_submission(work)).recordings)
     assert f"the {usual} recordings that every plan begins with, and 2 chosen ones" in done.stderr
@@ -415,7 +415,7 @@ def test_what_is_written_is_counted(work):
 
 
 def test_beside_a_misfit_the_errors_are_doubted(analysis, tmp_path):
-    """They count noise, so they are worthless where more than noise is left."""
+    """If the records show more than noise, a message doubts the predicted errors."""
     for chi_square, doubted in ((556.0, True), (1.0, False)):
         fit = replace(analysis.fit, chi_square_per_dof=chi_square)
         assert bool(_doubt(replace(analysis, fit=fit), tmp_path)) == doubted
@@ -423,7 +423,7 @@ def test_beside_a_misfit_the_errors_are_doubted(analysis, tmp_path):
 
 @pytest.mark.parametrize("words", [("--for", "zeta"), ("--next", 1, "--for", "omega_x")])
 def test_what_cannot_be_chosen_is_one_line(work, words, monkeypatch):
-    """A goal without a number, an unknown name: refused before the data are read."""
+    """A goal without a number, or an unknown goal, is refused before data are read."""
     monkeypatch.setattr("pipeline.experiments.next_recordings.analyse", None)
     done = cartlab_here("plan", work, *words)
     assert done.returncode == 2

@@ -1,4 +1,4 @@
-"""The plan proposed for a session at the bench, and its file."""
+"""The plan that is proposed for a session at the bench, and its file."""
 
 import json
 import sys
@@ -38,7 +38,7 @@ FIRST = ("decay", "step", "sweep")
 
 
 def bare(*, carts=2, springs=None, design=None, **system) -> Submission:
-    """A submission without any recording."""
+    """Return a submission without any recordings."""
     springs = (True,) * (carts + 1) if springs is None else springs
     system = System(
         carts=carts, springs=springs, **{"position": PositionScale(unit="cm"), **system}
@@ -47,7 +47,7 @@ def bare(*, carts=2, springs=None, design=None, **system) -> Submission:
 
 
 def recorded(example: str, *kinds: str) -> Submission:
-    """A shipped example with only some kinds of its runs."""
+    """Return a shipped example with only some kinds of its recordings."""
     submission = load_submission(EXAMPLES / example)
     kept = tuple(e for e in submission.experiments if e.kind in kinds)
     return submission.model_copy(update={"experiments": kept})
@@ -61,7 +61,7 @@ def of_kind(plan: Plan, kind: str) -> list[Recording]:
 
 
 def test_the_first_runs_are_those_a_bench_of_unknown_carts_allows():
-    """Each cart is released alone, then small steps to both sides and one sweep, all carts free."""
+    """For unknown carts the plan has decays of each cart alone, small steps and one sweep."""
     plan = propose_plan(bare(carts=3))
 
     runs = [(r.kind, r.carts, r.release) for r in plan.recordings]
@@ -73,7 +73,7 @@ def test_the_first_runs_are_those_a_bench_of_unknown_carts_allows():
 
 
 def test_a_cart_without_springs_is_not_let_go_and_untied_carts_are_not_pushed_aside():
-    """A cart that cannot swing is not released; free carts get no step, only the sweep."""
+    """A cart without springs is not released, and carts tied to no wall get no step."""
     plan = propose_plan(bare(carts=1, springs=(False, False)))
     assert [r.kind for r in plan.recordings] == ["sweep"]
     plan = propose_plan(bare(carts=2, springs=(False, True, False)))
@@ -81,7 +81,7 @@ def test_a_cart_without_springs_is_not_let_go_and_untied_carts_are_not_pushed_as
 
 
 def test_a_stock_bench_gets_no_command_it_does_not_know():
-    """Its sweep is a square wave, and after the dwells its own PID runs on cart 1."""
+    """A stock bench gets only its own commands: a square wave as sweep, and its PID on cart 1."""
     (sweep,) = of_kind(propose_plan(bare(), bench=STOCK), "sweep")
     assert (sweep.wave, sweep.frequency_end) == ("square", None)
     whole = recorded("two-cart", *FIRST, "sine")
@@ -96,7 +96,7 @@ def test_a_stock_bench_gets_no_command_it_does_not_know():
 
 
 def test_what_is_recorded_is_not_proposed():
-    """A submission with decays, steps and sweep needs nothing of the first stage."""
+    """If decays, steps and sweep are recorded, the plan does not propose them again."""
     assert propose_plan(recorded("two-cart", *FIRST)).recordings == ()
 
 
@@ -115,14 +115,14 @@ def test_what_is_recorded_is_not_proposed():
     ],
 )
 def test_limits_come_from_what_is_stated(system, design, expected):
-    """The design, the scale of the input, the unit of the positions; else the usual ones."""
+    """Limits come from the design, the input's scale and the unit, or are the usual ones."""
     limits = propose_plan(bare(**system, design=design)).limits
     assert (limits.input, limits.travel) == expected
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
 def test_the_first_runs_move_the_carts_well_and_not_too_far(preset):
-    """If full scale holds the carts 12 cm out: more than 0.2 cm, and below the limit."""
+    """The first runs move the carts by more than 0.2 cm and stay within the travel limit."""
     chain, per_count = PRESETS[preset], 0.5 / FULL_SCALE
     plan = propose_plan(bare(carts=chain.n, input=InputScale(per_count=per_count)))
     for recording in (*of_kind(plan, "step"), *of_kind(plan, "sweep")):
@@ -144,14 +144,14 @@ def test_the_first_runs_move_the_carts_well_and_not_too_far(preset):
 
 @pytest.fixture(scope="module", params=sorted(PRESETS))
 def extended(request):
-    """A preset's chain and the plan that follows from its decays, steps and sweep."""
+    """Return a preset's chain, and the plan that follows from its decays, steps and sweep."""
     submission = recorded(EXAMPLE_OF[request.param], *FIRST)
     plan = propose_plan(submission)
     return PRESETS[request.param], extend_plan(plan, submission), submission
 
 
 def test_dwells_bracket_every_resonance_and_null(extended):
-    """A dwell is within 1 % of each or within its bandwidth, and within 15 % on either side."""
+    """For each resonance and null there is a dwell close to it, and one on either side."""
     chain, plan, _ = extended
     dwells = np.array([2 * np.pi * r.frequency for r in of_kind(plan, "sine")])
     for roots in (chain.poles, *(chain.zeros(cart) for cart in range(1, chain.n))):
@@ -163,7 +163,7 @@ def test_dwells_bracket_every_resonance_and_null(extended):
 
 
 def test_dwells_move_the_carts_as_far_as_asked_and_never_past_the_limit(extended):
-    """On the true plant, in steady state: 0.3 to 1.3 of the aim; from rest: within the limit."""
+    """Dwells move the carts by 0.3 to 1.3 of the aim and never beyond the travel limit."""
     chain, plan, _ = extended
     aim = AIM * plan.limits.travel
     wait = settling_wait(chain, time_constants=SETTLED_DWELL)
@@ -175,12 +175,12 @@ def test_dwells_move_the_carts_as_far_as_asked_and_never_past_the_limit(extended
         assert 0.3 * aim < steady < 1.3 * aim, run.id
         assert x.max() < plan.limits.travel, run.id
         assert abs(run.amplitude) <= plan.limits.input
-        # Enough of the dwell is left for six periods in steady state.
+        # Enough of the dwell remains for six periods in steady state.
         assert (run.duration - wait) * run.frequency > 6
 
 
 def test_steps_rest_near_the_aim_and_overshoot_within_the_limit(extended):
-    """To both sides; on the true plant they end at 0.5 to 1 of the aim."""
+    """Steps to both sides end at 0.5 to 1 of the aim, and overshoot within the limit."""
     chain, plan, _ = extended
     aim, amplitudes = AIM * plan.limits.travel, [r.amplitude for r in of_kind(plan, "step")]
     assert amplitudes[0] == -amplitudes[1]
@@ -193,7 +193,7 @@ def test_steps_rest_near_the_aim_and_overshoot_within_the_limit(extended):
 
 
 def test_extending_twice_changes_nothing(extended):
-    """Not even after the person at the bench changed or removed a dwell."""
+    """Extending a plan again changes nothing, even after a person changed or removed a dwell."""
     _, plan, submission = extended
     assert extend_plan(plan, submission) == plan
     first, *rest = plan.recordings
@@ -204,7 +204,7 @@ def test_extending_twice_changes_nothing(extended):
 
 
 def test_the_loop_comes_once_the_dwells_are_recorded():
-    """Not with the dwells, but after them, for the designed controller, within the travel."""
+    """The closed loop is planned once the dwells are recorded, within the travel limit."""
     before, after = recorded("two-cart", *FIRST), recorded("two-cart", *FIRST, "sine")
     plan = propose_plan(before)
     assert of_kind(extend_plan(plan, before), "closed_loop") == []
@@ -216,7 +216,7 @@ def test_the_loop_comes_once_the_dwells_are_recorded():
 
 
 def test_a_long_set_point_is_cut_to_the_travel():
-    """A reference beyond the travel limit is reduced."""
+    """A set point beyond the travel limit is reduced."""
     submission = recorded("two-cart", *FIRST, "sine")
     plan = Plan(limits=PlanLimits(input=5.0, travel=0.5))
     (loop,) = extend_plan(plan, submission).recordings
@@ -224,7 +224,7 @@ def test_a_long_set_point_is_cut_to_the_travel():
 
 
 def test_new_recordings_take_names_of_their_own():
-    """Steps continue the submission's numbers; ids never clash."""
+    """New recordings get numbers that continue those of the submission."""
     submission = recorded("two-cart", *FIRST)
     taken = {e.id for e in submission.experiments}
     plan = extend_plan(propose_plan(submission), submission)
@@ -235,7 +235,7 @@ def test_new_recordings_take_names_of_their_own():
 
 
 def test_data_that_identify_nothing_say_so():
-    """A single sweep of free carts gives a reason in place of dwells."""
+    """If the data identify nothing, there are no dwells, and a reason is given."""
     submission = recorded("one-cart", "sweep")
     rigid = submission.system.model_copy(update={"springs": (False, False)})
     submission = submission.model_copy(update={"system": rigid})
@@ -244,7 +244,7 @@ def test_data_that_identify_nothing_say_so():
 
 
 def test_counts_in_the_plural_are_counts():
-    """A travel limit in "counts" is that of an ECP 210, not 2.5 counts."""
+    """For positions in "counts" the travel limit is that of an ECP 210, not 2.5 counts."""
     assert propose_plan(bare(position=PositionScale(unit="counts"))).limits.travel == 1100.0
 
 
@@ -265,7 +265,7 @@ positive = st.floats(1e-3, 1e3).map(lambda x: round(x, 6))
 def test_a_plan_reads_back_as_it_was_written(
     tmp_path_factory, input, travel, frequency, kp, cycles, note
 ):
-    """Every key survives the file, and the same plan gives the same bytes."""
+    """Every key of a plan survives writing and reading, and equal plans give equal bytes."""
     submission = bare().model_copy(update={"folder": tmp_path_factory.mktemp("plan")})
     common = {"frequency": frequency, "cycles": cycles, "note": note}
     loop = {"kind": "closed_loop", "carts": (1, 2), "wave": "square", "amplitude": travel}
@@ -302,7 +302,7 @@ def test_a_plan_reads_back_as_it_was_written(
 
 
 def test_adding_keeps_every_byte_that_stood_there(tmp_path):
-    """Comments, order and numbers stay; new tables come at the end."""
+    """Adding recordings keeps comments, order and numbers of the file; new ones come last."""
     example = recorded("two-cart", *FIRST)
     submission = example.model_copy(update={"folder": tmp_path})
     plan_path(submission).write_text(
@@ -323,7 +323,7 @@ def test_adding_keeps_every_byte_that_stood_there(tmp_path):
 
 
 def test_what_is_added_while_the_data_are_asked_stays(tmp_path):
-    """A recording added meanwhile is in the plan, before those that the data ask for."""
+    """A recording added while `plan` analyses the data is kept, before the new ones."""
     work = a_recorded_cart(tmp_path / "work")
     submission = load_submission(work)
     old = propose_plan(submission)
@@ -424,7 +424,7 @@ def with_run(**changes) -> str:
     ],
 )
 def test_what_is_wrong_is_a_line_that_names_the_key(tmp_path, text, message):
-    """File, key, what was expected, what was found, and the nearest valid key."""
+    """A mistake in the plan gives one line: file, key, what was expected, what was found."""
     submission = bare().model_copy(update={"folder": tmp_path})
     plan_path(submission).write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=message) as caught:
@@ -435,7 +435,7 @@ def test_what_is_wrong_is_a_line_that_names_the_key(tmp_path, text, message):
 
 
 def test_a_link_in_its_place_is_not_followed(tmp_path):
-    """A plan that is a link is refused, also for writing."""
+    """A plan that is a link is refused, for reading and for writing."""
     submission = bare().model_copy(update={"folder": tmp_path})
     (tmp_path / "other").write_text(with_run(), encoding="utf-8")
     plan_path(submission).symlink_to(tmp_path / "other")
@@ -454,7 +454,7 @@ def run(monkeypatch, *arguments) -> str | int:
 
 
 def test_the_command_writes_shows_and_extends(monkeypatch, capsys, tmp_path):
-    """It says which carts to hold and how long it takes; a second run changes nothing."""
+    """`plan` says which carts to hold and how long it takes; a second run changes nothing."""
     new_submission(tmp_path / "bench", carts=2)
     assert run(monkeypatch, "plan", tmp_path / "bench") == 0
     out, err = capsys.readouterr()

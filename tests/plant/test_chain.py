@@ -1,4 +1,4 @@
-"""The plant: matrices, poles, zeros, and the maps between chain and named parameters."""
+"""The plant: matrices, poles, zeros, and the conversion between chain and named parameters."""
 
 from itertools import pairwise
 
@@ -16,7 +16,7 @@ from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.recovery import recover_chain, recover_from_parameters
 from pipeline.set_up import PAPER_UNITS
 
-# The paper's final estimates: Tables 1 and 2 are met by presets, Table 3 by no real chain.
+# The paper's final estimates. Presets agree with Tables 1 and 2; no real chain agrees with Table 3.
 TABLE_1 = {"K": 28.9, "omega_n": 13.2, "zeta": 0.10}
 TABLE_2 = {
     "K_1": 24.3, "K_2": 16.4, "omega_a": 10.1, "omega_b": 37.3,
@@ -49,7 +49,8 @@ def chains(draw, min_carts=1, max_carts=4, max_zeta=0.3):
 
 
 def assert_same_chain(got, chain, *, rtol):
-    # A spring is a difference of terms as large as its neighbours, so its error is theirs.
+    # A spring is a difference of terms as large as its neighbours, so its error is as large as
+    # theirs.
     assert_allclose(got.m, chain.m, rtol=rtol)
     assert_allclose(got.c, chain.c, rtol=rtol, atol=rtol * chain.c.max())
     assert_allclose(got.k, chain.k, rtol=rtol, atol=rtol * chain.k.max())
@@ -80,7 +81,7 @@ def test_static_gains_and_tails_give_the_chain_back(chain):
 
 @pytest.mark.parametrize(("carts", "redundancies"), [(1, 0), (2, 1), (3, 5)])
 def test_number_of_redundancies(carts, redundancies):
-    """Two carts have 8 parameters for 7 numbers, three have 15 for 10."""
+    """The tables of one, two and three carts have none, one and five redundancies."""
     got = recover_from_parameters(PRESETS[f"throne-{carts}dof"].parameters())
 
     assert list(got.residuals) == [f"R{i}" for i in range(1, redundancies + 1)]
@@ -91,7 +92,7 @@ def test_number_of_redundancies(carts, redundancies):
     [("zeta_x", {"R1"}), ("zeta_b", {"R2", "R4"}), ("K_2", {"R5"}), ("omega_3", {"R3"})],
 )
 def test_an_inconsistent_table_shows_in_the_redundancies(name, broken):
-    """A table that no chain has leaves residuals far above rounding."""
+    """Changing one parameter by 10 % breaks the redundancies in which it appears."""
     values = PRESETS["throne-3dof"].parameters()
     got = recover_from_parameters(values | {name: 1.1 * values[name]})
 
@@ -131,7 +132,7 @@ def test_poles_are_those_of_the_state_matrix(chain):
     got = chain.poles
 
     T = chain.tails()[0]
-    # |T| relative to its terms: a root error of 1e-13 moves it by as much.
+    # |T| relative to its terms: an error of 1e-13 in a root changes it by as much.
     for pole in got:
         terms = np.abs(T * pole ** np.arange(T.size - 1, -1, -1))
         assert abs(np.polyval(T, pole)) < 1e-9 * terms.sum()
@@ -150,7 +151,8 @@ def test_zeros_make_each_response_vanish(chain):
         oracle = control.zeros(control.ss(A, B, C[[cart - 1]], D[[cart - 1]]))
         finite = oracle[np.abs(oracle) < 1e4]  # its infinite zeros come out huge
         matched = [np.min(np.abs(finite - zero)) / abs(zero) for zero in zeros]
-        # The oracle's generalised eigenvalues mix scales of 1 and 1e4 (k/m): 1e-6 is its own error.
+        # The eigenvalue routine of python-control mixes scales of 1 and 1e4 (k/m): 1e-6 is its own
+        # error.
         assert max(matched) < 1e-6
 
 
@@ -165,13 +167,13 @@ def test_frequency_response_matches_state_space(chain):
     A, B, C, _ = chain.state_space()
     eye = np.eye(A.shape[0])
     expected = np.stack([(C @ np.linalg.solve(1j * w * eye - A, B))[:, 0] for w in omega], axis=1)
-    # Beside a sharp null the terms of both methods cancel to a hundredth.
+    # Near a sharp null the terms of both methods cancel to a hundredth.
     scale = np.abs(expected).max(axis=1, keepdims=True)
     assert_allclose(got / scale, expected / scale, atol=1e-10)
 
 
 def test_frequency_response_of_a_preset_by_python_control():
-    """The oracle's evaluation of the three-cart system is the same."""
+    """The frequency response of the three-cart preset is that of python-control."""
     chain, omega = PRESETS["throne-3dof"], np.linspace(2.0, 50.0, 40)
 
     expected = control.ss(*chain.state_space())(1j * omega)[:, 0, :]
@@ -180,7 +182,7 @@ def test_frequency_response_of_a_preset_by_python_control():
 
 
 def test_the_response_at_an_undamped_pole_is_infinite():
-    """Exactly there and nowhere else, whatever the number of carts."""
+    """Only at an undamped pole is the response infinite, whatever the number of carts."""
     one = Chain(m=np.array([1.0]), c=np.array([0.0]), k=np.array([4.0, 0.0]))
     two = Chain(m=np.ones(2), c=np.zeros(2), k=np.array([1.0, 1.5, 1.0]))
     for chain in (one, two):
@@ -207,7 +209,7 @@ def test_transfer_function_is_gain_and_tails(chain):
 
 
 def test_rows_of_the_state_matrix():
-    """The paper's 4x4 matrix, entry by entry."""
+    """The state matrix of two carts is the paper's 4x4 matrix, entry by entry."""
     m, c, k = [2.0, 4.0], [0.6, 0.8], [1.0, 3.0, 5.0]
     A, B, C, D = Chain(m=np.array(m), c=np.array(c), k=np.array(k)).state_space()
 
@@ -229,7 +231,7 @@ def test_gains_fall_along_the_chain(chain):
 
     assert np.all(K > 0)
     assert np.all(np.diff(K) <= 1e-12 * K[0])
-    beyond = k[-1]  # the stiffness a cart leans on beyond spring i, from the far wall inwards
+    beyond = k[-1]  # the stiffness that supports a cart after spring i, from the far wall inwards
     for i in range(chain.n - 1, 0, -1):
         assert_allclose(K[i] / K[i - 1], k[i] / (k[i] + beyond), rtol=1e-9)
         beyond = k[i] * beyond / (k[i] + beyond)
@@ -238,7 +240,7 @@ def test_gains_fall_along_the_chain(chain):
 @given(chains(min_carts=2, max_carts=3, max_zeta=0.02))
 def test_frequencies_interlace(chain):
     """Resonances enclose nulls and single-cart frequencies (exact without damping)."""
-    # Damping moves a frequency by about zeta² = 4e-4; closer pairs prove nothing.
+    # Damping moves a frequency by about zeta² = 4e-4; pairs closer than that prove nothing.
     values = chain.parameters()
     if chain.n == 2:
         order = [("omega_a", "omega_1"), ("omega_1", "omega_b")]
@@ -265,13 +267,13 @@ def test_a_held_cart_is_a_wall(chain, data):
 
 
 def test_the_order_of_free_carts_does_not_matter():
-    """Free carts are a set; the state always runs from the first cart on."""
+    """The order in which free carts are named changes nothing: states start with cart 1."""
     chain = PRESETS["throne-3dof"]
     assert_allclose(chain.state_space(free=[3, 1])[0], chain.state_space(free=(1, 3))[0])
 
 
 def test_a_cart_that_is_not_there_cannot_be_free():
-    """Cart 3 of two is an error of the caller."""
+    """If cart 3 of two is named as free, the caller gets an error."""
     with pytest.raises(ValueError, match=r"free carts \[3\] are not among 1 to 2"):
         PRESETS["throne-2dof"].state_space(free=[3])
 
@@ -292,7 +294,7 @@ def test_equal_gains_without_a_far_spring():
 
 
 def test_a_rigid_body():
-    """One cart without springs has a mass and a damping, and no static gain."""
+    """One cart without springs has a mass and a damping but no static gain."""
     body = Chain(m=np.array([2e-4]), c=np.array([5e-4]), k=np.zeros(2))
 
     assert body.parameters() == {"mass": 2e-4, "damping": 5e-4}
@@ -304,7 +306,7 @@ def test_a_rigid_body():
 
 
 def test_carts_tied_only_to_each_other_have_no_static_gain():
-    """A spring between the carts but none to a wall: a constant force pushes them away."""
+    """Carts with a spring between them but none to a wall have no static gains."""
     chain = Chain(m=np.array([2e-4, 3e-4]), c=np.array([1e-4, 1e-4]), k=np.array([0.0, 0.1, 0.0]))
 
     with pytest.raises(DataError, match="no static gain"):
@@ -331,13 +333,13 @@ def test_heavy_damping_survives_the_maps(chain):
 
     got = recover_from_parameters(chain.parameters())
 
-    # A root next to another at distance 1e-3 is known to 1e-15/1e-3; large damping adds the
-    # cancellation of squares up to (2 zeta)^4 = 1300 times larger.
+    # A root whose neighbour is 1e-3 away is known to 1e-15/1e-3. Large damping also cancels squares
+    # up to (2 zeta)^4 = 1300 times larger.
     assert_same_chain(got, chain, rtol=1e-6)
 
 
 def test_arrays_are_read_only_and_checked():
-    """A chain cannot be changed, and its parts must fit."""
+    """The arrays of a chain cannot be changed, and arrays of wrong sizes are refused."""
     chain = PRESETS["throne-1dof"]
     with pytest.raises(ValueError, match="read-only"):
         chain.m[0] = 1.0
@@ -350,7 +352,7 @@ def test_arrays_are_read_only_and_checked():
 
 @pytest.mark.parametrize(("preset", "table"), [("throne-1dof", TABLE_1), ("throne-2dof", TABLE_2)])
 def test_presets_round_to_the_paper(preset, table):
-    """Each independent final value of Tables 1 and 2, to the digits printed."""
+    """The presets round to each independent final value printed in Tables 1 and 2."""
     values = PRESETS[preset].parameters()
 
     for name, printed in table.items():
@@ -359,20 +361,20 @@ def test_presets_round_to_the_paper(preset, table):
 
 
 def test_the_three_cart_preset_is_near_table_3():
-    """Gains and frequencies within 1.3 %, every damping but zeta_b within 15 %."""
+    """The three-cart preset is within 1.3 % of Table 3, in damping within 15 % except zeta_b."""
     values = PRESETS["throne-3dof"].parameters()
 
     for name, printed in TABLE_3.items():
         if name == "zeta_b":
             continue
         limit = 0.155 if name.startswith("zeta") else 0.013
-        # Printed dampings of one digit are known to half of 0.01 only.
+        # Printed dampings of one digit are known only to half of 0.01.
         rounding = 0.005 if name.startswith("zeta") else 0.0
         assert abs(values[name] - printed) <= limit * printed + rounding, name
 
 
 def test_table_2_obeys_its_redundancy_within_rounding():
-    """R1 of the printed Table 2 is what two digits of damping allow, and no spring is negative."""
+    """Table 2 violates its redundancy R1 by no more than rounding, and no spring is negative."""
     got = recover_from_parameters(TABLE_2)
 
     assert got.residuals["R1"] < 0.15
@@ -380,7 +382,7 @@ def test_table_2_obeys_its_redundancy_within_rounding():
 
 
 def test_table_3_is_no_real_chain():
-    """The printed Table 3 breaks R4 and R5 whatever its rounding; its first spring is negative."""
+    """Table 3 violates R4 and R5 by more than rounding, and its first spring is negative."""
     rng = np.random.default_rng(3)
     got = recover_from_parameters(TABLE_3)
     assert got.k[0] / got.m[0] == pytest.approx(-9, abs=1.5)

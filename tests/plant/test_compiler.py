@@ -1,4 +1,4 @@
-"""Where compiled functions are kept, and that a change in another file is noticed."""
+"""Where compiled functions are stored, and that a change in another file is noticed."""
 
 import ast
 import os
@@ -32,7 +32,7 @@ def inner(x):
 
 @pytest.fixture
 def package(tmp_path):
-    """A copy of the package with two compiled functions more, one of which calls the other."""
+    """A copy of the package with two more compiled functions, one of which calls the other."""
     shutil.copytree(
         ROOT / "pipeline", tmp_path / "pipeline", ignore=shutil.ignore_patterns("__pycache__")
     )
@@ -42,7 +42,7 @@ def package(tmp_path):
 
 
 def _outer(package: Path, **environment: str) -> tuple[str, str]:
-    """Return `outer(10)` as a new process finds it, and what that said on stderr."""
+    """Return the result of `outer(10)` in a new process, and its stderr."""
     script = "from pipeline.plant.nonlinear.simulator.caller import outer; print(outer(10))"
     environment = {**os.environ, "PYTHONPATH": str(package), **environment}
     environment.pop("NUMBA_CACHE_DIR", None)
@@ -54,7 +54,10 @@ def _outer(package: Path, **environment: str) -> tuple[str, str]:
 
 
 def test_a_change_in_another_file_is_noticed_and_the_old_folder_removed(package):
-    """The caller's own file is as it was, yet it calls the new function."""
+    """If a called function's file changes, the caller is compiled again.
+
+    The code compiled before is removed.
+    """
     first = _outer(package)
     again = _outer(package)
     (package / SIMULATOR / "called.py").write_text(CALLED.format(factor=3))
@@ -67,7 +70,7 @@ def test_a_change_in_another_file_is_noticed_and_the_old_folder_removed(package)
 
 
 def test_where_the_package_cannot_be_written_the_users_cache_is_used(package):
-    """Without any such folder it still computes, and says that it compiles each time."""
+    """If the package's folder is read-only, compiled code is stored in the user's cache."""
     (package / "pipeline" / "__pycache__").write_text("a file where the folder would be")
     home = package / "home"
 
@@ -84,7 +87,7 @@ def test_where_the_package_cannot_be_written_the_users_cache_is_used(package):
 
 
 def test_the_folders_name_covers_each_file_that_a_compiled_function_may_hold():
-    """A file with compiled functions imports only from its own room or the shared files."""
+    """Each file with compiled functions imports only files whose changes are noticed."""
     types_only = ROOT / "pipeline/arrays.py"
     rooms = set()
     for path in (ROOT / "pipeline").rglob("*.py"):

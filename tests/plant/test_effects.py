@@ -22,14 +22,14 @@ from tests.helpers.effects import SIZES, make_term
 
 
 def test_catalogue_has_the_agreed_names():
-    """Keys and parameters are those that files and users rely on."""
+    """The catalogue has the effects and parameters whose names files and users rely on."""
     found = {e.key: {p.name for p in e.parameters if p.reported} for e in CATALOGUE}
     assert found == {key: set(sizes) for key, sizes in SIZES.items()}
 
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda e: e.key)
 def test_an_entry_has_all_texts_a_student_needs(effect):
-    """Every entry has its sentence, equation, fingerprint, deciding run and reference."""
+    """Every effect has a sentence, an equation, a fingerprint, a deciding run and a reference."""
     for text in (effect.sentence, to_tex(effect.formula), effect.fingerprint, effect.deciding_run):
         assert len(text) >= len("f = F")
     assert effect.reference
@@ -45,7 +45,7 @@ def faint_term(effect: Effect, *, share: float, chain: Chain) -> EffectTerm:
     values = {}
     for parameter in effect.parameters:
         value, neutral = parameter.typical * parameter.size(scales), parameter.neutral or 0.0
-        if not sized:  # a limit acts on nothing that does not reach it
+        if not sized:  # a limit that is not reached has no effect
             value /= share
         elif parameter.neutral is not None or (parameter.reported and parameter.unit in sized):
             value = neutral + share * (value - neutral)
@@ -58,7 +58,7 @@ def faint_term(effect: Effect, *, share: float, chain: Chain) -> EffectTerm:
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda e: e.key)
 def test_an_effect_of_no_size_is_the_linear_bench(effect):
-    """As its size goes to zero, every effect of the catalogue leaves the motion of the chain."""
+    """As the size of an effect goes to zero, the motion becomes that of the linear chain."""
     chain = PRESETS["throne-2dof"]
     t = np.linspace(0.0, 3.0, 601)
     u = np.where(t < 1.5, 0.05, -0.025)
@@ -71,12 +71,13 @@ def test_an_effect_of_no_size_is_the_linear_bench(effect):
 
     plain = departs(1.0)
     assert plain > 3e-3
-    # In proportion, or with the root if a speed is involved; bodies that meet keep some give.
+    # In proportion to the size, or to its root if a speed is involved; a contact stays a little
+    # soft.
     assert departs(1e-4) < 0.02 * plain
 
 
 def test_what_an_effect_is_follows_from_its_law():
-    """Friction that varies between runs, hidden masses, contacts, several rest positions."""
+    """The laws show which effects are dry friction, hidden masses, contacts or need an input."""
 
     def those(is_so: Callable[[Effect], bool]) -> set[str]:
         return {effect.key for effect in CATALOGUE if is_so(effect)}
@@ -91,7 +92,7 @@ def test_what_an_effect_is_follows_from_its_law():
 
 
 def test_single_cart_has_one_spring_place():
-    """The two wall springs of one cart act through their sum, so only one is a place."""
+    """Only the sum of one cart's two wall springs matters, so only one of them is a place."""
     assert find_effect("cubic_spring").places((True, True)) == (1,)
     assert find_effect("cubic_spring").places((False, True)) == (2,)
     assert find_effect("cubic_spring").places((True, True, False)) == (1, 2)
@@ -109,12 +110,12 @@ def test_single_cart_has_one_spring_place():
     ],
 )
 def test_a_word_of_a_name_finds_the_effects_that_have_it(typed, meant):
-    """The most common comes first; a misspelt name finds the nearest."""
+    """A word of an effect's name finds the effects with it; a misspelt name, the nearest."""
     with pytest.raises(ConfigError, match=rf"did you mean {meant}\?"):
         find_effect(typed)
 
 
 def test_unknown_effect_is_refused():
-    """A name that is not in the catalogue is one clear error that lists the names."""
+    """The name of an unknown effect gives one error that lists the known names."""
     with pytest.raises(ConfigError, match="no effect 'glue'; known: coulomb_friction"):
         find_effect("glue")

@@ -1,4 +1,4 @@
-"""The compiled simulator against exact solutions, an event-driven one, and the fine-step one."""
+"""The compiled simulator agrees with exact solutions and with two slower simulators."""
 
 import subprocess
 import sys
@@ -31,7 +31,7 @@ def sample_times(count: int, interval: float) -> Array:
 def simulate(
     tables: Tables, t, u, *, x0=None, v0=None, free=None, refine=1.0, guided=None, knots=None
 ):
-    """Return (n, samples) readings of one run that starts once."""
+    """Return the readings (n, samples) of one run with a single start."""
     n = tables.cart.shape[0]
     x0, v0 = (np.zeros((1, n)) if one is None else np.array([one]) for one in (x0, v0))
     moving = [free is None or i + 1 in free for i in range(n)]
@@ -53,13 +53,13 @@ def test_linear_chain_is_exact(preset, irregular):
 
     got = simulate(linear_tables(chain), t, u)
 
-    # The series' remainder, (omega h)^6 / 720 of a step's motion with omega h <= 0.2, is 1e-7
-    # a step and changes sign with the motion; 1e-6 is what is promised.
+    # The rest of the series is (omega h)^6 / 720 of a step's motion, 1e-7 a step with omega h <=
+    # 0.2, and changes sign with the motion; 1e-6 is promised.
     assert_allclose(got, simulate_linear(chain, t, u), atol=1e-6 * np.abs(got).max())
 
 
 def test_held_cart_is_a_wall():
-    """A held cart does not move, and the others swing as against a wall."""
+    """A held cart does not move, and the others move as if it were a wall."""
     chain = PRESETS["throne-2dof"]
     t = sample_times(400, 0.005)
 
@@ -71,7 +71,7 @@ def test_held_cart_is_a_wall():
 
 
 def friction_decay(m, k, force, x0, t):
-    """Return the decay of one cart with dry friction only, half swing by half swing, exactly."""
+    """Return the exact decay of one cart with dry friction only, computed by half swings."""
     omega, x, y, start = np.sqrt(k / m), x0, np.empty(t.size), 0.0
     centre = force / k  # the rest point of a half swing lies on the side of the motion's start
     while True:
@@ -86,7 +86,7 @@ def friction_decay(m, k, force, x0, t):
 
 
 def test_a_held_cart_that_is_moved_moves_its_neighbour():
-    """Guided along its own free motion, it leaves the other cart's motion unchanged."""
+    """A cart that is guided along its own free motion leaves the other cart's motion unchanged."""
     tables = linear_tables(PRESETS["throne-2dof"])
     t = sample_times(2000, 1e-3)
     both = simulate(tables, t, np.where(t < 0.5, 1.0, 0.0))
@@ -94,8 +94,8 @@ def test_a_held_cart_that_is_moved_moves_its_neighbour():
 
     got = simulate(tables, t, np.where(t < 0.5, 1.0, 0.0), free=(1,), guided=guided)
 
-    # Straight lines between samples are off by an eighth of the curvature, always to the inside; a
-    # swinging cart follows such a pull by up to twice as much.
+    # Straight lines between samples err by an eighth of the curvature, always inwards. A swinging
+    # cart follows such an error by up to twice as much.
     np.testing.assert_allclose(got, both, atol=np.abs(np.diff(both[1], n=2)).max() / 4)
 
 
@@ -110,13 +110,13 @@ def test_friction_decay_follows_the_events(rate):
 
     got = simulate(tables, t, 0 * t, x0=[2.0])[0]
 
-    # 0.5 count is the requirement; reversals are found to the root of the velocity.
+    # 0.5 count is the requirement; reversals are found as the root of the velocity.
     assert np.abs(got - friction_decay(m, k, force, 2.0, t)).max() < 0.05 * COUNT
     assert np.ptp(got[-50:]) == 0.0
 
 
 def test_cart_stays_where_friction_holds_it():
-    """A force below the dry friction moves nothing at all; one above it does."""
+    """A force below the dry friction does not move the cart; a force above it does."""
     tables = linear_tables(PRESETS["throne-1dof"])
     tables[0][0, Cart.COULOMB_FRICTION_FORCE] = 0.01
     t = sample_times(500, 0.004)
@@ -127,7 +127,7 @@ def test_cart_stays_where_friction_holds_it():
 
 @pytest.mark.parametrize("key", list(SIZES))
 def test_every_effect_agrees_with_the_fine_step_truth(key):
-    """Each law, simulated here and by the independent 50-µs simulator, gives the same readings."""
+    """For each effect, this simulator and an independent one with 50-µs steps agree."""
     chain = PRESETS["throne-2dof"]
     effect = find_effect(key)
     place = {"cart": 1, "spring": 2, "input": 0}[effect.place]
@@ -156,7 +156,7 @@ def test_every_effect_agrees_with_the_fine_step_truth(key):
         free=(1, 2),
     )
 
-    # The fine-step simulator's own steps leave 0.1 count; a contact ends softer by one step of it.
+    # The 50-µs steps err by 0.1 count; a contact of that simulator is softer by one step.
     limit = {"end_stop": 1.5, "backlash": 0.6}.get(key, 0.25)
     assert np.sqrt(np.mean((got - truth) ** 2)) < limit * COUNT
     linear = simulate(linear_tables(chain), t, u)
@@ -168,7 +168,7 @@ DISSIPATIVE = ("coulomb_friction", "stiction", "presliding_friction", "quadratic
 
 @pytest.mark.parametrize("key", DISSIPATIVE)
 def test_energy_never_grows_without_input(key):
-    """Without an input swings only shrink, whatever the effect."""
+    """Without an input the swings only become smaller, whatever the effect."""
     chain = PRESETS["throne-1dof"]
     effect = find_effect(key)
     term = make_term(effect, place=1, values=SIZES[key], chain=chain)
@@ -185,7 +185,7 @@ def test_energy_never_grows_without_input(key):
 
 
 def test_delay_shifts_the_response():
-    """A delay of whole samples shifts the readings by as many, a negative one forwards."""
+    """A delay of whole samples shifts the readings by as many, and a negative delay forwards."""
     chain = PRESETS["throne-2dof"]
     t = sample_times(500, 0.005)
     u = np.where(t > 0.1, 0.03, 0.0)
@@ -199,7 +199,7 @@ def test_delay_shifts_the_response():
 
 
 def test_diverging_model_is_reported_as_nan():
-    """A softening spring that gives way yields NaN, not an endless run or a crash."""
+    """If a softening spring gives way, the readings become NaN, without a crash or endless run."""
     chain = PRESETS["throne-1dof"]
     term = make_term(
         find_effect("cubic_spring"), place=1, values={"coefficient": -0.5}, chain=chain
@@ -230,7 +230,7 @@ def test_batch_gives_what_single_runs_give():
 
 
 def test_a_hidden_mass_starts_at_the_given_position():
-    """A cart with a hidden mass, started away from it, is the first cart of a chain of two."""
+    """A cart with a hidden mass, started away from it, moves as the first cart of two."""
     chain = Chain(m=np.array([1.7e-4]), c=np.array([4e-4]), k=np.array([0.034, 0.0]))
     mass, stiffness = 2e-5, 0.004
     term = make_term(
@@ -283,12 +283,12 @@ assert [dict(one.cache_misses) for one in stats] == before
 
 
 def test_once_compiled_nothing_is_left_to_compile():
-    """A stepped bench and derivatives run the code that `compile_simulator` compiled."""
+    """After `compile_simulator`, no later call of the simulator compiles anything."""
     subprocess.run([sys.executable, "-c", _NOTHING_LEFT], check=True)
 
 
 def test_arrays_of_any_kind_meet_the_same_simulator():
-    """Views, integers and read-only arrays cost no compilation of their own."""
+    """Views, integer arrays and read-only arrays use the code that is compiled already."""
     tables = linear_tables(PRESETS["throne-2dof"])
     t = sample_times(50, 0.005)
     command = np.zeros(50, dtype=int)
@@ -305,11 +305,11 @@ def test_arrays_of_any_kind_meet_the_same_simulator():
     modules = (contacts, kernel, laws, sensitivity, state, step)
     mine = {id(one): one for module in modules for one in vars(module).values()}
     twice = [one for one in mine.values() if len(getattr(one, "signatures", ())) > 1]
-    assert twice in ([], [state.stretch])  # which takes the row it reads as a constant
+    assert twice in ([], [state.stretch])  # this function takes the row that it reads as a constant
 
 
 def test_no_array_is_counted():
-    """Reference counts of arrays would make two searching threads wait for each other."""
+    """Compiled code counts no references to arrays, for which two threads would wait."""
     compile_simulator()
     folder = kernel._simulate.stats.cache_path
     assert folder is not None
@@ -320,9 +320,9 @@ def test_no_array_is_counted():
 
 @pytest.mark.parametrize("preset", list(PRESETS))
 def test_an_input_that_changes_within_a_step_moves_the_carts_in_time(preset):
-    """Read every 4 ms under an input that changes every millisecond, the carts are right.
+    """If the input changes within a simulation step, the carts still move as they should.
 
-    The input's mean over a step alone would leave (omega h)² / 12 of the motion, 2e-3 here.
+    With only the input's mean over a step, (omega h)² / 12 of the motion, 2e-3, would be wrong.
     """
     chain = PRESETS[preset]
     t = sample_times(3001, 0.001)
@@ -336,7 +336,7 @@ def test_an_input_that_changes_within_a_step_moves_the_carts_in_time(preset):
 
 
 def test_an_input_that_jumps_inside_a_step_frees_a_held_cart_at_once():
-    """Whatever the steps, friction brakes the cart from the edge on, not from the step's start."""
+    """If the input jumps within a step, a cart held by friction is freed at the jump."""
     chain = PRESETS["throne-1dof"]
     dry = make_term(find_effect("coulomb_friction"), place=1, values={"force": 6e-3}, chain=chain)
     tables = AugmentedChain(chain=chain, terms=(dry,)).tables()
@@ -350,7 +350,7 @@ def test_an_input_that_jumps_inside_a_step_frees_a_held_cart_at_once():
 
 
 def test_what_stands_behind_the_last_sample_is_no_time():
-    """A run ends with its samples: driven to a later time the cart would be far away."""
+    """A run ends with its last sample: memory after the times is not read as a time."""
     chain = Chain(m=np.array([1e-4]), c=np.zeros(1), k=np.zeros(2))
     t = np.append(sample_times(100, 4e-3), 2e4)[:-1]  # a view: the time behind is its neighbour
     x = simulate(linear_tables(chain), t, np.full(t.size, 0.02))
@@ -362,7 +362,7 @@ def test_what_stands_behind_the_last_sample_is_no_time():
     [("actuator_lag", {"time_constant": 2.8e-3}), ("input_delay", {"delay": 2.8e-3})],
 )
 def test_what_is_late_is_as_late_in_long_steps(key, values):
-    """In a fast sweep of four ticks a step, lag and delay are right to a tenth of a count."""
+    """In a fast sweep with four ticks per step, lag and delay are right to a tenth of a count."""
     chain = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.array([0.05, 0.0]))
     term = make_term(find_effect(key), place=0, values=values, chain=chain)
     tables = AugmentedChain(chain=chain, terms=(term,)).tables()

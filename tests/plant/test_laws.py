@@ -1,4 +1,4 @@
-"""The laws, each written once: the generated code agrees with them, derivatives included."""
+"""Each law is written once, and the code generated from it agrees with it and its derivatives."""
 
 import ast
 import sys
@@ -33,13 +33,13 @@ STATES = [(0.4, 0.7, 0.02, 1.0), (-0.9, -0.3, -0.05, 1.0), (1.3, -1.1, 0.03, 0.0
 
 @pytest.mark.parametrize("name", MADE)
 def test_what_stands_there_is_made_from_the_laws(name):
-    """Nobody changed a law without `python -m docs.codegen`, or the generated files by hand."""
+    """The generated files are what `python -m docs.codegen` writes from the laws."""
     stored, made = (ROOM / name).read_text(encoding="utf-8"), MADE[name](CATALOGUE)
     assert ast.dump(ast.parse(stored)) == ast.dump(ast.parse(made)), "run python -m docs.codegen"
 
 
 def coordinates_of(effect: Effect) -> np.ndarray:
-    """Return coordinates (.,) of an effect for which a law is neither large nor small."""
+    """Return coordinates (.,) of an effect at which its law is neither large nor small."""
     shapes = {"end_stop": (2.0, 0.8, 0.1), "cogging": (0.3, -0.2, 0.7)}
     return np.array(shapes.get(effect.key, (0.3, 0.8, 0.5)[: len(effect.grown.coordinates)]))
 
@@ -54,7 +54,7 @@ def terms_of(kind: int, p: np.ndarray, x: float, v: float, u: float, on: float) 
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("effect", FOLLOWED, ids=lambda effect: effect.key)
 def test_derivatives_are_those_of_the_law(effect, state):
-    """By position, velocity, input and every coordinate, they agree with differences."""
+    """Derivatives by position, velocity, input and each coordinate agree with differences."""
     kind, p = CATALOGUE.index(effect), coordinates_of(effect)
     x, v, u, on = state
     out = terms_of(kind, p, *state)
@@ -67,13 +67,13 @@ def test_derivatives_are_those_of_the_law(effect, state):
         for s in (step, -step)
     ]  # fmt: skip
     by = (np.array(sides[0]) - sides[1]) / (2 * step)
-    # Differences of numbers near one over 2e-6: rounding leaves 1e-10, curvature less.
+    # Differences of numbers near one over 2e-6: rounding errs by 1e-10, curvature by less.
     assert_allclose(out[1 : 4 + p.size], by, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("key", ["end_stop", "slack_spring"])
 def test_contacts_are_those_of_the_law(key):
-    """Stiffness, damping and start give the force of the law on either side of it."""
+    """Stiffness, damping and start of a contact give the force of its law on either side."""
     effect = find_effect(key)
     law, kind = effect.law, CATALOGUE.index(effect)
     assert isinstance(law, ContactLaw)
@@ -97,7 +97,7 @@ def test_contacts_are_those_of_the_law(key):
 
 @pytest.mark.parametrize("v", [0.7, -0.3])
 def test_hysteresis_settles_as_its_rate_says(v):
-    """Its state goes to a value at a rate; both simulators agree, and its derivatives."""
+    """The state of hysteresis settles as its rate says, in both simulators and derivatives."""
     effect = find_effect("presliding_friction")
     law = effect.law
     assert isinstance(law, HysteresisLaw)
@@ -133,7 +133,7 @@ def test_hysteresis_settles_as_its_rate_says(v):
     ids=lambda effect: effect.key,
 )
 def test_simulator_and_follower_have_the_same_law(effect, state):
-    """Parameters computed from coordinates give the same force in the tables."""
+    """The simulator's tables give the same force as the coordinates of the fit."""
     kind, p = CATALOGUE.index(effect), coordinates_of(effect)
     x, v, u, on = state
     within = {"F": 0.2} if isinstance(effect.law, FrictionLaw) and effect.law.beyond else {}
@@ -158,14 +158,14 @@ def test_simulator_and_follower_have_the_same_law(effect, state):
 
 @pytest.mark.parametrize("effect", FOLLOWED, ids=lambda effect: effect.key)
 def test_a_law_vanishes_with_its_coefficients(effect):
-    """With its coefficients at zero nothing of the law is left, whatever its shape."""
+    """If the coefficients of a law are zero, its force is zero, whatever its shape."""
     kind, p = CATALOGUE.index(effect), coordinates_of(effect)
     p[list(terms.COEFFICIENTS[kind])] = 0.0
     assert all(terms_of(kind, p, *state)[0] == 0.0 for state in STATES)
 
 
 def test_dead_zone_and_saturation_shape_the_input():
-    """The input behind both is zero, reduced by the width, or at the limit."""
+    """Dead zone and saturation make an input zero, smaller by the width, or the limit."""
     drive = np.zeros(len(TABLES["input"]))
     for key in ("dead_zone", "saturation"):
         effect = find_effect(key)
@@ -176,7 +176,7 @@ def test_dead_zone_and_saturation_shape_the_input():
 
 
 def test_friction_at_rest_is_what_the_law_says():
-    """If `at_rest` differs from the size, it is the size at zero speed."""
+    """At zero speed, friction with a force `at_rest` of its own has that force."""
     for effect in CATALOGUE:
         if isinstance(effect.law, FrictionLaw) and effect.law.at_rest:
             row = np.zeros((1, len(TABLES["cart"])))
@@ -189,7 +189,7 @@ def test_friction_at_rest_is_what_the_law_says():
 
 
 def load(source: str, name: str, folder: Path):
-    """Import source as a temporary module."""
+    """Import Python source as a temporary module."""
     path = folder / f"{name}.py"
     path.write_text(source, encoding="utf-8")
     spec = util.spec_from_file_location(name, path)
@@ -210,7 +210,7 @@ WEAK_ZONE = replace(
 
 
 def test_a_new_effect_needs_only_its_own_file(tmp_path, monkeypatch):
-    """For a new law, columns, force, slopes and follower are generated."""
+    """For a new law, the columns, force, derivatives and terms of the fit are all generated."""
     catalogue = (*CATALOGUE, CUBIC_DRAG, WEAK_ZONE)
     load(columns_source(catalogue), "new_columns", tmp_path)
     source = laws_source(catalogue).replace("pipeline.plant.nonlinear.columns", "new_columns")
@@ -253,5 +253,5 @@ def test_a_new_effect_needs_only_its_own_file(tmp_path, monkeypatch):
     ],
 )
 def test_equations_read_as_in_a_book(key, equation):
-    """Factors side by side, no needless bracket, details of a contact left out."""
+    """Equations have factors side by side, no needless brackets and no details of contacts."""
     assert to_tex(find_effect(key).formula) == equation

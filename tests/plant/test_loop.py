@@ -1,4 +1,4 @@
-"""The sampled loop: its order of events, its exactness, its limits."""
+"""The sampled loop: the order of its events, its exactness and its limits."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def feedback(chain: Chain, gains: Array = GAINS, prefilter: float = 0.07) -> Sta
 
 
 def test_without_gains_the_prefilter_drives_the_open_loop():
-    """With zero gains the run is the open-loop response to prefilter r, one sample late."""
+    """With zero gains the run is the open-loop response to prefilter times r, one sample late."""
     run = simulate_loop(TWO, feedback(TWO, np.zeros(4)), t=CLOCK, reference=1.0)
 
     assert_allclose(run.u[:2], [0.0, 0.07])
@@ -42,7 +42,7 @@ def test_without_gains_the_prefilter_drives_the_open_loop():
 
 @pytest.mark.parametrize("delay", [0, 1])
 def test_an_exact_prediction_makes_the_delayed_loop_the_undelayed_one(delay):
-    """With the true model the loop runs as Phi - Gamma G does, later by the delay."""
+    """With the true model, a delayed loop moves as Phi - Gamma G without delay, only later."""
     run = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=1.0, setup=LoopSetup(delay=delay))
 
     phi, gamma = discretise(TWO, T)
@@ -55,7 +55,7 @@ def test_an_exact_prediction_makes_the_delayed_loop_the_undelayed_one(delay):
 
 @pytest.mark.parametrize("model", [None, PRESETS["throne-2dof"]])
 def test_the_loop_matrix_is_the_loop(model):
-    """Powers of the loop matrix give the run of a loop released from a displaced start."""
+    """Powers of the loop matrix give the motion of a loop that starts from a displacement."""
     controller = StateFeedback(gains=GAINS, prefilter=1.0, model=model)
     x0 = np.array([0.5, 3.0, -0.2, 1.0])
     run = simulate_loop(TWO, controller, t=CLOCK, reference=0.0, start=x0)
@@ -79,7 +79,7 @@ def test_an_exact_observer_adds_its_own_poles_and_moves_none():
 
 
 def test_the_input_stays_within_its_limit():
-    """A limit clips the input; a limit that is never reached changes nothing."""
+    """An input limit clips the input; a limit that is never reached changes nothing."""
     free = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=1.0)
     peak = np.abs(free.u).max()
     roomy = simulate_loop(
@@ -91,23 +91,23 @@ def test_the_input_stays_within_its_limit():
 
     assert_allclose(roomy.x, free.x, rtol=0, atol=0)
     assert np.abs(tight.u).max() == 0.5 * peak
-    # The observer knows what was applied, so the motion is that of the clipped input exactly.
+    # The observer gets the clipped input, so the motion is exactly that of the clipped input.
     assert_allclose(tight.x, simulate_linear(TWO, CLOCK, tight.u), atol=ROUNDING)
 
 
 def test_proportional_control_holds_a_share_of_the_reference():
-    """A proportional controller comes to rest at K kp / (1 + K kp) of the reference."""
+    """Under proportional control the cart rests at K kp / (1 + K kp) of the reference."""
     chain, kp = PRESETS["throne-1dof"], 0.02
     t = T * np.arange(1200.0)
     run = simulate_loop(chain, Pid(kp=kp), t=t, reference=2.0, setup=LoopSetup(delay=0))
 
     share = 28.9 * kp / (1 + 28.9 * kp)  # K of the preset is 28.9
-    # Its poles have a real part of -1.2 with the zero-order hold: exp(-12) is 6e-6 at the end.
+    # With the zero-order hold its poles have a real part of -1.2: exp(-12) is 6e-6 at the end.
     assert_allclose(run.x[0, -1], 2.0 * share, rtol=1e-4)
 
 
 def test_the_pid_terms_are_sum_and_difference():
-    """The first two inputs follow the stated sums and differences of the error."""
+    """The first two inputs of a PID follow from sums and differences of the error."""
     pid = Pid(kp=0.3, ki=2.0, kd=0.004, scale=0.1)
     run = simulate_loop(
         PRESETS["throne-1dof"], pid, t=CLOCK, reference=1.0, setup=LoopSetup(delay=0)
@@ -120,7 +120,7 @@ def test_the_pid_terms_are_sum_and_difference():
 
 
 def test_integral_action_removes_the_error():
-    """With integral action the cart ends at the reference, for a cart other than the first too."""
+    """With integral action any cart ends at the reference."""
     t = T * np.arange(4000.0)
     run = simulate_loop(TWO, Pid(kp=0.002, ki=0.02, cart=2), t=t, reference=1.0)
 
@@ -141,17 +141,17 @@ def test_the_controller_sees_whole_encoder_steps():
 
 
 def test_positions_between_the_ticks_are_those_of_the_held_input():
-    """Logged five times a tick, the run is the exact response to the logged input."""
+    """With five logged samples per tick, the run is the exact response to the logged input."""
     t = T / 5 * np.arange(1000.0)
     run = simulate_loop(TWO, feedback(TWO), t=t, reference=1.0, setup=LoopSetup(sample_time=T))
 
-    assert np.count_nonzero(np.diff(run.u)) <= 200  # held over five samples
-    # Cubic interpolation errs by (omega T)^4 / 384 of the fast mode's share: 0.36^4 / 384 = 4e-5.
+    assert np.count_nonzero(np.diff(run.u)) <= 200  # the input is held over five samples
+    # Cubic interpolation errs by (omega T)^4 / 384 of the fast mode's part: 0.36^4 / 384 = 4e-5.
     assert_allclose(run.x, simulate_linear(TWO, t, run.u), atol=5e-5)
 
 
 def test_a_controller_faster_than_the_log_acts_between_its_samples():
-    """A log of every tenth tick holds the same motion as the full one."""
+    """A log of every tenth tick shows the same motion as a log of every tick."""
     fine = T / 10 * np.arange(2001.0)
     full = simulate_loop(TWO, feedback(TWO), t=fine, reference=1.0)
     logged = simulate_loop(
@@ -163,18 +163,18 @@ def test_a_controller_faster_than_the_log_acts_between_its_samples():
 
 
 def test_rounded_time_stamps_keep_the_reference_at_its_sample():
-    """Stamps rounded to the millisecond do not move the reference's edge by a sample."""
+    """Time stamps rounded to the millisecond do not shift the reference's edge by a sample."""
     reference = np.where(np.arange(CLOCK.size) >= 57, 1.0, 0.0)
     exact = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=reference)
     rounded = simulate_loop(TWO, feedback(TWO), t=np.round(CLOCK, 3), reference=reference)
 
-    # A stamp is off by 0.5 ms at most, the carts move at up to 16 cm/s here; a sample is 8.84 ms.
+    # A stamp is off by at most 0.5 ms, and the carts move at up to 16 cm/s; a sample lasts 8.84 ms.
     assert np.abs(rounded.x - exact.x).max() < 0.0005 * np.abs(np.diff(exact.x)).max() / T * 1.1
     assert_allclose(rounded.u, exact.u, atol=1e-3 * np.abs(exact.u).max())
 
 
 def test_a_drive_of_the_other_sign_wants_the_other_gains():
-    """Negative inputs through a reversed drive are the same forces."""
+    """If the drive is reversed, negated gains give the same forces."""
     mirrored = Pid(kp=-0.02, kd=-0.0005)
     run = simulate_loop(TWO, Pid(kp=0.04, kd=0.001), t=CLOCK, reference=1.0)
     other = simulate_loop(TWO, mirrored, t=CLOCK, reference=1.0, setup=LoopSetup(drive=-2.0))
@@ -184,7 +184,7 @@ def test_a_drive_of_the_other_sign_wants_the_other_gains():
 
 
 def test_the_rest_adds_to_the_readings():
-    """An encoder zeroed away from the rest shifts the readings and the controller's response."""
+    """An encoder zeroed away from rest shifts the readings, and the controller reacts to that."""
     shift = np.array([0.3, -0.1])
     run = simulate_loop(TWO, Pid(kp=0.02), t=CLOCK, reference=1.0, setup=LoopSetup(rest=shift))
     same = simulate_loop(TWO, Pid(kp=0.02), t=CLOCK, reference=1.0 - 0.3)
@@ -193,7 +193,7 @@ def test_the_rest_adds_to_the_readings():
 
 
 def test_held_carts_are_walls():
-    """Two carts with the second held are one cart on both its springs."""
+    """With the second of two carts held, the first moves as one cart on both its springs."""
     alone = Chain(m=TWO.m[:1], c=TWO.c[:1], k=TWO.k[:2])
     pid = Pid(kp=0.02, kd=0.001)
     run = simulate_loop(TWO, pid, t=CLOCK, reference=1.0, setup=LoopSetup(free=[1]))
@@ -202,7 +202,7 @@ def test_held_carts_are_walls():
 
 
 def test_a_replay_gives_the_efforts_that_were_logged():
-    """On the readings of an undelayed PID run the law returns the logged input."""
+    """From the readings of a PID run without delay, the control law gives the logged input."""
     pid = Pid(kp=0.02, ki=0.01, kd=0.0004, scale=0.7, cart=2)
     run = simulate_loop(TWO, pid, t=CLOCK, reference=1.0, setup=LoopSetup(delay=0))
 
@@ -212,12 +212,12 @@ def test_a_replay_gives_the_efforts_that_were_logged():
 
 
 def test_gains_that_do_not_fit_the_carts_are_refused():
-    """Two gains for two carts are an error that says how many are needed."""
+    """Gains in the wrong number are an error that says how many are needed."""
     with pytest.raises(DataError, match="2 carts needs 4 gains, found 2"):
         simulate_loop(TWO, feedback(TWO, np.zeros(2)), t=CLOCK, reference=1.0)
 
 
 def test_a_pid_on_a_held_cart_is_refused():
-    """A controller cannot steer a cart that is held."""
+    """A PID on a held cart is refused, as it cannot steer it."""
     with pytest.raises(DataError, match=r"its cart 2 free, found \[1\]"):
         simulate_loop(TWO, Pid(kp=1.0, cart=2), t=CLOCK, reference=1.0, setup=LoopSetup(free=[1]))

@@ -1,4 +1,4 @@
-"""The equation of motion for python-control agrees with the simulator for every effect."""
+"""For every effect, the equation of motion for python-control agrees with the simulator."""
 
 from itertools import pairwise
 
@@ -31,7 +31,7 @@ def usual(effect: Effect) -> AugmentedChain:
 
 
 def respond(model: AugmentedChain, x0, *, driven: bool):
-    """Return the readings (carts, samples) of python-control's system, by an adaptive solver."""
+    """Return the readings (carts, samples) of python-control's system with an adaptive solver."""
     motion = EquationsOfMotion(model)
     system = motion.to_control()
     state, readings = motion.start(x0), []
@@ -56,9 +56,9 @@ def respond(model: AugmentedChain, x0, *, driven: bool):
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
 @pytest.mark.parametrize("driven", [True, False], ids=["step", "release"])
 def test_the_system_moves_as_the_simulator_does(effect, driven):
-    """A step, on and off, and a release: within half a percent of the motion, friction or not.
+    """A step and a release agree with the simulator within half a percent of the motion.
 
-    A stuck cart creeps by up to force / mass * stop, some 0.01 cm a second of motions of 2 cm.
+    A stuck cart creeps by force / mass * stop at most, some 0.01 cm/s in motions of 2 cm.
     """
     model = usual(effect)
     x0 = np.zeros(2) if driven else np.array([1.5, 0.5])
@@ -71,7 +71,7 @@ def test_the_system_moves_as_the_simulator_does(effect, driven):
 
 
 def test_without_effects_it_is_the_linear_chain():
-    """The rates of change are A x + B u."""
+    """Without effects the rates of change are A x + B u."""
     rng = np.random.default_rng(1)
     system = EquationsOfMotion(AugmentedChain(chain=CHAIN)).to_control()
     A, B, *_ = CHAIN.state_space()
@@ -85,7 +85,7 @@ def test_without_effects_it_is_the_linear_chain():
 
 
 def test_effects_have_states_of_their_own():
-    """Hidden motion and memory of the input are named states."""
+    """A hidden mass and the memory of the input are states with names of their own."""
     own = {
         "extra_mode": ["x2_hidden", "v2_hidden"],
         "presliding_friction": ["z2"],
@@ -99,7 +99,7 @@ def test_effects_have_states_of_their_own():
 
 
 def test_a_drive_that_leads_its_log_has_no_system():
-    """A negative delay needs future input, and the error says so."""
+    """A negative delay would need future input, so it has no system, and the error says so."""
     term = make_term(find_effect("input_delay"), place=0, values={"delay": -0.01}, chain=CHAIN)
 
     with pytest.raises(DataError, match="leads its log"):

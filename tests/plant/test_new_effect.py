@@ -1,4 +1,4 @@
-"""A new effect takes its file and a line in the catalogue; the rest is generated."""
+"""A new effect needs its own file and a line in the catalogue; all other code is generated."""
 
 import ast
 import re
@@ -31,7 +31,7 @@ CUBIC_DRAG = Effect(
 
 
 def function_of(name: str, source: str, **known: object) -> Any:
-    """Return one function of a generated file, without the compiler."""
+    """Return one function of a generated file, not compiled."""
     tree = ast.parse(source)
     (found,) = (n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == name)
     found.decorator_list = []
@@ -57,7 +57,7 @@ def made() -> dict[str, str]:
 
 
 def test_its_columns_force_and_slopes_are_made(made):
-    """The simulator reads its parameter from a column of its own, and has its derivative."""
+    """The simulator gets a column for the new parameter, and the law with its derivatives."""
     columns = kinds_of(made["columns.py"], "Cart")
     Cart = type("Cart", (), columns)
     row = np.zeros((1, len(columns)))
@@ -71,7 +71,7 @@ def test_its_columns_force_and_slopes_are_made(made):
 
 
 def test_a_model_that_follows_knows_it(made):
-    """By its kind: the law, its slopes, and its derivative by the coefficient."""
+    """The fit gets the new law, its slopes, and its derivative by the coefficient."""
     source = made["simulator/terms.py"]
     kinds = kinds_of(source, "Kind")
     terms = function_of("terms", source, Kind=type("Kind", (), kinds))
@@ -93,9 +93,9 @@ PLAIN = [
 
 @pytest.mark.parametrize("effect", PLAIN, ids=lambda effect: effect.key)
 def test_no_other_file_of_the_plant_names_it(effect):
-    """A law without a built-in state appears in one file only.
+    """No file names an effect without a state of its own, except the effect's file.
 
-    Trial shapes, for laws that need one, are in `gap.follow.score`.
+    Only laws that need trial shapes are also named, in `gap.follow.score`.
     """
     files = {
         path.relative_to(ROOM).as_posix()

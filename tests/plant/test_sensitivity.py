@@ -1,4 +1,4 @@
-"""The derivatives of the simulator against differences of its own readings."""
+"""The simulator's derivatives agree with differences of its readings."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from pipeline.plant.nonlinear.simulator.sensitivity import (
 from pipeline.plant.nonlinear.tables import Cart, Spring, Tables
 from tests.helpers.effects import SIZES, make_term
 
-# Small enough that a difference neither adds nor removes a contact or jump.
+# Small enough that the change of a difference neither adds nor removes a contact or jump.
 CASES = {
     **SIZES,
     "nothing": {},
@@ -31,13 +31,13 @@ CASES = {
 }
 
 
-# For carts at rest, effects that act only when the motor pulls.
+# Carts at rest are for effects that act only while the motor pulls.
 @pytest.mark.parametrize(
     ("effect", "speed"), [*((effect, 1.0) for effect in CASES), ("load_friction", 0.0)]
 )
 @pytest.mark.parametrize("preset", ["throne-1dof", "throne-2dof"])
 def test_derivatives_are_those_of_the_readings(preset, effect, speed):
-    """By mass, damping, stiffness, friction and start: central differences agree."""
+    """Derivatives by mass, damping, stiffness, friction and start agree with differences."""
     chain = PRESETS[preset]
     n = chain.n
     terms = ()
@@ -56,12 +56,12 @@ def test_derivatives_are_those_of_the_readings(preset, effect, speed):
     lanes += [(kind, i) for kind in (BY_FRICTION, BY_POSITION, BY_VELOCITY) for i in range(n)]
 
     def simulate(by=-1, at=0, change=0.0):
-        """Return readings and derivatives after one number is changed."""
+        """Return readings and derivatives after a change of one number."""
         tables = [cart.copy(), spring.copy(), x0.copy(), v0.copy(), scatter.copy()]
         if by in (BY_MASS, BY_DAMPING):
             tables[0][at, Cart.MASS if by == BY_MASS else Cart.DAMPING] += change
         elif by == BY_STIFFNESS:
-            # A change past a stretch is given as a share of the stiffness.
+            # The change of stiffness after a stretch is given as a share of the stiffness.
             tables[1][at, Spring.STIFFNESS] += change
         elif by in (BY_POSITION, BY_VELOCITY):
             tables[2 if by == BY_POSITION else 3][0, at] += change
@@ -86,6 +86,6 @@ def test_derivatives_are_those_of_the_readings(preset, effect, speed):
         difference = (simulate(by, at, step)[0] - simulate(by, at, -step)[0]) / (2.0 * step)
         scale = max(float(np.linalg.norm(difference)) * size, 1e-6)
         error = float(np.linalg.norm(derivative - difference)) * size / scale
-        # Impulses in place of forces leave (omega h)² / 12, 4e-3 at most; the friction's change
-        # inside a step, a tenth of the part it has in the derivative.
+        # Impulses in place of forces err by (omega h)² / 12, at most 4e-3. The change of friction
+        # inside a step is a tenth of its part in the derivative.
         assert error < 0.03, (by, at, error)

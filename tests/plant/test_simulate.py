@@ -29,7 +29,7 @@ def rms(x):
 
 @pytest.mark.parametrize("zeta", [0.02, 0.1, 0.7])
 def test_step_of_one_cart_is_the_textbook_step(zeta):
-    """1 - exp(-zeta omega t) (cos omega_d t + …), at times that follow no clock."""
+    """At irregular times a step is 1 - exp(-zeta omega t) (cos omega_d t + …), as in textbooks."""
     k, omega_n = 0.03, 13.2
     m = k / omega_n**2
     chain = Chain(m=np.array([m]), c=np.array([2 * zeta * omega_n * m]), k=np.array([k, 0.0]))
@@ -46,7 +46,7 @@ def test_step_of_one_cart_is_the_textbook_step(zeta):
 
 
 def test_free_decay_from_a_state():
-    """Released at 1 cm with a velocity, one cart follows the damped cosine and sine."""
+    """A cart released at 1 cm with a velocity follows the damped cosine and sine."""
     chain = PRESETS["throne-1dof"]
     t = irregular_times(np.random.default_rng(2), 400)
 
@@ -60,7 +60,7 @@ def test_free_decay_from_a_state():
 
 
 def test_agrees_with_python_control():
-    """On a uniform clock the oracle's sampled system gives the same positions."""
+    """On a uniform clock, python-control's sampled system gives the same positions."""
     rng = np.random.default_rng(3)
     t = clock(500)
     u = 0.05 * rng.standard_normal(t.size)
@@ -68,7 +68,7 @@ def test_agrees_with_python_control():
     sampled = control.sample_system(control.ss(*THREE.state_space()), SAMPLE_TIME, method="zoh")
     expected = control.forced_response(sampled, T=t, U=u).outputs
 
-    # Both exponentials are good to about 1e-13 of the largest motion.
+    # Both matrix exponentials are right to about 1e-13 of the largest motion.
     assert_allclose(simulate_linear(THREE, t, u), expected, atol=1e-10 * np.abs(expected).max())
 
 
@@ -105,7 +105,7 @@ def test_motions_add():
 
 
 def test_held_carts_are_walls():
-    """Carts 1 and 2 alone, cart 3 held, move as the two-cart chain with cart 3's place as wall."""
+    """With cart 3 held, carts 1 and 2 move as a chain of two with a wall in its place."""
     short = Chain(m=THREE.m[:2], c=THREE.c[:2], k=THREE.k[:3])
     t = clock(300)
     u = np.full(t.size, 0.02)
@@ -114,7 +114,7 @@ def test_held_carts_are_walls():
 
 
 def test_the_motor_does_not_reach_past_a_held_first_cart():
-    """With cart 1 held the input moves no cart."""
+    """If cart 1 is held, the input moves no cart."""
     t = clock(50)
 
     x = simulate_linear(THREE, t, np.ones(t.size), free=(2, 3))
@@ -139,12 +139,12 @@ def test_energy_never_grows_without_input(seed):
 
 
 def test_steady_state_of_a_held_sine():
-    """Held samples of a sine drive the carts as the sine, half a sample late and a little less."""
+    """A sampled sine moves the carts as a smooth sine, half a sample late and slightly weaker."""
     omega = 2 * np.pi * 4.0
     t = clock(1500)
     x = simulate_linear(THREE, t, np.sin(omega * t))
 
-    # The first harmonic of the staircase; the images, 28 times faster, move the carts by 28^-3.
+    # The first harmonic of the held samples; the images, 28 times faster, move the carts by 28^-3.
     half = omega * SAMPLE_TIME / 2
     response = THREE.frequency_response(np.array([omega]))[:, 0] * np.sin(half) / half
     expected = np.imag(response[:, None] * np.exp(1j * (omega * t - half)))
@@ -153,22 +153,22 @@ def test_steady_state_of_a_held_sine():
 
 
 def test_steady_state_of_a_band_limited_sine():
-    """Between its samples the input is the smooth sine itself, though there are few of them."""
+    """A band-limited input is the smooth sine itself between its few samples."""
     omega = 2 * np.pi * 4.0
     t = clock(500, 0.03)  # 8 samples a period
     x = simulate_linear(THREE, t, np.sin(omega * t), hold="band_limited")
 
     response = THREE.frequency_response(np.array([omega]))[:, 0]
     expected = np.imag(response[:, None] * np.exp(1j * omega * t))
-    inner = (t > 11.0) & (t < 14.5)  # the kernel is cut off at the ends
-    # Straight lines between points 64 a period cost (2 pi / 64)^2 / 12 = 8e-4 of amplitude.
+    inner = (t > 11.0) & (t < 14.5)  # the interpolation is cut off at the ends
+    # Straight lines between 64 points per period err by (2 pi / 64)^2 / 12 = 8e-4 of the amplitude.
     assert_allclose(x[:, inner], expected[:, inner], atol=1.2e-3 * np.abs(response).max())
     held = simulate_linear(THREE, t, np.sin(omega * t))
     assert rms(held[:, inner] - expected[:, inner]) > 0.2 * rms(expected[:, inner])
 
 
 def test_a_band_limited_constant_is_a_constant():
-    """The interpolation of equal samples is flat up to its ends."""
+    """The interpolation of equal samples is constant up to its ends."""
     t = clock(100)
     u = np.full(t.size, 0.03)
 
@@ -178,7 +178,7 @@ def test_a_band_limited_constant_is_a_constant():
 
 
 def test_input_that_runs_straight_between_samples():
-    """A ramp on a free mass: x = t³ / 6m, whatever the sample times."""
+    """A ramp input on a free mass gives x = t³ / 6m, whatever the sample times."""
     A, B, C, _ = Chain(m=np.array([2.0]), c=np.zeros(1), k=np.zeros(2)).state_space()
     t = irregular_times(np.random.default_rng(5), 80, mean=0.02)
 
@@ -189,7 +189,7 @@ def test_input_that_runs_straight_between_samples():
 
 @pytest.mark.parametrize("n", [2, 3, 4, 10, 101])
 def test_even_and_uneven_times_agree(n):
-    """Records of one interval are simulated in blocks, others sample by sample."""
+    """Records with one interval, simulated in blocks, agree with simulation sample by sample."""
     rng = np.random.default_rng(n)
     t, u, x0 = clock(n), rng.standard_normal(n), rng.standard_normal(6)
     uneven = t.copy()
@@ -199,7 +199,7 @@ def test_even_and_uneven_times_agree(n):
 
 
 def test_the_last_input_has_no_time_to_act():
-    """The input at the last sample acts only after the record."""
+    """The input at the last sample acts only after the end of the record."""
     t = clock(20)
     u = np.ones(t.size)
 
@@ -209,7 +209,7 @@ def test_the_last_input_has_no_time_to_act():
 
 
 def test_arguments_are_left_alone():
-    """Times, input and start are read, never written."""
+    """The simulator does not change the arrays of times, input and start."""
     t, u, x0 = clock(20), np.ones(20), np.ones(6)
     for array in (t, u, x0):
         array.flags.writeable = False

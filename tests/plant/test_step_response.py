@@ -1,4 +1,4 @@
-"""Overshoot and settling time against the closed form of a second-order system."""
+"""Overshoot and settling time agree with the closed form of a second-order system."""
 
 import numpy as np
 import pytest
@@ -18,28 +18,28 @@ def second_order(omega_n: float, zeta: float) -> np.ndarray:
 @pytest.mark.parametrize("zeta", [0.1, 0.3, 0.6])
 @pytest.mark.parametrize(("before", "level"), [(0.0, 1.0), (2.0, -3.0)])
 def test_overshoot_is_the_closed_form(zeta, before, level):
-    """The overshoot of a second-order step is exp(-pi zeta / sqrt(1 - zeta²)), either way up."""
+    """The overshoot of a second-order step, up or down, is exp(-pi zeta / sqrt(1 - zeta²))."""
     y = before + (level - before) * second_order(20.0, zeta)
 
     got = overshoot_percent(y, before=before, level=level)
 
-    # A sampled peak is low by (omega dt)²/2 = 2e-6 of the swing.
+    # The peak of the samples is low by (omega dt)²/2 = 2e-6 of the swing.
     assert_allclose(got, 100 * np.exp(-np.pi * zeta / np.sqrt(1 - zeta**2)), atol=1e-3)
 
 
 def test_settling_is_the_last_entry_into_the_band():
-    """The settling time is the last instant outside two percent, to a sample."""
+    """The settling time is the last instant outside two percent, to within a sample."""
     y = second_order(20.0, 0.2)
     got = float(settling_time(T, y, before=0.0, level=1.0))
 
     assert np.all(np.abs(y[T >= got] - 1) <= 0.02)
     assert np.abs(y[np.searchsorted(T, got) - 1] - 1) > 0.02
-    # The envelope reaches 2 % at 4 / (zeta omega) less ln of its factor: within half a swing.
+    # The envelope reaches 2 % at 4 / (zeta omega), less ln of its factor: within half a swing.
     assert_allclose(got, np.log(50) / 4.0, atol=np.pi / 20)
 
 
 def test_many_responses_at_once_are_each_judged_alone():
-    """A stack of responses gives the results of each; one that never settles gives NaN."""
+    """Each response of an array gets its own results; one that never settles gets NaN."""
     y = np.stack([second_order(20.0, 0.5), second_order(20.0, 0.1), np.zeros(T.size)])
     level = np.ones(3)
 
@@ -55,7 +55,7 @@ def test_many_responses_at_once_are_each_judged_alone():
 
 
 def test_noise_widens_the_band():
-    """A response that is settled except for noise counts as settled."""
+    """A response that has settled except for noise counts as settled."""
     y = second_order(20.0, 0.5) + 0.03 * np.sin(2000 * T)
 
     assert np.isnan(settling_time(T, y, before=0.0, level=1.0))

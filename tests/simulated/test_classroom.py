@@ -1,4 +1,4 @@
-"""The class of the demo: grading finds exactly the mistakes that were planted."""
+"""In the demo's class, grading finds exactly the planted mistakes."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from pipeline.simulated.classroom import PRESET, write_class
 
 
 def test_the_slip_and_the_copy_are_found_and_the_honest_team_is_not_touched(tmp_path):
-    """Team 1 has all points and no flag, team 2 its Hz, teams 2 and 3 the one recording."""
+    """Team 1 has all points, team 2 is flagged for Hz, and teams 2 and 3 for a shared recording."""
     write_class(tmp_path / "class")
     assert [p.name for p in tmp_path.iterdir()] == ["class"]
     grade_class(

@@ -1,4 +1,4 @@
-"""Synthetic submissions: complete, physically sensible, and the same bytes every time."""
+"""Synthetic submissions are complete, physically sensible, and the same bytes every time."""
 
 import re
 import tomllib
@@ -25,7 +25,7 @@ NOISE = 0.2 * COUNT
 
 @pytest.fixture(scope="module")
 def sessions(tmp_path_factory):
-    """One submission of every preset, with what students report."""
+    """Return one submission for each preset, with reported values."""
     root = tmp_path_factory.mktemp("sessions")
     for preset in PRESET_NAMES:
         write_submission(root / preset, preset, seed=1, reported=True)
@@ -41,7 +41,7 @@ def experiments(folder, kind):
 
 
 def table(folder, entry):
-    """Read one data file as columns by name."""
+    """Return the columns of one data file by name."""
     return np.genfromtxt(folder / entry["file"], delimiter=",", names=True)
 
 
@@ -61,7 +61,7 @@ def content(folder):
 
 
 def test_same_seed_same_bytes(tmp_path, sessions):
-    """A second run writes the same files; another seed writes other data."""
+    """The same seed gives the same files, and another seed gives other data."""
     preset = "throne-2dof"
     write_submission(tmp_path / "again", preset, seed=1, reported=True)
     write_submission(tmp_path / "other", preset, seed=2, reported=True)
@@ -74,7 +74,7 @@ def test_same_seed_same_bytes(tmp_path, sessions):
 
 
 def test_the_shipped_examples_are_what_the_program_writes(tmp_path):
-    """Every file in `submissions/` comes from `python -m pipeline.simulated.examples`."""
+    """The files in `submissions/` are what `python -m pipeline.simulated.examples` writes."""
     write_examples(tmp_path)
 
     for example in CATALOGUE:
@@ -82,7 +82,7 @@ def test_the_shipped_examples_are_what_the_program_writes(tmp_path):
 
 
 def test_the_examples_are_small():
-    """Together they are smaller than a photograph."""
+    """All shipped examples together are smaller than a photograph."""
     sizes = [
         len(data) for example in CATALOGUE for data in content(EXAMPLES / example.folder).values()
     ]
@@ -95,7 +95,7 @@ def test_the_examples_are_small():
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
 def test_loads_as_a_submission(sessions, preset):
-    """The folder passes the same validation as a student's."""
+    """The folder passes the same checks as a student's submission."""
     submission = load_submission(sessions / preset)
 
     assert submission.system.carts == PRESETS[preset].n
@@ -106,7 +106,7 @@ def test_loads_as_a_submission(sessions, preset):
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
 def test_a_whole_session(sessions, preset):
-    """Three decays of each cart, steps of two sizes and signs, 20 to 30 dwells, and the rest."""
+    """A session has three decays of each cart, four kinds of steps, dwells, sweep and loop."""
     folder, n = sessions / preset, PRESETS[preset].n
 
     assert [e["carts"] for e in experiments(folder, "decay")] == [
@@ -122,14 +122,14 @@ def test_a_whole_session(sessions, preset):
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
 def test_the_carts_move_well_and_not_too_far(sessions, preset):
-    """Every run moves some cart by 0.4 to 2 cm, in whole counts, with a realistic input."""
+    """In every run some cart moves by 0.4 to 2 cm, in whole counts, under a realistic input."""
     for entry in toml(sessions / preset)["experiments"]:
         data = table(sessions / preset, entry)
         x = positions(data)
 
         assert 0.4 <= np.abs(x).max() <= 2.0, entry["id"]
         assert np.abs(data["input"]).max() <= 5.0
-        # Four decimals: half of the last one.
+        # Four decimals are written: half of the last one.
         assert_allclose(x / COUNT, np.round(x / COUNT), atol=0.51e-4 / COUNT)
         assert_allclose(np.diff(data["time"]), SAMPLE_TIME, atol=1.01e-5)
 
@@ -145,13 +145,13 @@ def test_the_log_is_the_motion_of_the_plant(sessions, preset, kind):
 
         residual = positions(data) - model
         residual -= np.median(residual, axis=1, keepdims=True)  # the encoder's zero
-        # A cart at rest may lie anywhere between two counts, so rounding is at worst half a count.
+        # A cart at rest may be anywhere between two counts, so rounding errs by up to half a count.
         assert np.sqrt(np.mean(residual**2)) < np.hypot(NOISE, COUNT / 2), entry["id"]
 
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
 def test_dwells_settle_before_they_end(sessions, preset):
-    """The last two cycles of every dwell lie on the cycles before them."""
+    """The last two cycles of every dwell agree with the two cycles before them."""
     for entry in experiments(sessions / preset, "sine"):
         data = table(sessions / preset, entry)
         t, x = data["time"], positions(data)
@@ -159,14 +159,14 @@ def test_dwells_settle_before_they_end(sessions, preset):
         late = t > t[-1] - 2 * period
         for cart in x:
             earlier = np.interp(t[late] - 4 * period, t, cart)
-            # Two readings with noise and rounding each, and straight lines between them.
+            # Two readings, each with noise and rounding, and straight lines between samples.
             noise = np.sqrt(2 * (NOISE**2 + COUNT**2 / 12))
             bend = np.abs(cart).max() * (2 * np.pi * SAMPLE_TIME / period) ** 2 / 8
             assert np.sqrt(np.mean((cart[late] - earlier) ** 2)) < 1.2 * noise + bend, entry["id"]
 
 
 def test_the_three_cart_session_has_the_dwell_of_figures_12_to_14():
-    """The shipped example dwells at exactly 4 Hz, recorded from rest."""
+    """The shipped three-cart example has a dwell at exactly 4 Hz, recorded from rest."""
     folder = EXAMPLES / "three-cart"
     (entry,) = [e for e in experiments(folder, "sine") if e["frequency"] == 4.0]
 
@@ -178,7 +178,7 @@ def test_the_three_cart_session_has_the_dwell_of_figures_12_to_14():
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
 def test_dwells_surround_every_resonance_and_null(preset):
-    """Some dwell lies within 1 % of each, or within its bandwidth, and some on both sides."""
+    """Some dwell is very near each resonance and null, and some are on both sides."""
     chain = PRESETS[preset]
     dwells = 2 * np.pi * np.array(dwell_frequencies(chain, n=28))
     for roots in (chain.poles, *(chain.zeros(cart) for cart in range(1, chain.n))):
@@ -200,7 +200,7 @@ def release_by_hand(**changes):
 
 
 def test_a_hand_holds_then_lets_go_softly():
-    """Held within 1 % until the release; then the force fades, so nothing starts with a jerk."""
+    """A hand holds a cart within 1 % until the release, and its force then fades smoothly."""
     _, hand, run, bench = release_by_hand()
 
     x = bench.move(run).x
@@ -210,13 +210,14 @@ def test_a_hand_holds_then_lets_go_softly():
     assert_array_equal(x[0], 0.0)
     first = np.argmax(~held)
     step = np.diff(x[1])
-    # A cut string starts with omega² x T²/2 = 0.06 cm in a sample; the fading hand with less.
+    # After a sudden release the cart moves omega² x T²/2 = 0.06 cm in a sample; after a fading one,
+    # less.
     assert abs(step[first]) < 0.04
-    assert x[1].max() > 1.2  # and then it swings through
+    assert x[1].max() > 1.2  # then it swings to the other side
 
 
 def test_after_the_hand_the_decay_is_free():
-    """Past the fade each sample follows from the two before it, as in any damped oscillation."""
+    """After the hand has let go, each sample follows from the two before as in a free decay."""
     chain, hand, run, bench = release_by_hand()
 
     x = bench.move(run).x[1, run.t > hand.release + hand.fade + SAMPLE_TIME]
@@ -230,7 +231,7 @@ def test_after_the_hand_the_decay_is_free():
 
 
 def test_a_held_cart_reads_one_number():
-    """Noise moves only free carts."""
+    """Only the readings of free carts have noise; those of a held cart are constant."""
     _, _, run, bench = release_by_hand()
 
     y = bench.read(bench.move(run), run=run, rng=np.random.default_rng(1))
@@ -244,12 +245,12 @@ def test_a_held_cart_reads_one_number():
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
 def test_honest_claims_are_near_the_truth(sessions, preset):
-    """Final gains and frequencies within 2 %, dampings within 20 %; guesses as guessed."""
+    """Reported final gains and frequencies are within 2 % of the truth, dampings within 20 %."""
     truth, reported = PRESETS[preset].parameters(), toml(sessions / preset)["reported"]
 
     assert list(reported["initial"]) == list(reported["final"]) == list(truth)
     for name, value in truth.items():
-        # Two standard deviations, combined over two or three springs and masses.
+        # Two standard errors, combined over two or three springs and masses.
         limit = 0.2 if name.startswith("zeta") else 0.02
         assert reported["final"][name] == pytest.approx(value, rel=limit), name
         if re.fullmatch("zeta_[a-cxy]", name):
@@ -257,7 +258,7 @@ def test_honest_claims_are_near_the_truth(sessions, preset):
 
 
 def test_claims_have_three_digits(sessions):
-    """Numbers are typed with three significant digits, guesses with two."""
+    """Reported final values have three significant digits, and initial ones two."""
     text = (sessions / "throne-3dof" / "submission.toml").read_text(encoding="utf-8")
     final = text.split("[reported.final]")[1].split("[")[0]
 
@@ -268,17 +269,17 @@ def test_claims_have_three_digits(sessions):
 
 @pytest.mark.parametrize("preset", PRESET_NAMES[1:])
 def test_honest_claims_agree_with_each_other(sessions, preset):
-    """The reported final values belong to one chain: redundancies are at their rounding."""
+    """The reported final values violate the redundancies only by their rounding."""
     final = toml(sessions / preset)["reported"]["final"]
 
     residuals = recover_from_parameters(final).residuals
 
-    # Half of the third digit, 0.5 % at most, amplified some ten times on the worst route.
+    # Half of the third digit, 0.5 % at most, grows some ten times in the worst redundancy.
     assert max(residuals.values()) < 0.05
 
 
 def test_reported_state_space_and_feedback(sessions):
-    """A and B have the right shapes, and the gains are those that ran."""
+    """The reported A and B have the right shapes, and the reported gains are those that ran."""
     document = toml(sessions / "throne-3dof")
     reported = document["reported"]
     (control,) = [e for e in document["experiments"] if e["kind"] == "closed_loop"]
@@ -290,7 +291,10 @@ def test_reported_state_space_and_feedback(sessions):
 
 
 def test_the_controlled_cart_follows(sessions):
-    """The chosen cart ends within 5 % of its reference: the students' model is a little off."""
+    """The controlled cart ends within 5 % of its reference.
+
+    The students' model is slightly off.
+    """
     for preset in PRESET_NAMES:
         (entry,) = experiments(sessions / preset, "closed_loop")
         data = table(sessions / preset, entry)
@@ -302,7 +306,7 @@ def test_the_controlled_cart_follows(sessions):
 
 
 def test_four_carts(tmp_path):
-    """The plant is written for n carts."""
+    """The simulation works for four carts too."""
     chain = Chain(
         m=np.full(4, 2.5e-4), c=np.full(4, 4e-4), k=np.array([0.0, 0.12, 0.1, 0.08, 0.06])
     )
@@ -320,7 +324,7 @@ def test_four_carts(tmp_path):
 
 
 def test_counts_as_units(tmp_path):
-    """A bench that reads counts writes whole numbers."""
+    """On a bench that reads counts, the files hold whole numbers."""
     chain = Chain(m=np.array([5.5e-6]), c=np.array([2.6e-5]), k=np.array([2.8e-3, 0.0]))
 
     write_submission(
@@ -335,7 +339,7 @@ def test_counts_as_units(tmp_path):
 
 
 def test_rounded_time_stamps(tmp_path):
-    """Three decimals give the stamps of an ECP export."""
+    """Three decimals give the time stamps of an ECP export."""
     write_submission(
         tmp_path,
         "throne-1dof",
@@ -350,13 +354,13 @@ def test_rounded_time_stamps(tmp_path):
 
 
 def test_an_unknown_preset_names_the_known_ones(tmp_path):
-    """A misspelt preset is an error with the known names."""
+    """A misspelt preset gives an error that lists the known presets."""
     with pytest.raises(ConfigError, match=r"no preset 'throne-4dof': there are throne-1dof, "):
         write_submission(tmp_path, "throne-4dof", seed=0)
 
 
 def test_a_cart_without_damping_of_its_own(tmp_path):
-    """Its decay is cut when a student would stop it; the chain as a whole still settles."""
+    """The decay of a cart without damping is cut where a student would stop it."""
     chain = Chain(m=np.array([3e-4, 2e-4]), c=np.array([8e-4, 0.0]), k=np.array([0.05, 0.1, 0.05]))
 
     write_submission(tmp_path, SimulatedBench(chain=chain), seed=7, compact=True)
@@ -367,7 +371,7 @@ def test_a_cart_without_damping_of_its_own(tmp_path):
 
 
 def test_carts_that_never_settle_are_refused(tmp_path):
-    """Without damping there is no steady state to record."""
+    """Carts without any damping are refused, as they never reach a steady state."""
     undamped = Chain(m=np.array([2e-4]), c=np.zeros(1), k=np.array([0.03, 0.0]))
 
     with pytest.raises(DataError, match="never settle"):

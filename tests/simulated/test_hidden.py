@@ -1,6 +1,6 @@
 """Effects hidden in a synthetic bench.
 
-In every kind of run, against limits and the other simulator.
+They are tested in every kind of run, against limits and against an independent simulator.
 """
 
 import json
@@ -35,7 +35,7 @@ from tests.truth.bench import Hidden, simulate_truth
 
 TWO = PRESETS["throne-2dof"]
 KEYS = [effect.key for effect in CATALOGUE]
-# The second simulator has its own law for these contacts.
+# The independent simulator has its own law for these contacts.
 OWN_CONTACT = {"backlash", "end_stop"}
 
 
@@ -44,7 +44,7 @@ def bench(*terms, chain=TWO):
 
 
 def usual(key, chain=TWO, **changes):
-    """Return the effect at its usual place and size, some parameters changed."""
+    """Return the effect at its usual place and size, with some parameters changed."""
     term = usual_term(find_effect(key), chain)
     values = dict(zip(term.effect.names, term.values, strict=True)) | changes
     return replace(term, values=tuple(values[name] for name in term.effect.names))
@@ -66,7 +66,7 @@ def step(n=2, seconds=3.0):
 
 def decay(cart=1):
     t = clock(2.5)
-    # Its tremor turns at the release, so the cart is let go without velocity.
+    # The hand's tremor is at a turning point at the release, so the cart starts at rest.
     tremor = tuple(np.pi / 2 - 2 * np.pi * np.array([1.3, 4.1, 8.7]) * t[45])
     hand = ReleasingHand(cart=cart, position=-1.5, release=float(t[45]), fade=0.021, tremor=tremor)
     return BenchRun(id="decay", kind="decay", t=t, u=np.zeros(t.size), free=(cart,), hand=hand)
@@ -94,7 +94,7 @@ def control():
 
 
 def _cases():
-    """Every effect on every preset; in the quick suite, one of each preset."""
+    """Yield every effect on every preset; in the quick suite, each effect on one preset."""
     for i, key in enumerate(KEYS):
         for j, preset in enumerate(PRESETS):
             quick = i == 6 * j
@@ -104,7 +104,7 @@ def _cases():
 
 @pytest.fixture(scope="module")
 def linear(tmp_path_factory):
-    """A session without effects on each preset."""
+    """A session without effects for each preset."""
     root = tmp_path_factory.mktemp("linear")
     for preset in PRESETS:
         write_submission(root / preset, preset, seed=3, compact=True)
@@ -113,7 +113,7 @@ def linear(tmp_path_factory):
 
 @pytest.mark.parametrize(("key", "preset"), list(_cases()))
 def test_an_effect_hides_in_a_whole_submission(tmp_path, linear, key, preset):
-    """The session loads and reads like any other, shows the effect, and never names it."""
+    """A session with a hidden effect is read like any other, shows it, and never names it."""
     chain = PRESETS[preset]
 
     write_submission(
@@ -123,14 +123,14 @@ def test_an_effect_hides_in_a_whole_submission(tmp_path, linear, key, preset):
     records = read_data(load_submission(tmp_path)).records
     others = read_data(load_submission(linear / preset)).records
     apart = [float(np.abs(a.y - b.y).max()) for a, b in zip(records, others, strict=True)]
-    # Two readings of the same position differ by at most a count and the encoder noise.
+    # Two readings of one position differ by at most a count and the encoder noise.
     assert max(apart) > 4 * COUNT
     assert key not in (tmp_path / "submission.toml").read_text(encoding="utf-8")
     assert {path.name for path in tmp_path.iterdir()} == {"submission.toml", "data"}
 
 
 def test_several_effects_at_once():
-    """Each with its place, given or usual."""
+    """Several effects can be hidden at once, at given places or at their usual ones."""
     hide = ["coulomb_friction:cart=2", "cubic_spring:spring=3,coefficient=0.02", "dead_zone"]
     prepared = prepare_bench(preset="throne-2dof", hide=hide)
     assert [(t.effect.key, t.place) for t in prepared.effects] == [
@@ -141,7 +141,7 @@ def test_several_effects_at_once():
 
 
 def test_the_linear_path_compiles_nothing():
-    """Importing the synthesis and preparing a bench with effects loads no numba."""
+    """Importing the synthesis and preparing a bench with effects does not load numba."""
     code = (
         "import sys; from pipeline.simulated.hidden import prepare_bench as p; "
         "p(preset='throne-2dof', hide=['stiction']); print('numba' in sys.modules)"
@@ -156,9 +156,9 @@ def test_the_linear_path_compiles_nothing():
 @pytest.mark.parametrize("key", KEYS)
 @pytest.mark.parametrize("make_run", [step, decay, control], ids=lambda f: f.__name__)
 def test_next_to_nothing_is_the_linear_bench(key, make_run):
-    """At a hundred-thousandth of its size, each effect changes no run by a count."""
+    """At a hundred-thousandth of its usual size, no effect changes a run by a count."""
     term = usual(key)
-    # These have further sizes, without a neutral value of their own.
+    # These effects have further sizes, which have no neutral value.
     further = {
         "stiction": ("static_force",),
         "end_stop": ("damping",),
@@ -173,13 +173,13 @@ def test_next_to_nothing_is_the_linear_bench(key, make_run):
     if key == "saturation":
         values = [1e3]  # a limit that is never reached
     if key == "backlash":
-        values[0] = 0.0  # the contact's own stiffness stays, however small the gap
+        values[0] = 0.0  # the contact keeps its stiffness, however small the gap
     small = replace(term, values=tuple(values))
 
     moved, plain = bench(small).move(make_run()), bench().move(make_run())
 
-    # No effect would reach a hundred thousand counts if it grew in proportion; what else differs
-    # is now and then a rounding of an encoder in the loop.
+    # An effect that grows in proportion with its size stays below a count. The other differences
+    # are single roundings of an encoder in the loop.
     assert_allclose(moved.x, plain.x, atol=COUNT)
 
 
@@ -188,7 +188,7 @@ def test_next_to_nothing_is_the_linear_bench(key, make_run):
 
 @pytest.mark.parametrize("key", [key for key in KEYS if key not in OWN_CONTACT])
 def test_steps_agree_with_the_independent_bench(key):
-    """A step with an effect is that of the fine-step simulator, to a fifth of a count."""
+    """A step with an effect agrees with the 50-µs simulator to a fifth of a count."""
     term, run = usual(key), step()
     hidden = Hidden(effect=key, place=term.place, parameters=named(term))
 
@@ -199,8 +199,8 @@ def test_steps_agree_with_the_independent_bench(key):
         m=TWO.m, c=TWO.c, k=TWO.k, hidden=[hidden], t=run.t, u=run.u, free=(1, 2),
         x0=rest_positions(model),
     )  # fmt: skip
-    # The truth reads out along straight lines within 50 µs and errs by omega h / 2 of the phase:
-    # 0.07 count where the motion is linear.
+    # The 50-µs simulator reads along straight lines and errs by omega h / 2 in phase: 0.07 count in
+    # linear motion.
     assert_allclose(moved.x, truth, atol=0.2 * COUNT)
     assert np.abs(moved.x - bench().move(run).x).max() > 2 * COUNT
 
@@ -211,7 +211,7 @@ def test_steps_agree_with_the_independent_bench(key):
      "input_delay", "actuator_lag", "extra_mode", "sensor_gain"],
 )  # fmt: skip
 def test_closed_loops_agree_with_the_independent_bench(key):
-    """The logged input of a loop, applied to the fine-step simulator, gives the logged motion."""
+    """A closed loop's logged input, applied to the 50-µs simulator, gives the logged motion."""
     term, run = usual(key), control()
 
     moved = bench(term).move(run)
@@ -220,15 +220,16 @@ def test_closed_loops_agree_with_the_independent_bench(key):
     truth = simulate_truth(
         m=TWO.m, c=TWO.c, k=TWO.k, hidden=[hidden], t=run.t, u=moved.u, free=(1, 2)
     )
-    # As for the steps; an input that changes every sample adds an edge a sample to the truth.
+    # As for the steps; since the input changes every sample, that simulator has an edge in each
+    # sample.
     assert_allclose(moved.x, truth, atol=0.5 * COUNT)
-    # The loop feels it: the controller asks for other inputs than on the linear bench.
+    # The effect changes the loop: the controller asks for other inputs than on the linear bench.
     assert np.abs(moved.u - bench().move(run).u).max() > 1e-4
 
 
 @pytest.mark.parametrize("key", ["coulomb_friction", "quadratic_drag", "cubic_spring"])
 def test_releases_agree_with_the_independent_bench(key):
-    """After the hand begins to let go, the fine-step simulator under its force does the same."""
+    """From the release on, the 50-µs simulator under the hand's force gives the same motion."""
     run, term = decay(), usual(key)
     hand = run.hand
     assert hand is not None
@@ -240,7 +241,7 @@ def test_releases_agree_with_the_independent_bench(key):
     spring = TWO.k[0] + TWO.k[1]
     extra = named(term)["coefficient"] * held**3 if key == "cubic_spring" else 0.0
     fine = np.arange(run.t[start], run.t[-1] + 1e-9, SAMPLE_TIME / 40)
-    # The force falls in straight lines between the samples; the middle of each fine step.
+    # The force is linear between samples; each fine step takes its value in the middle.
     samples = run.t[start:]
     ramp = (spring * held + extra) * np.clip(1 - (samples - samples[0]) / hand.fade, 0, 1)
     push = np.interp(fine + SAMPLE_TIME / 80, samples, ramp)
@@ -248,13 +249,13 @@ def test_releases_agree_with_the_independent_bench(key):
         m=TWO.m, c=TWO.c, k=TWO.k, t=fine, u=push, free=(1,), x0=np.array([held, 0.0]),
         hidden=[Hidden(effect=key, place=term.place, parameters=named(term))],
     )  # fmt: skip
-    # The truth's phase errs by omega h / 2, 1e-3 of 1.5 cm where the spring is at its stiffest.
+    # The phase of the 50-µs simulator errs by omega h / 2: 1e-3 of 1.5 cm at the spring's stiffest.
     assert_allclose(x[0, start:], np.interp(samples, fine, truth[0]), atol=0.6 * COUNT)
 
 
 @pytest.mark.parametrize("key", KEYS)
 def test_sample_by_sample_is_the_whole_run(key):
-    """Stepping a bench through the samples gives the run simulated at once."""
+    """Stepping a bench sample by sample gives the run that is simulated at once."""
     term = usual(key)
     model, run = AugmentedChain(chain=TWO, terms=(term,)), step()
     stepped = SteppedBench(model)
@@ -263,7 +264,7 @@ def test_sample_by_sample_is_the_whole_run(key):
         stepped.step(float(now), following=float(following), interval=SAMPLE_TIME)
         x.append(stepped.readings)
 
-    # Their substeps differ, by which forces are held: some hundredths of a count.
+    # The two differ in their substeps, and so in when forces act: some hundredths of a count.
     assert_allclose(np.transpose(x), simulate_augmented(model, run.t, run.u), atol=0.1 * COUNT)
 
 
@@ -271,9 +272,9 @@ def test_sample_by_sample_is_the_whole_run(key):
 
 
 def test_a_constant_force_shows_where_the_carts_rest():
-    """Carts rest where springs carry the force.
+    """Under a constant force the carts rest where the springs balance it.
 
-    Elsewhere if other carts are held, not in a loop.
+    With other carts held that is elsewhere; before a closed loop the encoders are zeroed there.
     """
     term = usual("force_offset")
     (force,) = term.values
@@ -289,7 +290,7 @@ def test_a_constant_force_shows_where_the_carts_rest():
 
 
 def test_a_sensor_deceives_the_controller():
-    """A loop brings the reading to its place, so the cart itself is off by the gain."""
+    """If a sensor has a wrong gain, the loop brings the reading to its target, not the cart."""
     run = control()
     gain = 1.1
 
@@ -300,7 +301,7 @@ def test_a_sensor_deceives_the_controller():
 
 
 def test_a_hand_stops_before_the_end_stop():
-    """No hand pulls a cart into a stop; otherwise the cart is held where it should be."""
+    """A hand stops before the end stop; otherwise it holds the cart at the planned height."""
     stop = usual("end_stop", position=-1.0)
 
     assert bench(stop).move(decay()).x[0, 0] == pytest.approx(-0.9, rel=0.01)
@@ -310,7 +311,7 @@ def test_a_hand_stops_before_the_end_stop():
 
 
 def test_a_held_cart_stays_held():
-    """With effects on both carts, the cart that is held reads zero."""
+    """With effects on both carts, a held cart still reads zero."""
     terms = (usual("coulomb_friction"), replace(usual("force_offset"), place=2))
 
     x = bench(*terms).move(decay()).x
@@ -319,7 +320,7 @@ def test_a_held_cart_stays_held():
 
 
 def test_carts_that_run_away_are_refused():
-    """A spring that softens without end is one clear error, in a run and in a loop."""
+    """A spring that softens until carts run away gives one clear error, in any run."""
     soft = usual("cubic_spring", coefficient=-20.0)
     for run in (step(), control(), decay()):
         with pytest.raises(DataError, match="the carts diverge"):
@@ -327,7 +328,7 @@ def test_carts_that_run_away_are_refused():
 
 
 def test_a_loop_cannot_look_ahead():
-    """A drive may lead its log by one sample at most: later inputs are unknown."""
+    """A drive that leads its log by more than a sample is refused in a loop."""
     assert np.all(np.isfinite(bench(usual("input_delay", delay=-SAMPLE_TIME)).move(control()).x))
     with pytest.raises(DataError, match="lead its log by more than a sample"):
         bench(usual("input_delay", delay=-0.02)).move(control())
@@ -349,7 +350,7 @@ def stored(prepared):
 
 
 def test_a_stored_model_gives_the_same_records(tmp_path):
-    """Simulating from `gap.json` writes exactly the records of the bench it describes."""
+    """Simulating from `gap.json` gives exactly the records of the bench that it describes."""
     prepared = prepare_bench(preset="throne-1dof", hide=["stiction", "backlash:gap=0.02"])
     file = tmp_path / "gap.json"
     file.write_text(json.dumps(stored(prepared)), encoding="utf-8")
@@ -366,7 +367,7 @@ def test_a_stored_model_gives_the_same_records(tmp_path):
 
 
 def test_a_model_of_chain_and_effects_alone_will_do(tmp_path):
-    """The documented part of `gap.json` suffices: values with errors, without contact details."""
+    """The chain and effects of `gap.json` suffice for a simulation, without other entries."""
     document = {
         "chain": {"m": [2e-4], "c": [5e-4], "k": [0.035, 0.0]},
         "effects": [
@@ -390,7 +391,7 @@ def test_a_model_of_chain_and_effects_alone_will_do(tmp_path):
 
 
 def test_a_model_in_counts_moves_as_far(tmp_path):
-    """The file states its units: a model in counts moves by a centimetre's worth of counts."""
+    """A model in counts moves by as many counts as the same model in centimetres."""
     chain = PRESETS["throne-1dof"]
     document = {
         "chain": {name: (getattr(chain, name) * COUNT).tolist() for name in "mck"},
@@ -409,7 +410,7 @@ def test_a_model_in_counts_moves_as_far(tmp_path):
 
 
 def with_backlash(**sizes):
-    """Return a model with backlash of these sizes."""
+    """Return a model with a backlash of these sizes."""
     entry = {"effect": "backlash", "parameters": {"gap": 0.05, **sizes}}
     return {"chain": {"m": [2e-4], "c": [5e-4], "k": [0.035, 0.0]}, "effects": [entry]}
 
@@ -417,7 +418,7 @@ def with_backlash(**sizes):
 @pytest.mark.parametrize("command", ["simulate", "emulate"])
 @pytest.mark.parametrize("sizes", [{"contact_stiffness": 1e30}, {"motor_mass": 1e-30}])
 def test_a_model_too_stiff_to_simulate_is_one_line(command, sizes, tmp_path):
-    """A model that cannot be simulated in time is refused at once; nothing is written or served."""
+    """A model that would take too long to simulate is refused at once, with one line."""
     file = tmp_path / "gap.json"
     file.write_text(json.dumps(with_backlash(**sizes)), encoding="utf-8")
     out = ["--out", str(tmp_path / "out")] if command == "simulate" else []
@@ -448,7 +449,7 @@ def test_a_model_too_stiff_to_simulate_is_one_line(command, sizes, tmp_path):
     ],
 )  # fmt: skip
 def test_a_broken_model_is_one_line(tmp_path, document, message):
-    """Whatever is wrong with the file, the message names it and the place."""
+    """A mistake in the model's file gives one line that names the file and the place."""
     file = tmp_path / "gap.json"
     text = document if isinstance(document, str) else json.dumps(document)
     file.write_text(text, encoding="utf-8")
@@ -482,13 +483,13 @@ def test_a_broken_model_is_one_line(tmp_path, document, message):
     ],
 )
 def test_a_wrong_effect_is_one_line(hide, message):
-    """A wrong name, place or size gives the nearest valid one."""
+    """A wrong name, place or size of an effect gives one line with the nearest valid one."""
     with pytest.raises(ConfigError, match=message):
         prepare_bench(preset="throne-2dof", hide=[hide])
 
 
 def test_one_place_has_one_dry_friction():
-    """Two effects of a family exclude each other at one place, not at two."""
+    """Two laws of dry friction cannot be hidden at one place, but at two places they can."""
     with pytest.raises(ConfigError, match="cart 1 already has coulomb_friction"):
         prepare_bench(preset="throne-2dof", hide=["coulomb_friction", "stiction"])
     hide = ["coulomb_friction", "stiction:cart=2"]
@@ -496,7 +497,7 @@ def test_one_place_has_one_dry_friction():
 
 
 def test_defaults_are_reported():
-    """Omitted sizes get clearly visible defaults, and a note says so."""
+    """A size that is not given gets a clearly visible default, and a note says so."""
     prepared = prepare_bench(preset="throne-3dof", hide=["presliding_friction:force=0.002"])
 
     assert prepared.effect_sentences == (
@@ -507,7 +508,7 @@ def test_defaults_are_reported():
 
 
 def test_a_bench_needs_one_source(tmp_path):
-    """Neither a preset nor a model, or both, is an error."""
+    """A bench is made from either a preset or a model: both, or neither, is an error."""
     with pytest.raises(ConfigError, match="either --preset or --model"):
         prepare_bench()
     with pytest.raises(ConfigError, match="either --preset or --model"):
@@ -515,13 +516,13 @@ def test_a_bench_needs_one_source(tmp_path):
 
 
 def test_an_effect_the_linear_chain_can_replace_is_reported():
-    """An effect that no data of this bench can tell from the chain is hidden, and said so."""
+    """A note says if no data of this bench can distinguish a hidden effect from the chain."""
     prepared = prepare_bench(preset="throne-1dof", hide=["coupling_damper"])
 
     assert prepared.effect_sentences[0].endswith("here the linear chain can do the same")
     (term,) = prepared.effects
     assert isinstance(term, EffectTerm)
-    # It equals the cart's own damping.
+    # It acts as the cart's own damping.
     chain = PRESETS["throne-1dof"]
     damped = replace(chain, c=chain.c + term.values[0])
     assert_allclose(
