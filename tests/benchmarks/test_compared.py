@@ -1,4 +1,4 @@
-"""Other tools are compared fairly: the right model, failures counted, free runs judged."""
+"""Other tools are compared fairly: with the right model, failures counted, free runs judged."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -38,7 +38,7 @@ def _vector(n: int, named: dict[str, float]) -> np.ndarray:
 
 @pytest.mark.parametrize("chain", PRESETS.values(), ids=list(PRESETS))
 def test_the_papers_transfer_functions_are_those_of_the_chain(chain):
-    """The model of Nelder–Mead and `curve_fit` can be right: same response, same names."""
+    """The other tools' transfer functions have the chain's response and names."""
     p = _vector(chain.n, chain.parameters())
 
     assert p.shape == start_of(chain.n).shape
@@ -46,7 +46,7 @@ def test_the_papers_transfer_functions_are_those_of_the_chain(chain):
 
 
 def test_curve_fit_finds_the_truth_in_dwells_without_noise():
-    """From the paper's start, with phases, to the digits that its tolerance of 1e-8 allows."""
+    """From the paper's start, `curve_fit` finds the truth in dwells without noise."""
     chain = PRESETS["throne-2dof"]
     responses = measure(chain, rng=np.random.default_rng(0), phases=True, noise=1e-9)
 
@@ -60,7 +60,7 @@ def test_curve_fit_finds_the_truth_in_dwells_without_noise():
 
 
 def test_the_responses_for_a_modal_analysis_are_those_of_the_chain():
-    """The hold is undone and the transient left out; aliases of the hold are below 1 %."""
+    """The responses given to the modal analysis are those of the chain to 1 %."""
     chain = PRESETS["throne-2dof"]
     hertz, G = responses_of(multisine(chain, rng=np.random.default_rng(0), noise=1e-12))
 
@@ -70,7 +70,7 @@ def test_the_responses_for_a_modal_analysis_are_those_of_the_chain():
 
 
 def test_subspaces_find_the_truth_in_a_record_without_noise():
-    """A realisation of Markov parameters: after 8 s the ringing is below a thousandth."""
+    """From a record without noise, python-control's realisation finds the true resonances."""
     chain = PRESETS["throne-1dof"]
     found = realised(multisine(chain, rng=np.random.default_rng(0), noise=1e-9))
 
@@ -79,7 +79,7 @@ def test_subspaces_find_the_truth_in_a_record_without_noise():
 
 
 def test_no_answer_is_infinitely_wrong():
-    """A method that stops, or finds too few resonances, is counted."""
+    """If a method gives no answer or too few resonances, its error counts as infinite."""
     chain = PRESETS["throne-1dof"]
     truth = modes_named(chain, list(chain.parameters().values()))
 
@@ -92,7 +92,7 @@ def test_no_answer_is_infinitely_wrong():
 
 
 def test_a_free_run_is_judged_after_its_start_and_divergence_is_infinite():
-    """A constant error of a tenth of the motion is a tenth, whatever the first samples are."""
+    """A free run is judged after its first samples, and one that diverges has an infinite error."""
     y = np.ones(100)
     part = Part(dt=0.01, u=np.zeros(100), y=y, first=10)
     near = np.where(np.arange(100) < 10, 50.0, 1.1)
@@ -102,7 +102,10 @@ def test_a_free_run_is_judged_after_its_start_and_divergence_is_infinite():
 
 
 def test_of_nearly_equal_models_the_sparser_is_taken():
-    """And no model, if all of them diverge."""
+    """Of models with nearly equal errors, the one with fewest terms is kept.
+
+    If all models diverge, none is kept.
+    """
     part = Part(dt=0.01, u=np.zeros(100), y=np.ones(100), first=0)
 
     def off_by(value: float, terms: int) -> Model:
@@ -116,7 +119,7 @@ def test_of_nearly_equal_models_the_sparser_is_taken():
 
 
 def test_further_records_are_of_the_same_bench_and_none_that_anybody_had():
-    """No input exceeds those of the training records, and the linear carts are the same."""
+    """The further records come from the same bench, with inputs no larger than in training."""
     case = make_case(seed=7, n=1, rate=113.1)
     further = further_records(case, seed=8)
 
@@ -130,7 +133,7 @@ def test_further_records_are_of_the_same_bench_and_none_that_anybody_had():
     assert largest(further) < largest(case.records)
     for had, new in zip(case.records, further, strict=True):
         assert not np.array_equal(had.y, new.y)
-    had, new = case.records[0], further[0]  # steps: the only constant level is that of the input
+    had, new = case.records[0], further[0]  # in steps, the only constant level is that of the input
     scale = input_of(new).max() / input_of(had).max()
     assert np.abs(new.y - scale * had.y).max() < 4 * COUNT
 
@@ -147,7 +150,7 @@ def test_further_records_are_of_the_same_bench_and_none_that_anybody_had():
     ],
 )
 def test_only_what_is_said_as_named_counts_as_named(verdict, hidden, named):
-    """The right effects under another verdict do not count."""
+    """The right effects count as named only under the verdict `named`."""
     found = ("cubic_spring",) if verdict not in ("none", "unexplained") else ()
     effects = tuple(SimpleNamespace(effect=SimpleNamespace(key=key)) for key in found)
     gap: Any = SimpleNamespace(verdict=verdict, effects=effects)
@@ -156,7 +159,7 @@ def test_only_what_is_said_as_named_counts_as_named(verdict, hidden, named):
 
 
 def test_a_recurrent_network_without_cells_is_a_linear_system():
-    """A free run is C A^k x0 plus the response to the input; both by matrix powers here."""
+    """A recurrent network without nonlinear cells gives the free run of a linear system."""
     rng = np.random.default_rng(3)
     A, B = 0.4 * rng.standard_normal((STATES, STATES)), rng.standard_normal((STATES, 1))
     C, x0, u = (

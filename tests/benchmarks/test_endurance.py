@@ -1,4 +1,4 @@
-"""The endurance test sees what it looks for: lost, doubled and damaged changes, rising memory."""
+"""The endurance test notices lost, doubled and damaged changes, and rising memory."""
 
 import subprocess
 import sys
@@ -24,7 +24,7 @@ def _points(token: str, points: float, *, confirmed: bool = True) -> Change:
 
 @pytest.fixture(scope="module")
 def book(tmp_path_factory):
-    """A class with points by hand, some of them twice, and one request that was answered."""
+    """A class with points by hand, some given twice, and one request that was answered."""
     place = str(tmp_path_factory.mktemp("book"))
     fill_book(place)
     with RequestBook(place) as book:
@@ -58,7 +58,7 @@ def book(tmp_path_factory):
     ],
 )  # fmt: skip
 def test_a_change_of_points_is_there_once_and_whole(book, change, wrong):
-    """Confirmed: exactly once; not confirmed: at most once; for several teams: all or none."""
+    """A confirmed change must be stored once, any other at most once, and none in part."""
     found = Found()
     with RequestBook(book) as opened:
         teams = [one.submission for one in opened.class_now().listings]
@@ -71,7 +71,7 @@ def test_a_change_of_points_is_there_once_and_whole(book, change, wrong):
 
 
 def test_a_team_that_left_the_class_is_lost(book):
-    """The class list is compared with the teams that were graded; so are points nobody sent."""
+    """A graded team that is missing from the class list is reported, and so are unknown points."""
     found = Found()
 
     check_book(book, Journal(), teams=["team-01"], found=found)
@@ -81,7 +81,7 @@ def test_a_team_that_left_the_class_is_lost(book):
 
 
 def test_recordings_and_rows_are_compared_with_what_was_sent(tmp_path):
-    """A file that is missing or another, and a row with an earlier note."""
+    """A missing or changed recording, and a row with an old note, are reported."""
     folder = a_submission(tmp_path / "s0")
     first, *_ = load_submission(folder).experiments
     name = first.file.removeprefix("data/")
@@ -102,7 +102,7 @@ def test_recordings_and_rows_are_compared_with_what_was_sent(tmp_path):
 
 
 def test_the_slope_of_memory_is_that_of_a_line():
-    """10 MB an hour, after the start: with no scatter there is no error."""
+    """Memory that grows by 10 MB an hour after the start has this slope, with no error."""
     memory = Memory()
     for second in range(0, 1800, 2):
         start = 500.0 if second < SETTLING else 0.0
@@ -126,7 +126,7 @@ def test_the_table_has_a_row_for_each_page():
 @pytest.mark.slow
 @pytest.mark.parametrize("part", ["class", "exploration"])
 def test_a_minute_loses_nothing(part):
-    """A small class with kills, and a short exploration."""
+    """A minute of the class with kills, and a minute of an exploration, lose nothing."""
     if part == "class" and (why := postgres.missing()):
         pytest.skip(why)
     command = [sys.executable, "-m", "benchmarks.endurance", part, "--quick"]

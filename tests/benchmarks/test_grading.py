@@ -1,4 +1,4 @@
-"""The basis of the comparison is right: the notebook's reference, the slips, the records."""
+"""The comparison of graders is fair: the notebook's reference and the mistakes are right."""
 
 import json
 from functools import partial
@@ -14,7 +14,7 @@ from pipeline.submission import load_submission
 
 @pytest.fixture(scope="module")
 def teams(tmp_path_factory):
-    """Return a class of an honest team and one with each slip, and the slips by team."""
+    """Return a class with an honest team and one team per mistake, and the mistakes by team."""
     folder = tmp_path_factory.mktemp("class") / "class"
     return folder, grading_notebooks.write_teams(folder, honest=1, each=1)
 
@@ -74,7 +74,7 @@ def test_a_grader_is_judged_by_who_lost_points_and_who_was_told_why():
 
 
 def test_the_table_of_mistakes_counts_every_grading_in_one_line():
-    """A missed mistake is listed by its kind; an honest team with a flag is not right."""
+    """Each kind of mistake has one line; an honest team with a flag counts as wrong."""
 
     def row(kind, codes, found):
         return {

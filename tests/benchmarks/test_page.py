@@ -1,4 +1,4 @@
-"""The page of the benchmarks: making one section keeps the others, and quick runs work."""
+"""Making one section of the benchmarks' page keeps the others, and quick runs work."""
 
 import sys
 from importlib import import_module
@@ -23,7 +23,7 @@ def _section(name: str, cell: str) -> str:
 
 
 def test_one_section_made_anew_leaves_the_others_and_the_head(tmp_path):
-    """The page stores its sections in the order of the list, whichever was made first."""
+    """A section that is made again replaces only itself, and sections keep the list's order."""
     file, order = tmp_path / "README.md", ("first", "second")
     file.write_text("# Mine\n\nWritten by hand.\n", encoding="utf-8")
 
@@ -39,7 +39,7 @@ def test_one_section_made_anew_leaves_the_others_and_the_head(tmp_path):
 
 
 def test_a_section_says_what_it_was_made_with():
-    """Versions of the compared tools are listed below; tools that are not installed are named."""
+    """A section states the versions of the compared tools, and names those not installed."""
     text = _section("first", "1.0")
 
     assert f"numpy {version('numpy')}" in text
@@ -47,7 +47,7 @@ def test_a_section_says_what_it_was_made_with():
 
 
 def test_a_figure_is_written_beside_the_page_and_shown(tmp_path):
-    """It is drawn in the style of the reports, under the name of its benchmark."""
+    """A figure is written beside the page, in the style of the reports."""
 
     def draw() -> Figure:
         figure = Figure()
@@ -63,7 +63,7 @@ def test_a_figure_is_written_beside_the_page_and_shown(tmp_path):
 
 
 def test_rows_may_be_in_a_file_beside_the_figure(tmp_path):
-    """The page links to the file in place of the table; without a folder it has the table."""
+    """The page links to a CSV file with the rows; without a folder it shows the table itself."""
     table = Table(
         title="Times",
         head=["what", "s"],
@@ -92,7 +92,7 @@ def test_text_is_wrapped_to_the_width_of_the_page():
 
 @pytest.mark.parametrize("name", CHEAP)
 def test_quick_ones_run_and_leave_the_page_alone(name, monkeypatch, capsys):
-    """`--quick` prints its tables on stdout only."""
+    """`--quick` prints the tables and does not change the page."""
     page = command.page_of(name)
     before = page.read_bytes()
     monkeypatch.setattr(sys, "argv", ["benchmarks", name, "--quick"])
@@ -105,7 +105,7 @@ def test_quick_ones_run_and_leave_the_page_alone(name, monkeypatch, capsys):
 
 @pytest.mark.parametrize("name", command.BENCHMARKS)
 def test_a_stored_section_has_the_words_of_its_module(name):
-    """The page and the module are edited together: title, question and tools are the same."""
+    """Title, question and tools of a section on the page are those of its module."""
     module = import_module(f"benchmarks.{name}")
 
     text = command.page_of(name).read_text(encoding="utf-8")
@@ -116,7 +116,7 @@ def test_a_stored_section_has_the_words_of_its_module(name):
 
 
 def test_an_unknown_name_is_refused(monkeypatch):
-    """The message lists the known names; nothing is written."""
+    """An unknown name of a benchmark is refused with the known names, and nothing is written."""
     monkeypatch.setattr(sys, "argv", ["benchmarks", "no-such-benchmark"])
 
     with pytest.raises(SystemExit) as refused:
@@ -129,7 +129,7 @@ def test_an_unknown_name_is_refused(monkeypatch):
     ("value", "text"), [(0.01234, "0.012"), (12.34, "12"), (123.4, "123"), (1e7, "1e+07")]
 )
 def test_numbers_keep_two_digits(value, text):
-    """As many digits as are significant."""
+    """`significant` shows as many digits as asked, with exponents only for extreme values."""
     assert significant(value) == text
 
 

@@ -32,7 +32,7 @@ def matlab(analysis: Analysis) -> dict:
 
 
 def test_the_saved_tables_hold_the_analysis(analysis, tmp_path):
-    """Each table reads back to ten digits; headings have units; twice gives the same bytes."""
+    """Saved tables hold the analysis to ten digits, with units in headings, in the same bytes."""
     save_tables(analysis, tmp_path)
     assert {path.stem for path in (tmp_path / "tables").iterdir()} == TABLES
     dwells = pd.read_csv(tmp_path / "tables" / "dwells.csv", keep_default_na=True)
@@ -46,7 +46,7 @@ def test_the_saved_tables_hold_the_analysis(analysis, tmp_path):
 
 
 def test_matlab_finds_the_names_of_the_report(analysis):
-    """State model, gains, parameters, frequency response and records are as in the analysis."""
+    """The MAT-file has the report's names, and the state model and records of the analysis."""
     found = matlab(analysis)
     assert analysis.chain is not None
     assert analysis.feedback is not None
@@ -71,12 +71,12 @@ def test_matlab_finds_the_names_of_the_report(analysis):
 
 
 def test_a_file_of_matlab_does_not_tell_the_time(analysis):
-    """The header that MATLAB skips holds no date, so the bytes are always the same."""
+    """The header of a MAT-file has no date, so the same results give the same bytes."""
     assert matlab_file(analysis)[:116] == b"MATLAB 5.0 MAT-file".ljust(116)
 
 
 def test_bode_data_are_those_of_the_analysis(analysis):
-    """One row for each cart and frequency; standard errors have the units of their values."""
+    """The Bode table has a row per cart and frequency, and standard errors in the values' units."""
     frame = frames.frequency_response(analysis)
     second = frame[frame["cart"] == 2]
     for name in ("omega", "magnitude", "magnitude_std", "phase", "phase_std"):
@@ -88,7 +88,7 @@ def test_bode_data_are_those_of_the_analysis(analysis):
 
 
 def test_a_table_of_ratios_has_no_phase(analysis):
-    """It is missing in the table and empty in MATLAB, not zero."""
+    """If only ratios are known, the phase is missing in the table and empty in MATLAB."""
     first = replace(analysis.frequency_responses[0], phase=None, phase_std=None, source="table")
     reduced = replace(analysis, frequency_responses=(first,))
     assert np.isnan(frames.frequency_response(reduced)["phase"].to_numpy()).all()
@@ -97,7 +97,7 @@ def test_a_table_of_ratios_has_no_phase(analysis):
 
 
 def test_records_get_names_that_matlab_takes(analysis):
-    """Ids that MATLAB would confuse or refuse get different names, and keep their id."""
+    """Records whose ids MATLAB would refuse or confuse get other names, and keep their ids."""
     record = analysis.records[0]
     ids = ("step-1", "step 1", "1", "end", "é" * 80, "é" * 81, "x" * 70, "x" * 71)
     found = matlab(replace(analysis, records=tuple(replace(record, id=id_) for id_ in ids)))
@@ -108,7 +108,7 @@ def test_records_get_names_that_matlab_takes(analysis):
 
 
 def test_an_analysis_of_nothing_still_has_its_tables(analysis, tmp_path):
-    """Tables have their headings only, and the MAT-file has no A."""
+    """An analysis without results gives tables with headings only, and no A in the MAT-file."""
     nothing = replace(
         analysis, records=(), log_decrements=(), step_gains=(), sine_points=(), rows=(), checks=(),
         frequency_responses=(), fit=None, feedback=None,
@@ -122,7 +122,7 @@ def test_an_analysis_of_nothing_still_has_its_tables(analysis, tmp_path):
 
 
 def test_what_could_not_be_had_is_nan(analysis):
-    """A parameter with a final value only has NaN, not 0, for its initial one."""
+    """If a parameter has only a final value, its initial value is NaN in the table."""
     first = replace(analysis.rows[0], initial=None)
     found = matlab(replace(analysis, rows=(first, *analysis.rows[1:])))["parameters"]
     assert np.isnan(found["initial"]["K_1"])
@@ -130,7 +130,7 @@ def test_what_could_not_be_had_is_nan(analysis):
 
 
 def test_report_saves_tables_when_asked(tmp_path):
-    """`--tables` writes beside results.json; a report without it leaves none."""
+    """`report --tables` writes tables beside results.json; `report` alone removes old ones."""
     out = tmp_path / "out"
     folder = EXAMPLES / "one-cart"
     assert cartlab_here("report", folder, "--out", out, "--no-pdf").returncode == 0

@@ -1,4 +1,4 @@
-"""The gap workflow on a small fixed sample of benches with known, hidden physics."""
+"""The gap workflow on a few fixed benches whose hidden physics is known."""
 
 import json
 import subprocess
@@ -48,13 +48,13 @@ def test_a_bench_without_hidden_effects_reports_none(n, dirt):
 
 
 def test_friction_that_varies_from_run_to_run_stays_one_effect():
-    """Scatter of the friction between runs is learnt, not explained by more effects."""
+    """Friction that varies from run to run gets one effect with a scatter, not several effects."""
     case = make_case(seed=43, n=1, effects=["coulomb_friction"], rate=200.0, dirt=True)
 
     gap = explain(case)
 
     assert names(gap) == [("coulomb_friction", 1)]
-    # 4 % was hidden; seven runs determine a spread within a factor of two.
+    # 4 % was hidden; from seven runs a spread is known within a factor of two.
     assert 0.02 < gap.spread[1] < 0.08
     # The stated errors are those of the returned model, on the held-out runs as drawn.
     held_out = [trace for trace in gap.traces if trace.held_out]
@@ -70,7 +70,7 @@ def test_friction_that_varies_from_run_to_run_stays_one_effect():
 
 
 def test_what_the_catalogue_lacks_is_not_misnamed():
-    """Without the true effect in the catalogue nothing is named, and suspects are listed."""
+    """If the catalogue lacks the true effect, none is named, and suspects are listed."""
     case = make_case(seed=10700, n=1, effects=["cubic_spring"], rate=113.1)
     known = [e for e in CATALOGUE if e.key not in ("cubic_spring", "slack_spring")]
 
@@ -82,7 +82,7 @@ def test_what_the_catalogue_lacks_is_not_misnamed():
 
 
 def test_a_part_is_called_a_part():
-    """If the catalogue has one of two effects, it is found, with the verdict `partial`."""
+    """If the catalogue has one of two true effects, it is named with the verdict `partial`."""
     case = make_case(seed=53, n=1, effects=["coulomb_friction", "saturation"], rate=113.1)
     known = [e for e in CATALOGUE if e.key in ("coulomb_friction", "cubic_spring", "drive_damping")]
 
@@ -98,7 +98,7 @@ def test_a_part_is_called_a_part():
 
 @pytest.mark.parametrize("irregular", [False, True])
 def test_blocks_of_fast_samples_are_readings_at_their_middle(irregular):
-    """At 1 kHz every fourth millisecond is fitted, each reading on its own curve."""
+    """At 1 kHz four samples become one reading in their middle, from a curve through them."""
     t = np.arange(4001) / 1000.0
     if irregular:
         t = t + np.random.default_rng(0).uniform(-2e-4, 2e-4, t.size)
@@ -115,14 +115,14 @@ def test_blocks_of_fast_samples_are_readings_at_their_middle(irregular):
     assert thin.shots == (0, thin.t.size) == (0, 1001)
     assert thin.t[0] == run.t[0]
     assert not thin.weight[0, 0]
-    # The fourth derivative of the motion leaves (omega h)⁴ / 1000, 1e-7 here, uneven times the
-    # third, (omega h)³ / 100; a mean alone 4e-4.
+    # The motion's fourth derivative leaves (omega h)⁴ / 1000, 1e-7 here; at irregular times its
+    # third leaves (omega h)³ / 100. A mean alone would err by 4e-4.
     limit = 2e-5 if irregular else 1e-6
     np.testing.assert_allclose(thin.y[0, 2:-1], np.cos(omega * thin.t[2:-1]), atol=limit)
 
 
 def test_the_time_allowed_ends_the_search():
-    """Without any time the linear model is the best answer so far, and marked so."""
+    """Without any time for the search, the linear model is returned and marked as incomplete."""
     case = make_case(seed=45, n=1, effects=["dead_zone"], rate=113.1)
 
     gap = explain(case, budget=0.0)
@@ -132,7 +132,7 @@ def test_the_time_allowed_ends_the_search():
 
 
 def test_repeats_are_compared_by_the_edge_of_their_input():
-    """Recordings of the same step differ by their noise, though their clocks started apart."""
+    """Repeats are aligned at the edge of their input, so they differ only by noise."""
     case = make_case(seed=49, n=1, rate=113.1)
     first = next(record for record in case.records if record.kind == "step")
     assert first.u is not None
@@ -155,7 +155,7 @@ def test_repeats_are_compared_by_the_edge_of_their_input():
 
 @pytest.mark.parametrize("said", [(1,), (1, 2)])
 def test_a_cart_held_in_all_runs_is_a_wall(said):
-    """Runs of cart 1 alone in a two-cart folder give the result of one cart, in its own terms."""
+    """If all runs of a two-cart folder have cart 2 held, the result is that of one cart."""
     hidden = Hidden(effect="coulomb_friction", place=1, parameters={"force": 0.0025})
     case = make_case(seed=45, n=2, effects=[hidden], rate=113.1)
     alone = [r for r in case.records if r.id.startswith("decay-1")]
@@ -179,12 +179,12 @@ def test_a_cart_held_in_all_runs_is_a_wall(said):
 
 @pytest.fixture(scope="module")
 def one_gap() -> Gap:
-    """A gap to look at: dead zone on one cart."""
+    """A gap that the tests examine: a dead zone on one cart."""
     return explain(make_case(seed=45, n=1, effects=["dead_zone"], rate=113.1))
 
 
 def test_document_is_what_was_agreed(one_gap):
-    """`gap.json` has the documented keys, no NaN, and consistent figures."""
+    """`gap.json` has the documented keys, no NaN, and figures that agree with each other."""
     document = json.loads(json.dumps(plain(one_gap), allow_nan=False))
 
     assert document["schema"] == "cartlab-gap/1"
@@ -205,7 +205,7 @@ def test_document_is_what_was_agreed(one_gap):
 
 
 def test_same_records_give_the_same_document_however_busy_the_machine(one_gap):
-    """The workflow uses no chance and no clock: beside two programs that never rest, same bytes."""
+    """The result does not depend on chance or time: on a busy machine the bytes are the same."""
     case = make_case(seed=45, n=1, effects=["dead_zone"], rate=113.1)
 
     busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
@@ -220,7 +220,7 @@ def test_same_records_give_the_same_document_however_busy_the_machine(one_gap):
 
 
 def test_duplicate_files_do_not_judge_their_twin():
-    """A run that is listed twice is used once."""
+    """A run that is listed twice is used once, so it is not held out against itself."""
     case = make_case(seed=46, n=1, rate=113.1)
     twin = case.records[0]
     copy = Record(**{**vars(twin), "id": "copy-of-a"})
@@ -232,7 +232,7 @@ def test_duplicate_files_do_not_judge_their_twin():
 
 
 def test_single_run_is_cut_in_time():
-    """With one run its last part is held out, and the notes say so."""
+    """Of a single run the last part is held out, and a note says so."""
     case = make_case(seed=47, n=1, effects=["coulomb_friction"], rate=113.1)
 
     gap = explain_gap(case.records[:1], Bench(springs=case.springs))
@@ -242,7 +242,7 @@ def test_single_run_is_cut_in_time():
 
 
 def test_no_motion_is_one_clear_error():
-    """Records without motion are refused in one line."""
+    """Records without motion give one line of error."""
     t = np.linspace(0.0, 5.0, 500)
     still = Record(
         id="still",
@@ -260,7 +260,7 @@ def test_no_motion_is_one_clear_error():
 
 
 def positioning_stage(*, friction: float, seed: int, reference, push: float = 0.0) -> Record:
-    """Return one run of a cart without springs under PD feedback, stepped at 80 µs.
+    """Return one run of a cart without springs under PD feedback, simulated in steps of 80 µs.
 
     `push` is a constant force, V. u = 0.05 e + 0.004 de/dt (V, cm), sampled at 250 Hz; m = 2e-4, c
     = 5e-4 in V, s, cm.
@@ -302,10 +302,10 @@ REFERENCES = (
 
 @pytest.mark.parametrize("friction", [0.0, 0.003])
 def test_a_rigid_body_under_feedback(friction):
-    """Without springs, friction is found (or not) from feedback runs, each judged as a whole.
+    """On a cart without springs, runs under feedback show whether there is dry friction.
 
-    One simulation of a whole run, with nothing fitted to it, then ends within two encoder counts:
-    the start is known to half a count, and errors of the parameters add up.
+    A simulation of a whole run, without any fit to it, then ends within two encoder counts: the
+    start is known to half a count, and errors of the parameters add up.
     """
     records = [
         positioning_stage(friction=friction, seed=i, reference=r) for i, r in enumerate(REFERENCES)
@@ -324,7 +324,7 @@ def test_a_rigid_body_under_feedback(friction):
 
 
 def test_a_constant_force_without_springs():
-    """A tilted track causes a drift that only whole runs show: friction and force are named."""
+    """Without springs, a tilted track makes the cart drift, and force and friction are named."""
     records = [
         positioning_stage(friction=0.003, push=0.0008, seed=i, reference=r)
         for i, r in enumerate(REFERENCES)
@@ -340,18 +340,18 @@ def test_a_constant_force_without_springs():
 
 
 def test_a_single_decay_is_cut_where_it_still_moves():
-    """The held-out part of a single decay is one in which the cart still moves."""
+    """Of a single decay, a part is held out in which the cart still moves."""
     case = make_case(seed=47, n=1, effects=["coulomb_friction"], rate=113.1)
     (decay, *_) = (r for r in case.records if r.kind == "decay")
 
     gap = explain_gap([decay], Bench(springs=case.springs))
 
-    assert 0.0 < gap.noise_floor < 0.5  # the motion is above the noise
+    assert 0.0 < gap.noise_floor < 0.5  # the noise is below half of the motion
     assert all(r.noise_floor < 0.5 for r in gap.by_record)
 
 
 def test_carts_that_no_run_shows_do_no_harm():
-    """Decays of the second cart alone reveal its own friction; the first keeps its start."""
+    """If only decays of cart 2 are recorded, a linear bench still gets the verdict `none`."""
     case = make_case(seed=48, n=2, effects=[], rate=113.1)
     decays = [r for r in case.records if r.kind == "decay" and r.free == (2,)]
 
@@ -361,7 +361,7 @@ def test_carts_that_no_run_shows_do_no_harm():
 
 
 def test_a_run_without_its_input_is_left_out_with_a_message():
-    """A step without a logged input explains nothing."""
+    """A step without a logged input is left out of fit and test, and a note says so."""
     case = make_case(seed=49, n=1, rate=113.1)
     first, *others = case.records
     unknown = Record(**{**vars(first), "u": None})
@@ -373,7 +373,7 @@ def test_a_run_without_its_input_is_left_out_with_a_message():
 
 
 def _late(*, seed: int) -> Record:
-    """Return a driven cart on a cubic spring, whose last 40 % alone go far enough to show it."""
+    """Return a sweep of a cart on a cubic spring that shows only in the last, wider 40 %."""
     chain = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.array([0.05, 0.0]))
     term = make_term(
         find_effect("cubic_spring"), place=1, values={"coefficient": 0.004}, chain=chain
@@ -391,7 +391,10 @@ def _late(*, seed: int) -> Record:
 
 
 def test_an_effect_only_in_the_held_out_data_is_found():
-    """Training and held-out data change sides, and the notes say so."""
+    """An effect that only the held-out part shows is found.
+
+    The part is exchanged with the fitted one, and a note says so.
+    """
     gap = explain_gap([_late(seed=0)], Bench(springs=(True, False)))
     assert names(gap) == [("cubic_spring", 1)]
     assert gap.verdict == "named"
@@ -400,7 +403,7 @@ def test_an_effect_only_in_the_held_out_data_is_found():
 
 
 def test_a_slope_that_is_no_number_ends_a_fit(monkeypatch):
-    """If a parameter makes the simulation diverge, the fit stays where it is."""
+    """If a derivative is not a number, the fit keeps its start."""
     module = "pipeline.gap.fit.levenberg_marquardt.linearise"
     monkeypatch.setattr(
         module,

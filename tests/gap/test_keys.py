@@ -1,4 +1,4 @@
-"""The search uses the properties of effects, never their names."""
+"""The search for effects uses their properties, never their names."""
 
 import ast
 from pathlib import Path
@@ -14,7 +14,7 @@ NAMES = {name for effect in CATALOGUE for name in (effect.key, effect.family) if
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.stem)
 def test_no_effect_is_written_in_the_search(path):
-    """Neither the key nor the family of any effect is a string in the code of the search."""
+    """The code of the search contains no key and no family of an effect."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     written = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
     assert not NAMES & {text for text in written if isinstance(text, str)}

@@ -1,4 +1,4 @@
-"""The assumptions behind all numbers, listed in one place with their support in the data."""
+"""All results rest on assumptions, which are listed together with their support in the data."""
 
 import json
 import shutil
@@ -23,7 +23,7 @@ UNITS = 'input = { unit = "V", sign = 1 }\nposition = { unit = "cm" }\n'
 
 
 def edited(folder: Path, *changes: tuple[str, str], head: str = "") -> Analysis:
-    """Return the analysis of the two-cart example with another set-up; `head`: of its CSV files."""
+    """Return the analysis of a changed two-cart example; `head` is the head of its CSV files."""
     shutil.copytree(EXAMPLES / "two-cart", folder)
     toml = folder / "submission.toml"
     text = toml.read_text(encoding="utf-8")
@@ -38,7 +38,7 @@ def edited(folder: Path, *changes: tuple[str, str], head: str = "") -> Analysis:
 
 
 def by_key(analysis: Analysis) -> dict[str, Assumption]:
-    """Return the assumptions by key and place; for the carts, the free ones."""
+    """Return the assumptions by key and place, those about carts by the free carts."""
     return {
         f"{a.key} {a.about or (a.value if isinstance(a.value, tuple) else '')}".rstrip(): a
         for a in analysis.assumptions
@@ -46,7 +46,7 @@ def by_key(analysis: Analysis) -> dict[str, Assumption]:
 
 
 def test_what_an_example_states_is_listed_with_its_support():
-    """Every spring with its stiffness, units that no heading states, the sign, the held carts."""
+    """What the example states is listed with its origin and whether the data support it."""
     found = by_key(analysed("two-cart"))
     assert {key: (a.value, a.origin, a.support) for key, a in found.items()} == {
         "system.springs wall-1": (False, "stated", "supported"),
@@ -67,7 +67,7 @@ def test_what_an_example_states_is_listed_with_its_support():
 
 
 def test_an_unstated_value_is_a_default(tmp_path):
-    """Springs, unit and sign are assumed, and marked so; a spring too many is contradicted."""
+    """Springs, unit and sign that nobody states are defaults; data contradict one spring."""
     analysis = edited(tmp_path / "s", (SPRINGS, ""), (UNITS, ""))
     found = by_key(analysis)
     assert {key: (a.value, a.origin, a.support) for key, a in found.items()} == {
@@ -94,7 +94,7 @@ def test_an_unstated_value_is_a_default(tmp_path):
 
 
 def test_headings_support_a_unit(tmp_path):
-    """A unit in the files and in submission.toml, whichever way they are converted."""
+    """A unit in the files' headings supports the same unit in `submission.toml`."""
     analysis = edited(tmp_path / "s", head="time,input [mV],x1 [mm],x2 [mm]")
     found = by_key(analysis)
     assert found["system.position.unit"].support == "supported"
@@ -103,7 +103,7 @@ def test_headings_support_a_unit(tmp_path):
 
 
 def test_the_report_and_results_json_hold_them():
-    """One section, one row each; structured values that fit the schema."""
+    """The report has a section with a row per assumption, and results.json has the same."""
     analysis = analysed("two-cart")
     document = build_document(analysis)
     (section,) = (s for s in document.sections if s.id == "assumptions")
@@ -121,7 +121,7 @@ def test_the_report_and_results_json_hold_them():
 
 @pytest.mark.skipif(not (REAL_DATA / "ecp210-ucsd").is_dir(), reason="no real recordings here")
 def test_a_held_cart_that_was_not_measured_is_open(tmp_path):
-    """The real runs of one cart have no column for the other, so nothing shows that it was held."""
+    """If a held cart was not measured, nothing shows that it was held, so the support is "open"."""
     folder = write_two_cart_submission(tmp_path / "s", REAL_DATA, steps=(1, 2, 3, 4, 5))
     found = by_key(analyse(load_submission(folder), design=False))
     assert found["experiments.carts (1,)"].support == "open"
@@ -129,5 +129,5 @@ def test_a_held_cart_that_was_not_measured_is_open(tmp_path):
     assert found["system.position.unit"].support == "supported"
     sign = found["system.input.sign"]
     assert (sign.value, sign.origin, sign.support) == (-1.0, "data", "supported")
-    assert "pid" not in sign.experiments  # its log counts the other way
+    assert "pid" not in sign.experiments  # the log's sign is opposite
     assert "the opposite sign: pid" in sign.reason

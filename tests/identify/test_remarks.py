@@ -13,9 +13,9 @@ from pipeline.submission import load_submission
 
 @pytest.mark.parametrize("name", ["one-cart", "two-cart", "three-cart"])
 def test_centimetres_said_to_be_metres_are_asked_about(name):
-    """Carts at 60 km/h must have another unit.
+    """Carts that would move at 60 km/h get the question whether metres are the right unit.
 
-    Centimetres, millimetres and counts are not questioned.
+    Centimetres, millimetres and counts get no such question.
     """
     data = read_data(load_submission(EXAMPLES / name))
     (said,) = [one for one in reading_remarks(data, unit="m") if "m/s" in one]
@@ -25,7 +25,7 @@ def test_centimetres_said_to_be_metres_are_asked_about(name):
 
 
 def test_one_kind_of_recording_or_a_jump_accuses_no_unit():
-    """A slip in one file concerns that file; an encoder that jumps is not a fast cart."""
+    """One kind of recording, or an encoder that jumps, raises no doubt about the unit."""
     data = read_data(load_submission(EXAMPLES / "one-cart"))
     steps = replace(data, records=tuple(r for r in data.records if r.kind == "step"))
     assert not [one for one in reading_remarks(steps, unit="m") if "runs so fast" in one]

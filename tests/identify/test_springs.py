@@ -1,4 +1,4 @@
-"""`fill` and the springs: decided if steps show them, marked as unsure if not."""
+"""`fill` decides from steps which springs there are, and marks the others as unsure."""
 
 import shutil
 from pathlib import Path
@@ -21,7 +21,7 @@ MASS, DAMPING, SPRING = 2.5e-4, 1.5e-3, 0.06
 
 
 def step(k: list[float], *, seconds: float = 8.0) -> Record:
-    """Return a step on and off on a bench with these springs, as an encoder reads it."""
+    """Return an encoder's reading of a step on and off, on a bench with these springs."""
     n = len(k) - 1
     chain = Chain(m=np.full(n, MASS), c=np.full(n, DAMPING), k=np.array(k))
     t = np.arange(0.0, seconds, 0.00884)
@@ -50,27 +50,27 @@ def step(k: list[float], *, seconds: float = 8.0) -> Record:
     ],
 )
 def test_steps_tell_the_far_spring_and_whether_any_holds_the_carts(k, present, not_told):
-    """Equal gains: none at the far wall; no return: none at all; otherwise wall-1 stays open."""
+    """Equal gains exclude a spring at the far wall, and no return excludes all wall springs."""
     found = decide_springs([step(k)], n=len(k) - 1)
     assert found.present == tuple(present)
     assert found.open == not_told
 
 
 def test_without_a_step_of_all_carts_both_walls_are_open():
-    """Nothing is claimed without evidence."""
+    """Without a step of all carts, or with a short one, both wall springs stay open."""
     assert decide_springs([], n=2).open == (1, 3)
     short = step([0.0, SPRING, SPRING], seconds=0.7)
     assert decide_springs([short], n=2).open == (1, 3)
 
 
 def folder_of(data: Path, folder: Path) -> Path:
-    """Return a folder with recordings, but without their descriptions."""
+    """Return a folder with the recordings, but without their descriptions."""
     shutil.copytree(data, folder / "data")
     return folder
 
 
 def test_fill_marks_what_the_files_do_not_tell(tmp_path):
-    """On the terminal, and behind the key, until somebody removes the mark."""
+    """`fill` marks open questions in its output and after the key, until a person answers."""
     folder = folder_of(EXAMPLES / "two-cart" / "data", tmp_path / "s")
     done = CliRunner().invoke(app, ["fill", str(folder)], standalone_mode=False)
     text = (folder / "submission.toml").read_text(encoding="utf-8")
@@ -95,7 +95,7 @@ def test_fill_marks_what_the_files_do_not_tell(tmp_path):
 
 @pytest.mark.parametrize(("unit", "said"), [("furlong", "is not known"), ("count", "decimals")])
 def test_fill_speaks_of_a_unit_that_somebody_else_wrote(unit, said, tmp_path):
-    """An existing file gets no mark, but a message."""
+    """On a doubtful unit in an existing file, `fill` prints a message but sets no mark."""
     folder = folder_of(EXAMPLES / "one-cart" / "data", tmp_path / "s")
     text = f'version = 1\n[system]\ncarts = 1\nposition = {{ unit = "{unit}" }}\n'
     (folder / "submission.toml").write_text(text, encoding="utf-8")
@@ -107,7 +107,7 @@ def test_fill_speaks_of_a_unit_that_somebody_else_wrote(unit, said, tmp_path):
 
 @pytest.mark.skipif(not (REAL_DATA / "ecp210-ucsd").is_dir(), reason="no real recordings here")
 def test_the_real_rig_has_no_far_spring(tmp_path):
-    """Its static gains differ only by the effect of dry friction."""
+    """Static gains of the real rig differ only by dry friction, so it has no far spring."""
     folder = tmp_path / "s"
     (folder / "data").mkdir(parents=True)
     for file in (REAL_DATA / "ecp210-ucsd").glob("DOF*_test?.csv"):

@@ -32,7 +32,7 @@ LATE = 5  # samples
 
 
 def hand_in(folder: Path, *, hide: tuple[str, ...] = (), late: int = 0) -> Path:
-    """Write an honest submission of two carts, with cart 2 read that many samples late."""
+    """Write an honest submission of two carts, in which cart 2 is read that many samples late."""
     bench = prepare_bench(preset="throne-2dof", hide=hide)
     write_submission(folder, bench, seed=3, compact=True, reported=True)
     for path in (folder / "data").glob("*.csv") if late else ():
@@ -47,7 +47,7 @@ def hand_in(folder: Path, *, hide: tuple[str, ...] = (), late: int = 0) -> Path:
 
 
 def test_a_late_channel_is_reported_with_its_delay(tmp_path):
-    """In the report's checks, within a fifth of a sample, and in the grade of the data."""
+    """A late channel fails a check that gives its delay, and the recordings get a flag."""
     submission = load_submission(hand_in(tmp_path / "team", late=LATE))
     graded = grade_submission(
         submission, rubric=load_rubric(RUBRICS / "throne-2dof.toml"), name="team"
@@ -66,7 +66,7 @@ def test_a_late_channel_is_reported_with_its_delay(tmp_path):
 @pytest.mark.parametrize("kinds", [("step",), ("sweep",), ("decay",)])
 @pytest.mark.parametrize("cart", [1, 2, 3])
 def test_a_late_channel_is_found_without_dwells(kinds, cart):
-    """For three carts, with steps, a sweep or one decay of all carts alone, to half a sample."""
+    """A late channel is found from steps, a sweep or one decay, to half a sample."""
     late = find_late_channels(motions(kinds, late=cart), carts=3)
     told = {one.cart: one.delay / SAMPLE for one in late}
     assert told == pytest.approx(
@@ -77,7 +77,7 @@ def test_a_late_channel_is_found_without_dwells(kinds, cart):
 
 
 def test_a_channel_late_only_in_the_sweep_is_reported_only_for_it():
-    """One kind of experiment may have been logged differently; the others are not accused."""
+    """If a channel is late only in the sweep, only the sweep is reported."""
     sound, late = motions(("step", "sweep")), motions(("sweep",), late=2)
     records = [record for record in sound if record.kind != "sweep"] + late
     (one,) = find_late_channels(records, carts=3)
@@ -89,7 +89,7 @@ def test_a_channel_late_only_in_the_sweep_is_reported_only_for_it():
 
 @pytest.mark.parametrize(("late", "told"), [(0, []), (LATE, [2])])
 def test_the_channels_of_a_real_bench_are_of_one_moment(late, told, real_data, tmp_path):
-    """Steps with much dry friction pass, unless cart 2 is read late."""
+    """Real steps with much dry friction pass, unless cart 2 is made late."""
     folder = write_two_cart_submission(tmp_path / "real", real_data, steps=(1, 2, 3, 4, 5))
     records = [
         replace(record, y=np.array([record.y[0], delayed(record.y[1], late)]))
@@ -103,12 +103,12 @@ def test_the_channels_of_a_real_bench_are_of_one_moment(late, told, real_data, t
 
 
 def delayed(x: Array, samples: int) -> Array:
-    """Return a channel read that many samples later."""
+    """Return a channel that is read that many samples later."""
     return np.concatenate([np.repeat(x[:1], samples), x[: x.size - samples]])
 
 
 def motions(kinds: tuple[Kind, ...], *, late: int = 0) -> list[Record]:
-    """Return motions of three carts, read by encoders of 0.00227 cm, one of them late."""
+    """Return motions of three carts, read by encoders of 0.00227 cm, with one read late."""
     chain, rng = PRESETS["throne-3dof"], np.random.default_rng(5)
     t = np.linspace(0.0, 1399 * SAMPLE, 1400)
     hold = 1.0 / float(np.max(chain.static_gains()))
@@ -155,6 +155,6 @@ def motions(kinds: tuple[Kind, ...], *, late: int = 0) -> list[Record]:
     ],
 )
 def test_friction_and_a_late_input_are_no_late_channel(tmp_path, hide):
-    """A delay of the motor moves all carts equally, and friction shifts no phase in proportion."""
+    """Neither friction nor a delay of the motor is reported as a late channel."""
     analysis = analyse(load_submission(hand_in(tmp_path / "team", hide=hide)), design=False)
     assert not [c for c in analysis.checks if c.kind == "late_channel"]

@@ -1,4 +1,4 @@
-"""A factor shared by all records of a kind is a unit; else it is nobody's mistake."""
+"""A wrong factor in all records of a kind is a unit; otherwise it is no team's mistake."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -31,7 +31,7 @@ def record(name: str, *, size: float = 1.0, step: float = 0.01) -> Record:
 
 
 def kept(found: Mapping[str, Misread], *others: Record, sizes: Mapping[str, float]) -> set[str]:
-    """Return the mistakes that remain; the other records fit as they are."""
+    """Return the suspected mistakes that remain, if the other records fit as they are."""
     records = [*(record(name, size=size) for name, size in sizes.items()), *others]
     follows = {r.id: 1.0 if r.id in found else 0.0 for r in records}
     fits = {
@@ -55,13 +55,13 @@ def kept(found: Mapping[str, Misread], *others: Record, sizes: Mapping[str, floa
     ],
 )
 def test_a_unit_is_that_of_all_records_of_a_kind(misread, sizes, others, unit):
-    """If they move less, no limit of the amplifier explains that."""
+    """A factor is taken for a unit if all records of a kind share it and no limit explains it."""
     found = {name: misread for name in sizes}
     assert kept(found, *others, sizes=sizes) == (set(sizes) if unit else set())
 
 
 def test_one_record_with_another_clock_is_sampled_otherwise():
-    """A dwell with the same sampling has the same clock, whatever fits it."""
+    """A single dwell is said to have another clock only if it was sampled otherwise."""
     others = [record("sine-2"), record("sine-3")]
     assert kept({"sine-1": SLOW}, *others, sizes={"sine-1": 1.0}) == set()
     slow = replace(record("sine-1"), t=np.linspace(0.0, 1.98, 100))
@@ -73,5 +73,5 @@ def test_one_record_with_another_clock_is_sampled_otherwise():
 
 
 def test_an_inverted_channel_belongs_to_one_record():
-    """Neither a limit nor friction reverses a channel."""
+    """Even in one record an inverted channel counts, as no limit or friction inverts it."""
     assert kept({"step-1": TURNED}, record("step-2"), sizes={"step-1": 1.0}) == {"step-1"}

@@ -1,4 +1,4 @@
-"""Runs that give the same number: whether they agree, which one is odd, and why."""
+"""Runs that measure the same number: whether they agree, which run is odd, and why."""
 
 from dataclasses import replace
 
@@ -42,7 +42,7 @@ def compared(decays=(), steps=(), *, carts: int = 2, **fitted: float) -> Repeats
 
 
 def test_repeats_that_agree_pass():
-    """Three gains within 2 %: one check, passed; a number measured once has no check."""
+    """Three gains within 2 % pass one check; a number that is measured once gets no check."""
     found = compared([decay("a", 20.0)], [step(f"{i}", g) for i, g in enumerate((2.0, 2.04, 2.02))])
     (check,) = found.checks
     assert (check.id, check.outcome) == ("repeats.K_1", "pass")
@@ -51,7 +51,7 @@ def test_repeats_that_agree_pass():
 
 
 def test_two_different_numbers_do_not_show_which_is_wrong():
-    """Two repeats a factor 1000 apart: the check fails, no run is blamed, and neither is used."""
+    """If two repeats differ by a factor 1000, the check fails, but neither run is called odd."""
     found = compared([decay("a", 20.0), decay("b", 0.02)])
     assert [c.outcome for c in found.checks if c.id == "repeats.omega_1"] == ["fail"]
     assert found.odd == {}
@@ -59,7 +59,7 @@ def test_two_different_numbers_do_not_show_which_is_wrong():
 
 
 def test_the_fit_shows_which_of_two_numbers_is_wrong():
-    """If the other records give 20.3 rad/s, the run at 0.02 is odd: its time is in milliseconds."""
+    """If the other records agree with 20 rad/s, the run that gives 0.02 is called odd."""
     found = compared([decay("a", 20.0), decay("b", 0.02)], omega_1=20.3)
     assert list(found.odd) == ["b"]
     assert found.odd["b"].is_wrong
@@ -68,7 +68,7 @@ def test_the_fit_shows_which_of_two_numbers_is_wrong():
 
 
 def test_without_a_fit_the_majority_of_repeats_decides():
-    """One of three gains is off by a quarter, for no known reason."""
+    """If one of three gains is off by a quarter, its run is odd, though the reason is unknown."""
     found = compared(steps=[step("a", 2.0), step("b", 2.5), step("c", 2.01)])
     assert list(found.odd) == ["b"]
     assert not found.odd["b"].is_wrong
@@ -76,7 +76,7 @@ def test_without_a_fit_the_majority_of_repeats_decides():
 
 
 def test_a_run_is_odd_by_the_number_that_it_gives_otherwise():
-    """If one of four runs gives another K_1, its agreeing K_2 still passes."""
+    """A run that is odd by its K_1 is named, but the check of its agreeing K_2 still passes."""
     steps = [step(run, gain, cart=cart) for run in "abc" for cart, gain in ((1, 2.0), (2, 1.5))]
     steps += [step("d", 2.3, cart=1), step("d", 1.5, cart=2)]
     found = compared(steps=steps)
@@ -89,7 +89,7 @@ def test_a_run_is_odd_by_the_number_that_it_gives_otherwise():
 
 
 def test_a_reading_within_the_errors_of_those_like_the_fit_stays():
-    """Two steps agree with the fit, a vague one is off by a third: no run is left out."""
+    """A run whose large error covers the gain of the fit is not left out; a certain one is."""
     steps = [step("a", 2.0), step("b", 2.6), step("c", 2.05), step("vague", 2.5, std=0.2)]
     assert list(compared(steps=steps, K_1=2.0).odd) == ["b"]
 
@@ -99,7 +99,7 @@ def damped(run: str, zeta: float, *, std: float = 1e-4) -> LogDecrement:
 
 
 def test_dampings_of_repeats_are_compared():
-    """Of three decays one has a finger on the cart; a damping 1.5 times as large is accepted."""
+    """A decay with three times the damping of two others is odd; up to 1.5 times is accepted."""
     found = compared([damped("a", 0.03), damped("b", 0.031), damped("c", 0.09)])
     assert list(found.odd) == ["c"]
     assert not found.odd["c"].is_wrong
@@ -109,7 +109,7 @@ def test_dampings_of_repeats_are_compared():
 
 
 def test_wide_errors_are_no_contradiction_and_no_agreement():
-    """A third apart, each known to a tenth: neither is accused, and nothing agrees."""
+    """Two uncertain gains that differ by a third neither pass nor fail the check."""
     found = compared(steps=[step("a", 2.0, std=0.2), step("b", 2.7, std=0.2)])
     assert [check.outcome for check in found.checks] == ["skip"]
     assert found.odd == {}
@@ -117,7 +117,7 @@ def test_wide_errors_are_no_contradiction_and_no_agreement():
 
 
 def test_gains_that_depend_on_the_size_of_the_step_are_no_odd_runs():
-    """If a cart sticks, small steps give less: the check fails, and every run stays."""
+    """If a cart sticks and small steps give less gain, the check fails, but no run is odd."""
     found = compared(
         steps=[
             *(step(f"small-{i}", 1.5, size=0.5) for i in range(2)),

@@ -1,4 +1,4 @@
-"""A repeat that differs from the others is named, and no other."""
+"""A repeat that differs from the others is named, and no other repeat."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ CHAIN = PRESETS["throne-2dof"]
 
 
 def repeats(count, *, rng, swing=1.0):
-    """Return honest repeats, stopped by hand a little earlier or later."""
+    """Return honest repeats that were stopped by hand a little earlier or later."""
     whole = [step_record(CHAIN, rng=rng, swing=swing, id=f"{swing}-{i}") for i in range(count)]
     return [cut(record, int(rng.integers(0, 60))) for record in whole]
 
@@ -28,14 +28,14 @@ def cut(record, samples):
 
 
 def strange(record, rng):
-    """Return the same experiment on a cart with a weight left on it."""
+    """Return the same experiment on a cart with an additional weight."""
     heavier = Chain(m=CHAIN.m * [1.4, 1.0], c=CHAIN.c, k=CHAIN.k)
     return step_record(heavier, rng=rng, id=record.id)
 
 
 @pytest.mark.parametrize("count", [3, 4, 5, 8])
 def test_a_repeat_with_another_mass_is_named(count):
-    """A weight left on cart 1 makes one repeat differ from three or more."""
+    """If a weight was left on cart 1 in one of several repeats, that repeat is named."""
     rng = np.random.default_rng(count)
     records = repeats(count, rng=rng)
     records[1] = strange(records[1], rng)
@@ -46,14 +46,14 @@ def test_a_repeat_with_another_mass_is_named(count):
 
 
 def test_one_of_two_is_never_named():
-    """From two repeats that differ, nobody can tell which one is wrong."""
+    """If two repeats differ, neither is named, as nobody can know which one is wrong."""
     rng = np.random.default_rng(0)
     records = repeats(2, rng=rng)
     assert find_outlier_repeats([records[0], strange(records[1], rng)], unit="cm") == {}
 
 
 def test_repeats_that_differ_only_by_noise_are_accepted():
-    """In 200 sets of 3 to 6 honest repeats nothing is named."""
+    """In 200 sets of 3 to 6 honest repeats, none is named."""
     rng = np.random.default_rng(1)
     for _ in range(200):
         assert (
@@ -63,7 +63,7 @@ def test_repeats_that_differ_only_by_noise_are_accepted():
 
 
 def test_other_experiments_are_not_repeats():
-    """Another step size, free cart or kind is not a repeat, however it moves."""
+    """A run with another step size, free cart or kind is not counted as a repeat."""
     rng = np.random.default_rng(2)
     others = [
         *repeats(2, rng=rng, swing=2.0),
@@ -75,16 +75,16 @@ def test_other_experiments_are_not_repeats():
 
 
 def test_a_motor_switched_off_later_is_no_outlier():
-    """A response that differs because its input differs is not an outlier."""
+    """A run is not odd if it differs only because its input differs."""
     rng = np.random.default_rng(4)
     records = [step_record(CHAIN, rng=rng, id=f"{i}") for i in range(4)]
-    # Off at half time: the last runs 0.1 s longer.
+    # The input ends at half time, and in the last run 0.1 s later.
     records.append(step_record(CHAIN, rng=rng, duration=6.2, id="longer"))
     assert find_outlier_repeats(records, unit="cm") == {}
 
 
 def test_an_encoder_that_was_not_zeroed_makes_no_outlier():
-    """Positions count from the start of the record."""
+    """Positions are compared from the start of each record, so an encoder may start anywhere."""
     rng = np.random.default_rng(3)
     records = repeats(5, rng=rng)
     records[2] = replace(records[2], y=records[2].y + 3.0)
@@ -92,7 +92,7 @@ def test_an_encoder_that_was_not_zeroed_makes_no_outlier():
 
 
 def test_the_first_real_repeat_is_named_and_no_other(real_data, tmp_path):
-    """Of five real two-cart repeats the first is odd; of the single-cart ones, no run is."""
+    """Of five real repeats with two carts the first is odd; of those with one cart, none is."""
     folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(1, 2, 3, 4, 5))
     records = read_data(load_submission(folder)).records
     (outlier,) = find_outlier_repeats(records, unit="cm").values()

@@ -1,6 +1,6 @@
-"""Bode fit over many benches.
+"""The fit to frequency responses, over many benches.
 
-As accurate as theory allows, honest errors, also from poor starts.
+It is as accurate as the data allow, states true standard errors, and works from poor starts.
 """
 
 import numpy as np
@@ -15,13 +15,13 @@ from pipeline.plant.linear.presets import PRESETS
 @pytest.mark.parametrize("phases", [False, True], ids=["magnitudes", "phases"])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_fit_is_efficient_and_its_errors_honest(preset, phases):
-    """Over 400 noisy sets: coverage near 95 %, and nearly the accuracy that the data allow."""
+    """Over 400 noisy data sets intervals cover near 95 %, at nearly the best possible accuracy."""
     got = quality(PRESETS[preset], seeds=400, phases=phases)
 
-    # 95 % of 400 has a standard error of 1.1 %: 3 of them below, and 1 % above for a true 96 %,
-    # which the bound at k_1 = 0 may make of it.
+    # The share of 400 intervals has a standard error of 1.1 %. The limits are three of them below
+    # 95 %; above it, one per cent more, as the bound k_1 >= 0 may make the true share 96 %.
     assert np.all((got.coverage > 0.917) & (got.coverage < 0.99))
-    # A variance from 400 draws is good to 7 %; the true efficiencies are above 0.97.
+    # The variance of 400 draws is good to 7 %; the true efficiencies are above 0.97.
     assert np.exp(np.mean(np.log(got.efficiency))) >= 0.9
     assert np.min(got.efficiency) >= 0.75
 
@@ -31,5 +31,5 @@ def test_the_fit_is_efficient_and_its_errors_honest(preset, phases):
 @pytest.mark.parametrize(("kind", "least"), [("paper", 0.995), ("random", 0.99), ("wide", 0.94)])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_fit_gets_there_from_poor_starts(preset, kind, least):
-    """From the paper's, random and wide starts, the right resonances are found."""
+    """From the paper's, random and wide starts, the fit finds the right resonances."""
     assert converged_share(PRESETS[preset], kind=kind, seeds=400) >= least

@@ -1,4 +1,4 @@
-"""Effects hidden in benches of another simulator are named with place and size."""
+"""Effects hidden by an independent simulator are named with their place and size."""
 
 import pytest
 
@@ -31,7 +31,7 @@ LONG = [pytest.mark.slow, pytest.mark.sample]
     ],
 )
 def test_names_the_hidden_effect(effect, n):
-    """One hidden effect is named at its place with its size, and the error falls to the floor."""
+    """A single hidden effect is named with place and size, and only noise is left."""
     case = make_case(seed=41, n=n, effects=[effect], rate=113.1)
     (hidden,) = case.hidden
 
@@ -40,12 +40,12 @@ def test_names_the_hidden_effect(effect, n):
     assert gap.verdict == "named"
     assert names(gap) == [(hidden.effect, hidden.place)]
     assert gap.baseline > 4.0 * gap.noise_floor
-    # The bars: 1.2 times the floor, three times behind an end stop.
+    # The limits: 1.2 times the noise floor, and three times beyond an end stop.
     assert gap.final < (3.0 if effect == "end_stop" else 1.2) * gap.noise_floor
     assert gap.spread == {}  # the friction of this bench is the same in every run
     for name, true in hidden.parameters.items():
         found = gap.effects[0].parameters[name]
-        # Contact stiffness depends on a contact law that the two simulators do not share.
+        # Contact stiffness depends on the law of contact, in which the two simulators differ.
         limit = 0.2 if effect == "end_stop" and name == "stiffness" else 0.02
         assert found.value == pytest.approx(true, rel=limit, abs=5 * (found.std or 0.0))
 
@@ -53,7 +53,7 @@ def test_names_the_hidden_effect(effect, n):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_hidden_mass_that_moves_when_a_hand_lets_go(tmp_path):
-    """When a hand releases a cart the hidden mass already moves; the gap closes all the same."""
+    """A hidden mass is found even if it moves already when a hand releases the cart."""
     bench = prepare_bench(preset="throne-2dof", model=None, hide=["extra_mode"])
     write_submission(tmp_path / "bench", bench, seed=3, reported=False)
 
@@ -87,9 +87,9 @@ def test_two_effects_are_found_together():
     ],
 )
 def test_a_stop_and_a_stiffening_spring_are_told_apart(effect, hardness, part):
-    """Met just before the largest swing or far from it, neither is taken for the other.
+    """Neither an end stop nor a stiffening spring is taken for the other, wherever it begins.
 
-    A stop may be soft and bounce fully: if a stiffening spring fits equally, both are listed.
+    A stop may be soft and lossless. If a stiffening spring fits equally well, both are listed.
     """
     bare = make_case(seed=7, n=1, rate=200.0)
     top = part * max(float(r.y.max()) for r in bare.records if r.kind == "step")
@@ -111,9 +111,10 @@ def test_a_stop_and_a_stiffening_spring_are_told_apart(effect, hardness, part):
 @pytest.mark.sample
 @pytest.mark.parametrize("n", [2, 3])
 def test_friction_on_all_carts_is_found_at_once(n):
-    """As on a real rig: friction on all carts, a braking motor, hands that let go.
+    """Friction on all carts of a realistic rig is found in one step, each with its own force.
 
-    Its errors fall to the noise; one step finds the frictions, each with its own force.
+    The rig also has damping while the motor drives, and hands that release carts. Errors fall to
+    the noise.
     """
     case = make_rig(seed=1, n=n)
 
@@ -130,5 +131,5 @@ def test_friction_on_all_carts_is_found_at_once(n):
             if (f.effect.key, f.where.get("cart", 0)) == (hidden.effect, hidden.place)
         )
         for name, true in hidden.parameters.items():
-            # Each run has 8 % of its own: the force that all share is known to 3 or 4 %.
+            # Each run has a scatter of 8 %, so the force common to all is known to 3 or 4 %.
             assert found.parameters[name].value == pytest.approx(float(true), rel=0.1)

@@ -1,4 +1,4 @@
-"""The gap workflow on real measurements, knowing only what was published."""
+"""The gap workflow on real recordings, given only what was published about the benches."""
 
 from pathlib import Path
 
@@ -31,9 +31,9 @@ def explain_five(folder: Path, name: str, *, column: int, kind: str) -> Gap:
 
 
 def test_driven_cart_has_dry_friction(real_data):
-    """Five steps of a real cart: dry friction is found, unseen repeats come within 2.7 %.
+    """Five steps of a real cart show dry friction, and unseen repeats are right to 2.7 %.
 
-    The difference between repeats is the best that can be reached.
+    No model can do better than the difference between the repeats.
     """
     folder = real_data / "ecp210-ucsd"
 
@@ -46,7 +46,7 @@ def test_driven_cart_has_dry_friction(real_data):
 
 
 def test_released_cart_has_dry_friction(real_data):
-    """Five decays by hand, from the release on: dry friction first, within 4 %."""
+    """Five hand-released decays show dry friction first, and the errors are within 4 %."""
     folder = real_data / "ecp210-ucsd"
 
     gap = explain_five(folder, "DOF1_en2_manual2", column=3, kind="decay")
@@ -57,7 +57,7 @@ def test_released_cart_has_dry_friction(real_data):
 
 
 def test_a_cart_held_in_all_runs_is_a_wall(real_data, tmp_path):
-    """The steps of cart 1 in a two-cart folder give the errors of a one-cart folder."""
+    """Steps of cart 1 in a two-cart folder give the same errors as in a one-cart folder."""
     folder = write_two_cart_submission(tmp_path / "lab", real_data, steps=())
     analysis = analyse(load_submission(folder), design=False)
     records = [r for r in analysis.records if r.id.startswith("alone-1")]
@@ -70,7 +70,7 @@ def test_a_cart_held_in_all_runs_is_a_wall(real_data, tmp_path):
 
 
 def test_all_runs_of_two_carts_have_friction_on_both(real_data, tmp_path):
-    """Cart 1 alone, cart 2 alone, both: friction on both carts brings unseen runs within 4 %."""
+    """In all runs of two real carts friction is found on both, and unseen runs are right to 4 %."""
     folder = write_two_cart_submission(tmp_path / "lab", real_data, steps=(1, 2, 3, 4, 5))
     analysis = analyse(load_submission(folder), design=False)
 
@@ -82,9 +82,10 @@ def test_all_runs_of_two_carts_have_friction_on_both(real_data, tmp_path):
 
 
 def test_an_axis_on_no_spring_is_simulated_over_a_whole_record(real_data):
-    """EMPS: from one record alone, friction, a constant force and cogging; 4.6 mm on the other.
+    """From one record of the EMPS axis, the other record is simulated within 4.6 mm.
 
-    5.17 mm is the best published by the same rule (`benchmarks/emps.py`).
+    The model has friction, a constant force and cogging. The best published error by the same rule
+    is 5.17 mm (`benchmarks/emps.py`).
     """
     assert real_data.exists()
     train, test = emps_record("train"), emps_record("test")
@@ -101,7 +102,7 @@ def test_an_axis_on_no_spring_is_simulated_over_a_whole_record(real_data):
 
 
 def test_silverbox_has_a_hardening_spring(real_data):
-    """The benchmark's circuit: the cubic spring is named first and alone explains the gap."""
+    """In the Silverbox the cubic spring is named first, and it alone explains the gap."""
     data = loadmat(real_data / "silverbox" / "SNLS80mV.mat")
     u, y = data["V1"].ravel(), data["V2"].ravel()
     interval = 2**14 / 1e7

@@ -1,4 +1,4 @@
-"""Classes on benches of every kind: no honest team is flagged, slips are named."""
+"""In classes on benches of every kind, no honest team is flagged and mistakes are named."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from tests.helpers.grading_slips import OF_SEVERAL_CARTS, SLIPS
 @pytest.mark.slow
 @pytest.mark.parametrize("start", range(1000, 1060, 10))
 def test_no_honest_team_is_flagged(start):
-    """1 to 3 carts, ζ from 0.003 to 0.15, 6 to 22 dwells, coarse encoders, a trace of friction."""
+    """On varied benches, even with coarse encoders and some friction, no honest team is flagged."""
     for seed in range(start, start + 10):
         team = make_team(seed)
         assert flags(team) == [], (seed, team.bench)
@@ -24,7 +24,7 @@ NAMED = 0.9  # of the mistakes; on such varied benches some cannot be recognised
 
 @pytest.mark.slow
 def test_mistakes_get_their_codes():
-    """On benches without friction and with three digits nearly every slip is named."""
+    """On benches without friction, nearly every mistake is named from three digits."""
     named, missed = 0, []
     for seed in range(2001, 2019, 2):
         team = make_team(seed, friction=0.0, digits=3)

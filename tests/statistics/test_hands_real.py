@@ -1,4 +1,4 @@
-"""Hands in the recordings of a real rig: all that a person sees in a plot, and no others."""
+"""In recordings of a real rig, every hand that a person sees in a plot is found, and no other."""
 
 import numpy as np
 import pytest
@@ -9,21 +9,21 @@ from pipeline.workflow import analyse
 
 pytestmark = pytest.mark.slow
 
-# From the plots of all 17 files: when somebody moves the free cart. In the last five, under
-# feedback, and in the steps nobody does.
+# From plots of all 17 files: when somebody moves the free cart. In the last five, under feedback,
+# and in the steps, nobody does.
 SEEN = {
-    "07-Feb-2025_10_34_21": [(0.0, 0.55)],  # held where the encoders were zeroed, and let go
-    "07-Feb-2025_11_28_21": [(5.45, 5.6)],  # begins in motion; pulled out and let go
+    "07-Feb-2025_10_34_21": [(0.0, 0.55)],  # held where the encoders were zeroed, then released
+    "07-Feb-2025_11_28_21": [(5.45, 5.6)],  # begins in motion; pulled out and released
     "14-Feb-2025_09_22_43": [(1.18, 1.32), (4.8, 4.93), (9.73, 9.95)],  # three plucks
     "14-Feb-2025_09_44_21": [(0.73, 1.2), (1.55, 1.68)],  # a pluck that is stopped, and another
 }
-TO = 0.16  # s, read off a plot; the hand that stops a cart stays on it for longer than one sees
-ALONE = ("09_26", "09_29", "09_35", "21-Feb-2025_09")  # cart 1, the other held by hand
+TO = 0.16  # s, read from a plot; the hand that stops a cart stays on it longer than one can see
+ALONE = ("09_26", "09_29", "09_35", "21-Feb-2025_09")  # cart 1; the other is held by hand
 
 
 @pytest.fixture(scope="module")
 def rig(real_data, tmp_path_factory):
-    """The 17 files as a submission."""
+    """Return the 17 files as a submission."""
     folder = tmp_path_factory.mktemp("rig")
     lines = ["version = 1", 'title = "Two carts"', "[system]", "carts = 2",
              "springs = [true, true, false]"]  # fmt: skip
@@ -45,7 +45,7 @@ def rig(real_data, tmp_path_factory):
 
 
 def test_hands_are_where_a_person_sees_them(rig):
-    """Seven hands in four files, each where the plot shows it."""
+    """The seven interventions by hand in four files are found where the plots show them."""
     assert len(rig.records) == 17
     found: dict[str, list[tuple[float, float]]] = {}
     for one in find_interventions(rig.records):
@@ -58,9 +58,9 @@ def test_hands_are_where_a_person_sees_them(rig):
 
 
 def test_three_plucks_are_three_decays(rig):
-    """One natural frequency each, within 1 %.
+    """Three plucks in one recording count as three decays, with one frequency within 1 %.
 
-    The damping depends on the swing, as with friction.
+    Their damping depends on the swing, as with dry friction.
     """
     decays = [d for d in rig.log_decrements if d.experiment == "14-Feb-2025_09_22_43"]
 
@@ -70,7 +70,7 @@ def test_three_plucks_are_three_decays(rig):
 
 
 def test_a_hold_that_was_none_is_said(rig):
-    """In the last decay somebody moved the cart that should be held: by 7 % of the other's."""
+    """A check reports the decay in which the held cart moved by 7 % of the other."""
     held = [check for check in rig.failed_checks if check.kind == "held"]
 
     assert [check.about for check in held] == ["14-Feb-2025_09_44_21.cart_1"]

@@ -1,4 +1,4 @@
-"""Honest records from many kinds of lab: no record is called spoilt."""
+"""No honest recording is called faulty, in many kinds of lab."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ LONG = "sticking at every small step"
     ],
 )
 def test_no_honest_record_is_accused(case, tmp_path):
-    """Without encoder noise carts rest exactly, stick, or stay within one coarse step."""
+    """Without noise carts may rest exactly or stick, and still no recording is called faulty."""
     force = HONEST[case].get("hide")
     hidden = [f"coulomb_friction:cart={cart},force={force}" for cart in (1, 2)] if force else []
     made = prepare_bench(preset=PRESET, hide=tuple(hidden))

@@ -1,4 +1,4 @@
-"""Rates of friction found in decays: never without it, always with it; honest errors."""
+"""Dry friction is found in decays that have it, and in no others; standard errors are right."""
 
 import numpy as np
 import pytest
@@ -9,14 +9,14 @@ from tests.stages.test_log_decrement import flags, standardised
 @pytest.mark.slow
 @pytest.mark.sample
 def test_friction_is_not_seen_where_there_is_none():
-    """At most 1 % of 600 clean decays are called friction."""
+    """Of 600 decays without friction, at most 1 % are said to have friction."""
     assert flags(600, d=0.0).mean() <= 0.01
 
 
 @pytest.mark.slow
 @pytest.mark.sample
 def test_friction_of_a_tenth_of_a_millimetre_is_always_seen():
-    """At least 99 % of 400 decays with d = 0.01 cm are called friction."""
+    """Of 400 decays with a friction of d = 0.01 cm, at least 99 % are said to have friction."""
     assert flags(400, d=0.01).mean() >= 0.99
 
 

@@ -1,4 +1,4 @@
-"""Classes on one bench each, of every kind: no honest team is accused, copied files are found."""
+"""In classes that share one bench, no honest team is accused, and copied files are found."""
 
 from dataclasses import replace
 
@@ -34,9 +34,9 @@ def member(name, records):
     ids=lambda x: "-".join(x) if isinstance(x, tuple) else "",
 )
 def test_the_bench_is_no_copy_and_a_copy_is_no_bench(number, bench):
-    """Twelve honest teams are not accused; four copied files are found as equal.
+    """On each bench twelve honest teams are not accused, and four copied files are found.
 
-    One of them may move too little to tell.
+    One of the four may move too little to show that it is a copy.
     """
     preset, effect = bench
     count = COUNT if bench in SAMPLE else COUNTS[number % len(COUNTS)]

@@ -1,4 +1,4 @@
-"""Standard errors of fitted sines cover the truth at their rate."""
+"""The standard errors of fitted sines are right."""
 
 import numpy as np
 import pytest
@@ -9,9 +9,9 @@ from tests.stages.test_sine import coverage
 @pytest.mark.slow
 @pytest.mark.parametrize("from_rest", [True, False])
 def test_the_standard_errors_are_honest(from_rest):
-    """95 % intervals of gain and phase hold the truth in about 95 % of 400 dwells."""
+    """Over 400 dwells the 95 % intervals of gain and phase hold the truth in about 95 %."""
     covered = np.mean(np.abs(coverage(400, from_rest=from_rest)) < 1.96, axis=0)
-    # Binomial spread 1.1 %; the rounding's own error is not normal, and after seven time constants
-    # 0.1 % of a transient is left.
+    # The binomial spread is 1.1 %. The error of rounding is not normal, and after seven time
+    # constants 0.1 % of a transient is left.
     assert np.all(covered > 0.89)
     assert np.all(covered < 0.985)

@@ -1,4 +1,4 @@
-"""Fits in time over many chains: found from any start, with intervals that cover at their rate."""
+"""The fit to time records finds many kinds of chains, and its intervals are right."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from tests.stages.test_time_fit import errors
 @pytest.mark.parametrize("noise", [0.0, 0.0005, 0.00227])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_intervals_cover_the_truth_at_their_rate(preset, noise):
-    """95 % intervals hold the truth 95 times in 100, also where only rounding errs."""
+    """The 95 % intervals hold the truth 95 times in 100, even if rounding is the only error."""
     chain, rng = PRESETS[preset], np.random.default_rng(15)
     seeds = 120
     inside = np.zeros(len(chain.parameters()))
@@ -34,15 +34,16 @@ def test_intervals_cover_the_truth_at_their_rate(preset, noise):
         fit = fit_records(records, bench=Bench(springs=(True,) * (chain.n + 1)))
         assert fit.converged
         inside += np.abs(errors(fit, chain)) < 1.96
-    # Each count is binomial, 120 draws at 0.95: standard error 0.02; the worst of 19 within 3.5.
+    # Each count is binomial, 120 draws at 0.95, with a standard error of 0.02; the worst of 19 is
+    # within 3.5 of them.
     assert np.min(inside / seeds) > 0.88
-    # The mean over parameters is steadier. Pure rounding errs less than its intervals allow.
+    # The mean over parameters varies less. Rounding alone errs less than its intervals allow.
     assert 0.92 < np.mean(inside / seeds) < 0.995
 
 
 @pytest.mark.slow
 def test_every_random_chain_is_found():
-    """All of 200 random chains with 1 to 4 carts are found."""
+    """Each of 200 random chains with 1 to 4 carts is found."""
     rng = np.random.default_rng(16)
     for i in range(200):
         n = 1 + i % 4
@@ -62,5 +63,5 @@ def test_every_random_chain_is_found():
         ]
         fit = fit_records(records, bench=Bench(springs=springs))
         assert fit.converged
-        # 200 × some 10 numbers: beyond 5.5 standard errors once in 10 000 such tests.
+        # Of 200 × some 10 numbers, one is beyond 5.5 standard errors once in 10 000 such tests.
         assert np.max(np.abs(errors(fit, chain))) < 5.5

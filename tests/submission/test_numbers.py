@@ -45,7 +45,7 @@ name = "a"
 role = "ta"
 folders = ["."]
 """
-# Numbers where a number is allowed: behind a "=", or in a list.
+# Numbers where a number is allowed: after a "=", or in a list.
 _NUMBER = re.compile(r"(?<=[=\[,{] )-?\d[\d.eE+-]*(?=\s*(?:[,\]}#]|$))", re.MULTILINE)
 
 digits = st.integers(1, 6000).map(lambda n: "1" + "0_7"[n % 3 :: 2].replace("_", "") * n)
@@ -78,7 +78,7 @@ def with_number(text: str, number: str, at: int) -> tuple[str, str]:
 
 
 def assert_read_or_refused(read: Callable[[], object], key: str, file: str) -> None:
-    """Check that it is read, or refused with file and key, or line."""
+    """Check that the file is read, or refused with its name and the key or line."""
     try:
         read()
     except PipelineError as error:
@@ -96,7 +96,7 @@ where = st.integers(0, 10**6)
 @example("-1e-99999999999999999999", 7)
 @example("0x" + "f" * 5000, 3)
 def test_any_number_of_a_submission(number, at):
-    """In `submission.toml`, in its form at the desk, and in a program that changes it."""
+    """Any number in `submission.toml` is read or refused, and can then be shown at the desk."""
     text, key = with_number(SUBMISSION, number, at)
     assert_read_or_refused(lambda: parse_submission(text, folder=EXAMPLE), key, NAME)
     document = read_document(text)
@@ -108,7 +108,7 @@ def test_any_number_of_a_submission(number, at):
 
 @given(numbers, where)
 def test_any_number_of_a_rubric(number, at):
-    """In a rubric, whose points and tolerances are used as soon as it is read."""
+    """Any number in a rubric is read or refused, before points and tolerances are computed."""
     text, key = with_number(RUBRIC, number, at)
     assert_read_or_refused(lambda: parse_rubric(text, where="r.toml"), key, "r.toml")
 
@@ -129,7 +129,7 @@ def planned(tmp_path_factory) -> Path:
 @given(numbers, where)
 @example("0x" + "f" * 5000, 0)
 def test_any_number_of_a_plan(planned, number, at):
-    """In `plan.toml`, where a run of 1e300 s would never end."""
+    """Any number in `plan.toml` is read or refused, such as a run of 1e300 s."""
     submission = load_submission(planned)
     before = plan_path(submission).read_text(encoding="utf-8")
     text, key = with_number(before, number, at)
@@ -142,7 +142,7 @@ def test_any_number_of_a_plan(planned, number, at):
 
 @given(numbers, st.sampled_from(["address", "header", "name", "role", "folders", "more"]))
 def test_any_number_of_the_users_file(tmp_path_factory, number, key):
-    """It has no numbers; one that is there is refused by its key."""
+    """The file of users has no numbers, so any number in it is refused with its key."""
     path = tmp_path_factory.mktemp("users") / "users.toml"
     path.write_text(USERS, encoding="utf-8")
     text = path.read_text(encoding="utf-8")
@@ -154,7 +154,7 @@ def test_any_number_of_the_users_file(tmp_path_factory, number, key):
 
 @given(numbers, st.sampled_from(["period", "baud", "input", "position", "encoders", "carts"]))
 def test_any_number_of_a_benchs_description(number, key):
-    """The bench's numbers become its limits, so impossible ones are refused."""
+    """Any number in a bench's description is accepted as a limit or refused."""
     line = format_description(Description(name="b", encoders=2, carts=2)).decode()
     new = re.sub(rf" {key}=[-\d.]+", f" {key}={number}", line)
     assert_read_or_refused(lambda: parse_description(new.encode()), key, "describes itself as")
@@ -162,7 +162,7 @@ def test_any_number_of_a_benchs_description(number, key):
 
 @pytest.mark.parametrize("number", ["1e1000000", "-1e-1000000", "9" * 5000, "0x" + "f" * 5000])
 def test_what_changes_a_file_refuses_such_a_number_too(tmp_path, number):
-    """`fill` and the desk name the key or the line, as every other command does."""
+    """`fill` and the desk refuse an impossible number with its key or line before they write."""
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "a.csv").write_text("time,input,x1\n0,0,0\n0.1,0,0\n", encoding="utf-8")
     (tmp_path / NAME).write_text(
@@ -177,7 +177,7 @@ def test_what_changes_a_file_refuses_such_a_number_too(tmp_path, number):
 
 
 def test_a_column_typed_with_thousands_of_digits_is_refused(tmp_path):
-    """Text typed into the desk's form never becomes a number that cannot be shown."""
+    """A column with thousands of digits, typed into the desk's form, is refused."""
     (tmp_path / NAME).write_text("version = 1\n[system]\ncarts = 2\n", encoding="utf-8")
     columns = Field(path="system.columns", label="", kind="columns", value=f"time = {'9' * 5000}")
     with pytest.raises(SubmissionError, match="a number has too many digits"):
@@ -185,7 +185,7 @@ def test_a_column_typed_with_thousands_of_digits_is_refused(tmp_path):
 
 
 def test_numbers_that_are_sound_come_out_as_python_reads_them():
-    """Floats are those of tomllib; exact digits are kept where they are needed."""
+    """Numbers are read as tomllib reads them, or with their exact digits if asked."""
     text = "a = 0.1\nb = -1.5e-7\nc = [1, 2.50]\nd = { e = 1_000.0 }\n"
     assert parse_toml(text, where="f", error=PipelineError) == tomllib.loads(text)
     exact = parse_toml(text, where="f", error=PipelineError, as_typed=True)

@@ -1,4 +1,4 @@
-"""`submission.toml` becomes a validated model, with digits as typed and defaults filled in."""
+"""`submission.toml` becomes a checked model, with digits as typed and defaults filled in."""
 
 import re
 from decimal import Decimal
@@ -82,7 +82,7 @@ def folder(tmp_path):
 
 
 def test_every_table_of_the_format_is_read(folder):
-    """Missing carts mean all, paths are normalised, whole numbers serve as decimals."""
+    """Every table is read: missing carts mean all, and whole numbers are accepted as decimals."""
     submission = load_submission(folder)
 
     decay, control, pid = submission.experiments
@@ -102,7 +102,10 @@ def test_every_table_of_the_format_is_read(folder):
 
 
 def test_reported_numbers_keep_their_digits(folder):
-    """0.10 has two decimals, 25 zero, 1.0e1 one: tolerances come from the last digit."""
+    """Reported numbers keep their digits: 0.10 has two decimals, 25 none, 1.0e1 one.
+
+    The last digit gives a tolerance.
+    """
     reported = load_submission(folder).reported
 
     assert reported is not None
@@ -121,7 +124,7 @@ def test_reported_numbers_keep_their_digits(folder):
     )
 )
 def test_any_typed_number_comes_back_as_typed(number):
-    """A number under [reported] keeps its text."""
+    """Any number under [reported] keeps the text that was typed."""
     text = str(number)
     typed = text if "." in text else f"{text}.0"
     with TemporaryDirectory() as name:
@@ -135,13 +138,13 @@ def test_any_typed_number_comes_back_as_typed(number):
 
 @pytest.mark.parametrize("carts", [1, 2, 3, 4])
 def test_springs_left_out_are_all_there(carts, tmp_path):
-    """Between walls, n carts have n + 1 springs."""
+    """If `springs` is missing, n carts have n + 1 springs between the walls."""
     (tmp_path / "submission.toml").write_text(f"version = 1\n[system]\ncarts = {carts}\n")
     assert load_submission(tmp_path).system.springs == (True,) * (carts + 1)
 
 
 def test_a_cart_without_springs_reports_mass_and_damping(tmp_path):
-    """[false, false] on one cart is a rigid body, whose parameters have other names."""
+    """One cart with springs [false, false] is a rigid body, with mass and damping as parameters."""
     head = "version = 1\n[system]\ncarts = 1\nsprings = [false, false]\n[reported.final]\n"
     (tmp_path / "submission.toml").write_text(head + "mass = 2.0\ndamping = 0.1\n")
     reported = load_submission(tmp_path).reported
@@ -164,12 +167,12 @@ def test_windows_files_are_read(encode, folder):
 
 
 def test_the_toml_itself_may_be_named(folder):
-    """The folder, or the file in it."""
+    """The path may be that of the folder or of the file in it."""
     assert load_submission(folder / "submission.toml") == load_submission(folder)
 
 
 def test_notes_are_the_discussion(folder):
-    """`notes.md` is kept as written; one with only comments counts as missing."""
+    """`notes.md` is kept as written; if it has only comments, it counts as missing."""
     assert load_submission(folder).discussion is None
     (folder / "notes.md").write_text("<!-- hint\n -->\n", encoding="utf-8")
     assert load_submission(folder).discussion is None
@@ -178,7 +181,7 @@ def test_notes_are_the_discussion(folder):
 
 
 def test_every_problem_is_listed(folder):
-    """Three mistakes in one file are three lines, each with file and key."""
+    """Three mistakes in one file give three lines, each with file and key."""
     text = FULL.replace("K_1 = 25", "K_7 = 25\nzeta_q = 1").replace(
         "cart = 2\nref", "cart = 9\nref"
     )
@@ -196,7 +199,7 @@ def test_every_problem_is_listed(folder):
 
 
 def test_an_unknown_table_hides_no_other_mistake(folder):
-    """A misspelt table, a misspelt key inside one, and a wrong value are all reported."""
+    """A misspelt table does not hide a misspelt key in another or a wrong value."""
     text = FULL.replace("[design]", "[desing]").replace("version = 1", "version = 1\ncolour = 3")
     text = text.replace("carts = 2\n", 'carts = "two"\n')
     (folder / "submission.toml").write_text(text, encoding="utf-8")
@@ -208,7 +211,7 @@ def test_an_unknown_table_hides_no_other_mistake(folder):
 
 
 def test_a_slip_in_one_line_hides_no_slip_in_another(folder):
-    """Every line that is not TOML has its number; the rest of a list is not a second mistake."""
+    """Each line that is not TOML is reported once, with its number."""
     text = "version = 1\ntitle = “a”\n[system\ncarts = 2\n[design]\ncart = 1,5\nx = [1, two,\n 3]\n"
     (folder / "submission.toml").write_text(text, encoding="utf-8")
     with pytest.raises(SubmissionError) as told:
@@ -218,7 +221,7 @@ def test_a_slip_in_one_line_hides_no_slip_in_another(folder):
 
 
 def test_a_list_that_is_not_closed_is_one_slip(folder):
-    """The keys after it are read as they are, so nothing else is called wrong."""
+    """A list that is not closed is one mistake; the keys after it are read as they are."""
     text = "version = 1\ntitle = [1,\n 2\n[system]\ncarts = 1\n[design]\ncart = 1,5\n"
     (folder / "submission.toml").write_text(text, encoding="utf-8")
     with pytest.raises(SubmissionError) as told:
@@ -230,7 +233,7 @@ def test_a_list_that_is_not_closed_is_one_slip(folder):
 
 @pytest.mark.parametrize("carts", [1, 2, 3, 4])
 def test_a_new_submission_loads_and_says_what_is_next(carts, tmp_path):
-    """It is valid as written; reading its data asks for the first experiment."""
+    """A new submission is valid; reading its data asks for the first experiment."""
     new_submission(tmp_path / "team", carts=carts)
 
     submission = load_submission(tmp_path / "team")
@@ -243,7 +246,7 @@ def test_a_new_submission_loads_and_says_what_is_next(carts, tmp_path):
 
 @pytest.mark.parametrize("carts", [1, 2, 3, 4])
 def test_every_commented_key_of_a_new_submission_is_valid(carts, tmp_path):
-    """With every # before a key removed and files in place, the whole template loads."""
+    """The template of a new submission is valid with every # before a key removed."""
     folder = tmp_path / "team"
     new_submission(folder, carts=carts)
     text = (folder / "submission.toml").read_text(encoding="utf-8")
@@ -263,7 +266,7 @@ def test_every_commented_key_of_a_new_submission_is_valid(carts, tmp_path):
 
 
 def test_a_new_submission_overwrites_nothing(tmp_path):
-    """A folder that is not empty is left alone."""
+    """A folder that is not empty is not overwritten by a new submission."""
     (tmp_path / "mine.txt").write_text("work")
     with pytest.raises(ConfigError, match="not empty"):
         new_submission(tmp_path, carts=2)
@@ -276,7 +279,7 @@ def test_a_new_submission_overwrites_nothing(tmp_path):
 
 
 def test_a_wrong_number_of_carts_is_said_before_what_follows_from_it(tmp_path):
-    """Two lengths that agree on two carts: the three is wrong, not both of them."""
+    """If `carts` contradicts two lengths that agree, only `carts` is called wrong."""
     text = """
 version = 1
 [system]
@@ -295,7 +298,7 @@ gains = [1, 0, 1, 0]
 
 
 def test_of_many_thousand_mistakes_the_first_are_worded(tmp_path):
-    """The others are counted: naming the nearest keys of all would take minutes."""
+    """Of thousands of mistakes the first are written out, and the others only counted."""
     keys = "".join(f"k{i} = 1\n" for i in range(60_000))
     text = f"version = 1\n[system]\ncarts = 1\n{keys}"
     (tmp_path / "submission.toml").write_text(text, encoding="utf-8")

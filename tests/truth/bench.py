@@ -1,8 +1,8 @@
 """A bench with known, hidden physics, simulated independently of `pipeline.plant`.
 
-Fine fixed steps (50 µs, velocity Verlet), dry friction as an inclusion solved at every step
-(Moreau's time stepping), penalty contacts, the delay as a look-up in past commands. It is slow and
-plain on purpose: the workflow's simulator is judged by it.
+It has fine fixed steps (50 µs, velocity Verlet), dry friction as an inclusion solved at every step
+(Moreau's time stepping), penalty contacts, and the delay as a look-up in past commands. It is slow
+and simple on purpose, because the simulator of the workflow is judged by it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ STEP = 5e-5  # s
 CONTACT_STEP = 2e-6  # s; bounces multiply the error of each impact
 _CONTACTS = ("backlash", "end_stop")
 
-# Numbers of one cart and one spring in the truth's own tables.
+# Numbers of one cart and one spring, in tables of this simulator's own.
 _CART = (
     "m c coulomb excess stribeck dahl delta mu drag offset stop stop_k stop_c gain hm hk hc"
 ).split()
@@ -36,9 +36,9 @@ class Hidden:
 class Hand:
     """An unmeasured hand on one cart from `start` to `end` (s).
 
-    It grips the cart with a spring and a damper of its own, moves it by `pull` (position units)
-    until the share `there` of its time, holds it, and lets go over the last tenth. Or it pushes
-    with a force that swells to `push` (input units) and fades. A soft hold is a grip that never
+    The hand may grip the cart with a spring and a damper, move it by `pull` (position units) until
+    the share `there` of its time, hold it, and release it over the last tenth. Or it pushes with a
+    force that rises to `push` (input units) and falls again. A soft hold is a grip that never
     pulls.
     """
 
@@ -48,7 +48,7 @@ class Hand:
     pull: float = 0.0
     push: float = 0.0
     there: float = 0.8
-    grip: float = 8.0  # times the stiffness of the springs beside the cart
+    grip: float = 8.0  # as a multiple of the stiffness of the springs beside the cart
 
 
 @njit(cache=True)
@@ -84,7 +84,7 @@ def _motion(cart, spring, drive, hands, free, t, times, command, x0, v0, scatter
     xh, vh = x0.copy(), v0.copy()
     lag = command[0]
     xm, vm = x0[0], v0[0]
-    # Velocities in the middle of a step, continued from the last one: second order.
+    # Velocities in the middle of a step are continued from the last step: second order.
     v_last, vh_last = v0.copy(), v0.copy()
     w, wh = v0.copy(), v0.copy()
     has_gap = drive[5] > 0.0
@@ -107,8 +107,8 @@ def _motion(cart, spring, drive, hands, free, t, times, command, x0, v0, scatter
         mid = now + 0.5 * h
         while on < times.size - 1 and times[on + 1] <= mid:
             on += 1
-        # The delayed command over this step: steps are far shorter than samples, so at most one
-        # edge falls inside, and counts for the remaining part of the step.
+        # The delayed command over this step. Steps are far shorter than samples, so at most one
+        # edge falls into a step; it counts for the part of the step after it.
         begin = now - drive[2]
         while at < times.size - 1 and times[at + 1] <= begin:
             at += 1
@@ -181,7 +181,7 @@ def _motion(cart, spring, drive, hands, free, t, times, command, x0, v0, scatter
                 rise = h * (w[i] - abs(w[i]) * z[i]) / cart[i, 6]
                 f[i] -= scatter[i] * cart[i, 5] * (z[i] + 0.5 * rise)
                 z[i] += rise
-            # The inclusion: the impulse that stops the cart, or as much of it as friction has.
+            # The inclusion: the impulse that stops the cart, limited to what friction can give.
             target = v[i] + h / m * f[i]
             most = cart[i, 2] + cart[i, 7] * abs(u)
             if cart[i, 3] > 0.0:
@@ -220,8 +220,8 @@ def simulate_truth(
 ) -> np.ndarray:
     """Return the true readings (n, samples), before noise and encoder.
 
-    `t` are the sample times; the input is held from sample to sample. `step` (s) defaults to
-    what the effects need.
+    `t` are the sample times; the input is held from sample to sample. By default `step` (s) is as
+    small as the effects need.
     """
     if step is None:
         step = CONTACT_STEP if any(e.effect in _CONTACTS for e in hidden) else STEP
@@ -251,7 +251,7 @@ def simulate_truth(
 
 
 def _hands(hands: Sequence[Hand], m, k) -> np.ndarray:
-    """Return (hands, 8): cart, start, end, pull, push, there, stiffness and damping of the grip."""
+    """Return an array (hands, 8): cart, start, end, pull, push, there, stiffness and damping."""
     rows = []
     for h in hands:
         i = h.cart - 1
@@ -277,7 +277,7 @@ def _hide(effect: Hidden, cart: np.ndarray, spring: np.ndarray, drive: np.ndarra
         case "force_offset":
             cart[i, 9] = p["force"]
         case "end_stop":
-            # Its own contact law: a fifth of critical damping on the contact spring.
+            # This simulator's own contact law: a fifth of critical damping on the contact spring.
             damping = p.get("damping", 0.4 * np.sqrt(p["stiffness"] * cart[i, 0]))
             cart[i, 10:13] = p["position"], p["stiffness"], damping
         case "sensor_gain":

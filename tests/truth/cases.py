@@ -1,4 +1,4 @@
-"""Random benches with hidden effects, and the recordings that a class would make."""
+"""Random benches with hidden effects, and the recordings that a class would make of them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from pipeline.results import Record
 from tests.truth.bench import Hand, Hidden, simulate_truth
 
 COUNT = 0.00227  # cm, the encoder step
-_SMALLER = (0.7, 0.95)  # of a case's largest input: that of its further records
+_SMALLER = (0.7, 0.95)  # as a share of a case's largest input: the input of its further records
 RATES = (113.1, 200.0, 250.0, 500.0, 1000.0)  # Hz
 
 _M = ([1.98587e-4], [3.128204e-4, 1.737182e-4], [3.2732e-4, 2.516715e-4, 1.960671e-4])
@@ -45,7 +45,7 @@ EFFECTS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A bench, its hidden effects, its records, and the hands in them by record."""
+    """A bench, its hidden effects, its records, and the hands in the records."""
 
     n: int
     springs: tuple[bool, ...]
@@ -68,16 +68,16 @@ def make_case(
     handled: bool = False,
     rate: float | None = None,
 ) -> Case:
-    """Make a bench with the named effects at random places and sizes, or with the given ones.
+    """Make a bench with the named effects at random places and sizes, or with given effects.
 
-    `wide` draws sizes over a decade, soft and hard contacts of any damping, and motors of any mass,
-    including cases that are hard to recognise or fit.
+    `wide` draws sizes over a decade, soft and hard contacts of any damping, and motors of any mass.
+    Some of these cases are hard to recognise or fit.
 
     `dirt` adds features of real benches: friction that varies by 4 % between runs, encoders zeroed
     where the cart happens to rest, time stamps rounded to a tenth of a millisecond.
 
-    `handled` has carts plucked by hand, once and twice a record, nudged, pushed at the end, and
-    held by a hand that gives way.
+    With `handled`, people pluck carts once or twice per record, nudge them, push at the end, and
+    hold them with a hand that yields.
     """
     rng = np.random.default_rng(seed)
     m = np.array(_M[n - 1]) * rng.uniform(0.8, 1.25, n)
@@ -110,7 +110,7 @@ def make_case(
         scatter = 1.0 + (0.04 * rng.standard_normal(n) if dirt else np.zeros(n))
         lead = 0.0
         if dirt and kind != "decay":
-            # The cart was left somewhere inside its friction band, and zeroed there.
+            # The cart was left somewhere within its friction band, and the encoder zeroed there.
             x0 = np.array([_rest_band(h, stiffness, i, rng) for i, h in _by_cart(hidden, n)])
             x0 = np.where([i + 1 in free for i in range(n)], x0, 0.0)
         y = simulate_truth(
@@ -129,7 +129,8 @@ def make_case(
 def further_records(case: Case, *, seed: int) -> tuple[Record, ...]:
     """Return new records of a clean case's bench.
 
-    Other sizes of steps and sweep, none larger than before; other releases, other noise.
+    The sizes of steps and sweep differ, and none is larger than before; releases and noise differ
+    too.
     """
     rng = np.random.default_rng(seed)
     m, c, k = np.array(case.m), np.array(case.c), np.array(case.k)
@@ -144,11 +145,12 @@ def further_records(case: Case, *, seed: int) -> tuple[Record, ...]:
 
 
 def make_rig(*, seed: int, n: int, trials: int = 3) -> Case:
-    """Make a realistic bench with several effects, which no single one explains.
+    """Make a realistic bench with several effects, none of which alone explains the gap.
 
-    Dry friction of nearly one size on every cart, which differs between runs. Viscous damping of
-    cart 1 that doubles while the motor drives. Decays released by hand, with a speed and a zero of
-    their own. A coarse encoder; `trials` repeats of each run, and no other sizes.
+    Every cart has dry friction of nearly the same size, which differs between runs. The viscous
+    damping of cart 1 doubles while the motor drives. Decays are released by hand, with a speed and
+    a zero of their own. The encoder is coarse; each run has `trials` repeats, and there are no
+    other sizes.
     """
     rng = np.random.default_rng(seed)
     m = np.array(_M[n - 1]) * rng.uniform(0.8, 1.25, n)
@@ -232,7 +234,7 @@ def _rest_band(h, stiffness, i, rng):
 
 
 def _plan(n, large, rng, rate):
-    """Steps of two sizes (one repeated), a sweep, hand-released decays."""
+    """Return the plan: steps of two sizes (one repeated), a sweep, and hand-released decays."""
     dt = 1.0 / rate
     everything = tuple(range(1, n + 1))
     plan = []
@@ -260,7 +262,7 @@ def _plan(n, large, rng, rate):
 
 
 def _lay_hands(n, large, rng) -> dict[str, tuple[Hand, ...]]:
-    """Draw what hands do to the runs of `_plan`: every decay is plucked, one step is nudged."""
+    """Draw what hands do in the runs of `_plan`: all decays are plucked, one step is nudged."""
     hands = {}
     for cart in range(1, n + 1):
         soft = [
@@ -288,7 +290,7 @@ def _lay_hands(n, large, rng) -> dict[str, tuple[Hand, ...]]:
 
 
 def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng, wide=False) -> Hidden:
-    """Draw a place and sizes; `severity` scales the departure from the linear bench."""
+    """Draw a place and sizes; `severity` scales the difference from the linear bench."""
     s = severity * float(np.exp(rng.uniform(np.log(0.3), np.log(1.5)))) if wide else severity
     i = int(rng.integers(n))
     present = [j for j in range(n + 1) if k[j] > 0]

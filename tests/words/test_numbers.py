@@ -44,7 +44,7 @@ def read(text: str) -> tuple[float, float]:
     ],
 )
 def test_rounds_value_and_error_together(value, std, expected):
-    """Both end at the decimal place of the error's second digit."""
+    """A value and its error both end at the decimal place of the error's second digit."""
     assert with_error(value, std) == expected
 
 
@@ -53,13 +53,13 @@ def test_rounds_value_and_error_together(value, std, expected):
     st.floats(1e-7, 1e7),
 )
 def test_rounding_changes_nothing_that_the_error_could_tell(value, ratio):
-    """The value read back differs from the true one by at most a twentieth of the error."""
+    """Rounding changes a value by at most a twentieth of its error."""
     std = ratio * abs(value) or ratio
 
     got, got_std = read(with_error(value, std))
 
-    # Two digits of the error: its own rounding is at most 5 % (0.5 in 10), and the value is
-    # rounded at the same place; the 1e-4 is for the rounding of doubles.
+    # The error has two digits: its rounding is at most 5 % (0.5 in 10), and the value is rounded at
+    # the same place. The 1e-4 is for the rounding of floats.
     assert abs(got - value) <= 0.0501 * std
     assert abs(got_std - std) <= 0.0501 * std
 
@@ -77,12 +77,12 @@ def test_rounding_changes_nothing_that_the_error_could_tell(value, ratio):
     ],
 )
 def test_significant_digits(value, expected):
-    """Four digits; a power of ten if plain digits would be long; a dash for a missing number."""
+    """A number has four digits, a power of ten if it would be long, a dash if it is missing."""
     assert significant(value) == expected
 
 
 def test_percentages_carry_their_sign_where_they_are_changes():
-    """A change has a sign, a share does not; a missing one is a dash."""
+    """A percentage that is a change has a sign, a share has none, and a missing one is a dash."""
     assert percent(5.14, signed=True) == "+5.1 %"
     assert percent(-148.2, signed=True) == "−148 %"
     assert percent(5.14) == "5.1 %"
@@ -90,7 +90,7 @@ def test_percentages_carry_their_sign_where_they_are_changes():
 
 
 def test_listing_reads_as_english():
-    """Commas, and an "and" before the last."""
+    """A list has commas, and an "and" before its last item."""
     assert [listing(list("abc")[:n]) for n in range(4)] == ["", "a", "a and b", "a, b and c"]
     assert [listing("abcd"[:n], most=2) for n in (2, 3, 4)] == [
         "a and b",
@@ -100,7 +100,7 @@ def test_listing_reads_as_english():
 
 
 def test_margins_say_lag_lead_and_no_limit():
-    """A negative phase margin is a lead; without a critical gain or phase there is no limit."""
+    """A negative phase margin is called a lead; without a critical gain there is no limit."""
     lag = Margins(gain=4.0, phase_deg=60.0, modulus=0.7, omega_gain=0.0, omega_phase=20.0)
     assert margin_rows(lag) == [
         ("gain margin", "4.00", "", "at 0 rad/s"),
@@ -116,7 +116,7 @@ def test_margins_say_lag_lead_and_no_limit():
 
 
 def test_a_column_has_one_form():
-    """If one number needs a power of ten, the whole column has one."""
+    """If one number of a column needs a power of ten, all its numbers have one."""
     small, large = (3.12812e-4, 1.2e-6), (0.1274769, 3.9e-6)
     assert with_errors([large]) == ["0.1274769 ± 0.0000039"]
     assert with_errors([small, large]) == ["(3.128 ± 0.012) × 10⁻⁴", "(1.274769 ± 0.000039) × 10⁻¹"]

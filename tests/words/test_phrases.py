@@ -1,4 +1,4 @@
-"""The sentences that an instructor may edit: found by key, values inserted, markup set."""
+"""The sentences that an instructor may edit: found by key, with values and markup."""
 
 import ast
 import re
@@ -20,7 +20,7 @@ SUBJECTS = sorted(path.stem for path in (TEMPLATES / "words").glob("*.toml"))
 
 
 def written(folder: Path, text: str) -> Phrases:
-    """Return the sentences of an edited file."""
+    """Return the sentences of a catalogue after an edit."""
     path = folder / "gap.toml"
     path.write_text(text + "\n", encoding="utf-8")
     return Phrases(path)
@@ -28,7 +28,7 @@ def written(folder: Path, text: str) -> Phrases:
 
 @pytest.fixture(scope="module")
 def modules() -> list[tuple[str, set[str]]]:
-    """The text of each module of the package, and the strings in it."""
+    """Return each module of the package as text, with the strings in it."""
     texts = [path.read_text(encoding="utf-8") for path in PIPELINE.rglob("*.py")]
     return [
         (text, {n.value for n in ast.walk(ast.parse(text))
@@ -39,10 +39,10 @@ def modules() -> list[tuple[str, set[str]]]:
 
 @pytest.mark.parametrize("subject", SUBJECTS)
 def test_every_sentence_is_said_somewhere(subject, modules):
-    """Every sentence of a catalogue is used somewhere."""
+    """Every sentence of a catalogue is used by some module."""
     asking = (f'"{subject}"', "WORDS", "words: Phrases", "said=(")
     strings: set[str] = set()
-    parts: set[str] = set()  # keys that are built, as in f"title_{verdict}"
+    parts: set[str] = set()  # keys that are put together, as in f"title_{verdict}"
     for text, found in modules:
         strings |= found
         parts |= found if any(word in text for word in asking) else set()
@@ -54,7 +54,7 @@ def test_every_sentence_is_said_somewhere(subject, modules):
 
 
 def test_marks_are_set_and_values_are_never_markup(tmp_path):
-    """Bold text, code and links come from the sentence, never from a value."""
+    """Bold text, code and links come from a sentence, and never from a value put into it."""
     words = written(tmp_path, 'a = "**Yes: **{name}, see `f` under [here](#x)."')
     assert words.spans("a", name="**no** [b](#y)") == (
         Span("Yes: ", "strong"),
@@ -71,7 +71,7 @@ def test_marks_are_set_and_values_are_never_markup(tmp_path):
 
 @pytest.mark.parametrize("subject", SUBJECTS)
 def test_a_catalogue_is_plain_toml(subject):
-    """One table of strings, in which a brace always belongs to a value."""
+    """A catalogue is one table of strings, in which braces are only around values."""
     found = tomllib.loads((TEMPLATES / "words" / f"{subject}.toml").read_text(encoding="utf-8"))
     for key, text in found.items():
         assert isinstance(text, str), key
@@ -92,7 +92,7 @@ def test_a_catalogue_is_plain_toml(subject):
     ],
 )
 def test_a_mistake_in_a_sentence_is_reported_in_one_line(tmp_path, text, named):
-    """The message names the file, the key and the values allowed there, with and without markup."""
+    """A mistake in a sentence gives one line with the file, the key and the allowed values."""
     words = written(tmp_path, text)
     for say in (words.text, words.spans):
         with pytest.raises(ConfigError) as error:
@@ -103,7 +103,7 @@ def test_a_mistake_in_a_sentence_is_reported_in_one_line(tmp_path, text, named):
 
 @pytest.mark.parametrize("text", ['effects = "{shaer}"', 'effects = "All', 'made = "By hand"'])
 def test_a_slip_ends_a_command_in_one_line(tmp_path, monkeypatch, text):
-    """Exit status 2 and no traceback."""
+    """A mistake in a sentence ends a command with exit status 2 and without a traceback."""
     monkeypatch.setattr(gallery, "_WORDS", written(tmp_path, text))
     done = cartlab_here("effects", "coulomb_friction", "--out", tmp_path / "out")
     assert done.returncode == 2
