@@ -1,11 +1,11 @@
 """Find crooked English, and keep each folder within its budget.
 
-`python .ci/prose.py` checks every text in the project that a person reads: Markdown, pages and
-words of templates, docstrings, comments and messages. A folder that has more finds than
-`.ci/prose.toml` allows fails; `--lower` writes the numbers of today, and only if no folder fails,
-so a budget can only fall. `python .ci/prose.py PATH...` lists the finds of these files.
+`python .ci/prose.py` checks every text of the project that a person reads: Markdown, pages and
+words of templates, docstrings, comments and messages. A folder with more finds than
+`.ci/prose.toml` allows fails. `--lower` writes today's numbers, and only if no folder fails, so a
+budget can only fall. `python .ci/prose.py PATH...` lists the finds in these files.
 
-A find is a place to read aloud. Rewrite the thought; do not swap the word.
+A find is a sentence to read aloud. Rewrite the whole thought, not only the word.
 """
 
 import ast
@@ -23,7 +23,7 @@ BUDGET = ROOT / ".ci" / "prose.toml"
 ROOTS = "README.md CONTRIBUTING.md CHANGELOG.md docs rubrics templates pipeline benchmarks tests"
 KINDS = {".py", ".md", ".j2", ".html", ".toml"}
 LONGEST = 38  # words in a sentence; above it a reader has to go back
-MESSAGE = 5  # words that make a string of a program a text
+MESSAGE = 5  # from this number of words on, a string of a program counts as a text
 
 # Constructions that read as translated, and what native readers write.
 RULES = {
@@ -39,7 +39,8 @@ RULES = {
     r"\b(?:is|are|was|were) (?:not )?to be (?!able)\w+|\bthere to (?:see|read)\b": "'must be'",
 }
 FOUND = [(re.compile(pattern), advice) for pattern, advice in RULES.items()]
-# Where a docstring goes on with another paragraph, or with the next entry of a numpydoc section.
+# Places where a docstring goes on with a new paragraph or with the next entry of a numpydoc
+# section.
 ENTRY = re.compile(r"\n\s*\n|\n\s*-{4,}\s*\n|\n(?=\s*[\w`][^:\n]{0,60} : )")
 INLINE = "a|abbr|b|code|em|i|kbd|label|mark|small|span|strong|sub|sup|time|var"
 

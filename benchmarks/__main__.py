@@ -2,8 +2,8 @@
 
     python -m benchmarks [NAME…] [--quick] [--out PAGE.md]
 
-Without a name all benchmarks run. With names, the other sections stay as they are. `--quick` runs
-small versions, only to show that everything works; they are printed, or written to `--out`.
+Without a name all benchmarks run. With names, only their sections change. `--quick` runs small
+versions, only to show that everything works; they are printed, or written to `--out`.
 
 A benchmark is a module of this folder whose name is in `PAGES`, in the order of its page. The
 module has four names.
@@ -24,12 +24,13 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-# One thread per tool, so that processor time is time of one core. Set before numpy is loaded.
+# One thread per tool, so that processor time is that of one core. Set before numpy is loaded.
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 
 from benchmarks.page import section, write_page
 
-# The comparisons, those on published data, and what cartlab promises of its own results.
+# The comparisons with other tools, those on published data, and the promises about cartlab's own
+# results.
 PAGES = {
     "README.md": ("bode", "gap_tools", "grading", "report"),
     "published.md": ("silverbox", "emps", "friction"),
@@ -40,7 +41,7 @@ FOLDER = Path(__file__).parent
 
 
 def main() -> None:
-    """Make the sections that the user names."""
+    """Make the sections of the benchmarks that the user names."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks")
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS))
     parser.add_argument("--quick", action="store_true", help="small, to test that it runs")

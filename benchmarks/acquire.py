@@ -32,14 +32,14 @@ FAULTS = ("drop", "garble", "merge", "delay")
 
 
 class _Once(Notes):
-    """An observer that confirms no second try and keeps no lines."""
+    """An observer that never repeats a recording and keeps no lines."""
 
     def confirm(self, instruction: str) -> None:
-        """Give up."""
+        """Refuse, as nobody is there to confirm."""
         raise ConfigError(instruction)
 
     def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
-        """Let them go."""
+        """Drop the readings."""
 
 
 def stream(folder: Path, *, minutes: float) -> None:
@@ -68,7 +68,7 @@ def stream(folder: Path, *, minutes: float) -> None:
 
 
 def faults(folder: Path, *, seconds: float) -> None:
-    """Spoil 1 % of the lines in each way; check that valid lines are kept and faults counted."""
+    """Damage 1 % of the lines in each way; check that good lines are kept, faults counted."""
     write_work(folder, [sine("faulty", seconds=seconds)])
     options = [option for kind in FAULTS for option in ("--fault", f"{kind}=0.01")]
     with emulator(*options) as bench:
@@ -90,7 +90,7 @@ def faults(folder: Path, *, seconds: float) -> None:
 
 
 def stops(folder: Path, *, n: int) -> None:
-    """Pass the travel limit; print the ms from the offending line to the last line of the bench."""
+    """Pass the travel limit; print the ms from the line that passes it to the bench's last line."""
     delays = []
     with emulator() as bench:
         for trial in range(n):
@@ -110,7 +110,7 @@ def stops(folder: Path, *, n: int) -> None:
 
 
 def kills(folder: Path, *, n: int) -> None:
-    """Kill the host at random; print what the raw file lacks and when the motor is off."""
+    """Kill the host at random; print what the raw file lacks, and when the motor stops."""
     rng, missing, off = np.random.default_rng(0), [], []
     with emulator() as bench:
         for trial in range(n):
@@ -125,7 +125,7 @@ def kills(folder: Path, *, n: int) -> None:
             sent = bench.event("run")["lines"]
             run = read_raw(raw)
             kept = readings_of(run)
-            # The watchdog lets the bench stream on; the host was killed up to 30 ms later than
+            # The bench streams on until its watchdog acts; the host was killed up to 30 ms after
             # its last heartbeat.
             missing.append(1.0024 * sent - silent - (kept[-1].ms if kept else 0))
             off.append(silent)

@@ -1,7 +1,7 @@
 """Other tools that learn a nonlinear model of one cart from records.
 
-Each tool tries the settings in its documentation. Of the models with nearly the smallest free-run
-error on the held-out records, the smallest is kept.
+Each tool tries the settings in its documentation. Of the models whose free-run error on the
+held-out records is nearly the smallest, the one with the fewest terms is kept.
 """
 
 import contextlib
@@ -19,8 +19,8 @@ from scipy.optimize import least_squares
 
 from pipeline.arrays import Array
 
-_NEAR = 1.1  # times the least error: within, fewer terms are preferred
-_FAR = 1e3  # times the largest motion: a run that gets there has diverged
+_NEAR = 1.1  # times the least error: within this factor, fewer terms are preferred
+_FAR = 1e3  # times the largest motion: a run that gets that far has diverged
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,8 +33,8 @@ class Part:
     dt: float
     u: Array
     y: Array
-    held: bool = True  # the input, from sample to sample; else band-limited
-    first: int = 48  # sample to judge from: those before start what has a memory
+    held: bool = True  # the input is held from sample to sample; otherwise it is band-limited
+    first: int = 48  # first sample to judge: the samples before it start a model that has a memory
     source: Any = None
 
 
@@ -75,7 +75,7 @@ def best(models: Iterator[Model], parts: Sequence[Part]) -> Model | None:
 
 
 def _thinned(part: Part, every: int) -> tuple[Array, Array]:
-    """Return input and position at every few samples, the input as its mean until the next one."""
+    """Return every n-th position, and the mean input until the next one."""
     n = part.y.size // every * every
     u = part.u[:n].reshape(-1, every).mean(axis=1) if every > 1 else part.u
     return u, part.y[::every][: u.size]
@@ -83,7 +83,7 @@ def _thinned(part: Part, every: int) -> tuple[Array, Array]:
 
 # -------------------------------------------------------------------------- PySINDy
 
-# By name, of position, velocity and input: what an engineer would put into the library.
+# By name: terms of position, velocity and input that an engineer would put into the library.
 FEATURES: dict[str, Callable[[Any, Any, Any], Any]] = {
     "1": lambda x, v, u: 1.0 + 0 * x,
     "x": lambda x, v, u: x,
@@ -123,7 +123,8 @@ def sindy(parts: Sequence[Part], *, windows: Sequence[int] = (5, 7, 11, 15)) -> 
                 order=_ORDER,
             )
         )
-        # A derivative is that of the middle: between the hold before a sample and the one after.
+        # The derivative belongs to the middle of an interval: between the input held before a
+        # sample and the one held after it.
         u = [(part.u + np.roll(part.u, 1)) / 2 if part.held else part.u for part in parts]
         v = [np.asarray(smooth(part.y, part.dt)).ravel() for part in parts]
         states = [np.column_stack([part.y, slope]) for part, slope in zip(parts, v, strict=True)]
@@ -146,7 +147,7 @@ def sindy(parts: Sequence[Part], *, windows: Sequence[int] = (5, 7, 11, 15)) -> 
                     states, t=[part.dt * np.arange(part.y.size) for part in parts],
                     u=[held[:, None] for held in u],
                 )  # fmt: skip
-            acceleration = np.asarray(model.coefficients())[1]  # dx/dt = v is no question
+            acceleration = np.asarray(model.coefficients())[1]  # dx/dt = v is known
             yield Model(
                 run=_integrated(acceleration, names, smooth),
                 every=1,
@@ -233,7 +234,7 @@ def frols(
             try:
                 model.fit(X=u if driven else None, y=y)
             except (ValueError, np.linalg.LinAlgError):
-                continue  # fewer terms than are asked for
+                continue  # fewer terms than were asked for
 
         def run(part: Part, model: Any = model, every: int = every) -> Array:
             u, y = _thinned(part, every)
@@ -282,7 +283,7 @@ def network(
             random_state=0,
         )
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # not yet converged
+            warnings.simplefilter("ignore")  # the network has not converged yet
             net.fit((X - mean) / std, Y / scale)
         layers = list(zip(net.coefs_, net.intercepts_, strict=True))
 
@@ -409,7 +410,7 @@ def _recurrent(weights: Sequence[Array], x0: Array, u: Array) -> Array:
 
 
 STATES, CELLS = 4, 6
-ADAM, LBFGS = 1000, 1000  # as its documentation has them
+ADAM, LBFGS = 1000, 1000  # as in its documentation
 _GONE = 1e-3  # a weight below it counts as removed by the lasso
 _SATURATED = 1000.0  # jax-sysid limits states to this size, also while it learns
 TOOLS: tuple[tuple[str, str, Callable[..., Iterator[Model]]], ...] = (

@@ -51,7 +51,7 @@ _MARKS = "oDsv^P"
 
 @dataclass(frozen=True, kw_only=True)
 class Try:
-    """One fit: errors over the bound (infinite where it failed), whether right, CPU ms."""
+    """One fit: errors in units of the bound (infinite if it failed), whether right, CPU ms."""
 
     modes: float
     gains: float
@@ -63,7 +63,7 @@ Trials = dict[tuple[str, int, float], list[Try]]  # by tool, carts, noise
 
 
 def judged(find: Callable[[], Modes], *, truth: Modes, least: Modes) -> Try:
-    """Run one method and compare it with the truth, in units of the bound."""
+    """Run one method and compare its result with the truth, in units of the bound."""
     start = time.process_time()
     try:
         found = find()
@@ -92,7 +92,7 @@ def _rms(values: Array) -> float:
 
 
 def modes_named(chain: Chain, values: Sequence[float]) -> Modes:
-    """Return the resonances and gains, which are compared, of all named parameters."""
+    """Return the resonances and gains among named parameters, which are what is compared."""
     named = dict(zip(chain.parameters(), values, strict=True))
     keys = "n" if chain.n == 1 else "abc"[: chain.n]
     zetas = ["zeta"] if chain.n == 1 else [f"zeta_{key}" for key in keys]
@@ -192,7 +192,7 @@ def from_records(*, seeds: int) -> Trials:
 def rows_of(
     data: str, trials: Trials, *, tools: Sequence[tuple[str, str]], middle: float
 ) -> list[list[str]]:
-    """Return a row for each tool: error at the middle noise by carts, share right, time."""
+    """Return a row for each tool: its error at the middle noise by carts, share right, and time."""
     rows = []
     for name, tool in ((OURS, ""), *tools):
         if tool and not installed(tool):
@@ -238,7 +238,7 @@ def _speed(trials: Trials) -> list[float]:
 def picture(
     kinds: Sequence[tuple[str, Trials, Sequence[float]]],
 ) -> Figure:
-    """Draw the error over the bound against the noise, by data and carts."""
+    """Draw the error in units of the bound against the noise, by data and by carts."""
     figure = Figure(figsize=(6.5, 5.2), layout="constrained")
     grid = figure.subplots(len(kinds), 3, sharey=True, squeeze=False)
     shown = list(dict.fromkeys(name for _, trials, _ in kinds for name, _, _ in trials))
@@ -270,7 +270,7 @@ def picture(
     return figure
 
 
-_CEILING = 300.0  # larger errors, and missing answers, are drawn here
+_CEILING = 300.0  # larger errors and missing answers are drawn at this value
 
 
 def tables(*, quick: bool) -> list[Table]:

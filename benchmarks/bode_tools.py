@@ -1,7 +1,7 @@
-"""Find the modes of a chain with other tools, each as its documentation shows.
+"""Find the resonances of a chain with other tools, each used as its documentation shows.
 
-From dwells: `DWELL_TOOLS`; what fits a rational function takes the paper's: common denominator,
-K_i, and the zeros of cart i, as factors 1 + 2 ζ s/ω + (s/ω)². From records: `RECORD_TOOLS`.
+`DWELL_TOOLS` use dwells. Those that fit a rational function use the paper's: a common denominator,
+K_i, and the zeros of cart i, as factors 1 + 2 ζ s/ω + (s/ω)². `RECORD_TOOLS` use time records.
 """
 
 import contextlib
@@ -18,12 +18,12 @@ from benchmarks.identification import PAPER_STARTS
 from pipeline.arrays import Array, ComplexArray
 from pipeline.results import FrequencyResponse, Record
 
-_TINY = 1e-9  # position unit per input unit: a logarithm needs more than nothing
+_TINY = 1e-9  # position unit per input unit: a logarithm needs more than zero
 
 
 @dataclass(frozen=True, kw_only=True)
 class Modes:
-    """Resonances, ascending, and static gains by cart, as (n,); no gains from a modal analysis."""
+    """Resonances, ascending, and static gains by cart, as (n,); a modal analysis gives no gains."""
 
     omega: Array
     zeta: Array
@@ -35,7 +35,7 @@ def modes_of(poles: ComplexArray, *, n: int, gains: Array | None) -> Modes:
 
     Raises
     ------
-    ArithmeticError : fewer than n oscillate.
+    ArithmeticError : fewer than n modes oscillate.
     """
     upper = poles[np.imag(poles) > 0]
     if upper.size < n:
@@ -79,7 +79,7 @@ def rational(p: Array, omega: Array, *, n: int) -> ComplexArray:
 def _modes_of_vector(p: Array, *, n: int, phases: bool) -> Modes:
     omega, zeta = np.abs(p[n : 3 * n : 2]), p[n + 1 : 3 * n : 2] * np.sign(p[n : 3 * n : 2])
     order = np.argsort(omega)
-    # Magnitudes cannot tell a negative damping from a positive one, which the user can.
+    # Magnitudes do not show the sign of a damping, but the user knows that it is positive.
     return Modes(omega=omega[order], zeta=(zeta if phases else np.abs(zeta))[order], gains=p[:n])
 
 
@@ -94,7 +94,7 @@ class Dwells:
 
     @classmethod
     def of(cls, responses: Sequence[FrequencyResponse]) -> "Dwells":
-        """Take them from the responses that cartlab fits."""
+        """Take the responses that cartlab fits."""
         turns = [np.exp(1j * (0.0 if r.phase is None else r.phase)) for r in responses]
         return cls(
             omega=responses[0].omega,
@@ -125,7 +125,8 @@ def nelder_mead(dwells: Dwells, *, log: bool) -> Modes:
             off[n:] = np.angle(np.exp(1j * off[n:]))
         return float(np.sum(off**2))
 
-    # xatol, fatol, 200 evaluations a parameter and the 5 % simplex: both have the same defaults.
+    # xatol, fatol, 200 evaluations per parameter and the 5 % simplex are the defaults of both
+    # programs.
     return _modes_of_vector(
         minimize(misfit, start_of(n), method="Nelder-Mead").x, n=n, phases=dwells.phases
     )
@@ -153,7 +154,7 @@ def curve_fitted(dwells: Dwells) -> Modes:
 
 
 def vector_fitted(dwells: Dwells) -> Modes:
-    """Fit common poles by scikit-rf, the responses as the parameters of a network."""
+    """Fit common poles by scikit-rf, which takes the responses as parameters of a network."""
     skrf = import_module("skrf")
     fitting = import_module("skrf.vectorFitting")
     n, ports = len(dwells.G), 1 if len(dwells.G) == 1 else 2
@@ -164,7 +165,7 @@ def vector_fitted(dwells: Dwells) -> Modes:
         S[:, row, column] = G / scale
     hertz = dwells.omega / (2 * np.pi)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about passivity, which does not matter here
+        warnings.simplefilter("ignore")  # warnings about passivity, which does not matter here
         fit = fitting.VectorFitting(skrf.Network(f=hertz, f_unit="hz", s=S, z0=50))
         fit.vector_fit(
             n_poles_real=0,
@@ -230,8 +231,8 @@ def _of_state_model(model: object, record: Record, *, scale: Array) -> Modes:
 def modal(record: Record, *, method: str) -> Modes:
     """Analyse the frequency responses of a periodic record by sdypy-EMA.
 
-    The first period is left out. Frequencies are given a hundredfold: the windows in which poles
-    are gathered are made for structures of hundreds of Hz.
+    The first period is left out. Frequencies are multiplied by 100, because the windows in which
+    the tool gathers poles suit structures of hundreds of Hz.
     """
     ema = import_module("sdypy.EMA")
     n = len(record.y)

@@ -20,10 +20,10 @@ from pipeline.simulated.emulator.carts import TRUE_PERIOD
 from pipeline.simulated.hidden import default_values, prepare_bench
 from pipeline.submission import Submission
 
-_SPREAD = 0.3  # of the logarithms of masses, dampings and springs, about those of a preset
+_SPREAD = 0.3  # scatter of the logarithms of masses, dampings and springs around those of a preset
 USUAL = (0.6, 1.6)  # times the usual size of an effect
-# In every driven run it is damping of the first cart itself. A constant force, too, is never drawn:
-# it is looked for by the rest points.
+# In every driven run this effect acts as damping of the first cart. A constant force is never drawn
+# either, because cartlab looks for it in the rest points.
 _UNSEEN = ("drive_damping",)
 PAGE = Path(__file__).with_name("next.md")
 Named = tuple[str, int]  # an effect and where it sits
@@ -57,7 +57,7 @@ def draw(seed: int, *, effects: int, sizes: tuple[float, float] = USUAL) -> Draw
         if effect.only_rest or effect.key in _UNSEEN or not places:
             continue
         place = places[int(rng.integers(len(places)))]
-        # The size of a limit or a stop is its distance: a nearer one has more effect.
+        # The size of a limit or a stop is its distance: a smaller distance has more effect.
         mine = sizes if effect.parameters[0].neutral is not None else USUAL
         term = _sized(effect, place, chain, float(np.exp(rng.uniform(*np.log(mine)))))
         if not any(_alike(term.effect, other.effect) for other in terms):
@@ -67,10 +67,10 @@ def draw(seed: int, *, effects: int, sizes: tuple[float, float] = USUAL) -> Draw
 
 
 def counted(effect: Effect, place: int, value: float) -> Named:
-    """Return an effect under the name that counts: indistinguishable effects have the same name.
+    """Return an effect under the name that counts: effects that data cannot separate share a name.
 
-    The data show only ratios of the sensors' gains, so all sensors count as one. A lag much shorter
-    than a tick of the bench counts as a delay.
+    The data show only the ratios of the sensors' gains, so all sensors count as one. A lag much
+    shorter than a tick of the bench counts as a delay.
     """
     if effect.same_as == effect.key:
         return effect.key, 0
@@ -80,7 +80,7 @@ def counted(effect: Effect, place: int, value: float) -> Named:
 
 
 def acted(drawn: Drawn, submission: Submission) -> list[list]:
-    """Return the hidden effects, sorted, without stops that no cart has reached."""
+    """Return the hidden effects, sorted, without end stops that no cart has reached."""
     records = read_data(submission).records
     missed = set()
     for term in drawn.bench.effects:
@@ -94,7 +94,7 @@ def acted(drawn: Drawn, submission: Submission) -> list[list]:
 
 
 def _sized(effect: Effect, place: int, chain: Chain, share: float) -> EffectTerm:
-    """Return the effect with its first parameter, and what goes with it, at a share of the usual.
+    """Return the effect with its first parameter, and those tied to it, at a share of its size.
 
     The share is of the difference from no effect. Both forces of dry friction grow together,
     because a static force below the sliding one is impossible.
@@ -114,7 +114,7 @@ def _sized(effect: Effect, place: int, chain: Chain, share: float) -> EffectTerm
 
 
 def _alike(one: Effect, other: Effect) -> bool:
-    """Return whether two effects must not be combined: the same family of laws, or two contacts."""
+    """Return whether two effects may not be combined: the same family, or two contacts."""
     same_family = bool(one.family) and one.family == other.family
     return one.key == other.key or same_family or (one.contact and other.contact)
 
@@ -122,9 +122,9 @@ def _alike(one: Effect, other: Effect) -> bool:
 def kept_rows(
     path: Path, wanted: Iterable[int], make: Callable[[int], dict], *, until: float
 ) -> list[dict]:
-    """Return the rows of a study: one JSON line each in the file, which gets those it lacks.
+    """Return the rows of a study: one JSON line each in the file, to which missing rows are added.
 
-    None is begun once the clock (`time.monotonic`) is past `until`.
+    No new row is begun once the clock (`time.monotonic`) is past `until`.
     """
     rows = {}
     if path.exists():
@@ -149,7 +149,7 @@ def run_study(
     first: int,
     count: int,
 ) -> None:
-    """Make the missing rows of a study, with options of the command line, and write its table."""
+    """Add the missing rows of a study, with options of the command line, and write its table."""
     parser = argparse.ArgumentParser(description=doc)
     parser.add_argument("--count", type=int, default=count)
     parser.add_argument("--minutes", type=float, default=np.inf, help="begin no bench after")

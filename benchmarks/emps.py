@@ -59,7 +59,7 @@ def emps_record(name: str) -> Record:
 
 
 def free_run(model: AugmentedChain, record: Record) -> float:
-    """Return the error (m) of one simulation of a whole record, without any fit to it."""
+    """Return the error (m) of one simulation of a whole record, with nothing fitted to it."""
     (run,) = prepare([record], springs=SPRINGS, notes=[])
     read = simulate_run(start_at(model, springs=SPRINGS), run, fresh_nuisance(run))
     return float(np.sqrt(np.mean((run.y - read) ** 2)))

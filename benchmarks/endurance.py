@@ -1,12 +1,12 @@
-"""A lab server for half an hour and a bench for two hours: nothing lost, memory flat, in time.
+"""Run a lab server for half an hour and a bench for two hours; check data, memory and times.
 
     python -m benchmarks.endurance class [--minutes 30] [--teams 300]
     python -m benchmarks.endurance exploration [--hours 2]
     python -m benchmarks.endurance page
 
-The first two keep endurance.json, the last writes endurance.md. With `--quick`, the first two take
-about a minute each and print. All is drawn from a seed, and listens at 127.0.0.1 only. The class
-needs PostgreSQL.
+The first two commands keep endurance.json, and the last writes endurance.md. With `--quick`, the
+first two take about a minute each and only print. All random choices come from a seed, and servers
+listen at 127.0.0.1 only. The class needs PostgreSQL.
 """
 
 import argparse
@@ -67,13 +67,13 @@ from tests.helpers.waiting import PATIENCE, kill, until
 KEPT = Path(__file__).with_name("endurance.json")
 PAGE = Path(__file__).with_name("endurance.md")
 PRESET, ASSIGNMENT = "throne-2dof", "lab"
-SLIPS = (1.1, 0.9, 2.0, 0.5, 1 / (2 * np.pi), 100.0)  # by which a number is made wrong
-# After a start memory rises for some s: imports, caches, and cycles of dead objects, for which
-# these programs look only after 300,000 new objects.
+SLIPS = (1.1, 0.9, 2.0, 0.5, 1 / (2 * np.pi), 100.0)  # factors by which a number is made wrong
+# After a start memory rises for some seconds, through imports, caches and cycles of dead objects.
+# These programs look for such cycles only after 300,000 new objects.
 SETTLING = 480.0
 BLOCK = 60.0  # s over which memory is averaged, because neighbouring samples are not independent
 KILLED = {"desk": 5, "worker": 3, "connection": 2}  # how often each, while the desk is killed
-FOLDERS = 4  # of each student
+FOLDERS = 4  # number for each student
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,10 +93,10 @@ class Size:
 
 
 def graded_class(place: str, size: Size, *, folder: Path, seed: int) -> list[Files]:
-    """Grade a class into a gradebook and release it; return the recordings of each base.
+    """Grade a class into a gradebook and release it; return the recordings of each base submission.
 
-    A few simulated submissions are analysed; each team reports the numbers of one of them, with
-    slips of its own, and is graded by them. Its figures are those of its base.
+    A few simulated submissions, the bases, are analysed. Each team reports the numbers of one base,
+    with mistakes of its own, and is graded on them. Its figures are those of its base.
     """
     rubric, draw = load_rubric(Path(PRESET)), random.Random(f"{seed} class")
     bases = [_base(folder / f"base-{n}", rubric, seed=seed + n) for n in range(size.bases)]
@@ -139,7 +139,7 @@ def _base(folder: Path, rubric: Rubric, *, seed: int) -> tuple[Reporter, Any, by
 
 
 def _with_slips(base: Reporter, draw: random.Random) -> Reporter:
-    """Return the base with one to five numbers wrong."""
+    """Return the base submission with one to five wrong numbers."""
     wrong: dict[str, dict[str, Decimal]] = {"initial": {}, "final": {}}
     for _ in range(draw.randint(1, 5)):
         table = draw.choice(["initial", "final"])
@@ -154,7 +154,7 @@ def _with_slips(base: Reporter, draw: random.Random) -> Reporter:
 
 @dataclass(kw_only=True)
 class Memory:
-    """Resident memory of some processes over time: s since the start, MB."""
+    """Resident memory of some processes over time: s since the start, and MB."""
 
     at: list[float] = field(default_factory=list)
     mb: list[float] = field(default_factory=list)
@@ -169,7 +169,7 @@ class Memory:
         self.mb.append(total)
 
     def slope(self, since: float) -> dict[str, float]:
-        """Return MB an hour and its standard error, of means of blocks; with median and most."""
+        """Return the slope of memory in MB per hour, its standard error, median and maximum."""
         t, mb = np.array(self.at), np.array(self.mb)
         kept = t >= since
         t, mb = t[kept], mb[kept]
@@ -193,7 +193,7 @@ class Memory:
 
 @dataclass(kw_only=True)
 class Server:
-    """The desk of a lab server in its own process, killed and started again at the same port."""
+    """The desk of a lab server in its own process, killed and started again at its port."""
 
     users: Path
     port: int
@@ -202,7 +202,7 @@ class Server:
     outlived: int = 0  # processes of a killed desk that did not end by themselves
 
     def start(self) -> None:
-        """Start it and wait until it listens."""
+        """Start the desk and wait until it listens."""
         command = [sys.executable, "-m", "pipeline", "desk", "--host", "127.0.0.1", "--users"]
         command += [str(self.users), "--port", str(self.port), "--no-browser"]
         with self.log.open("ab") as log:
@@ -238,7 +238,7 @@ class Server:
         self.outlived += len(left)
 
     def stop(self) -> float:
-        """End the desk as an administrator does; return the time that it took, s."""
+        """End the desk as an administrator does; return how long that took, s."""
         assert self.process is not None
         began = time.monotonic()
         self.process.terminate()
@@ -254,7 +254,7 @@ def _words(process: psutil.Process) -> list[str]:
 
 
 def write_lab(base: Path, place: str, *, students: int) -> Path:
-    """Make the folders of a lab and the file of its users."""
+    """Make the folders of a lab and its file of users."""
     users = [_user(name, "ta", gradebooks=[place]) for name in ("Ada", "Bob")]
     for number, team in enumerate(team_names(students)):
         folders = [student_folder(number, k) for k in range(FOLDERS)]
@@ -269,7 +269,7 @@ def write_lab(base: Path, place: str, *, students: int) -> Path:
 
 
 def student_folder(number: int, k: int) -> str:
-    """Return where a student's recordings go."""
+    """Return the folder for a student's recordings."""
     return f"s{number}-{k}"
 
 
@@ -282,7 +282,7 @@ def _user(name: str, role: str, **places: Sequence[str]) -> str:
 
 
 def kill_something(server: Server, lab: Lab, place: str, *, what: str, draw: random.Random) -> bool:
-    """Kill the desk, one of its workers or one of its connections; return whether one was there."""
+    """Kill the desk, a worker or a connection; return whether there was one to kill."""
     if what == "desk":
         lab.up.clear()
         server.kill()
@@ -311,7 +311,7 @@ def kill_something(server: Server, lab: Lab, place: str, *, what: str, draw: ran
 
 
 def run_class(size: Size, *, seed: int) -> dict[str, Any]:
-    """Have a class reviewed while students upload and things are killed; return what was found."""
+    """Let a class be graded while students upload and processes are killed; return the findings."""
     with tempfile.TemporaryDirectory() as scratch, postgres.running() as place:
         base = Path(scratch)
         os.environ["XDG_STATE_HOME"] = str(base / "state")  # the desks' log
@@ -378,10 +378,10 @@ def _running(server: Server) -> Iterator[None]:
 def _watch(
     server: Server, lab: Lab, people: Sequence[Person], place: str, *, size: Size, seed: int
 ) -> dict[str, Any]:
-    """Have people work while things are killed; return kills, memory and load.
+    """Let people work while processes are killed; return kills, memory and load.
 
-    In the first half all is killed at random; in the second half workers and connections only, so
-    that the memory of one desk is seen for long enough.
+    In the first half anything is killed at random. In the second half only workers and connections
+    are, so that the memory of one desk is observed for long enough.
     """
     draw, kills = random.Random(f"{seed} kills"), Counter()
     desk, workers, load = Memory(), Memory(), []
@@ -437,7 +437,7 @@ def _count_said(log: Path) -> dict[str, int]:
 
 
 def _page_times(journal: Journal) -> dict[str, dict[str, float]]:
-    """Return, by page, how many answers there were and how long they took, s."""
+    """Return for each page the number of answers and how long they took, s."""
     times: Mapping[str, list[float]] = defaultdict(list)
     for page, seconds in journal.times:
         times[page].append(seconds)
@@ -454,9 +454,9 @@ def _page_times(journal: Journal) -> dict[str, dict[str, float]]:
 
 
 def run_exploration(*, hours: float, speed: float, seed: int) -> dict[str, Any]:
-    """Explore a fast virtual bench until its time is up; return what was seen of its memory.
+    """Explore a fast virtual bench until its time is up; return how its memory developed.
 
-    The goal is out of reach, so that only the time ends it.
+    The goal cannot be reached, so that only the time ends the exploration.
     """
     memory, load = Memory(), []
     allowed = 3600 * hours
@@ -520,7 +520,7 @@ QUICK = Size(minutes=0.75, teams=12, students=3, bases=1, rest=12.0, sample=0.5,
 
 
 def main() -> None:
-    """Run one part, or write the page of the parts that were run."""
+    """Run one part, or write the page from the parts that were run."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("part", choices=("class", "exploration", "page"))
     parser.add_argument("--minutes", type=float, default=30.0, help="of the class")
@@ -554,7 +554,7 @@ def failed(made: Mapping[str, Any]) -> bool:
 
 
 def write_page() -> None:
-    """Write the results kept into the page, between its marks."""
+    """Write the stored results into the page, between its marks."""
     kept, page = json.loads(KEPT.read_text(encoding="utf-8")), PAGE.read_text(encoding="utf-8")
     parts = {
         "class": class_words(kept["class"]) if "class" in kept else "",
@@ -612,13 +612,13 @@ def memory_words(seen: Mapping[str, float]) -> str:
 
 
 def load_words(made: Mapping[str, Any]) -> str:
-    """Return the machine, and how busy it was."""
+    """Return a description of the machine and its load."""
     middle, most = made["load"]
     return f"Load average {middle:.1f} (most {most:.1f}) on {made['machine']}."
 
 
 def page_table(pages: Mapping[str, Mapping[str, float]]) -> str:
-    """Return the times of the answers in Markdown, the slow ones first, most others together."""
+    """Return a Markdown table of answer times: slow pages first, most others together."""
     lines = [
         "| page or form | answers | median | 99 % | most | over 1 s |",
         "|---|---|---|---|---|---|",

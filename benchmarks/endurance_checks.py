@@ -1,4 +1,4 @@
-"""Compare everything sent to a desk with the gradebook and the folders of students."""
+"""Compare everything that was sent to a desk with the gradebook and the students' folders."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -14,14 +14,14 @@ from pipeline.submission import load_submission
 
 @dataclass(kw_only=True)
 class Found:
-    """The changes that went wrong: a sentence for each."""
+    """The changes that went wrong, with a sentence for each."""
 
     lost: list[str] = field(default_factory=list)
     doubled: list[str] = field(default_factory=list)
     spoilt: list[str] = field(default_factory=list)
 
     def count(self, change: Change, times: int) -> None:
-        """Note a change that was stored this number of times, but should be stored once."""
+        """Note a change that should be stored once, but was stored this number of times."""
         if change.confirmed and times == 0:
             self.lost.append(_say(change))
         if times > 1:
@@ -33,7 +33,7 @@ def _say(change: Change) -> str:
 
 
 def check_book(place: str, journal: Journal, *, teams: Sequence[str], found: Found) -> None:
-    """Look for each change in the gradebook: once where it was confirmed, else at most once."""
+    """Look for each change in the gradebook: once if it was confirmed, else at most once."""
     with RequestBook(place) as book:
         given: dict[tuple[str, str, str], list[Any]] = defaultdict(list)
         for team, one in book.changes_since(0):

@@ -1,7 +1,7 @@
 """Scripted TAs and students of a lab server, and a journal of everything that they sent.
 
-Each is a browser without scripts, in a thread of its own, and draws what to do next by chance.
-Whenever the desk is killed they wait until it is back, and look at the page again.
+Each person is a browser without scripts, in its own thread, and chooses its next action by chance.
+When the desk is killed, all wait until it is back and open their page again.
 """
 
 import hashlib
@@ -20,8 +20,8 @@ from tests.helpers.desks import Answer, Visitor, through_proxy
 
 RESTS_OF_TA = (1.0, 4.0)  # s between two actions
 RESTS_OF_STUDENT = (10.0, 30.0)
-FULL = 40  # recordings; then a student goes on in the next folder
-_MOST_TOGETHER = 8  # teams that get the same points in one go
+FULL = 40  # recordings in one folder; then a student continues in the next folder
+_MOST_TOGETHER = 8  # teams that get the same points in one change
 
 Files = Sequence[tuple[str, bytes]]
 
@@ -35,8 +35,8 @@ class Change:
     kind : points, together, request, answer, reopened, upload, row.
     where : team and criterion; or number of the folder, file or experiment.
     token : a text that nobody else sends, or the digest of a file.
-    teams : that get the same points.
-    confirmed : whether the desk answered that it is done.
+    teams : the teams that get the same points.
+    confirmed : whether the desk answered that the change is done.
     """
 
     kind: str
@@ -55,7 +55,7 @@ class Journal:
     Attributes
     ----------
     times : page and s of each answer.
-    refused : status and page of each form that was not done.
+    refused : status and page of each form that was refused.
     """
 
     sent: list[Change] = field(default_factory=list)
@@ -77,7 +77,7 @@ class Lab:
 
     Attributes
     ----------
-    pace : by which the rests between two actions are shorter.
+    pace : factor by which the pauses between two actions are shorter.
     """
 
     port: int
@@ -89,7 +89,7 @@ class Lab:
 
 
 class Person(threading.Thread):
-    """A person who does one thing after the other; errors of the script itself are kept."""
+    """A person who does one action after another; errors of the script itself are kept."""
 
     rests = RESTS_OF_TA
 
@@ -150,7 +150,7 @@ class Person(threading.Thread):
         self._send(page, change, lambda: self._visitor.send(path, body, kind=kind))
 
     def upload(self, path: str, changes: Sequence[Change], files: Files) -> None:
-        """Send files."""
+        """Upload files to the desk."""
         page, *others = changes
         self.lab.journal.sent += others
         self._send("upload", page, lambda: self._visitor.upload(path, files))
@@ -182,7 +182,7 @@ class Assistant(Person):
         return {self.look: 2, self.review: 6, self.decide: 1, self.answer: 3, self.read: 1}
 
     def look(self) -> None:
-        """Look at the class, filtered or not, as a browser does: with its figure and its news."""
+        """Open the class page, filtered or not, with its figure and its news, as a browser does."""
         asked = self.draw.choice([{}, {"seen": "no"}, {"state": "remark"}, {"order": "points"},
                                   {"page": "3"}, {"q": "12"}])  # fmt: skip
         text = self.get("class", f"/grades/0/?{urlencode(asked)}")
@@ -192,7 +192,7 @@ class Assistant(Person):
         self.get("news", "/grades/0/news?since=0&told=0")
 
     def read(self) -> None:
-        """Read what a team reads, or the class page."""
+        """Open a team's feedback or the class page."""
         if self.draw.random() < 0.5:
             self.get("class page", "/grades/0/class.html")
         else:
@@ -200,7 +200,7 @@ class Assistant(Person):
             self.get("feedback in full", f"/grades/0/feedback/{team}/feedback.html")
 
     def review(self) -> None:
-        """Give a criterion other points, or the same with a comment; then perhaps accept."""
+        """Change a criterion's points, or only comment on them; then perhaps accept the grade."""
         team = self.draw.choice(self.lab.teams)
         path = f"/grades/0/team?of={team}"
         text = self.get("team", path)
@@ -228,7 +228,7 @@ class Assistant(Person):
             self._timed("accept", lambda: self._visitor.post(path, do="accept"))
 
     def decide(self) -> None:
-        """Give several teams the same points, or a comment, in one go."""
+        """Give several teams the same points, or a comment, in one change."""
         text = self.get("class", "/grades/0/")
         lost = re.findall(r"[?&;]lost=([\w-]+)", text) or re.findall(
             r'<option value="([\w-]+)"', text.partition('name="lost"')[2].partition("</select>")[0]
@@ -252,7 +252,7 @@ class Assistant(Person):
             **{f"seen.{team}": seen for team, seen in chosen}})  # fmt: skip
 
     def answer(self) -> None:
-        """Answer one of the requests that wait; else let a team ask once more."""
+        """Answer one of the open requests; if there is none, let a team ask again."""
         text = self.get("requests", "/grades/0/again")
         names = ("team", "criterion", "seen")
         hidden = "".join(rf'<input type="hidden" name="{name}" value="(.*?)">' for name in names)
@@ -276,11 +276,11 @@ class Assistant(Person):
 
 
 class Student(Person):
-    """A student: uploads recordings, saves rows, reads the feedback, asks for another look.
+    """A student: uploads recordings, saves rows, reads feedback, asks for another review.
 
     Parameters
     ----------
-    recordings : to upload, one after the other; each upload has fewer lines than the last.
+    recordings : to upload, one after another; each upload has fewer lines than the last.
     """
 
     rests = RESTS_OF_STUDENT
@@ -298,17 +298,17 @@ class Student(Person):
 
     @property
     def room(self) -> str:
-        """The address of the folder that they are in."""
+        """The address of the student's current folder."""
         return f"/student/{self._folder}/"
 
     def finish(self) -> None:
-        """Let the desk write missing tables, because it was killed before it wrote them."""
+        """Let the desk write tables that it had no time to write before it was killed."""
         for number in range(self._folder + 1):
             self._folder = number
             self._complete(self.get("submission", self.room))
 
     def send(self) -> None:
-        """Upload one to three recordings; where a table is missing then, have it written."""
+        """Upload one to three recordings; if a table is missing then, have it written."""
         files = [self._next() for _ in range(self.draw.randint(1, 3))]
         changes = [
             Change(kind="upload", by=self.name, where=(str(self._folder), name), token=digest(raw))
@@ -338,7 +338,7 @@ class Student(Person):
         self.get("feedback in full", "/feedback/0/whole")
 
     def ask(self) -> None:
-        """Ask for another look at a criterion, if there is one to ask about."""
+        """Ask for another review of a criterion, if there is one to ask about."""
         text = self.get("feedback", "/feedback/0/")
         open_ = re.findall(r'class="asking">\s*<input type="hidden" name="criterion" value="(.*?)"',
                            text)  # fmt: skip
@@ -350,7 +350,7 @@ class Student(Person):
             ), {"criterion": criterion, "why": why})  # fmt: skip
 
     def _next(self) -> tuple[str, bytes]:
-        """Return a recording that nobody uploaded before: one without its last lines."""
+        """Return a recording that nobody has uploaded yet: one without its last lines."""
         rounds, number = divmod(self._uploaded, len(self._recordings))
         self._uploaded += 1
         name, raw = self._recordings[number]
@@ -369,6 +369,6 @@ def digest(raw: bytes) -> str:
 
 
 def wrong_in(answer: Answer) -> str:
-    """Return the first thing that a page says is wrong."""
+    """Return the first message of a page that says that something is wrong."""
     found = re.search(r'class="wrong"[^>]*>([^<]*)<', answer.text)
     return " ".join(unescape(found[1]).split()) if found else answer.text[:200]

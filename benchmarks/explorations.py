@@ -2,10 +2,10 @@
 
     python -m benchmarks.explorations [--count 100] [--minutes 60]
 
-Each random bench has one to three carts and up to two hidden effects. It uses the carts, encoders
-and controller of the emulator, tick by tick, without a serial line. `cartlab explore` knows which
-springs are present and aims at 1 % of everything within ten minutes. A stopped study continues
-where it stopped.
+Each random bench has one to three carts and up to two hidden effects. It has the carts, encoders
+and controller of the emulator, simulated tick by tick without a serial line. `cartlab explore`
+knows which springs are present and aims at an error of 1 % in all parameters within ten minutes. A
+study that was stopped continues where it stopped.
 """
 
 import os
@@ -57,12 +57,12 @@ def run(seed: int) -> dict:
             return row | {"ended": f"{type(error).__name__}: {error}"[:200]}
         submission = load_submission(folder)
         row["hidden"] = acted(drawn, submission)
-        # What `cartlab plan` would still record: decays by hand and dwells, no sweep and steps.
+        # What `cartlab plan` would propose next: decays by hand and dwells, but no sweep and steps.
         plan = propose_plan(submission, bench=bench.description)
         try:
             fixed = session_time(extend_plan(plan, submission).recordings)
         except DataError:
-            fixed = None  # dwells need a linear chain, and none fits these records
+            fixed = None  # dwells need a linear chain, and no chain fits these records
         gap_file = folder / "gap" / "gap.json"
         gap = json.loads(gap_file.read_text(encoding="utf-8")) if gap_file.exists() else {}
     found = [counted_of(effect) for effect in gap.get("effects", ())]
@@ -94,13 +94,13 @@ def counted_of(effect: dict) -> tuple[str, int]:
 
 
 def off(gap: dict, drawn: Drawn) -> dict[str, float]:
-    """Return by how many standard errors each parameter is off, of chain and effects named."""
+    """Return how many standard errors each parameter of the chain and the named effects is off."""
     chain, errors = drawn.bench.chain, {}
     terms = {(term.effect.key, term.place): term for term in drawn.bench.effects}
     named = {named_of(effect) for effect in gap.get("effects", ())}
     if any(key == SCALE and (key, place) not in named for key, place in terms):
-        return {}  # with another sensor's scale another chain moves in the same way
-    if chain.n == 1:  # its two springs act as one
+        return {}  # with a wrong scale of a sensor, another chain moves in the same way
+    if chain.n == 1:  # only the sum of its two springs matters
         chain = replace(chain, k=np.array([chain.k.sum(), 0.0]))
     for letter in "mck":
         for i, true in enumerate(getattr(chain, letter), start=1):

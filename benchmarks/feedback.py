@@ -38,7 +38,7 @@ def design(chain: Chain, cart: int, method: Method) -> FeedbackDesign:
 def on_other_plants(
     chain: Chain, result: FeedbackDesign, *, plants: int
 ) -> tuple[int, list[float]]:
-    """Return the unstable loops and the worst overshoot, settling time and level error."""
+    """Return the number of unstable loops, and the worst overshoot, settling and level error."""
     rng = np.random.default_rng(1)
     controller = StateFeedback(gains=result.gains, prefilter=result.prefilter, model=chain)
     T = result.sample_time

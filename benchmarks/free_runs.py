@@ -1,4 +1,4 @@
-"""The same records and the same error measure for all tools that learn models."""
+"""The same records and the same measure of error for all tools that learn models."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,7 +22,7 @@ OURS, LINEAR_CART = "cartlab", "linear"
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """One tool on one bench: its model (none if all diverge), error where judged, seconds."""
+    """One tool's result on one bench: its model (None if all diverge), errors, and seconds."""
 
     model: Model | None
     error: float
@@ -30,7 +30,7 @@ class Answer:
 
 
 def part_of(record: Record, *, first: int = 48) -> Part:
-    """Return a record as all tools get it: as read, but from the release on."""
+    """Return a record in the form that all tools get: as read, but only from the release on."""
     run = make_run(record, n=1)
     u = np.zeros(record.t.size) if record.u is None else record.u
     return Part(
@@ -44,7 +44,7 @@ def part_of(record: Record, *, first: int = 48) -> Part:
 
 
 def start_at(model: AugmentedChain, *, springs: tuple[bool, ...]) -> FitModel:
-    """Return a model in the form used by the fits: its structure and its vector."""
+    """Return a model in the form used by the fits: its structure and its vector of parameters."""
     structure = Structure(springs=springs)
     for term in model.terms:
         signs = tuple(float(np.sign(v) or 1.0) for v in term.values)
@@ -56,7 +56,7 @@ def start_at(model: AugmentedChain, *, springs: tuple[bool, ...]) -> FitModel:
 
 
 def ours(model: AugmentedChain, gap: Gap, *, springs: tuple[bool, ...]) -> Model:
-    """Return cartlab's model as one that runs freely: nothing is fitted to the record.
+    """Return cartlab's model in a form that runs freely, without any fit to the record.
 
     The zero of the encoder is also learnt from the training records.
     """
@@ -91,9 +91,9 @@ def others(
     *,
     settings: Mapping[str, dict[str, tuple[int, ...]]] | None = None,
 ) -> Iterator[tuple[str, Answer]]:
-    """Yield each installed tool's model, chosen by the second records.
+    """Yield each installed tool's model, chosen by its error on the held-out records.
 
-    With `settings`, only the tools named there run.
+    If `settings` is given, only the tools named in it run.
     """
     for name, tool, learn in TOOLS:
         if installed(tool) and (settings is None or name in settings):

@@ -1,6 +1,6 @@
-"""Which laws of friction a servo and a cart need: models with more and more laws.
+"""Which laws of friction a servo and a cart need, by models with more and more laws.
 
-The search of `cartlab gap` runs once for each model, with the laws of that model only.
+The search of `cartlab gap` runs once for each model, with only the laws of that model.
 """
 
 from collections.abc import Iterator, Sequence
@@ -37,7 +37,7 @@ LADDER = (
     ("M2 + presliding (Dahl)", (*STRIBECK, "presliding_friction")),
 )
 VISCOUS, WHOLE = "viscous alone", "cartlab, whole catalogue"
-# A constant force is not friction, but on an axis without a spring every model needs one.
+# A constant force is not friction, but every model of an axis without a spring needs it.
 ALWAYS = ("force_offset",)
 CART = "DOF1_en1_input1"
 
@@ -70,7 +70,7 @@ def axes() -> Iterator[Axis]:
 
 
 def climb(axis: Axis) -> Iterator[Gap]:
-    """Yield the result of each model, then that with the whole catalogue."""
+    """Yield the result of each model, then the result with the whole catalogue."""
     for _, laws in LADDER:
         allowed = [find_effect(key) for key in (*laws, *ALWAYS)]
         yield explain_gap(axis.records, axis.bench, catalogue=allowed)

@@ -1,10 +1,10 @@
-"""How often the gap workflow names what was hidden: confusion matrix, gaps, times.
+"""How often the gap workflow names the hidden effects: confusion matrix, gaps, times.
 
     python benchmarks/gap_confusion.py singles --count 300 --jobs 2 --out singles.jsonl
 
-Benches are random; the truth is simulated independently (tests/truth). Development and report
-seeds are apart: thresholds were never set on the seeds behind `--report`. A run that was stopped
-goes on where it left off, one JSON line a case.
+Benches are random, and an independent simulator gives the truth (tests/truth). Thresholds were set
+on other seeds than those that `--report` uses. A run that was stopped continues where it stopped,
+with one JSON line per case.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-# Cases run side by side: one BLAS thread each, set before numpy is loaded.
+# Cases run side by side, so each gets one BLAS thread. Set before numpy is loaded.
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
@@ -28,7 +28,7 @@ SUITES = [
     "singles", "small", "tiny", "weak", "dirt", "pairs", "clean", "clean-dirt", "wide", "wide-pairs"
 ]  # fmt: skip
 SEVERITY = {"small": 0.3, "weak": 0.2, "tiny": 0.05}
-# Two of these on one cart would act as one friction law, so they are never a pair.
+# Two of these on one cart would act as a single friction law, so they are never paired.
 DRY = ("coulomb_friction", "stiction", "presliding_friction")
 
 
@@ -52,7 +52,7 @@ def plan(suite: str, index: int) -> tuple[int, tuple[str, ...], float, bool]:
 
 
 def run_case(job: tuple[str, int, int]) -> dict:
-    """Make one case, explain it, and say how it went."""
+    """Make one case, explain it, and return how well that worked."""
     suite, index, base = job
     from pipeline.gap.explain import explain_gap
     from pipeline.set_up import Bench
@@ -79,7 +79,7 @@ def run_case(job: tuple[str, int, int]) -> dict:
         for f in gap.effects:
             if (f.effect.key, next(iter(f.where.values()), 0)) == (hidden.effect, hidden.place):
                 for name, true in hidden.parameters.items():
-                    if name not in f.parameters:  # a detail of the contact
+                    if name not in f.parameters:  # a detail of the contact, not reported
                         continue
                     value = f.parameters[name]
                     z.append((value.value - float(true)) / value.std if value.std else None)
@@ -103,7 +103,7 @@ def run_case(job: tuple[str, int, int]) -> dict:
 
 
 def outcome(truth: list, found: list, listed: set, verdict: str, baseline: float) -> str:
-    """Classify a case; `equivalent` are the provable ones of the catalogue."""
+    """Classify a case; `equivalent` lists pairs of effects that no data can tell apart."""
     if verdict == "unexplained":
         return "unexplained"
     if verdict == "partial":
@@ -111,7 +111,7 @@ def outcome(truth: list, found: list, listed: set, verdict: str, baseline: float
     if found == truth:
         return "ambiguous, right first" if verdict == "ambiguous" else "exact"
     if not found:
-        # A sensor gain that a linear chain can absorb is not counted as hidden.
+        # A sensor gain that a linear chain reproduces exactly does not count as hidden.
         invisible = all(effect == "sensor_gain" for effect, _ in truth)
         return "equivalent" if invisible and baseline < 1.1 else "missed"
     missing, extra = set(map(tuple, truth)) - set(found), set(found) - set(map(tuple, truth))
@@ -163,7 +163,7 @@ def _name(row: dict) -> str:
 
 
 def summarise(rows: list[dict]) -> None:
-    """Print outcomes and times by effect and carts, the gap after, coverage of the errors."""
+    """Print outcomes and times by effect and carts, the gap that is left, and coverage."""
     outcomes = Counter(row["outcome"] for row in rows)
     print(f"\n{len(rows)} cases: " + ", ".join(f"{k} {v}" for k, v in outcomes.most_common()))
     by_effect: dict[str, Counter] = {}

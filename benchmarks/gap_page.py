@@ -2,8 +2,8 @@
 
     python benchmarks/gap_page.py RESULTS.jsonl… [--rig FOLDER]
 
-The results are those of `gap_confusion.py --report`; FOLDER holds the recordings of an ECP 210.
-Without one of them its part of the page stays as it is.
+The results are those of `gap_confusion.py --report`, and FOLDER holds the recordings of an ECP 210.
+If one is not given, its part of the page stays as it is.
 """
 
 import argparse
@@ -139,7 +139,7 @@ def _times(rows: Sequence[dict]) -> str:
 
 
 def pairs_of(rows: Sequence[dict]) -> str:
-    """Return the pairs that were not named exactly."""
+    """Return the pairs of effects that were not named exactly."""
     pairs = [row for row in rows if row["suite"].endswith("pairs")]
     out = [
         [" + ".join(_named(key) for key, _ in row["truth"]), str(row["n"]), _said(row)]
@@ -152,7 +152,7 @@ def pairs_of(rows: Sequence[dict]) -> str:
 
 
 def sureness_of(rows: Sequence[dict]) -> str:
-    """Return how often the truth lies within the errors stated."""
+    """Return how often the truth lies within the stated errors."""
     z = np.array(
         [v for row in rows if row["outcome"] == "exact" for v in row["z"] if v is not None]
     )
@@ -176,7 +176,7 @@ class Rig:
 
 
 def rigs_in(folder: Path) -> Iterator[Rig]:
-    """Yield one cart at a time, and both."""
+    """Yield rigs with one free cart each, and the rig with both carts free."""
     from pipeline.submission import load_submission
     from pipeline.workflow import analyse
     from tests.helpers.ucsd import ecp_record, write_two_cart_submission
@@ -215,7 +215,7 @@ def rigs_in(folder: Path) -> Iterator[Rig]:
 
 
 def _write_plucked(lab: Path, folder: Path) -> Path:
-    """Write a submission of the recordings in which a hand plucks cart 2; cart 1 is held."""
+    """Write a submission with the recordings in which a hand plucks cart 2 and cart 1 is held."""
     lab.mkdir()
     text = ['version = 1\ntitle = "Plucked"\n[system]\ncarts = 2\nsprings = [true, true, false]\n']
     for number, name in enumerate(PLUCKED, start=1):
@@ -268,7 +268,7 @@ def explain_rig(rig: Rig, tell: Callable[[str], None]) -> str:
 
 
 def _hands(gap: Gap) -> list[str]:
-    """Return the stretches in which a hand moved a cart, as a sentence."""
+    """Return a sentence about the times in which a hand moved a cart."""
     if not gap.interventions:
         return []
     times = (f"{one.experiment} {one.start:.2f} to {one.end:.2f} s" for one in gap.interventions)
@@ -276,7 +276,7 @@ def _hands(gap: Gap) -> list[str]:
 
 
 def _steps(gap: Gap, rig: Rig) -> Iterator[tuple[Study, Hypothesis, Hypothesis]]:
-    """Yield the linear model and that with one effect, two, …, each fitted to the training runs."""
+    """Yield the linear model and those with one effect, two, …, all fitted to training runs."""
     hands = find_interventions(rig.records)
     runs = prepare(rig.records, springs=rig.springs, interventions=hands, notes=[])
     training, held_out = take_sides(runs, notes=[])
@@ -296,7 +296,7 @@ def _steps(gap: Gap, rig: Rig) -> Iterator[tuple[Study, Hypothesis, Hypothesis]]
 
 
 def _where_it_helps(before: Hypothesis, after: Hypothesis, study: Study) -> Trace:
-    """Return the cart and run, of those held out, of which the effects explain most."""
+    """Return the cart and the held-out run of which the effects explain most."""
 
     def gained(trace: Trace) -> float:
         left = [((trace.measured - model) ** 2).sum() for model in (trace.baseline, trace.final)]

@@ -43,9 +43,9 @@ TOOLS = ("pysindy", "sysidentpy", "scikit-learn", "jax-sysid")
 RATE = 113.1  # Hz, the ECP's usual
 FIRST_SEED = 950_000
 FURTHER = 1_000_000  # added to a seed for the further records
-REPEATS = 3  # of each run of a class's bench; the same number again is for judging
+REPEATS = 3  # number of each run on a class's bench; as many again are for judging
 OF_ONE_CART = tuple(e for e in EFFECTS if e not in ("coupling_damper", "sensor_gain"))
-# The term of the library that is the effect, or that a person would take for it.
+# The term of the library that is the effect itself, or that a person would take for it.
 TERM = {
     "coulomb_friction": "sign v",
     "stiction": "sign v",
@@ -55,7 +55,7 @@ TERM = {
     "cubic_spring": "x³",
     "force_offset": "1",
 }
-SHOWN = "coulomb_friction"  # the bench whose answers are shown
+SHOWN = "coulomb_friction"  # the bench whose equations are shown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +76,7 @@ def compare(
     hidden: tuple[str, ...],
     unit: str,
 ) -> Bench:
-    """Let every tool learn from cartlab's training runs; judge it by further records."""
+    """Let every tool learn from cartlab's training runs, and judge it on further records."""
     began = time.process_time()
     gap = explain_gap(records, SetUp(springs=springs, units=Units(position=unit, input="V")))
     seconds = time.process_time() - began
@@ -101,7 +101,7 @@ def compare(
 
 
 def benches(*, quick: bool) -> list[Bench]:
-    """Return twenty benches of one cart: with no effect, one or two; and a class's bench."""
+    """Return twenty benches of one cart, with up to two effects, and one bench of a class."""
     plans: list[tuple[str, ...]] = [(), *((e,) for e in OF_ONE_CART)]
     plans.append(("coulomb_friction", "cubic_spring"))
     found = []
@@ -130,7 +130,7 @@ def is_named(bench: Bench) -> bool:
 
 
 def sindy_says(bench: Bench) -> tuple[bool, int]:
-    """Return whether PySINDy's equation has the hidden effect, and how many other terms."""
+    """Return whether PySINDy's equation has the hidden effect, and how many other terms it has."""
     answer = bench.answers.get("PySINDy")
     found = set() if answer is None or answer.model is None else set(answer.model.terms)
     own = {TERM[key] for key in bench.hidden if key in TERM}
@@ -161,7 +161,7 @@ def each(found: Sequence[Bench]) -> Table:
 
 
 def picture(found: Sequence[Bench]) -> Figure:
-    """Draw the error of every bench over its noise, with a marker for each tool."""
+    """Draw the error on every bench against its noise, with a marker for each tool."""
     figure = Figure(figsize=(6.5, 3.2), layout="constrained")
     axes = figure.subplots()
     names = (OURS, *(name for name, _, _ in OTHERS), LINEAR_CART)
@@ -236,7 +236,7 @@ def summary(found: Sequence[Bench]) -> Table:
 
 
 def equations(found: Sequence[Bench]) -> Table:
-    """Return the tools' own answers about one bench."""
+    """Return the tools' own equations for one bench."""
     rows = []
     for bench in found:
         if bench.hidden == (SHOWN,):

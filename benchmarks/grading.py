@@ -1,12 +1,12 @@
-"""How often grading names a mistake and leaves an honest team alone, its cost, and other graders.
+"""How often grading names a mistake and spares an honest team, its cost, and other graders.
 
 Benches cover everything that a lab may have (`tests/helpers/grading_class.py`). Each team is graded
-honest, then again with a few kinds of mistake in turn, made with its own recordings and numbers
-(`tests/helpers/grading_slips.py`). To look into one kind:
+as it is, and then with a few kinds of mistakes made with its own recordings and numbers
+(`tests/helpers/grading_slips.py`). The command for a closer look:
 
     python -m benchmarks.grading --start 50000 --count 300 --out grading.jsonl
 
-writes one JSON line for each grading and prints the flags of each that went wrong.
+It writes one JSON line per grading, and prints the flags of each wrong one.
 """
 
 import argparse
@@ -80,13 +80,13 @@ def tables(*, quick: bool) -> list[Table]:
 
 
 def mistakes(*, start: int, count: int) -> Table:
-    """Return how many teams of each kind got exactly their codes."""
+    """Return how many teams with each kind of mistake got exactly the right flags."""
     rows = [row for seed in range(start, start + count) for row in graded(seed, slips=4)]
     return named_mistakes(rows)
 
 
 def named_mistakes(rows: Sequence[dict[str, Any]]) -> Table:
-    """Return the table of the study, from its rows."""
+    """Return the table of the study, made from its rows."""
     groups: dict[str, list[dict[str, Any]]] = {name: [] for name in GROUPS}
     for row in rows:
         groups[_group(row["kind"])].append(row)
@@ -112,7 +112,7 @@ def named_mistakes(rows: Sequence[dict[str, Any]]) -> Table:
 
 
 def _group(kind: str) -> str:
-    """Return the line of the table to which a kind belongs."""
+    """Return the line of the table to which a kind of mistake belongs."""
     if kind.startswith(HONEST):
         return WRONG_RUBRIC if kind == WRONG_RUBRIC else HONEST
     if kind == DATA:
@@ -123,7 +123,7 @@ def _group(kind: str) -> str:
 
 
 def _is_right(row: dict[str, Any]) -> bool:
-    """Return whether a mistake has all its flags, and an honest team no flag."""
+    """Return whether a mistake got all its flags, and an honest team none."""
     if not row["codes"]:
         return not row["found"]
     return set(row["codes"]) <= set(row["found"])
@@ -161,7 +161,7 @@ def graded(seed: int, *, slips: int) -> Iterator[dict[str, Any]]:
 
 
 def gradings(seed: int, *, slips: int) -> Iterator[tuple[str, Team, set[str]]]:
-    """Yield (kind, team, codes it should get) of one bench."""
+    """Yield (kind, team, right codes) for one bench."""
     team = make_team(seed)
     yield f"{HONEST}, {team.bench.chain.n} carts", team, set()
     for turn in range(slips):
@@ -215,7 +215,7 @@ WAYS: tuple[tuple[str, dict[str, Any]], ...] = (
 
 
 def costs(base: Path, *, teams: int, ways: Sequence[tuple[str, dict[str, Any]]]) -> Table:
-    """Return the cost of a submission: by carts, with figures, and once more."""
+    """Return the cost of a submission: by number of carts, with figures, and when graded again."""
     for carts in sorted({how.get("carts", 2) for _, how in ways}):
         write_class(base / f"{carts}", teams, preset=f"throne-{carts}dof")
     rows = []

@@ -2,8 +2,9 @@
 
     python -m benchmarks.grading_batch [--kills 300]
 
-kills -9 at random moments, then compares with an undisturbed run. It works on a copy of the code,
-because a grade belongs to the code that made it. The tables are part of `benchmarks/grading.py`.
+This kills the grader with -9 at random moments, and compares the result with an undisturbed run. It
+works on a copy of the code, because a grade belongs to the code that made it. The tables are part
+of `benchmarks/grading.py`.
 """
 
 import argparse
@@ -38,7 +39,7 @@ from pipeline.submission import load_submission
 
 ROOT = Path(__file__).parents[1]
 PRESET = "throne-2dof"
-# Noise added to a copy, in encoder steps, and other changes to it.
+# Noise added to a copy, in encoder steps, and other changes of the copy.
 DISGUISES = {
     "as it is": {},
     "cut to 60 %": {"keep": 0.6},
@@ -49,7 +50,7 @@ DISGUISES = {
     "noise 1, cut, rescaled": {"noise": 1.0, "keep": 0.8, "scale": 1.3},
     "noise 2": {"noise": 2.0},
 }
-IN_CLASS = 10  # honest teams beside the two
+IN_CLASS = 10  # honest teams, besides the original and its copy
 COPIED_KINDS = ("decay", "step", "sweep", "closed_loop")
 
 
@@ -67,7 +68,7 @@ def write_class(folder: Path, teams: int, *, preset: str = PRESET) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """Seconds on the clock, and of the processor: this process and its workers."""
+    """Seconds on the clock, and processor seconds of this process and of its workers."""
 
     clock: float
     parent: float
@@ -105,7 +106,7 @@ def grade(
     preset: str,
     figures: bool = False,
 ) -> Cost:
-    """Grade a class with one worker, all files written."""
+    """Grade a class with one worker, and write all files."""
     costs: list[Cost] = []
     with measured(costs):
         grade_class(

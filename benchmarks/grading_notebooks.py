@@ -1,10 +1,10 @@
 """The one-cart lab as a notebook assignment, graded by nbgrader and by otter-grader.
 
-The smallest assignment that asks for the same six numbers. A team types them into one cell, and
-each number is compared with that of `lab_reference.py` from the team's recordings. Both tools are
-used on their command lines: nbgrader's `generate_assignment`, `autograde` and
-`generate_feedback`; otter's `generate` and, without containers, `run`, with a submission zipped
-as by `otter.export`.
+It is the smallest assignment that asks for the same six numbers. A team types them into one cell,
+and each number is compared with that of `lab_reference.py` from the team's recordings. Both tools
+run on their command lines: nbgrader with `generate_assignment`, `autograde` and
+`generate_feedback`; otter with `generate` and, without containers, `run`, on a submission zipped as
+by `otter.export`.
 """
 
 import json
@@ -56,7 +56,7 @@ def _hertz(reported: Numbers) -> None:
         table["omega_n"] /= 2 * math.pi
 
 
-# Each mistake with the flag that names it.
+# Each kind of mistake with the flag that names it.
 SLIPS: dict[str, Callable[[Numbers], None]] = {
     "hz_for_rad_s": _hertz,
     "log10_for_ln": _times("initial", zeta=math.log10(math.e)),
@@ -68,7 +68,7 @@ SLIPS: dict[str, Callable[[Numbers], None]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Graded:
-    """One tool's result for the class: its cost, teams that lost points, and mistakes it named.
+    """One tool's result for the class: its cost, the teams that lost points, the mistakes it named.
 
     `named` has the codes of each team's flags; it is empty for a tool without flags.
     """
@@ -79,7 +79,7 @@ class Graded:
 
 
 def write_teams(folder: Path, *, honest: int, each: int) -> dict[str, str]:
-    """Write a class with `each` teams per slip; return the slip of each team, or ""."""
+    """Write a class with `each` teams for every mistake; return the mistake of each team, or ""."""
     slips = [""] * honest + [slip for slip in (*SLIPS, COPIED) for _ in range(each)]
     write_class(folder, len(slips), preset=PRESET)
     teams = sorted(folder.iterdir())
@@ -146,7 +146,7 @@ def nbgrader(folder: Path, base: Path) -> Graded | None:
 
 
 def otter(folder: Path, base: Path) -> Graded | None:
-    """Grade with otter-grader, one submission after the other; None if it is not installed."""
+    """Grade with otter-grader, one submission after another; None if it is not installed."""
     if not installed("otter-grader"):
         return None
     tests = base / "otter" / "tests"
@@ -198,7 +198,7 @@ def _put(folder: Path, notebook: dict[str, Any], *, data: Path | None = None) ->
 
 
 def _notebook(team: Path | None, *, tested: bool = True) -> dict[str, Any]:
-    """Return the assignment, with the answers of a team, and with nbgrader's tests in it."""
+    """Return the assignment with a team's answers and with nbgrader's tests."""
     answer = "reported = dwells = {}"
     if team:
         handed_in = tomllib.loads((team / "submission.toml").read_text(encoding="utf-8"))

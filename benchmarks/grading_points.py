@@ -19,18 +19,18 @@ GRADED_TABLE = {
     "claims": "feedback",
     "prefilter": "feedback",
 }
-Grading = tuple[str, Team, set[str]]  # kind, team, and the codes it should get
+Grading = tuple[str, Team, set[str]]  # kind of mistake, team, and the codes of the right flags
 STRICT, LENIENT = 0.5, 2.0  # factors of all tolerances
 
 
 @dataclass(frozen=True, kw_only=True)
 class Judged:
-    """One grading: its share of the points, and which criteria lost points that had them before.
+    """One grading: its share of the points, and the criteria that lost points by the mistake.
 
     Attributes
     ----------
-    wrong, wrong_lost : criteria about numbers that the mistake changed; those that lost points.
-    right, right_lost : criteria about numbers that it did not change; those that lost points.
+    wrong, wrong_lost : number of criteria about changed numbers; number of these that lost points.
+    right, right_lost : the same for criteria about numbers that the mistake did not change.
     """
 
     points: float
@@ -67,7 +67,7 @@ def _scaled(rubric: Rubric, factor: float) -> Rubric:
 
 
 def points(benches: Sequence[Iterable[Grading]]) -> Table:
-    """Return what honest teams and teams with mistakes get under each rubric."""
+    """Return the points of honest teams and of teams with mistakes under each rubric."""
     judged: dict[str, dict[bool, list[Judged]]] = defaultdict(lambda: defaultdict(list))
     for bench in benches:
         for name, honest, one in _judge_bench(bench):
@@ -110,7 +110,7 @@ def _judge_bench(bench: Iterable[Grading]) -> Iterator[tuple[str, bool, Judged]]
     reported: Reported | None = None
     for _, team, codes in bench:
         if codes & {"data_problem", "missing"} or (honest and not codes):
-            continue  # other recordings, none, or another rubric
+            continue  # other recordings, no recordings, or another rubric
         for name, rubric in three_rubrics(team.rubric).items():
             grade = replace(team, rubric=rubric).grade()
             share_of = grade.points / grade.out_of
@@ -123,7 +123,7 @@ def _judge_bench(bench: Iterable[Grading]) -> Iterator[tuple[str, bool, Judged]]
 
 
 def _compare(team: Team, before: Reported, honest: Grade, grade: Grade, rubric: Rubric) -> Judged:
-    """Return which criteria lost points by a mistake."""
+    """Return which criteria lost points through a mistake."""
     had = {criterion.id: criterion.points for criterion in honest.criteria}
     has = {criterion.id: criterion.points for criterion in grade.criteria}
     counts = {True: [0, 0], False: [0, 0]}
@@ -136,7 +136,7 @@ def _compare(team: Team, before: Reported, honest: Grade, grade: Grade, rubric: 
             names = matching(criterion.parameters, rubric.names)
             old, new = ([numbers.get(name) for name in names] for numbers in (old, new))
         elif table == "state_space" and before.final != team.reported.final:
-            continue  # it is compared with the final table
+            continue  # this table is compared with the final one
         changed = old != new
         counts[changed][0] += 1
         counts[changed][1] += has.get(criterion.id, 0.0) < had[criterion.id]

@@ -56,7 +56,7 @@ def dwell_errors(chain: Chain, omega: Array, *, noise: float = 1.0) -> Array:
 def measure(
     chain: Chain, *, rng: np.random.Generator, phases: bool = False, noise: float = 1.0
 ) -> tuple[FrequencyResponse, ...]:
-    """Draw one set of dwells; errors as in the module's docstring."""
+    """Draw one set of dwells, with errors as in the module's docstring."""
     omega = 2 * np.pi * np.geomspace(*BAND_HZ, POINTS[chain.n])
     G, std = chain.frequency_response(omega), dwell_errors(chain, omega, noise=noise)
     noisy = np.abs(G) + std * rng.standard_normal(G.shape)
@@ -76,14 +76,14 @@ def measure(
 
 
 def least_possible_std(chain: Chain, *, phases: bool = False, noise: float = 1.0) -> Array:
-    """Return the Cramér-Rao bound on the error of every named parameter, all springs free."""
+    """Return the Cramér-Rao bound on each named parameter's error, with all springs free."""
     omega = 2 * np.pi * np.geomspace(*BAND_HZ, POINTS[chain.n])
     weight = 1 / dwell_errors(chain, omega, noise=noise)
 
     def log_response(of: Chain) -> Array:
         G = np.log(of.frequency_response(omega)).astype(
             np.complex128
-        )  # real part size, imaginary phase
+        )  # the real part is the error in size, the imaginary part that in phase
         size = np.abs(chain.frequency_response(omega)) * weight
         return np.concatenate([G.real * size, G.imag * size] if phases else [G.real * size])
 
@@ -91,7 +91,7 @@ def least_possible_std(chain: Chain, *, phases: bool = False, noise: float = 1.0
 
 
 def bound(chain: Chain, measured: Callable[[Chain], Array]) -> Array:
-    """Return the Cramér-Rao bound by name, for measured values with a standard error of 1."""
+    """Return the Cramér-Rao bound by name, if all measured values have a standard error of 1."""
     P = Parametrisation(bench=Bench(springs=(True,) * (chain.n + 1)))
     p = P.physical(chain)
     steps = 1e-6 * np.where(p > 0, p, np.max(chain.k))
@@ -109,7 +109,7 @@ def bound(chain: Chain, measured: Callable[[Chain], Array]) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Quality:
-    """Over many seeds: coverage and efficiency (n_named,), milliseconds and chi² (n_seeds,)."""
+    """Over many seeds: coverage and efficiency (n_named,), and time in ms and chi² (n_seeds,)."""
 
     names: tuple[str, ...]
     coverage: Array
@@ -119,7 +119,7 @@ class Quality:
 
 
 def quality(chain: Chain, *, seeds: int, phases: bool = False, first_seed: int = 0) -> Quality:
-    """Fit many noisy sets from the paper's start; compare with truth and with the bound."""
+    """Fit many noisy data sets from the paper's start; compare with the truth and the bound."""
     truth = np.array(list(chain.parameters().values()))
     values, stds, times, chi = [], [], [], []
     for seed in range(first_seed, first_seed + seeds):

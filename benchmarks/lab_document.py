@@ -1,4 +1,4 @@
-"""The one-cart lab with figures coded by hand: notebook cells, run in the submission's folder."""
+"""The one-cart lab with figures coded by hand, as notebook cells that run in a submission."""
 
 # %%
 import tomllib

@@ -1,8 +1,8 @@
 """Compute the numbers of the one-cart lab from a team's own files, as a TA would write it.
 
-Handed to nbgrader and to otter-grader beside the assignment (`grading_notebooks.py`). Numpy and
-scipy, the textbook's methods: the level of a step, the logarithms of a decay's peaks, a sine
-fitted to the end of each dwell and one cart fitted to the ratios.
+nbgrader and otter-grader get this file together with the assignment (`grading_notebooks.py`). It
+uses numpy, scipy and the textbook's methods: the level of a step, the logarithms of a decay's
+peaks, a sine fitted to the end of each dwell, and one cart fitted to the ratios.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,7 +17,7 @@ from scipy.optimize import curve_fit
 Table = Mapping[str, float]
 TOLERANCE = {"K": 0.08, "omega_n": 0.05, "zeta": 0.15}
 _DATA = Path("data")
-_SEEN = 0.05  # of the largest swing; smaller peaks are the encoder's
+_SEEN = 0.05  # share of the largest swing; smaller peaks come from the encoder
 
 
 def check(table: str, name: str, reported: Mapping[str, Table], dwells: Table) -> None:
@@ -31,7 +31,7 @@ def check(table: str, name: str, reported: Mapping[str, Table], dwells: Table) -
 
 @cache
 def initial() -> dict[str, float]:
-    """Return K of the steps, and omega_n (rad/s) and zeta of the decays."""
+    """Return K from the steps, and omega_n (rad/s) and zeta from the decays."""
     gains = [_gain(read(file)) for file in sorted(_DATA.glob("step-*.csv"))]
     swings = np.array([_decrement(read(file)) for file in sorted(_DATA.glob("decay-*.csv"))])
     omega_n, zeta = np.median(swings, axis=0)
@@ -69,7 +69,7 @@ def _gain(data: NDArray) -> float:
 def _decrement(data: NDArray) -> tuple[float, float]:
     y = data["x1"] - data["x1"][-len(data) // 10 :].mean()
     crossings = np.flatnonzero(np.diff(np.sign(y)) != 0)
-    halves = pairwise(crossings)  # before this, the hand moves the cart
+    halves = pairwise(crossings)  # until then the hand moves the cart
     peaks = [int(a + np.argmax(np.abs(y[a : b + 1]))) for a, b in halves]
     large = [peak for peak in peaks if abs(y[peak]) > _SEEN * np.abs(y).max()]
     first, last, cycles = large[0], large[-1], (len(large) - 1) / 2

@@ -1,11 +1,11 @@
-"""The benefit of chosen experiments: predicted error, true error and bench time.
+"""How much chosen experiments help: predicted error, true error and bench time.
 
     python benchmarks/next_experiment.py [--seeds 4] [--dwells 24] [--next 1]
 
-Each bench is a preset with the carts, encoders and controller of the emulator, tick by tick,
-without a serial line. It records two steps and a sweep, then the experiment that `cartlab plan
+Each bench is a preset with the carts, encoders and controller of the emulator, simulated tick by
+tick without a serial line. It records two steps and a sweep, then the experiment that `cartlab plan
 --next` chooses. For comparison it records as many log-spaced dwells as the paper, and the carts are
-fitted to these alone. Writes the table and the figure of `benchmarks/next.md`.
+fitted to these dwells alone. The program writes the table and the figure of `benchmarks/next.md`.
 """
 
 import argparse
@@ -45,7 +45,7 @@ FIGURE = Path(__file__).with_name("figures") / "next.svg"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Stage:
-    """The relative errors of all named parameters after a time at the bench, s."""
+    """The relative errors of all named parameters after a given time at the bench, s."""
 
     seconds: float
     stated: Array
@@ -53,7 +53,7 @@ class Stage:
 
 
 def known_after(bench: VirtualBench, analysis: Analysis, chain: Chain) -> Stage:
-    """Compare what was found with the truth."""
+    """Return the errors of the identified carts, compared with the truth."""
     assert analysis.fit is not None
     found = analysis.fit.parameters.values()
     true = np.array(list(chain.parameters().values()))
@@ -62,7 +62,7 @@ def known_after(bench: VirtualBench, analysis: Analysis, chain: Chain) -> Stage:
 
 
 def log_spaced(known: Knowledge, plan: Plan, *, n: int) -> list[Recording]:
-    """Return the paper's dwells, each as long as `cartlab plan` has it, as large as the limits."""
+    """Return the paper's dwells, as long as `cartlab plan` makes them and as large as allowed."""
     resonances = np.sort(np.abs(known.chain.poles)) / (2 * np.pi)
     wait = settling_wait(known.chain, time_constants=SETTLED_DWELL)
     dwells = []
@@ -110,7 +110,7 @@ def run(preset: str, *, seed: int, n: int, dwells: int, scratch: Path) -> tuple[
 
 
 def row(preset: str, runs: list[tuple[list[Stage], Array]]) -> list[str]:
-    """Return a line of the table, errors as root mean squares over parameters and seeds."""
+    """Return a line of the table: errors as root mean squares over parameters and seeds."""
     stages = [stage for stage, _ in runs]
     first, chosen = ([run[i] for run in stages] for i in (0, 1))
     dwells = [run[2] for run in stages if len(run) > 2]
@@ -126,7 +126,7 @@ def row(preset: str, runs: list[tuple[list[Stage], Array]]) -> list[str]:
 
 
 def draw(results: dict[str, list[tuple[list[Stage], Array]]]) -> str:
-    """Draw the worst error against bench time."""
+    """Draw the largest error against bench time."""
     with drawing():
         figure, panels = small_multiples(list(results), height=1.9, share_y=True)
         for axes, runs in zip(panels, results.values(), strict=True):

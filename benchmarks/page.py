@@ -1,6 +1,6 @@
-"""The page of the benchmarks: its tables, the notes below them, and how one section is replaced.
+"""The page of the benchmarks: its tables, the notes below them, and how a section is replaced.
 
-Results are stored in the page itself. Each section is between two comments. A run replaces only the
+The page itself stores the results, with each section between two comments. A run replaces only the
 sections that it made, and notes the machine and the versions.
 """
 
@@ -40,11 +40,11 @@ class Table:
 
     Attributes
     ----------
-    rows : cells as text; a row of `missing` for a tool that is not installed.
-    better : where other tools are better: Markdown, above the table.
+    rows : cells as text; for a tool that is not installed, a row of `missing`.
+    better : in which respect other tools are better: Markdown, above the table.
     note : the method, and how each tool was used: Markdown, below the table.
     picture : draws the figure, in the style of the reports.
-    in_file : the page has only the figure; the rows are in a CSV file beside it.
+    in_file : if true, the page has only the figure, and the rows are in a CSV file beside it.
     """
 
     title: str
@@ -86,7 +86,7 @@ def spread(values: Iterable[float] | Array, *, digits: int = 2) -> str:
 
 
 def significant(value: float, *, digits: int = 2) -> str:
-    """Return a number to some significant digits, with an exponent only for extreme values."""
+    """Return a number with some significant digits, with an exponent only for extreme values."""
     if not np.isfinite(value) or value == 0 or not 1e-4 < abs(value) < 1e6:
         return f"{value:.{digits}g}"
     places = max(0, digits - 1 - int(np.floor(np.log10(abs(value)))))
@@ -94,12 +94,12 @@ def significant(value: float, *, digits: int = 2) -> str:
 
 
 def share(hits: int, of: int) -> str:
-    """Return a share with its two counts."""
+    """Return a share in percent with the two counts that it is made of."""
     return f"{100 * hits / of:.0f} % ({hits} of {of})" if of else "–"
 
 
 def write_page(page: Path, made: dict[str, str], *, order: Sequence[str]) -> None:
-    """Replace the sections that were made; keep the others and the head."""
+    """Replace the sections that were made; keep the other sections and the head of the page."""
     text = page.read_text(encoding="utf-8") if page.exists() else _HEAD
     sections = {found[1]: found[0] for found in _SECTION.finditer(text)} | made
     head = _SECTION.split(text, maxsplit=1)[0].rstrip() + "\n"
@@ -110,7 +110,7 @@ def write_page(page: Path, made: dict[str, str], *, order: Sequence[str]) -> Non
 def section(
     name: str, module: ModuleType, tables: Sequence[Table], *, seconds: float, figures: Path | None
 ) -> str:
-    """Return a benchmark's part of the page; its figures go into a folder, if there is one."""
+    """Return a benchmark's part of the page; write its figures into a folder, if there is one."""
     parts = [f"<!-- {name} -->", f"## {module.TITLE}", wrapped(module.WORDS)]
     for number, table in enumerate(tables, start=1):
         parts += [f"### {table.title}", wrapped(table.better)]
@@ -168,7 +168,7 @@ def markdown(table: Table) -> str:
 
 
 def machine() -> str:
-    """Return the facts of the machine that a time depends on, without its name."""
+    """Return the facts about the machine on which times depend, without its name."""
     memory = psutil.virtual_memory().total / 1e9
     return (
         f"{os.cpu_count()} cores ({platform.machine()}), {memory:.0f} GB, {platform.system()}, "

@@ -1,4 +1,4 @@
-"""The time and memory of a report, by carts and by records, and of a notebook."""
+"""Time and memory of a report, by number of carts and of records, and of a notebook."""
 
 import json
 import os
@@ -39,7 +39,7 @@ _DOCUMENT = Path(__file__).with_name("lab_document.py")
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """Seconds of the processor and on the clock, and the most memory of a process, MB."""
+    """Seconds of the processor and on the clock, and the largest memory of a process, MB."""
 
     cpu: float
     clock: float
@@ -47,7 +47,7 @@ class Cost:
 
 
 def tables(*, quick: bool) -> list[Table]:
-    """Return the costs by carts, by records, and beside a notebook of the same figures."""
+    """Return the costs by carts, by records, and compared with a notebook of the same figures."""
     with tempfile.TemporaryDirectory() as folder:
         base = Path(folder)
         return [
@@ -69,7 +69,7 @@ def run(command: Sequence[str | Path], *, cwd: Path = _ROOT, **environment: str)
     )
     _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode not in (0, 1):  # 1: done, a check of the recordings failed
+    if process.returncode not in (0, 1):  # 1: done, but a check of the recordings failed
         raise RuntimeError(f"{' '.join(map(str, command))}: exit status {process.returncode}")
     kilo = 1024 if sys.platform == "darwin" else 1
     return Cost(
@@ -111,7 +111,7 @@ def by_carts(base: Path, *, runs: int, examples: Sequence[str]) -> Table:
 
 
 def by_records(base: Path, *, records: Sequence[int]) -> Table:
-    """Return the costs of submissions with these numbers of records, all different."""
+    """Return the costs of submissions with these numbers of records, which all differ."""
     costs = []
     for count in records:
         folder = base / f"records-{count}"
@@ -155,10 +155,10 @@ One cart: steps, decays and dwells of many sessions on one bench, up to the limi
 
 
 def write_records(folder: Path, count: int) -> None:
-    """Write a submission of `count` different records: sessions on one bench, put together."""
+    """Write a submission of `count` different records, taken from several sessions on one bench."""
     kept: list[Any] = []
     document: Any = None
-    for session in range(count):  # one has some thirty
+    for session in range(count):  # one session has some thirty records
         part = folder.with_name(f"{folder.name}-part")
         write_submission(part, "throne-1dof", seed=session, compact=True)
         document = tomlkit.parse((part / NAME).read_text(encoding="utf-8"))
@@ -201,7 +201,7 @@ def documents(base: Path, *, runs: int) -> Table:
             rows.append(missing(name, columns=4))
             continue
         cwd = folder if tool else _ROOT
-        warmed = runs > 1  # the first run then does not count
+        warmed = runs > 1  # then the first run does not count
         costs = [run(command, cwd=cwd) for _ in range(runs + warmed)][warmed:]
         rows.append(
             [

@@ -4,8 +4,8 @@
 
 Each random bench has one or two small hidden effects and records one sweep, as `cartlab explore`
 does first. If the verdict is "ambiguous" or "partial", it records the experiment that `cartlab gap`
-proposes and looks again, at most twice. The program knows which springs are present. A stopped
-study continues where it stopped.
+proposes and searches again, at most twice. The program knows which springs are present. A study
+that was stopped continues where it stopped.
 """
 
 import os
@@ -32,13 +32,13 @@ from tests.helpers.virtual import VirtualBench, VirtualSession
 ROWS = Path(__file__).with_name("rivals.jsonl")
 FIRST_SEED = 80_000
 SMALL = (0.02, 0.3)  # times the usual size: larger effects are named after one sweep
-MORE = 2  # proposed experiments, one after the other
+MORE = 2  # proposed experiments, one after another
 OPEN = ("ambiguous", "partial")
-BUDGET = 300.0  # s for a search for the gap, as in an exploration
+BUDGET = 300.0  # s for one search for the gap, as in an exploration
 
 
 def run(seed: int) -> dict:
-    """Record a sweep; while the explanation is open, record the proposed experiment."""
+    """Record a sweep; while several explanations remain, record the proposed experiment."""
     drawn = draw(seed, effects=1 + seed % 2, sizes=SMALL)
     bench = VirtualBench(drawn.bench, seed=seed)
     began, looks = time.process_time(), []
@@ -64,7 +64,7 @@ def run(seed: int) -> dict:
 
 
 def look(folder: Path) -> Gap:
-    """Return the gap of these records, with the proposed experiment."""
+    """Return the gap of these records, with a proposed experiment."""
     submission = load_submission(folder)
     gap = investigate(analyse(submission), progress=lambda text: None, budget=BUDGET)
     return propose_for(gap, submission)

@@ -1,10 +1,10 @@
-"""From one class to a million submissions: measured costs and a simulated cluster.
+"""From one class to a million submissions, by measured costs and a simulated cluster.
 
     python -m benchmarks.scaling measure [--teams 6]    # some minutes; keeps scaling.json
     python -m benchmarks.scaling page                   # simulates, writes benchmarks/scaling.md
 
-Seconds are of the processor, so that other work on the machine makes them longer only by what the
-memory and the caches are shared; the simulation draws service times from those measured.
+Times are processor times. Other work on the machine lengthens them only through shared memory and
+caches. The simulation draws its service times from the measured ones.
 """
 
 import argparse
@@ -40,7 +40,7 @@ PRESETS = ("throne-1dof", "throne-2dof", "throne-3dof")
 COMPARED = (50, 100, 200, 400)  # submissions at once
 NIGHT = 8 * 3600.0  # s
 HOUR = 3600.0
-PRICES = (0.02, 0.05)  # of a core-hour in a rented cluster, dollars or euros
+PRICES = (0.02, 0.05)  # price of a core-hour in a rented cluster, in dollars or euros
 
 # ------------------------------------------------------------------------------- costs
 
@@ -58,7 +58,7 @@ def measure(*, teams: int) -> dict[str, Any]:
                 task = Task(id=team.name, key=team.name, sources=(str(team),))
                 start = time.process_time()
                 grading = grade_task(task, rubric=rubric, scratch=base)
-                if number:  # the first one also loads everything that all of them need
+                if number:  # the first one also loads the code that all use
                     seconds.append(round(time.process_time() - start, 3))
                 book = len(grading.grade) + len(grading.fingerprints)
                 start = time.process_time()
@@ -68,11 +68,11 @@ def measure(*, teams: int) -> dict[str, Any]:
             costs["seconds"][preset] = seconds
         handed_in, kept = np.mean(sizes, axis=0)
         costs |= {"handed_in": round(handed_in), "kept": round(kept)}
-        costs["pack"] = round(packing / len(sizes), 4)  # on a cluster only
+        costs["pack"] = round(packing / len(sizes), 4)  # only on a cluster
         # The client process handles each submission: hash, send, store, compare, write.
         write_class(base / "few", teams, preset=PRESETS[0])
         write_class(base / "many", 4 * teams, preset=PRESETS[0])
-        grade(base / "few", base / "first", preset=PRESETS[0])  # loads what is needed
+        grade(base / "few", base / "first", preset=PRESETS[0])  # loads the code that is needed
         few, many = (
             grade(base / name, base / f"out-{name}", preset=PRESETS[0]).parent
             for name in ("few", "many")
@@ -96,7 +96,7 @@ def measure(*, teams: int) -> dict[str, Any]:
 
 
 def comparison(costs: dict[str, Any]) -> tuple[float, float]:
-    """Return seconds a submission and seconds a pair of them, by least squares."""
+    """Return seconds per submission and seconds per pair of them, by least squares."""
     n = np.array([float(x) for x in costs["compare"]])
     seconds = np.array(list(costs["compare"].values()))
     a, b = np.linalg.lstsq(np.column_stack([n, n**2]) / seconds[:, None], np.ones(n.size))[0]
@@ -112,7 +112,8 @@ class Cluster:
 
     Attributes
     ----------
-    loss : of each machine; another machine repeats its work, and it is back after `repair`.
+    loss : rate at which each machine is lost; another repeats its work, and it returns after
+        `repair`.
     hang : share of submissions that reach the time limit; each becomes a row with its reason.
     """
 
@@ -129,7 +130,7 @@ class Cluster:
 
 @dataclass(frozen=True, kw_only=True)
 class Night:
-    """The result of a run: seconds to the last stored result, core-seconds done and repeated."""
+    """The result of a run: seconds to the last stored result, and core-seconds of work."""
 
     seconds: float
     busy: float
@@ -142,7 +143,7 @@ def simulate(n: int, service: np.ndarray, *, cluster: Cluster, seed: int) -> Nig
     rng = np.random.default_rng(seed)
     length = rng.choice(service, n)
     length[rng.random(n) < cluster.hang] = cluster.time_limit
-    order, events = count(), []  # (time, order, what, of which)
+    order, events = count(), []  # (time, order, event, number of its object)
     ready: deque[int] = deque()
     inbox, unsent, sent = 0, n, 0
     free = [cluster.cores] * cluster.machines
@@ -160,7 +161,7 @@ def simulate(n: int, service: np.ndarray, *, cluster: Cluster, seed: int) -> Nig
         for machine in range(cluster.machines):
             at(rng.exponential(HOUR / cluster.loss), "lost", machine)
     while stored < n:
-        # Half of a client's work is sending, half is storing, which goes first.
+        # Half of a client's work is sending and half is storing; storing goes first.
         while clients and (inbox or (unsent and sent - stored < window)):
             clients -= 1
             client_busy += cluster.client_cost / 2
@@ -211,7 +212,7 @@ def simulate(n: int, service: np.ndarray, *, cluster: Cluster, seed: int) -> Nig
 
 
 def tables(costs: dict[str, Any]) -> dict[str, str]:
-    """Return the tables of the page by their names."""
+    """Return the tables of the page by name."""
     service = np.concatenate([np.array(v) for v in costs["seconds"].values()])
     mean, client = float(service.mean()), costs["client"] + costs["pack"]
     a, b = comparison(costs)

@@ -1,4 +1,4 @@
-"""The Silverbox, an electronic mass on a hardening spring, by its official split."""
+"""The Silverbox, an electronic mass on a hardening spring, with its official split of the data."""
 
 import time
 
@@ -38,7 +38,7 @@ TESTS = {"multisine": (105712, 127400), "arrow": (100, 40575), "no extrapolation
 START = 50  # first samples of a test part, which are not judged
 
 
-# Published errors, mV on the parts of `TESTS`; `_NOTE` says how far they were checked.
+# Published errors in mV on the parts of `TESTS`; `_NOTE` says how far they were checked.
 _BASELINES = "baselines"
 _SYSIDENTPY = "[SysIdentPy's book](https://sysidentpy.org/book/0-Preface/)"
 PUBLISHED = (
@@ -127,14 +127,14 @@ def millivolts(model: Model | None, part: Part) -> str:
     )
 
 
-# The effects of an electronic circuit: its cubic feedback, and an offset voltage.
+# The effects that an electronic circuit has: its cubic feedback, and an offset voltage.
 _IN_IT = ("cubic_spring", "force_offset")
 _STAND_IN = """
 cartlab's names are those of carts. An electronic circuit has no {effects}: that name describes the
 small remainder besides the cube and an offset.
 """
 _PIECE = 10_000  # samples
-# A period has nine samples; smoothing over more would remove the motion.
+# A period has nine samples; smoothing over more samples would remove the motion.
 _SETTINGS = {
     "PySINDy": {"windows": (1, 5)},
     "SysIdentPy, FROLS": {"thinnings": (1,), "lags": (2, 3), "degrees": (3,)},

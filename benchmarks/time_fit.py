@@ -1,4 +1,4 @@
-"""The joint fit on time records: its speed, success rate and standard errors."""
+"""The joint fit to time records: its speed, success rate and standard errors."""
 
 import time
 
@@ -17,7 +17,7 @@ Other tools are compared in the [benchmarks](README.md).
 """
 TOOLS = ()
 NOISES = (0.0, 0.0005, 0.00227)  # cm: rounding only, a fifth of a count, a count
-INSIDE = 1.96  # standard errors: 95 % of the estimates, if the standard errors are right
+INSIDE = 1.96  # standard errors: 95 % of the estimates are within, if the standard errors are right
 
 
 def tables(*, quick: bool) -> list[Table]:
@@ -25,7 +25,7 @@ def tables(*, quick: bool) -> list[Table]:
 
 
 def coverage(seeds: int) -> Table:
-    """Return how far the named parameters are off, in standard errors, for each preset."""
+    """Return how many standard errors the named parameters are off, for each preset."""
     rows = []
     for name, chain in PRESETS.items():
         truth = np.array(list(chain.parameters().values()))

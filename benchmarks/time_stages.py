@@ -1,4 +1,4 @@
-"""How well the time-domain stages measure: sine dwells, decays, dry friction, steps."""
+"""How well the time-domain stages measure sine dwells, decays, dry friction and steps."""
 
 import numpy as np
 
@@ -20,7 +20,7 @@ COUNT = 0.00227  # cm
 RATES = (113.1, 333.0, 1000.0)  # Hz
 DWELL_RATES = (113.1, 500.0)  # Hz
 ZETAS = (0.01, 0.03, 0.07, 0.15)
-INSIDE = 1.96  # standard errors: 95 % of the estimates, if the standard errors are right
+INSIDE = 1.96  # standard errors: 95 % of the estimates are within, if the standard errors are right
 
 
 def record(t: Array, y: Array, *, kind: Kind, u: Array | None = None, omega: float | None = None):
@@ -38,7 +38,7 @@ def record(t: Array, y: Array, *, kind: Kind, u: Array | None = None, omega: flo
 
 
 def release(t: Array, *, omega_n: float, zeta: float, start: float, d: float) -> Array:
-    """Position of a cart let go at `start` at 0.4 s; dry friction holds it within d of rest."""
+    """Position of a cart released at `start` at 0.4 s; dry friction holds it within d of rest."""
     omega_d, decay = omega_n * np.sqrt(1 - zeta**2), zeta * omega_n
     half, turning, y = np.pi / omega_d, start, np.full_like(t, start)
     for k in range(int((t[-1] - 0.4) / half) + 1):
@@ -69,7 +69,7 @@ def tables(*, quick: bool) -> list[Table]:
 
 
 def errors(*, decays: int, dwells: int) -> Table:
-    """Return a row for each kind of number; `decays` and `dwells` of each sort."""
+    """Return a row for each kind of number, from the given decays and dwells."""
     damping = np.concatenate([_decay_errors(decays, zeta, fs) for zeta in ZETAS for fs in RATES])
     rows = [
         _row("ζ of a clean decay: fit of the record", damping[:, 0]),
@@ -88,7 +88,7 @@ def errors(*, decays: int, dwells: int) -> Table:
 
 
 def _row(words: str, off: Array, z: Array | None = None) -> list[str]:
-    """Return a row of the table: errors, and the same in standard errors if there are any."""
+    """Return a row of the table: errors, and errors in standard errors if there are any."""
     inside = "–" if z is None else f"{np.mean(np.abs(z) < INSIDE):.0%}"
     size = np.abs(off)
     return [
@@ -97,7 +97,7 @@ def _row(words: str, off: Array, z: Array | None = None) -> list[str]:
 
 
 def _decay_errors(seeds: int, zeta: float, fs: float) -> Array:
-    """Return relative errors of ζ, from the fit and from the peaks, for random clean decays."""
+    """Return relative errors of ζ in random clean decays, from the fit and from the peaks."""
     rng = np.random.default_rng(1)
     found = []
     for _ in range(seeds):
@@ -152,7 +152,7 @@ def _dwell_errors(seed: int, fs: float, from_rest: bool) -> list[float]:
 
 
 def _step_errors() -> list[tuple[float, float]]:
-    """Return the relative error of each static gain, and the same in its standard errors."""
+    """Return each static gain's relative error, and its error in standard errors."""
     found = []
     for wait in (6.0, 2.0, 1.0):
         t = np.arange(0, 0.5 + 2 * wait, 0.00884)

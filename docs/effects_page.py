@@ -1,4 +1,4 @@
-"""Write the catalogue of effects as a page of these documents: `effects.md`, a picture for each."""
+"""Write the catalogue of effects as a page of these documents, `effects.md`, with pictures."""
 
 import textwrap
 from collections.abc import Iterator
@@ -32,7 +32,7 @@ def main() -> None:
 
 
 def effects_page() -> str:
-    """Return the page in Markdown, all its words from the catalogue."""
+    """Return the page in Markdown, with all words taken from the catalogue."""
     head = [
         "# The effects",
         "<!-- written by python -m docs.codegen -->",

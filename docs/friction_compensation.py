@@ -2,8 +2,9 @@
 
 Usage: `python friction_compensation.py team-07/gap/model.fmu socket://127.0.0.1:40123`.
 
-A PD controller moves cart 1 by 1 cm, but the spring and dry friction keep it off the target. The
-linear model corrects the set point for the spring, the model with friction corrects it for both.
+A PD controller moves cart 1 by 1 cm, but the spring and dry friction keep the cart off the target.
+The linear model corrects the set point for the spring. The model with friction corrects it for
+both.
 """
 
 import sys
@@ -17,7 +18,7 @@ from fmpy import extract, read_model_description
 from fmpy.fmi2 import FMU2Slave
 
 TARGET = 441  # encoder counts, 1 cm
-KP, KD = 0.2, 0.02  # duty counts per encoder count, and per encoder count a second
+KP, KD = 0.2, 0.02  # duty counts per encoder count, and per encoder count per second
 MOST = 4096  # duty counts
 PERIOD, SECONDS = 0.001, 2.0
 VOLT, CM = 0.0001220703125, 0.00227  # per duty count and encoder count, as the bench says
@@ -27,7 +28,7 @@ class Cart:
     """The model of one cart under the controller of the bench (docs/protocol.md)."""
 
     def __init__(self, fmu: Path, folder: str) -> None:
-        """Load the FMU, unpacked into a folder."""
+        """Load the FMU and unpack it into a folder."""
         description = read_model_description(str(fmu))
         self._refer = {v.name: v.valueReference for v in description.modelVariables}
         self._fmu = FMU2Slave(
@@ -39,7 +40,7 @@ class Cart:
         self._fmu.instantiate()
 
     def rest(self, set_point: int, *, friction: bool) -> float:
-        """Return where the cart rests, in counts."""
+        """Return the position at which the cart rests, in counts."""
         fmu, refer = self._fmu, self._refer
         fmu.reset()
         fmu.setupExperiment()
@@ -67,7 +68,7 @@ def solve(rests_at: Callable[[int], float]) -> int:
 
 
 def try_on_bench(line: serial.SerialBase, set_point: int) -> int:
-    """Return where the cart rests on the bench, in counts."""
+    """Return the position at which the cart rests on the bench, in counts."""
     step = f"d;q;c;o;{0.5 / SECONDS};{set_point};1;"  # zero for SECONDS, then the set point
     line.write(f"h;0;0;z;g;{KP};0;{KD};{step}".encode())
     x, milliseconds = read_line(line)

@@ -25,7 +25,7 @@ FIGURES = {
     "decay-cart-2": "decay.svg",
     "free-bodies": "free-bodies.svg",
 }
-# Of what `cartlab demo` writes: figures as they are, and pages as a browser shows them.
+# From the output of `cartlab demo`: figures as they are, and pages as a browser shows them.
 DEMO_FIGURES = {
     "report/figures/overview.svg": "overview.svg",
     "report/figures/bode-cart-2.svg": "three-carts-bode.svg",
@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def tutorials(out: Path) -> None:
-    """Draw figures of a bench simulated as the tutorials do it."""
+    """Draw figures of a bench that is simulated as in the tutorials."""
     bench = prepare_bench(
         preset="throne-2dof", model=None, hide=["coulomb_friction:cart=2,force=0.002"]
     )
@@ -66,7 +66,7 @@ def tutorials(out: Path) -> None:
 
 
 def gallery(made: Path) -> None:
-    """Copy the demo's figures and photograph its pages."""
+    """Copy the demo's figures and take pictures of its pages."""
     for figure, name in DEMO_FIGURES.items():
         shutil.copyfile(made / figure, IMAGES / name)
     with sync_playwright() as playwright:
@@ -79,7 +79,7 @@ def gallery(made: Path) -> None:
 
 
 def exploration(team: Path) -> None:
-    """Photograph a virtual bench that investigates itself, once it says why it goes on."""
+    """Take a picture of a virtual bench that explores itself, once it says why it goes on."""
     command = [sys.executable, "-m", "pipeline", "emulate", "--preset", "throne-1dof"]
     options = ["--hide", "coulomb_friction", "--speed", "8"]
     with (
@@ -107,7 +107,7 @@ def exploration(team: Path) -> None:
 
 
 def desk(team: Path, grades: Path) -> None:
-    """Photograph a team's files and next experiment, a team of a class, an exercise being made."""
+    """Take pictures of a team's files and next experiment, a graded team, and a new exercise."""
     with DeskServer(folder=team) as server, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"))
         page = browser.new_page(viewport=WINDOW)

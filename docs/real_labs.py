@@ -1,9 +1,9 @@
-"""Make the numbers and pictures of `docs/real-labs.md` again, where the recordings are.
+"""Make the numbers and pictures of `docs/real-labs.md` again, if the recordings are available.
 
     python docs/real_labs.py [--keep FOLDER] [LAB …]
 
 The recordings may not be passed on, so they are not part of the project. FOLDER gets the
-submissions; a gap analysis that is there already is used as it is.
+submissions; a gap analysis that is already there is used as it is.
 """
 
 import argparse
@@ -42,8 +42,8 @@ class Lab:
 
     Attributes
     ----------
-    write : writes it into a new folder.
-    figures : which figures of its report and gap pages the gallery shows, and their names there.
+    write : function that writes the submission into a new folder.
+    figures : figures of its report and gap pages for the gallery, with their names there.
     """
 
     write: Callable[[Path], object]
@@ -51,7 +51,7 @@ class Lab:
 
 
 def write_lab(folder: Path, data: str, system: str, runs: Mapping[str, str]) -> None:
-    """Write a submission: the lines of its system, and of each file's experiment."""
+    """Write a submission from the lines of its system and of each file's experiment."""
     (folder / "data").mkdir(parents=True)
     text = f"version = 1\n[system]\n{system}\n"
     for file, lines in runs.items():
@@ -69,7 +69,7 @@ def write_one(folder: Path) -> None:
 
 
 def write_day(folder: Path) -> None:
-    """Write the submission of one day: cart 2 by hand, several times in a recording."""
+    """Write the submission of one day, with cart 2 moved by hand several times in a recording."""
     files = ("14-Feb-2025_09_22_43.txt", "14-Feb-2025_09_44_21.txt")
     runs = {file: 'kind = "decay"\ncarts = [2]' for file in files}
     write_lab(folder, "ecp210-2025", "carts = 2\nsprings = [true, true, false]", runs)
@@ -94,14 +94,14 @@ def write_emps(folder: Path) -> None:
 
 
 def write_servo(folder: Path) -> None:
-    """Write the sweep of the servo and its loop."""
+    """Write the servo's sweep and its closed loop."""
     loop = 'kind = "closed_loop"\ncontrolled_cart = 1'
     runs = {"raw_data_freq.txt": 'kind = "sweep"', "raw_data_cl_step1.m": loop}
     write_lab(folder, "ecp220-servo", "carts = 1\nsprings = [false, false]", runs)
 
 
 def write_torsion(folder: Path) -> None:
-    """Write the step of one disk whose input is only in the column of targets."""
+    """Write the step of a disk whose input is only in the column of targets."""
     step = 'kind = "step"\ninput = { per_count = 0.001220703125 }\n'
     step += 'columns = { time = "t_received", input = "target_value", x1 = "cart1pos" }'
     system = "carts = 1\nsprings = [true, false]"
@@ -149,7 +149,7 @@ def main() -> None:
 
 
 def make(name: str, folder: Path) -> None:
-    """Write a lab, let the program work on it, and keep its numbers and figures."""
+    """Write a lab, analyse it with cartlab, and keep its numbers and figures."""
     lab = LABS[name]
     if not folder.exists():
         lab.write(folder)
@@ -174,7 +174,7 @@ def rows(analysis: Analysis, gap: Gap) -> Iterator[str]:
             yield f"| {with_symbols(row.name)} | {number} |"
     driven = any(record.u is not None and np.any(record.u) for record in analysis.records)
     if analysis.fit is None and driven:
-        # The report needs a run in open loop, the search does not.
+        # The report needs a run in open loop; the search for effects does not.
         chain, units = gap.chain, gap.chain.units
         yield f"| mass | {with_unit(chain.m[0], gap.chain_std['m_1'], units.m)} |"
         yield f"| damping | {with_unit(chain.c[0], gap.chain_std['c_1'], units.c)} |"
@@ -218,7 +218,7 @@ def _viscous(decay: LogDecrement) -> float:
 
 
 def draw_limit_cycle() -> None:
-    """Draw a run that the program leaves out: the swing grows while the motor drives."""
+    """Draw a run that the program leaves out, in which the swing grows while the motor drives."""
     columns = np.loadtxt(REAL_DATA / "ecp210-2025" / LIMIT_CYCLE, skiprows=1, delimiter="\t")
     part = columns[3500::12]
     with drawing():

@@ -1,6 +1,6 @@
-"""The site of `mkdocs build`: the repository's pages at their own paths, and nothing from outside.
+"""The site of `mkdocs build`: the repository's pages at their own paths, loading nothing else.
 
-A page lies in the site where it lies in the repository, so that one relative link serves both.
+In the site each page has its path in the repository, so that one relative link serves both.
 """
 
 import re
@@ -39,12 +39,12 @@ _FETCHED = re.compile(
     rf"|<link\b[^>]*?\shref={_OUTSIDE}"
     rf"|(?:url\(|@import)\s*{_OUTSIDE}"
 )
-# "name : meaning" in one line, as docstrings here are written; types are in the annotations.
+# "name : meaning" in one line, as in docstrings here; types are in the annotations.
 _ITEM = re.compile(r"^(\w[\w, ]*?) : (.+)$", re.MULTILINE)
 
 
 class OneLineItems(Extension):
-    """Bring the items of docstrings into the two lines that numpydoc gives them."""
+    """Bring one-line items of docstrings into the two lines that numpydoc expects."""
 
     def on_object(self, *, obj: Object, **_: Any) -> None:
         """Rewrite one docstring."""
@@ -53,7 +53,7 @@ class OneLineItems(Extension):
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Set formulas as the program does; list the pages of the benchmarks."""
+    """Set formulas as the program does, and list the pages of the benchmarks."""
     fence = {"name": "math", "class": "math", "format": _formula}
     config.mdx_configs["pymdownx.superfences"] = {"custom_fences": [fence]}
     benchmarks = sorted(ROOT.glob("benchmarks/*.md"))

@@ -35,7 +35,7 @@ def test_a_file_is_replaced_whole(tmp_path):
 
 
 def test_a_file_that_many_write_at_once_is_one_of_theirs(tmp_path):
-    """If many write a file at once, it holds one writer's content; failed writes leave nothing."""
+    """If many write a file at once, it holds one writer's content; failed writes add no files."""
     path, texts = tmp_path / "notes.md", [str(i) * 300_000 for i in range(8)]
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda text: write_file(path, text), 5 * texts))

@@ -104,7 +104,7 @@ def test_a_free_run_is_judged_after_its_start_and_divergence_is_infinite():
 def test_of_nearly_equal_models_the_sparser_is_taken():
     """Of models with nearly equal errors, the one with fewest terms is kept.
 
-    If all models diverge, none is kept.
+    If all models diverge, no model is kept.
     """
     part = Part(dt=0.01, u=np.zeros(100), y=np.ones(100), first=0)
 

@@ -70,7 +70,7 @@ def test_friction_that_varies_from_run_to_run_stays_one_effect():
 
 
 def test_what_the_catalogue_lacks_is_not_misnamed():
-    """If the catalogue lacks the true effect, none is named, and suspects are listed."""
+    """If the catalogue lacks the true effect, no effect is named, and suspects are listed."""
     case = make_case(seed=10700, n=1, effects=["cubic_spring"], rate=113.1)
     known = [e for e in CATALOGUE if e.key not in ("cubic_spring", "slack_spring")]
 

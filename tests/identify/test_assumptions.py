@@ -46,7 +46,7 @@ def by_key(analysis: Analysis) -> dict[str, Assumption]:
 
 
 def test_what_an_example_states_is_listed_with_its_support():
-    """What the example states is listed with its origin and whether the data support it."""
+    """Each stated value is listed with its origin and whether the data support it."""
     found = by_key(analysed("two-cart"))
     assert {key: (a.value, a.origin, a.support) for key, a in found.items()} == {
         "system.springs wall-1": (False, "stated", "supported"),

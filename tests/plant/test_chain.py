@@ -81,7 +81,7 @@ def test_static_gains_and_tails_give_the_chain_back(chain):
 
 @pytest.mark.parametrize(("carts", "redundancies"), [(1, 0), (2, 1), (3, 5)])
 def test_number_of_redundancies(carts, redundancies):
-    """The tables of one, two and three carts have none, one and five redundancies."""
+    """The tables of one, two and three carts have zero, one and five redundancies."""
     got = recover_from_parameters(PRESETS[f"throne-{carts}dof"].parameters())
 
     assert list(got.residuals) == [f"R{i}" for i in range(1, redundancies + 1)]

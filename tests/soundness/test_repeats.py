@@ -53,7 +53,7 @@ def test_one_of_two_is_never_named():
 
 
 def test_repeats_that_differ_only_by_noise_are_accepted():
-    """In 200 sets of 3 to 6 honest repeats, none is named."""
+    """In 200 sets of 3 to 6 honest repeats, no repeat is named."""
     rng = np.random.default_rng(1)
     for _ in range(200):
         assert (
@@ -92,7 +92,7 @@ def test_an_encoder_that_was_not_zeroed_makes_no_outlier():
 
 
 def test_the_first_real_repeat_is_named_and_no_other(real_data, tmp_path):
-    """Of five real repeats with two carts the first is odd; of those with one cart, none is."""
+    """Of five real repeats with two carts the first is odd; repeats with one cart all agree."""
     folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(1, 2, 3, 4, 5))
     records = read_data(load_submission(folder)).records
     (outlier,) = find_outlier_repeats(records, unit="cm").values()

@@ -151,7 +151,7 @@ def test_a_class_is_gone_through_by_its_keys(show, tmp_path):
 
 
 def test_two_at_once_see_what_the_other_did(show):
-    """If two TAs change one class, each sees the other's change, and none is overwritten."""
+    """If two TAs change one class, each sees the other's change, and no change is lost."""
     if why := postgres.missing():
         pytest.skip(why)
     with postgres.running() as place:

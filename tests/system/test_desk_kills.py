@@ -1,4 +1,4 @@
-"""If the desk's server is killed at random, confirmed changes survive and none is half done.
+"""If the desk's server is killed at random, confirmed changes survive whole.
 
 A change is confirmed by the answer to its form; grading again, by the page that says it is done.
 """

@@ -129,8 +129,7 @@ def make_case(
 def further_records(case: Case, *, seed: int) -> tuple[Record, ...]:
     """Return new records of a clean case's bench.
 
-    The sizes of steps and sweep differ, and none is larger than before; releases and noise differ
-    too.
+    Steps and sweep have other sizes, no larger than before; releases and noise differ too.
     """
     rng = np.random.default_rng(seed)
     m, c, k = np.array(case.m), np.array(case.c), np.array(case.k)

@@ -82,7 +82,7 @@ def test_significant_digits(value, expected):
 
 
 def test_percentages_carry_their_sign_where_they_are_changes():
-    """A percentage that is a change has a sign, a share has none, and a missing one is a dash."""
+    """A percentage has a sign only if it is a change; a missing percentage is a dash."""
     assert percent(5.14, signed=True) == "+5.1 %"
     assert percent(-148.2, signed=True) == "−148 %"
     assert percent(5.14) == "5.1 %"
