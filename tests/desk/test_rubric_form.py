@@ -174,7 +174,10 @@ def test_the_form_and_the_text_may_both_be_changed(visitor, lab):
 
 
 def test_a_number_that_cannot_be_is_told_at_its_field_and_line(visitor, lab):
-    """A wrong number is reported at its field and line; nothing is written, and the text stays."""
+    """A wrong number is reported at its field and at its line of the text; nothing is saved.
+
+    The typed text stays on the page.
+    """
     page = editor(visitor, lab)
     answer = visitor.post("/rubric/save", **sent(page, lab, **{"criteria.pieces.points": "1.1"}))
     line = ONE_CART.split("\n").index("points = 1") + 1

@@ -133,8 +133,8 @@ def test_a_renamed_folder_is_the_same_submission(school, tmp_path):
 def test_a_folder_in_a_strangers_zip_takes_nothing_from_a_team(school, tmp_path, author):
     """If a stranger's zip file has a folder named like a team, the team keeps its row.
 
-    Points given by hand stay, and the stranger's submission gets a longer id. The same holds if it
-    has the team's id, or if a submission cannot be read.
+    Points given by hand stay, and the stranger's submission gets a longer id. The team also keeps
+    its row if the stranger's submission has the team's id or cannot be read.
     """
     out, folder = tmp_path / "out", tmp_path / "class"
     shutil.copytree(school / "B" / "team-1", folder / "team-1")

@@ -48,7 +48,7 @@ def points_of(folder: Path, team: str) -> float:
 def test_an_override_reaches_the_pages_at_once(run, tmp_path):
     """An override appears on the pages at once, and `auto` removes it.
 
-    The history lists both.
+    The history lists the override and its removal.
     """
     grades = write_class(tmp_path)
     before = points_of(grades, "team-03")

@@ -71,9 +71,9 @@ def memory(program: Path) -> tuple[int, int]:
 
 
 class Mega:
-    """A simulated board with power; time passes only in the methods that say so.
+    """A simulated board with power, whose time passes only during calls such as `run`.
 
-    The pins are those of firmware/cartlab_bench/board.h.
+    Its pins are those of firmware/cartlab_bench/board.h.
     """
 
     def __init__(self, program: Path, folder: Path) -> None:

@@ -226,7 +226,7 @@ def _early(team: Team, cycles: float) -> list[FrequencyResponse]:
 
 
 def wrong_state_space(team: Team) -> Team:
-    """Report a wrong sign, wrong couplings, another order of the states, or ω for ω²."""
+    """Report a state model with a wrong sign or coupling, another order of states, or ω for ω²."""
     space, n = team.reported.state_space, team.bench.chain.n
     assert space is not None
     A = [list(row) for row in space.A]
@@ -289,7 +289,7 @@ def wrong_prefilter(team: Team) -> Team:
 
 
 def missing(team: Team) -> Team:
-    """Leave out a parameter, the state model or the closed loop."""
+    """Leave out a parameter, the state model or the closed loop of the report."""
     kind = int(team.rng.integers(3))
     if kind == 0:
         final = dict(team.reported.final)

@@ -47,7 +47,7 @@ def be(*, words: list[str], watchdog: float, port: int) -> None:
 
 @cache
 def _nursery() -> "subprocess.Popen[str]":
-    """Start the process; it ends when this process ends, since its stdin is then closed."""
+    """Start the process from which benches are forked; it ends together with this process."""
     script = "from tests.helpers.nursery import fork_benches; fork_benches()"
     return subprocess.Popen(
         [sys.executable, "-c", script], stdin=subprocess.PIPE, text=True, cwd=ROOT

@@ -26,7 +26,7 @@ _OTHER = ("true", "[]", "{}", "[[]]", "[1, 2, 3]", "2024-01-01", "''", "[" * 500
 
 
 def damaged(raw: bytes, rng: Random, *, hits: int = 3) -> bytes:
-    """Cut, flip, insert, remove or repeat bytes up to this many times."""
+    """Cut, flip, insert, remove or repeat bytes of a file up to this many times."""
     for _ in range(rng.randint(1, hits)):
         at, n = rng.randrange(len(raw) + 1), rng.randint(1, 60)
         junk = rng.choice([*map(str.encode, (*_MARKS, *_NUMBERS[:20])), rng.randbytes(n)])

@@ -180,7 +180,7 @@ def test_coefficients_are_those_of_the_product_of_factors(n):
 
 
 def test_the_redundancies_are_as_many_as_the_checks():
-    """The solution has one redundancy for two carts and five for three, like the checks."""
+    """The solution gives as many redundancies as the checks test: 1 for two carts, 5 for three."""
     assert [len(derivation.redundancies(n)) for n in (1, 2, 3)] == [0, 1, 5]
 
 

@@ -204,9 +204,9 @@ def test_a_damping_at_its_bound_is_no_measurement():
 
 
 def test_what_rests_on_a_damping_at_its_bound_is_known_no_better_than_it():
-    """If one of two dampings is held at zero, the dampings of the modes have larger errors.
+    """If one of two dampings is held at zero, the modes' dampings get larger standard errors.
 
-    The errors allow for a damping that is not zero.
+    The true value of the held damping need not be zero.
     """
     chain = replace(PRESETS["throne-2dof"], c=np.array([6e-4, 0.0]))
     got = fit_bode(exact(chain), bench=Bench(springs=(False, True, True)))

@@ -279,7 +279,7 @@ def test_noise_at_a_fast_sample_is_no_scale_of_the_log():
     ],
 )
 def test_the_timing_of_the_bench_is_found(law, sample_time):
-    """Slow and fast controllers, with and without a model, are simulated down to the noise."""
+    """The simulations leave only noise for slow and fast controllers, with and without a model."""
     y, u = bench(TWO, law, sample_time=sample_time)
     controller: submission.Controller
     if isinstance(law, Pid):

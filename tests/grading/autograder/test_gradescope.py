@@ -212,7 +212,7 @@ HOSTILE = (  # one of a kind; `tests/system/test_hostile.py` grades all of them 
 
 
 def test_hostile_uploads_get_a_sentence_and_no_more(root, team, tmp_path):
-    """Zip bombs, links and the like get a result that names the reason.
+    """A hostile upload, such as a zip bomb or a link, gets a result that names the reason.
 
     No file outside the upload is read or written.
     """

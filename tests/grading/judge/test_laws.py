@@ -47,7 +47,7 @@ def test_table_3_of_the_paper_fails_where_it_is_known_to():
 
 
 def test_one_digit_excuses_no_more_than_two():
-    """A table typed with one digit is not excused so much rounding that every law holds."""
+    """If a table is typed with one digit, rounding does not excuse every broken law."""
     vague = {name: f"{float(value):.0e}" for name, value in TABLE_2.items()}
     assert broken(vague, n=2) == {"recomputed.omega_1", "recomputed.zeta_1"}
     assert "positive.K_1" in broken({**TABLE_2, "K_1": "0e2"}, n=2)

@@ -127,7 +127,10 @@ LONG = [pytest.mark.slow, pytest.mark.sample]
 
 
 def _cases() -> Iterator[Any]:
-    """Return all cases without a stated sign, and with one those that look like a wrong sign."""
+    """Return every case without a stated sign.
+
+    Return with a stated sign only the cases that look like a wrong sign.
+    """
     for case in SPOILT:
         yield pytest.param(case, "", marks=LONG if case in SEARCHED else ())
         if "turned" in case or "exchanged" in case:
@@ -261,9 +264,9 @@ def test_grading_says_what_the_stated_frequencies_are_in(bench, tmp_path):
 
 
 def test_a_held_cart_that_nobody_called_free_is_told_with_its_cure(bench, tmp_path):
-    """If a recording with a held cart lacks `carts`, the message gives the line to add.
+    """If the key `carts` is missing although a cart was held, the message gives the line to add.
 
-    Without `carts`, all carts count as free.
+    Without the key, all carts count as free.
     """
     folder = shutil.copytree(bench, tmp_path / "spoilt")
     path = folder / "submission.toml"

@@ -161,8 +161,8 @@ def test_one_copied_recording_is_found_however_disguised(teams, others, kind, di
 def test_under_feedback_the_input_gives_a_copy_away(teams, others):
     """Under feedback, a copy is recognised by its input, even if noise was added.
 
-    The controller turned the carts' own noise into input. The start, where the reference steps, is
-    cut off as well.
+    The controller turned the carts' own noise into input. The copy here also lacks the start, where
+    the reference steps.
     """
     rng = np.random.default_rng(9)
     record = of_kind(teams[0], "closed_loop")
