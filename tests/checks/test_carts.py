@@ -44,7 +44,7 @@ def fitted(
 
 
 def vanishing(checks: tuple[Check, ...]) -> dict[str, str]:
-    """Return the message for each parameter that may not exist, by its name."""
+    """Return a message for each parameter that may not exist, with the names as keys."""
     return {check.about: check.message for check in checks if check.kind == "vanishing"}
 
 

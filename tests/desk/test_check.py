@@ -64,7 +64,7 @@ def root(tmp_path):
 
 @pytest.fixture
 def lab(root):
-    """Start a desk behind a proxy that serves these folders; return visitors by name."""
+    """Start a desk behind a proxy for the folders of `root`; return visitors by name."""
     with DeskServer(users=write_users(root, USERS)) as server:
         port = urlsplit(server.url).port or 0
         yield lambda name: through_proxy(port, name)

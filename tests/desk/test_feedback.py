@@ -61,7 +61,7 @@ HOSTILE = (
 
 @pytest.fixture
 def lab(tmp_path, request):
-    """Start a desk with a graded class that is not released; return visitors by name."""
+    """Start a desk with a graded class that is not yet released; return visitors by name."""
     write_class(tmp_path / "grades", anonymous=getattr(request, "param", False))
     a_submission(tmp_path / "five")
     with DeskServer(users=write_users(tmp_path, USERS)) as server:

@@ -318,7 +318,7 @@ def is_real(chain: Chain) -> bool:
 
 
 def _first(team: Team, name: str, read: float, right: float) -> float:
-    """Return an initial estimate: as read if that is near the truth, else more carefully read."""
+    """Return the value that a student reads, or a more careful one if it is far from the truth."""
     guessed = team.bench.chain.n > 1 and read_name(name).is_damping and not name[-1].isdigit()
     if guessed:
         return 0.1

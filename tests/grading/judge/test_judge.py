@@ -294,7 +294,10 @@ def test_a_broken_law_is_told_in_words():
 
 
 def test_lateness_takes_its_share_for_every_day_begun():
-    """Each day begun costs 10 %, after an hour of grace, up to half of the points."""
+    """Each day begun after the due date costs 10 %, at most half of the points.
+
+    The first hour is free.
+    """
     one = student(1)
     full = one.grade().points
     for days, share in ((0.0, 0), (0.04, 0), (0.5, 0.1), (1.04, 0.1), (2.0, 0.2), (30.0, 0.5)):

@@ -426,7 +426,10 @@ def test_the_class_page_counts_what_there_is():
 
 
 def shares(*found: tuple[str, str, str]) -> Flag:
-    """Return the flag for triples of own recording, other submission and its recording."""
+    """Return a flag for shared data.
+
+    Each argument is an own recording, another submission and its recording.
+    """
     keys = ("experiment", "submission", "other_experiment")
     recordings = [{**dict(zip(keys, one, strict=True)), "sigmas": 9.5} for one in found]
     evidence = {"submissions": [], "recordings": recordings}
