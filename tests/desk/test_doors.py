@@ -296,7 +296,7 @@ ENTER = {"": "s t i w", "static": "s t i w", "student": "s i w", "grades": "t i 
 
 @pytest.mark.parametrize("path", PATHS)
 def test_each_role_has_its_rooms(lab, path):
-    """Whoever asks for a page of another role is refused, whatever is sent."""
+    """A user who asks for a page of another role is refused, whatever the request contains."""
     for role, name in {"s": "s1", "t": "t", "i": "i", "w": "w"}.items():
         let_in = role in ENTER[path.split("/")[1]].split()
         if not let_in:

@@ -177,7 +177,7 @@ def test_what_is_wrong_stands_beside_its_field(filled):
 
 
 def test_a_unit_in_doubt_is_asked_about_beside_its_field(room):
-    """If a unit is in doubt, a question stands beside its field until the unit is stated."""
+    """If a unit is in doubt, the page asks for it beside its field until it is stated."""
     visitor, folder = room
     visitor.upload(HERE + "files", some_files())
     page = visitor.get(HERE)

@@ -251,7 +251,7 @@ def test_suspects_are_listed_as_such():
 
 
 def test_nothing_to_name_is_said():
-    """If the verdict is none, a sentence says that no effect is needed."""
+    """If the verdict is "none", a sentence says that no effect is needed."""
     gap = replace(make_gap("none", ()), final=0.031, baseline=0.031)
     text = page_of(gap).text
 
@@ -261,7 +261,7 @@ def test_nothing_to_name_is_said():
 
 
 def test_the_page_of_none_speaks_of_no_effects():
-    """If the verdict is none, the page mentions no effects and draws one model."""
+    """If the verdict is "none", the page mentions no effects and draws one model."""
     gap = replace(make_gap("none", ()), final=0.031, baseline=0.031, where=())
     page = page_of(gap)
 
