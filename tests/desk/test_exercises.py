@@ -60,7 +60,7 @@ def test_every_effect_has_its_sizes_and_slides_about_them():
 
 
 def test_a_slider_counts_when_moved_and_a_number_when_typed():
-    """A typed size is used; if none is typed, the slider counts if it was moved."""
+    """A typed size is used; without a typed size, the slider counts if it was moved."""
 
     def force(preset: str, **size: str) -> dict[str, str]:
         chosen = [{"key": "coulomb_friction", "place": "1", "sizes": {"force": size}}]

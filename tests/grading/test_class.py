@@ -95,7 +95,7 @@ def test_a_model_made_of_a_vague_table_is_no_wrong_one(seed, digits):
         (73025, 0, ("hz_for_rad_s",), {"hz_for_rad_s"}),  # one resonance seen anywhere by eye
         # the seventh period of one decay
         pytest.param(73026, 0, ("peak_count",), {"peak_count"}, marks=LONG),
-        # typed too coarsely to be told from 6/5
+        # typed too coarsely to differ from 6/5
         pytest.param(72007, 3, ("initial_off",), {"initial_off"}, marks=LONG),
         pytest.param(
             72021, 0, ("hz_for_rad_s", "log10_for_ln"), {"hz_for_rad_s", "log10_for_ln"}, marks=LONG

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 from axe_playwright_python.sync_playwright import Axe
 
-# Figures are images with their own text, and the rows of a table are alike, as are formulas.
+# Figures are images with their own text, and the rows of a table are similar, as are formulas.
 # Without the drawings, the rows after the fourth and the formulas after the tenth, axe takes a
 # tenth of the time. All are put back afterwards.
 _THIN = """() => {

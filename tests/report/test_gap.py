@@ -1,4 +1,4 @@
-"""The gap report is right for all verdicts and effects, and so is what other files quote."""
+"""The gap report, its file, and the report's quote of it are right for all verdicts and effects."""
 
 import json
 import re

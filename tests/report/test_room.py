@@ -49,7 +49,7 @@ def test_full_pages_are_left_as_they_are():
 
 
 def test_a_table_stays_whole_where_less_is_white_then():
-    """A table is kept on one page if that leaves less white space."""
+    """A table is kept on one page if the pages then have less white space."""
 
     def lay_out(choices: Choices) -> Pages:
         begun = 2 if choices.whole == (7,) else 1

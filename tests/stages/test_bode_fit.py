@@ -351,7 +351,7 @@ def test_a_misfit_widens_the_errors():
     for name, value in chain.parameters().items():
         estimate = got.parameters[name]
         assert estimate.std is not None
-        # For ten parameters of one draw, none is beyond 4 standard errors.
+        # All ten parameters of one draw are within 4 standard errors.
         assert abs(estimate.value - value) < 4 * estimate.std
         # 500 times the error that 0.01 % would give, so 100 times is safe.
         claimed = honest.parameters[name].std
