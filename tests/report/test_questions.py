@@ -150,7 +150,7 @@ def test_a_cart_that_sticks_is_asked_about_with_its_interval():
 
 
 def test_a_fit_that_leaves_more_than_noise_asks_at_its_worst_point():
-    """If a fit leaves more than noise, a question names the cart and frequency that fit worst."""
+    """If a fit's error exceeds the noise, a question names the cart and frequency fitted worst."""
     analysis = well()
     assert analysis.fit is not None
     response = analysis.frequency_responses[1]
