@@ -7,9 +7,10 @@ import numpy as np
 
 from pipeline.estimation.chain.time_search import FOLLOWED
 from pipeline.grading import limits
+from pipeline.grading.references.readings import readings
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
-from pipeline.results import Analysis, Estimate, ParameterRow, StepEdge, StepGain
+from pipeline.results import Analysis, Estimate, ParameterRow
 from pipeline.stages.compare import GAIN_AND_FREQUENCY_LIMIT
 
 OFF_SCALE = "the recordings are not in the units stated, see the data"
@@ -117,9 +118,11 @@ def recompute(analysis: Analysis) -> References:
     """
     chain = trusted_chain(analysis)
     trusted, tables = chain is not None, _by_decays(chain, analysis) if chain else []
+    scales = {symbol: _birge_ratio(symbol, analysis) for symbol in ("K", "omega")}
     final, initial = {}, {}
     for row in analysis.rows:
-        fitted = _final(row, analysis, tables) if trusted else None
+        scale = scales.get(read_name(row.name).symbol, 1.0)
+        fitted = _final(row, analysis, tables, scale=scale) if trusted else None
         measured = _initial(row, fitted, analysis)
         if measured is not None:
             initial[row.name] = measured
@@ -233,15 +236,41 @@ def in_doubt(references: References, *, analysis: Analysis) -> References:
     )
 
 
+def _birge_ratio(symbol: str, analysis: Analysis) -> float:
+    """Return by how much the fit's errors of gains or frequencies are too small, at least 1.
+
+    Gains from steps and frequencies from decays do not use the fit. The ratio is the root mean
+    square of their differences from the fit, in standard errors (Birge, Physical Review 40, 1932).
+
+    Parameters
+    ----------
+    symbol : "K" or "omega".
+    """
+    apart = []
+    for row in analysis.rows:
+        read, fitted = row.initial, row.final
+        if read is None or fitted is None or read.source not in ("step", "log_decrement"):
+            continue
+        std = np.hypot(read.std or 0.0, fitted.std or 0.0)
+        if read_name(row.name).symbol == symbol and std > 0:
+            apart.append((read.value - fitted.value) / std)
+    return max(1.0, float(np.sqrt(np.mean(np.square(apart))))) if apart else 1.0
+
+
 def _final(
-    row: ParameterRow, analysis: Analysis, tables: Sequence[Mapping[str, float]]
+    row: ParameterRow,
+    analysis: Analysis,
+    tables: Sequence[Mapping[str, float]],
+    *,
+    scale: float,
 ) -> Reference | None:
     """Return the bounds of a final number: from the fit, and from all measurements without it.
 
-    A fit that stops at its bound, zero damping, does not measure the damping. A fit that explains
-    neither the response nor the recordings does not count if there is no other measurement.
+    The standard errors of the fit are multiplied by `scale`. A fit that stops at its bound, zero
+    damping, does not measure the damping. A fit that explains neither the response nor the
+    recordings does not count if there is no other measurement.
     """
-    fitted, read_off = row.final, _readings(row.name, analysis)
+    fitted, read_off = row.final, readings(row.name, analysis)
     if read_name(row.name).is_damping:
         measured = [table[row.name] for table in tables]
     else:
@@ -263,7 +292,7 @@ def _final(
         value=fitted.value if fitted and told else sum(measured) / len(measured),
         low=min(bounds),
         high=max(bounds),
-        std=(fitted.std or 0.0) if fitted and told else 0.0,
+        std=scale * (fitted.std or 0.0) if fitted and told else 0.0,
         source=fitted.source if fitted and told else read,
     )
 
@@ -289,13 +318,13 @@ def _by_decays(chain: Chain, analysis: Analysis) -> list[dict[str, float]]:
     A cart without decays has the damping of the fit. If the fit found zero damping, no table is
     returned.
     """
-    readings = [_readings(f"zeta_{cart}", analysis) for cart in range(1, chain.n + 1)]
-    if not any(readings) or not chain.is_tied:
+    decays = [readings(f"zeta_{cart}", analysis) for cart in range(1, chain.n + 1)]
+    if not any(decays) or not chain.is_tied:
         return []
     critical = 2 * chain.m * chain.omega_carts
     found = []
     for choose in (min, max):
-        zeta = [choose(r) if r else z for r, z in zip(readings, chain.zeta_carts, strict=True)]
+        zeta = [choose(r) if r else z for r, z in zip(decays, chain.zeta_carts, strict=True)]
         found.append(replace(chain, c=np.array(zeta) * critical))
     return [one.parameters() for one in found] if np.all(found[0].c > 0) else []
 
@@ -306,8 +335,8 @@ def _initial(row: ParameterRow, final: Reference | None, analysis: Analysis) -> 
         return None
     if measured is None:
         return final
-    readings = _readings(row.name, analysis)
-    bounds = [measured.value, *readings]
+    read_off = readings(row.name, analysis)
+    bounds = [measured.value, *read_off]
     if final is not None:
         bounds += [final.low, final.high]
     spread = limits.READ_BY_EYE if measured.source == "frequency_response" else 1.0
@@ -316,79 +345,6 @@ def _initial(row: ParameterRow, final: Reference | None, analysis: Analysis) -> 
         low=min(bounds) / spread,
         high=max(bounds) * spread,
         # With several readings, the bounds already include the error.
-        std=0.0 if len(readings) > 1 else measured.std or 0.0,
+        std=0.0 if len(read_off) > 1 else measured.std or 0.0,
         source=measured.source,
     )
-
-
-def _readings(name: str, analysis: Analysis) -> list[float]:
-    """Return the readings of a gain, frequency or damping of a single cart; students may quote any.
-
-    The damping of a decay is read twice: with dry friction subtracted, and without. Friction need
-    not be certain, because with little damping even a trace of it matters.
-    """
-    read = read_name(name)
-    if read.is_by_eye:
-        return []
-    cart = read.cart or 1
-    readings: list[float] = []
-    if read.is_gain:
-        held = _held(cart, analysis)
-        for step in analysis.step_gains:
-            if step.cart == cart:
-                readings += [step.gain, *(step.interval or ())]
-                readings += [_shortest(edge, held=held) for edge in step.edges if held]
-        readings += _by_size([step for step in analysis.step_gains if step.cart == cart])
-    for decay in analysis.log_decrements:
-        if decay.cart == cart and read.is_frequency:
-            readings.append(decay.omega_n)
-        if decay.cart == cart and read.is_ratio:
-            without = decay.friction.zeta if decay.friction else decay.zeta
-            readings += [zeta for zeta in (decay.zeta, without) if zeta > 0]
-    return readings
-
-
-def _by_size(steps: Sequence[StepGain]) -> list[float]:
-    """Return the gain as a slope from small to large steps, if it depends on the size of the step.
-
-    The slope is the difference of levels divided by the difference of inputs. A dead zone, or an
-    amplifier that responds only above a threshold, subtracts the same from every step.
-    """
-    edges = sorted(
-        (abs(e.u_after - e.u_before), abs(e.level_after - e.level_before))
-        for step in steps
-        for e in step.edges
-    )
-    if not edges:
-        return []
-    size, far = np.array(edges).T
-    small, large = size < size.mean(), size >= size.mean()
-    if not np.any(small) or size[small].max() > (1 - limits.SAME_STEP) * size[large].min():
-        return []
-    (u, x), (v, y) = ((size[at].mean(), far[at].mean()) for at in (small, large))
-    slope = float((y - x) / (v - u))
-    return [slope] if y / v > limits.BY_SIZE * x / u else []
-
-
-def _held(cart: int, analysis: Analysis) -> float:
-    """Return the largest input step that did not move a free cart, because friction held it."""
-    held = [
-        float(np.abs(r.u).max())
-        for r in analysis.records
-        if r.kind == "step"
-        and r.u is not None
-        and cart in r.free
-        and cart in r.carts
-        and np.ptp(r.position(cart)) <= limits.STILL * r.encoder_step(cart)
-    ]
-    return max(held, default=0.0)
-
-
-def _shortest(edge: StepEdge, *, held: float) -> float:
-    """Return the gain of an edge if friction kept the cart too far out.
-
-    Parameters
-    ----------
-    held : the friction, as the input that it can hold.
-    """
-    return abs((edge.level_after - edge.level_before) / (abs(edge.u_after - edge.u_before) + held))

@@ -1,0 +1,82 @@
+"""Read single numbers off the recordings of a submission, as students may quote them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.grading import limits
+from pipeline.names import read_name
+from pipeline.results import Analysis, StepEdge, StepGain
+
+
+def readings(name: str, analysis: Analysis) -> list[float]:
+    """Return the readings of a gain, frequency or damping of a single cart; students may quote any.
+
+    The damping of a decay is read twice: with dry friction subtracted, and without. Friction need
+    not be certain, because with little damping even a trace of it matters.
+    """
+    read = read_name(name)
+    if read.is_by_eye:
+        return []
+    cart = read.cart or 1
+    readings: list[float] = []
+    if read.is_gain:
+        held = _held(cart, analysis)
+        for step in analysis.step_gains:
+            if step.cart == cart:
+                readings += [step.gain, *(step.interval or ())]
+                readings += [_shortest(edge, held=held) for edge in step.edges if held]
+        readings += _by_size([step for step in analysis.step_gains if step.cart == cart])
+    for decay in analysis.log_decrements:
+        if decay.cart == cart and read.is_frequency:
+            readings.append(decay.omega_n)
+        if decay.cart == cart and read.is_ratio:
+            without = decay.friction.zeta if decay.friction else decay.zeta
+            readings += [zeta for zeta in (decay.zeta, without) if zeta > 0]
+    return readings
+
+
+def _by_size(steps: Sequence[StepGain]) -> list[float]:
+    """Return the gain as a slope from small to large steps, if it depends on the size of the step.
+
+    The slope is the difference of levels divided by the difference of inputs. A dead zone, or an
+    amplifier that responds only above a threshold, subtracts the same from every step.
+    """
+    edges = sorted(
+        (abs(e.u_after - e.u_before), abs(e.level_after - e.level_before))
+        for step in steps
+        for e in step.edges
+    )
+    if not edges:
+        return []
+    size, far = np.array(edges).T
+    small, large = size < size.mean(), size >= size.mean()
+    if not np.any(small) or size[small].max() > (1 - limits.SAME_STEP) * size[large].min():
+        return []
+    (u, x), (v, y) = ((size[at].mean(), far[at].mean()) for at in (small, large))
+    slope = float((y - x) / (v - u))
+    return [slope] if y / v > limits.BY_SIZE * x / u else []
+
+
+def _held(cart: int, analysis: Analysis) -> float:
+    """Return the largest input step that did not move a free cart, because friction held it."""
+    held = [
+        float(np.abs(r.u).max())
+        for r in analysis.records
+        if r.kind == "step"
+        and r.u is not None
+        and cart in r.free
+        and cart in r.carts
+        and np.ptp(r.position(cart)) <= limits.STILL * r.encoder_step(cart)
+    ]
+    return max(held, default=0.0)
+
+
+def _shortest(edge: StepEdge, *, held: float) -> float:
+    """Return the gain of an edge if friction kept the cart too far out.
+
+    Parameters
+    ----------
+    held : the friction, as the input that it can hold.
+    """
+    return abs((edge.level_after - edge.level_before) / (abs(edge.u_after - edge.u_before) + held))

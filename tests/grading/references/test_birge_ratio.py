@@ -1,0 +1,45 @@
+"""A fit that contradicts other readings of the same carts counts with larger standard errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.grading.references.reference import recompute
+from pipeline.results import Analysis
+from tests.helpers.grading_students import student
+
+
+def with_gain_off(analysis: Analysis, *, sigmas: float) -> Analysis:
+    """Return the analysis with the fitted K_1 so many standard errors from that of the steps."""
+    rows = []
+    for row in analysis.rows:
+        if row.name == "K_1":
+            assert row.initial is not None
+            assert row.final is not None
+            std = float(np.hypot(row.initial.std or 0.0, row.final.std or 0.0))
+            off = replace(row.final, value=row.initial.value + sigmas * std)
+            row = replace(row, final=off)
+        rows.append(row)
+    return replace(analysis, rows=tuple(rows))
+
+
+@pytest.mark.parametrize("sigmas", [0.0, 30.0])
+def test_the_errors_grow_with_the_contradiction(sigmas):
+    """The errors of all fitted gains grow by the gains' Birge ratio; those of frequencies stay."""
+    analysis = with_gain_off(student(2).analysis, sigmas=sigmas)
+    apart = [
+        (row.initial.value - row.final.value) / np.hypot(row.initial.std or 0, row.final.std or 0)
+        for row in analysis.rows
+        if row.initial and row.final and row.initial.source == "step"
+    ]
+    ratio = max(1.0, float(np.sqrt(np.mean(np.square(apart)))))
+    assert len(apart) == 2  # K_1 and K_2
+    assert (ratio > 10) == (sigmas > 0)
+    found = recompute(analysis).final
+    fitted = next(row.final for row in analysis.rows if row.name == "K_2")
+    assert fitted is not None
+    assert fitted.std is not None
+    assert found["K_2"].std == pytest.approx(ratio * fitted.std)
+    before = recompute(student(2).analysis).final
+    assert found["omega_a"].std == before["omega_a"].std
