@@ -180,7 +180,7 @@ def _ask_if_there(name: str, *, bench: Bench) -> str:
 
 
 def _redundancy_checks(values: Mapping[str, float]) -> list[Check]:
-    meaning = "two ways from the transfer functions to the same physical number"
+    meaning = "two computations of the same physical number from the transfer functions"
     return [
         Check(
             kind="redundancy",

@@ -169,7 +169,7 @@ def _step_check(step: StepGain, *, shown: Sequence[str], bench: Bench) -> Check:
             ),
         )
     else:
-        back = "" if step.rest_shift is None else ", and it returns to its first rest"
+        back = "" if step.rest_shift is None else " and returns to its initial rest position"
         all_edges = "both edges" if edges == 2 else f"all {edges} edges"
         outcome, found = "pass", f"has the same gain at {all_edges} of the input{back}."
     return Check(

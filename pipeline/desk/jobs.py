@@ -66,7 +66,7 @@ class Job:
 
 
 class Jobs:
-    """The long work of this desk: at most one job per folder and one per processor at a time."""
+    """The desk's long tasks: at most one job per folder and one per processor at a time."""
 
     def __init__(self) -> None:
         self._jobs: dict[Path, Job] = {}

@@ -91,7 +91,7 @@ def _state_springs(submission: Submission) -> None:
 
 
 def decide_springs(records: Sequence[Record], *, n: int) -> Springs:
-    """Return the springs of n carts from their steps; springs between carts are assumed.
+    """Decide from steps which carts have a spring to a wall; springs between carts are assumed.
 
     Only steps with all carts free and measured are used.
     """

@@ -53,7 +53,7 @@ class Answer:
 
 @dataclass(kw_only=True)
 class Visitor:
-    """A visitor with a cookie or a proxy's headers, who sends from this computer."""
+    """A visitor whose requests come from this computer, with a cookie or a proxy's headers."""
 
     port: int
     headers: dict[str, str] = field(default_factory=dict)
@@ -116,7 +116,7 @@ class Visitor:
 class WorkerHere:
     """A desk's worker in this process, since another process takes a second to start.
 
-    It does one task at a time, which cannot be killed.
+    It does one task at a time; a running task cannot be killed.
     """
 
     runs = True

@@ -63,7 +63,7 @@ def test_a_stuck_encoder_is_found():
 
 
 def test_a_coarse_encoder_that_stuck_comes_back_with_a_jump():
-    """A coarse encoder was stuck if it comes back with a jump.
+    """A coarse encoder counts as stuck if its reading resumes with a jump.
 
     A cart held by friction does not jump.
     """

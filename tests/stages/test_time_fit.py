@@ -125,7 +125,7 @@ def test_a_band_limited_input_is_used_as_such():
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
 def test_exact_records_give_the_chain_back(n):
-    """Records without noise or rounding give the chain back without a start."""
+    """From records without noise or rounding, the fit finds the chain without starting values."""
     rng = np.random.default_rng(n)
     chain, springs = random_chain(n, rng)
     record = step_record(chain, rng=rng, noise=0.0, count=0.0)

@@ -73,7 +73,7 @@ class GapFit(GapModel):
 
     @property
     def without_nuisance(self) -> GapModel:
-        """The model without nuisance parameters; a fit then starts runs at expected values."""
+        """The model without nuisance parameters: each run then starts at its expected state."""
         return GapModel(structure=self.structure, theta=self.theta)
 
 

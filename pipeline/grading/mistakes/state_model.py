@@ -33,7 +33,7 @@ class StateMatrices:
 
     Attributes
     ----------
-    right : the entries; NaN if unknown.
+    right : the right entries; NaN if unknown.
     slack : their uncertainty.
     """
 
