@@ -199,7 +199,7 @@ def test_every_tdms_gives_the_same_numbers(raw):
 
 
 def test_what_a_tdms_holds_besides_is_said():
-    """A note names the short channels and text channels that are not read; units join the headings."""
+    """A note names short channels and text channels that are not read; units join the headings."""
     got = table(TDMS["settings"])
     assert got.notes == (
         "not read: run/gains, settings/gain (2 × 1, float64), run/by (1 × 1, no numbers)",
