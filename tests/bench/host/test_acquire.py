@@ -1,4 +1,4 @@
-"""A plan is carried out on a virtual bench over a real line."""
+"""`acquire` carries out a plan on a virtual bench over a real line."""
 
 import json
 import os
@@ -41,7 +41,7 @@ NEAR = PlanLimits(input=0.5, travel=0.1)  # cm: a dwell of 0.01 V passes it with
 
 
 class Alone(Notes):
-    """A session without a person at the bench."""
+    """A session without a person at the bench, in which every instruction is refused."""
 
     def confirm(self, instruction: str) -> None:
         """Refuse."""
@@ -49,7 +49,7 @@ class Alone(Notes):
 
 
 def decay(name: str, cart: int = 1) -> Recording:
-    """Return a decay of one cart, let go by hand."""
+    """Return a decay of one cart that is released by hand."""
     return Recording(
         id=name,
         kind="decay",
@@ -73,9 +73,10 @@ def last_run(bench) -> dict:
 
 
 def test_a_plan_becomes_a_submission(tmp_path, fast):
-    """Decays, a dwell and a closed loop each get a file and a table, in the right units.
+    """Decays, a dwell and a closed loop of a plan each get a file and a table in the right units.
 
-    The virtual hands hold and let go, so nobody is asked; existing comments are kept.
+    The virtual bench holds and releases its carts itself, so no person is asked. Existing comments
+    are kept.
     """
     loop = Recording(
         id="control",
@@ -86,7 +87,7 @@ def test_a_plan_becomes_a_submission(tmp_path, fast):
         frequency=0.25,
         controller=StateLoop(gains=(0.01, 0.002, 0.0, 0.0), prefilter=0.05),
     )
-    # Identified before its loop is closed: a step and a sweep do that.
+    # The carts must be identified before their loop is closed: a step and a sweep suffice.
     step = Recording(
         id="step",
         kind="step",
@@ -103,7 +104,7 @@ def test_a_plan_becomes_a_submission(tmp_path, fast):
     )
     whole = [outcome.recording.id for outcome in outcomes if not outcome.partial]
     assert whole == ["decay-1", "step", "dwell", "control"]
-    assert all(asked.endswith("again") for asked in notes.confirmed)  # of runs a busy host lost
+    assert all(asked.endswith("again") for asked in notes.confirmed)  # after a busy host
     submission = load_submission(work)
     assert "# ours" in (work / "submission.toml").read_text(encoding="utf-8")
     assert submission.system.position.per_count == 0.00227
@@ -116,16 +117,16 @@ def test_a_plan_becomes_a_submission(tmp_path, fast):
     assert records["dwell"].omega == pytest.approx(2 * np.pi * 2.0)
     reference = records["control"].reference
     assert reference is not None
-    # An amplitude goes over the line in whole counts of 0.00227 cm.
+    # An amplitude is sent in whole counts of 0.00227 cm.
     assert reference.max() == pytest.approx(0.3, abs=0.5 * 0.00227)
     controller = next(e.controller for e in submission.experiments if e.id == "control")
     assert isinstance(controller, StateFeedbackController)
-    # Commands carry nine digits, the table six.
+    # Commands carry nine digits, the table has six.
     assert controller.gains == pytest.approx((0.01, 0.002, 0.0, 0.0), rel=1e-5)
 
 
 def test_a_folder_without_a_submission_gets_one(tmp_path):
-    """The bench's description starts the submission; a plan is proposed and written."""
+    """For a folder without a submission, the bench's description starts one, and a plan is made."""
     with emulator("--speed", "20", "--period", "5.003", preset="throne-1dof") as bench:
         outcomes = acquire(
             tmp_path / "new", port=bench.address, observers=[Notes()], only=["step-1"]
@@ -150,7 +151,7 @@ def test_what_is_recorded_is_skipped(tmp_path, fast):
 
 
 def test_a_stock_bench_is_driven_by_people(tmp_path):
-    """If the bench has no extension, a person holds its carts and no watchdog guards the motor."""
+    """On a stock bench a person holds the carts, and no watchdog guards the motor."""
     work = write_work(tmp_path, [sine("dwell", seconds=1, settle=0.3)], scales="")
     text = (work / "submission.toml").read_text(encoding="utf-8")
     scaled = text.replace('unit = "cm"', 'unit = "cm", per_count = 0.00227')
@@ -167,7 +168,7 @@ def test_a_stock_bench_is_driven_by_people(tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 def test_a_pty_is_a_port_like_any_other(tmp_path):
-    """A pseudo-terminal gives the same kind of record from the same plan."""
+    """From the same plan, a pseudo-terminal gives the same kind of record as a socket."""
     work = write_work(tmp_path, [sine("dwell", seconds=1)])
     with emulator("--port", "pty", "--speed", "5") as bench:
         *_, outcome = acquire(work, port=bench.address, observers=[Notes()], only=["dwell"])
@@ -178,7 +179,7 @@ def test_a_pty_is_a_port_like_any_other(tmp_path):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_the_whole_loop_names_what_the_bench_hides(tmp_path):
-    """Emulate with dry friction, acquire the proposed plan, report, gap: friction is named."""
+    """Dry friction of a virtual bench is named after acquiring the proposed plan."""
     work = tmp_path / "work"
     hidden = "coulomb_friction:cart=1,force=0.0025"
     with emulator("--hide", hidden, "--speed", "20", "--period", "8.84") as bench:
@@ -205,7 +206,7 @@ def test_the_whole_loop_names_what_the_bench_hides(tmp_path):
 
 
 def test_faults_of_every_kind_are_counted_and_the_rest_is_kept(tmp_path):
-    """One line in a hundred is spoilt in each way: all valid lines are kept, all faults counted."""
+    """If one line in a hundred is damaged in each way, good lines are kept and faults counted."""
     work = write_work(tmp_path, [sine("dwell", seconds=8)])
     options = [o for kind in ("drop", "garble", "merge") for o in ("--fault", f"{kind}=0.01")]
     with emulator(*options, "--speed", "10") as bench:
@@ -216,16 +217,15 @@ def test_faults_of_every_kind_are_counted_and_the_rest_is_kept(tmp_path):
     spoilt = struck["drop"] + struck["garble"] + 2 * struck["merge"]
     assert outcome.lines == sent["lines"] - spoilt
     assert outcome.anomalies.garbled == struck["garble"] + struck["merge"]
-    # At the very ends of a run a loss leaves no gap in the stamps.
+    # At the very beginning or end of a run, a lost line leaves no gap in the stamps.
     assert abs(outcome.anomalies.lost - struck["drop"]) <= 2
     submission = load_submission(work)
     assert f"{outcome.anomalies.garbled} garbled" in submission.experiments[0].note
-    # And the record is as good as a whole one: the gains of the preset at this frequency.
+    # And the record is as good as a whole one: it gives the preset's gains at this frequency.
     points = analyse(submission).sine_points
     true = np.abs(PRESETS["throne-2dof"].frequency_response(np.array([points[0].omega])))[:, 0]
     for point in points:
-        # The input is sent in counts of 0.12 mV, here of 10 mV; stamps are good to half a ms of
-        # 500.
+        # The input, here 10 mV, is sent in counts of 0.12 mV; stamps are good to half a ms of 500.
         assert point.gain == pytest.approx(true[point.cart - 1], rel=3e-3)
 
 
@@ -237,9 +237,9 @@ def test_faults_of_every_kind_are_counted_and_the_rest_is_kept(tmp_path):
     ],
 )
 def test_a_run_that_breaks_off_is_saved_as_partial_and_recorded_again(tmp_path, fault, why):
-    """The partial record is kept where no report mistakes it for a whole one.
+    """A run that breaks off is saved as partial, where no report reads it, and is repeated.
 
-    The retry succeeds.
+    The second try succeeds.
     """
     work = write_work(tmp_path, [sine("dwell", seconds=2)])
     notes = Notes()
@@ -247,7 +247,7 @@ def test_a_run_that_breaks_off_is_saved_as_partial_and_recorded_again(tmp_path, 
         outcomes = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
     assert [bool(o.partial) for o in outcomes] == [True, False]
     assert why in outcomes[0].partial
-    # The reason is beside the request.
+    # The reason is given together with the request.
     assert notes.confirmed == [f"dwell ended early: {outcomes[0].partial}. Record dwell again"]
     assert (work / "data" / "dwell.partial.txt").exists()
     assert [e.file for e in load_submission(work).experiments] == ["data/dwell.txt"]
@@ -256,7 +256,7 @@ def test_a_run_that_breaks_off_is_saved_as_partial_and_recorded_again(tmp_path, 
 
 
 def test_a_run_that_passes_the_travel_limit_is_stopped_at_once(tmp_path, real):
-    """The stop goes out before the port is read again; the run is not added as an experiment."""
+    """A run that passes the travel limit is stopped at once and not added as an experiment."""
     work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=NEAR)
     (outcome,) = acquire(work, port=real.address, observers=[Alone()], only=["dwell"])
     assert last_run(real)["ended"] == "stopped"
@@ -268,7 +268,7 @@ def test_a_run_that_passes_the_travel_limit_is_stopped_at_once(tmp_path, real):
 
 
 def test_a_run_that_passes_the_input_limit_is_stopped_at_once(tmp_path, real):
-    """The input to the motor is watched as well, no matter which program set it."""
+    """A run that passes the input limit is stopped at once, whatever program set the input."""
     recording, system = sine("dwell", seconds=4), System(carts=2, springs=(True,) * 3)
     with open_line(real.address, baud=115_200) as line:
         order = make_order(
@@ -288,7 +288,7 @@ def test_a_run_that_passes_the_input_limit_is_stopped_at_once(tmp_path, real):
 
 
 def assert_stopped_at_once(raw: Path, offending: int) -> None:
-    """Check that the port was not read again after the look that found the offending line."""
+    """Check that the port was not read again after the offending line was found."""
     run = read_raw(raw)
     *_, last = [lump for lump, _ in run.lumps()]
     seen = readings_of(replace(run, content=run.content[: -len(last)], arrivals=run.arrivals[:-1]))
@@ -307,7 +307,7 @@ def test_an_amplitude_past_the_limits_is_never_sent(tmp_path, real):
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no SIGTERM to catch")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["ctrl-c", "sigterm"])
 def test_a_host_told_to_end_stops_the_motor_and_saves(tmp_path, number, real):
-    """Ctrl-C and SIGTERM end a run with a stop, not by the watchdog; the partial record is kept."""
+    """Ctrl-C or SIGTERM ends a run by a stop command, and the partial record is saved."""
     work = write_work(tmp_path, [sine("dwell", seconds=30)])
     with host(work, real.address, "--only", "dwell") as process:
         until_bytes(work / "raw" / "dwell-1.raw", process)
@@ -321,7 +321,7 @@ def test_a_host_told_to_end_stops_the_motor_and_saves(tmp_path, number, real):
 
 
 def test_a_killed_host_leaves_a_readable_file_and_a_motor_that_is_off(tmp_path, fast):
-    """After kill -9 the watchdog cuts the motor; the file lacks only what was still on its way."""
+    """After `kill -9` the watchdog stops the motor, and the file lacks only the latest lines."""
     work = write_work(tmp_path, [sine("dwell", seconds=10)])
     with emulator(watchdog=2.0) as bench:
         with host(work, bench.address, "--only", "dwell", "--yes") as process:
@@ -331,8 +331,8 @@ def test_a_killed_host_leaves_a_readable_file_and_a_motor_that_is_off(tmp_path, 
         sent = last_run(bench)["lines"]
     kept = readings_of(read_raw(work / "raw" / "dwell-1.raw"))
     assert silent >= 1999
-    # The bench streamed until its watchdog cut in. Up to its last heartbeat only lines that a busy
-    # machine had not yet delivered may be missing.
+    # The bench sent lines until its watchdog acted. Of those up to its last heartbeat, only lines
+    # that a busy machine had not yet delivered may be missing.
     assert kept[-1].ms > 1.0024 * sent - silent - 500
     notes = Notes()
     *_, outcome = acquire(work, port=fast.address, observers=[notes], only=["dwell"])
@@ -341,7 +341,7 @@ def test_a_killed_host_leaves_a_readable_file_and_a_motor_that_is_off(tmp_path, 
 
 
 def test_a_stuck_encoder_is_said(tmp_path):
-    """An encoder that stands still while the motor drives is counted and noted."""
+    """An encoder that does not move while the motor drives is counted and mentioned in a note."""
     work = write_work(tmp_path, [sine("dwell", seconds=6)])
     with emulator("--fault", "stuck=2@0.2", "--speed", "10", "--period", "5.003") as bench:
         *_, outcome = acquire(work, port=bench.address, observers=[Notes()], only=["dwell"])
@@ -353,20 +353,20 @@ def test_a_stuck_encoder_is_said(tmp_path):
 
 
 def test_nobody_at_the_port_is_said_at_once():
-    """A port where nothing listens gives one line that says what to do."""
+    """If nothing listens at a port, one line says what to do."""
     with pytest.raises(HardwareError, match="no bench listens there; start one"):
         open_line("socket://127.0.0.1:9", baud=115_200)
 
 
 def test_a_port_that_is_not_there_names_those_that_are():
-    """A device that does not exist gives one line, with the ports of this machine."""
+    """If a device does not exist, one line names the ports of this machine."""
     with pytest.raises(HardwareError, match=r"no such port; is the bench plugged in\?; .*port"):
         open_line("/dev/ttyNONE7", baud=115_200)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 def test_a_port_that_another_program_has_is_said():
-    """If two programs open one port, the second gets a clear message."""
+    """If another program has the port open, the message says so."""
     controller, device = os.openpty()
     import fcntl
 
@@ -381,7 +381,7 @@ def test_a_port_that_another_program_has_is_said():
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 def test_what_is_no_bench_is_said():
-    """A device that gives other answers is not taken for a bench."""
+    """If a device answers with something else, the message says that it is no bench."""
     controller, device = os.openpty()
     echo = subprocess.Popen(
         [sys.executable, "-c", f"import os\nwhile os.read({controller}, 99): "
@@ -409,7 +409,7 @@ BENCH = Description(
 
 
 def test_scales_are_added_without_touching_the_rest(tmp_path):
-    """The scales from the bench go into [system]; all comments and the order of keys stay."""
+    """The bench's scales are added to [system], and all comments and the order of keys stay."""
     text = """# first
 version = 1  # one
 
@@ -431,7 +431,7 @@ cart = 1
 
 @pytest.mark.parametrize("stock", [True, False])
 def test_a_scale_that_nobody_knows_is_asked_for(tmp_path, stock):
-    """If the bench does not state its units, one line says what to add."""
+    """If the bench does not state its units, one line says what to add to the submission."""
     text = 'version = 1\n[system]\ncarts = 2\nposition = { unit = "mm" }\n'
     (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
     wanted = r'position = \{ unit = "mm", per_count = … \} under \[system\]'
@@ -440,7 +440,7 @@ def test_a_scale_that_nobody_knows_is_asked_for(tmp_path, stock):
 
 
 def test_more_carts_than_encoders_is_refused(tmp_path):
-    """Three carts cannot be measured with two encoders."""
+    """A submission of three carts is refused on a bench with two encoders."""
     text = 'version = 1\n[system]\ncarts = 3\nposition = { unit = "cm" }\n'
     (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match="has 3 carts, but the bench has 2 encoders"):
@@ -449,14 +449,14 @@ def test_more_carts_than_encoders_is_refused(tmp_path):
 
 @pytest.mark.parametrize("options", [[], ["--port", "x", "--import", "y"]])
 def test_either_a_port_or_a_folder(tmp_path, options):
-    """Giving neither or both is refused with a clear message."""
+    """`acquire` with both a port and a folder to import, or with neither, is refused."""
     result = CliRunner().invoke(app, ["acquire", str(tmp_path), *options])
     assert isinstance(result.exception, ConfigError)
     assert "either --port or --import" in str(result.exception)
 
 
 def test_an_id_that_the_plan_does_not_have_is_said(tmp_path, real):
-    """`--only` with an unknown name lists the recordings of the plan."""
+    """`--only` with an unknown name gives the list of the plan's recordings."""
     work = write_work(tmp_path, [sine("a", seconds=1)])
     with pytest.raises(ConfigError, match=r"--only nine: no such recording; plan.toml has a$"):
         acquire(work, port=real.address, observers=[Notes()], only=["nine"])
@@ -466,13 +466,13 @@ def test_an_id_that_the_plan_does_not_have_is_said(tmp_path, real):
 
 
 def shown(*, terminal: bool, **options) -> tuple[Terminal, StringIO]:
-    """Return a terminal view and what it printed."""
+    """Return a terminal view and the text that it prints."""
     out = StringIO()
     return Terminal(console=Console(file=out, force_terminal=terminal, width=100), **options), out
 
 
 def test_the_view_tells_plan_rate_faults_and_positions():
-    """During a run it shows what is done and left, what is lost, and where the carts are."""
+    """During a run the terminal shows progress, lost lines and where the carts are."""
     view, out = shown(terminal=True)
     plan = Plan(limits=LIMITS, recordings=(sine("a", seconds=30), sine("b", seconds=45)))
     with view:
@@ -491,7 +491,7 @@ def test_the_view_tells_plan_rate_faults_and_positions():
 
 
 def test_without_a_terminal_only_trouble_is_told():
-    """In a log file a good run leaves no line, and a bad one leaves its reason."""
+    """In a log file a good run leaves no line, and a bad run leaves its reason."""
     view, out = shown(terminal=False)
     well = RunOutcome(recording=sine("a", seconds=1), lines=998)
     with view:
@@ -505,7 +505,7 @@ def test_without_a_terminal_only_trouble_is_told():
 
 
 def test_nobody_at_the_keyboard_confirms_nothing(monkeypatch):
-    """Without a keyboard an instruction ends the session; `--yes` takes it as done and says so."""
+    """Without a keyboard an instruction ends the session, unless `--yes` is given."""
     monkeypatch.setattr("sys.stdin", StringIO())
     view, _ = shown(terminal=False)
     with pytest.raises(ConfigError, match=r"Hold cart 2: nobody is at the keyboard to confirm it"):
@@ -519,5 +519,5 @@ def test_nobody_at_the_keyboard_confirms_nothing(monkeypatch):
     ("values", "bars"), [([5, 5], "▁▁"), ([0, 7], "▁█"), (range(8), "▁▂▃▄▅▆▇█")]
 )
 def test_a_sparkline_goes_from_the_least_to_the_greatest(values, bars):
-    """One bar for each value, the least lowest and the greatest highest; equal values are low."""
+    """A sparkline has a bar for each value, low to high; if all are equal, all are low."""
     assert sparkline(values) == bars

@@ -1,4 +1,4 @@
-"""Benches whose clock, line or motor differs from what they state; the data are kept."""
+"""If a bench's clock, line or motor differs from what it states, the data are still kept."""
 
 import socket
 import threading
@@ -44,12 +44,12 @@ NOTHING = Start(wave=Wave.DELTA, frequency=20.0, amplitude=0)
 
 
 class OddBench(threading.Thread):
-    """A bench on a socket that keeps to the protocol but for its lines.
+    """A bench on a socket that keeps to the protocol, but changes the lines of a run.
 
     Parameters
     ----------
-    lines : from those of a run as they should be to those that it sends.
-    late : more lines, which the first stop finds under way; they come when all are taken for gone.
+    lines : function from the lines that a run should have to those that are sent.
+    late : further lines, which are under way at the first stop and arrive after it.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ def leapt(lines: list[Reading]) -> Iterator[Reading]:
     ],
 )
 def test_a_clock_that_cannot_be_believed_ends_the_run(tmp_path, lines, said, kept):
-    """The run is partial and says why; its lines up to then are in a file, at little cost."""
+    """A run whose clock stands still or leaps is partial; its lines up to then are saved."""
     work = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)])
     tracemalloc.start()
     outcomes = acquire(work, port=OddBench(lines).address, observers=[Notes()], only=["dwell"])
@@ -127,7 +127,7 @@ def test_a_clock_that_cannot_be_believed_ends_the_run(tmp_path, lines, said, kep
 
 
 def test_lines_of_the_run_before_that_come_late_are_not_of_this_one(tmp_path):
-    """A computer may deliver lines that the bench sent before it heard the stop much later."""
+    """Lines of an earlier run that arrive after the stop are not counted in the next run."""
     first = iter([True])
 
     def reset(lines: list[Reading]) -> Iterator[Reading]:
@@ -143,7 +143,7 @@ def test_lines_of_the_run_before_that_come_late_are_not_of_this_one(tmp_path):
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.6])
 def test_lost_lines_are_told_however_many(tmp_path, share):
-    """The stated period of a bench is believed; missing lines are counted as lost and noted."""
+    """A bench's stated period is trusted, so missing lines are counted and noted."""
     lost = np.random.default_rng(5).random(RUN) < share
 
     def thinned(lines: list[Reading]) -> Iterator[Reading]:
@@ -158,7 +158,7 @@ def test_lost_lines_are_told_however_many(tmp_path, share):
 
 @pytest.mark.parametrize("lost", [(), (500, 1700, 1701)])
 def test_a_clock_slower_than_stated_loses_nothing(tmp_path, lost):
-    """A line every 1.3 ms instead of 1.0 is noted once, and only lines really lost are counted."""
+    """A line every 1.3 ms instead of 1.0 is noted once, and only really lost lines are counted."""
 
     def slow(lines: list[Reading]) -> Iterator[Reading]:
         for k in range(round(len(lines) / 1.3)):
@@ -174,7 +174,7 @@ def test_a_clock_slower_than_stated_loses_nothing(tmp_path, lost):
 
 @pytest.mark.parametrize("factor", [25, -1])
 def test_a_motor_driven_with_another_duty_than_the_target_is_stopped(tmp_path, factor):
-    """In open loop the duty is the target; if they differ, the run ends and is not tried again."""
+    """If the duty in open loop differs from the target, the run ends and is not repeated."""
 
     def driven(lines: list[Reading]) -> Iterator[Reading]:
         return (_with(r, duty=factor * r.duty) for r in lines)

@@ -1,4 +1,4 @@
-"""Mistakes of people at a bench are reported and harm no recorded data."""
+"""Mistakes of people at a bench are reported, and harm no recorded data."""
 
 import re
 import signal
@@ -35,7 +35,7 @@ def test_another_bench_than_the_submission_is_of_is_refused(tmp_path):
 
 
 def test_a_bench_of_more_carts_is_said(tmp_path):
-    """A person who holds the third cart by hand may go on; the wrong cable is named."""
+    """If the bench has more carts than the submission, a message says so and the run goes on."""
     submission = load_submission(write_work(tmp_path, []))
     bench = Description(name="three", encoders=3, carts=3, commands=EXTENSIONS)
     (remark,) = cart_remarks(submission, bench)
@@ -44,7 +44,7 @@ def test_a_bench_of_more_carts_is_said(tmp_path):
 
 
 def test_a_run_in_which_nothing_moves_is_not_recorded(tmp_path):
-    """Two unplugged encoders do not make a dwell; the run is offered again, twice."""
+    """A dwell in which no encoder moves is not recorded, and is offered again twice."""
     work = write_work(tmp_path, [sine("dwell", seconds=2)])
     notes = Notes()
     dead = ("--fault", "stuck=1@0", "--fault", "stuck=2@0")
@@ -55,7 +55,7 @@ def test_a_run_in_which_nothing_moves_is_not_recorded(tmp_path):
 
 
 def test_a_second_session_in_a_folder_is_refused(tmp_path, real, fast):
-    """The message names the process that records there; its data stay whole."""
+    """A second session in the same folder is refused, and the message names the first process."""
     work = write_work(tmp_path / "work", [sine("dwell", seconds=6)])
     with host(work, real.address, "--only", "dwell", "--yes") as process:
         until_bytes(work / "raw" / "dwell-1.raw", process)
@@ -71,14 +71,14 @@ class Late(Notes):
     """An observer that once keeps the computer busy for longer than the watchdog waits."""
 
     def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
-        """Note the lines, and be slow after the first of them."""
+        """Note the lines, and be slow after the first batch."""
         if not self.readings_seen:
             time.sleep(0.3)
         super().readings(batch, anomalies)
 
 
 def test_a_busy_computer_is_named_where_the_watchdog_bites(tmp_path):
-    """If the host sends no heartbeat for too long, the message names the busy computer."""
+    """If the computer is too busy to send a heartbeat, the message says so."""
     work = write_work(tmp_path, [sine("dwell", seconds=5)])
     notes = Late()
     with emulator(watchdog=WATCHDOG) as bench:
@@ -100,7 +100,7 @@ class LastMoment(Notes):
 
 
 def test_an_interrupt_after_the_last_line_keeps_the_run(tmp_path):
-    """A run that was over when Ctrl-C came is kept; the session ends all the same."""
+    """If Ctrl-C comes after the last line, the run is kept and the session ends."""
     work = write_work(tmp_path, [sine("first", seconds=2), sine("second", seconds=2)])
     notes = LastMoment()
     with emulator("--speed", "4") as bench, pytest.raises(KeyboardInterrupt):
@@ -111,27 +111,27 @@ def test_an_interrupt_after_the_last_line_keeps_the_run(tmp_path):
 
 
 def test_a_network_port_typed_as_a_device_is_told_how_to_write_it():
-    """Neither a number nor HOST:PORT is a device; the message names the form that works."""
+    """A network port typed as a device gives a message with the right form."""
     for port in ("41001", "127.0.0.1:41001"):
         with pytest.raises(HardwareError, match=r"is written socket://HOST:PORT"):
             open_line(port, baud=115_200)
 
 
 def test_a_port_that_is_taken_says_what_to_choose():
-    """A second emulator on the same port is told that port 0 picks a free one."""
+    """If a port is taken, a second emulator's message says that port 0 picks a free one."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         with pytest.raises(ConfigError, match="choose another port, or 0 for any"):
             open_link(f"socket://127.0.0.1:{taken.getsockname()[1]}")
 
 
 def test_one_is_not_many():
-    """The noun agrees with the number: one line, one encoder, two resets."""
+    """The noun agrees with its number: one line, one encoder, two resets."""
     assert str(Anomalies(lost=1, stuck=1, resets=2)) == "1 line lost, 2 resets, 1 encoder stuck"
     assert str(Anomalies(lost=2, stuck=2, resets=1)) == "2 lines lost, 1 reset, 2 encoders stuck"
 
 
 def test_a_new_submission_says_what_the_bench_does_not_know(tmp_path):
-    """The springs are there to be checked; authors and design only need their # removed."""
+    """A new submission has springs to check, and authors and design to uncomment."""
     bench = Description(name="two", encoders=2, carts=2, commands=EXTENSIONS, position_unit="cm")
     folder = tmp_path / "new"
     assert prepare_submission(folder, bench, stock=False).authors == ()
@@ -145,7 +145,7 @@ def test_a_new_submission_says_what_the_bench_does_not_know(tmp_path):
 
 
 def test_where_nothing_was_recorded_no_report_is_offered(tmp_path, fast):
-    """The message says which limit is too small; no report is offered, as nothing was recorded."""
+    """If no recording was possible, the message names the limit and offers no report."""
     near = PlanLimits(input=0.5, travel=0.05)
     work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=near)
     with host(work, fast.address, "--only", "dwell", "--yes") as process:
@@ -157,7 +157,7 @@ def test_where_nothing_was_recorded_no_report_is_offered(tmp_path, fast):
 
 
 def test_files_need_a_submission_to_go_to(tmp_path):
-    """If the folder does not exist, the message says how to make it."""
+    """If the folder for imported files does not exist, the message says how to make it."""
     where = str(tmp_path / "new")
     done = CliRunner().invoke(app, ["acquire", where, "--import", str(tmp_path), "--once"])
     assert isinstance(done.exception, ConfigError)

@@ -1,4 +1,4 @@
-"""The raw file describes itself, holds the bytes as they came, and survives every interruption."""
+"""The raw file describes itself, holds the bytes as they came, and survives interruptions."""
 
 import pytest
 
@@ -36,7 +36,7 @@ def raw(tmp_path):
 
 
 def test_what_was_written_is_read(raw):
-    """Header, bytes and chunks all come back, with rising times."""
+    """Header, bytes and chunks of a raw file are read as written, with rising times."""
     run = read_raw(raw)
     assert run.header == HEADER
     assert run.content == b"".join(LUMPS)
@@ -55,7 +55,7 @@ def test_the_bytes_follow_the_first_line_as_they_came(raw):
 
 @pytest.mark.parametrize("which", [".raw", ".times"])
 def test_a_file_cut_at_any_byte_is_read_up_to_there(raw, which):
-    """Wherever the file ends, every complete line before is read, and no line is invented."""
+    """A raw file cut anywhere gives every complete line before the cut, and no other line."""
     path = raw.with_suffix(which)
     whole = path.read_bytes()
     first = len(HEADER.to_json().encode()) + 1 if which == ".raw" else 0
@@ -69,7 +69,7 @@ def test_a_file_cut_at_any_byte_is_read_up_to_there(raw, which):
 
 
 def test_a_raw_file_is_never_written_over(raw):
-    """A second run of the same name is refused and the first file stays."""
+    """A second run of the same name is refused, and the first raw file stays."""
     with pytest.raises(FileExistsError), RawWriter(raw, HEADER):
         pass
     assert read_raw(raw).content == b"".join(LUMPS)
@@ -87,7 +87,7 @@ def test_a_raw_file_is_never_written_over(raw):
     ],
 )
 def test_what_is_no_raw_file_is_refused(tmp_path, content, why):
-    """A file without a whole header is one error that names the file."""
+    """A file without a whole header gives one error that names the file."""
     path = tmp_path / "strange.raw"
     path.write_bytes(content)
     with pytest.raises(DataError, match=f"strange.raw: .*{why}"):
@@ -95,7 +95,7 @@ def test_what_is_no_raw_file_is_refused(tmp_path, content, why):
 
 
 def test_the_record_reads_as_a_bench_log(raw, tmp_path):
-    """The data file is an ordinary bench log, with scaled counts and straight stamps."""
+    """The data file is a normal bench log, with scaled counts and even time stamps."""
     text = """version = 1
 [system]
 carts = 2
@@ -117,7 +117,7 @@ file = "data/sine-µ.txt"
 
 
 def test_a_closed_loop_has_its_reference():
-    """Under feedback the target is a column of its own, read as the reference."""
+    """Under feedback the target has its own column, which is read as the reference."""
     heading, first, *_ = log_text(LINES, carts=1, reference=True).splitlines()
     assert heading == "Sample\tTime\tEncoder 1 Pos\tTarget\tControl Effort"
     assert first == "0\t0.000\t0\t0\t0"

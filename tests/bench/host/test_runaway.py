@@ -1,4 +1,4 @@
-"""A bench that misbehaves is stopped and not started again, in every state of a session."""
+"""A bench that misbehaves is stopped and not started again, in every phase of a session."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -22,10 +22,10 @@ from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 
-AT_ONCE = 20  # ms of the bench, as docs/bench.md promises
+AT_ONCE = 20  # ms on the bench's clock, as docs/bench.md promises
 FULL = 4096
-FAR = round(11.0 / PER_COUNT)  # counts, of a limit of 2.5 cm
-BY_HANDS = EXTENSIONS - {"h"}  # people move the carts
+FAR = round(11.0 / PER_COUNT)  # counts, for a limit of 2.5 cm
+BY_HANDS = EXTENSIONS - {"h"}  # a person moves the carts
 Wrong = Callable[[RunawayBench], bool]
 
 
@@ -59,37 +59,37 @@ def resting(bench: RunawayBench) -> bool:
 
 
 def resting_again(bench: RunawayBench) -> bool:
-    """Return one that misbehaves before the second recording, with the carts zeroed at rest."""
+    """Return a bench that misbehaves before the second recording, with the carts zeroed at rest."""
     return resting(bench) and len(bench.starts) > 2
 
 
 def running(bench: RunawayBench) -> bool:
-    """Return one that misbehaves while the motor should move the carts."""
+    """Return a bench that misbehaves while the motor should move the carts."""
     return bench.run_on is not None and bench.run_on.amplitude != 0
 
 
 def between(bench: RunawayBench) -> bool:
-    """Return one that misbehaves between the stop of the first run and the next rest."""
+    """Return a bench that misbehaves between the stop of the first run and the next rest."""
     return bench.is_stopped and len(bench.starts) == 2
 
 
 def tried(bench: RunawayBench) -> bool:
-    """Return one that misbehaves in the empty run with which a host looks for a stock bench."""
+    """Return a bench that misbehaves in the empty run that shows whether it is a stock bench."""
     return bench.run_on is not None and len(bench.starts) == 1
 
 
 def ended(bench: RunawayBench) -> bool:
-    """Return one that misbehaves after a stock bench has finished its first recording."""
+    """Return a stock bench that misbehaves after its first recording."""
     return bench.run_on is None and len(bench.starts) == 3
 
 
 def at_the_end(bench: RunawayBench) -> bool:
-    """Return one that misbehaves after the last recording."""
+    """Return a bench that misbehaves after the last recording."""
     return bench.is_stopped and len(bench.starts) == 4
 
 
 def assert_over(bench: RunawayBench) -> None:
-    """Check that it misbehaved, was stopped at once, and was not started again."""
+    """Check that the bench misbehaved, was stopped at once, and was not started again."""
     assert bench.offence is not None
     assert bench.told is not None
     assert bench.told - bench.offence <= AT_ONCE
@@ -99,7 +99,7 @@ def assert_over(bench: RunawayBench) -> None:
 def session(
     work: Path, bench: RunawayBench, *, notes: Notes | None = None, only: Sequence[str] = ()
 ) -> tuple[list[str], str]:
-    """Acquire; return the reasons of the incomplete runs, and what ended the session."""
+    """Acquire; return the reasons of the incomplete runs, and the error that ended the session."""
     notes, error = notes or Notes(), ""
     everything = [recording.id for recording in plan()]
     try:
@@ -112,7 +112,7 @@ def session(
 @pytest.mark.parametrize("wrong", [before_start, between, at_the_end])
 @pytest.mark.parametrize("commands", [EXTENSIONS, BY_HANDS], ids=["hands", "people"])
 def test_a_motor_that_is_on_while_no_run_is_ends_the_session(tmp_path, wrong, commands):
-    """The line is watched before the first run, between two runs and after the last one."""
+    """If the motor is on outside a run, before, between or after runs, the session ends."""
     work = write_work(tmp_path, plan())
     with RunawayBench(wrong, duty=FULL, commands=commands) as bench:
         partial, error = session(work, bench)
@@ -126,7 +126,7 @@ def test_a_motor_that_is_on_while_no_run_is_ends_the_session(tmp_path, wrong, co
 @pytest.mark.parametrize("duty", [FULL, 3])
 @pytest.mark.parametrize("wrong", [resting, resting_again, running])
 def test_a_motor_that_is_not_driven_as_told_ends_the_session(tmp_path, wrong, duty):
-    """In a rest or a run: full duty, or a few counts, that nothing asked for."""
+    """If the motor has another duty than ordered, full or slight, the session ends."""
     work = write_work(tmp_path, plan())
     with RunawayBench(wrong, duty=duty) as bench:
         (partial,), error = session(work, bench)
@@ -138,7 +138,7 @@ def test_a_motor_that_is_not_driven_as_told_ends_the_session(tmp_path, wrong, du
 
 
 def test_a_cart_past_its_limit_at_rest_ends_the_session(tmp_path):
-    """Once the carts are zeroed at rest, their travel is watched in every rest."""
+    """Once the carts are zeroed, their travel is watched in every rest."""
     work = write_work(tmp_path, plan())
     with RunawayBench(resting_again, out=FAR) as bench:
         (partial,), _ = session(work, bench)
@@ -147,7 +147,7 @@ def test_a_cart_past_its_limit_at_rest_ends_the_session(tmp_path):
 
 
 def test_before_the_carts_are_zeroed_they_may_be_anywhere(tmp_path):
-    """A cart's position when the line is opened is not its zero, so nothing is stopped."""
+    """Before the carts are zeroed, no position stops the bench."""
     work = write_work(tmp_path, plan())
     with RunawayBench(lambda bench: bench.resets < 3, out=FAR) as bench:
         assert session(work, bench) == ([], "")
@@ -155,10 +155,10 @@ def test_before_the_carts_are_zeroed_they_may_be_anywhere(tmp_path):
 
 
 def test_carts_that_a_run_took_too_far_may_swing_back(tmp_path):
-    """After a run that was stopped for its travel, the next one waits and is recorded."""
+    """After a run that was stopped for its travel, the next run waits and is recorded."""
     near = PlanLimits(
         input=0.5, travel=70 * PER_COUNT
-    )  # one count for two of duty: at most 82 counts
+    )  # one count per two duty counts: at most 82 counts
 
     def swinging(bench: RunawayBench) -> bool:
         return resting_again(bench) and bench.ms - bench_began.setdefault("at", bench.ms) < 50
@@ -174,7 +174,7 @@ def test_carts_that_a_run_took_too_far_may_swing_back(tmp_path):
 
 
 def test_a_cart_that_stays_too_far_out_is_not_driven_again(tmp_path):
-    """If the cart is still too far out after a rest, the motor is not started."""
+    """If a cart is still too far out after a rest, the motor is not started."""
     near = PlanLimits(input=0.5, travel=70 * PER_COUNT)
     first, second = plan()
     work = write_work(tmp_path, [first.model_copy(update={"amplitude": 0.03}), second], limits=near)
@@ -185,7 +185,7 @@ def test_a_cart_that_stays_too_far_out_is_not_driven_again(tmp_path):
 
 
 def test_a_stop_that_is_not_heeded_is_sent_again(tmp_path):
-    """If a bench goes on after its stop, the stop is sent again and no run is started."""
+    """If a bench goes on after a stop command, the stop is sent again and no run is started."""
     near = PlanLimits(input=0.5, travel=70 * PER_COUNT)
     first, second = plan()
     work = write_work(tmp_path, [first.model_copy(update={"amplitude": 0.03}), second], limits=near)
@@ -202,7 +202,7 @@ def test_a_stop_that_is_not_heeded_is_sent_again(tmp_path):
 
 @pytest.mark.parametrize("period", [1, 2, 5, 10])
 def test_a_bench_of_few_lines_is_stopped_as_soon(period):
-    """Two lines that are far apart suffice: the limit counts milliseconds, not lines."""
+    """On a bench with few lines two of them suffice: the limit is in ms, not in lines."""
     order = make_order(
         plan()[0],
         limits=PlanLimits(input=0.5, travel=2.5),
@@ -218,7 +218,7 @@ def test_a_bench_of_few_lines_is_stopped_as_soon(period):
 
 
 class Pulling(Notes):
-    """A person who pulls a cart out and is not done before the bench is stopped."""
+    """A person who is still pulling a cart out when the bench is stopped."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -238,17 +238,17 @@ class Pulling(Notes):
 
 
 def test_a_motor_that_comes_on_while_a_person_is_awaited_is_stopped(tmp_path):
-    """However long somebody holds the cart, the stop does not wait for the Enter key."""
+    """If the motor starts while a person holds a cart, the bench is stopped at once."""
     work, notes = write_work(tmp_path, [decay("decay")]), Pulling()
     with RunawayBench(notes.is_pulling, duty=FULL, commands=BY_HANDS) as notes.bench:
         (partial,), _ = session(work, notes.bench, notes=notes, only=["decay"])
     assert_over(notes.bench)
     assert partial.startswith("stopped: the bench drives its motor")
-    assert partial in notes.remarks  # at once, not after the key
+    assert partial in notes.remarks  # at once, not only after the Enter key
 
 
 def test_a_motor_that_comes_on_while_a_virtual_hand_pulls_is_stopped(tmp_path):
-    """The hands of a virtual bench take their time as well."""
+    """If the motor starts while the virtual bench pulls a cart, the bench is stopped."""
     work = write_work(tmp_path, [decay("decay")])
     with RunawayBench(lambda bench: bench.is_pulled, duty=FULL) as bench:
         (partial,), _ = session(work, bench, only=["decay"])
@@ -257,7 +257,7 @@ def test_a_motor_that_comes_on_while_a_virtual_hand_pulls_is_stopped(tmp_path):
 
 
 def test_a_motor_that_comes_on_in_a_decay_by_hand_is_stopped(tmp_path):
-    """A run that only a hand moves has no duty at all."""
+    """If the motor starts in a decay by hand, in which it has no duty, the bench is stopped."""
 
     def in_the_decay(bench: RunawayBench) -> bool:
         return bench.run_on is not None and len(bench.starts) == 2
@@ -270,7 +270,7 @@ def test_a_motor_that_comes_on_in_a_decay_by_hand_is_stopped(tmp_path):
 
 
 def test_a_bench_that_misbehaves_after_its_line_was_lost_is_stopped(tmp_path):
-    """A line that is opened again is watched from its first answer on."""
+    """After a lost line is opened again, the bench is watched from its first answer on."""
 
     def mute(bench: RunawayBench) -> bool:
         return bench.resets == 3 and bench.lines > 800  # in the first run
@@ -288,7 +288,7 @@ def test_a_bench_that_misbehaves_after_its_line_was_lost_is_stopped(tmp_path):
 
 @pytest.mark.parametrize("wrong", [resting, running])
 def test_an_exploration_ends_where_the_bench_misbehaves(tmp_path, wrong):
-    """An exploration does not choose another experiment on a bench that misbehaves."""
+    """If the bench misbehaves, an exploration ends and chooses no other experiment."""
     with RunawayBench(wrong, duty=FULL) as bench:
         with pytest.raises(HardwareError, match=r"stopped: .*; the exploration ends here"):
             explore_bench(
@@ -304,7 +304,7 @@ def test_an_exploration_ends_where_the_bench_misbehaves(tmp_path, wrong):
 
 @pytest.mark.parametrize("wrong", [tried, resting, running, ended])
 def test_a_stock_bench_that_misbehaves_is_stopped(tmp_path, wrong):
-    """A bench that answers no query is watched as well."""
+    """A stock bench, which answers no query, is watched as well."""
     scales = f'input = {{ unit = "V", per_count = {0.5 / FULL} }}\n'
     work = write_work(tmp_path, plan(), scales=scales)
     text = (work / "submission.toml").read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The motor never stays on, whatever the line, the terminal or a plan does."""
+"""The motor never stays on, whatever happens to the line, the terminal or the plan."""
 
 import os
 import queue
@@ -46,7 +46,7 @@ TWO_CARTS = System(carts=2, springs=(True,) * 3)
 
 
 class Alone(Notes):
-    """A session without a person at the bench."""
+    """A session without a person at the bench, in which every instruction is refused."""
 
     def confirm(self, instruction: str) -> None:
         """Refuse."""
@@ -54,7 +54,7 @@ class Alone(Notes):
 
 
 def test_lines_that_cannot_be_read_end_a_run(tmp_path):
-    """Without readable lines no limit can be checked, so the motor is stopped."""
+    """If lines cannot be read, no limit can be checked, so the motor is stopped."""
     work = write_work(tmp_path, [sine("dwell", seconds=10)])
     with emulator("--fault", "garble=1") as bench:
         (outcome,) = acquire(work, port=bench.address, observers=[Alone()], only=["dwell"])
@@ -65,7 +65,7 @@ def test_lines_that_cannot_be_read_end_a_run(tmp_path):
 
 
 def test_a_run_that_passed_a_limit_is_not_tried_again(tmp_path, fast):
-    """With `--yes` the carts are still not driven past the limit three times."""
+    """A run that passed a limit is not repeated, even with `--yes`."""
     near = PlanLimits(input=0.5, travel=0.1)  # cm: the dwell passes it within its first swing
     work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=near)
     notes = Notes()
@@ -75,7 +75,7 @@ def test_a_run_that_passed_a_limit_is_not_tried_again(tmp_path, fast):
 
 
 def test_a_plan_for_a_stronger_bench_moves_nothing(tmp_path, real):
-    """A bench of 0.5 V has a tenth of "5 V"; the plan is refused with both numbers."""
+    """A plan for 5 V is refused on a bench of 0.5 V, with both numbers."""
     strong = PlanLimits(input=5.0, travel=2.5)
     work = write_work(tmp_path, [sine("dwell", seconds=1)], limits=strong)
     with pytest.raises(
@@ -88,7 +88,7 @@ def test_a_plan_for_a_stronger_bench_moves_nothing(tmp_path, real):
 
 
 def test_the_numbers_are_said_before_anything_moves(tmp_path, fast):
-    """The limits are listed beside full scale and count.
+    """Before anything moves, the limits are printed with full scale and encoder count.
 
     2.5 cm in counts of 0.00227 cm are 1101.
     """
@@ -100,9 +100,9 @@ def test_the_numbers_are_said_before_anything_moves(tmp_path, fast):
 
 
 def test_what_a_bench_cannot_do_is_left_out_and_the_rest_recorded(tmp_path):
-    """A chirp on a stock bench, and less than one count, are skipped with reasons.
+    """A chirp on a stock bench, or less than one count, is skipped with a reason.
 
-    Exit status 1.
+    All other recordings are made, and the exit status is 1.
     """
     chirp = Recording(
         id="sweep",
@@ -134,7 +134,7 @@ def test_what_a_bench_cannot_do_is_left_out_and_the_rest_recorded(tmp_path):
 
 def test_a_bench_that_goes_on_after_its_run_is_stopped(tmp_path, monkeypatch, real):
     """A bench that runs more cycles than ordered, as after a changed digit, is stopped."""
-    # A bench that gets no time near the end of its run would seem to be done.
+    # A bench that gets no processor time near the end of its run would seem to have finished.
     monkeypatch.setattr("pipeline.bench.host.session._AFTER_END", PATIENCE)
     with _session(real) as (session, _, ask):
         order = make_order(sine("dwell", seconds=20), **ask)
@@ -163,7 +163,7 @@ def _session(bench: Emulator, *, carts: int = 2, observer: Notes | None = None):
 
 @pytest.mark.parametrize("change", [{"frequency": 3.0}, {"amplitude": 92}, {"wave": Wave.TRIANGLE}])
 def test_a_changed_digit_of_a_start_is_noticed(tmp_path, monkeypatch, change, real):
-    """The targets in the lines differ from the wave, so the run ends and is tried again."""
+    """If a digit of a start command was changed, the targets show it, and the run is repeated."""
     with _session(real) as (session, line, ask):
         order = make_order(sine("dwell", seconds=2), **ask)
         send = line.send
@@ -193,7 +193,7 @@ class Slow(Notes):
 
 
 def test_the_stop_goes_out_before_anybody_is_told(tmp_path, real):
-    """The motor stops even if an observer hangs at the very line past the limit."""
+    """The motor is stopped even if an observer hangs at the line that passes the limit."""
     with _session(real, observer=Slow()) as (session, _, ask):
         near = PlanLimits(input=0.5, travel=22 * 0.00227)
         order = make_order(sine("dwell", seconds=4), **{**ask, "limits": near})
@@ -210,10 +210,10 @@ def test_the_stop_goes_out_before_anybody_is_told(tmp_path, real):
 
 
 def test_every_cart_of_the_bench_is_watched(tmp_path, real):
-    """If a submission has one cart and the bench two, the second cart is watched too."""
+    """On a bench of two carts, both are watched even if the submission has only one."""
     with _session(real, carts=1) as (session, _, ask):
         near = PlanLimits(input=0.5, travel=0.25)
-        # At their second resonance, near 6 Hz, the second cart moves twice as far as the first.
+        # At the second resonance, near 6 Hz, the second cart moves twice as far as the first.
         dwell = sine("dwell", seconds=8, frequency=6.0)
         order = make_order(
             dwell.model_copy(update={"carts": (1,), "amplitude": 0.02}), **{**ask, "limits": near}
@@ -223,7 +223,7 @@ def test_every_cart_of_the_bench_is_watched(tmp_path, real):
 
 
 def test_a_new_line_is_zeroed_once_the_carts_rest(tmp_path, real):
-    """A line opened while carts swing has a zero in mid-swing; the next run's zero is at rest."""
+    """If a line is opened while carts swing, the zero is set again once they are at rest."""
     recording = sine("dwell", seconds=1, settle=3.0)
     notes = Notes()
     with _session(real, observer=notes) as (session, line, ask):
@@ -245,7 +245,7 @@ def test_a_new_line_is_zeroed_once_the_carts_rest(tmp_path, real):
 
 
 class Answers(threading.Thread):
-    """A port on which each query gets the next of some answers."""
+    """A port on which each query gets the next one of some answers."""
 
     def __init__(self, answers: Iterable[bytes]) -> None:
         super().__init__(daemon=True)
@@ -263,7 +263,7 @@ class Answers(threading.Thread):
 
 
 def test_a_description_is_believed_when_it_came_twice():
-    """A changed digit would move every limit, so answers that differ are asked for again."""
+    """The bench's description is asked for until two answers agree, as one may be damaged."""
     true = DESCRIPTION.encode() + b"\n"
     wrong = [true.replace(b"0.002cm", b"0.00%dcm" % digit) for digit in (1, 3, 6)]
     port = Answers([wrong[0], true, true])
@@ -277,14 +277,14 @@ def test_a_description_is_believed_when_it_came_twice():
 
 
 def test_a_late_answer_leaves_none_under_way():
-    """A bench that is asked twice answers twice; the run starts after both answers.
+    """A run starts only after both answers to two queries have arrived.
 
-    An answer that is lost, here by a byte before it, delays nobody.
+    If an answer is lost, here through a byte before it, the start is not delayed.
     """
     described = DESCRIPTION.encode() + b"\n"
 
     def answers() -> Iterator[bytes]:
-        yield from (described, described)  # of the handshake
+        yield from (described, described)  # bytes of the handshake
         time.sleep(0.8)
         yield described
         time.sleep(0.1)
@@ -302,7 +302,7 @@ def test_a_late_answer_leaves_none_under_way():
 
 
 def test_a_stock_bench_may_take_half_a_second_to_begin(monkeypatch):
-    """A busy computer may deliver the lines of the trial run late."""
+    """The trial run of a stock bench may deliver its lines half a second late."""
     monkeypatch.setattr("pipeline.bench.host.serial_line._ANSWER", 0.05)  # to what it cannot answer
     door = socket.create_server(("127.0.0.1", 0))
 
@@ -324,9 +324,9 @@ def test_a_stock_bench_may_take_half_a_second_to_begin(monkeypatch):
 
 @pytest.fixture
 def _hearing() -> Iterator[None]:
-    """Let programs started here end with their terminal, also under nohup.
+    """Let programs started here end with their terminal, even under nohup.
 
-    They inherit an ignored signal, as nohup wants it, but not a function that ignores it.
+    Programs inherit an ignored signal, as nohup wants, but not a function that ignores it.
     """
     before = signal.signal(signal.SIGHUP, lambda number, frame: None)
     yield
@@ -336,7 +336,7 @@ def _hearing() -> Iterator[None]:
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no SIGHUP")
 @pytest.mark.usefixtures("_hearing")
 def test_a_closed_terminal_stops_the_motor(tmp_path, real):
-    """SIGHUP ends a run with a stop, not by the watchdog, and the data so far are saved."""
+    """If the terminal is closed, the run ends by a stop command and its data are saved."""
     work = write_work(tmp_path, [sine("dwell", seconds=30)])
     with host(work, real.address, "--only", "dwell") as process:
         until_bytes(work / "raw" / "dwell-1.raw", process)
@@ -349,7 +349,7 @@ def test_a_closed_terminal_stops_the_motor(tmp_path, real):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no file's size")
 def test_a_full_disk_stops_the_motor_and_says_what_to_do(tmp_path, real):
-    """A run that cannot be saved ends with a stop; the message names the folder, not `--out`."""
+    """If the disk is full, the run ends by a stop command, and the message names the folder."""
     work = write_work(tmp_path, [sine("dwell", seconds=30)])
     command = 'ulimit -f 20; exec "$0" -m pipeline acquire "$1" --port "$2" --only dwell'
     shell = ["sh", "-c", command, sys.executable, work, real.address]
@@ -379,14 +379,14 @@ DESCRIPTION = (
     ],
 )
 def test_a_description_that_no_limit_can_be_reckoned_with_is_refused(stated, wrong):
-    """Counts worth zero or infinitely much would switch the limits off."""
+    """A description whose counts are worth zero or infinity is refused: no limit would hold."""
     assert parse_description(DESCRIPTION.encode()).carts == 2
     with pytest.raises(DataError, match=f"describes itself as .*{wrong}.* is wrong"):
         parse_description(DESCRIPTION.replace(stated, wrong).encode())
 
 
 def test_more_than_the_bench_can_give_is_refused():
-    """An amplitude past full scale would be clipped, and a sine would not be a sine."""
+    """An amplitude beyond full scale is refused, as it would be clipped."""
     bench = Description(name="b", encoders=2, carts=2)
     scales = CountScales(input=1e-4, position=0.002)
     ask = {"limits": LIMITS, "scales": scales, "system": TWO_CARTS, "bench": bench}
@@ -399,7 +399,7 @@ def test_more_than_the_bench_can_give_is_refused():
 def test_a_lost_byte_leaves_no_gains_of_an_earlier_run():
     """A gain command that lost a letter or a semicolon does nothing.
 
-    Old gains do not act either.
+    Gains sent earlier do not act either.
     """
     bench = Description(name="b", encoders=2, carts=2, commands=EXTENSIONS)
     loop = sine("loop", seconds=1).model_copy(update={"controller": StateLoop()})
@@ -433,7 +433,7 @@ def _header(name: str) -> RawHeader:
 
 
 def test_nothing_is_written_outside_or_over_the_data_of_others(tmp_path, fast):
-    """Neither a raw file that names another place nor a plan's id reaches another file."""
+    """Neither the path in a raw file nor a plan's id can make cartlab write to another file."""
     work = write_work(tmp_path / "a" / "work", [sine("dwell", seconds=1)])
     (work / "data").mkdir()
     mine = work / "data" / "dwell.txt"
@@ -450,7 +450,7 @@ def test_nothing_is_written_outside_or_over_the_data_of_others(tmp_path, fast):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links need a privilege on Windows")
 def test_a_raw_file_is_not_written_through_a_link(tmp_path):
-    """A link in place of a run's time file is replaced; its target stays as it is."""
+    """A link in place of a run's time file is replaced, and its target stays as it is."""
     mine = tmp_path / "mine"
     mine.write_text("mine", encoding="utf-8")
     (tmp_path / "dwell-1.times").symlink_to(mine)
@@ -470,7 +470,7 @@ print('held')"""
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 @pytest.mark.parametrize(("typed", "held"), [(b"\n", True), (b"\x04", False)])
 def test_only_what_is_typed_after_the_question_answers_it(typed, held):
-    """An Enter typed before the question starts no motor; Ctrl-D is a no, in one line."""
+    """Only an Enter typed after the question starts the motor, and Ctrl-D means no."""
     controller, terminal = os.openpty()
     pipes = {"stdin": terminal, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with started([sys.executable, "-c", ASK], **pipes, encoding="utf-8") as process:

@@ -1,4 +1,4 @@
-"""From chunks of bytes to lines: which are kept and which are counted as lost."""
+"""From chunks of bytes to lines: which lines are kept, and which are counted as lost."""
 
 import numpy as np
 import pytest
@@ -65,7 +65,7 @@ def test_noise_is_never_an_error(raw, lump):
 
 @pytest.mark.parametrize("period", [1.0, 1.0024, 1.0007, 2.08])
 def test_a_clock_without_losses_is_told_exactly(period):
-    """However uneven the clock, a whole run lacks no line, and its period is found."""
+    """However uneven the clock, a whole run counts no line as lost, and its period is found."""
     fit = fit_stamps(clock(5000, period=period), period=1.0)
     assert fit.missing == 0
     # A slope through n stamps rounded to 1 ms is accurate to far less than 1 ms over the run.
@@ -75,19 +75,19 @@ def test_a_clock_without_losses_is_told_exactly(period):
 @pytest.mark.parametrize("share", [0.002, 0.01, 0.04])
 @pytest.mark.parametrize("period", [1.0, 1.0024, 2.08])
 def test_lost_lines_are_told_from_the_skips_of_an_odd_clock(period, share):
-    """Some of 20 000 lines are lost at random; the count is right although the clock skips too."""
+    """If lines are lost at random, their number is found although the clock skips too."""
     rng = np.random.default_rng(7)
     stamps = clock(20_000, period=period)
     kept = rng.random(stamps.size) > share
     kept[[0, -1]] = True
     fit = fit_stamps(stamps[kept], period=1.0)
-    # A loss that falls on a skip of the clock, or beside one, may count as the other.
+    # A loss at a skip of the clock, or beside it, may count as a skip, and a skip as a loss.
     assert abs(fit.missing - np.count_nonzero(~kept)) <= 2
     assert fit.period == pytest.approx(period, abs=2e-4)
 
 
 def test_a_short_run_counts_by_the_expected_period():
-    """300 stamps cannot distinguish 1.0024 ms from 1 ms, so the period of earlier runs decides."""
+    """In a short run the period of earlier runs decides, as 300 stamps cannot show it."""
     stamps = np.delete(clock(300, period=1.0024, phase=0.0), [50, 51, 200])
     # In 300 lines the clock skips 0.7 times on average; one loss may be taken for a skip.
     assert fit_stamps(stamps, period=1.0024).missing == 2
@@ -95,12 +95,12 @@ def test_a_short_run_counts_by_the_expected_period():
 
 
 def test_every_fault_is_counted_and_every_valid_line_kept():
-    """With drops, noise and merged lines together, whole lines are kept and faults counted."""
+    """With losses, noise and merged lines together, whole lines are kept and faults counted."""
     rng = np.random.default_rng(3)
     sent = lines(20_000)
     kind = rng.choice(["whole", "drop", "garble", "merge"], size=20_000, p=[0.97] + 3 * [0.01])
     kind[[0, 1, -2, -1]] = "whole"
-    kind[1:][kind[:-1] == "merge"] = "whole"  # the line behind a merger is damaged enough
+    kind[1:][kind[:-1] == "merge"] = "whole"  # the line after a merged one is damaged enough
     raw, whole = bytearray(), []
     for reading, what, before in zip(sent, kind, ["", *kind[:-1]], strict=True):
         line = format_reading(reading)
@@ -122,7 +122,7 @@ def test_every_fault_is_counted_and_every_valid_line_kept():
 
 @pytest.mark.parametrize("period", [1.0, 1.0004, 1.0024, 1.017, 5.003])
 def test_no_line_is_said_to_be_lost_of_a_stream_that_is_whole(period):
-    """During a run the skips of an uneven clock are not taken for losses."""
+    """During a run the skips of an uneven clock are not counted as lost lines."""
     stream = Stream(encoders=2, period=round(period))
     for i in range(10_000):
         reading = Reading(counts=(0, 0), target=0, duty=0, ms=round(i * period))
@@ -136,7 +136,7 @@ def test_no_line_is_said_to_be_lost_of_a_stream_that_is_whole(period):
     ids=["stamp ahead", "stamp behind", "count"],
 )
 def test_a_line_that_can_be_read_but_cannot_be_is_garbled(field, wrong):
-    """A digit too many or too few can still be parsed, but differs from its neighbours."""
+    """A line with a digit too many or too few can be parsed, but counts as garbled."""
     sent = lines(200)
     texts = [format_reading(reading) for reading in sent]
     struck = texts[120]
@@ -151,7 +151,7 @@ def test_a_line_that_can_be_read_but_cannot_be_is_garbled(field, wrong):
 
 
 def test_a_hard_hit_on_a_stop_is_no_fault():
-    """A cart that bounces off an end stop turns within one line; its lines are kept."""
+    """If a cart bounces off an end stop within one line, the lines are kept."""
     out = [*range(0, 600, 12), *range(600, 0, -12)]
     sent = [Reading(counts=(x, 0), target=0, duty=0, ms=i) for i, x in enumerate(out)]
     got, stream = read(join(sent))
@@ -160,7 +160,7 @@ def test_a_hard_hit_on_a_stop_is_no_fault():
 
 
 def test_a_bench_that_begins_again_ends_the_run():
-    """Stamps that start over are counted as a reset, and no line after it belongs to the run."""
+    """If stamps start again at zero, a reset is counted, and no later line belongs to the run."""
     sent = lines(500)
     got, stream = read(join(sent) + join(lines(300)))
     assert got == sent
@@ -171,7 +171,7 @@ def test_a_bench_that_begins_again_ends_the_run():
 
 
 def test_what_an_earlier_run_left_in_the_line_is_not_of_this_one():
-    """A last line, or half a line, of the run before does not count as this run's first."""
+    """A last line of the run before, or half of it, is not taken for this run's first line."""
     sent = lines(100)
     got, _ = read(b"5:0:0\n" + format_reading(lines(9000)[-1]) + join(sent))
     assert got == sent
@@ -179,9 +179,9 @@ def test_what_an_earlier_run_left_in_the_line_is_not_of_this_one():
 
 @pytest.mark.parametrize("closed", [True, False])
 def test_a_kick_of_the_duty_is_a_line_in_a_closed_loop_only(closed):
-    """At rest a controller kicks for one line when an encoder flickers.
+    """A duty in a single line at rest is accepted in a closed loop, as an encoder may flicker.
 
-    In open loop nothing does.
+    In open loop such a line is not accepted.
     """
     sent = lines(100, period=1.0)
     sent[50] = Reading(counts=sent[50].counts, target=0, duty=120, ms=sent[50].ms)
@@ -193,7 +193,7 @@ def test_a_kick_of_the_duty_is_a_line_in_a_closed_loop_only(closed):
 
 
 def test_late_lines_are_counted_and_kept():
-    """Lines held back for 60 ms and sent together are late while 20 ms of the delay are left."""
+    """Lines held back for up to 60 ms are kept, and those over 20 ms late are counted."""
     sent = lines(1000, period=1.0)
     stream = Stream(encoders=2)
     got = []
@@ -208,9 +208,9 @@ def test_late_lines_are_counted_and_kept():
 
 
 def test_a_host_that_was_busy_makes_no_line_late():
-    """Lines that waited because the host was busy are not late.
+    """Lines that waited because the host was busy do not count as late.
 
-    Its last look found the port empty.
+    The host knows that from its last look, at which the port was empty.
     """
     sent = lines(1000, period=1.0)
     stream = Stream(encoders=2)
@@ -221,7 +221,7 @@ def test_a_host_that_was_busy_makes_no_line_late():
 
 @pytest.mark.parametrize("since", [0, 2500])
 def test_an_encoder_that_stands_still_is_noticed(since):
-    """An encoder that stops, or never moves, while the motor drives is noticed."""
+    """An encoder that stops, or never moves, while the motor drives is reported as stuck."""
     sent = [
         Reading(counts=(r.counts[0], r.counts[1] if r.ms < since else 77), target=r.target,
                 duty=r.duty, ms=r.ms)
@@ -232,7 +232,7 @@ def test_an_encoder_that_stands_still_is_noticed(since):
 
 
 def test_a_cart_that_rests_after_a_step_is_not_stuck():
-    """Under a constant input a cart comes to rest; its encoder is not faulty."""
+    """A cart that comes to rest under a constant input does not count as a stuck encoder."""
     sent = [
         Reading(counts=(min(i, 300), 0), target=200, duty=200, ms=i) for i in range(4000)
     ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Stop, Skip, Keep and Repeat: a person presses; the acquiring process decides."""
+"""A person presses Stop, Skip, Keep or Repeat, and the acquiring process decides."""
 
 import threading
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ NEAR = PlanLimits(input=0.5, travel=0.1)  # cm: a dwell of 0.01 V passes it with
 
 
 class Finger(Notes):
-    """Presses buttons half a second into a recording, or when its run has ended."""
+    """An observer that presses a button half a second into a recording, or at its end."""
 
     def __init__(self, *wishes: Wish, at_end: bool = False) -> None:
         super().__init__()
@@ -33,13 +33,13 @@ class Finger(Notes):
         self._wishes, self._at_end = list(wishes), at_end
 
     def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
-        """Press."""
+        """Press the button half a second into the recording."""
         super().readings(batch, anomalies)
         if not self._at_end and self.readings_seen[-1].ms > 500:
             self._press()
 
     def finished(self, outcome: RunOutcome) -> None:
-        """Press."""
+        """Press the button when the run has ended."""
         super().finished(outcome)
         if self._at_end:
             self._press()
@@ -50,7 +50,7 @@ class Finger(Notes):
 
 
 def record(work: Path, port: str, finger: Finger, *only: str) -> list[RunOutcome]:
-    """Carry the plan out."""
+    """Record the plan with this observer."""
     with suppress(Stopped):
         acquire(work, port=port, observers=[finger], only=only, buttons=finger.buttons)
     return finger.outcomes
@@ -58,7 +58,7 @@ def record(work: Path, port: str, finger: Finger, *only: str) -> list[RunOutcome
 
 @pytest.mark.parametrize("before", [(), ("skip",), ("keep",), ("repeat",)])
 def test_stop_ends_the_session_whatever_else_was_pressed(tmp_path, before, real):
-    """The bench is stopped; the data so far are partial; nothing more is recorded."""
+    """Stop ends the session, whatever else was pressed; the data so far are partial."""
     work = write_work(tmp_path, [sine("long", seconds=30), sine("next", seconds=1)])
     finger = Finger(*before, "stop")
     with pytest.raises(Stopped):
@@ -79,7 +79,7 @@ def test_stop_ends_the_session_whatever_else_was_pressed(tmp_path, before, real)
 
 
 def test_skip_goes_on_with_the_next(tmp_path, fast):
-    """The run ends, its data are kept apart, and nobody is asked about it again."""
+    """Skip ends the run, keeps its data apart, and asks nothing more about it."""
     work = write_work(tmp_path, [sine("long", seconds=300), sine("next", seconds=1)])
     finger = Finger("skip", "repeat")
     outcomes = record(work, fast.address, finger, "long", "next")
@@ -91,7 +91,7 @@ def test_skip_goes_on_with_the_next(tmp_path, fast):
 
 
 def test_keep_takes_what_came_and_says_so(tmp_path, fast):
-    """The record holds every line so far, and its table says how it ended."""
+    """Keep records every line so far, and the table says how the run ended."""
     work = write_work(tmp_path, [sine("long", seconds=300), sine("next", seconds=1)])
     outcomes = record(work, fast.address, Finger("keep"), "long", "next")
     assert [(o.recording.id, bool(o.partial)) for o in outcomes[:2]] == [
@@ -107,7 +107,7 @@ def test_keep_takes_what_came_and_says_so(tmp_path, fast):
 
 
 def test_repeat_begins_the_run_again(tmp_path, fast):
-    """The first try does not count; the second is the record; nobody is asked."""
+    """Repeat discards the first try and records the second, without a question."""
     work = write_work(tmp_path, [sine("dwell", seconds=20)])
     finger = Finger("repeat")
     outcomes = record(work, fast.address, finger, "dwell")
@@ -118,7 +118,7 @@ def test_repeat_begins_the_run_again(tmp_path, fast):
 
 
 def test_what_passed_a_limit_is_neither_repeated_nor_kept(tmp_path, real):
-    """A limit decides, whatever is pressed."""
+    """A run that passed a limit is neither kept nor repeated, whatever is pressed."""
     for wish in ("repeat", "keep"):
         work = write_work(tmp_path / wish, [sine("dwell", seconds=4)], limits=NEAR)
         finger = Finger(wish, at_end=True)
@@ -131,7 +131,7 @@ def test_what_passed_a_limit_is_neither_repeated_nor_kept(tmp_path, real):
 
 
 def test_what_broke_off_is_kept_when_asked_about(tmp_path):
-    """After a fault the page offers three answers; Keep takes the lines before the fault."""
+    """After a fault the page offers three answers, of which Keep takes the lines before it."""
     work = write_work(tmp_path, [sine("dwell", seconds=2)])
     state, done = LiveState(work), []
     with emulator("--fault", "reset@0.6") as bench:
@@ -162,7 +162,7 @@ def test_what_broke_off_is_kept_when_asked_about(tmp_path):
 
 @pytest.mark.parametrize("wish", ["stop", "skip"])
 def test_a_run_that_waits_for_hands_need_not_begin(tmp_path, wish):
-    """A person who should free the carts presses a button instead; the motor gets no command."""
+    """If a person is asked to free the carts, Stop or Skip ends the run before the motor moves."""
     scale = 'input = { unit = "V", per_count = 0.001220703125 }\n'
     work = write_work(tmp_path, [sine("dwell", seconds=2, settle=0.3)], scales=scale)
     text = (work / "submission.toml").read_text(encoding="utf-8")

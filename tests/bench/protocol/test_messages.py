@@ -1,4 +1,4 @@
-"""Messages between host and bench arrive unchanged, and noise is never taken for a message."""
+"""Messages between host and bench arrive unchanged, and noise is not taken for a message."""
 
 import pytest
 from hypothesis import example, given
@@ -27,7 +27,7 @@ from pipeline.bench.protocol.messages import (
 from pipeline.errors import DataError
 
 ENCODERS = 2
-# Nine significant digits go over the line.
+# Nine significant digits are sent.
 numbers = st.floats(-1e9, 1e9).map(lambda x: float(f"{x:.9g}"))
 frequencies = st.floats(1e-3, 1e3).map(lambda x: float(f"{x:.9g}"))
 starts = st.builds(
@@ -125,9 +125,9 @@ def test_a_bench_without_extensions_is_reset_all_the_same(data):
         b"d;q;o;o;1;100;0;",
         b"d;x;o;o;1;100;1;",
         b"g;1;2;1e10;",
-        b"h;4;0;",  # there are two carts
+        b"h;4;0;",  # the bench has two carts
         b"h;1;3;",
-        b"f;1;2;3;4;",  # one too few, and no more comes
+        b"f;1;2;3;4;",  # one field too few, and no more comes
         b"x;;0;",
         b"d;q;o;o;0.00000000000000000000000000000001;100;1;",  # too long
     ],
@@ -214,6 +214,6 @@ def test_descriptions_come_across(bench):
     ],
 )
 def test_another_answer_is_refused(line, message):
-    """Text that is not a description, or one that lacks a field, gives one clear message."""
+    """A text that is no description, or lacks a field, gives one clear message."""
     with pytest.raises(DataError, match=message):
         parse_description(line)

@@ -39,9 +39,9 @@ def running_bench() -> Iterator[str]:
 
 @no_compiler
 def test_friction_is_compensated_on_the_virtual_bench(tmp_path):
-    """With friction in the model the cart rests on the target; without, far from it.
+    """With friction in the model the cart rests on the target; without it, far from the target.
 
-    A cart rests within the last count, and the noise of the encoder is another.
+    The cart rests within one count, and the encoder's noise adds another count.
     """
     model = AugmentedChain(chain=HIDDEN.chain, terms=HIDDEN.effects)
     save_model(model, analysed("one-cart"), tmp_path, free=(1,))
@@ -58,7 +58,7 @@ def test_friction_is_compensated_on_the_virtual_bench(tmp_path):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_the_commands_of_the_page_lead_to_the_same(tmp_path, monkeypatch):
-    """From the simulated recordings to the compensated bench."""
+    """The commands of docs/model.md lead from simulated recordings to the compensated bench."""
     monkeypatch.chdir(tmp_path)
     commands = re.findall(r"^cartlab ((?:simulate|gap) .*bench-4.*)$", PAGE, re.MULTILINE)
     assert [c.split()[0] for c in commands] == ["simulate", "gap"]

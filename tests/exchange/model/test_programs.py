@@ -48,7 +48,7 @@ SMOOTH, KNOCKS = 4e-5, 1e-3
 
 
 def model_of(*keys: str, last: bool = True) -> AugmentedChain:
-    """Return the carts with effects of sizes that are plain to see."""
+    """Return the carts with effects of clearly visible sizes."""
     effects = [find_effect(key) for key in keys]
     places = [(one.places((True, True, True)) or (0,))[-1 if last else 0] for one in effects]
     terms = [
@@ -75,9 +75,9 @@ HARD = model_of("coulomb_friction", "backlash", "input_delay", last=False)
 @no_compiler
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
 def test_c_moves_as_the_simulator_does(effect: Effect, tmp_path):
-    """A step, a sweep and a release with each effect; a shorter step makes the error smaller.
+    """With each effect, C agrees with the simulator, the better the shorter its steps are.
 
-    In theory a quarter of the step gives a sixteenth of the error; an event may spoil this.
+    In theory a quarter of the step gives a sixteenth of the error, but an event may spoil that.
     """
     model = model_of(effect.key)
     in_c = compiled(model, tmp_path)
@@ -92,7 +92,7 @@ def test_c_moves_as_the_simulator_does(effect: Effect, tmp_path):
 @no_compiler
 @pytest.mark.parametrize("run", RUNS)
 def test_c_moves_as_the_simulator_does_with_friction_play_and_delay(run, tmp_path):
-    """With all three at once, and without any effect."""
+    """With friction, play and delay together, or without effects, C agrees with the simulator."""
     u, x0 = RUNS[run]
     for name, model, limit in (("hard", HARD, KNOCKS), ("linear", model_of(), SMOOTH)):
         (tmp_path / name).mkdir()
@@ -103,7 +103,7 @@ def test_c_moves_as_the_simulator_does_with_friction_play_and_delay(run, tmp_pat
 @no_compiler
 @pytest.mark.parametrize("free", [1, 2])
 def test_a_cart_that_was_always_held_is_a_wall(free, tmp_path):
-    """It keeps its place, and nothing that only belongs to it is a parameter."""
+    """A cart that was held in all runs keeps its place, and has no parameters in the model."""
     model = model_of("coulomb_friction", "cubic_spring", last=free == 2)
     names = {p.name for p in describe(model, units=PAPER_UNITS, free=(free,)).parameters}
     assert f"m{free}" in names
@@ -119,7 +119,7 @@ def test_a_cart_that_was_always_held_is_a_wall(free, tmp_path):
 
 @no_compiler
 def test_a_cart_that_friction_holds_does_not_move(tmp_path):
-    """A force below the friction moves it by exactly zero; a moving cart stops for good."""
+    """A force below the friction does not move a cart at all, and a moving cart finally stops."""
     model = model_of("coulomb_friction", last=False)
     in_c = compiled(model, tmp_path)
     held = in_c.simulate(T, np.full(T.size, 0.99e-3), x0=np.zeros(2))
@@ -133,10 +133,10 @@ def test_a_cart_that_friction_holds_does_not_move(tmp_path):
 @no_compiler
 @pytest.mark.parametrize("interval", [1e-5, 1e-3, 7e-3])
 def test_a_delay_is_true_at_any_length_of_step(interval, tmp_path):
-    """Nothing moves before the delay is over; then the motion is that without a delay.
+    """With a delay the same motion comes later, whatever the step, and nothing moves before.
 
-    The model remembers 254 jumps of the input during a delay. Of an input that jumps more often,
-    as here every 10 us, it delays the mean.
+    The model remembers 254 jumps of the input within a delay. If there are more, as here with one
+    every 10 us, it delays their mean.
     """
     delay = SIZES["input_delay"]["delay"]
     t = np.arange(0.0, 0.2, interval)
@@ -155,9 +155,10 @@ def test_a_delay_is_true_at_any_length_of_step(interval, tmp_path):
 
 @pytest.mark.parametrize("name", RUNS)
 def test_python_control_moves_as_the_simulator_does(name):
-    """Its system agrees within 0.5 %: friction and delay are approximations there (`motion`).
+    """python-control's system agrees with the simulator within 0.5 %.
 
-    It interpolates the input linearly, so the simulator gets the mean of two samples.
+    Its friction and delay are approximations (`motion`), and it interpolates the input linearly, so
+    the simulator gets the mean of two samples.
     """
     u, x0 = RUNS[name]
     t, u = T[T < 1.0], u[T < 1.0]
@@ -175,7 +176,7 @@ def test_python_control_moves_as_the_simulator_does(name):
 
 
 def in_octave(models: dict[str, AugmentedChain], runs: str, folder: Path) -> dict[str, Array]:
-    """Return what a script prints for each model, a row of numbers for each time."""
+    """Return the numbers that a script prints for each model, one row per time."""
     found = {}
     for name, model in models.items():
         home = folder / name
@@ -197,7 +198,7 @@ def in_octave(models: dict[str, AugmentedChain], runs: str, folder: Path) -> dic
 @no_octave
 @no_compiler
 def test_octave_moves_as_c_does_with_every_effect(tmp_path):
-    """With all effects, in two models, the difference is only rounding."""
+    """With all effects, Octave and C differ only by rounding."""
     keys = [effect.key for effect in CATALOGUE]
     models = {
         "many": model_of(*(key for key in keys if key != "coulomb_friction"), last=False),
@@ -219,7 +220,7 @@ def test_octave_moves_as_c_does_with_every_effect(tmp_path):
 
 @no_octave
 def test_octave_moves_as_the_simulator_does(tmp_path):
-    """A step, a sweep and a release of 0.4 s with friction, play and delay, taken step by step."""
+    """With friction, play and delay, Octave's model agrees with the simulator step by step."""
     u = {name: run[0][T < 0.4] for name, run in RUNS.items()}
     np.savetxt(tmp_path / "u.txt", np.column_stack(list(u.values())), fmt="%.17g")
     lines = (
@@ -254,7 +255,7 @@ def hard_fmu(tmp_path_factory) -> Path:
 
 
 def simulate_in_fmpy(path: Path, u: Array, x0: Array) -> Array:
-    """Return the readings (carts, samples), the input held from sample to sample."""
+    """Return the readings (carts, samples), with the input held from sample to sample."""
     instance, refer = instantiate(path)
     values = {f"x{i + 1}_start": x for i, x in enumerate(x0)}
     y = run(instance, refer, u, values)
@@ -264,7 +265,7 @@ def simulate_in_fmpy(path: Path, u: Array, x0: Array) -> Array:
 
 
 def instantiate(path: Path) -> tuple[FMU2Slave, dict[str, int]]:
-    """Return an instance, and the references of its variables."""
+    """Return an instance of the model, and the references of its variables."""
     description = read_model_description(str(path))
     instance = FMU2Slave(
         guid=description.guid,
@@ -292,7 +293,7 @@ def run(instance, refer, u: Array, values) -> Array:
 
 @no_compiler
 def test_fmpy_finds_no_fault_in_the_fmu(hard_fmu, tmp_path):
-    """Schema, names, units and structure of the description are right, with every effect."""
+    """FMPy finds no fault in the FMU's schema, names, units and structure, with every effect."""
     assert validate_fmu(str(hard_fmu)) == []
     everything = model_of(*(effect.key for effect in CATALOGUE))
     for name, model in (("all", everything), ("none", model_of())):
@@ -305,7 +306,7 @@ def test_fmpy_finds_no_fault_in_the_fmu(hard_fmu, tmp_path):
 @no_compiler
 @pytest.mark.parametrize("name", RUNS)
 def test_fmpy_moves_as_the_simulator_does(name, hard_fmu):
-    """A step, a sweep and a release with friction, play and delay."""
+    """With friction, play and delay, the FMU in FMPy agrees with the simulator."""
     u, x0 = RUNS[name]
     found = simulate_in_fmpy(hard_fmu, u, x0)
     assert off(found, simulate_augmented(HARD, T, u, x0=x0)) < KNOCKS
@@ -313,7 +314,7 @@ def test_fmpy_moves_as_the_simulator_does(name, hard_fmu):
 
 @no_compiler
 def test_an_fmu_forgets_at_a_reset_and_returns_to_a_state(hard_fmu):
-    """A reset gives the same run again; a saved state gives the same continuation."""
+    """After a reset an FMU repeats its run, and from a saved state it continues as before."""
     instance, refer = instantiate(hard_fmu)
     values = {"x1_start": 1.5, "x2_start": 0.5, "m1": 2 * CHAIN.m[0]}
     first = run(instance, refer, STEP, values)
@@ -333,7 +334,7 @@ def test_an_fmu_forgets_at_a_reset_and_returns_to_a_state(hard_fmu):
 
 @no_compiler
 def test_an_fmu_refuses_what_it_cannot(hard_fmu):
-    """A step before the start, setting a state and a run-away cart are errors."""
+    """A step before the start, setting a state, and a cart that runs away are errors."""
     instance, refer = instantiate(hard_fmu)
     with pytest.raises(FMICallException, match="DoStep"):
         instance.doStep(currentCommunicationPoint=0.0, communicationStepSize=0.01)
@@ -346,7 +347,7 @@ def test_an_fmu_refuses_what_it_cannot(hard_fmu):
 
 @no_compiler
 def test_the_same_model_gives_the_same_bytes(hard_fmu):
-    """The file is the same twice; another model has another GUID."""
+    """The same model gives the same bytes of an FMU, and another model has another GUID."""
     assert fmu(describe(HARD, units=PAPER_UNITS))[0] == hard_fmu.read_bytes()
     other, _ = fmu(describe(model_of("coulomb_friction"), units=PAPER_UNITS))
     guids = {read_model_description(f).guid for f in (io.BytesIO(other), str(hard_fmu))}
@@ -354,7 +355,7 @@ def test_the_same_model_gives_the_same_bytes(hard_fmu):
 
 
 def test_without_a_compiler_the_fmu_has_its_sources(monkeypatch):
-    """The FMU then has no binary, and the caller knows it."""
+    """Without a compiler the FMU has only its sources, which the returned value shows."""
     monkeypatch.setattr(fmu_module.shutil, "which", lambda name: None)
     whole, compiled_too = fmu(describe(HARD, units=PAPER_UNITS))
     assert not compiled_too

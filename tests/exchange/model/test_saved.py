@@ -34,7 +34,7 @@ def analysis() -> Analysis:
 
 
 def test_the_files_are_saved_and_cleared(analysis, tmp_path):
-    """All four files are written and later removed; other files stay."""
+    """All four files of a model are written and later removed, and no other files."""
     (tmp_path / "model.slx").write_text("mine")
     said = save_model(with_effect("coulomb_friction"), analysis, tmp_path, free=(1,))
     assert all((tmp_path / name).stat().st_size > 1000 for name in FILES)
@@ -44,14 +44,14 @@ def test_the_files_are_saved_and_cleared(analysis, tmp_path):
 
 
 def test_a_drive_that_leads_its_log_is_refused_in_a_sentence(analysis, tmp_path):
-    """It would need future inputs: nothing is written, and the sentence says why."""
+    """A drive that leads its log would need future inputs: no model is saved."""
     said = save_model(with_effect("input_delay", delay=-0.01), analysis, tmp_path, free=(1,))
     assert said.startswith("no model was written: the drive leads its log")
     assert not [*tmp_path.iterdir()]
 
 
 def test_the_sign_of_the_recordings_is_reported(analysis, tmp_path):
-    """Each file says so if the recordings count the input the other way."""
+    """If the recordings count the input the other way, each file says so."""
     other_way = {
         turned: [replace(r, input_scale=-1.0 if turned else 1.0) for r in analysis.records]
         for turned in (False, True)
@@ -71,7 +71,7 @@ def read(folder: Path) -> list:
 @no_compiler
 @pytest.mark.parametrize("unit", ["µm", "*/ #error", "°", '"<&>', "\\", "??/", "m%n", ""])
 def test_a_unit_stays_a_word(unit, analysis, tmp_path):
-    """No unit of a submission can end a comment or break the description."""
+    """No unit of a submission can end a comment or damage the description."""
     units = Units(position=unit, input=unit)
     bench = replace(analysis.bench, units=units)
     save_model(with_effect("cubic_spring"), replace(analysis, bench=bench), tmp_path, free=(1,))
@@ -82,7 +82,7 @@ def test_a_unit_stays_a_word(unit, analysis, tmp_path):
 
 
 def test_every_parameter_has_its_unit_in_the_header():
-    """The unit is the submission's own."""
+    """The C header states the submission's unit of every parameter."""
     units = Units(position="mm", input="N")
     header = c_sources(describe(with_effect("quadratic_drag"), units=units))["model.h"]
     assert "double m1; /* N s^2/mm: mass of cart 1 */" in header

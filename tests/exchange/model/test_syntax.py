@@ -53,14 +53,14 @@ MODELLED = [substitute(text, {name: f"s{i}" for i, name in enumerate(SYMBOLS)}) 
 
 
 def test_every_law_of_the_catalogue_is_an_expression():
-    """Only laws with a state of their own are built into the simulators instead."""
+    """Every law of the catalogue is an expression, unless it has a state of its own."""
     assert all(laws(effect) or isinstance(effect.law, BuiltLaw) for effect in CATALOGUE)
     assert len(LAWS) >= 15
 
 
 @no_compiler
 def test_expressions_keep_their_value_in_c(tmp_path):
-    """The value is the same with precedence, powers, whole numbers, functions and every law."""
+    """In C every law and expression has the same value as in Python."""
     known = "".join(f"static const double {n} = {v!r};\n" for n, v in named().items())
     body = "".join(f"    out[{i}] = {in_c(text)};\n" for i, text in enumerate(MODELLED))
     source = (
@@ -79,7 +79,7 @@ def test_expressions_keep_their_value_in_c(tmp_path):
 
 @no_octave
 def test_expressions_keep_their_value_in_octave(tmp_path):
-    """The same, as MATLAB writes them."""
+    """In Octave, as MATLAB would write them, expressions have the same value as in Python."""
     known = "".join(f"{n} = {v!r};\n" for n, v in named().items())
     body = "".join(
         f"printf('%.17g\\n', {in_matlab(text, bodies=(), bristles=())});\n" for text in MODELLED
@@ -93,7 +93,7 @@ def test_expressions_keep_their_value_in_octave(tmp_path):
 
 @pytest.mark.parametrize("text", ["a if b else c", "a < b", "[a]", "f(a)", "a @ b", "'a'"])
 def test_what_no_law_may_have_is_refused(text):
-    """A form that no law has is an error, in both languages."""
+    """An expression that no law has is refused, in both languages."""
     with pytest.raises(ValueError, match="no part of a law"):
         in_c(text)
     with pytest.raises(ValueError, match="no part of a law"):
@@ -101,7 +101,7 @@ def test_what_no_law_may_have_is_refused(text):
 
 
 def test_numbers_for_symbols_simplify_an_expression():
-    """The expressions of a straight and of a fully bent bristle are short."""
+    """With numbers for some symbols, the expressions of a bristle become short."""
     rate = "(v - abs(v) * z) / d"
     assert substitute(rate, {"z": "0"}) == "v / d"
     assert substitute(rate, {"z": "1"}) == "(v - abs(v)) / d"

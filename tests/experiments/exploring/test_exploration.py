@@ -1,4 +1,4 @@
-"""A bench explores itself, on the emulator's carts and over a real line."""
+"""A bench explores itself, with the emulator's carts and over a real line."""
 
 import json
 from dataclasses import replace
@@ -39,12 +39,12 @@ from tests.helpers.virtual import VirtualBench, VirtualSession, new_folder
     ],
 )
 def test_error_goals_are_read_from_text(text, wish):
-    """A name or none, and a percentage."""
+    """A goal is read as a percentage, with or without a parameter's name."""
     assert read_error_goal(text) == wish
 
 
 def test_durations_are_read_in_seconds_minutes_or_hours():
-    """In seconds, minutes or hours."""
+    """A duration is read in seconds, minutes or hours."""
     assert [read_time(t) for t in ("90s", "20min", "20 min", "1.5h")] == [90, 1200, 1200, 5400]
 
 
@@ -52,7 +52,7 @@ def test_durations_are_read_in_seconds_minutes_or_hours():
     "text", ["zeta", "zeta 1", "zeta omega 1%", "1.5", "0%", "200%", "%", "zeta 1% K 2%"]
 )
 def test_what_is_no_wish_is_refused(text):
-    """The message has an example."""
+    """A text that is no goal is refused with an example."""
     with pytest.raises(ConfigError, match="expected a name and a percentage"):
         read_error_goal(text)
 
@@ -61,14 +61,14 @@ def test_what_is_no_wish_is_refused(text):
     "text", ["20", "min", "-3s", "20 parsec", "inf s", "1e999s", "1e308h", "nan s"]
 )
 def test_what_is_no_duration_is_refused(text):
-    """The message has an example."""
+    """A text that is no duration is refused with an example."""
     with pytest.raises(ConfigError, match="expected a duration"):
         read_time(text)
 
 
 @pytest.fixture(scope="module")
 def explored(tmp_path_factory):
-    """A bench with a stop far out to one side, where no step goes, explored to the end."""
+    """A bench with an end stop far out on one side, where no step reaches, explored to the end."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=["end_stop:position=-1.7"])
     folder = tmp_path_factory.mktemp("explored") / "work"
     said: list[str] = []
@@ -84,7 +84,7 @@ def explored(tmp_path_factory):
 
 
 def test_an_exploration_names_what_acts_and_knows_the_carts(explored):
-    """The stop is named on its cart, and every parameter is known and right."""
+    """The exploration names the end stop on its cart, and finds every parameter correctly."""
     folder, turns, said, bench = explored
     last = turns[-1]
     assert last.verdict == "named"
@@ -102,7 +102,7 @@ def test_an_exploration_names_what_acts_and_knows_the_carts(explored):
 
 
 def test_an_exploration_leaves_an_ordinary_submission_and_its_diary(explored):
-    """Every record is in submission.toml and plan.toml; each turn is in the diary."""
+    """Every record is in submission.toml and plan.toml, and every turn is in the diary."""
     folder, turns, _, _ = explored
     recorded = [name for turn in turns for name in turn.recorded]
     submission = load_submission(folder)
@@ -114,7 +114,7 @@ def test_an_exploration_leaves_an_ordinary_submission_and_its_diary(explored):
 
 
 def test_an_exploration_keeps_no_trace_that_its_diary_does_not_show(explored):
-    """Earlier turns keep the one run of their picture; the last one has all runs."""
+    """Earlier turns keep only the run in their picture, and the last turn keeps all runs."""
     folder, turns, _, _ = explored
     *earlier, last = [turn.gap for turn in turns]
     assert earlier
@@ -124,7 +124,7 @@ def test_an_exploration_keeps_no_trace_that_its_diary_does_not_show(explored):
 
 @pytest.fixture
 def no_gap(monkeypatch):
-    """Only the carts are identified, if the gap does not matter or cannot be searched."""
+    """Make the search for the gap fail, so that only the carts are identified."""
 
     def none(analysis, **other):
         raise DataError("no run can be held out")
@@ -134,9 +134,9 @@ def no_gap(monkeypatch):
 
 @pytest.mark.usefixtures("no_gap")
 def test_time_that_is_up_ends_it_before_the_next_recording(tmp_path):
-    """No recording begins that would last too long; the diary says which it would have been.
+    """No recording begins that would last too long, and the diary says which it would have been.
 
-    If the gap cannot be searched, the carts are identified and no claim is made about effects.
+    If the gap cannot be searched, the carts are identified and no effect is named.
     """
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
@@ -154,7 +154,7 @@ def test_time_that_is_up_ends_it_before_the_next_recording(tmp_path):
 
 
 def test_less_time_than_the_sweep_takes_moves_no_cart(tmp_path):
-    """Nothing is recorded, and the message says how much time is needed."""
+    """If the time is too short for the first sweep, nothing is recorded, and a message says so."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     virtual = VirtualBench(bench, seed=1)
     session = VirtualSession(tmp_path / "work", virtual)
@@ -170,7 +170,7 @@ def test_less_time_than_the_sweep_takes_moves_no_cart(tmp_path):
 
 
 def test_a_wish_that_meets_no_parameter_is_refused_before_a_cart_moves(explored, tmp_path):
-    """The message has the nearest name; nothing is recorded."""
+    """A goal for a parameter that does not exist is refused with the nearest name."""
     asked: list[str] = []
 
     def record(ids):
@@ -187,7 +187,7 @@ def test_a_wish_that_meets_no_parameter_is_refused_before_a_cart_moves(explored,
 
 
 def test_a_wish_for_what_a_rigid_cart_has_is_heard(tmp_path):
-    """Nobody knows yet whether springs hold the carts, so the first sweep is made."""
+    """A goal for a rigid cart is accepted, as nobody knows yet whether springs hold the carts."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
     with pytest.raises(ConfigError, match="the first sweep alone takes"):
@@ -202,7 +202,7 @@ def test_a_wish_for_what_a_rigid_cart_has_is_heard(tmp_path):
 
 @pytest.mark.usefixtures("no_gap")
 def test_a_bench_on_which_nothing_comes_off_is_left_after_three_tries(tmp_path):
-    """Each time another recording is chosen; the diary says what failed, and why."""
+    """If three recordings fail, an exploration ends, and the diary says what failed and why."""
     asked = []
 
     def record(ids):
@@ -224,9 +224,9 @@ def test_a_bench_on_which_nothing_comes_off_is_left_after_three_tries(tmp_path):
 
 
 def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
-    """A vetoed recording is replaced, an added one comes next, and the diary shows both.
+    """A recording that a person vetoes is replaced, and one that is added comes next.
 
-    gap.json is written again; it proposes what decides apart from the vetoed recording.
+    gap.json is written again, with the recording that decides if the vetoed one is left out.
     """
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     folder, offered, said = tmp_path / "work", [], []
@@ -270,7 +270,7 @@ def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
 
 
 def test_what_is_added_counts_whatever_it_is_called(tmp_path):
-    """Even with an id that the program would give its own first step, in an empty plan."""
+    """A recording that a person adds comes next, even with the id of the program's own step."""
     bench = VirtualBench(prepare_bench(preset="throne-1dof", model=None, hide=[]), seed=1)
     folder = new_folder(tmp_path / "work", bench, springs=[True, True])
     submission = load_submission(folder)
@@ -303,7 +303,7 @@ def test_what_is_added_counts_whatever_it_is_called(tmp_path):
 
 
 def test_the_large_step_remains_after_all_better_proposals_were_refused(tmp_path):
-    """Carts that were driven only gently may hide effects far out."""
+    """If all better proposals were refused, a large step remains, which shows effects far out."""
     submission = load_submission(a_recorded_cart(tmp_path / "work"))
     analysis = analyse(submission)
     plan = propose_plan(submission)
@@ -319,7 +319,7 @@ def test_the_large_step_remains_after_all_better_proposals_were_refused(tmp_path
 
 
 def test_thinking_can_be_ended(tmp_path):
-    """An exception in the progress display ends it; the recordings stay."""
+    """An exception in the progress display ends the exploration, and the recordings stay."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
 
@@ -339,7 +339,7 @@ def test_thinking_can_be_ended(tmp_path):
 
 
 def test_the_command_explores_a_bench_over_its_line(tmp_path):
-    """From no folder at all to a submission with its diary, over a socket, faster than real time.
+    """`cartlab explore` makes a submission with its diary from an empty folder, over a socket.
 
     The time limit holds for the first recordings too: the sweep fits and the steps do not.
     """
@@ -356,7 +356,7 @@ def test_the_command_explores_a_bench_over_its_line(tmp_path):
 
 @pytest.mark.slow
 def test_one_large_step_shows_what_acts_far_out(tmp_path):
-    """Carts held back by drag do not reach the distance wanted; the step is made once."""
+    """Carts held back by drag do not reach the wanted distance, so the large step is made once."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=["quadratic_drag"])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=13))
     turns = Exploration(

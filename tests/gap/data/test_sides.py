@@ -48,7 +48,7 @@ def analysis(tmp_path_factory):
 
 
 def test_what_the_report_leaves_out_is_in_no_figure_of_the_gap(analysis):
-    """The odd repeat is neither trained nor judged on; gap.json has the report's reason."""
+    """The odd repeat is used neither for fitting nor as a test; gap.json has the reason."""
     (odd,) = analysis.left_out
     assert (odd.experiment, odd.is_wrong) == ("step-4", False)
 
@@ -65,14 +65,14 @@ def test_what_the_report_leaves_out_is_in_no_figure_of_the_gap(analysis):
 
 
 def test_a_gap_file_of_before_is_still_read(analysis):
-    """A gap.json without `left_out` is read as an empty list."""
+    """A gap.json without `left_out`, as older versions wrote it, is read as an empty list."""
     document = json.loads(json_text(investigate(analysis, progress=lambda text: None)))
     del document["left_out"]
     assert read_gap(json.dumps(document)).left_out == ()
 
 
 def test_a_cart_at_rest_before_a_release_is_not_a_run():
-    """A cart creeps by some steps, a hand pulls it: only the decay after the hand is a run."""
+    """If a cart rests until a hand pulls and releases it, only the decay is a run."""
     decay = decay_record(CHAIN, free=(1,), rng=np.random.default_rng(6))
     wait = np.arange(int(2.0 / decay.sample_time)) * decay.sample_time
     steps = np.interp(wait, [0.06, 0.2, 0.7, 1.9], [17, 3, 3, 0])
@@ -91,7 +91,7 @@ def test_a_cart_at_rest_before_a_release_is_not_a_run():
 
 
 def test_nothing_left_is_an_error_that_says_why(analysis):
-    """If every recording is left out, the message gives the reasons."""
+    """If every recording is left out, the error gives the reasons."""
     out = tuple(
         LeftOut(experiment=record.id, reason="its clock stood still", is_wrong=True)
         for record in analysis.records

@@ -58,9 +58,10 @@ def standardised(folder, *, preset, hide, seed):
     ],
 )
 def test_parameters_are_off_by_what_is_stated(tmp_path, preset, hide, seeds):
-    """A cart that friction holds for seconds gives one reading, not a thousand.
+    """Errors match even if friction holds a cart for seconds, which counts as one reading.
 
-    The root mean square of so few numbers scatters by a quarter; under white noise it was four.
+    From so few numbers, the root mean square scatters by a quarter. If the noise were taken as
+    white, it would be four.
     """
     z = np.array(
         [
@@ -81,7 +82,7 @@ def fitted(case):
 
 
 def test_a_model_that_runs_away_has_no_errors():
-    """A spring that softens without end gives no finite readings or derivatives."""
+    """A spring that softens until the cart runs away gives no standard errors."""
     fit, runs = fitted(make_case(seed=42, n=1, rate=113.1))
     chain = fit.structure.chain(fit.theta)
     soft = make_candidate(find_effect("cubic_spring"), 1, (-1.0,), runs=runs, chain=chain)

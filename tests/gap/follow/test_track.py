@@ -1,4 +1,4 @@
-"""A model that follows a record: its derivatives equal differences of its errors."""
+"""When a model follows a record, its derivatives equal differences of its errors."""
 
 from dataclasses import replace
 
@@ -32,14 +32,14 @@ SIZES = {
     Kind.BACKLASH: lambda u, x, m, k: (0.1 * x, 0.3 * m, 0.6),
 }
 DRIVEN = (Kind.DRIVE_DAMPING, Kind.COGGING, Kind.BACKLASH)
-# Whether a cart turns, or bodies meet, before or after a reading makes its error jump.
+# The error jumps when a cart's turn, or the contact of bodies, moves past a reading.
 JUMPS = (*DRY, Kind.BACKLASH)
 
 
 @pytest.mark.parametrize("gain", [0.5, 0.1, 0.0])
 @pytest.mark.parametrize("kind", SIZES)
 def test_derivatives_are_those_of_what_is_computed(kind, gain):
-    """All parameters and a run's own unknowns, with all laws of a drive: central differences."""
+    """Derivatives by all parameters and a run's own unknowns agree with central differences."""
     case = make_case(seed=44, n=2, rate=113.1)
     chain = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
     track = make_track(make_run(case.records[0], n=2))
@@ -78,7 +78,7 @@ def test_derivatives_are_those_of_what_is_computed(kind, gain):
 
 
 def test_a_model_that_runs_away_is_told():
-    """A spring that softens without end gives neither errors nor derivatives."""
+    """A spring that softens until the cart runs away gives neither errors nor derivatives."""
     case = make_case(seed=44, n=2, rate=113.1)
     chain = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
     track = make_track(make_run(case.records[0], n=2))

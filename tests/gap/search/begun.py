@@ -1,4 +1,4 @@
-"""One cart with hidden effects, ready to be searched: the linear fit and the study."""
+"""One cart with hidden effects, ready for a search: the linear fit and the study."""
 
 from dataclasses import replace
 

@@ -32,17 +32,17 @@ def judged(
 @pytest.mark.parametrize(
     ("child", "worth"),
     [
-        ({"chi": 2.0, "held": 2.0}, True),  # 100 ln 3 on either side
+        ({"chi": 2.0, "held": 2.0}, True),  # 100 ln 3 in the training runs and in the held-out runs
         (
             {"chi": 2.0, "held": 2.0, "n_independent": 5.0},
             False,
         ),  # what is left swings: little is n_independent
-        ({"chi": 1.0, "held": 7.0}, False),  # of the runs fitted only
-        ({"chi": 5.6, "held": 5.7}, False),  # too little for the criterion
+        ({"chi": 1.0, "held": 7.0}, False),  # a gain in the fitted runs only
+        ({"chi": 5.6, "held": 5.7}, False),  # too small a gain for the criterion
     ],
 )
 def test_an_effect_is_worth_it_by_independent_residuals(child, worth):
-    """Both of the training runs and of the held-out runs; counted in the fuller model."""
+    """An effect must pay in training and held-out runs, counted in independent residuals."""
     parent = judged(CUBIC, chi=6.0, held=6.0)
     both = judged(CUBIC, DELAY, **child)
     study: Any = SimpleNamespace(explains=lambda h: True)
@@ -55,7 +55,7 @@ def test_an_effect_is_worth_it_by_independent_residuals(child, worth):
      (0.014, False, 0.01, False)],
 )  # fmt: skip
 def test_a_name_that_leaves_more_than_noise_says_so(error, contact, repeatability, said):
-    """Except beside a contact, whose law is approximate, and within the difference of repeats."""
+    """If more than noise is left, the model may be incomplete, unless contacts or repeats explain it."""
     chosen: Any = SimpleNamespace(error=error, has_contact=contact)
     study: Any = SimpleNamespace(floor=0.01, repeatability=repeatability)
     assert Study.may_be_half(study, chosen) == said

@@ -15,7 +15,7 @@ from tests.truth.bench import Hidden
 
 
 def test_a_richer_law_that_explains_no_more_gives_way():
-    """Friction that yields over almost no distance is plain dry friction."""
+    """Friction that yields over almost no distance is replaced by plain dry friction."""
     fit, study = begun(
         Hidden(effect="coulomb_friction", place=1, parameters={"force": 0.0006}),
         Hidden(effect="input_delay", parameters={"delay": 0.015}),
@@ -38,7 +38,7 @@ def test_a_richer_law_that_explains_no_more_gives_way():
 
 @pytest.mark.parametrize(("value", "nothing"), [(0.015, False), (1e-4, True)])
 def test_an_effect_of_zero_within_its_error_is_reported(value, nothing):
-    """A delay is named if it is three standard errors from zero."""
+    """A delay is named only if it is three standard errors from zero."""
     fit, study = begun(Hidden(effect="input_delay", parameters={"delay": 0.015}))
     chain = fit.structure.chain(fit.theta)
     delay = make_candidate(
@@ -50,4 +50,4 @@ def test_an_effect_of_zero_within_its_error_is_reported(value, nothing):
 
     (found,) = significance(replace(known, covariance=sure))
     assert (found < SURE) == nothing
-    assert significance(known) == [np.inf]  # without an error no statement is made
+    assert significance(known) == [np.inf]  # without a standard error no statement is possible

@@ -34,7 +34,7 @@ def searched(*hidden: Hidden, seconds: float | None = None) -> Search:
     ],
 )
 def test_what_is_hidden_is_named(hidden, verdict, found):
-    """Nothing, one effect, two: each step of the path adds one, and lowers the error."""
+    """With no, one or two hidden effects, each step adds one and lowers the error."""
     search = searched(*hidden)
 
     assert search.verdict == verdict
@@ -49,7 +49,7 @@ def test_what_is_hidden_is_named(hidden, verdict, found):
 
 
 def test_without_time_the_linear_model_is_the_answer():
-    """Past the time limit nothing more is tried, and the deadline is reported."""
+    """Past the time limit no effect is tried, and the linear model is returned."""
     search = searched(FRICTION, seconds=0.0)
 
     assert search.deadline.cut
@@ -58,7 +58,7 @@ def test_without_time_the_linear_model_is_the_answer():
 
 
 def test_overestimated_noise_is_measured_again():
-    """With an assumed noise three times too large, friction and noise are still found."""
+    """If the noise is assumed three times too large, friction and the noise are still found."""
     fit, study = begun(FRICTION)
     loud = study.with_noise([replace(run, sigma=3.0 * run.sigma) for run in study.training])
     search = Search(loud, fit, Deadline(map, seconds=None))

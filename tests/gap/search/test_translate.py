@@ -25,7 +25,7 @@ ALL = frozenset().union(*(filled(effect) for effect in CATALOGUE))
     ],
 )
 def test_a_law_is_looked_for_where_it_would_show(kind, free, places):
-    """Held carts show nothing; springs with the same stretch are represented by the first."""
+    """An effect is searched for where it would show: not on held carts, once for equal springs."""
     bench = FollowedBench(
         chain=PRESETS["throne-2dof"], springs=(True,) * 3, largest=1.0, free=tuple(free)
     )
@@ -35,7 +35,7 @@ def test_a_law_is_looked_for_where_it_would_show(kind, free, places):
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
 def test_values_are_read_back_from_the_columns(effect):
-    """Also if a column is the difference of two values."""
+    """Values of an effect are read back, even if a column is the difference of two values."""
     values = tuple(0.3 * (1.0 + i) for i in range(len(effect.names)))
     columns = effect.columns(effect.named(values))
     np.testing.assert_allclose(values_of(effect, columns), values, rtol=1e-12)
@@ -43,14 +43,14 @@ def test_values_are_read_back_from_the_columns(effect):
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
 def test_every_effect_has_its_law(effect):
-    """Every column that an effect fills is filled by a law that can be followed."""
+    """Every column that an effect fills is filled by a law that the fit can follow."""
     laws = column_set([column for columns in COLUMNS for column in columns])
     assert filled(effect) <= laws | column_set(DRIVE_COLUMNS)
 
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
 def test_an_effect_put_into_a_model_and_taken_out_leaves_it(effect):
-    """Its values come back from the vector, each side separately; the rest is unchanged."""
+    """An effect added to a model and removed again leaves the model unchanged."""
     chain = PRESETS["throne-2dof"]
     case = make_case(seed=44, n=2, rate=113.1)
     runs = [make_run(record, n=2) for record in case.records[:2]]

@@ -1,4 +1,4 @@
-"""Verdicts of a search as a table: hypotheses with their errors in, verdicts out."""
+"""The verdicts of a search, from a table of hypotheses with their errors."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +19,7 @@ DELAY, CUBIC, DRAG, DEAD = (
 
 
 def hypothesis(*keys: tuple[str, int], error: float, bic: float, held: float = 1.0) -> Any:
-    """Return a hypothesis as a verdict sees it, without a fit."""
+    """Return a hypothesis with the attributes that a verdict needs, without a fit."""
     effects = [SimpleNamespace(key=key, effect=find_effect(key[0])) for key in keys]
     structure = SimpleNamespace(effects=effects)
     return SimpleNamespace(
@@ -52,7 +52,7 @@ def verdict_on(*steps: Any, others: tuple[Any, ...] = ()) -> tuple[str, set[Any]
 
 
 def test_an_effect_beside_which_another_does_as_well_alone_is_taken_back():
-    """The last step does not pay; then the first does not either, as the second alone suffices."""
+    """If the second effect alone explains as much as both, the first is taken back."""
     delay = hypothesis(DELAY, error=0.25, bic=-10)
     both = hypothesis(DELAY, COULOMB, error=0.2, bic=-500)
     three = hypothesis(DELAY, COULOMB, CUBIC, error=0.195, bic=-600)
@@ -71,7 +71,7 @@ def test_an_effect_beside_which_another_does_as_well_alone_is_taken_back():
     ],
 )
 def test_effects_that_only_together_explain_have_rivals_too(rival, verdict):
-    """Two others that fit equally, in place of one or both."""
+    """If two other effects explain as much as the two found, the verdict is "ambiguous"."""
     one = hypothesis(COULOMB, error=0.2, bic=-100)
     both = hypothesis(COULOMB, SECOND, error=0.015, bic=-1000)
     same = hypothesis(*rival, error=0.015, bic=-999.5)
@@ -81,7 +81,7 @@ def test_effects_that_only_together_explain_have_rivals_too(rival, verdict):
 
 
 def test_a_rival_far_less_likely_is_none():
-    """A BIC that is higher by forty decides."""
+    """A hypothesis whose BIC is higher by forty is no rival."""
     one = hypothesis(COULOMB, error=0.2, bic=-100)
     both = hypothesis(COULOMB, SECOND, error=0.015, bic=-1000)
     other = hypothesis(DRAG, DEAD, error=0.0151, bic=-950)
@@ -90,7 +90,7 @@ def test_a_rival_far_less_likely_is_none():
 
 @pytest.mark.parametrize(("held", "verdict"), [(1.0, "ambiguous"), (1.05, "named")])
 def test_runs_held_out_are_evidence_too(held: float, verdict: str):
-    """Of 30 from the training runs and 1000 ln 1.05 = 49 from the others, 40 excludes a rival."""
+    """Held-out runs count too: the gain of 30 from training and 49 from them excludes a rival."""
     drag = hypothesis(DRAG, error=0.01, bic=-1000)
     cubic = hypothesis(CUBIC, error=0.01, bic=-970, held=held)
     assert verdict_on(drag, others=(cubic,))[0] == verdict

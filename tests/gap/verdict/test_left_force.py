@@ -1,4 +1,4 @@
-"""The unexplained force: laws that are not in the catalogue are read off the data."""
+"""Laws that are not in the catalogue are found from the unexplained force."""
 
 from collections.abc import Callable
 
@@ -27,9 +27,9 @@ CARTS = {
 
 
 def record(chain: Chain, law: Law, *, cart: int, kind: Kind, size: float, seed: int) -> Record:
-    """Return one run of carts on springs with an extra law of force on one of them.
+    """Return one run of carts on springs with an extra law of force on one cart.
 
-    Heun's method with steps of 1 ms; encoder steps and noise of a third of one.
+    It uses Heun's method with steps of 1 ms, whole encoder steps, and noise of a third of a step.
     """
     n = chain.n
     t = np.arange(int(DURATION * RATE)) / RATE
@@ -82,7 +82,7 @@ def recordings(law: Law, *, carts: int = 1, cart: int = 1) -> list[Record]:
 
 
 def left_by_the_chain(records: list[Record], *, springs: tuple[bool, ...]) -> tuple[Residual, ...]:
-    """Return the force that the best linear chain leaves."""
+    """Return the force that the best linear chain leaves unexplained."""
     runs = prepare(records, springs=springs, interventions=(), notes=[])
     training, held_out = take_sides(runs, notes=[])
     fit, training = fit_baseline(training, springs=springs, start=None)
@@ -103,9 +103,9 @@ def left_by_the_chain(records: list[Record], *, springs: tuple[bool, ...]) -> tu
     ids=["drag", "root friction", "van der Pol", "force by place", "two laws"],
 )
 def test_a_law_is_read_off_what_it_leaves(law, terms):
-    """The terms of a law are found, and no others, with numbers within 6 %.
+    """From the unexplained force the terms of a law are found, and no others, to within 6 %.
 
-    That is three of the stated standard errors of the least certain one, the root.
+    That is three stated standard errors of the least certain term, the square root.
     """
     (residual,) = left_by_the_chain(recordings(law), springs=(True, False))
 
@@ -125,7 +125,7 @@ def test_noise_has_no_formula():
 
 
 def test_the_force_is_on_the_cart_that_it_acts_on():
-    """Of two carts only the second has a formula: its neighbour's motion is subtracted."""
+    """Of two carts only the one on which the law acts gets a formula."""
     records = recordings(lambda x, v, u: -6e-5 * v * abs(v), carts=2, cart=2)
 
     first, second = left_by_the_chain(records, springs=(True, True, True))
@@ -141,7 +141,7 @@ def test_the_force_is_on_the_cart_that_it_acts_on():
 
 
 def test_an_effect_that_the_catalogue_lacks_is_described():
-    """Without quadratic drag in the catalogue: unexplained, and the formula is that of drag."""
+    """Without drag in the catalogue the verdict is "unexplained", with the formula of drag."""
     catalogue = [effect for effect in CATALOGUE if effect.key != "quadratic_drag"]
 
     gap = explain_gap(

@@ -21,7 +21,7 @@ from pipeline.plant.loop.sampled_loop import LoopSetup, Pid, StateFeedback, simu
 from pipeline.simulated.emulator.core import ReferenceCore
 
 PERIOD = 1e-3
-# Two carts in counts and duty counts: some 10 counts a duty count, 2 and 5 Hz.
+# Two carts in counts and duty counts: some 10 counts per duty count, 2 and 5 Hz.
 CHAIN = Chain(m=np.array([2e-4, 1.5e-4]), c=np.array([2e-4, 1e-4]), k=np.array([0.0, 0.1, 0.06]))
 
 
@@ -31,9 +31,9 @@ def make_core(**changes) -> ReferenceCore:
 
 
 def run(core: ReferenceCore, commands: bytes, y, *, ticks: int, first: int = 0) -> list[Reading]:
-    """Send something to the core, then tick.
+    """Send something to the core, and tick; return its lines.
 
-    Return its lines. `y` gives the counts at each tick.
+    `y` gives the counts at each tick.
     """
     core.receive(commands)
     for k in range(first, first + ticks):
@@ -49,7 +49,7 @@ def still(k: int) -> tuple[int, int]:
 
 @pytest.mark.parametrize("wave", Wave)
 def test_a_run_streams_its_wave_and_ends(wave):
-    """A run of REPS/FREQ seconds sends that many lines of the wave, clipped, and then stops."""
+    """A run sends lines of the wave for REPS/FREQ seconds, clipped to full scale, and stops."""
     start = Start(wave=wave, frequency=8.0, amplitude=5000, cycles=3)
     lines = run(make_core(), encode(start), still, ticks=500)
     assert [line.ms for line in lines] == list(range(375))
@@ -59,7 +59,7 @@ def test_a_run_streams_its_wave_and_ends(wave):
 
 
 def test_the_waves_are_what_they_are_called():
-    """Each wave at the eighths of its period of 0.8 s, and a chirp's instantaneous frequency."""
+    """Each wave is right at the eighths of its period, and a chirp in its frequency."""
 
     def eighths(wave: Wave) -> list[int]:
         start = Start(wave=wave, frequency=1.25, amplitude=1000)
@@ -77,8 +77,8 @@ def test_the_waves_are_what_they_are_called():
     t = np.arange(0, 20, 1e-4)
     x = np.array([target_at(chirp, s, chirp_end=10.0) for s in t])
     rising = t[:-1][(x[:-1] < 0) & (x[1:] >= 0)]
-    # Between two upward zeros the mean frequency is that in their middle, but for its curvature:
-    # (ln 10 / 20 / f)² / 24 of it, under 1e-3.
+    # Between two upward zeros the mean frequency is that in their middle, except for curvature: (ln
+    # 10 / 20 / f)² / 24 of it, under 1e-3.
     np.testing.assert_allclose(
         1 / np.diff(rising), 10 ** ((rising[1:] + rising[:-1]) / 40), rtol=1e-3
     )
@@ -100,7 +100,7 @@ def simulated(controller, reference, *, delay):
 
 @pytest.mark.parametrize("amplitude", [400, 40_000])
 def test_state_feedback_is_the_law_of_the_simulated_loop(amplitude):
-    """The duty equals that of the loop's simulation at the same readings, clipping included."""
+    """The duty of state feedback equals that of the loop's simulation, clipping included."""
     gains = StateGains(gains=(0.02, 0.002, 0.05, -0.001), prefilter=0.3)
     start = Start(wave=Wave.SQUARE, encoder=1, frequency=2.0, amplitude=amplitude)
     r = np.array([float(target_at(start, PERIOD * k)) for k in range(500)])
@@ -110,13 +110,13 @@ def test_state_feedback_is_the_law_of_the_simulated_loop(amplitude):
     y = np.rint(loop.x).astype(int)
     lines = run(make_core(), encode(gains) + encode(start), lambda k: tuple(y[:, k]), ticks=500)
     assert np.abs(loop.u).max() > 100
-    # Half a count is the rounding of the duty; arithmetic in another order may tip it over.
+    # Half a count is the rounding of the duty; another order of arithmetic may round the other way.
     np.testing.assert_allclose([line.duty for line in lines], loop.u, atol=0.5 + 1e-6)
 
 
 @pytest.mark.parametrize("encoder", [1, 2])
 def test_pid_is_the_law_of_the_simulated_loop(encoder):
-    """The duty equals that of the loop's simulation at the same readings, acting at once."""
+    """The duty of a PID equals that of the loop's simulation, and acts at once."""
     gains = PidGains(kp=0.05, ki=0.2, kd=0.001)
     start = Start(wave=Wave.SAWTOOTH, encoder=encoder, frequency=2.0, amplitude=3000)
     r = np.array([float(target_at(start, PERIOD * k)) for k in range(500)])
@@ -128,7 +128,7 @@ def test_pid_is_the_law_of_the_simulated_loop(encoder):
 
 
 def test_the_last_gains_count_from_the_next_start():
-    """`g` after `f` makes it a PID; gains that arrive during a run change the next one only."""
+    """Gains that arrive during a run act from the next start on, and the last ones count."""
     core = make_core()
     lines = run(core, b"g;1;0;0;d;q;c;o;10;50;5;", still, ticks=100)
     assert lines[-1].duty == 50
@@ -141,7 +141,7 @@ def test_the_last_gains_count_from_the_next_start():
 
 
 def test_a_reset_forgets_and_a_stop_does_not():
-    """After `z` counts are zero and gains are gone; after `s` both are as before."""
+    """A reset with `z` clears counts and gains; a stop with `s` keeps both."""
     core = make_core()
     run(core, b"g;1;0;0;d;q;c;o;10;50;5;", lambda k: (k, 0), ticks=10)
     assert run(core, b"s;", lambda k: (k, 0), ticks=10, first=10) == []
@@ -153,7 +153,7 @@ def test_a_reset_forgets_and_a_stop_does_not():
 
 
 def test_a_start_during_a_run_restarts_it():
-    """Stamps start again at zero, and so do the sums of the PID."""
+    """A start during a run sets the stamps and the PID's sum to zero."""
     core = make_core()
     first = run(core, b"g;0;1;0;d;q;c;o;10;500;9;", lambda k: (-100, 0), ticks=80)
     again = run(core, b"d;q;c;o;10;500;9;", lambda k: (-100, 0), ticks=80, first=80)
@@ -162,13 +162,13 @@ def test_a_start_during_a_run_restarts_it():
 
 
 def test_silence_after_a_heartbeat_cuts_the_motor():
-    """100 ms of wall time after the last heartbeat the run ends, and no other begins without one.
+    """100 ms after the last heartbeat the run ends, and no other run starts without a heartbeat.
 
-    A bench that never had one runs on; a reset disarms.
+    A bench that never had a heartbeat runs on, and a reset disarms the watchdog.
     """
     core = make_core()
     core.receive(b"k;d;q;o;o;1;50;9;")
-    for k in range(600):  # a bench six times as fast as time
+    for k in range(600):  # a bench whose clock is six times as fast as wall time
         core.tick((0, 0), stamp=k, now=k // 6)
     assert len(core.take().splitlines()) == 600  # 99 ms of wall time
     core.tick((0, 0), stamp=600, now=100)
@@ -181,7 +181,7 @@ def test_silence_after_a_heartbeat_cuts_the_motor():
 def test_a_query_is_answered_and_hands_are_not_the_controllers():
     """A query during a run gets its line between the others.
 
-    `h` changes nothing; stock is silent.
+    `h` changes nothing, and a stock bench answers nothing.
     """
     core = make_core()
     core.receive(b"d;q;o;o;1;50;1;h;1;2;?;")
@@ -193,7 +193,7 @@ def test_a_query_is_answered_and_hands_are_not_the_controllers():
 
 
 def test_a_bench_of_three_encoders_sends_three_counts():
-    """The line then has one more field, and state feedback six gains."""
+    """On a bench of three encoders a line has three counts, and state feedback six gains."""
     core = make_core(encoders=3, carts=3)
     lines = run(core, b"f;0;0;0;0;1;0;0;d;q;c;o;100;9;1;", lambda k: (0, 0, k), ticks=5)
     assert lines[-1] == Reading(counts=(0, 0, 4), target=0, duty=-4, ms=4)

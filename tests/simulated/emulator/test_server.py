@@ -33,14 +33,14 @@ from pipeline.stages.log_decrement import fit_log_decrement
 from tests.helpers.benches import Emulator, emulator
 from tests.helpers.waiting import started
 
-QUIET = 0.3  # s a read waits
+QUIET = 0.3  # s that a read waits
 MOTOR_OFF = 1000  # ms after the last heartbeat: the watchdog's 100 and a machine as busy as can be
 pty_only = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 
 
 @contextmanager
 def host(bench: Emulator) -> Iterator[serial.SerialBase]:
-    """Open the line as a host does, at a bench that has been reset."""
+    """Open the line as a host does, with the bench reset."""
     line = serial.serial_for_url(bench.address, timeout=QUIET)
     try:
         line.write(encode(Signal.RESET))
@@ -55,14 +55,14 @@ def play(
     """Return all bytes until a run has ended, and add them to `heard` as they come."""
     heard, runs = bytearray() if heard is None else heard, bench.runs
     line.write(b"".join(commands))
-    # pyserial forgets what it has read of a piece when the cable is pulled: small pieces.
+    # If the cable is pulled, pyserial forgets the part of a piece that it has read: small pieces.
     while (got := line.read(64)) or bench.runs == runs:
         heard += got
     return bytes(heard)
 
 
 def stream(bench: Emulator, line: serial.SerialBase, start: Start) -> list[Reading]:
-    """Run it; check that every line is a reading."""
+    """Make a run; check that every line is a reading."""
     readings = [parse_reading(text) for text in play(bench, line, encode(start)).splitlines()]
     assert None not in readings
     return [reading for reading in readings if reading is not None]
@@ -70,7 +70,7 @@ def stream(bench: Emulator, line: serial.SerialBase, start: Start) -> list[Readi
 
 @pytest.fixture(scope="module")
 def fast_bench() -> Iterator[Emulator]:
-    """Yield the two-cart preset, ten times as fast as time."""
+    """Yield the two-cart preset on a clock ten times as fast as wall time."""
     with emulator("--speed", "10", "--seed", "3", watchdog=WATCHDOG) as bench:
         yield bench
 
@@ -79,9 +79,10 @@ def fast_bench() -> Iterator[Emulator]:
 @pytest.mark.sample
 @pty_only
 def test_hosts_talk_to_a_pseudo_terminal_one_after_the_other():
-    """In real time: a description, then a run whose period is not a whole ms.
+    """At a pseudo-terminal a host gets a description, and a run in real time.
 
-    The next host finds the bench as the last one left it; a signal ends it with exit status 0.
+    The next host finds the bench as the last one left it, and a signal ends the bench with exit
+    status 0.
     """
     with emulator("--port", "pty", "--hide", "coulomb_friction:force=0.004") as bench:
         for _ in range(2):
@@ -94,7 +95,7 @@ def test_hosts_talk_to_a_pseudo_terminal_one_after_the_other():
                     bench, line, Start(wave=Wave.SQUARE, frequency=1.0, amplitude=300, cycles=2)
                 )
                 took = time.monotonic() - began - QUIET
-            # One more or less, by where in a ms the run began.
+            # One more or less, depending on where in a ms the run began.
             assert len(readings) == pytest.approx(2.0 / TRUE_PERIOD, abs=1)
             steps = np.diff([reading.ms for reading in readings])
             assert set(steps) == {1, 2}
@@ -107,7 +108,7 @@ def test_hosts_talk_to_a_pseudo_terminal_one_after_the_other():
 
 
 def test_the_static_gain_comes_out(fast_bench):
-    """The motion of a step, in cm/V by the description, is the preset's static gain."""
+    """A step's motion, scaled by the description, gives the preset's static gain."""
     with host(fast_bench) as line:
         line.write(encode(Signal.QUERY))
         scales = parse_description(line.readline())
@@ -118,13 +119,13 @@ def test_the_static_gain_comes_out(fast_bench):
     level = x[:, -3000:].mean(axis=1) - x[:, : x.shape[1] // 3].mean(axis=1)
     gain = level * scales.position_per_count / (duty[-1] * scales.input_per_count)
     expected = PRESETS["throne-2dof"].static_gains()
-    # A mean of rounded counts is 0.15 of one off, twice, in at least 1400; and after 7 s of the
+    # The mean of rounded counts is off by 0.15 count, twice, in at least 1400. After 7 s of the
     # slower mode (0.9/s) 2e-3 are left, averaged over half of its swings and so far less.
     np.testing.assert_allclose(gain, expected, rtol=1e-3)
 
 
 def test_a_cart_that_hands_let_go_rings_at_its_own_frequency(fast_bench):
-    """Cart 2 with cart 1 held swings at ω_2 and ζ_2 of the chain; the held cart is at rest."""
+    """With cart 1 held, cart 2 swings at ω_2 and ζ_2 of the chain after its release."""
     chain = PRESETS["throne-2dof"]
     with host(fast_bench) as line:
         line.write(encode(Hands(held=(1,), released=2)))
@@ -152,7 +153,7 @@ def test_a_cart_that_hands_let_go_rings_at_its_own_frequency(fast_bench):
 
 
 def test_a_hand_lets_go_even_where_the_run_starts_before_it_is_ready():
-    """It pulls for 1.5 s, then pauses; the motor is idle meanwhile, and works afterwards."""
+    """If a run starts while a virtual hand still pulls, the hand releases the cart all the same."""
     carts = VirtualCarts(prepare_bench(preset="throne-1dof"), seed=1)
     carts.take_in_hand(Hands(released=1))
     carts.start()
@@ -164,20 +165,20 @@ def test_a_hand_lets_go_even_where_the_run_starts_before_it_is_ready():
     assert 0 < out[0] < 1.5 / TRUE_PERIOD
     gain = PRESETS["throne-1dof"].static_gains()[0]
     rest = -2000 * carts.input_per_count * gain / 0.00227
-    # The swing of the start has e^(-1.32 · 4) left of it, 5e-3 of at most 1.8 cm and the rest.
+    # After the start e^(-1.32 · 4) of the swing is left, 5e-3 of at most 1.8 cm and the rest.
     assert np.mean(x[-400:]) == pytest.approx(rest, abs=5e-3 * (800 + abs(rest)))
-    held = np.array(x[1600:1780])  # until 0.3 s after the pull: only a tremor
+    held = np.array(x[1600:1780])  # until 0.3 s after the pull only a tremor
     assert np.ptp(held) < 0.03 * np.abs(held).max()
 
 
 def damaged(readings: bytes) -> tuple[list[Reading], int]:
-    """Return the lines that a host can read, and the number that it cannot."""
+    """Return the lines that a host can read, and the number of those that it cannot."""
     parsed = [parse_reading(line) for line in readings.split(b"\n") if line]
     return [reading for reading in parsed if reading is not None], parsed.count(None)
 
 
 def test_what_is_injected_is_what_a_host_finds():
-    """Lost, garbled and merged lines and new clocks add up; no other line is missing."""
+    """Lost, garbled and merged lines and new clocks add up to the injected faults."""
     faults = [f"--fault={kind}=0.01" for kind in ("drop", "garble", "merge", "delay", "reset")]
     with emulator("--speed", "10", *faults) as bench, host(bench) as line:
         start = encode(Start(wave=Wave.SINE, frequency=1.0, amplitude=200, cycles=20))
@@ -190,14 +191,14 @@ def test_what_is_injected_is_what_a_host_finds():
     lost = injected["drop"] + injected["garble"] + 2 * injected["merge"]
     assert len(readings) == run["lines"] - lost
     ms = np.array([reading.ms for reading in readings])
-    # Of a new clock that begins right behind another the host may see one.
+    # If a new clock follows another at once, the host may see only one of them.
     assert np.sum(np.diff(ms) < 0) == pytest.approx(injected["reset"], abs=5)
     # A lump holds the lines of 50 ms.
     assert injected["late"] == pytest.approx(50 * injected["delay"], rel=0.05)
 
 
 def test_faults_come_at_the_requested_time():
-    """An encoder sticks 1 s into the stream, for good; the cable is pulled 1 s later, once."""
+    """An encoder sticks 1 s into the stream, and the cable is pulled 1 s later, as requested."""
     options = ("--speed", "5", "--fault", "stuck=2@1", "--fault", "disconnect@2")
     with emulator(*options) as bench:
         with host(bench) as line:
@@ -217,7 +218,7 @@ def test_faults_come_at_the_requested_time():
 
 
 def test_what_is_held_up_still_comes():
-    """A lost line end comes once the run is over; a late chunk keeps its order, and comes."""
+    """A lost line end is sent once the run is over, and a late chunk keeps its place."""
     faults = Faults([read_fault("merge@0.003"), read_fault("delay@0.004")], seed=0, period=1e-3)
     sent = [faults.strike(b"1:2:3:4:%d\n" % ms, clock=1e-3 * ms)[0] for ms in range(3)]
     assert sent == [b"1:2:3:4:0\n", b"1:2:3:4:1\n", b"1:2:3:4:2"]
@@ -258,14 +259,14 @@ def test_the_motor_is_cut_when_the_host(fast_bench, way):
 
 
 def test_a_host_that_leaves_an_unguarded_bench_stops_nothing(fast_bench):
-    """Without a heartbeat the run goes on to its end, as on the stock bench; a stop ends it."""
+    """Without any heartbeat a run goes on to its end after the host has left."""
     with host(fast_bench) as line:
         line.write(encode(Start(wave=Wave.SINE, frequency=0.5, amplitude=30, cycles=1)))
     assert fast_bench.event("run")["ended"] == "done"
     with host(fast_bench) as line:
         line.write(encode(Start(wave=Wave.SINE, frequency=0.01, amplitude=30, cycles=1)))
         line.read(100)
-        # A start that noise cut short before it.
+        # A start command that noise cut short comes before it.
         play(fast_bench, line, b"d;q;o;\xff", encode(Signal.STOP))
     ended = fast_bench.event("run")
     assert ended["ended"] == "stopped"
@@ -273,7 +274,7 @@ def test_a_host_that_leaves_an_unguarded_bench_stops_nothing(fast_bench):
 
 
 def test_a_stock_bench_knows_no_query_and_no_stop():
-    """It answers nothing and runs on until the stock way of stopping; cart two does not exist."""
+    """A stock bench answers no query and has no cart two; only the stock stop ends its run."""
     with (
         emulator("--stock", "--period", "2.005", preset="throne-1dof") as bench,
         host(bench) as line,
@@ -321,13 +322,13 @@ def test_an_unknown_fault_is_reported(fault, message):
     ],
 )
 def test_an_invalid_port_is_reported(port, message):
-    """A malformed port, or one open to others, gives one clear message."""
+    """A malformed port, or one open to other computers, gives one clear message."""
     with pytest.raises(ConfigError, match=message):
         open_link(port)
 
 
 def test_a_port_in_use_is_reported():
-    """Two benches cannot share one port; a remote port must be requested explicitly."""
+    """Two benches cannot share one port, and a remote port must be requested explicitly."""
     first = open_link("socket://127.0.0.1:0")
     with pytest.raises(ConfigError, match=r"in use|normally permitted"):
         open_link(first.address)
