@@ -55,7 +55,7 @@ def test_an_effect_is_worth_it_by_independent_residuals(child, worth):
      (0.014, False, 0.01, False)],
 )  # fmt: skip
 def test_a_name_that_leaves_more_than_noise_says_so(error, contact, repeatability, said):
-    """If more than noise is left, the model may be incomplete, unless contacts or repeats explain it."""
+    """A model that leaves more than noise may be incomplete, except with contacts or repeats."""
     chosen: Any = SimpleNamespace(error=error, has_contact=contact)
     study: Any = SimpleNamespace(floor=0.01, repeatability=repeatability)
     assert Study.may_be_half(study, chosen) == said
