@@ -193,7 +193,7 @@ DWELL_TOOLS: tuple[tuple[str, str, bool, Callable[[Dwells], Modes]], ...] = (
 
 
 def subspace(record: Record) -> Modes:
-    """Identify a state model of the true order by N4SID of SIPPY, signals scaled to one."""
+    """Identify a state model of the true order by SIPPY's N4SID, with signals scaled to one."""
     with contextlib.redirect_stdout(io.StringIO()):
         sippy = import_module("sippy_unipi")
         assert record.u is not None

@@ -296,7 +296,7 @@ def _steps(gap: Gap, rig: Rig) -> Iterator[tuple[Study, Hypothesis, Hypothesis]]
 
 
 def _where_it_helps(before: Hypothesis, after: Hypothesis, study: Study) -> Trace:
-    """Return the cart and the held-out run of which the effects explain most."""
+    """Return the cart and held-out run in which the effects reduce the error most."""
 
     def gained(trace: Trace) -> float:
         left = [((trace.measured - model) ** 2).sum() for model in (trace.baseline, trace.final)]

@@ -47,7 +47,7 @@ class Cost:
 
 
 def tables(*, quick: bool) -> list[Table]:
-    """Return the costs by carts, by records, and compared with a notebook of the same figures."""
+    """Return the costs of a report by carts and by records, and of a notebook with its figures."""
     with tempfile.TemporaryDirectory() as folder:
         base = Path(folder)
         return [

@@ -160,7 +160,7 @@ PARTS = {
 
 
 def _run(said: Path, *command: str | Path) -> None:
-    """Run one command; keep its exit code and messages, without the paths of this run."""
+    """Run one command; store its exit status and messages, without the paths of this run."""
     done = subprocess.run(
         [sys.executable, "-m", "pipeline", *map(str, command)],
         cwd=ROOT,

@@ -35,7 +35,7 @@ def other(tmp_path):
 
 
 def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
-    """While one process writes, a second run is refused with its number and removes nothing of it.
+    """While one process writes into a folder, a second run is refused and removes nothing.
 
     Once the first process is dead, the next run gets the lock, and removes the scratch folders of
     both.
@@ -60,7 +60,7 @@ def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
 
 
 def test_a_lock_that_is_none_is_said(tmp_path):
-    """A file with the lock's name that is not a lock stops the run with a message."""
+    """If a file has the lock's name but is no lock, the run stops with a message."""
     (tmp_path / ".lock").write_bytes(b"something else" * 100)
     with pytest.raises(ConfigError, match="not a lock of cartlab"), alone_in(tmp_path):
         pass

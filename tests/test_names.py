@@ -10,7 +10,7 @@ from pipeline.set_up import PAPER_UNITS
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
 def test_every_name_is_read_back(n):
-    """Each parameter name gives its kind back, and a name with a cart number gives the cart."""
+    """Each parameter name is taken apart into symbol and cart, and put together again."""
     for name in parameter_names(n):
         read = read_name(name)
         assert read.is_gain + read.is_frequency + read.is_ratio == 1

@@ -71,7 +71,7 @@ def test_a_folder_is_looked_through_once(tmp_path):
 
 
 def test_a_link_is_replaced_not_followed(tmp_path):
-    """A link in a submission is replaced by the output, which does not go to the link's target."""
+    """A link in a submission is replaced by the output file; the link's target is unchanged."""
     victim = tmp_path / "victim"
     victim.write_text("precious")
     link = tmp_path / "report.html"
@@ -92,7 +92,7 @@ def test_a_linked_folder_inside_a_submission_is_refused(tmp_path):
 
 
 def test_a_file_in_the_way_is_refused(tmp_path):
-    """If a file has the name of the output folder, the error names it."""
+    """If the output folder's name is that of an existing file, the error names the file."""
     (tmp_path / "out").write_text("")
     with pytest.raises(ConfigError, match="out: is a file"):
         check_folder(tmp_path / "out")

@@ -21,14 +21,14 @@ def results():
 
 
 def test_it_has_every_documented_key(results):
-    """All top-level keys are there, in their order, under the schema's name."""
+    """results.json has all top-level keys in the documented order, and the schema's name."""
     assert results["schema"] == "cartlab-results/1"
     page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8").split("\n## ")[0]
     assert list(results) == re.findall(r"^- \*\*`(\w+)`\*\*:", page, re.MULTILINE)
 
 
 def test_parameters_follow_the_papers_table(results):
-    """The rows have the order of Table 2, with units and both estimates."""
+    """The parameters are in the order of the paper's Table 2, with units and both estimates."""
     rows = results["parameters"]
     assert [row["name"] for row in rows] == [
         "K_1",

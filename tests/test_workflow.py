@@ -52,7 +52,7 @@ def test_same_input_gives_same_bytes(analyses):
 
 
 def test_how_the_records_follow_is_handed_on(analyses):
-    """`analyse` hands on how well the carts explain each record, as a new computation confirms."""
+    """`analyse` returns how well the carts explain each record, the same as a new computation."""
     for analysis in analyses.values():
         fits = follow(analysis.records, analysis.chain)
         assert fits
@@ -85,7 +85,7 @@ def _without(tmp_path, *, kinds, example="two-cart"):
 def test_a_missing_experiment_is_skipped_with_its_reason_and_the_rest_goes_on(
     tmp_path, kind, stage
 ):
-    """Without one kind of experiment its stage is skipped; the carts are still identified."""
+    """If one kind of experiment is missing, its stage is skipped; the carts are still found."""
     analysis = analyse(_without(tmp_path, kinds=[kind]))
     assert stage in {skip.name for skip in analysis.skipped}
     truth = PRESETS["throne-2dof"]
@@ -97,7 +97,7 @@ def test_a_missing_experiment_is_skipped_with_its_reason_and_the_rest_goes_on(
 
 
 def test_steps_alone_still_give_a_full_report(tmp_path):
-    """Without dwells and sweep the joint fit uses the step records, and the report says so."""
+    """Without dwells and sweep the carts are fitted to the step records, and a warning says so."""
     analysis = analyse(_without(tmp_path, kinds=["sine", "sweep"]))
     assert analysis.fit is not None
     assert analysis.fit.method == "time_fit"

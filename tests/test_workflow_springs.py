@@ -150,7 +150,7 @@ def test_two_carts_that_no_spring_ties_to_a_wall_are_found(tmp_path):
     "springs", [(False, True, False), (True, False, False)], ids=["no wall", "not joined"]
 )
 def test_springs_that_the_bench_does_not_have_are_asked_about(tmp_path, springs):
-    """If no carts fit, the summary asks about the springs, and no heading or column is empty."""
+    """If no carts fit the stated springs, the summary asks about them; no heading is empty."""
     shutil.copytree(EXAMPLES / "two-cart", tmp_path / "bench")  # between cart 2 and the wall is one
     toml = tmp_path / "bench" / "submission.toml"
     text = re.sub("springs = .*", f"springs = {json.dumps(springs)}", toml.read_text("utf-8"))

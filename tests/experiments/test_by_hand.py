@@ -29,7 +29,7 @@ def work(tmp_path):
     ],
 )
 def test_what_is_wanted_stands_in_the_plan_after_what_is_there(work, kind, numbers, expected):
-    """A recording of any kind is added after those in the plan, with a new id and its settings."""
+    """A recording of any kind is added at the end of the plan, with a new id."""
     submission = load_submission(work)
     plan = load_plan(submission)
     wanted = make_recording(
@@ -74,7 +74,7 @@ def test_a_number_outside_the_limits_is_refused_by_name(work, kind, numbers, wor
     ("seconds", "frequency", "cycles"), [(100.0, 0.07, 7), (101.0, 0.07, 8), (120.0, 0.07, 8)]
 )
 def test_whole_periods_last_as_long_as_typed(work, seconds, frequency, cycles):
-    """100 s at 0.07 Hz become exactly 7 periods, and the limit of 120 s is not exceeded."""
+    """100 s at 0.07 Hz become exactly 7 periods, despite the rounding of floats."""
     submission = load_submission(work)
     made = make_recording(
         WantedRecording(kind="sine", seconds=seconds, amplitude=0.1, frequency=frequency),

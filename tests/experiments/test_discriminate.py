@@ -113,7 +113,7 @@ def test_what_is_proposed_keeps_the_limits_and_sets_them_apart(proposed):
 
 
 def test_what_the_parameters_can_take_up_is_no_difference():
-    """A difference between explanations that a fit of the parameters removes does not count."""
+    """A difference that other values of the parameters can remove does not count."""
     heavier = replace(DRY, chain=replace(CHAIN, m=CHAIN.m * 1.002, k=CHAIN.k * 0.999))
     gap = with_proposal(disputed(DRY, heavier), limits=LIMITS)
     other = with_proposal(disputed(DRY, DRAG), limits=LIMITS)
@@ -129,7 +129,7 @@ def test_what_the_parameters_can_take_up_is_no_difference():
 
 
 def test_what_is_held_elsewhere_starts_there():
-    """Under a constant force the carts start at rest where it holds them, without a transient."""
+    """Under a constant force the carts start at rest where that force holds them."""
     pushed = model("force_offset", place=1, force=0.004)
     recording = Recording(
         id="quiet", kind="step", carts=(1, 2), wave="square", amplitude=0.1, frequency=0.2, cycles=1
@@ -207,7 +207,7 @@ def test_of_those_that_settle_a_pair_the_best_is_proposed(proposed):
 
 
 def test_what_would_not_settle_it_is_recorded_for_longer(proposed):
-    """If twelve seconds cannot separate a lag from a delay of 0.1 ms, a longer run is proposed."""
+    """If twelve seconds cannot separate two explanations, a longer recording is proposed."""
     late, lagged = (
         model("input_delay", place=0, delay=1e-4),
         model("actuator_lag", place=0, time_constant=1e-4),
@@ -239,7 +239,7 @@ def test_what_acts_on_the_input_alone_shows_in_no_decay():
 
 
 def test_a_release_says_how_far_out_and_is_drawn_from_there():
-    """Each release height is a candidate of its own, and the entry in the plan states it."""
+    """Each height of a release is a separate candidate, and its plan entry states the height."""
     heights = set()
     for recording, height in _candidates(CHAIN, LIMITS):
         assert (height > 0) == (recording.kind == "decay")
@@ -258,7 +258,7 @@ def test_a_release_says_how_far_out_and_is_drawn_from_there():
 
 @pytest.fixture
 def swept(tmp_path) -> Callable[[list[str]], Callable[..., Gap]]:
-    """Return a function that makes a sweep of one cart with hidden effects, and its search."""
+    """Return a function that records a sweep of one cart with hidden effects and finds its gap."""
     folder = tmp_path / "work"
 
     def sweep(hide: list[str]) -> Callable[..., Gap]:

@@ -126,7 +126,7 @@ def simulated(chain: Chain | None, law, *, delay: int) -> tuple[Array, Array]:
 
 
 def test_the_designed_loop_runs_on_the_bench_as_simulated(identified):
-    """With gains in counts and duty, the carts move as with the design's gains in V and cm."""
+    """With gains in counts and duty, the carts move as in the simulation in V and cm."""
     _, analysis = identified
     design, chain = design_of(analysis), analysis.chain
     gains = state_gains_of(identified, StateLoop(cart=analysis.bench.n))
@@ -146,7 +146,7 @@ def test_the_designed_loop_runs_on_the_bench_as_simulated(identified):
 
 
 def test_a_pid_is_sent_as_typed_and_runs_as_simulated(identified):
-    """PID gains typed in duty counts per count act as the converted gains in V and cm."""
+    """PID gains typed in duty counts per count act as the same gains in V and cm."""
     _, analysis = identified
     loop = PidLoop(kp=0.05, ki=0.1, kd=0.005)
     gains = gains_of(identified, loop)
@@ -176,7 +176,7 @@ def test_the_submission_records_what_ran(identified):
 
 
 def test_an_input_that_pushes_the_other_way_turns_the_gains_round(identified):
-    """If positive duty pushes the carts backwards, the gains that are sent change their sign."""
+    """If positive duty pushes the carts backwards, gains are sent with the opposite sign."""
     submission, analysis = identified
     turned = tuple(replace(r, input_scale=-r.input_scale) for r in analysis.records)
     reversed_ = replace(analysis, records=turned)
@@ -260,7 +260,7 @@ def test_a_pid_is_refused_where_it_swings_up(identified, kd, stable):
 
 @pytest.mark.parametrize("example", ["one-cart", "two-cart", "three-cart"])
 def test_a_proposed_pid_brings_cart_1_to_the_level(example):
-    """On its own carts, the proposed PID brings cart 1 within 2 % of 1 cm in 5 s."""
+    """The PID proposed for a bench brings its cart 1 to within 2 % of 1 cm in 5 s."""
     submission = load_submission(EXAMPLES / example)
     kept = tuple(e for e in submission.experiments if e.kind in ("step", "sweep"))
     submission = submission.model_copy(update={"experiments": kept})
@@ -288,7 +288,7 @@ def test_a_proposed_pid_brings_cart_1_to_the_level(example):
 
 
 def test_an_unstated_scale_is_asked_for(identified):
-    """If nobody states how centimetres and the bench's counts are related, that is asked."""
+    """If the scale from the bench's counts to centimetres is not stated, cartlab asks for it."""
     submission, analysis = identified
     with pytest.raises(DataError, match=r"state system\.position\.per_count in cm"):
         bench_scales(submission, bench=replace(BENCH, position_unit="count"), analysis=analysis)

@@ -79,7 +79,7 @@ def multisine(known: Knowledge, goal: Goal) -> Recording:
 
 
 def test_what_is_known_is_what_the_fit_says(known, analysis):
-    """H and S give the fit's own standard error of every named parameter."""
+    """The information matrices give the fit's own standard error of every parameter."""
     half = known.by_parameters() @ np.linalg.inv(known.information[0])
     std = np.sqrt(np.diag(half @ known.information[1] @ half.T))
     fitted = [e.std / e.value for e in analysis.fit.parameters.values()]
@@ -145,7 +145,7 @@ def test_steady_sines_tell_what_a_long_record_does(known):
 
 @pytest.mark.parametrize("mean", ["largest", "root mean square", "volume"])
 def test_the_exchange_finds_the_best_of_all_sets(mean):
-    """The exchange finds the best of all 220 choices of three among ten, for every criterion."""
+    """The exchange finds the best of all 220 sets of three experiments, for every criterion."""
     rng = np.random.default_rng(5)
     J = rng.standard_normal((10, 3, 4))
     H = np.einsum("cjp,cjq->cpq", J, J)
@@ -158,7 +158,7 @@ def test_the_exchange_finds_the_best_of_all_sets(mean):
 
 
 def test_the_goals_are_errors_of_what_they_name(known, analysis):
-    """The goal of a parameter is its relative error, and `worst` is the largest of all."""
+    """The goal of a parameter is its relative standard error; `worst` is the largest of them."""
     fitted = {name: e.std / e.value for name, e in analysis.fit.parameters.items()}
     for name in ("zeta_2", "K_1"):
         goal = find_goal(name, known, feedback=None)
@@ -197,7 +197,7 @@ def test_the_design_goal_is_the_spread_of_the_peak(known, analysis):
 
 
 def test_each_choice_serves_its_own_goal(analysis):
-    """A choice made for one parameter serves it at least as well as a choice for another."""
+    """An experiment chosen for one parameter serves it at least as well as others do."""
     plan = Plan(limits=LIMITS)
     left = {}
     for goal in ("K_1", "zeta_2"):
@@ -229,7 +229,7 @@ def test_no_choice_passes_a_limit(analysis):
 
 
 def test_what_somebody_proposes_is_weighed_beside_what_is_chosen(analysis, known):
-    """A user's proposal is compared with the program's choice, each recorded alone."""
+    """The error after a user's proposal is compared with that after the program's choice."""
     mine = Recording(id="mine", kind="sweep", carts=(1, 2), wave="square", amplitude=0.02,
                      frequency=0.4, cycles=8)  # fmt: skip
     plan = Plan(limits=LIMITS)
@@ -270,7 +270,7 @@ def test_a_useless_proposal_gets_a_reason(known, change, words):
 
 
 def test_where_dwells_identify_dwells_are_chosen():
-    """If carts are fitted to dwells alone, only dwells are chosen."""
+    """If the carts were fitted to dwells alone, only further dwells are chosen."""
     analysis = analysed("two-cart")
     found = choose_next(analysis, Plan(limits=LIMITS), n=2, goal="zeta_2", commands=COMMANDS)
     assert {r.kind for r in found.recordings} == {"sine"}
@@ -300,7 +300,7 @@ def test_carts_that_hardly_settle_get_no_dwells():
 
 
 def test_a_predicted_error_below_calibration_is_reported(analysis):
-    """If the predicted error is below that of any calibration, the message says so."""
+    """If the predicted error is below what any calibration allows, the message says so."""
     found = choose_next(analysis, Plan(limits=LIMITS), n=1, goal="worst", commands=COMMANDS)
     assert (STATISTICAL in found.said) == (found.errors[-1] < CALIBRATION)
     assert (STATISTICAL in found.recordings[0].note) == (found.errors[-1] < CALIBRATION)
@@ -315,7 +315,7 @@ def test_a_predicted_error_below_calibration_is_reported(analysis):
 
 
 def test_clipped_phases_keep_the_swing_low():
-    """With clipped phases, twelve sines on three carts peak lower than with 500 random phases."""
+    """With optimised phases the motion under twelve sines peaks lower than with random ones."""
     lines = np.arange(10, 70, 5)
     omega = np.asarray(2 * np.pi * 0.1 * lines, dtype=np.float64)
     G = PRESETS["throne-3dof"].frequency_response(omega)

@@ -151,7 +151,7 @@ def extended(request):
 
 
 def test_dwells_bracket_every_resonance_and_null(extended):
-    """For each resonance and null there is a dwell close to it, and one on either side."""
+    """Each resonance and null has a dwell very near it, and one on either side."""
     chain, plan, _ = extended
     dwells = np.array([2 * np.pi * r.frequency for r in of_kind(plan, "sine")])
     for roots in (chain.poles, *(chain.zeros(cart) for cart in range(1, chain.n))):
@@ -163,7 +163,7 @@ def test_dwells_bracket_every_resonance_and_null(extended):
 
 
 def test_dwells_move_the_carts_as_far_as_asked_and_never_past_the_limit(extended):
-    """Dwells move the carts by 0.3 to 1.3 of the aim and never beyond the travel limit."""
+    """Dwells move the carts by 0.3 to 1.3 of the distance aimed at, within the travel limit."""
     chain, plan, _ = extended
     aim = AIM * plan.limits.travel
     wait = settling_wait(chain, time_constants=SETTLED_DWELL)
@@ -180,7 +180,7 @@ def test_dwells_move_the_carts_as_far_as_asked_and_never_past_the_limit(extended
 
 
 def test_steps_rest_near_the_aim_and_overshoot_within_the_limit(extended):
-    """Steps to both sides end at 0.5 to 1 of the aim, and overshoot within the limit."""
+    """Steps end at 0.5 to 1 of the distance aimed at, and overshoot within the limit."""
     chain, plan, _ = extended
     aim, amplitudes = AIM * plan.limits.travel, [r.amplitude for r in of_kind(plan, "step")]
     assert amplitudes[0] == -amplitudes[1]

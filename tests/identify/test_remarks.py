@@ -25,7 +25,7 @@ def test_centimetres_said_to_be_metres_are_asked_about(name):
 
 
 def test_one_kind_of_recording_or_a_jump_accuses_no_unit():
-    """One kind of recording, or an encoder that jumps, raises no doubt about the unit."""
+    """If only one kind of recording is too fast, or an encoder jumps, no unit is doubted."""
     data = read_data(load_submission(EXAMPLES / "one-cart"))
     steps = replace(data, records=tuple(r for r in data.records if r.kind == "step"))
     assert not [one for one in reading_remarks(steps, unit="m") if "runs so fast" in one]

@@ -31,7 +31,7 @@ def test_the_encoder_step_is_recovered(step, travel, decimals, seed):
 
 
 def test_a_signal_without_steps_has_no_encoder_step():
-    """Full-precision noise shows no step, nor does a constant."""
+    """Neither noise in full precision nor a constant has an encoder step."""
     rng = np.random.default_rng(1)
     assert encoder_step(rng.standard_normal(1000)) == 0.0
     assert encoder_step(np.full(1000, 3.0)) == 0.0

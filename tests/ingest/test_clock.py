@@ -138,7 +138,7 @@ def a_session(interval: float, *, n: int = 15, jitter: float = 0.0) -> list[np.n
     [(1.00031e-3, 3e-7 / 15), (0.99987e-3, 3e-7 / 15), (1.000047e-3, 2e-3 / 120)],
 )
 def test_the_records_of_a_session_share_one_period(interval, error):
-    """Near 1 kHz all records of a session together give the period, which one alone would not."""
+    """Near 1 kHz a single record does not show its period; all records of a session together do."""
     stamps = a_session(interval)
 
     clocks = read_clocks(stamps)
@@ -159,7 +159,7 @@ def test_ticks_that_are_late_at_times_leave_one_period(interval):
 
 
 def test_clocks_that_differ_stay_apart():
-    """Records of two benches in one session keep their own periods, and exact stamps are kept."""
+    """Records of two benches keep their own periods, and exact time stamps are kept."""
     one, other = a_session(1.00031e-3, n=4), a_session(0.0088542, n=4)
     exact = 0.00500001 * np.arange(900, dtype=np.float64)
 
@@ -172,7 +172,7 @@ def test_clocks_that_differ_stay_apart():
 
 
 def test_a_session_of_even_stamps_is_left_alone():
-    """If the stamps show no other period than their own, they are kept."""
+    """If the stamps of a session are exactly even, they are kept."""
     stamps = a_session(1e-3)
     for clock, kept in zip(read_clocks(stamps), stamps, strict=True):
         assert clock.pieces == 0
@@ -180,7 +180,7 @@ def test_a_session_of_even_stamps_is_left_alone():
 
 
 def test_dropped_samples_do_not_bend_the_shared_period():
-    """A record that lost samples is straightened in parts, each with the session's period."""
+    """Each part of a record that lost samples gets even times with the session's period."""
     stamps = a_session(0.0011279)
     lost = np.delete(stamps[9], [2000, 2001, 2002, 6000, 6001, 6002, 6003])
 

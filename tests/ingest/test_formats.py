@@ -123,7 +123,7 @@ CSV = {
 
 @pytest.mark.parametrize("content", CSV.values(), ids=CSV.keys())
 def test_delimiter_and_decimal_mark_are_found(content):
-    """A table of text gives the same numbers however a spreadsheet wrote it."""
+    """Whatever delimiter and decimal mark a text table has, it gives the same numbers."""
     got = table(content)
 
     assert got.form == "csv"
@@ -218,7 +218,7 @@ def test_a_big_endian_mat_file_is_read():
 
 
 def test_a_bare_matrix_has_numbered_columns():
-    """The columns of a single matrix are numbered; a lying matrix is transposed, with a note."""
+    """The columns of a matrix are numbered; one saved in rows is transposed, with a note."""
     matrix = np.column_stack([np.arange(N), TIME, X1, U])
     upright, lying = table(mat(data=matrix)), table(mat(data=matrix.T))
     assert upright.form == "matrix"
@@ -274,7 +274,7 @@ def test_the_recording_is_the_matrix_whatever_lies_beside_it():
 
 
 def test_a_matrix_beside_vectors_of_its_length_gives_its_columns_too():
-    """The columns of a matrix as long as the vectors beside it are read too, by number."""
+    """The columns of a matrix are numbered and read too if it is as long as the vectors."""
     got = table(mat(t=TIME, y=np.column_stack([X1, U])))
     assert set(got.names) == {"t", "y column 1", "y column 2"}
     assert_array_equal(column(got, "y column 2"), U)
@@ -417,7 +417,7 @@ def test_a_matlab_7_3_variable_that_lies_about_its_class_is_not_read(odd):
 
 
 def mat73_with(fill: Callable[[h5py.File], object]) -> bytes:
-    """Return a version 7.3 file with a time and with what a function adds."""
+    """Return a version 7.3 file with a time and with what a given function adds."""
     stream = BytesIO(mat73(time=TIME))
     with h5py.File(stream, "r+") as file:
         fill(file)
@@ -436,7 +436,7 @@ def test_a_matlab_7_3_file_takes_no_more_memory_than_a_recording():
 
 
 def test_the_class_of_a_matlab_7_3_variable_is_one_line():
-    """A variable of version 7.3 with any class attribute is named with a short kind."""
+    """Whatever its class attribute holds, a variable of version 7.3 is named in one line."""
 
     def fill(file: h5py.File) -> None:
         file["note"] = np.arange(5.0)

@@ -127,7 +127,7 @@ def test_a_cut_file_is_inspected_all_the_same(tmp_path):
 
 
 def test_a_remark_does_not_keep_a_file_from_being_used(tmp_path):
-    """A column without a role is a remark only, and the file can be used."""
+    """A column without a role is reported, but the file can still be used."""
     got = inspect(tmp_path, time=T, input=np.sin(T), x1=X, temperature=X)
     assert got.problems
     assert got.unusable == ()
@@ -183,7 +183,7 @@ def test_a_link_may_be_inspected(tmp_path):
 
 
 def test_what_is_no_data_file_is_one_line(tmp_path):
-    """A missing file and a folder without recordings each give one line of error."""
+    """A missing file, or a folder without recordings, gives one line of error."""
     typed = tmp_path / "none.csv"
     with pytest.raises(SubmissionError, match=r"there is no file 'none\.csv'") as caught:
         inspect_file(typed)

@@ -50,7 +50,7 @@ SPECIAL = "***Start_Special***\r\nWaveform\t1,2\r\n***End_Special***\r\n\r\n"
 
 
 def multi(clock: np.ndarray) -> str:
-    """Return a file with an X column for each channel, in which the second has these times."""
+    """Return a file with an X column for each channel; the second channel's holds `clock`."""
     rows = ["\t".join(f"{v:.6f}" for v in row) for row in zip(TIME, U, clock, X1, strict=True)]
     text = GOOD[: GOOD.index("X_Value")] + "X_Value\tinput\tX_Value\tx1\tComment\r\n"
     return text.replace("X_Columns\tOne", "X_Columns\tMulti") + "\r\n".join(rows) + "\r\n"
@@ -93,7 +93,7 @@ def test_units_of_the_header_go_into_the_headings():
 
 
 def test_segments_that_continue_each_other_are_one_recording():
-    """Segments that follow in time are one recording, with one header each or one for all."""
+    """Segments that follow each other in time become one recording."""
     for text in (
         GOOD + "\r\n" + lvm_segment(LATER),
         GOOD + "\r\n" + lvm_segment(LATER).partition("Comment\r\n")[2],
@@ -273,7 +273,7 @@ def test_a_broken_tdms_is_one_line(raw, said, capfd):
 
 
 def test_a_tdms_in_tiny_pieces_is_read_up_to_a_limit(monkeypatch):
-    """A .tdms file with more pieces than a limit is refused, since reading it would be slow."""
+    """A .tdms file in too many pieces is refused, since reading it would be slow."""
     data = np.arange(200.0).tobytes()
     raw = lead_in(14, len(TINY) + len(data), len(TINY)) + TINY + data
     assert_array_equal(table(raw).values, np.arange(200.0).reshape(100, 2).T)

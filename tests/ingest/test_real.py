@@ -35,7 +35,7 @@ def experiment(name: str, kind: str, more: str = "") -> str:
 
 
 def test_every_text_export_is_recognised(real_data):
-    """`inspect` finds the kind of each recording that its file name states."""
+    """`inspect` finds the kind of each recording, which its file name states."""
     for path in sorted((real_data / "ecp210-ucsd").glob("*.csv")):
         got = inspect_file(path)
         expected = next((k for start, k in KINDS.items() if path.name.startswith(start)), None)
@@ -90,7 +90,7 @@ def test_the_exported_matrix_is_the_export(real_data, tmp_path):
 
 
 def test_the_serial_bench_logs_are_read(real_data, tmp_path):
-    """Both layouts of a serial log are read, and an edited copy agrees with the original's end."""
+    """Serial logs of both layouts are read; an edited copy agrees with the end of its original."""
     toml = experiment("Jan281500.mat", "closed_loop")
     toml += experiment("Modified_Jan281500.mat", "closed_loop")
     whole, part = read(real_data / "teensy-torsional", toml, tmp_path).records
@@ -108,7 +108,7 @@ def test_the_serial_bench_logs_are_read(real_data, tmp_path):
 
 
 def test_the_silverbox_is_read(real_data, tmp_path):
-    """The Silverbox files, which have no time column, are read with a rate and column names."""
+    """The Silverbox files have no time column, and are read with a stated sample rate."""
     more = (
         f"sample_rate = {1e7 / 2**14}\ncarts = [1]\nhold = 'band_limited'\n"
         'columns = { input = "V1", x1 = "V2" }'

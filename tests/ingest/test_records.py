@@ -104,7 +104,7 @@ def test_a_unit_in_the_heading_is_converted(unit, factor, tmp_path):
     ],
 )
 def test_the_usual_headings_are_understood(headings, tmp_path):
-    """Usual headings of students for time, input and positions are understood."""
+    """Headings that students commonly use for time, input and positions are understood."""
     record = read(
         tmp_path, CM, STEP, csv(a=T, b=U, c=X1, d=X2).replace("a,b,c,d", ",".join(headings))
     ).records[0]
@@ -301,7 +301,7 @@ def test_a_bare_matrix_is_read_by_column_numbers(tmp_path):
 
 
 def test_the_system_names_the_columns_of_all_its_recordings(tmp_path):
-    """`columns` of `[system]` holds for all files that have them; an experiment's own go first."""
+    """`columns` of `[system]` holds for all files, unless an experiment states its own."""
     named = CM + '\ncolumns = { x1 = "first", x2 = "second", reference = "goal" }'
     content = csv(time=T, input=U, first=X1, second=X2)
     record = read(tmp_path, named, STEP, content).records[0]
@@ -326,7 +326,7 @@ def test_a_sample_rate_against_the_time_column_is_mentioned(tmp_path):
 
 
 def test_a_window_keeps_its_part_of_the_times(tmp_path):
-    """A window keeps the file's times between its ends, which may be rounded up a little."""
+    """A window keeps the samples between its ends, with their times from the file."""
     record = read(tmp_path, "", STEP + "\nwindow = [1.0, 2.0]", csv(time=T, u=U, x1=X1)).records[0]
     inside = (T >= 1.0) & (T <= 2.0)
     assert_allclose(record.t, T[inside], atol=1e-6)
@@ -431,7 +431,7 @@ def test_a_wrong_sign_of_a_session_is_one_sentence(tmp_path):
 
 
 def test_signs_may_differ_between_experiments(tmp_path):
-    """Records of another sign are found; an unclear record follows those of its own kind."""
+    """Records with the other sign are found; an unclear record gets the sign of its kind."""
     toml = "version = 1\n[system]\ncarts = 2\n"
     runs = {
         "step": ("step", csv(time=T, input=-U, x1=X1)),
@@ -456,14 +456,14 @@ def test_signs_may_differ_between_experiments(tmp_path):
 
 
 def test_data_that_do_not_show_the_sign_are_reported(tmp_path):
-    """If cart 1 is not measured, the sign is taken as +1, with a note."""
+    """If cart 1 is not measured, the input's sign is taken as +1, and a note says so."""
     data = read(tmp_path, "", STEP, csv(time=T, input=U, x2=X2))
     assert_array_equal(data.records[0].u, U)
     assert "the data do not show the sign of the input" in data.warnings[0]
 
 
 def test_a_dwell_carries_its_frequency(tmp_path):
-    """A dwell's frequency in Hz becomes rad/s; without one, it is left to the fit."""
+    """A dwell's stated frequency in Hz becomes rad/s; if it is missing, the fit finds it."""
     content = csv(time=T, input=np.sin(10 * T), x1=X1)
     with_f = read(tmp_path, "", 'kind = "sine"\nfrequency = 4.0', content).records[0]
     assert with_f.omega == pytest.approx(8 * np.pi)
@@ -487,7 +487,7 @@ def test_a_bode_table_becomes_a_response_a_cart(tmp_path):
 
 
 def test_repeats_in_a_bode_table_give_its_standard_errors(tmp_path):
-    """Repeated frequencies of a Bode table are averaged, and their spread gives all its errors."""
+    """Repeats in a Bode table are averaged, and their spread gives the error of every point."""
     rng = np.random.default_rng(11)
     f = np.repeat(np.geomspace(0.5, 8.0, 100), 4)
     x = (1 + f) * np.exp(0.03 * rng.standard_normal(f.size))

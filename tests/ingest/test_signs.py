@@ -63,7 +63,7 @@ CASES = {
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
 def test_the_sign_of_a_single_record_is_found(case, sign, preset):
-    """Any record of motion from rest gives the sign of the input."""
+    """A single record of motion from rest shows the sign of the input."""
     assert find_signs(one(case, respond(preset, case, sign)), stated={}) == {"a": sign}
 
 
@@ -79,7 +79,7 @@ def test_the_sign_is_never_wrong_on_a_late_log(frequency):
 
 
 def test_without_motion_or_input_there_is_no_sign():
-    """A decay, a held cart or no records at all give no sign."""
+    """From a decay or a held cart, or without records, no sign is found."""
     decay: Array = np.rint(440 * np.exp(-T) * np.cos(13 * T))
     assert find_signs(one(np.zeros_like(T), decay), stated={}) == {}
     assert find_signs(one(np.sin(T), np.full_like(T, 3.0)), stated={}) == {}
@@ -88,7 +88,7 @@ def test_without_motion_or_input_there_is_no_sign():
 
 @pytest.mark.parametrize("size", [1e-320, 1e-160, 1e-9, 1e9, 1e160, 1e305])
 def test_numbers_of_any_size_do_no_harm(size):
-    """The sign is found in any units; near the limits of floats it may stay open."""
+    """The sign is found in any units, but may stay open near the limits of floats."""
     u = CASES["sweep"]
     x = respond("throne-1dof", u, 1)
     for records in (one(size * u, x), one(u, size * x), one(size * u, size * x)):

@@ -79,7 +79,7 @@ def kinds_of(real: Path) -> dict[str, dict[str, int]]:
 
 
 def test_exports_of_a_real_bench_are_told_without_their_headings(real_data):
-    """In real steps the roles are found, beside a copied position and a sample number."""
+    """In real step recordings all roles are found, although one column copies a position."""
     folder = real_data / "ecp210-ucsd"
     for name, roles in kinds_of(folder).items():
         table, _ = read_table(folder, name)

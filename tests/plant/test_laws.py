@@ -133,7 +133,7 @@ def test_hysteresis_settles_as_its_rate_says(v):
     ids=lambda effect: effect.key,
 )
 def test_simulator_and_follower_have_the_same_law(effect, state):
-    """The simulator's tables give the same force as the coordinates of the fit."""
+    """For the same parameters, the simulator and the fit compute the same force."""
     kind, p = CATALOGUE.index(effect), coordinates_of(effect)
     x, v, u, on = state
     within = {"F": 0.2} if isinstance(effect.law, FrictionLaw) and effect.law.beyond else {}

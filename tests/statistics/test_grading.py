@@ -24,7 +24,7 @@ NAMED = 0.9  # of the mistakes; on such varied benches some cannot be recognised
 
 @pytest.mark.slow
 def test_mistakes_get_their_codes():
-    """On benches without friction, nearly every mistake is named from three digits."""
+    """On benches without friction nearly every mistake in three-digit numbers is named."""
     named, missed = 0, []
     for seed in range(2001, 2019, 2):
         team = make_team(seed, friction=0.0, digits=3)

@@ -70,7 +70,7 @@ LENGTHS = {"whole": slice(None), "first": slice(8), "short": slice(40), "half": 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A submission, its tables (header and values) by file, and what was done to it."""
+    """A submission, its tables (header and values) by file, and a list of what was changed."""
 
     submission: Submission = field(repr=False)
     files: dict[str, tuple[str, Array]] = field(repr=False)
@@ -91,7 +91,7 @@ def example(name: str) -> tuple[Submission, dict[str, tuple[list[str], Array]]]:
 
 @st.composite
 def broken(draw: st.DrawFn, names: list[str]) -> Case:
-    """Draw an example with missing kinds, spoilt channels, and mislabelled experiments."""
+    """Draw an example with missing kinds, damaged channels, and wrongly declared experiments."""
     name = draw(st.sampled_from(names))
     submission, tables = example(name)
     system = submission.system
@@ -121,7 +121,7 @@ def broken(draw: st.DrawFn, names: list[str]) -> Case:
 
 
 def spoil(draw: st.DrawFn, header: list[str], values: Array) -> tuple[Array, list[str]]:
-    """Spoil one or two columns other than the time, or truncate the record."""
+    """Damage one or two columns other than the time, or cut the record."""
     values, done = values.copy(), []
     for _ in range(draw(st.integers(1, 2))):
         column = draw(st.integers(1, len(header) - 1))

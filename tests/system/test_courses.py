@@ -46,7 +46,7 @@ def need(tool: str) -> None:
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory) -> Path:
-    """A student's recordings, for which the answers "right" are correct."""
+    """A student's recordings, for which the numbers in ANSWERS["right"] are correct."""
     folder = tmp_path_factory.mktemp("bench") / "recordings"
     write_submission(folder, "throne-1dof", seed=7, compact=True)
     return folder

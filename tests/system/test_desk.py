@@ -160,7 +160,7 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
 
 @pytest.mark.usefixtures("work_here")
 def test_the_way_is_gone_with_the_keyboard_alone_on_a_phone(show, tmp_path):
-    """With keys alone, on a phone, a student gets from the doubt about a unit to the zip."""
+    """With keys alone, on a phone, a student answers a question about units and gets the zip."""
     folder = tmp_path / "team"
     (folder / "data").mkdir(parents=True)
     for file in FILES:
@@ -258,7 +258,7 @@ def test_what_is_typed_stays_until_it_is_saved(show, tmp_path):
 
 @pytest.mark.usefixtures("work_here")
 def test_one_key_answers_what_several_recordings_ask(show, tmp_path):
-    """One key answers the same question for several recordings; answered rows fold away."""
+    """If several recordings ask the same question, one key answers it for all of them."""
     folder = tmp_path / "team"
     (folder / "data").mkdir(parents=True)
     for name, n in (("a", 400), ("b", 420), ("c", 440)):
@@ -282,7 +282,7 @@ def test_one_key_answers_what_several_recordings_ask(show, tmp_path):
 
 
 def test_what_is_made_of_the_file_waits_for_what_is_not_saved(show, tmp_path):
-    """While typed text is unsaved, zip and report wait and say so."""
+    """While typed text is not saved, zip and report are not made, and a message says why."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
         window = show(server.url)
@@ -333,7 +333,7 @@ def test_what_is_made_of_the_file_waits_for_what_is_not_saved(show, tmp_path):
 
 @pytest.mark.usefixtures("work_here")
 def test_everybody_can_use_it(show, tmp_path):
-    """The desk passes axe by day and night, is never wider than the screen and works by keys."""
+    """The desk passes axe by day and night, fits every screen and can be used by keyboard."""
     folder = a_submission(tmp_path / "team", "two-cart")
     with DeskServer(folder=folder) as server:
         window = show(server.url, size=PHONE)
@@ -370,7 +370,7 @@ def test_without_scripts_it_works_too(show, tmp_path):
 
 
 def test_the_command_says_its_address_and_ends_with_a_signal(tmp_path):
-    """The desk prints one line when ready or if the port is taken, and ends with 0 on a signal."""
+    """`cartlab desk` prints its address in one line, and a signal ends it with status 0."""
     command = [sys.executable, "-m", "pipeline", "desk", str(tmp_path / "team"), "--no-browser"]
     with started(command, stderr=subprocess.PIPE, encoding="utf-8") as desk:
         assert desk.stderr is not None

@@ -67,7 +67,7 @@ def press(window, control, key: str = "Enter") -> None:
 
 @pytest.mark.usefixtures("work_here")
 def test_from_the_request_to_the_answer_by_keyboard(show, lab, tmp_path: Path):
-    """A student asks about a grade on a phone, and reads the TA's answer with its points."""
+    """By keyboard, a student asks about a grade, the TA answers, and the student reads it."""
     prof = show(f"{lab}/", extra_http_headers=named("prof"))
     press(prof, prof.get_by_role("button", name="Let students read their feedback"))
     expect(prof.get_by_role("status")).to_contain_text("Students can read their feedback.")

@@ -34,7 +34,7 @@ _RECORD = some_files(most=1)[0][1]
 
 @dataclass(kw_only=True)
 class _Save:
-    """Save new titles of a submission, one after the other."""
+    """Save new titles of a submission, one after another."""
 
     folder: Path
     page: str = "/student/0/"

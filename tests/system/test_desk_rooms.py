@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("work_here")
 
 
 def test_a_session_is_begun_watched_and_decided_on(show, tmp_path, real, monkeypatch):
-    """In a session one run is kept, the next recorded, another ended, then all others recorded."""
+    """During a session, buttons keep one run, end another, and the session goes on to its end."""
     monkeypatch.chdir(tmp_path)
     work = write_work(
         tmp_path / "team",
@@ -128,7 +128,7 @@ def test_an_exploration_is_watched_and_steered(show, tmp_path):
 
 
 def test_an_exercise_is_made_of_what_is_seen(show, tmp_path):
-    """An instructor makes an exercise by ticking an effect and moving its slider."""
+    """An instructor ticks an effect, moves its slider, and makes an exercise from it."""
     out = tmp_path / "exercise"
     with DeskServer() as server:
         window = show(server.url, size=WIDE)

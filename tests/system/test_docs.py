@@ -116,7 +116,7 @@ def test_the_files_that_contributors_are_sent_to_are_there():
 
 
 def test_the_hooks_before_a_commit_are_the_checks_of_ci():
-    """For each call of ruff, pyright and mkdocs in `.ci/run` there is a hook that is as strict."""
+    """Each call of ruff, pyright and mkdocs in `.ci/run` is also a pre-commit hook."""
     checked = re.findall(
         r"^(?:\w+=\S+ )?((?:ruff|pyright|mkdocs)\b.*)", (ROOT / ".ci/run").read_text(), re.MULTILINE
     )

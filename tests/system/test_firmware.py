@@ -104,7 +104,7 @@ TICKS = st.tuples(
 @example(encoders=2, session=[(b"?;?;?;d;s;o;o;1;5;1;", [([0, 0, 0], 1)])])
 @settings(max_examples=200)
 def test_any_session_is_that_of_the_reference(library, encoders, session):
-    """Whatever arrives, in whatever state, duties and lines equal those of the reference.
+    """Whatever bytes arrive, firmware and reference give the same duties and lines.
 
     The host reads all the time: lines without room on their way out are dropped (see below), while
     the reference, which answers at its next tick, has room for all.
@@ -284,7 +284,7 @@ NOT_STOPPING = [
     [(data, True) for data in STOPPING] + [(data, False) for data in NOT_STOPPING],
 )
 def test_no_lost_byte_swallows_a_stop(library, data, stops):
-    """A stop command works after any damaged bytes, and without one the run goes on."""
+    """A stop command works after any damaged bytes; without a stop, the run goes on."""
     duties = []
     for core in _both(library):
         core.receive(encode(Start(wave=Wave.SQUARE, frequency=1e-3, amplitude=70)))
@@ -399,7 +399,7 @@ def test_the_sketch_compiles_for_other_boards(tmp_path, options):
     form=st.sampled_from([".9g", ".8e"]),
 )
 def test_numbers_are_read_as_python_reads_them(library, size, sign, form):
-    """Nine digits, as the host sends them, come out to the last bit."""
+    """Numbers of nine digits, as the host sends them, are read as exactly the same floats."""
     text, read = sign + format(size, form), ctypes.c_double()
     assert library.read_number(text.encode(), False, ctypes.byref(read))
     assert read.value == float(text)
@@ -409,7 +409,7 @@ def test_numbers_are_read_as_python_reads_them(library, size, sign, form):
     "text", ["12345678901234567890123", "0.1234567890123456789012", "98765432109876543210.5e-3"]
 )
 def test_more_digits_than_fit_keep_their_place(library, text):
-    """Of a number with more than 18 digits, as many are kept as a double can hold."""
+    """A number with more than 18 digits is read as precisely as a float can hold it."""
     read = ctypes.c_double()
     assert library.read_number(text.encode(), False, ctypes.byref(read))
     assert read.value == pytest.approx(float(text), rel=1e-15)

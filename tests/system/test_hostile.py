@@ -61,7 +61,7 @@ sys.addaudithook(_tell)
     ],
 )
 def graded(request, tmp_path_factory):
-    """A hostile class and the output of the command line: folder, names, audit lines."""
+    """Grade a hostile class; return its folder, the names, and the audit log of all processes."""
     base = tmp_path_factory.mktemp("hostile")
     school = base / "school"
     for number, place in enumerate((*(school / name for name in HONEST), base / "spoilt")):
@@ -240,7 +240,7 @@ def test_no_cell_is_a_formula_and_all_json_is_valid(graded):
     not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root changes user"
 )
 def test_what_may_not_be_read_is_a_row(tmp_path_factory):
-    """A folder or file without read permission changes only the row of its own submission."""
+    """If a folder or file may not be read, only the row of its submission says so."""
     base = tmp_path_factory.mktemp("rights")
     for name in ("folder", "inside", "toml", "listed", "good"):
         (base / "class" / name / "data").mkdir(parents=True)
@@ -270,7 +270,7 @@ def test_what_may_not_be_read_is_a_row(tmp_path_factory):
 
 
 def test_what_goes_away_or_changes_meanwhile_is_a_row(tmp_path):
-    """If a file disappears or is replaced while it is graded, only its own row says so."""
+    """If a file disappears or changes during grading, only the row of its submission says so."""
     for name in ("gone", "changed"):
         (tmp_path / "class" / name).mkdir(parents=True)
         (tmp_path / "class" / name / "submission.toml").write_text(

@@ -74,7 +74,7 @@ def take(work, source) -> tuple[list, Notes]:
 
 
 def test_files_become_the_recordings_that_the_plan_asks_for(work, source):
-    """Each exported file becomes the plan's next recording, in the order written."""
+    """In the order written, each exported file becomes the next recording of the plan."""
     put(source, "B.txt", dwell(2.0), at=200)
     put(source, "A.txt", STEP, at=100)
     put(source, "extra run!.txt", dwell(5.0), at=150)
@@ -121,7 +121,7 @@ def test_the_usb_logger_is_known(tmp_path, source):
 
 
 def test_a_matrix_without_names_gets_its_columns_guessed(work, source):
-    """A table without headings becomes the plan's next item; a message asks to check it."""
+    """The columns of a table without headings are guessed, and a message asks to check them."""
     u = np.where((T > 1) & (T < 3), 0.5, 0.0)
     rows = "".join(
         f"{t:.5f}\t{round(400 * v)}\t{round(200 * v + i % 2)}\t{v:.4f}\n"
@@ -189,7 +189,7 @@ def test_everything_else_in_the_folder_is_said_once(work, source):
 
 
 def test_a_file_is_waited_for_until_it_is_complete(work, source):
-    """A file that is still being written is not read, and watching ends when the plan is done."""
+    """A file that is still being written is imported only when it is complete."""
     half = len(STEP) // 2
     looks = iter(range(100))
 
@@ -234,7 +234,7 @@ def test_a_file_that_vanishes_between_two_looks_ends_nothing(work, source):
     sys.platform == "win32" or os.geteuid() == 0, reason="root and Windows lock otherwise"
 )
 def test_a_locked_file_is_taken_once_it_can_be_read(work, source):
-    """A file that its program still locks is reported once, and imported when it can be read."""
+    """A file that its program locks is reported once, and imported when the lock is gone."""
     put(source, "A.txt", STEP, at=1)
     (source / "A.txt").chmod(0)
     waits = iter(range(9))

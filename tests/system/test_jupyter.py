@@ -24,7 +24,7 @@ PREFIX = "/user/ada/"
 
 @pytest.fixture
 def lab(tmp_path):
-    """A JupyterLab of the user Ada, as JupyterHub starts it.
+    """A JupyterLab of the user Ada, as JupyterHub starts it, with its process, address and token.
 
     With its process, address and token.
     """

@@ -113,7 +113,7 @@ def test_points_are_few_in_units_and_of_this_run(folder):
 
 
 def test_a_slow_reader_gets_less_and_not_later(folder):
-    """A page that has not asked for a minute gets the last twelve seconds only."""
+    """A page that did not ask for a minute then gets only the last twelve seconds."""
     state = LiveState(folder)
     state.planned(PLAN, frozenset())
     state.started(SINE)
@@ -125,7 +125,7 @@ def test_a_slow_reader_gets_less_and_not_later(folder):
 
 
 def test_the_plan_says_what_is_done_now_and_broken(folder):
-    """The plan shows the state of each recording, and why one is partial until it succeeds."""
+    """The plan shows the state of each recording, and for a partial one the reason."""
     state = LiveState(folder)
     state.planned(PLAN, frozenset({"decay-1"}))
     state.started(SINE)
@@ -140,7 +140,7 @@ def test_the_plan_says_what_is_done_now_and_broken(folder):
 
 
 def test_an_instruction_waits_for_its_own_answer(folder):
-    """Only the answer to the current instruction counts; if the page ends, the wait ends too."""
+    """An instruction ends by its own answer, not by that to an earlier one, or with the page."""
     state = LiveState(folder)
     assert not state.answer(1)
     waiting = threading.Thread(target=state.confirm, args=("hold cart 2",))
@@ -159,7 +159,7 @@ def test_an_instruction_waits_for_its_own_answer(folder):
 
 
 def ask(page: LivePage, path: str = "", method: str = "GET", body: str | None = None, **headers):
-    """Make one request as any program could; return the response, read."""
+    """Make one request, as any program could; return the response and its text."""
     url = urlsplit(page.url)
     connection = http.client.HTTPConnection(url.hostname or "", url.port or 0, timeout=PATIENCE)
     named = {key.replace("_", "-"): value for key, value in headers.items()}
@@ -182,7 +182,7 @@ def news(page: LivePage, opened: ExitStack) -> http.client.HTTPResponse:
 
 
 def test_it_is_served_to_this_computer_only_with_strict_headers(page):
-    """The page listens on this computer only, allows only its own scripts, and forbids caching."""
+    """Only this computer can open the page, which loads only its own scripts and is not cached."""
     assert urlsplit(page.url).hostname == "127.0.0.1"
     response, text = ask(page)
     assert response.status == 200
@@ -259,7 +259,7 @@ def test_the_secret_is_new_each_time_and_written_nowhere(folder, caplog, capfd):
 
 
 def test_a_port_that_is_taken_is_one_clear_line(page, folder):
-    """If the port is taken, the error says so."""
+    """If the requested port is in use, the error says that it is not free."""
     with pytest.raises(HardwareError, match="is not free for the page"):
         LivePage(folder, port=urlsplit(page.url).port or 0)
 
@@ -540,7 +540,7 @@ def test_by_night_the_curves_change_colour(page, show):
 
 
 def test_the_end_is_told(folder, browser):
-    """After the session the page says so, keeps its curves, and sends no more requests."""
+    """After the session the page says that it is over, keeps its curves, and sends no requests."""
     context = browser.new_context()
     context.set_default_timeout(1e3 * PATIENCE)
     window = context.new_page()

@@ -26,7 +26,7 @@ def shown(window) -> str:
 
 @pytest.mark.usefixtures("work_here")
 def test_a_student_looks_through_runs_and_models(show, tmp_path):  # noqa: F811
-    """By keys alone a student compares two runs, and sees one cart's residual and its spectrum."""
+    """By keys a student compares two runs, then looks at one cart's residual and spectrum."""
     folder = a_submission(tmp_path / "team", "two-cart")
     with DeskServer(folder=folder) as server:
         window = show(server.url)

@@ -51,7 +51,7 @@ def test_long_work_tells_a_pipe_what_it_is_about(work, monkeypatch, capsys):
 
 
 def test_what_was_known_before_is_no_speed():
-    """The time left ignores grades known from before: 4 submissions left at 2 s each take 8 s."""
+    """Submissions graded in an earlier run do not count in the estimate of the time left."""
     now = 0.0
     bar = Progress(get_time=lambda: now, disable=True)
     show = counting(bar)
@@ -80,7 +80,7 @@ def test_a_time_says_what_it_is_of():
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo terminals")
 def test_a_terminal_sees_what_is_done_and_for_how_long(tmp_path):
-    """A terminal shows the stage with the time so far, and the line is removed in the end."""
+    """On a terminal a line shows the current stage and the time; it is removed at the end."""
     import pty
 
     ours, theirs = pty.openpty()

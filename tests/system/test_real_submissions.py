@@ -38,7 +38,7 @@ def test_single_carts_have_their_frequencies_and_friction(two_carts):
 
 
 def test_the_closed_loop_is_compared_and_its_logged_effort_found_out(two_carts):
-    """The PID run is compared with the model, and its logged input has another sign or scale."""
+    """Compared with the model, the log of the PID run has another sign or scale."""
     closed = {h.cart: h for h in two_carts.hardware if h.loop == "closed"}
     assert set(closed) == {1, 2}
     # On the bench and in the model, the loop holds cart 1 at the set point.

@@ -200,7 +200,7 @@ def test_no_page_of_the_print_is_a_third_empty(case, folder, request):
 
 
 def pictures(pgm: bytes) -> Iterator[NDArray[np.uint8]]:
-    """Yield the pages written by pdftoppm, one after the other."""
+    """Yield the pages written by pdftoppm, one after another."""
     while head := re.match(rb"P5\s+(\d+)\s+(\d+)\s+255\s", pgm):
         width, height = map(int, head.groups())
         end = head.end() + width * height
@@ -218,7 +218,7 @@ def white_stretch(page: NDArray[np.uint8]) -> float:
 
 @pytest.mark.parametrize("case", PRINTED)
 def test_no_table_begins_at_the_foot_of_a_page(case, folder, request):
-    """In print the caption of a table has at least the headings and four rows beside it."""
+    """In print a table's caption is on the same page as its headings and first four rows."""
     (pdf,) = folder(case, request).glob("*.pdf")
     tables = list(rows_by_page(PdfReader(pdf)))
     assert len(tables) > 2
@@ -409,7 +409,7 @@ SMALLEST = """() => Math.min(...Array.from(document.querySelectorAll('figure svg
 
 
 def test_figures_can_be_read_on_a_laptop(made, show):
-    """On a laptop letters of figures are at least ten pixels high.
+    """On a laptop letters in figures are at least ten pixels high.
 
     No button lies below a figure.
     """
@@ -435,7 +435,7 @@ def test_a_class_begins_with_how_the_points_are_spread(folder, request, show):
 
 
 def test_a_class_is_searched_and_sorted(folder, request, show):
-    """Words filter the table of a class, and headings sort it by number or name, up and down."""
+    """Words filter the table of a class, and clicks on headings sort it up and down."""
     page = show(page_of(folder("class", request)))
     table = page.locator("table.finder")
     rows = table.locator("tbody tr:visible")

@@ -90,7 +90,7 @@ def spoilt(name: str, rng: Random) -> bytes:
 
 
 def use(name: str, path: Path) -> None:
-    """Read a file with the function for its name, and use what was read."""
+    """Read a file with the function for its name, and use the result."""
     student = Student(
         id="s1", name="Jane Doe", number="7", grade=make_grade("a"), by_hand=frozenset()
     )
@@ -128,7 +128,7 @@ def use(name: str, path: Path) -> None:
 
 
 def try_seed(name: str, seed: int) -> None:
-    """Spoil a file at random and read it.
+    """Damage a file at random and read it; expect at most a few lines of error.
 
     Expect at most one line of error, in TOML one per mistake.
     """

@@ -36,7 +36,7 @@ def test_what_a_browser_would_fetch_elsewhere_is_found(name, text, tmp_path):
 
 
 def test_links_and_local_files_are_no_loads(tmp_path):
-    """A link to another site, a namespace and a local file do not count as loads from outside."""
+    """Links to other sites, namespaces and local files do not count as loading from outside."""
     website = pytest.importorskip("docs.website", reason="the site needs cartlab[docs]")
     (tmp_path / "a.html").write_text(
         '<a href="https://example.org">there</a> <img src="../a.png"> <script src="a.js"></script>'

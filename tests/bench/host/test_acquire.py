@@ -179,7 +179,7 @@ def test_a_pty_is_a_port_like_any_other(tmp_path):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_the_whole_loop_names_what_the_bench_hides(tmp_path):
-    """Dry friction of a virtual bench is named after acquiring the proposed plan."""
+    """From a virtual bench, plan, recordings, report and gap lead to its hidden dry friction."""
     work = tmp_path / "work"
     hidden = "coulomb_friction:cart=1,force=0.0025"
     with emulator("--hide", hidden, "--speed", "20", "--period", "8.84") as bench:
@@ -206,7 +206,7 @@ def test_the_whole_loop_names_what_the_bench_hides(tmp_path):
 
 
 def test_faults_of_every_kind_are_counted_and_the_rest_is_kept(tmp_path):
-    """If one line in a hundred is damaged in each way, good lines are kept and faults counted."""
+    """With 1 % of the lines damaged in each way, good lines are kept and faults counted."""
     work = write_work(tmp_path, [sine("dwell", seconds=8)])
     options = [o for kind in ("drop", "garble", "merge") for o in ("--fault", f"{kind}=0.01")]
     with emulator(*options, "--speed", "10") as bench:
@@ -296,7 +296,7 @@ def assert_stopped_at_once(raw: Path, offending: int) -> None:
 
 
 def test_an_amplitude_past_the_limits_is_never_sent(tmp_path, real):
-    """A plan that asks for more than its own limits is refused before anything is sent."""
+    """A plan with an amplitude beyond its own limits is refused before anything is sent."""
     work = write_work(tmp_path, [sine("dwell", seconds=1)])
     plan = (work / "plan.toml").read_text(encoding="utf-8")
     (work / "plan.toml").write_text(plan.replace("input = 0.5", "input = 0.005"), encoding="utf-8")
@@ -381,7 +381,7 @@ def test_a_port_that_another_program_has_is_said():
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 def test_what_is_no_bench_is_said():
-    """If a device answers with something else, the message says that it is no bench."""
+    """If a device gives other answers than a bench, the message says so."""
     controller, device = os.openpty()
     echo = subprocess.Popen(
         [sys.executable, "-c", f"import os\nwhile os.read({controller}, 99): "
@@ -519,5 +519,5 @@ def test_nobody_at_the_keyboard_confirms_nothing(monkeypatch):
     ("values", "bars"), [([5, 5], "▁▁"), ([0, 7], "▁█"), (range(8), "▁▂▃▄▅▆▇█")]
 )
 def test_a_sparkline_goes_from_the_least_to_the_greatest(values, bars):
-    """A sparkline has a bar for each value, low to high; if all are equal, all are low."""
+    """A sparkline has a bar for each value, as high as the value; equal values are low."""
     assert sparkline(values) == bars

@@ -127,7 +127,7 @@ def test_a_clock_that_cannot_be_believed_ends_the_run(tmp_path, lines, said, kep
 
 
 def test_lines_of_the_run_before_that_come_late_are_not_of_this_one(tmp_path):
-    """Lines of an earlier run that arrive after the stop are not counted in the next run."""
+    """Lines of an earlier run that arrive late are not counted in the next run."""
     first = iter([True])
 
     def reset(lines: list[Reading]) -> Iterator[Reading]:
@@ -143,7 +143,7 @@ def test_lines_of_the_run_before_that_come_late_are_not_of_this_one(tmp_path):
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.6])
 def test_lost_lines_are_told_however_many(tmp_path, share):
-    """A bench's stated period is trusted, so missing lines are counted and noted."""
+    """As a bench's stated period is trusted, missing lines are counted as lost and noted."""
     lost = np.random.default_rng(5).random(RUN) < share
 
     def thinned(lines: list[Reading]) -> Iterator[Reading]:

@@ -44,7 +44,7 @@ def test_a_bench_of_more_carts_is_said(tmp_path):
 
 
 def test_a_run_in_which_nothing_moves_is_not_recorded(tmp_path):
-    """A dwell in which no encoder moves is not recorded, and is offered again twice."""
+    """A dwell in which no encoder moves is not recorded, but tried twice more."""
     work = write_work(tmp_path, [sine("dwell", seconds=2)])
     notes = Notes()
     dead = ("--fault", "stuck=1@0", "--fault", "stuck=2@0")
@@ -125,13 +125,13 @@ def test_a_port_that_is_taken_says_what_to_choose():
 
 
 def test_one_is_not_many():
-    """The noun agrees with its number: one line, one encoder, two resets."""
+    """In messages the noun agrees with its number: one line, one encoder, two resets."""
     assert str(Anomalies(lost=1, stuck=1, resets=2)) == "1 line lost, 2 resets, 1 encoder stuck"
     assert str(Anomalies(lost=2, stuck=2, resets=1)) == "2 lines lost, 1 reset, 2 encoders stuck"
 
 
 def test_a_new_submission_says_what_the_bench_does_not_know(tmp_path):
-    """A new submission has springs to check, and authors and design to uncomment."""
+    """A new submission lists its springs to check, and has comments for authors and design."""
     bench = Description(name="two", encoders=2, carts=2, commands=EXTENSIONS, position_unit="cm")
     folder = tmp_path / "new"
     assert prepare_submission(folder, bench, stock=False).authors == ()

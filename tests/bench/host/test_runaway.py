@@ -112,7 +112,7 @@ def session(
 @pytest.mark.parametrize("wrong", [before_start, between, at_the_end])
 @pytest.mark.parametrize("commands", [EXTENSIONS, BY_HANDS], ids=["hands", "people"])
 def test_a_motor_that_is_on_while_no_run_is_ends_the_session(tmp_path, wrong, commands):
-    """If the motor is on outside a run, before, between or after runs, the session ends."""
+    """If the motor is on before, between or after runs, the session ends."""
     work = write_work(tmp_path, plan())
     with RunawayBench(wrong, duty=FULL, commands=commands) as bench:
         partial, error = session(work, bench)
@@ -147,7 +147,7 @@ def test_a_cart_past_its_limit_at_rest_ends_the_session(tmp_path):
 
 
 def test_before_the_carts_are_zeroed_they_may_be_anywhere(tmp_path):
-    """Before the carts are zeroed, no position stops the bench."""
+    """Before the carts are zeroed, no position counts as too far, so nothing is stopped."""
     work = write_work(tmp_path, plan())
     with RunawayBench(lambda bench: bench.resets < 3, out=FAR) as bench:
         assert session(work, bench) == ([], "")
@@ -155,7 +155,7 @@ def test_before_the_carts_are_zeroed_they_may_be_anywhere(tmp_path):
 
 
 def test_carts_that_a_run_took_too_far_may_swing_back(tmp_path):
-    """After a run that was stopped for its travel, the next run waits and is recorded."""
+    """After a run stopped at the travel limit, the next run waits for rest and is recorded."""
     near = PlanLimits(
         input=0.5, travel=70 * PER_COUNT
     )  # one count per two duty counts: at most 82 counts
@@ -202,7 +202,7 @@ def test_a_stop_that_is_not_heeded_is_sent_again(tmp_path):
 
 @pytest.mark.parametrize("period", [1, 2, 5, 10])
 def test_a_bench_of_few_lines_is_stopped_as_soon(period):
-    """On a bench with few lines two of them suffice: the limit is in ms, not in lines."""
+    """A bench that sends few lines is stopped as soon as others, after two of them."""
     order = make_order(
         plan()[0],
         limits=PlanLimits(input=0.5, travel=2.5),

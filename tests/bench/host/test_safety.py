@@ -75,7 +75,7 @@ def test_a_run_that_passed_a_limit_is_not_tried_again(tmp_path, fast):
 
 
 def test_a_plan_for_a_stronger_bench_moves_nothing(tmp_path, real):
-    """A plan for 5 V is refused on a bench of 0.5 V, with both numbers."""
+    """A plan for 5 V is refused on a bench of 0.5 V, and the message has both numbers."""
     strong = PlanLimits(input=5.0, travel=2.5)
     work = write_work(tmp_path, [sine("dwell", seconds=1)], limits=strong)
     with pytest.raises(
@@ -88,7 +88,7 @@ def test_a_plan_for_a_stronger_bench_moves_nothing(tmp_path, real):
 
 
 def test_the_numbers_are_said_before_anything_moves(tmp_path, fast):
-    """Before anything moves, the limits are printed with full scale and encoder count.
+    """Before anything moves, the limits are printed in units and counts, with full scale.
 
     2.5 cm in counts of 0.00227 cm are 1101.
     """
@@ -100,7 +100,7 @@ def test_the_numbers_are_said_before_anything_moves(tmp_path, fast):
 
 
 def test_what_a_bench_cannot_do_is_left_out_and_the_rest_recorded(tmp_path):
-    """A chirp on a stock bench, or less than one count, is skipped with a reason.
+    """A chirp on a stock bench, or an amplitude below one count, is skipped with a reason.
 
     All other recordings are made, and the exit status is 1.
     """
@@ -146,7 +146,7 @@ def test_a_bench_that_goes_on_after_its_run_is_stopped(tmp_path, monkeypatch, re
 
 @contextmanager
 def _session(bench: Emulator, *, carts: int = 2, observer: Notes | None = None):
-    """Yield a session on a new line, and what `make_order` needs besides the recording."""
+    """Yield a session on a new line, and the other arguments of `make_order`."""
     with open_line(bench.address, baud=115_200) as line:
         session = Session(line, carts=carts, limits=LIMITS, observer=observer or Notes())
         yield (
@@ -223,7 +223,7 @@ def test_every_cart_of_the_bench_is_watched(tmp_path, real):
 
 
 def test_a_new_line_is_zeroed_once_the_carts_rest(tmp_path, real):
-    """If a line is opened while carts swing, the zero is set again once they are at rest."""
+    """If the line is opened while carts swing, they are zeroed again once they are at rest."""
     recording = sine("dwell", seconds=1, settle=3.0)
     notes = Notes()
     with _session(real, observer=notes) as (session, line, ask):
@@ -302,7 +302,7 @@ def test_a_late_answer_leaves_none_under_way():
 
 
 def test_a_stock_bench_may_take_half_a_second_to_begin(monkeypatch):
-    """The trial run of a stock bench may deliver its lines half a second late."""
+    """Lines of a stock bench's trial run are accepted if they come half a second late."""
     monkeypatch.setattr("pipeline.bench.host.serial_line._ANSWER", 0.05)  # to what it cannot answer
     door = socket.create_server(("127.0.0.1", 0))
 

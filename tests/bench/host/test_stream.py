@@ -95,7 +95,7 @@ def test_a_short_run_counts_by_the_expected_period():
 
 
 def test_every_fault_is_counted_and_every_valid_line_kept():
-    """With losses, noise and merged lines together, whole lines are kept and faults counted."""
+    """With lost, noisy and merged lines together, whole lines are kept and faults counted."""
     rng = np.random.default_rng(3)
     sent = lines(20_000)
     kind = rng.choice(["whole", "drop", "garble", "merge"], size=20_000, p=[0.97] + 3 * [0.01])
@@ -151,7 +151,7 @@ def test_a_line_that_can_be_read_but_cannot_be_is_garbled(field, wrong):
 
 
 def test_a_hard_hit_on_a_stop_is_no_fault():
-    """If a cart bounces off an end stop within one line, the lines are kept."""
+    """If a cart reverses within one line at an end stop, its lines are kept."""
     out = [*range(0, 600, 12), *range(600, 0, -12)]
     sent = [Reading(counts=(x, 0), target=0, duty=0, ms=i) for i, x in enumerate(out)]
     got, stream = read(join(sent))
@@ -179,7 +179,7 @@ def test_what_an_earlier_run_left_in_the_line_is_not_of_this_one():
 
 @pytest.mark.parametrize("closed", [True, False])
 def test_a_kick_of_the_duty_is_a_line_in_a_closed_loop_only(closed):
-    """A duty in a single line at rest is accepted in a closed loop, as an encoder may flicker.
+    """A duty in only one line is accepted in a closed loop, where an encoder may flicker.
 
     In open loop such a line is not accepted.
     """

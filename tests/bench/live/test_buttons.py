@@ -91,7 +91,7 @@ def test_skip_goes_on_with_the_next(tmp_path, fast):
 
 
 def test_keep_takes_what_came_and_says_so(tmp_path, fast):
-    """Keep records every line so far, and the table says how the run ended."""
+    """Keep saves every line of the run so far, and its table says how the run ended."""
     work = write_work(tmp_path, [sine("long", seconds=300), sine("next", seconds=1)])
     outcomes = record(work, fast.address, Finger("keep"), "long", "next")
     assert [(o.recording.id, bool(o.partial)) for o in outcomes[:2]] == [
@@ -131,7 +131,7 @@ def test_what_passed_a_limit_is_neither_repeated_nor_kept(tmp_path, real):
 
 
 def test_what_broke_off_is_kept_when_asked_about(tmp_path):
-    """After a fault the page offers three answers, of which Keep takes the lines before it."""
+    """After a fault the page offers Repeat, Keep and Skip; Keep saves the lines before it."""
     work = write_work(tmp_path, [sine("dwell", seconds=2)])
     state, done = LiveState(work), []
     with emulator("--fault", "reset@0.6") as bench:

@@ -39,7 +39,7 @@ from tests.helpers.virtual import VirtualBench, VirtualSession, new_folder
     ],
 )
 def test_error_goals_are_read_from_text(text, wish):
-    """A goal is read as a percentage, with or without a parameter's name."""
+    """A goal is a percentage, with or without a parameter's name before it."""
     assert read_error_goal(text) == wish
 
 
@@ -68,7 +68,7 @@ def test_what_is_no_duration_is_refused(text):
 
 @pytest.fixture(scope="module")
 def explored(tmp_path_factory):
-    """A bench with an end stop far out on one side, where no step reaches, explored to the end."""
+    """A bench with an end stop on one side that no step reaches, explored to the end."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=["end_stop:position=-1.7"])
     folder = tmp_path_factory.mktemp("explored") / "work"
     said: list[str] = []
@@ -114,7 +114,7 @@ def test_an_exploration_leaves_an_ordinary_submission_and_its_diary(explored):
 
 
 def test_an_exploration_keeps_no_trace_that_its_diary_does_not_show(explored):
-    """Earlier turns keep only the run in their picture, and the last turn keeps all runs."""
+    """Each earlier turn keeps only the run that its picture shows; the last keeps all runs."""
     folder, turns, _, _ = explored
     *earlier, last = [turn.gap for turn in turns]
     assert earlier
@@ -134,7 +134,7 @@ def no_gap(monkeypatch):
 
 @pytest.mark.usefixtures("no_gap")
 def test_time_that_is_up_ends_it_before_the_next_recording(tmp_path):
-    """No recording begins that would last too long, and the diary says which it would have been.
+    """A recording that would exceed the time is not begun, and the diary names it.
 
     If the gap cannot be searched, the carts are identified and no effect is named.
     """
@@ -187,7 +187,7 @@ def test_a_wish_that_meets_no_parameter_is_refused_before_a_cart_moves(explored,
 
 
 def test_a_wish_for_what_a_rigid_cart_has_is_heard(tmp_path):
-    """A goal for a rigid cart is accepted, as nobody knows yet whether springs hold the carts."""
+    """A goal for a rigid cart is accepted, as cartlab cannot know yet whether there are springs."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
     with pytest.raises(ConfigError, match="the first sweep alone takes"):
@@ -303,7 +303,7 @@ def test_what_is_added_counts_whatever_it_is_called(tmp_path):
 
 
 def test_the_large_step_remains_after_all_better_proposals_were_refused(tmp_path):
-    """If all better proposals were refused, a large step remains, which shows effects far out."""
+    """After all better proposals were refused, a large step is proposed."""
     submission = load_submission(a_recorded_cart(tmp_path / "work"))
     analysis = analyse(submission)
     plan = propose_plan(submission)
@@ -356,7 +356,7 @@ def test_the_command_explores_a_bench_over_its_line(tmp_path):
 
 @pytest.mark.slow
 def test_one_large_step_shows_what_acts_far_out(tmp_path):
-    """Carts held back by drag do not reach the wanted distance, so the large step is made once."""
+    """If drag keeps carts from the wanted distance, the large step is still made only once."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=["quadratic_drag"])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=13))
     turns = Exploration(
