@@ -40,7 +40,7 @@ class Part:
 
 @dataclass(frozen=True, kw_only=True)
 class Model:
-    """A learnt model: its free run, with a value every `every` samples, and its text."""
+    """A learnt model: its free run, with a value at every `every` samples, and its text."""
 
     run: Callable[[Part], Array]
     every: int

@@ -138,7 +138,7 @@ def from_dwells(*, seeds: int, phases: bool) -> Trials:
 
 
 def multisine(chain: Chain, *, rng: np.random.Generator, noise: float) -> Record:
-    """Return a record of a multisine of random phases, from rest; white noise, no rounding."""
+    """Return a record of a multisine with random phases, from rest, with white noise."""
     t = np.arange(round(PERIODS * PERIOD * RATE)) / RATE
     lines = np.arange(1, round(PERIOD * RATE / 2)) / PERIOD
     phases = rng.uniform(0, 2 * np.pi, lines.size)

@@ -31,7 +31,7 @@ class Modes:
 
 
 def modes_of(poles: ComplexArray, *, n: int, gains: Array | None) -> Modes:
-    """Return the n modes of poles; the first n by frequency if there are more.
+    """Return the n oscillating modes of lowest frequency among these poles.
 
     Raises
     ------
@@ -48,7 +48,7 @@ def modes_of(poles: ComplexArray, *, n: int, gains: Array | None) -> Modes:
 
 
 def factors(n: int) -> list[tuple[str, ...]]:
-    """Return the factors by name: of the denominator, then of the numerator of each cart."""
+    """Return the names of the factors: first the denominator's, then each numerator's."""
     of_carts = {1: ("",), 2: ("2", ""), 3: ("xy", "3", "")}[n]
     return [("n",) if n == 1 else tuple("abc"[:n]), *(tuple(cart) for cart in of_carts)]
 
@@ -255,7 +255,7 @@ def modal(record: Record, *, method: str) -> Modes:
 
 
 def responses_of(record: Record) -> tuple[Array, ComplexArray]:
-    """Return frequencies in Hz and X_i/U (n, n_w) of all periods but the first, hold undone."""
+    """Return frequencies (Hz) and X_i/U (n, n_w) without the first period and the hold's effect."""
     period = round(PERIOD / record.sample_time)
     assert record.u is not None
     U, Y = (

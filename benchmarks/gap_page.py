@@ -74,7 +74,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def summary_of(rows: Sequence[dict]) -> str:
-    """Return the suites: number of right answers, remaining error, and time."""
+    """Return, for each suite, the number of right answers, the remaining error, and the time."""
     out = []
     for suite, words in SUITES.items():
         cases = [row for row in rows if row["suite"] == suite]

@@ -18,7 +18,7 @@ MADE = {
 
 
 def main() -> None:
-    """Write each file; the page is made by another process, which has the new columns."""
+    """Write each file; another process, which loads the new columns, makes the page."""
     for name, source in MADE.items():
         write_file(ROOM / name, source(CATALOGUE))
     files = [str(ROOM / name) for name in MADE]

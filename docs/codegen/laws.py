@@ -68,7 +68,7 @@ def code(expr: Expr) -> str:
 
 
 def parse(text: str, effect: Effect) -> Expr:
-    """Return an expression of an effect; a symbol of its parameters stands before a quantity."""
+    """Return an expression of an effect, in which its parameters' symbols have precedence."""
     names = {name: _symbol(name) for name in _QUANTITIES}
     names |= {p.symbol: _parameter(p.symbol) for p in effect.parameters}
     if effect.growth is not None:
@@ -81,7 +81,7 @@ def _parameter(symbol: str) -> sympy.Symbol:
 
 
 def text_of(effect: Effect) -> str:
-    """Return the expression of a law, "" for one that is built in."""
+    """Return the expression of a law, or "" for a law that is built in."""
     match effect.law:
         case (
             ForceLaw(force=text)
@@ -94,7 +94,7 @@ def text_of(effect: Effect) -> str:
 
 
 def derivative(expr: Expr, by: sympy.Symbol) -> Expr:
-    """Return the derivative, that of a corner or jump taken beside it."""
+    """Return the derivative; at a corner or jump, the derivative beside it."""
     out: Expr = sympy.expand(sympy.diff(expr, by)).replace(
         sympy.DiracDelta, lambda *_: sympy.S.Zero
     )
@@ -116,7 +116,7 @@ def _cell(effect: Effect, parameter: EffectParameter) -> str:
 
 
 def _gate(effect: Effect) -> str:
-    """Return the condition under which an effect is there."""
+    """Return the condition under which an effect acts."""
     sizes = [p for p in effect.parameters if p.neutral == 0.0]
     first = _cell(effect, (sizes or effect.parameters)[0])
     if isinstance(effect.law, FrictionLaw) and effect.law.beyond:
@@ -194,7 +194,7 @@ def terms_source(catalogue: Sequence[Effect]) -> str:
 
 
 def _is_linear(effect: Effect) -> bool:
-    """Whether a force belongs to the linear chain's matrices."""
+    """Return whether a force belongs to the linear chain's matrices."""
     if not isinstance(effect.law, ForceLaw) or effect.place == "input":
         return False
     force = parse(effect.law.force, effect)
@@ -280,7 +280,7 @@ def _friction(catalogue: Iterable[Effect]) -> Iterator[str]:
 
 
 def _own_size(effect: Effect, catalogue: Iterable[Effect]) -> Expr:
-    """Return the size of a friction without that of the one within."""
+    """Return the size of a friction, less the size of the friction that it contains."""
     law = effect.law
     assert isinstance(law, FrictionLaw)
     size = parse(law.size, effect)

@@ -38,7 +38,7 @@ def _vector(n: int, named: dict[str, float]) -> np.ndarray:
 
 @pytest.mark.parametrize("chain", PRESETS.values(), ids=list(PRESETS))
 def test_the_papers_transfer_functions_are_those_of_the_chain(chain):
-    """The other tools' transfer functions have the chain's response and names."""
+    """The paper's transfer functions, which other tools fit, have the chain's response."""
     p = _vector(chain.n, chain.parameters())
 
     assert p.shape == start_of(chain.n).shape
@@ -119,7 +119,7 @@ def test_of_nearly_equal_models_the_sparser_is_taken():
 
 
 def test_further_records_are_of_the_same_bench_and_none_that_anybody_had():
-    """The further records come from the same bench, with inputs no larger than in training."""
+    """New records for judging come from the same bench, with inputs no larger than in training."""
     case = make_case(seed=7, n=1, rate=113.1)
     further = further_records(case, seed=8)
 
@@ -159,7 +159,7 @@ def test_only_what_is_said_as_named_counts_as_named(verdict, hidden, named):
 
 
 def test_a_recurrent_network_without_cells_is_a_linear_system():
-    """A recurrent network without nonlinear cells gives the free run of a linear system."""
+    """A recurrent network without nonlinear cells moves as a linear system."""
     rng = np.random.default_rng(3)
     A, B = 0.4 * rng.standard_normal((STATES, STATES)), rng.standard_normal((STATES, 1))
     C, x0, u = (

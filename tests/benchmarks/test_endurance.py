@@ -58,7 +58,7 @@ def book(tmp_path_factory):
     ],
 )  # fmt: skip
 def test_a_change_of_points_is_there_once_and_whole(book, change, wrong):
-    """A confirmed change must be stored once, any other at most once, and none in part."""
+    """A confirmed change must be stored exactly once; any other change at most once."""
     found = Found()
     with RequestBook(book) as opened:
         teams = [one.submission for one in opened.class_now().listings]
@@ -102,7 +102,7 @@ def test_recordings_and_rows_are_compared_with_what_was_sent(tmp_path):
 
 
 def test_the_slope_of_memory_is_that_of_a_line():
-    """Memory that grows by 10 MB an hour after the start has this slope, with no error."""
+    """If memory grows steadily by 10 MB an hour, that slope is found, with no error."""
     memory = Memory()
     for second in range(0, 1800, 2):
         start = 500.0 if second < SETTLING else 0.0

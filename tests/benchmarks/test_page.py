@@ -63,7 +63,7 @@ def test_a_figure_is_written_beside_the_page_and_shown(tmp_path):
 
 
 def test_rows_may_be_in_a_file_beside_the_figure(tmp_path):
-    """The page links to a CSV file with the rows; without a folder it shows the table itself."""
+    """With a folder, the page links to a CSV file of the rows; without one it has the table."""
     table = Table(
         title="Times",
         head=["what", "s"],
@@ -105,7 +105,7 @@ def test_quick_ones_run_and_leave_the_page_alone(name, monkeypatch, capsys):
 
 @pytest.mark.parametrize("name", command.BENCHMARKS)
 def test_a_stored_section_has_the_words_of_its_module(name):
-    """Title, question and tools of a section on the page are those of its module."""
+    """Each section of the page has the title, question and tools of its benchmark's module."""
     module = import_module(f"benchmarks.{name}")
 
     text = command.page_of(name).read_text(encoding="utf-8")

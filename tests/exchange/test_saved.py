@@ -32,7 +32,7 @@ def matlab(analysis: Analysis) -> dict:
 
 
 def test_the_saved_tables_hold_the_analysis(analysis, tmp_path):
-    """Saved tables hold the analysis to ten digits, with units in headings, in the same bytes."""
+    """Saved tables hold the analysis to ten digits, and saving again gives the same bytes."""
     save_tables(analysis, tmp_path)
     assert {path.stem for path in (tmp_path / "tables").iterdir()} == TABLES
     dwells = pd.read_csv(tmp_path / "tables" / "dwells.csv", keep_default_na=True)
@@ -76,7 +76,7 @@ def test_a_file_of_matlab_does_not_tell_the_time(analysis):
 
 
 def test_bode_data_are_those_of_the_analysis(analysis):
-    """The Bode table has a row per cart and frequency, and standard errors in the values' units."""
+    """The Bode table has a row for each cart and frequency, with the standard errors."""
     frame = frames.frequency_response(analysis)
     second = frame[frame["cart"] == 2]
     for name in ("omega", "magnitude", "magnitude_std", "phase", "phase_std"):
@@ -130,7 +130,7 @@ def test_what_could_not_be_had_is_nan(analysis):
 
 
 def test_report_saves_tables_when_asked(tmp_path):
-    """`report --tables` writes tables beside results.json; `report` alone removes old ones."""
+    """`report --tables` writes tables; a later `report` without the option removes them."""
     out = tmp_path / "out"
     folder = EXAMPLES / "one-cart"
     assert cartlab_here("report", folder, "--out", out, "--no-pdf").returncode == 0

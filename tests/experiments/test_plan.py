@@ -204,7 +204,7 @@ def test_extending_twice_changes_nothing(extended):
 
 
 def test_the_loop_comes_once_the_dwells_are_recorded():
-    """The closed loop is planned once the dwells are recorded, within the travel limit."""
+    """A closed loop is planned only once the dwells are recorded."""
     before, after = recorded("two-cart", *FIRST), recorded("two-cart", *FIRST, "sine")
     plan = propose_plan(before)
     assert of_kind(extend_plan(plan, before), "closed_loop") == []
@@ -302,7 +302,7 @@ def test_a_plan_reads_back_as_it_was_written(
 
 
 def test_adding_keeps_every_byte_that_stood_there(tmp_path):
-    """Adding recordings keeps comments, order and numbers of the file; new ones come last."""
+    """Adding recordings changes nothing that is in the file; new ones come last."""
     example = recorded("two-cart", *FIRST)
     submission = example.model_copy(update={"folder": tmp_path})
     plan_path(submission).write_text(
@@ -323,7 +323,7 @@ def test_adding_keeps_every_byte_that_stood_there(tmp_path):
 
 
 def test_what_is_added_while_the_data_are_asked_stays(tmp_path):
-    """A recording added while `plan` analyses the data is kept, before the new ones."""
+    """A recording that is added while `plan` analyses the data is kept."""
     work = a_recorded_cart(tmp_path / "work")
     submission = load_submission(work)
     old = propose_plan(submission)

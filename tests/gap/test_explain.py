@@ -98,7 +98,7 @@ def test_a_part_is_called_a_part():
 
 @pytest.mark.parametrize("irregular", [False, True])
 def test_blocks_of_fast_samples_are_readings_at_their_middle(irregular):
-    """At 1 kHz four samples become one reading in their middle, from a curve through them."""
+    """Four samples at 1 kHz become one reading, taken from a curve through them."""
     t = np.arange(4001) / 1000.0
     if irregular:
         t = t + np.random.default_rng(0).uniform(-2e-4, 2e-4, t.size)
@@ -205,7 +205,7 @@ def test_document_is_what_was_agreed(one_gap):
 
 
 def test_same_records_give_the_same_document_however_busy_the_machine(one_gap):
-    """The result does not depend on chance or time: on a busy machine the bytes are the same."""
+    """The same records give the same bytes, even on a busy machine."""
     case = make_case(seed=45, n=1, effects=["dead_zone"], rate=113.1)
 
     busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
@@ -232,7 +232,7 @@ def test_duplicate_files_do_not_judge_their_twin():
 
 
 def test_single_run_is_cut_in_time():
-    """Of a single run the last part is held out, and a note says so."""
+    """If there is only one run, its last part is held out, and a note says so."""
     case = make_case(seed=47, n=1, effects=["coulomb_friction"], rate=113.1)
 
     gap = explain_gap(case.records[:1], Bench(springs=case.springs))
@@ -302,7 +302,7 @@ REFERENCES = (
 
 @pytest.mark.parametrize("friction", [0.0, 0.003])
 def test_a_rigid_body_under_feedback(friction):
-    """On a cart without springs, runs under feedback show whether there is dry friction.
+    """For a cart without springs, runs under feedback show whether there is dry friction.
 
     A simulation of a whole run, without any fit to it, then ends within two encoder counts: the
     start is known to half a count, and errors of the parameters add up.
@@ -373,7 +373,7 @@ def test_a_run_without_its_input_is_left_out_with_a_message():
 
 
 def _late(*, seed: int) -> Record:
-    """Return a sweep of a cart on a cubic spring that shows only in the last, wider 40 %."""
+    """Return a sweep of a cart whose cubic spring shows only in the last 40 %."""
     chain = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.array([0.05, 0.0]))
     term = make_term(
         find_effect("cubic_spring"), place=1, values={"coefficient": 0.004}, chain=chain

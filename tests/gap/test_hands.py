@@ -12,7 +12,7 @@ from tests.truth.cases import Case, make_case
 
 @pytest.fixture(scope="module", params=[1, 2])
 def explained(request) -> tuple[Case, Gap]:
-    """The gap of a linear bench on which hands pluck all decays, nudge a step and hold loosely."""
+    """The gap of a linear bench on which hands pluck, nudge and loosely hold the carts."""
     n = request.param
     case = make_case(seed=8999 + n, n=n, rate=200.0, handled=True)
     return case, explain_gap(case.records, Bench(springs=case.springs))
@@ -39,7 +39,7 @@ def test_interventions_by_hand_are_reported(explained):
 
 
 def test_data_after_an_intervention_by_hand_are_used(explained):
-    """Every plucked record is used for the fit or as a test, without the samples under a hand."""
+    """Every plucked record is used in the gap, without the samples in which a hand acts."""
     case, gap = explained
 
     assert {*gap.training, *gap.held_out} == {record.id for record in case.records}

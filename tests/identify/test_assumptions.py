@@ -38,7 +38,7 @@ def edited(folder: Path, *changes: tuple[str, str], head: str = "") -> Analysis:
 
 
 def by_key(analysis: Analysis) -> dict[str, Assumption]:
-    """Return the assumptions by key and place, those about carts by the free carts."""
+    """Return the assumptions by key and place; those about carts by the free carts."""
     return {
         f"{a.key} {a.about or (a.value if isinstance(a.value, tuple) else '')}".rstrip(): a
         for a in analysis.assumptions
@@ -121,7 +121,7 @@ def test_the_report_and_results_json_hold_them():
 
 @pytest.mark.skipif(not (REAL_DATA / "ecp210-ucsd").is_dir(), reason="no real recordings here")
 def test_a_held_cart_that_was_not_measured_is_open(tmp_path):
-    """If a held cart was not measured, nothing shows that it was held, so the support is "open"."""
+    """If a held cart was not measured, its assumption is "open", as nothing supports it."""
     folder = write_two_cart_submission(tmp_path / "s", REAL_DATA, steps=(1, 2, 3, 4, 5))
     found = by_key(analyse(load_submission(folder), design=False))
     assert found["experiments.carts (1,)"].support == "open"

@@ -50,7 +50,7 @@ def step(k: list[float], *, seconds: float = 8.0) -> Record:
     ],
 )
 def test_steps_tell_the_far_spring_and_whether_any_holds_the_carts(k, present, not_told):
-    """Equal gains exclude a spring at the far wall, and no return excludes all wall springs."""
+    """If all gains are equal, there is no far spring; if carts do not return, no wall spring."""
     found = decide_springs([step(k)], n=len(k) - 1)
     assert found.present == tuple(present)
     assert found.open == not_told
@@ -70,7 +70,7 @@ def folder_of(data: Path, folder: Path) -> Path:
 
 
 def test_fill_marks_what_the_files_do_not_tell(tmp_path):
-    """`fill` marks open questions in its output and after the key, until a person answers."""
+    """`fill` prints open questions and marks them in the file, until a person answers."""
     folder = folder_of(EXAMPLES / "two-cart" / "data", tmp_path / "s")
     done = CliRunner().invoke(app, ["fill", str(folder)], standalone_mode=False)
     text = (folder / "submission.toml").read_text(encoding="utf-8")
@@ -107,7 +107,7 @@ def test_fill_speaks_of_a_unit_that_somebody_else_wrote(unit, said, tmp_path):
 
 @pytest.mark.skipif(not (REAL_DATA / "ecp210-ucsd").is_dir(), reason="no real recordings here")
 def test_the_real_rig_has_no_far_spring(tmp_path):
-    """Static gains of the real rig differ only by dry friction, so it has no far spring."""
+    """The real rig has no far spring, since its gains differ only by dry friction."""
     folder = tmp_path / "s"
     (folder / "data").mkdir(parents=True)
     for file in (REAL_DATA / "ecp210-ucsd").glob("DOF*_test?.csv"):

@@ -72,7 +72,7 @@ def test_chain_to_parameters_and_back(chain):
 
 @given(chains())
 def test_static_gains_and_tails_give_the_chain_back(chain):
-    """Four carts too: the gains and the chain's polynomials determine every number."""
+    """Static gains and the chain's polynomials give all numbers of up to four carts back."""
     got = recover_chain(chain.static_gains(), chain.tails()[:-1])
 
     assert_same_chain(got, chain, rtol=1e-9)
@@ -81,7 +81,7 @@ def test_static_gains_and_tails_give_the_chain_back(chain):
 
 @pytest.mark.parametrize(("carts", "redundancies"), [(1, 0), (2, 1), (3, 5)])
 def test_number_of_redundancies(carts, redundancies):
-    """The tables of one, two and three carts have zero, one and five redundancies."""
+    """One cart's table has no redundancies, that of two carts has one, that of three has five."""
     got = recover_from_parameters(PRESETS[f"throne-{carts}dof"].parameters())
 
     assert list(got.residuals) == [f"R{i}" for i in range(1, redundancies + 1)]
@@ -100,7 +100,7 @@ def test_an_inconsistent_table_shows_in_the_redundancies(name, broken):
 
 
 def test_the_names_of_the_tables():
-    """Names come in the order of the paper's tables; a rigid body has its own two."""
+    """Parameter names are in the order of the paper's tables; a rigid body has two of its own."""
     assert parameter_names(2) == [
         "K_1", "K_2", "omega_a", "omega_b", "zeta_a", "zeta_b",
         "omega_1", "omega_2", "zeta_1", "zeta_2",
@@ -143,7 +143,7 @@ def test_poles_are_those_of_the_state_matrix(chain):
 @given(chains(min_carts=2))
 @settings(max_examples=30)
 def test_zeros_make_each_response_vanish(chain):
-    """Between force and cart i there are 2 (n - i) zeros; python-control finds the same."""
+    """From force to cart i there are 2 (n - i) zeros, the same as python-control finds."""
     for cart in range(1, chain.n):
         zeros = chain.zeros(cart)
         assert zeros.size == 2 * (chain.n - cart)
@@ -159,7 +159,7 @@ def test_zeros_make_each_response_vanish(chain):
 @given(chains())
 @settings(max_examples=30)
 def test_frequency_response_matches_state_space(chain):
-    """The impedance form and C (sI - A)^-1 B are one function."""
+    """The response computed from impedances is that of the state model, C (sI - A)^-1 B."""
     omega = np.geomspace(1.0, 100.0, 25)
 
     got = chain.frequency_response(omega)
@@ -226,7 +226,7 @@ def test_rows_of_the_state_matrix():
 
 @given(chains(max_zeta=0.05))
 def test_gains_fall_along_the_chain(chain):
-    """K_1 >= K_2 >= … > 0, and the ratios are those of the springs (statics)."""
+    """Static gains fall along the chain, and their ratios are those of the springs."""
     K, k = chain.static_gains(), chain.k
 
     assert np.all(K > 0)
@@ -256,7 +256,7 @@ def test_frequencies_interlace(chain):
 
 @given(chains(min_carts=2), st.data())
 def test_a_held_cart_is_a_wall(chain, data):
-    """One cart alone has the frequency and damping with its number."""
+    """A cart that moves alone has the frequency and damping that bear its number."""
     cart = data.draw(st.integers(1, chain.n))
 
     A, B, _, _ = chain.state_space(free=[cart])
@@ -323,7 +323,7 @@ def test_an_overdamped_factor_has_zeta_above_one():
 
 @given(chains(max_carts=3, max_zeta=3.0))
 def test_heavy_damping_survives_the_maps(chain):
-    """Overdamped carts come back too, as long as the real poles are distinct."""
+    """Overdamped carts are recovered too, as long as the real poles are distinct."""
     roots = [chain.poles, *(chain.zeros(cart) for cart in range(1, chain.n))]
     gaps = [
         np.min(np.abs(r[:, None] - r[None, :]) + np.diag(np.full(r.size, np.inf))) / np.abs(r).min()
@@ -352,7 +352,7 @@ def test_arrays_are_read_only_and_checked():
 
 @pytest.mark.parametrize(("preset", "table"), [("throne-1dof", TABLE_1), ("throne-2dof", TABLE_2)])
 def test_presets_round_to_the_paper(preset, table):
-    """The presets round to each independent final value printed in Tables 1 and 2."""
+    """Rounded, the presets give each independent final value printed in Tables 1 and 2."""
     values = PRESETS[preset].parameters()
 
     for name, printed in table.items():
@@ -361,7 +361,7 @@ def test_presets_round_to_the_paper(preset, table):
 
 
 def test_the_three_cart_preset_is_near_table_3():
-    """The three-cart preset is within 1.3 % of Table 3, in damping within 15 % except zeta_b."""
+    """The three-cart preset is within 1.3 % of Table 3; dampings except zeta_b within 15 %."""
     values = PRESETS["throne-3dof"].parameters()
 
     for name, printed in TABLE_3.items():

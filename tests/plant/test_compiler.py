@@ -87,7 +87,7 @@ def test_where_the_package_cannot_be_written_the_users_cache_is_used(package):
 
 
 def test_the_folders_name_covers_each_file_that_a_compiled_function_may_hold():
-    """Each file with compiled functions imports only files whose changes are noticed."""
+    """A compiled function uses only files of which a change makes it compile again."""
     types_only = ROOT / "pipeline/arrays.py"
     rooms = set()
     for path in (ROOT / "pipeline").rglob("*.py"):

@@ -77,7 +77,7 @@ def test_an_effect_of_no_size_is_the_linear_bench(effect):
 
 
 def test_what_an_effect_is_follows_from_its_law():
-    """The laws show which effects are dry friction, hidden masses, contacts or need an input."""
+    """From its law follows whether an effect is dry, a contact, hides a mass or needs an input."""
 
     def those(is_so: Callable[[Effect], bool]) -> set[str]:
         return {effect.key for effect in CATALOGUE if is_so(effect)}
@@ -92,7 +92,7 @@ def test_what_an_effect_is_follows_from_its_law():
 
 
 def test_single_cart_has_one_spring_place():
-    """Only the sum of one cart's two wall springs matters, so only one of them is a place."""
+    """Only the sum of one cart's wall springs matters, so an effect is offered at only one."""
     assert find_effect("cubic_spring").places((True, True)) == (1,)
     assert find_effect("cubic_spring").places((False, True)) == (2,)
     assert find_effect("cubic_spring").places((True, True, False)) == (1, 2)

@@ -86,7 +86,7 @@ def friction_decay(m, k, force, x0, t):
 
 
 def test_a_held_cart_that_is_moved_moves_its_neighbour():
-    """A cart that is guided along its own free motion leaves the other cart's motion unchanged."""
+    """If a cart is guided along its own free motion, the other cart moves as before."""
     tables = linear_tables(PRESETS["throne-2dof"])
     t = sample_times(2000, 1e-3)
     both = simulate(tables, t, np.where(t < 0.5, 1.0, 0.0))
@@ -101,7 +101,7 @@ def test_a_held_cart_that_is_moved_moves_its_neighbour():
 
 @pytest.mark.parametrize("rate", [113.1, 250.0, 1000.0])
 def test_friction_decay_follows_the_events(rate):
-    """Dry friction alone gives the exact half swings, and the cart then stays where it stopped."""
+    """With dry friction only, a decay has the exact half swings and ends where it stops."""
     m, k, force = 2e-4, 0.035, 0.004
     chain = Chain(m=np.array([m]), c=np.array([0.0]), k=np.array([k, 0.0]))
     tables = linear_tables(chain)
@@ -185,7 +185,7 @@ def test_energy_never_grows_without_input(key):
 
 
 def test_delay_shifts_the_response():
-    """A delay of whole samples shifts the readings by as many, and a negative delay forwards."""
+    """A delay of whole samples shifts the readings by as many; a negative one, forwards."""
     chain = PRESETS["throne-2dof"]
     t = sample_times(500, 0.005)
     u = np.where(t > 0.1, 0.03, 0.0)
@@ -230,7 +230,7 @@ def test_batch_gives_what_single_runs_give():
 
 
 def test_a_hidden_mass_starts_at_the_given_position():
-    """A cart with a hidden mass, started away from it, moves as the first cart of two."""
+    """A cart and its hidden mass, started apart, move as a chain of two carts."""
     chain = Chain(m=np.array([1.7e-4]), c=np.array([4e-4]), k=np.array([0.034, 0.0]))
     mass, stiffness = 2e-5, 0.004
     term = make_term(
@@ -320,7 +320,7 @@ def test_no_array_is_counted():
 
 @pytest.mark.parametrize("preset", list(PRESETS))
 def test_an_input_that_changes_within_a_step_moves_the_carts_in_time(preset):
-    """If the input changes within a simulation step, the carts still move as they should.
+    """If the input changes within a simulation step, the motion is still right to 1e-4.
 
     With only the input's mean over a step, (omega h)² / 12 of the motion, 2e-3, would be wrong.
     """
@@ -350,7 +350,7 @@ def test_an_input_that_jumps_inside_a_step_frees_a_held_cart_at_once():
 
 
 def test_what_stands_behind_the_last_sample_is_no_time():
-    """A run ends with its last sample: memory after the times is not read as a time."""
+    """A run ends with its last sample, and memory beyond the array of times is not read."""
     chain = Chain(m=np.array([1e-4]), c=np.zeros(1), k=np.zeros(2))
     t = np.append(sample_times(100, 4e-3), 2e4)[:-1]  # a view: the time behind is its neighbour
     x = simulate(linear_tables(chain), t, np.full(t.size, 0.02))

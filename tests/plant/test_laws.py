@@ -73,7 +73,7 @@ def test_derivatives_are_those_of_the_law(effect, state):
 
 @pytest.mark.parametrize("key", ["end_stop", "slack_spring"])
 def test_contacts_are_those_of_the_law(key):
-    """Stiffness, damping and start of a contact give the force of its law on either side."""
+    """The stiffness, damping and start of a contact give the force of its law."""
     effect = find_effect(key)
     law, kind = effect.law, CATALOGUE.index(effect)
     assert isinstance(law, ContactLaw)
@@ -97,7 +97,7 @@ def test_contacts_are_those_of_the_law(key):
 
 @pytest.mark.parametrize("v", [0.7, -0.3])
 def test_hysteresis_settles_as_its_rate_says(v):
-    """The state of hysteresis settles as its rate says, in both simulators and derivatives."""
+    """The hysteresis state settles at the rate of its law, in both simulators."""
     effect = find_effect("presliding_friction")
     law = effect.law
     assert isinstance(law, HysteresisLaw)
@@ -165,7 +165,7 @@ def test_a_law_vanishes_with_its_coefficients(effect):
 
 
 def test_dead_zone_and_saturation_shape_the_input():
-    """Dead zone and saturation make an input zero, smaller by the width, or the limit."""
+    """A dead zone makes the input zero, or smaller by its width; saturation limits it."""
     drive = np.zeros(len(TABLES["input"]))
     for key in ("dead_zone", "saturation"):
         effect = find_effect(key)

@@ -42,7 +42,7 @@ def test_without_gains_the_prefilter_drives_the_open_loop():
 
 @pytest.mark.parametrize("delay", [0, 1])
 def test_an_exact_prediction_makes_the_delayed_loop_the_undelayed_one(delay):
-    """With the true model, a delayed loop moves as Phi - Gamma G without delay, only later."""
+    """With the true model, a loop with delay moves as Phi - Gamma G, only later."""
     run = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=1.0, setup=LoopSetup(delay=delay))
 
     phi, gamma = discretise(TWO, T)
@@ -55,7 +55,7 @@ def test_an_exact_prediction_makes_the_delayed_loop_the_undelayed_one(delay):
 
 @pytest.mark.parametrize("model", [None, PRESETS["throne-2dof"]])
 def test_the_loop_matrix_is_the_loop(model):
-    """Powers of the loop matrix give the motion of a loop that starts from a displacement."""
+    """Powers of the loop matrix give the motion after a start from a displacement."""
     controller = StateFeedback(gains=GAINS, prefilter=1.0, model=model)
     x0 = np.array([0.5, 3.0, -0.2, 1.0])
     run = simulate_loop(TWO, controller, t=CLOCK, reference=0.0, start=x0)
@@ -141,7 +141,7 @@ def test_the_controller_sees_whole_encoder_steps():
 
 
 def test_positions_between_the_ticks_are_those_of_the_held_input():
-    """With five logged samples per tick, the run is the exact response to the logged input."""
+    """If five samples are logged per tick, they show the exact response to the held input."""
     t = T / 5 * np.arange(1000.0)
     run = simulate_loop(TWO, feedback(TWO), t=t, reference=1.0, setup=LoopSetup(sample_time=T))
 
@@ -151,7 +151,7 @@ def test_positions_between_the_ticks_are_those_of_the_held_input():
 
 
 def test_a_controller_faster_than_the_log_acts_between_its_samples():
-    """A log of every tenth tick shows the same motion as a log of every tick."""
+    """If only every tenth tick is logged, the motion is the same as with every tick."""
     fine = T / 10 * np.arange(2001.0)
     full = simulate_loop(TWO, feedback(TWO), t=fine, reference=1.0)
     logged = simulate_loop(
@@ -193,7 +193,7 @@ def test_the_rest_adds_to_the_readings():
 
 
 def test_held_carts_are_walls():
-    """With the second of two carts held, the first moves as one cart on both its springs."""
+    """With cart 2 of two held, cart 1 moves as a single cart on both its springs."""
     alone = Chain(m=TWO.m[:1], c=TWO.c[:1], k=TWO.k[:2])
     pid = Pid(kp=0.02, kd=0.001)
     run = simulate_loop(TWO, pid, t=CLOCK, reference=1.0, setup=LoopSetup(free=[1]))
@@ -212,7 +212,7 @@ def test_a_replay_gives_the_efforts_that_were_logged():
 
 
 def test_gains_that_do_not_fit_the_carts_are_refused():
-    """Gains in the wrong number are an error that says how many are needed."""
+    """A wrong number of gains is an error that says how many are needed."""
     with pytest.raises(DataError, match="2 carts needs 4 gains, found 2"):
         simulate_loop(TWO, feedback(TWO, np.zeros(2)), t=CLOCK, reference=1.0)
 

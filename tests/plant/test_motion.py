@@ -56,7 +56,7 @@ def respond(model: AugmentedChain, x0, *, driven: bool):
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
 @pytest.mark.parametrize("driven", [True, False], ids=["step", "release"])
 def test_the_system_moves_as_the_simulator_does(effect, driven):
-    """A step and a release agree with the simulator within half a percent of the motion.
+    """python-control's system and the simulator agree to half a percent, in steps and releases.
 
     A stuck cart creeps by force / mass * stop at most, some 0.01 cm/s in motions of 2 cm.
     """
@@ -85,7 +85,7 @@ def test_without_effects_it_is_the_linear_chain():
 
 
 def test_effects_have_states_of_their_own():
-    """A hidden mass and the memory of the input are states with names of their own."""
+    """A hidden mass, and an input with memory, add named states to the system."""
     own = {
         "extra_mode": ["x2_hidden", "v2_hidden"],
         "presliding_friction": ["z2"],

@@ -57,7 +57,7 @@ def made() -> dict[str, str]:
 
 
 def test_its_columns_force_and_slopes_are_made(made):
-    """The simulator gets a column for the new parameter, and the law with its derivatives."""
+    """The simulator gets a column for the new parameter, and the new law with derivatives."""
     columns = kinds_of(made["columns.py"], "Cart")
     Cart = type("Cart", (), columns)
     row = np.zeros((1, len(columns)))
@@ -71,7 +71,7 @@ def test_its_columns_force_and_slopes_are_made(made):
 
 
 def test_a_model_that_follows_knows_it(made):
-    """The fit gets the new law, its slopes, and its derivative by the coefficient."""
+    """The fit gets the new law with its derivatives, also that by the coefficient."""
     source = made["simulator/terms.py"]
     kinds = kinds_of(source, "Kind")
     terms = function_of("terms", source, Kind=type("Kind", (), kinds))
@@ -93,7 +93,7 @@ PLAIN = [
 
 @pytest.mark.parametrize("effect", PLAIN, ids=lambda effect: effect.key)
 def test_no_other_file_of_the_plant_names_it(effect):
-    """No file names an effect without a state of its own, except the effect's file.
+    """Only an effect's own file names it, unless its law has a state of its own.
 
     Only laws that need trial shapes are also named, in `gap.follow.score`.
     """

@@ -75,7 +75,7 @@ def test_agrees_with_python_control():
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3))
 @settings(max_examples=25)
 def test_a_sample_between_two_changes_nothing(seed, carts):
-    """A held input sampled more often is the same input, so the motion is the same."""
+    """Sampling a held input more often does not change the motion."""
     rng = np.random.default_rng(seed)
     chain = PRESETS[f"throne-{carts}dof"]
     t = irregular_times(rng, 60)
@@ -139,7 +139,7 @@ def test_energy_never_grows_without_input(seed):
 
 
 def test_steady_state_of_a_held_sine():
-    """A sampled sine moves the carts as a smooth sine, half a sample late and slightly weaker."""
+    """A sine held between samples moves the carts half a sample late and slightly less."""
     omega = 2 * np.pi * 4.0
     t = clock(1500)
     x = simulate_linear(THREE, t, np.sin(omega * t))
@@ -189,7 +189,7 @@ def test_input_that_runs_straight_between_samples():
 
 @pytest.mark.parametrize("n", [2, 3, 4, 10, 101])
 def test_even_and_uneven_times_agree(n):
-    """Records with one interval, simulated in blocks, agree with simulation sample by sample."""
+    """Records with even times are simulated in blocks, with the result of sample by sample."""
     rng = np.random.default_rng(n)
     t, u, x0 = clock(n), rng.standard_normal(n), rng.standard_normal(6)
     uneven = t.copy()

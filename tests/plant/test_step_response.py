@@ -55,7 +55,7 @@ def test_many_responses_at_once_are_each_judged_alone():
 
 
 def test_noise_widens_the_band():
-    """A response that has settled except for noise counts as settled."""
+    """A response that has settled apart from noise counts as settled."""
     y = second_order(20.0, 0.5) + 0.03 * np.sin(2000 * T)
 
     assert np.isnan(settling_time(T, y, before=0.0, level=1.0))

@@ -178,7 +178,7 @@ def test_the_three_cart_session_has_the_dwell_of_figures_12_to_14():
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
 def test_dwells_surround_every_resonance_and_null(preset):
-    """Some dwell is very near each resonance and null, and some are on both sides."""
+    """Each resonance and null has a dwell very near it, and dwells on both sides."""
     chain = PRESETS[preset]
     dwells = 2 * np.pi * np.array(dwell_frequencies(chain, n=28))
     for roots in (chain.poles, *(chain.zeros(cart) for cart in range(1, chain.n))):
@@ -360,7 +360,7 @@ def test_an_unknown_preset_names_the_known_ones(tmp_path):
 
 
 def test_a_cart_without_damping_of_its_own(tmp_path):
-    """The decay of a cart without damping is cut where a student would stop it."""
+    """The decay of a cart without damping is cut where a student would stop the recording."""
     chain = Chain(m=np.array([3e-4, 2e-4]), c=np.array([8e-4, 0.0]), k=np.array([0.05, 0.1, 0.05]))
 
     write_submission(tmp_path, SimulatedBench(chain=chain), seed=7, compact=True)

@@ -290,7 +290,7 @@ def test_a_constant_force_shows_where_the_carts_rest():
 
 
 def test_a_sensor_deceives_the_controller():
-    """If a sensor has a wrong gain, the loop brings the reading to its target, not the cart."""
+    """If a sensor's gain is wrong, the loop brings its reading, not the cart, to the target."""
     run = control()
     gain = 1.1
 
@@ -301,7 +301,7 @@ def test_a_sensor_deceives_the_controller():
 
 
 def test_a_hand_stops_before_the_end_stop():
-    """A hand stops before the end stop; otherwise it holds the cart at the planned height."""
+    """A hand never pulls a cart into an end stop, and otherwise holds it as planned."""
     stop = usual("end_stop", position=-1.0)
 
     assert bench(stop).move(decay()).x[0, 0] == pytest.approx(-0.9, rel=0.01)
@@ -391,7 +391,7 @@ def test_a_model_of_chain_and_effects_alone_will_do(tmp_path):
 
 
 def test_a_model_in_counts_moves_as_far(tmp_path):
-    """A model in counts moves by as many counts as the same model in centimetres."""
+    """A model stored in counts moves the carts as far as the same model in centimetres."""
     chain = PRESETS["throne-1dof"]
     document = {
         "chain": {name: (getattr(chain, name) * COUNT).tolist() for name in "mck"},

@@ -32,7 +32,7 @@ LATE = 5  # samples
 
 
 def hand_in(folder: Path, *, hide: tuple[str, ...] = (), late: int = 0) -> Path:
-    """Write an honest submission of two carts, in which cart 2 is read that many samples late."""
+    """Write an honest submission of two carts in which cart 2 is read `late` samples late."""
     bench = prepare_bench(preset="throne-2dof", hide=hide)
     write_submission(folder, bench, seed=3, compact=True, reported=True)
     for path in (folder / "data").glob("*.csv") if late else ():
@@ -103,7 +103,7 @@ def test_the_channels_of_a_real_bench_are_of_one_moment(late, told, real_data, t
 
 
 def delayed(x: Array, samples: int) -> Array:
-    """Return a channel that is read that many samples later."""
+    """Return a channel that is read that number of samples later."""
     return np.concatenate([np.repeat(x[:1], samples), x[: x.size - samples]])
 
 

@@ -31,7 +31,7 @@ def record(name: str, *, size: float = 1.0, step: float = 0.01) -> Record:
 
 
 def kept(found: Mapping[str, Misread], *others: Record, sizes: Mapping[str, float]) -> set[str]:
-    """Return the suspected mistakes that remain, if the other records fit as they are."""
+    """Return the suspected mistakes that remain if the other records fit as they are."""
     records = [*(record(name, size=size) for name, size in sizes.items()), *others]
     follows = {r.id: 1.0 if r.id in found else 0.0 for r in records}
     fits = {
@@ -73,5 +73,5 @@ def test_one_record_with_another_clock_is_sampled_otherwise():
 
 
 def test_an_inverted_channel_belongs_to_one_record():
-    """Even in one record an inverted channel counts, as no limit or friction inverts it."""
+    """An inverted channel counts even in one record, as no limit or friction inverts it."""
     assert kept({"step-1": TURNED}, record("step-2"), sizes={"step-1": 1.0}) == {"step-1"}

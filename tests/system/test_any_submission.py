@@ -170,7 +170,7 @@ quick = settings(max_examples=5, deadline=None, suppress_health_check=[HealthChe
 @quick
 @given(broken(["one-cart", "two-cart"]))
 def test_broken_data_end_in_a_result_or_in_one_line(case):
-    """Whatever is wrong with the channels, `analyse` reports it or goes on."""
+    """Whatever is wrong with the channels, `analyse` returns a result or one line of error."""
     check(case)
 
 
@@ -178,5 +178,5 @@ def test_broken_data_end_in_a_result_or_in_one_line(case):
 @settings(quick, max_examples=400)
 @given(broken(["one-cart", "two-cart", "three-cart"]))
 def test_broken_data_of_up_to_three_carts_end_in_a_result_or_in_one_line(case):
-    """The same for many more submissions, also with three carts."""
+    """Broken data of up to three carts give a result or one line of error, in many more cases."""
     check(case)

@@ -75,7 +75,7 @@ HARD = model_of("coulomb_friction", "backlash", "input_delay", last=False)
 @no_compiler
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
 def test_c_moves_as_the_simulator_does(effect: Effect, tmp_path):
-    """With each effect, C agrees with the simulator, the better the shorter its steps are.
+    """With each effect the C program agrees with the simulator, better with shorter steps.
 
     In theory a quarter of the step gives a sixteenth of the error, but an event may spoil that.
     """
@@ -103,7 +103,7 @@ def test_c_moves_as_the_simulator_does_with_friction_play_and_delay(run, tmp_pat
 @no_compiler
 @pytest.mark.parametrize("free", [1, 2])
 def test_a_cart_that_was_always_held_is_a_wall(free, tmp_path):
-    """A cart that was held in all runs keeps its place, and has no parameters in the model."""
+    """A cart that is held in all runs does not move and adds no parameters to the model."""
     model = model_of("coulomb_friction", "cubic_spring", last=free == 2)
     names = {p.name for p in describe(model, units=PAPER_UNITS, free=(free,)).parameters}
     assert f"m{free}" in names
@@ -133,7 +133,7 @@ def test_a_cart_that_friction_holds_does_not_move(tmp_path):
 @no_compiler
 @pytest.mark.parametrize("interval", [1e-5, 1e-3, 7e-3])
 def test_a_delay_is_true_at_any_length_of_step(interval, tmp_path):
-    """With a delay the same motion comes later, whatever the step, and nothing moves before.
+    """A delay shifts the whole motion by the same time, whatever the length of steps.
 
     The model remembers 254 jumps of the input within a delay. If there are more, as here with one
     every 10 us, it delays their mean.

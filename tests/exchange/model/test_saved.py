@@ -34,7 +34,7 @@ def analysis() -> Analysis:
 
 
 def test_the_files_are_saved_and_cleared(analysis, tmp_path):
-    """All four files of a model are written and later removed, and no other files."""
+    """All four files of a model are written, and later only these are removed."""
     (tmp_path / "model.slx").write_text("mine")
     said = save_model(with_effect("coulomb_friction"), analysis, tmp_path, free=(1,))
     assert all((tmp_path / name).stat().st_size > 1000 for name in FILES)
@@ -51,7 +51,7 @@ def test_a_drive_that_leads_its_log_is_refused_in_a_sentence(analysis, tmp_path)
 
 
 def test_the_sign_of_the_recordings_is_reported(analysis, tmp_path):
-    """If the recordings count the input the other way, each file says so."""
+    """If the recordings count the input the other way, each file of the model says so."""
     other_way = {
         turned: [replace(r, input_scale=-1.0 if turned else 1.0) for r in analysis.records]
         for turned in (False, True)

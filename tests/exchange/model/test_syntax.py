@@ -44,7 +44,7 @@ def values(text: str) -> float:
 
 
 def named() -> dict[str, float]:
-    """Return every symbol under a name of the model, as a language writes it."""
+    """Return every symbol under its name in the model, as the given language writes it."""
     return {f"s{i}": values(name) for i, name in enumerate(SYMBOLS)} | VALUES
 
 
@@ -79,7 +79,7 @@ def test_expressions_keep_their_value_in_c(tmp_path):
 
 @no_octave
 def test_expressions_keep_their_value_in_octave(tmp_path):
-    """In Octave, as MATLAB would write them, expressions have the same value as in Python."""
+    """Expressions written for MATLAB have the same value in Octave as in Python."""
     known = "".join(f"{n} = {v!r};\n" for n, v in named().items())
     body = "".join(
         f"printf('%.17g\\n', {in_matlab(text, bodies=(), bristles=())});\n" for text in MODELLED
@@ -93,7 +93,7 @@ def test_expressions_keep_their_value_in_octave(tmp_path):
 
 @pytest.mark.parametrize("text", ["a if b else c", "a < b", "[a]", "f(a)", "a @ b", "'a'"])
 def test_what_no_law_may_have_is_refused(text):
-    """An expression that no law has is refused, in both languages."""
+    """An operation that laws may not use is refused, for C and for MATLAB."""
     with pytest.raises(ValueError, match="no part of a law"):
         in_c(text)
     with pytest.raises(ValueError, match="no part of a law"):
@@ -101,7 +101,7 @@ def test_what_no_law_may_have_is_refused(text):
 
 
 def test_numbers_for_symbols_simplify_an_expression():
-    """With numbers for some symbols, the expressions of a bristle become short."""
+    """If numbers replace some symbols of a bristle's law, its expressions become shorter."""
     rate = "(v - abs(v) * z) / d"
     assert substitute(rate, {"z": "0"}) == "v / d"
     assert substitute(rate, {"z": "1"}) == "(v - abs(v)) / d"

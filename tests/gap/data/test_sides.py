@@ -24,7 +24,7 @@ HEAVIER = Chain(m=1.4 * CHAIN.m, c=CHAIN.c, k=CHAIN.k)  # a weight was left on t
 
 @pytest.fixture(scope="module")
 def analysis(tmp_path_factory):
-    """The analysis of a linear bench: two step sizes, decays, one repeat with an extra weight."""
+    """The analysis of a linear bench with steps, decays and one repeat with an extra weight."""
     folder = tmp_path_factory.mktemp("bench")
     rng = np.random.default_rng(5)
     records = [
@@ -72,7 +72,7 @@ def test_a_gap_file_of_before_is_still_read(analysis):
 
 
 def test_a_cart_at_rest_before_a_release_is_not_a_run():
-    """If a cart rests until a hand pulls and releases it, only the decay is a run."""
+    """If a cart rests before a hand pulls and releases it, only the decay counts as a run."""
     decay = decay_record(CHAIN, free=(1,), rng=np.random.default_rng(6))
     wait = np.arange(int(2.0 / decay.sample_time)) * decay.sample_time
     steps = np.interp(wait, [0.06, 0.2, 0.7, 1.9], [17, 3, 3, 0])

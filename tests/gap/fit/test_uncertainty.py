@@ -58,7 +58,7 @@ def standardised(folder, *, preset, hide, seed):
     ],
 )
 def test_parameters_are_off_by_what_is_stated(tmp_path, preset, hide, seeds):
-    """Errors match even if friction holds a cart for seconds, which counts as one reading.
+    """Standard errors are right even if friction holds a cart still for seconds.
 
     From so few numbers, the root mean square scatters by a quarter. If the noise were taken as
     white, it would be four.
@@ -92,7 +92,7 @@ def test_a_model_that_runs_away_has_no_errors():
 
 
 def test_every_record_has_encoder_errors_of_its_own():
-    """A record that is listed twice is drawn twice, so the covariance is not just halved."""
+    """If a record is listed twice, its errors are drawn twice, so variances are not just halved."""
     fit, runs = fitted(make_case(seed=42, n=1, rate=113.1))
     once = covariance(replace(fit, nuisance=fit.nuisance[:1]), runs[:1]).covariance
     twice = covariance(replace(fit, nuisance=fit.nuisance[:1] * 2), runs[:1] * 2).covariance

@@ -8,7 +8,7 @@ from tests.truth.bench import Hidden
 
 
 def test_what_hides_below_the_floor_is_looked_for():
-    """Small friction is searched for even if a delay alone leaves about the noise."""
+    """Small friction is looked for even if, with a delay, only noise seems to be left."""
     fit, study = begun(
         Hidden(effect="coulomb_friction", place=1, parameters={"force": 2.4e-6}),
         Hidden(effect="input_delay", parameters={"delay": 0.014}),

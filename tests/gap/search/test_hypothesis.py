@@ -42,7 +42,7 @@ def judged(
     ],
 )
 def test_an_effect_is_worth_it_by_independent_residuals(child, worth):
-    """An effect must pay in training and held-out runs, counted in independent residuals."""
+    """An effect must improve training and held-out runs, by independent residuals."""
     parent = judged(CUBIC, chi=6.0, held=6.0)
     both = judged(CUBIC, DELAY, **child)
     study: Any = SimpleNamespace(explains=lambda h: True)
@@ -55,7 +55,7 @@ def test_an_effect_is_worth_it_by_independent_residuals(child, worth):
      (0.014, False, 0.01, False)],
 )  # fmt: skip
 def test_a_name_that_leaves_more_than_noise_says_so(error, contact, repeatability, said):
-    """A model that leaves more than noise may be incomplete, except with contacts or repeats."""
+    """If more than noise is left, effects may be missing, except with contacts or poor repeats."""
     chosen: Any = SimpleNamespace(error=error, has_contact=contact)
     study: Any = SimpleNamespace(floor=0.01, repeatability=repeatability)
     assert Study.may_be_half(study, chosen) == said

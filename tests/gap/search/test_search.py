@@ -34,7 +34,7 @@ def searched(*hidden: Hidden, seconds: float | None = None) -> Search:
     ],
 )
 def test_what_is_hidden_is_named(hidden, verdict, found):
-    """With no, one or two hidden effects, each step adds one and lowers the error."""
+    """The search names the hidden effects, if any, one in each step."""
     search = searched(*hidden)
 
     assert search.verdict == verdict
@@ -58,7 +58,7 @@ def test_without_time_the_linear_model_is_the_answer():
 
 
 def test_overestimated_noise_is_measured_again():
-    """If the noise is assumed three times too large, friction and the noise are still found."""
+    """If the assumed noise is three times too large, friction is still found."""
     fit, study = begun(FRICTION)
     loud = study.with_noise([replace(run, sigma=3.0 * run.sigma) for run in study.training])
     search = Search(loud, fit, Deadline(map, seconds=None))

@@ -25,7 +25,7 @@ ALL = frozenset().union(*(filled(effect) for effect in CATALOGUE))
     ],
 )
 def test_a_law_is_looked_for_where_it_would_show(kind, free, places):
-    """An effect is searched for where it would show: not on held carts, once for equal springs."""
+    """Effects are tried only at places where they would show, and once for equal springs."""
     bench = FollowedBench(
         chain=PRESETS["throne-2dof"], springs=(True,) * 3, largest=1.0, free=tuple(free)
     )
@@ -35,7 +35,7 @@ def test_a_law_is_looked_for_where_it_would_show(kind, free, places):
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
 def test_values_are_read_back_from_the_columns(effect):
-    """Values of an effect are read back, even if a column is the difference of two values."""
+    """The values of an effect are recovered, even if one is stored as a difference."""
     values = tuple(0.3 * (1.0 + i) for i in range(len(effect.names)))
     columns = effect.columns(effect.named(values))
     np.testing.assert_allclose(values_of(effect, columns), values, rtol=1e-12)

@@ -52,7 +52,7 @@ def verdict_on(*steps: Any, others: tuple[Any, ...] = ()) -> tuple[str, set[Any]
 
 
 def test_an_effect_beside_which_another_does_as_well_alone_is_taken_back():
-    """If the second effect alone explains as much as both, the first is taken back."""
+    """If the effect found second explains as much alone, the first is taken back."""
     delay = hypothesis(DELAY, error=0.25, bic=-10)
     both = hypothesis(DELAY, COULOMB, error=0.2, bic=-500)
     three = hypothesis(DELAY, COULOMB, CUBIC, error=0.195, bic=-600)
@@ -90,7 +90,7 @@ def test_a_rival_far_less_likely_is_none():
 
 @pytest.mark.parametrize(("held", "verdict"), [(1.0, "ambiguous"), (1.05, "named")])
 def test_runs_held_out_are_evidence_too(held: float, verdict: str):
-    """Held-out runs count too: the gain of 30 from training and 49 from them excludes a rival."""
+    """A rival is excluded by training and held-out runs together."""
     drag = hypothesis(DRAG, error=0.01, bic=-1000)
     cubic = hypothesis(CUBIC, error=0.01, bic=-970, held=held)
     assert verdict_on(drag, others=(cubic,))[0] == verdict

@@ -27,7 +27,7 @@ CARTS = {
 
 
 def record(chain: Chain, law: Law, *, cart: int, kind: Kind, size: float, seed: int) -> Record:
-    """Return one run of carts on springs with an extra law of force on one cart.
+    """Return one run of carts on springs, with an extra law of force on one cart.
 
     It uses Heun's method with steps of 1 ms, whole encoder steps, and noise of a third of a step.
     """
@@ -103,7 +103,7 @@ def left_by_the_chain(records: list[Record], *, springs: tuple[bool, ...]) -> tu
     ids=["drag", "root friction", "van der Pol", "force by place", "two laws"],
 )
 def test_a_law_is_read_off_what_it_leaves(law, terms):
-    """From the unexplained force the terms of a law are found, and no others, to within 6 %.
+    """From the unexplained force the terms of a law are found to 6 %, and no other terms.
 
     That is three stated standard errors of the least certain term, the square root.
     """

@@ -31,7 +31,7 @@ def make_core(**changes) -> ReferenceCore:
 
 
 def run(core: ReferenceCore, commands: bytes, y, *, ticks: int, first: int = 0) -> list[Reading]:
-    """Send something to the core, and tick; return its lines.
+    """Send something to the core, then tick it; return its lines.
 
     `y` gives the counts at each tick.
     """
@@ -59,7 +59,7 @@ def test_a_run_streams_its_wave_and_ends(wave):
 
 
 def test_the_waves_are_what_they_are_called():
-    """Each wave is right at the eighths of its period, and a chirp in its frequency."""
+    """Each wave has the right value at eighths of its period, and a chirp the right frequency."""
 
     def eighths(wave: Wave) -> list[int]:
         start = Start(wave=wave, frequency=1.25, amplitude=1000)
@@ -128,7 +128,7 @@ def test_pid_is_the_law_of_the_simulated_loop(encoder):
 
 
 def test_the_last_gains_count_from_the_next_start():
-    """Gains that arrive during a run act from the next start on, and the last ones count."""
+    """Gains that arrive during a run act only from the next start on."""
     core = make_core()
     lines = run(core, b"g;1;0;0;d;q;c;o;10;50;5;", still, ticks=100)
     assert lines[-1].duty == 50
