@@ -82,7 +82,7 @@ def test_rows_may_be_in_a_file_beside_the_figure(tmp_path):
 
 
 def test_text_is_wrapped_to_the_width_of_the_page():
-    """Paragraphs stay apart, and the lines of a list item are indented."""
+    """Wrapped text keeps its paragraphs apart, and the lines of its list items are indented."""
     text = page.wrapped("\none\ntwo\n\n- " + "word " * 40 + "\n- end\n")
 
     assert text.startswith("one two\n\n- word")
@@ -129,7 +129,7 @@ def test_an_unknown_name_is_refused(monkeypatch):
     ("value", "text"), [(0.01234, "0.012"), (12.34, "12"), (123.4, "123"), (1e7, "1e+07")]
 )
 def test_numbers_keep_two_digits(value, text):
-    """`significant` shows as many digits as asked, with exponents only for extreme values."""
+    """`significant` shows as many digits as asked, with a power of ten only for extreme values."""
     assert significant(value) == text
 
 

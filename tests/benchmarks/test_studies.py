@@ -48,7 +48,7 @@ def test_a_limit_passed_is_told_apart_from_other_ends():
 
 
 def test_a_recording_beyond_the_travel_limit_is_a_limit_passed(tmp_path):
-    """If a recording passes the travel limit, the study counts that under the exception's name."""
+    """A recording that passes the travel limit is counted as such in the study."""
     drawn = draw(71_001, effects=0)
     bench = VirtualBench(drawn.bench, seed=1)
     submission = load_submission(new_folder(tmp_path / "lab", bench, springs=drawn.springs))

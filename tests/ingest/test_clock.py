@@ -17,7 +17,7 @@ from pipeline.ingest.clock import decimal_step, read_clock, read_clocks
     rounded_down=st.booleans(),
 )
 def test_a_rounded_even_clock_is_straightened(interval, start, n, rounded_down):
-    """Stamps in whole ms give back the even clock behind them."""
+    """From stamps rounded to whole ms, the even clock is recovered."""
     true = start + interval * np.arange(n, dtype=np.float64)
     stamps = np.floor(true * 1e3 + 1e-6) / 1e3 if rounded_down else np.round(true, 3)
 

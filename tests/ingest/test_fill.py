@@ -105,7 +105,7 @@ def test_what_is_no_recording_by_its_name_is_said_to_be_left_out(tmp_path, comma
 
 
 def test_every_file_is_named_but_for_what_a_tool_hides(tmp_path):
-    """Files that are no recordings are named, at most the first few, except what tools hide."""
+    """Files that are no recordings are named, except files that a tool hides."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     data = tmp_path / "data"
     for name in (".git/HEAD", ".cache/b.csv", "report/bode.svg", "plot.py", "Thumbs.db"):
@@ -387,7 +387,7 @@ _TABLES = st.permutations(["system", "experiments", "reported.initial", "design"
 
 @given(_COMMENTS, _TABLES, st.integers(0, 3), st.booleans())
 def test_whatever_stands_there_stays(tmp_path_factory, comments, tables, n, blank):
-    """Adding a table keeps every comment, key and digit of the file, in any order."""
+    """Whatever tables are added to the file, every comment, key and digit in it stays."""
     bodies = {
         "system": "[system] {}\ncarts = 1\ninput = {{ unit = 'V' }} {}\n",
         "experiments": "".join(

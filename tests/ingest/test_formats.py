@@ -293,7 +293,7 @@ def test_what_may_hold_another_recording_is_told_with_what_to_do():
 
 
 def test_a_matlab_table_is_told_by_its_name():
-    """A MATLAB `table` object cannot be read, and the error names it and how to export it."""
+    """A MATLAB `table` object cannot be read, and the error shows how to export it."""
     flags, name = np.array([6, 8, 17, 0], dtype="<u4").tobytes(), b"run7".ljust(8, b"\0")
     body = flags + np.array([1, 4], dtype="<u4").tobytes() + name
     kept = scipy_element(np.zeros((1, 400), "u1"), name="")

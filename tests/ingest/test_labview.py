@@ -155,7 +155,7 @@ def test_an_lvm_cut_short_is_known_even_between_two_rows():
 
 @given(st.integers(0, len(GOOD) - 1))
 def test_any_piece_of_an_lvm_is_cut_or_refused(end):
-    """Of a file cut anywhere before its last row, no table comes without a word."""
+    """If an .lvm file is cut before its last row, it is refused or reported as cut."""
     got = table_or_one_line(GOOD[:end].encode())
     assert got is None or got.cut or got.values.shape[1] == N
 
@@ -289,7 +289,7 @@ def test_a_tdms_in_tiny_pieces_is_read_up_to_a_limit(monkeypatch):
     )
 )  # fmt: skip
 def test_a_damaged_tdms_is_a_table_or_one_line(hits):
-    """After damage anywhere, the file is a table or one line of error."""
+    """A .tdms file with damage anywhere gives a table or one line of error."""
     raw = bytearray(GOOD_TDMS)
     for at, junk in hits:
         raw[at : at + len(junk)] = junk

@@ -385,7 +385,7 @@ def test_any_sheet_is_a_table_or_one_line(rows):
 
 @given(st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.binary(max_size=12)), max_size=4))
 def test_a_damaged_sheet_is_a_table_or_one_line(hits):
-    """After damage to its XML, a sheet is a table or one line of error."""
+    """A sheet with damaged XML gives a table or one line of error."""
     part = bytearray(BOOK.encode())
     for where, junk in hits:
         at = int(where * len(part))

@@ -101,7 +101,7 @@ def test_a_held_cart_that_is_moved_moves_its_neighbour():
 
 @pytest.mark.parametrize("rate", [113.1, 250.0, 1000.0])
 def test_friction_decay_follows_the_events(rate):
-    """With dry friction only, a decay has the exact half swings and ends where it stops."""
+    """With dry friction only, each half swing of a decay is exact, and the cart stays at rest."""
     m, k, force = 2e-4, 0.035, 0.004
     chain = Chain(m=np.array([m]), c=np.array([0.0]), k=np.array([k, 0.0]))
     tables = linear_tables(chain)

@@ -255,7 +255,7 @@ def test_releases_agree_with_the_independent_bench(key):
 
 @pytest.mark.parametrize("key", KEYS)
 def test_sample_by_sample_is_the_whole_run(key):
-    """Stepping a bench sample by sample gives the run that is simulated at once."""
+    """A bench simulated sample by sample gives the same run as one simulated all at once."""
     term = usual(key)
     model, run = AugmentedChain(chain=TWO, terms=(term,)), step()
     stepped = SteppedBench(model)

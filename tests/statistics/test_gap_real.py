@@ -31,7 +31,7 @@ def explain_five(folder: Path, name: str, *, column: int, kind: str) -> Gap:
 
 
 def test_driven_cart_has_dry_friction(real_data):
-    """Five steps of a real cart show dry friction, and unseen repeats are right to 2.7 %.
+    """In five steps of a real cart dry friction is found, and unseen repeats are right to 2.7 %.
 
     No model can do better than the difference between the repeats.
     """
@@ -46,7 +46,7 @@ def test_driven_cart_has_dry_friction(real_data):
 
 
 def test_released_cart_has_dry_friction(real_data):
-    """Five hand-released decays show dry friction first, and the errors are within 4 %."""
+    """In five hand-released decays dry friction is found first, and errors are within 4 %."""
     folder = real_data / "ecp210-ucsd"
 
     gap = explain_five(folder, "DOF1_en2_manual2", column=3, kind="decay")
@@ -70,7 +70,7 @@ def test_a_cart_held_in_all_runs_is_a_wall(real_data, tmp_path):
 
 
 def test_all_runs_of_two_carts_have_friction_on_both(real_data, tmp_path):
-    """In all runs of two real carts friction is found on both, and unseen runs are right to 4 %."""
+    """From all runs of two real carts, friction is found on both."""
     folder = write_two_cart_submission(tmp_path / "lab", real_data, steps=(1, 2, 3, 4, 5))
     analysis = analyse(load_submission(folder), design=False)
 

@@ -31,7 +31,7 @@ def test_benches_that_once_were_accused_are_not(preset, seed, tmp_path):
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("start", STARTS)
 def test_no_honest_recording_is_accused(preset, start, tmp_path):
-    """With each effect at up to three times its usual size, no recording is called wrong."""
+    """For each effect at up to three times its usual size, no recording is called wrong."""
     for seed in range(start, start + 10):
         grade, analysis, term = grade_honest_team(tmp_path / f"{seed}", preset=preset, seed=seed)
         assert not any(one.is_wrong for one in analysis.left_out), (seed, term)

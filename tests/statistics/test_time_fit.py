@@ -43,7 +43,7 @@ def test_intervals_cover_the_truth_at_their_rate(preset, noise):
 
 @pytest.mark.slow
 def test_every_random_chain_is_found():
-    """Each of 200 random chains with 1 to 4 carts is found."""
+    """The fit finds each of 200 random chains with 1 to 4 carts."""
     rng = np.random.default_rng(16)
     for i in range(200):
         n = 1 + i % 4

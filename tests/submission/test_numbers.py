@@ -129,7 +129,7 @@ def planned(tmp_path_factory) -> Path:
 @given(numbers, where)
 @example("0x" + "f" * 5000, 0)
 def test_any_number_of_a_plan(planned, number, at):
-    """Any number in `plan.toml` is read or refused, such as a run of 1e300 s."""
+    """Any number in `plan.toml` is read or refused, even 1e300 s."""
     submission = load_submission(planned)
     before = plan_path(submission).read_text(encoding="utf-8")
     text, key = with_number(before, number, at)
@@ -154,7 +154,7 @@ def test_any_number_of_the_users_file(tmp_path_factory, number, key):
 
 @given(numbers, st.sampled_from(["period", "baud", "input", "position", "encoders", "carts"]))
 def test_any_number_of_a_benchs_description(number, key):
-    """Any number in a bench's description is accepted as a limit or refused."""
+    """Any number in a bench's description is either accepted or refused with its key."""
     line = format_description(Description(name="b", encoders=2, carts=2)).decode()
     new = re.sub(rf" {key}=[-\d.]+", f" {key}={number}", line)
     assert_read_or_refused(lambda: parse_description(new.encode()), key, "describes itself as")

@@ -82,7 +82,7 @@ def folder(tmp_path):
 
 
 def test_every_table_of_the_format_is_read(folder):
-    """Every table is read: missing carts mean all, and whole numbers are accepted as decimals."""
+    """Every table of `submission.toml` is read; missing carts mean all carts."""
     submission = load_submission(folder)
 
     decay, control, pid = submission.experiments
@@ -159,7 +159,7 @@ def test_a_cart_without_springs_reports_mass_and_damping(tmp_path):
     "encode", [lambda t: b"\xef\xbb\xbf" + t, lambda t: t.replace(b"\n", b"\r\n")]
 )
 def test_windows_files_are_read(encode, folder):
-    """A byte-order mark and CR LF line ends change nothing."""
+    """A byte-order mark and CR LF line ends do not change what is read."""
     plain = load_submission(folder)
     raw = (folder / "submission.toml").read_bytes()
     (folder / "submission.toml").write_bytes(encode(raw))
@@ -167,7 +167,7 @@ def test_windows_files_are_read(encode, folder):
 
 
 def test_the_toml_itself_may_be_named(folder):
-    """The path may be that of the folder or of the file in it."""
+    """The path of a submission may be its folder or the file `submission.toml` in it."""
     assert load_submission(folder / "submission.toml") == load_submission(folder)
 
 
@@ -233,7 +233,7 @@ def test_a_list_that_is_not_closed_is_one_slip(folder):
 
 @pytest.mark.parametrize("carts", [1, 2, 3, 4])
 def test_a_new_submission_loads_and_says_what_is_next(carts, tmp_path):
-    """A new submission is valid; reading its data asks for the first experiment."""
+    """A new submission is valid, but reading its data gives an error that asks for experiments."""
     new_submission(tmp_path / "team", carts=carts)
 
     submission = load_submission(tmp_path / "team")

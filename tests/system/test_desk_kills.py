@@ -120,7 +120,7 @@ class _Override(_Save):
 
 @dataclass(kw_only=True)
 class _Regrade(_Save):
-    """Grade a changed submission again, in a class where another has points by hand."""
+    """Grade a changed submission again, in a class in which another one has points by hand."""
 
     page: str = "/grades/0/"
     longest: float = 20.0

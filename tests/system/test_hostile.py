@@ -168,7 +168,7 @@ def test_nothing_is_written_elsewhere_and_nobody_is_called(graded):
 
 
 def test_the_honest_are_graded_as_if_they_were_alone(graded):
-    """Honest submissions get the same feedback, byte for byte, as without the hostile ones."""
+    """Honest submissions get the same grade, byte for byte, with or without hostile ones."""
     base, _, _ = graded
     _grade(base, "alone")
     for name in HONEST:

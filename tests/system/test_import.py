@@ -165,7 +165,7 @@ def test_an_export_for_matlab_is_a_record(work, source):
 
 
 def test_everything_else_in_the_folder_is_said_once(work, source):
-    """A script, a picture and a folder are each named once with the reason.
+    """A script, a picture and a folder are each named once, with the reason for not importing them.
 
     Hidden files are ignored.
     """

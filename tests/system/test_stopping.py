@@ -23,7 +23,7 @@ def _work(said: list[str], *, look: bool = False, error: Exception | None = None
 
 @pytest.mark.parametrize("how", [{"look": True}, {"look": False}, {"error": ValueError("broken")}])
 def test_an_interrupt_that_a_library_drops_ends_the_work(how):
-    """If a library swallows Ctrl-C, the command still ends, at its next look or at its end.
+    """If a library swallows Ctrl-C, the command still ends, at its next check or at its end.
 
     If the interrupted library raises an error, the command ends with 130 all the same.
     """

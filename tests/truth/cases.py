@@ -289,7 +289,7 @@ def _lay_hands(n, large, rng) -> dict[str, tuple[Hand, ...]]:
 
 
 def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng, wide=False) -> Hidden:
-    """Draw a place and sizes; `severity` scales the difference from the linear bench."""
+    """Draw a place and sizes of an effect; `severity` scales its difference from linear."""
     s = severity * float(np.exp(rng.uniform(np.log(0.3), np.log(1.5)))) if wide else severity
     i = int(rng.integers(n))
     present = [j for j in range(n + 1) if k[j] > 0]

@@ -77,7 +77,7 @@ def test_rounding_changes_nothing_that_the_error_could_tell(value, ratio):
     ],
 )
 def test_significant_digits(value, expected):
-    """A number has four digits, a power of ten if it would be long, a dash if it is missing."""
+    """A number has four digits, a power of ten if it is very long, a dash if it is missing."""
     assert significant(value) == expected
 
 

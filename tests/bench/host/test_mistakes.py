@@ -24,7 +24,7 @@ from tests.helpers.benches import emulator
 
 
 def test_another_bench_than_the_submission_is_of_is_refused(tmp_path):
-    """A submission of two carts refuses data from a bench with one cart."""
+    """A bench with one cart is refused for a submission of two carts."""
     work = write_work(tmp_path, [sine("dwell", seconds=1)])
     with emulator("--speed", "20", preset="throne-1dof") as bench:
         with pytest.raises(

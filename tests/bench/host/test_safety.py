@@ -245,7 +245,7 @@ def test_a_new_line_is_zeroed_once_the_carts_rest(tmp_path, real):
 
 
 class Answers(threading.Thread):
-    """A port on which each query gets the next one of some answers."""
+    """A port that answers each query with the next of the given answers."""
 
     def __init__(self, answers: Iterable[bytes]) -> None:
         super().__init__(daemon=True)

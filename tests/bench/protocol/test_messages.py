@@ -73,7 +73,7 @@ def test_commands_come_across(sent, chunk):
 
 @given(st.binary(max_size=80), st.integers(1, 9))
 def test_the_pieces_do_not_matter_for_noise_either(data, chunk):
-    """Noise gives the same commands and the same number of rejects in any pieces."""
+    """Noise gives the same commands and the same number of rejects, however it is cut."""
     whole, pieces = CommandReader(encoders=ENCODERS), CommandReader(encoders=ENCODERS)
     expected = whole.feed(data)
     got = [c for at in range(0, len(data), chunk) for c in pieces.feed(data[at : at + chunk])]
@@ -82,7 +82,7 @@ def test_the_pieces_do_not_matter_for_noise_either(data, chunk):
 
 @st.composite
 def garbled(draw):
-    """Draw a few commands with bytes lost, changed and put in."""
+    """Draw a few commands in which bytes are lost, changed or inserted."""
     data = b"".join(map(encode, draw(st.lists(commands, min_size=1, max_size=3))))
     for _ in range(draw(st.integers(1, 3))):
         at = draw(st.integers(0, len(data)))
@@ -96,7 +96,7 @@ def garbled(draw):
 @example(b"d;q")
 @example(b"0" * 40)
 def test_nothing_swallows_a_stop_or_a_reset(data):
-    """After any noise, the last stop or reset sent is the last thing a bench hears."""
+    """After any noise, a bench still obeys the last stop or reset that was sent."""
     assert read(data + b"z;")[-1] is Signal.RESET
     assert read(data + encode(Signal.STOP))[-1] is Signal.STOP
     # A lone stop may look like the wave of a truncated start, until the next heartbeat.
@@ -157,7 +157,7 @@ readings = st.builds(
 
 @given(readings)
 def test_lines_come_across(reading):
-    """A line is read as it was meant, with or without its end."""
+    """A line is read as the reading that was written, with or without its line end."""
     line = format_reading(reading)
     assert parse_reading(line) == parse_reading(line.rstrip()) == reading
 
@@ -191,7 +191,7 @@ descriptions = st.builds(
 
 @given(descriptions)
 def test_descriptions_come_across(bench):
-    """The answer to a query is read as it was meant.
+    """A bench's answer to a query is read as the description that was written.
 
     Entries added in later versions are ignored.
     """

@@ -71,7 +71,7 @@ def read(folder: Path) -> list:
 @no_compiler
 @pytest.mark.parametrize("unit", ["µm", "*/ #error", "°", '"<&>', "\\", "??/", "m%n", ""])
 def test_a_unit_stays_a_word(unit, analysis, tmp_path):
-    """No unit of a submission can end a comment or damage the description."""
+    """Whatever unit a submission states, it cannot break the files of the model."""
     units = Units(position=unit, input=unit)
     bench = replace(analysis.bench, units=units)
     save_model(with_effect("cubic_spring"), replace(analysis, bench=bench), tmp_path, free=(1,))

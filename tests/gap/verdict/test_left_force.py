@@ -141,7 +141,7 @@ def test_the_force_is_on_the_cart_that_it_acts_on():
 
 
 def test_an_effect_that_the_catalogue_lacks_is_described():
-    """Without drag in the catalogue the verdict is "unexplained", with the formula of drag."""
+    """If the catalogue lacks drag, the gap is unexplained, and the formula of drag is found."""
     catalogue = [effect for effect in CATALOGUE if effect.key != "quadratic_drag"]
 
     gap = explain_gap(

@@ -179,9 +179,9 @@ def test_silence_after_a_heartbeat_cuts_the_motor():
 
 
 def test_a_query_is_answered_and_hands_are_not_the_controllers():
-    """A query during a run gets its line between the others.
+    """A query during a run is answered between two lines of the run.
 
-    `h` changes nothing, and a stock bench answers nothing.
+    The command `h` changes nothing, and a stock bench answers no query.
     """
     core = make_core()
     core.receive(b"d;q;o;o;1;50;1;h;1;2;?;")
