@@ -53,7 +53,7 @@ class OneLineItems(Extension):
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Set formulas as the program does, and list the pages of the benchmarks."""
+    """Typeset formulas as the program does, and list the pages of the benchmarks."""
     fence = {"name": "math", "class": "math", "format": _formula}
     config.mdx_configs["pymdownx.superfences"] = {"custom_fences": [fence]}
     benchmarks = sorted(ROOT.glob("benchmarks/*.md"))

@@ -176,7 +176,7 @@ def test_dead_zone_and_saturation_shape_the_input():
 
 
 def test_friction_at_rest_is_what_the_law_says():
-    """At zero speed, friction with a force `at_rest` of its own has that force."""
+    """If a law of friction has a separate force at rest, that force acts at zero speed."""
     for effect in CATALOGUE:
         if isinstance(effect.law, FrictionLaw) and effect.law.at_rest:
             row = np.zeros((1, len(TABLES["cart"])))

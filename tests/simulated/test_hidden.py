@@ -211,7 +211,7 @@ def test_steps_agree_with_the_independent_bench(key):
      "input_delay", "actuator_lag", "extra_mode", "sensor_gain"],
 )  # fmt: skip
 def test_closed_loops_agree_with_the_independent_bench(key):
-    """A closed loop's logged input, applied to the 50-µs simulator, gives the logged motion."""
+    """The 50-µs simulator, driven by a closed loop's logged input, gives the logged motion."""
     term, run = usual(key), control()
 
     moved = bench(term).move(run)

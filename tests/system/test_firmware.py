@@ -106,8 +106,8 @@ TICKS = st.tuples(
 def test_any_session_is_that_of_the_reference(library, encoders, session):
     """Whatever bytes arrive, firmware and reference give the same duties and lines.
 
-    The host reads all the time: lines without room on their way out are dropped (see below), while
-    the reference, which answers at its next tick, has room for all.
+    The host reads after each byte here, because the firmware drops lines for which its buffer has
+    no room. The reference has room for all lines, and sends them at its next tick.
     """
     firmware, reference = _both(library, encoders)
     stamp, sent = 0, b""

@@ -111,7 +111,7 @@ def test_an_interrupt_after_the_last_line_keeps_the_run(tmp_path):
 
 
 def test_a_network_port_typed_as_a_device_is_told_how_to_write_it():
-    """A network port typed as a device gives a message with the right form."""
+    """If a network port is typed as a device, the message shows the right notation."""
     for port in ("41001", "127.0.0.1:41001"):
         with pytest.raises(HardwareError, match=r"is written socket://HOST:PORT"):
             open_line(port, baud=115_200)

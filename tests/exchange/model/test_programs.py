@@ -355,7 +355,7 @@ def test_the_same_model_gives_the_same_bytes(hard_fmu):
 
 
 def test_without_a_compiler_the_fmu_has_its_sources(monkeypatch):
-    """Without a compiler the FMU has only its sources, which the returned value shows."""
+    """Without a compiler the FMU contains only its sources, and `fmu` returns False with it."""
     monkeypatch.setattr(fmu_module.shutil, "which", lambda name: None)
     whole, compiled_too = fmu(describe(HARD, units=PAPER_UNITS))
     assert not compiled_too
