@@ -127,8 +127,6 @@ def test_stages_never_import_each_other(stage):
     """No stage imports another stage.
 
     Only the workflow knows their order; code that they share is in `estimation`.
-
-    only the workflow knows their order, and they share `estimation`.
     """
     assert len(STAGES) > 10
     assert not [name for name in _imports(stage) if name.startswith("pipeline.stages")]

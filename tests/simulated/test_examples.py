@@ -293,7 +293,7 @@ def test_reported_state_space_and_feedback(sessions):
 def test_the_controlled_cart_follows(sessions):
     """The controlled cart ends within 5 % of its reference.
 
-    The students' model is slightly off.
+    It is not closer, because the students' model is slightly off.
     """
     for preset in PRESET_NAMES:
         (entry,) = experiments(sessions / preset, "closed_loop")

@@ -274,7 +274,7 @@ def test_sample_by_sample_is_the_whole_run(key):
 def test_a_constant_force_shows_where_the_carts_rest():
     """Under a constant force the carts rest where the springs balance it.
 
-    With other carts held that is elsewhere; before a closed loop the encoders are zeroed there.
+    They rest elsewhere if other carts are held. Before a closed loop the encoders are zeroed there.
     """
     term = usual("force_offset")
     (force,) = term.values

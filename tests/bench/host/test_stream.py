@@ -210,7 +210,7 @@ def test_late_lines_are_counted_and_kept():
 def test_a_host_that_was_busy_makes_no_line_late():
     """Lines that waited because the host was busy do not count as late.
 
-    The host knows that from its last look, at which the port was empty.
+    The host counts from its previous look, which found the port empty.
     """
     sent = lines(1000, period=1.0)
     stream = Stream(encoders=2)

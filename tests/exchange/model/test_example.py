@@ -41,7 +41,7 @@ def running_bench() -> Iterator[str]:
 def test_friction_is_compensated_on_the_virtual_bench(tmp_path):
     """With friction in the model the cart rests on the target; without it, far from the target.
 
-    The cart rests within one count, and the encoder's noise adds another count.
+    The cart rests within one count of the target; the encoder's noise adds another count.
     """
     model = AugmentedChain(chain=HIDDEN.chain, terms=HIDDEN.effects)
     save_model(model, analysed("one-cart"), tmp_path, free=(1,))

@@ -101,7 +101,7 @@ def test_what_no_law_may_have_is_refused(text):
 
 
 def test_numbers_for_symbols_simplify_an_expression():
-    """If numbers replace some symbols of a bristle's law, its expressions become shorter."""
+    """If symbols of a law are replaced by numbers, its expression becomes shorter."""
     rate = "(v - abs(v) * z) / d"
     assert substitute(rate, {"z": "0"}) == "v / d"
     assert substitute(rate, {"z": "1"}) == "(v - abs(v)) / d"

@@ -116,7 +116,7 @@ def test_state_feedback_is_the_law_of_the_simulated_loop(amplitude):
 
 @pytest.mark.parametrize("encoder", [1, 2])
 def test_pid_is_the_law_of_the_simulated_loop(encoder):
-    """The duty of a PID equals that of the loop's simulation, and acts at once."""
+    """A PID's duty equals that in the simulated loop, and acts in the same tick."""
     gains = PidGains(kp=0.05, ki=0.2, kd=0.001)
     start = Start(wave=Wave.SAWTOOTH, encoder=encoder, frequency=2.0, amplitude=3000)
     r = np.array([float(target_at(start, PERIOD * k)) for k in range(500)])
