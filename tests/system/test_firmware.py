@@ -144,7 +144,7 @@ def test_whole_runs_are_those_of_the_reference(library, wave):
 
 @pytest.mark.parametrize("end", [0.5, 2.0, 30.0])
 def test_chirps_end_where_they_are_told(library, end):
-    """A chirp ends at the frequency asked for, be it below, above or equal to its start (a sine)."""
+    """A chirp ends at the requested frequency: below, above or equal to its start (a sine)."""
     firmware, reference = _both(library)
     start = Start(wave=Wave.CHIRP, frequency=2.0, amplitude=1500, cycles=8)
     for core in (firmware, reference):

@@ -148,8 +148,8 @@ def test_waves_are_those_of_the_reference(mega, wave):
 def test_it_closes_the_loop_over_its_pins(mega, gains):
     """Over the board's pins, a closed loop holds a simulated cart at the target.
 
-    The reference gets the board's own lines, so they differ only by rounding to 24 bits. A duty of some
-    thousand counts is exact to a thousandth, but may round up or down.
+    The reference gets the board's own lines, so they differ only by rounding to 24 bits. A duty of
+    some thousand counts is exact to a thousandth, but may round up or down.
     """
     start = Start(wave=Wave.SQUARE, encoder=1, frequency=0.5, amplitude=800)
     mega.send(encode(gains) + encode(start))
