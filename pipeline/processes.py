@@ -49,8 +49,8 @@ class Ended(Failed):
 
     Attributes
     ----------
-    how : why it ended. `start` and `crash` mean that it ended by itself, before or after it was
-        ready.
+    how : why it ended. `start` means that it ended by itself before it was ready, `crash` that it
+        did so later.
     status : its exit status or signal, in words.
     said : the end of what it wrote to stderr.
     """

@@ -7,9 +7,9 @@ pushes. The equation of motion is
 
 It holds for every record of a bench with the same m, c, k and k', so all records together decide s.
 No data are differentiated: both sides are averaged with a bump that slides along the record
-(`modulating`). A late input (a delay or a lag) turns the phase above the resonance so far that such
-a record by itself seems to have the other sign. Together with the inertia and stiffness from the
-other records, it does not.
+(`modulating`). A late input (a delay or a lag) shifts the phase above the resonance so far that a
+record, taken alone, can seem to have the other sign. With the inertia and stiffness from the other
+records, this does not happen.
 """
 
 from collections.abc import Mapping, Sequence

@@ -331,7 +331,7 @@ def _first(team: Team, name: str, read: float, right: float) -> float:
 
 
 def _fitted(team: Team, first: Mapping[str, float]) -> dict[str, float] | None:
-    """Return the final table of a fit in dB, or None if the fit is far from the truth."""
+    """Return the final table of a fit to magnitudes in dB, or None if it is far from the truth."""
     n = team.bench.chain.n
     try:
         found = final_table(team.analysis.records, n, dict(first))

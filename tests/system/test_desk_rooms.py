@@ -101,8 +101,8 @@ def test_an_exploration_is_watched_and_steered(show, tmp_path):
         window.get_by_label("to within ± %").press("Enter")  # as its button does
 
         thought = window.locator("#thought")
-        expect(thought).to_contain_text(re.compile(r"^ζ is known .* therefore \S+:"))
-        chosen = re.search(r"therefore (\S+):", thought.inner_text())
+        expect(thought).to_contain_text(re.compile(r"^ζ is known .* The next recording is \S+:"))
+        chosen = re.search(r"The next recording is (\S+):", thought.inner_text())
         assert chosen is not None
         window.get_by_role("button", name="Veto").click()
         window.get_by_text("Add an experiment of your own").click()

@@ -53,7 +53,7 @@ def explore_bench(
             ids=made,
             seconds=session_time(tried),
             vetoed=skipped and not made,
-            why="; then ".join(ends),
+            why=". Then: ".join(ends),
         )
 
     def think(stage: str) -> None:

@@ -203,13 +203,13 @@ class Exploration:
         if gap and not gap.complete:
             doubt += WORDS.text("search_ended", seconds=f"{_SEARCH:.0f}")
         parts = [describe_accuracy(missing, errors), doubt, why or WORDS.text("the_end")]
-        said, but = "; ".join(filter(None, parts)), ""
+        but = ""
         if recording and not self._has_time_for([recording]):
             but = WORDS.text("time_up", time=time_words(self.seconds), name=recording.id)
         elif recording and self.failures >= 3:  # in a row; choosing better does not help
             but = WORDS.text("none_came", count=self.failures)
         if but:
-            said, recording = f"{said}, but {but}", None
+            recording = None
         wanting = bool(but or (self.failures and not recording))  # something useful was left undone
         turn = Turn(
             seconds=self.spent,
@@ -220,7 +220,7 @@ class Exploration:
             left=gap.final if gap else None,
             floor=gap.noise_floor if gap else None,
             reached=not missing and not wanting and gap is not None and gap.verdict in SETTLED,
-            said=self.lost + said,
+            said=". ".join(filter(None, [self.lost, *parts, but])),
             gap=gap,
         )
         if self.turns:
@@ -276,7 +276,7 @@ class Exploration:
         self.failures = 0 if came.vetoed else self.failures + 1
         key = "vetoed" if came.vetoed else "lost_why" if came.why else "lost"
         values = {"name": recording.id} | ({"why": came.why} if key == "lost_why" else {})
-        self.lost = WORDS.text(key, **values) + "; "
+        self.lost = WORDS.text(key, **values)
         self._propose(self.analysis)  # which recording decides must be found again
 
 

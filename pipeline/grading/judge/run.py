@@ -91,11 +91,11 @@ def grade_submission(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Analysed:
-    """A submission under a rubric's system, with its analysis.
+    """A submission with the system of its rubric, and the analysis of its recordings.
 
     Attributes
     ----------
-    springs : those that the recordings need and the rubric lacks.
+    springs : springs that the recordings show but the rubric lacks.
     notes : the settings of the submission that the rubric replaced, one sentence each.
     """
 

@@ -77,7 +77,8 @@ def _criterion_text(judged: Criterion, grade: Grade, rubric: Rubric, *, hidden: 
 
     Parameters
     ----------
-    hidden : show only the outcome, the titles of flags, and reasons for points by hand.
+    hidden : show only the outcome, the titles of the flags, and the reasons for points given by
+        hand.
     """
     outcome = WORDS.text(f"outcome_{judged.outcome}")
     if not hidden:

@@ -116,7 +116,7 @@ class _Channel:
 
 
 def _refuse_endless(raw: bytes, *, source: str) -> None:
-    """Refuse a file that is truncated, or takes npTDMS longer than any recording.
+    """Refuse a file that is truncated, or that npTDMS would read for longer than any recording.
 
     Raises
     ------

@@ -50,7 +50,7 @@ class Turn:
     left : error of the model as a share of the motion; None if unknown.
     floor : the noise floor as a share of the motion; None if unknown.
     reached : all requested parameters are known, and the gap is named or absent.
-    said : results, doubts and the reason for the next recording, in one sentence.
+    said : results, doubts and the reason for the next recording, as sentences.
     gap : the gap analysis of this turn, or None; for an earlier turn only with the trace that the
         diary shows.
     """

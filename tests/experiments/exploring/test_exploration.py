@@ -217,8 +217,8 @@ def test_a_bench_on_which_nothing_comes_off_is_left_after_three_tries(tmp_path):
         tell=silent,
     ).run()
     assert len(set(asked)) == 3
-    assert [turn.said.split("; ")[0] for turn in turns[1:]] == [
-        f"{name} failed (the line is silent)" for name in asked
+    assert [turn.said.split(". ")[0] for turn in turns[1:]] == [
+        f"{name} failed: the line is silent" for name in asked
     ]
     assert not turns[-1].reached
 
@@ -264,7 +264,7 @@ def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
     recorded = {experiment.id for experiment in load_submission(folder).experiments}
     assert mine.id in recorded
     assert first.id not in recorded
-    assert said[1].startswith(f"{first.id} was vetoed; ")
+    assert said[1].startswith(f"{first.id} was vetoed. ")
     assert "mine, which was added by hand" in said[1]
     assert f"{first.id} was vetoed" in (folder / NAME).read_text(encoding="utf-8")
 

@@ -43,7 +43,7 @@ def test_values_are_read_back_from_the_columns(effect):
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
 def test_every_effect_has_its_law(effect):
-    """Every column that an effect fills is filled by a law that the fit can follow."""
+    """Each effect has a law in the fit for every column of the simulator that it uses."""
     laws = column_set([column for columns in COLUMNS for column in columns])
     assert filled(effect) <= laws | column_set(DRIVE_COLUMNS)
 
