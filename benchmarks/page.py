@@ -95,7 +95,10 @@ def significant(value: float, *, digits: int = 2) -> str:
 
 def share(hits: int, of: int) -> str:
     """Return a share in percent with the two counts that it is made of."""
-    return f"{100 * hits / of:.0f} % ({hits} of {of})" if of else "–"
+    if not of:
+        return "–"
+    digits = 1 if 0 < hits < of and not 0.5 < 100 * hits / of < 99.5 else 0
+    return f"{100 * hits / of:.{digits}f} % ({hits} of {of})"
 
 
 def write_page(page: Path, made: dict[str, str], *, order: Sequence[str]) -> None:
