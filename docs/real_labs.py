@@ -182,8 +182,8 @@ def rows(analysis: Analysis, gap: Gap) -> Iterator[str]:
     for cart in sorted({d.cart for d in rubbed}):
         own = [d for d in rubbed if d.cart == cart]
         decays = f"{len(own)} decay{'s' * (len(own) > 1)}"
-        yield f"| ζ of cart {cart}, {decays}, viscous damping only | {span(own, _apparent)} |"
-        yield f"| ζ of cart {cart}, {decays}, with dry friction | {span(own, _viscous)} |"
+        yield f"| ζ of cart {cart} from {decays}, friction ignored | {span(own, _apparent)} |"
+        yield f"| ζ of cart {cart} from {decays}, friction included | {span(own, _viscous)} |"
     for found in gap.effects:
         place = next((f", {what} {number}" for what, number in found.where.items()), "")
         values = ", ".join(
@@ -193,7 +193,8 @@ def rows(analysis: Analysis, gap: Gap) -> Iterator[str]:
         yield f"| {found.effect.key.replace('_', ' ')}{place} | {values} |"
     repeats = f"; repeats differ by {gap.repeatability:.1%}" if gap.repeatability else ""
     left = f"{gap.baseline:.1%} → {gap.final:.1%} of the motion; noise {100 * gap.noise_floor:.2g}%"
-    yield f"| error on held-out runs | **{gap.verdict}**: {left}{repeats} |"
+    what = "error on held-out runs: linear model → with effects"
+    yield f"| {what} | **{gap.verdict}**: {left}{repeats} |"
 
 
 def with_unit(value: float, std: float | None, unit: str) -> str:
