@@ -109,8 +109,13 @@ def fill(folder: Folder, as_json: AsJson = False) -> None:
     say(f"{did} {toml}: check springs, units and everything marked unsure")
     for message in (*filled.doubts, *format_passed_over(found)):
         say(f"cartlab: {message}")
+    gone = [f.file for f in left if f.state == "missing"]
+    unused = [f.file for f in left if f.state != "missing"]
+    if gone:
+        say(f"cartlab: there is no such file: {', '.join(gone)}")
+    if unused:
+        say(f"cartlab: not used yet: {', '.join(unused)}")
     if left:
-        say(f"cartlab: not used yet: {', '.join(f.file for f in left)}")
         raise typer.Exit(1)
 
 

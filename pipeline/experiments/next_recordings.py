@@ -140,7 +140,8 @@ def plan_next(
     wrote = f"{path}: {count(n, 'recording')} added"
     if new and old.recordings:
         usual = count(len(old.recordings), "recording")
-        wrote = f"wrote {path}: the {usual} that every plan begins with, and {n} chosen ones"
+        chosen = count(n, "chosen recording")
+        wrote = f"wrote {path}: the {usual} that every plan begins with, and {chosen}"
     return replace(found, plan=plan, recordings=plan.recordings[-n:], wrote=wrote)
 
 

@@ -59,7 +59,7 @@ def read_data(submission: Submission) -> Ingested:
     if not submission.experiments:
         raise SubmissionError(
             f"{submission.folder.resolve().name}/submission.toml: it has no [[experiments]] "
-            f"table yet; add one for each data file"
+            f"table yet; add one for each data file, as `cartlab fill` does"
         )
     tables: dict[str, tuple[FileTable, str]] = {}
     opened: list[_Opened] = []

@@ -120,7 +120,7 @@ def append_experiment(
 def comment_text(remark: str) -> str:
     """Return a remark that is safe after a #, whatever characters a file's name contains."""
     plain = "".join(c if c.isprintable() else " " for c in remark)
-    return plain if len(plain) <= 90 else plain[:89] + "…"
+    return plain if len(plain) <= 300 else plain[:299] + "…"
 
 
 def toml_item(value: Value) -> Any:

@@ -240,11 +240,14 @@ def _agreement(analysis: Analysis) -> tuple[bool, Spans] | None:
     off, same = [row for row in judged if not row.consistent], _same_recordings(judged)
     if not off:
         return True, _WORDS.spans("agree", parameters=parameters, same=same)
+    rest = len(judged) - len(off)
     changes = [f"{row.name} ({percent(row.change_percent, signed=True)})" for row in off]
     return False, _WORDS.spans(
         "disagree",
         changes=rich(listing(changes)),
-        rest=_WORDS.text("rest" if len(off) < len(judged) else "no_rest", parameters=parameters),
+        rest=_WORDS.text("rest", parameters=count(rest, "parameter"))
+        if rest
+        else _WORDS.text("no_rest", parameters=parameters),
         same=same,
     )
 
