@@ -252,7 +252,7 @@ class Assistant(Person):
             **{f"seen.{team}": seen for team, seen in chosen}})  # fmt: skip
 
     def answer(self) -> None:
-        """Answer one of the open requests; if there is none, let a team ask again."""
+        """Answer one of the open requests; without any, let a team ask again."""
         text = self.get("requests", "/grades/0/again")
         names = ("team", "criterion", "seen")
         hidden = "".join(rf'<input type="hidden" name="{name}" value="(.*?)">' for name in names)

@@ -407,7 +407,8 @@ def test_what_is_written_is_counted(work):
     """The message counts the recordings that were added, those of a new plan included."""
     done = cartlab_here("plan", work, "--next", 2, "--for", "zeta")
     usual = len(propose_plan(load_submission(work)).recordings)
-    assert f"the {usual} recordings that every plan begins with, and 2 chosen recordings" in done.stderr
+    usual_words = f"the {usual} recordings that every plan begins with"
+    assert f"{usual_words}, and 2 chosen recordings" in done.stderr
     done = cartlab_here("plan", work, "--next", 1, "--for", "zeta")
     assert "plan.toml: 1 recording added" in done.stderr
     assert ", 1 new (+); " in done.stdout
