@@ -3,13 +3,16 @@
 import json
 import re
 from dataclasses import replace
+from itertools import permutations
 from types import SimpleNamespace
 
 import numpy as np
 import pypdf
 import pytest
 from numpy.testing import assert_allclose
+from typer.main import get_command
 
+from pipeline.cli.commands import app
 from pipeline.errors import ConfigError
 from pipeline.gap.types import (
     ForceAgainst,
@@ -37,13 +40,14 @@ from pipeline.plant.nonlinear.effects import (
     EffectTerm,
     find_effect,
 )
-from pipeline.plant.nonlinear.effects.base import chain_scales
+from pipeline.plant.nonlinear.effects.base import chain_scales, input_steps
+from pipeline.plant.nonlinear.simulator.laws import arriving
 from pipeline.report.document import Formula
 from pipeline.report.draft.content import build_document
-from pipeline.report.equations.effects import augmented_equations, law
+from pipeline.report.equations.effects import augmented_equations, in_order, law
 from pipeline.report.gap.beside import with_gap
 from pipeline.report.gap.story import build_gap_document, render_gap
-from pipeline.report.gap.verdict import terminal_verdict
+from pipeline.report.gap.verdict import WORDS, terminal_verdict
 from pipeline.report.render.html import render_html
 from pipeline.results import Provenance
 from pipeline.set_up import Bench
@@ -404,6 +408,84 @@ def test_two_effects_share_the_equations():
     assert "= u_a;" in motion
     assert to_text(law(terms, 0).math).startswith("u_a = ")
     assert to_text(law(terms, 1).math).startswith("f_b = −F")
+
+
+@pytest.mark.parametrize(
+    "keys", list(permutations(("saturation", "actuator_lag", "dead_zone", "input_delay")))[::5]
+)
+def test_changes_of_the_input_follow_each_other_as_in_the_simulator(keys):
+    """In any order of the effects, each change of the input starts from the one before it.
+
+    The last one, and no other, pushes cart 1, and the friction that grows with the drive uses it.
+    """
+    terms = make_gap("named", (*keys, "load_friction")).model.terms
+    laws = [to_text(law(terms, index).math) for index in in_order(terms)]
+
+    assert [text.replace(" ", "") for text in laws] == [
+        "u_a=\u2009sign\u2009u·\u2009max(|u|−w,0)",
+        "u_b=\u2009clip(u_a,−L,L)",
+        "u_c(t)=u_b(t−T)",
+        "τu′_d+u_d=u_c",
+        laws[-1].replace(" ", ""),
+    ]
+    assert laws[-1].startswith("f_e = −μ|u_d|")
+    first, second = to_text(augmented_equations((True, True, True), terms).math).split("; ")
+    assert first.endswith("= u_d")
+    assert second.endswith("= f_e")
+
+
+def test_the_dead_zone_comes_before_the_saturation_in_the_simulator():
+    """The simulator's input is clip(sign u · max(|u| − w, 0), −L, L), as the page says."""
+    limit, width = 0.2, 0.3
+    terms = (
+        make_term(find_effect("saturation"), place=0, values={"limit": limit}, chain=CHAIN),
+        make_term(find_effect("dead_zone"), place=0, values={"width": width}, chain=CHAIN),
+    )
+    drive = AugmentedChain(chain=CHAIN, terms=terms).tables().drive
+    u = np.linspace(-0.8, 0.8, 33)
+
+    # In the other order nothing would arrive, because the limit is below the width.
+    expected = np.clip(np.sign(u) * np.maximum(np.abs(u) - width, 0.0), -limit, limit)
+    assert_allclose([arriving(drive, one) for one in u], expected, atol=1e-15)
+    assert [term.effect.key for term in input_steps(terms)] == ["dead_zone", "saturation"]
+
+
+def test_with_a_play_the_input_pushes_the_motor():
+    """With backlash, cart 1 feels the contact, and the motor feels input, contact and cogging.
+
+    The motor's mass is part of m_1, so it is subtracted on the right-hand side.
+    """
+    terms = make_gap("named", ("backlash", "cogging", "input_delay", "drive_damping")).model.terms
+    laws = [to_text(law(terms, index).math) for index in in_order(terms)]
+
+    motion = to_text(augmented_equations((True, True, True), terms).math)
+    assert motion.split("; ")[0].endswith("= f_a + m_mx″_1 + f_d")
+    assert laws[0].endswith("m_mx″_m = u_c−f_a + f_b")
+    assert "x_m/λ" in laws[1]
+
+
+def test_a_model_of_many_effects_has_its_equations():
+    """Each of a dozen effects has its own letter in the equations."""
+    keys = ("saturation", "dead_zone", "input_delay", "actuator_lag", "cogging", "drive_damping",
+            "coulomb_friction", "quadratic_drag", "cubic_spring", "slack_spring", "end_stop",
+            "coupling_damper")  # fmt: skip
+    terms = make_gap("named", keys).model.terms
+    laws = [to_text(law(terms, index).math) for index in in_order(terms)]
+
+    named = [re.search("[uf]′?_(.)", text) for text in laws]
+    assert [found and found[1] for found in named] == list("abcdefghijkl")
+
+
+def test_every_command_on_the_page_can_be_copied(tmp_path):
+    """A command on the page has all arguments that it needs; else parsing it raises an error."""
+    commands = re.findall("`cartlab ([^`]+)`", WORDS.path.read_text(encoding="utf-8"))
+    assert len(commands) == 3
+    (tmp_path / "gap").mkdir()
+    (tmp_path / "gap" / "gap.json").write_text("{}", encoding="utf-8")
+    for command in commands:
+        name, *args = command.replace("DIR", str(tmp_path)).split()
+        group = get_command(app)
+        group.commands[name].make_context(name, args)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_a_spring_pulls_both_its_carts():

@@ -14,7 +14,7 @@ from pipeline.errors import DataError
 from pipeline.exchange.model.syntax import substitute
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.augmented import SteppedBench, rest_positions
-from pipeline.plant.nonlinear.effects.base import AugmentedChain, EffectTerm
+from pipeline.plant.nonlinear.effects.base import AugmentedChain, EffectTerm, input_steps
 from pipeline.plant.nonlinear.effects.law import (
     BuiltLaw,
     ContactLaw,
@@ -232,7 +232,6 @@ def describe(
     free = sorted(range(1, chain.n + 1) if free is None else free)
     gains = {term.place: f"{_names(term)[0]} * " for term in built["reading"]}
     step = Parameter("max_step", _longest_step(model, free), "s", "longest step inside")
-    inputs = sorted(by_law.get(InputLaw, []), key=lambda term: term.effect.key)
     return Description(
         units=units,
         n=chain.n,
@@ -260,7 +259,7 @@ def describe(
         ),
         inputs=tuple(
             (_title(term), _law(term, term.effect.law.arrives))
-            for term in inputs
+            for term in input_steps(terms)
             if isinstance(term.effect.law, InputLaw)
         ),
         delay=_names(built["delay"][0])[0] if built["delay"] else "",

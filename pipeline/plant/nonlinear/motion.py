@@ -21,7 +21,7 @@ from scipy.special import factorial
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.plant.nonlinear.effects.base import AugmentedChain, EffectTerm
+from pipeline.plant.nonlinear.effects.base import AugmentedChain, EffectTerm, input_steps
 from pipeline.plant.nonlinear.effects.law import (
     BuiltLaw,
     ContactLaw,
@@ -110,12 +110,9 @@ class EquationsOfMotion:
             for term in terms
             if isinstance(term.effect.law, FrictionLaw)
         ]
-        # The dead zone comes first in the input of the drive.
-        inputs = [term for term in terms if isinstance(term.effect.law, InputLaw)]
-        inputs.sort(key=lambda term: term.effect.key)
         self._inputs = [
             _expression(term.effect.law.arrives, term)
-            for term in inputs
+            for term in input_steps(terms)
             if isinstance(term.effect.law, InputLaw)
         ]
         self._built: dict[str, list[tuple[EffectTerm, int]]] = {}

@@ -1,28 +1,50 @@
 """The equations of motion with effects included."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from string import ascii_lowercase
 
-from pipeline.plant.nonlinear.effects.base import EffectTerm
+from pipeline.plant.nonlinear.effects.base import EffectTerm, input_steps
+from pipeline.plant.nonlinear.effects.law import ForceLaw
 from pipeline.report.document import Formula
 from pipeline.report.equations.model import equations_of_motion, formula
-from pipeline.words.math import Term, row, sub
+from pipeline.words.math import WIDE_SPACE, Math, Term, dot, row, sub, upright
 
 _LINEAR_PART = ("k", "d", "+")  # part of a spring's law that the linear chain already has
 _ACTS = ("f", "=")
+_COMMAND = sub("u", "command")
+_MOTOR_MASS = sub("m", "m")
+
+
+def in_order(terms: Sequence[EffectTerm]) -> list[int]:
+    """Return the indices of the effects in the order of their letters.
+
+    That is their own order, except that changes of the input follow each other as in the simulator.
+    """
+    steps = input_steps(terms)
+    after = iter(steps)
+    return [terms.index(next(after) if term in steps else term) for term in terms]
 
 
 def augmented_equations(springs: Sequence[bool], terms: Sequence[EffectTerm]) -> Formula:
     """Return Newton's law of every cart, in which each effect adds a force.
 
-    The forces have the letters a, b, … in the order of the effects.
+    The forces have the letters a, b, … in the order of the effects. The first cart feels the input
+    after its last change. With a play it feels the contact's force; the mass of the motor is part
+    of its mass and is subtracted.
     """
     n = len(springs) - 1
+    letters = _letters(terms)
     forces: list[list[Term]] = [[] for _ in range(n)]
-    forces[0] = [_input(terms)]
-    for letter, term in zip(_letters(terms), terms, strict=True):
-        if term.effect.formula.parts[:2] != _ACTS:
+    play = _play(terms)
+    if play is None:
+        forces[0] = [_arriving(terms)]
+    else:
+        forces[0] = [sub("f", letters[play]), "+", _MOTOR_MASS, sub(dot("x", order=2), "1")]
+    for index in in_order(terms):
+        term, f = terms[index], sub("f", letters[index])
+        if term.effect.formula.parts[:2] != _ACTS or (play is not None and _on_motor(term)):
             continue
-        f = sub("f", letter)
         if "spring" in term.where:
             spring = term.place
             if spring <= n:
@@ -35,30 +57,82 @@ def augmented_equations(springs: Sequence[bool], terms: Sequence[EffectTerm]) ->
 
 
 def law(terms: Sequence[EffectTerm], index: int) -> Formula:
-    """Return the law of one effect, with its letter in the equations of motion."""
-    effect, letter = terms[index].effect, _letters(terms)[index]
-    parts = effect.formula.parts
-    if parts[:2] == _ACTS:
-        force = parts[2:]
-        if effect.place == "spring" and force[:3] == _LINEAR_PART:
-            force = force[3:]
-        return formula(row(sub("f", letter), "=", *force))
-    if "→" in parts:
-        at = parts.index("→")
-        return formula(row(sub(parts[0], letter), *parts[1:at], "=", *parts[at + 1 :]))
-    return formula(effect.formula)
+    """Return the law of one effect, with its letter in the equations of motion.
+
+    A change of the input starts from the change before it. A force that depends on the input
+    depends on the input after its last change.
+    """
+    term, letter = terms[index], _letters(terms)[index]
+    effect, parts = term.effect, term.effect.formula.parts
+    steps = input_steps(terms)
+    if term in steps:
+        before, after = _arriving(terms, before=term), sub("u", letter)
+        if "→" in parts:
+            at = parts.index("→")
+            changed = _replaced(parts[at + 1 :], {"u": before})
+            return formula(row(after, *parts[1:at], "=", *changed))
+        own = {_COMMAND: before, "u": after, dot("u"): sub(dot("u"), letter)}
+        return formula(row(*_replaced(parts, own)))
+    if effect.has_play:
+        return formula(row(*_across(terms, index)))
+    if parts[:2] != _ACTS:
+        return formula(effect.formula)  # a sensor
+    force = parts[2:]
+    if effect.place == "spring" and force[:3] == _LINEAR_PART:
+        force = force[3:]
+    # A drive is powered while its logged input is not zero.
+    powered = upright(" while ")
+    end = force.index(powered) if powered in force else len(force)
+    symbols: dict[Term, Term] = {"u": _arriving(terms), "f": sub("f", letter)}
+    if _on_motor(term) and _play(terms) is not None:
+        symbols |= {sub(letter, "1"): sub(letter, "m") for letter in "xv"}
+    return formula(row(sub("f", letter), "=", *_replaced(force[:end], symbols), *force[end:]))
 
 
-def _letters(terms: Sequence[EffectTerm]) -> str:
-    return "abcdefgh"[: len(terms)]
+def _across(terms: Sequence[EffectTerm], index: int) -> list[Term]:
+    """Return the force across the play, and Newton's law of the motor."""
+    letters = _letters(terms)
+    force = sub("f", letters[index])
+    motor: list[Term] = [_arriving(terms), "−", force]
+    for i in in_order(terms):
+        if _on_motor(terms[i]):
+            motor += ["+", sub("f", letters[i])]
+    contact = _replaced(terms[index].effect.formula.parts, {sub("f", "1"): force})
+    return [*contact, ",", WIDE_SPACE, _MOTOR_MASS, sub(dot("x", order=2), "m"), "=", *motor]
 
 
-def _input(terms: Sequence[EffectTerm]) -> Term:
-    """Return the symbol of cart 1's input: u, or u with the letter of an effect in the drive."""
-    for letter, term in reversed(list(zip(_letters(terms), terms, strict=True))):
-        if "→" in term.effect.formula.parts:
-            return sub("u", letter)
-    return "u"
+def _letters(terms: Sequence[EffectTerm]) -> dict[int, str]:
+    """Return the letter of each effect, by its index."""
+    return dict(zip(in_order(terms), ascii_lowercase, strict=False))
+
+
+def _arriving(terms: Sequence[EffectTerm], *, before: EffectTerm | None = None) -> Term:
+    """Return the symbol of the input after its last change, or before one of its changes."""
+    steps = input_steps(terms)
+    done = steps if before is None else steps[: steps.index(before)]
+    return sub("u", _letters(terms)[terms.index(done[-1])]) if done else "u"
+
+
+def _play(terms: Sequence[EffectTerm]) -> int | None:
+    """Return the index of the play between motor and cart 1, or None."""
+    return next((i for i, term in enumerate(terms) if term.effect.has_play), None)
+
+
+def _on_motor(term: EffectTerm) -> bool:
+    """Return whether the force acts on the motor if there is a play."""
+    return isinstance(term.effect.law, ForceLaw) and term.effect.law.on_motor
+
+
+def _replaced(terms: Sequence[Term], by: Mapping[Term, Term]) -> list[Term]:
+    """Return terms with other symbols, at any depth."""
+    return [
+        by[term]
+        if term in by
+        else replace(term, parts=tuple(_replaced(term.parts, by)))
+        if isinstance(term, Math)
+        else term
+        for term in terms
+    ]
 
 
 def _sum(parts: list[Term]) -> Term:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from pipeline.gap.replay import Replay, replay_driven
 from pipeline.gap.types import Gap
 from pipeline.report.document import Block, paragraph
-from pipeline.report.equations.effects import augmented_equations, law
+from pipeline.report.equations.effects import augmented_equations, in_order, law
 from pipeline.report.figures.style import (
     keep_in_sight,
     legend_above,
@@ -58,7 +58,7 @@ def gap_blocks(page: Page, gap: Gap) -> list[Block]:
     terms = gap.model.terms
     if terms:
         blocks.append(augmented_equations(page.analysis.bench.springs, terms))
-        blocks += [law(terms, index) for index in range(len(terms))]
+        blocks += [law(terms, index) for index in in_order(terms)]
     if gap.verdict == "none":
         blocks += scope_blocks(gap, position=page.position, drive=page.drive)
     return [*blocks, *next_block(gap), paragraph(WORDS.spans("story"))]

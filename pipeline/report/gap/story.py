@@ -10,7 +10,7 @@ from pipeline.gap.types import FoundEffect, Gap, RecordGap, Trace
 from pipeline.gap.verdict.residual_force import ResidualForce, residual_forces
 from pipeline.plant.nonlinear.effects.base import AugmentedChain
 from pipeline.report.document import Block, Document, bullet_list, paragraph
-from pipeline.report.equations.effects import augmented_equations, law
+from pipeline.report.equations.effects import augmented_equations, in_order, law
 from pipeline.report.figures.gap import (
     before_after_figure,
     by_record_figure,
@@ -345,7 +345,8 @@ def _model(page: Page, gap: Gap) -> list[Block]:
         paragraph(WORDS.spans("model", drive=page.drive)),
         augmented_equations(page.analysis.bench.springs, terms),
     ]
-    for index, term in enumerate(terms):
+    for index in in_order(terms):
+        term = terms[index]
         name, place = effect_name(term.effect, term.where), place_name(term.where)
         where = WORDS.spans(f"where_{term.effect.place}", name=capital(name), place=place)
         blocks += [paragraph(where), law(terms, index)]

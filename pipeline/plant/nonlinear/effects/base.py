@@ -322,6 +322,17 @@ class AugmentedChain:
         return tables
 
 
+def input_steps(terms: Sequence[EffectTerm]) -> list[EffectTerm]:
+    """Return the effects that change the input, in the order of the simulator.
+
+    The dead zone comes first, then the saturation, the delay and the lag.
+    """
+    laws = [term for term in terms if isinstance(term.effect.law, InputLaw)]
+    laws.sort(key=lambda term: term.effect.key)
+    built = [[term for term in terms if term.effect.is_built(kind)] for kind in ("delay", "lag")]
+    return [*laws, *built[0], *built[1]]
+
+
 def chain_scales(
     chain: Chain,
     *,
