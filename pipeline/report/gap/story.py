@@ -157,7 +157,9 @@ def before_after_picture(page: Page, gap: Gap, trace: Trace, *, number: int) -> 
         "cart": trace.cart,
         "run": trace.experiment,
         "held": WORDS.text("held_out" if trace.held_out else "used"),
-        "errors": WORDS.text(f"run_errors{alone}", **shares(row)) if row else "",
+        "errors": WORDS.text(f"run_errors{alone}", added=added_name(gap), **shares(row))
+        if row
+        else "",
         "model": whole_model(gap),
     }
     return page.picture(f"before-after-{number}", figure, WORDS, f"before_after{alone}", **said)
