@@ -9,12 +9,14 @@ from types import SimpleNamespace
 import numpy as np
 import pypdf
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.testing import assert_allclose
 from typer.main import get_command
 
 from pipeline.cli.commands import app
 from pipeline.errors import ConfigError
 from pipeline.gap.types import (
+    Contender,
     ForceAgainst,
     ForceFormula,
     FormulaTerm,
@@ -23,6 +25,8 @@ from pipeline.gap.types import (
     Gap,
     GapWindow,
     NamedValue,
+    Prediction,
+    Proposal,
     RecordGap,
     Residual,
     Rival,
@@ -45,9 +49,10 @@ from pipeline.plant.nonlinear.simulator.laws import arriving
 from pipeline.report.document import Formula
 from pipeline.report.draft.content import build_document
 from pipeline.report.equations.effects import augmented_equations, in_order, law
+from pipeline.report.figures.gap import predicted_figure
 from pipeline.report.gap.beside import with_gap
-from pipeline.report.gap.story import build_gap_document, render_gap
-from pipeline.report.gap.verdict import WORDS, terminal_verdict
+from pipeline.report.gap.story import LEGEND, build_gap_document, render_gap
+from pipeline.report.gap.verdict import WORDS, kept_together, terminal_verdict
 from pipeline.report.render.html import render_html
 from pipeline.results import Provenance
 from pipeline.set_up import Bench
@@ -379,6 +384,120 @@ def test_an_answer_so_far_is_said_to_be_one():
     assert "best answer so far" in text
     assert "The same input gives the same report." not in text
     assert "best answer so far" not in page_of(make_gap()).text
+
+
+def test_effects_that_help_only_together_are_one_step():
+    """If an effect raises the error until the next one acts, the page takes both as one step.
+
+    The table has one row for both, and each effect's section gives the error before and after both.
+    """
+    gap = make_gap("partial", ("coulomb_friction", "saturation", "dead_zone"))
+    errors = (0.135, 0.0925, 0.0968, 0.0723)
+    gap = replace(
+        gap,
+        effects=tuple(
+            replace(found, nrmse_before=before, nrmse_after=after)
+            for found, before, after in zip(gap.effects, errors, errors[1:], strict=False)
+        ),
+    )
+    text = page_of(gap).text
+
+    said = (
+        "from 9.2 % of the motion to 7.2 %. With saturation of the input alone it would be 9.7 %."
+    )
+    assert text.count(said) == 2
+    assert "with saturation of the input and dead zone of the input7.2 %" in text
+    assert "with dry (Coulomb) friction on cart 29.2 %" in text
+    assert "from 13.5 % of the motion to 9.2 %." in text
+    assert "9.7 % of the motion" not in text
+    friction, saturation, dead_zone = gap.effects
+    assert kept_together(gap.effects) == [(friction,), (saturation, dead_zone)]
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_the_band_of_the_noise_is_mentioned_if_it_can_be_seen(seen):
+    """A caption mentions the band only if the residuals are not much larger than the noise.
+
+    With both models right, the residuals are the noise. The linear model here is far off.
+    """
+    gap = make_gap()
+    if seen:
+        gap = replace(gap, traces=tuple(replace(one, baseline=one.final) for one in gap.traces))
+
+    assert ("the band is twice the noise" in page_of(gap).text) == seen
+
+
+LINE = np.linspace(0.0, 1.0, 50)
+PREDICTION = Prediction(
+    pair=(0, 1), cart=2, t=LINE, u=LINE, positions=np.array([np.sin(LINE), np.cos(LINE)])
+)
+
+
+def predicted(first, second) -> Gap:
+    """Return a gap whose proposed recording tells two models with these effects apart."""
+    contenders = tuple(
+        Contender(chain=CHAIN, terms=make_gap("named", keys).model.terms, weight=0.5)
+        for keys in (first, second)
+    )
+    proposal = Proposal(
+        recording={"wave": "triangle", "amplitude": 0.6, "frequency": 0.12},
+        limits={},
+        separation=42.0,
+        prediction=PREDICTION,
+    )
+    return replace(make_gap("partial"), contenders=contenders, proposal=proposal)
+
+
+MANY = ("cogging", "drive_damping", "input_delay", "slack_spring", "coulomb_friction")
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "names", "legend"),
+    [
+        (
+            ("coulomb_friction",),
+            ("cogging", "coulomb_friction"),
+            "with cogging of the motor and without it",
+            ["with cogging of the motor", "without it"],
+        ),
+        (
+            ("end_stop", "coulomb_friction"),
+            ("end_stop", "cubic_spring"),
+            "with dry (Coulomb) friction on cart 2 and with ",
+            ["the first model", "the second model"],
+        ),
+        (
+            ("saturation",),
+            ("saturation", *MANY),
+            "and dry (Coulomb) friction on cart 2 and without them",
+            ["with these effects", "without them"],
+        ),
+    ],
+)
+def test_two_models_are_named_by_what_differs(first, second, names, legend):
+    """The text names the effects that only one model has; the legend is inside the figure."""
+    gap = predicted(first, second)
+    page = page_of(gap)
+
+    assert names in page.text
+    shared = set(first) & set(second)
+    deciding = page.text[page.text.index("Of all recordings") :].split("times the noise")[0]
+    for key in shared:
+        assert find_effect(key).title[1:] not in deciding
+    for label in legend:
+        assert f">{label}</text>" in html_of(gap)
+
+
+def test_the_longest_names_in_a_legend_fit_in_the_figure():
+    """Two names of as many characters as a legend may have end inside the figure."""
+    names = ("with a sensor with a scale", "without a dead zone.")
+    assert len("".join(names)) == LEGEND
+    figure = predicted_figure(PREDICTION, names=names, position_unit="cm")
+    legend = figure.axes[0].get_legend()
+    assert legend is not None
+    box = legend.get_window_extent(FigureCanvasAgg(figure).get_renderer())
+
+    assert box.x1 < figure.bbox.x1
 
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)

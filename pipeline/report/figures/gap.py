@@ -32,6 +32,8 @@ from pipeline.words.text import clean
 
 # Name of the model that has effects besides masses, dampings and springs.
 ADDED = "with the effects"
+_RESIDUALS = 1.0  # inches: height of the residuals' panel
+_SEEN = 3.0  # points: a narrower band is hidden by the lines of the residuals
 
 
 # ---------------------------------------------------------------------- in time
@@ -52,10 +54,8 @@ def before_after_figure(
     added : name of the model with effects; "" if it has no effects.
     touched : times and readings of stretches next to the run in which a hand moved a cart.
     """
-    models = {"linear model": trace.baseline}
-    if added:
-        models = {added: trace.final} | models
-    figure, (above, below) = panels(1.5, 1.0)
+    models = _models(trace, added)
+    figure, (above, below) = panels(1.5, _RESIDUALS)
     plot_measured(above, trace.t, trace.measured)
     for t, y in touched:
         above.axvspan(float(t[0]), float(t[-1]), color=SHADE, lw=0)
@@ -66,11 +66,24 @@ def before_after_figure(
     plot_model(above, trace.t, model, label=name)
     above.set_ylabel(position_label(trace.cart, position_unit))
     legend_above(above)
-    below.axhspan(-2 * noise, 2 * noise, color=SHADE, lw=0)
+    if band_shows(trace, noise=noise, added=added):
+        below.axhspan(-2 * noise, 2 * noise, color=SHADE, lw=0)
     plot_residuals(below, trace.t, {name: trace.measured - y for name, y in models.items()})
     below.set_ylabel(f"residual [{position_unit}]")
     below.set_xlabel("time [s]")
     return figure
+
+
+def band_shows(trace: Trace, *, noise: float, added: str = ADDED) -> bool:
+    """Return whether the band of the noise is wide enough to be seen behind the residuals."""
+    largest = max(float(np.ptp(trace.measured - y)) for y in _models(trace, added).values())
+    return 4 * noise * 72.0 * _RESIDUALS > _SEEN * max(largest, 4 * noise)
+
+
+def _models(trace: Trace, added: str) -> dict[str, Array]:
+    """Return the models' motions by name; the one with effects, if there is one, comes first."""
+    linear = {"linear model": trace.baseline}
+    return {added: trace.final} | linear if added else linear
 
 
 def predicted_figure(

@@ -1,6 +1,7 @@
 """The gap report: the verdict on one page, then the evidence step by step."""
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from pipeline import __version__
@@ -12,6 +13,7 @@ from pipeline.plant.nonlinear.effects.base import AugmentedChain
 from pipeline.report.document import Block, Document, bullet_list, paragraph
 from pipeline.report.equations.effects import augmented_equations, in_order, law
 from pipeline.report.figures.gap import (
+    band_shows,
     before_after_figure,
     by_record_figure,
     force_figure,
@@ -33,6 +35,7 @@ from pipeline.report.gap.verdict import (
     contenders,
     effect_name,
     error_board,
+    kept_together,
     next_block,
     place_name,
     scope_blocks,
@@ -50,10 +53,12 @@ from pipeline.report.sections.parameters import chain_table
 from pipeline.results import Analysis
 from pipeline.words.numbers import count, listing, percent
 from pipeline.words.progress import Progress, silent
-from pipeline.words.spans import plain
+from pipeline.words.spans import Spans, plain
 from pipeline.words.text import capital, clean
 
 _MOST_ROWS = 28  # runs in the overview; gap.json has all
+LEGEND = 46  # characters of two names that fit above a figure
+_MOST_NAMES = 3  # effects named in a caption; the text above names all
 _MORE_TRACES = 3  # traces drawn after the one in the summary
 
 
@@ -146,11 +151,12 @@ def before_after_picture(page: Page, gap: Gap, trace: Trace, *, number: int) -> 
         left = trace.measured - trace.final
         noise = row.noise_floor * (float((left**2).mean() ** 0.5) / row.final)
     alone = "" if gap.effects else "_linear"
+    added = added_name(gap)
     figure = before_after_figure(
         trace,
         noise=noise,
         position_unit=page.position,
-        added=added_name(gap),
+        added=added,
         touched=_touched(page, gap, trace),
     )
     said = {
@@ -161,6 +167,7 @@ def before_after_picture(page: Page, gap: Gap, trace: Trace, *, number: int) -> 
         if row
         else "",
         "model": whole_model(gap),
+        "band": WORDS.text("band") if band_shows(trace, noise=noise, added=added) else "",
     }
     return page.picture(f"before-after-{number}", figure, WORDS, f"before_after{alone}", **said)
 
@@ -171,9 +178,8 @@ def before_after_picture(page: Page, gap: Gap, trace: Trace, *, number: int) -> 
 def _effect(page: Page, gap: Gap, index: int, *, forces: Sequence[ResidualForce]) -> list[Block]:
     found = gap.effects[index]
     effect = found.effect
-    before, after = share(found.nrmse_before), share(found.nrmse_after)
     blocks: list[Block] = [
-        paragraph(WORDS.spans("step", sentence=effect.sentence, before=before, after=after)),
+        paragraph(_step(gap, found)),
         law(gap.model.terms, index),
         *_evidence(page, gap, found, forces=forces, number=index + 1),
         effect_parameter_table(page, found),
@@ -188,6 +194,27 @@ def _effect(page: Page, gap: Gap, index: int, *, forces: Sequence[ResidualForce]
     }
     blocks.append(bullet_list(WORDS.spans(key, text=text) for key, text in facts.items() if text))
     return blocks
+
+
+def _step(gap: Gap, found: FoundEffect) -> Spans:
+    """Return what an effect is, and the error before and after it and those kept with it."""
+    group = next(group for group in kept_together(gap.effects) if found in group)
+    said = {
+        "sentence": found.effect.sentence,
+        "before": share(group[0].nrmse_before),
+        "after": share(group[-1].nrmse_after),
+    }
+    if len(group) == 1:
+        return WORDS.spans("step", **said)
+    names = [effect_name(one.effect, one.where) for one in group]
+    return WORDS.spans(
+        "step_together",
+        names=capital(listing(names)),
+        count="both" if len(group) == 2 else "all",
+        first=names[0],
+        alone=share(group[0].nrmse_after),
+        **said,
+    )
 
 
 def _evidence(
@@ -308,8 +335,18 @@ def _predicted(page: Page, gap: Gap) -> list[Block]:
             drive=page.drive,
             **{key: str(table[key]) for key in ("wave", "amplitude", "frequency")},
         )
-    one, other = _distinct_effects(*(gap.contenders[i] for i in proposal.prediction.pair))
-    figure = predicted_figure(proposal.prediction, names=(one, other), position_unit=page.position)
+    prediction = proposal.prediction
+    first, second = _distinct_effects(*(gap.contenders[i] for i in prediction.pair))
+    if not first:
+        first, second = second, first
+        prediction = replace(prediction, pair=prediction.pair[::-1])
+    one, other = _apart_names(first, second)
+    names = one, other
+    if len(one) + len(other) > LEGEND:
+        names = WORDS.text("with_first"), WORDS.text("with_second")
+        if not second:
+            names = WORDS.text("with_these"), other
+    figure = predicted_figure(prediction, names=names, position_unit=page.position)
     paragraph_ = WORDS.spans(
         "predicted",
         recording=said,
@@ -318,22 +355,36 @@ def _predicted(page: Page, gap: Gap) -> list[Block]:
         other=other,
         hand=WORDS.text("predicted_hand", note=table["note"]) if "note" in table else "",
     )
-    names = {"cart": proposal.prediction.cart, "names": f"{one}; {other}"}
-    picture = page.picture("predicted", figure, WORDS, "predicted_figure", **names)
+    short = "; ".join(_apart_names(first, second, most=_MOST_NAMES))
+    said = {"cart": prediction.cart, "names": short}
+    picture = page.picture("predicted", figure, WORDS, "predicted_figure", **said)
     return [paragraph(paragraph_), picture]
 
 
-def _distinct_effects(one: AugmentedChain, other: AugmentedChain) -> tuple[str, str]:
-    """Return, for each of two models, the effects that the other model lacks, in words."""
+def _distinct_effects(
+    one: AugmentedChain, other: AugmentedChain
+) -> tuple[Sequence[str], Sequence[str]]:
+    """Return the names of the effects that only one of two models has."""
     mine, yours = (
         [effect_name(term.effect, term.where) for term in model.terms] for model in (one, other)
     )
-    apart = (
+    return (
         [name for name in mine if name not in yours],
         [name for name in yours if name not in mine],
     )
-    first, second = map(listing, apart)
-    return first or f"without {second}", second or f"without {first}"
+
+
+def _apart_names(
+    first: Sequence[str], second: Sequence[str], *, most: int | None = None
+) -> tuple[str, str]:
+    """Return names of two models from the effects that only one of them has.
+
+    A second model without effects of its own is "without it" or "without them".
+    """
+    one = f"with {listing(first, most=most)}"
+    if second:
+        return one, f"with {listing(second, most=most)}"
+    return one, WORDS.text("without_it" if len(first) == 1 else "without_them")
 
 
 # --------------------------------------------------------------------- the model

@@ -4,17 +4,22 @@ from collections.abc import Sequence
 
 from pipeline.gap.types import FoundEffect, Gap, GapWindow
 from pipeline.report.document import Cell, Table, Tone, cell
-from pipeline.report.gap.verdict import WORDS, effect_name, phase, share
+from pipeline.report.gap.verdict import WORDS, effect_name, kept_together, phase, share
 from pipeline.report.sections.page import Page
 from pipeline.results import Intervention
-from pipeline.words.numbers import percent, unit_text, with_error
+from pipeline.words.numbers import listing, percent, unit_text, with_error
 from pipeline.words.text import clean
 
 
 def error_table(page: Page, gap: Gap) -> Table:
-    """Return the error on held-out runs after each step, next to noise and repeatability."""
+    """Return the error on held-out runs after each step, next to noise and repeatability.
+
+    Effects that lower the error only together are one step.
+    """
     models = [("linear model", gap.baseline)]
-    models += [(f"with {effect_name(f.effect, f.where)}", f.nrmse_after) for f in gap.effects]
+    for group in kept_together(gap.effects):
+        names = listing([effect_name(found.effect, found.where) for found in group])
+        models.append((f"with {names}", group[-1].nrmse_after))
     limits = [("noise alone", gap.noise_floor)]
     if gap.repeatability is not None:
         limits.append(("repeats of one run differ by", gap.repeatability))

@@ -1,6 +1,6 @@
 """The gap in words: what explains it, how well, and what to do next."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -234,6 +234,21 @@ def contenders(gap: Gap) -> tuple[FoundEffect, Rival | None]:
         return gap.effects[-1], None
     _, _, found, rival = max(close, key=lambda entry: entry[:2])
     return found, rival
+
+
+def kept_together(effects: Sequence[FoundEffect]) -> list[tuple[FoundEffect, ...]]:
+    """Return the effects in their order, in groups of which each lowers the held-out error.
+
+    A group has one effect, unless the error falls only with the next ones.
+    """
+    groups: list[tuple[FoundEffect, ...]] = []
+    group: tuple[FoundEffect, ...] = ()
+    for found in effects:
+        group = (*group, found)
+        if found.nrmse_after < group[0].nrmse_before:
+            groups.append(group)
+            group = ()
+    return [*groups, group] if group else groups
 
 
 # ----------------------------------------------------------------------- phrases
