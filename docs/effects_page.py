@@ -18,6 +18,7 @@ from pipeline.words.phrases import phrases
 
 DOCS = Path(__file__).parent
 IMAGES = Path("images", "effects")
+_ACTS_ON = {"cart": "one cart", "spring": "one spring", "input": "the drive"}
 
 
 def main() -> None:
@@ -38,8 +39,8 @@ def effects_page() -> str:
         "<!-- written by python -m docs.codegen -->",
         _wrapped(phrases("effects").text("effects")),
         _wrapped(
-            "[`cartlab gap`](gap.md) looks for these effects. To simulate a bench with one, add "
-            f"its option to `cartlab simulate --preset {BENCH} --out bench`."
+            "[`cartlab gap`](gap.md) looks for these effects. To simulate a bench with one of "
+            f"them, add its `--hide` option to `cartlab simulate --preset {BENCH} --out bench`."
         ),
     ]
     return "\n\n".join([*head, *(part for e in CATALOGUE for part in _entry(e))]) + "\n"
@@ -54,7 +55,9 @@ def _entry(effect: Effect) -> Iterator[str]:
     yield f"![Fingerprint and example]({picture})"
     parameters = ", ".join(parameter_text(p) for p in effect.parameters if p.reported)
     facts = {
-        f"Parameters ({effect.place})": f"{parameters}, as in `{hiding_option(term)}`",
+        "Acts on": _ACTS_ON[effect.place],
+        "Parameters": parameters,
+        "Option": f"`{hiding_option(term)}`",
         "Fingerprint": effect.fingerprint,
         "Deciding experiment": effect.deciding_run,
         "Easily mistaken for": effect.equivalent,

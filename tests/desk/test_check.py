@@ -138,15 +138,15 @@ def test_first_which_then_where_and_the_count_is_shown(lab, root):
     assert "not checked yet" in words_of(student.get(f"{HERE}check"))
     which = ask_check(student)
     assert "ω, first estimate" in words_of(which) or "ω_n, first estimate" in words_of(which)
-    assert "Asked 1 time." in words_of(which)
+    assert "run 1 time." in words_of(which)
     assert "Where should I look?" in which.text
     where = ask_check(student, number="initial.omega_n")
     assert "Hz where rad/s is asked" in words_of(where)
-    assert "Asked 2 times." in words_of(where)
+    assert "run 2 times." in words_of(where)
     for page in (which, where):
         said = words_of(page).replace("2.085", "").replace("2π", "")
         said = re.sub(
-            r"\d+ of \d+ numbers|\d+ agree|Asked \d+ times?|[a-z]+-\d+|[AB]\([\d, ]+\)", "", said
+            r"\d+ of \d+ numbers|\d+ agree|run \d+ times?|[a-z]+-\d+|[AB]\([\d, ]+\)", "", said
         )
         assert re.findall(r".{0,20}\d.{0,20}", re.sub(r"\b1 of \d+", "", said)) == []
     assert [one.stage for one in read_answers(root / "team")] == ["which", "where"]
@@ -224,7 +224,7 @@ def test_what_is_wrong_with_a_rubric_of_the_list_is_one_line(root, entry, said):
 
 
 def test_the_ta_reads_the_count_beside_the_grade(root):
-    """The team's page for the TA says how often the check was asked."""
+    """The team's page for the TA says how often the check was run."""
     for _ in range(2):
         cartlab_here("check", root / "other")
     cartlab_here("grade", root / "other", "--rubric", RUBRICS / "throne-1dof.toml",
@@ -232,4 +232,4 @@ def test_the_ta_reads_the_count_beside_the_grade(root):
     with DeskServer() as server:
         ta = Visitor.of(server.url)
         ta.post("/open", folder=str(root / "grades"))
-        assert "cartlab check was asked 2 times." in ta.get("/grades/0/team?of=other").text
+        assert "cartlab check was run 2 times." in ta.get("/grades/0/team?of=other").text

@@ -427,7 +427,7 @@ def test_a_wrong_sign_of_a_session_is_one_sentence(tmp_path):
     signs = read_data(load_submission(tmp_path)).signs
     (check,) = check_signs(signs, without=())
     assert check.value == 2.0
-    assert "one, two (2 of the 3 that show a sign). Set sign = -1 there" in check.message
+    assert "one, two (2 of the 3 that show a sign) show -1. Set sign = -1 there" in check.message
 
 
 def test_signs_may_differ_between_experiments(tmp_path):

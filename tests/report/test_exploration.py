@@ -74,7 +74,7 @@ def test_the_answer_comes_first_and_each_turn_has_the_run_that_decided(tmp_path)
     assert titles[2].startswith("1. After 20")
     answer, story = page.split('<section id="turns"')
     assert "Coulomb" in answer
-    assert "The carts as known now" in answer
+    assert "The parameters as known so far" in answer
     decided = deciding_trace(gap, turns[0].recorded)
     assert decided is not None
     assert f"Cart {decided.cart} in {turns[0].recorded[0]}" in story

@@ -192,7 +192,7 @@ def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
         traces=tuple(traces),
         chain_std={f"{letter}_{i}": 1e-7 for letter in "mck" for i in (1, 2)},
         spread={2: 0.05} if "coulomb_friction" in keys else {},
-        notes=("no run to spare: the last 40 % of the longest is held out",),
+        notes=("no run could be spared for testing, so the last 40 % of the longest is held out",),
     )  # fmt: skip
 
 

@@ -39,7 +39,7 @@ def test_a_student_finds_a_wrong_number_and_mends_it(show, tmp_path):
         row.get_by_role("button", name="Where should I look").focus()
         window.keyboard.press("Enter")
         expect(row).to_contain_text("Hz where rad/s is asked")
-        expect(window.get_by_text("Asked 2 times.")).to_be_visible()
+        expect(window.get_by_text("run 2 times.")).to_be_visible()
         assert fits(window)
         new = path.read_text(encoding="utf-8").replace("omega_n = 2.085", "omega_n = 13.1", 1)
         path.write_text(new, encoding="utf-8")

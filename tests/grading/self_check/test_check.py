@@ -42,7 +42,7 @@ def stripped(text: str, one: Team) -> str:
     for run in sorted((e.id for e in one.submission.experiments), key=len, reverse=True):
         text = text.replace(run, "")
     text = re.sub(r"(initial|final)\.\w+|state_space\.[AB]\([\d, ]+\)", "", text)
-    text = re.sub(r"^(\d+ of|All) \d+ numbers?|Asked \d+ times?", "", text, flags=re.MULTILINE)
+    text = re.sub(r"^(\d+ of|All) \d+ numbers?|run \d+ times?", "", text, flags=re.MULTILINE)
     said = ("2π", "cart 1", "n − 1", "log10", "cartlab-check/1")  # the names of recordings
     return re.sub("|".join(said), "", text)
 

@@ -64,7 +64,7 @@ def test_first_which_then_where(in_hertz):
     assert "Hz" not in first.stdout
     assert "initial.omega_n: Hz where rad/s is asked" in second.stdout
     assert re.search(r"Look at (decay-|every decay)", second.stdout)
-    assert "Asked 2 times." in second.stdout
+    assert "run 2 times." in second.stdout
     for said in (first.stdout, second.stdout, (in_hertz / FILE).read_text(encoding="utf-8")):
         assert not re.search(r"13[.\d]|6\.28", said)
 
@@ -155,7 +155,7 @@ def test_a_link_is_not_followed(honest, tmp_path):
 
 
 def test_the_grade_tells_how_often_it_was_asked(in_hertz, tmp_path):
-    """A note in the grade says how often the check was asked, or that its file was changed.
+    """A note in the grade says how often the check was run, or that its file was changed.
 
     It costs no points.
     """
@@ -168,7 +168,7 @@ def test_the_grade_tells_how_often_it_was_asked(in_hertz, tmp_path):
             grade_task(task, rubric=load_rubric(RUBRIC), scratch=tmp_path).grade
         ).notes
 
-    assert "cartlab check was asked 2 times." in notes()
+    assert "cartlab check was run 2 times." in notes()
     (in_hertz / FILE).write_text("{}\n", encoding="utf-8")
     assert "was changed and cannot be read" in notes()[-1]
 

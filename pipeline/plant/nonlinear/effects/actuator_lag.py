@@ -14,10 +14,10 @@ EFFECT = Effect(
     parameters=(
         EffectParameter("time_constant", "τ", "s", scale="sample_time", typical=1.5, neutral=0.0),
     ),
-    fingerprint="The cart answers an edge of the input gradually. At high frequencies it moves "
-    "less and later.",
-    deciding_run="A sweep beyond the resonances: a lag lowers the amplitude there, a delay does "
-    "not.",
+    fingerprint="The cart responds to an edge of the input gradually. At high frequencies it "
+    "moves less, and later.",
+    deciding_run="A sweep beyond the resonances: a lag lowers the amplitude there, but a delay "
+    "does not.",
     reference="K. J. Åström, R. M. Murray, Feedback Systems, section 3.2",
     axis="frequency",
     equivalent="A delay, if the time constant is much shorter than a sample.",

@@ -52,9 +52,9 @@ EFFECT = Effect(
             reported=False,
         ),
     ),
-    fingerprint="At each reversal of the force, a short pause and then a knock.",
+    fingerprint="At each reversal of the force there is a short pause, then a knock.",
     deciding_run="Small steps about zero, and the same steps on top of a constant input. Only the "
-    "former cross the gap and are late.",
+    "steps about zero cross the gap, so only they start late.",
     reference="M. Nordin, P.-O. Gutman, Automatica 38 (2002), 1633-1649",
     axis="time",
 )

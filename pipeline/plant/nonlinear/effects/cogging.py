@@ -30,7 +30,7 @@ EFFECT = Effect(
     fingerprint="The cart tends to rest at evenly spaced positions. Plotted over position, the "
     "unexplained force is a sine wave, the same in both directions of travel.",
     deciding_run="A slow ramp of the input, up and down: the cart jumps between rest positions "
-    "that are the same both ways. With dry friction these positions differ.",
+    "that are the same in both directions. With dry friction they differ.",
     reference="D. C. Hanselman, Brushless Permanent Magnet Motor Design, 2nd ed., chapter 5",
     axis="position",
 )

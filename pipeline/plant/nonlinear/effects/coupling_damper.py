@@ -8,7 +8,7 @@ from pipeline.plant.nonlinear.effects.law import ForceLaw
 EFFECT = Effect(
     key="coupling_damper",
     title="A damper between two carts",
-    sentence="The spring between two carts (or a hose or cable) damps changes of its length.",
+    sentence="A spring, hose or cable between two carts damps changes in its length.",
     place="spring",
     law=ForceLaw("c * rate", step=inf),
     parameters=(

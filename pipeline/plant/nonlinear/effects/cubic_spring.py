@@ -20,10 +20,10 @@ EFFECT = Effect(
             neutral=0.0,
         ),
     ),
-    fingerprint="The frequency changes with the amplitude, and the static gain with the size of "
-    "the step.",
+    fingerprint="The frequency depends on the amplitude, and the static gain depends on the size "
+    "of the step.",
     deciding_run="Free decay from a large distance: the first period differs from the last.",
     reference="D. J. Inman, Engineering Vibration, 4th ed., section 1.10",
     axis="stretch",
-    equivalent="On a single cart, the other wall spring.",
+    equivalent="With only one cart, the same effect in the other wall spring.",
 )

@@ -11,8 +11,8 @@ EFFECT = Effect(
     law=InputLaw("sign(u) * max(abs(u) - w, 0)"),
     parameters=(EffectParameter("width", "w", "input", scale="input", typical=0.08, neutral=0.0),),
     fingerprint="Small inputs move the cart too little: the static gain grows with the step.",
-    deciding_run="Steps of three sizes: settled position against input is a line that misses the "
-    "origin.",
+    deciding_run="Steps of three sizes: plotted over the input, the settled position is a line "
+    "that misses the origin.",
     reference="K. J. Åström, R. M. Murray, Feedback Systems, section 10.5",
     axis="input",
 )

@@ -22,8 +22,9 @@ EFFECT = Effect(
             neutral=0.0,
         ),
     ),
-    fingerprint="The cart is damped more after a step on than after a step off.",
-    deciding_run="Steps of two sizes and a free decay: both steps add the same damping.",
+    fingerprint="The cart is damped more after the input steps on than after it steps off.",
+    deciding_run="Steps of two sizes and a free decay: compared with the decay, both steps add the "
+    "same damping.",
     reference="back-EMF of a voltage-driven DC motor; any text on electric drives",
     axis="velocity",
 )

@@ -47,8 +47,8 @@ EFFECT = Effect(
         ),
     ),
     fingerprint="There is one resonance more than there are carts, or a resonance has two peaks.",
-    deciding_run="A sweep through the extra resonance, then the same with the suspect part held by "
-    "hand.",
+    deciding_run="A sweep through the extra resonance, then the same sweep with the suspected part "
+    "held by hand.",
     reference="J. P. Den Hartog, Mechanical Vibrations, section 3.2",
     axis="frequency",
 )

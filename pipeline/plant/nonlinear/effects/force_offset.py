@@ -6,7 +6,8 @@ from pipeline.plant.nonlinear.effects.law import ForceLaw
 EFFECT = Effect(
     key="force_offset",
     title="A constant force",
-    sentence="A tilted track, or a motor at zero input, pushes the cart with a constant force.",
+    sentence="A constant force pushes the cart: the track is tilted, or the motor pushes even at "
+    "zero input.",
     place="cart",
     law=ForceLaw("F"),
     parameters=(
@@ -21,8 +22,8 @@ EFFECT = Effect(
         ),
     ),
     fingerprint="In every run the cart rests off zero, as if pushed by the same force.",
-    deciding_run="Runs with different carts held: against stiffer springs a force displaces the "
-    "cart less, but a wrong encoder zero stays the same.",
+    deciding_run="Runs with different carts held: the stiffer the springs on the cart, the less a "
+    "force displaces it. A wrong encoder zero shifts it equally in all runs.",
     reference="the balance of forces in the chain at rest",
     axis="position",
     only_rest=True,

@@ -18,10 +18,10 @@ EFFECT = Effect(
     ),
     fingerprint="Every driven motion starts late by the same time. Free decays fit the linear "
     "model.",
-    deciding_run="A step at a high sample rate: the cart moves some time after the edge.",
+    deciding_run="A step at a high sample rate: the cart starts to move some time after the edge.",
     reference="K. J. Åström, B. Wittenmark, Computer-Controlled Systems, section 2.3",
     axis="time",
-    equivalent="A lag much shorter than a sample.",
+    equivalent="A first-order lag whose time constant is much shorter than a sample.",
     same_as="actuator_lag",
     same_below=MUCH_SHORTER,
 )

@@ -6,7 +6,7 @@ from pipeline.plant.nonlinear.effects.law import ForceLaw
 EFFECT = Effect(
     key="quadratic_drag",
     title="Quadratic drag",
-    sentence="Air or another fluid resists with the square of the speed.",
+    sentence="The drag of air or another fluid grows with the square of the speed.",
     place="cart",
     law=ForceLaw("-q * v * abs(v)"),
     parameters=(

@@ -12,12 +12,12 @@ EFFECT = Effect(
     law=BuiltLaw("reading", row("y", "=", "g", "x")),
     growth=Growth(("e",), {"g": "1 + e"}, signed=True),
     parameters=(EffectParameter("gain", "g", "", scale="1", typical=0.97, neutral=1.0),),
-    fingerprint="No chain of springs gives the measured ratio between the carts' amplitudes.",
-    deciding_run="Move each cart along a ruler and compare with its encoder.",
+    fingerprint="No chain of springs can give the measured ratio between the carts' amplitudes.",
+    deciding_run="Move each cart along a ruler and compare the distance with its encoder.",
     reference="the balance of forces in the chain at rest",
     axis="position",
     fewest_carts=2,
     same_as="sensor_gain",
-    equivalent="The gain of another cart, as the data show only ratios of gains. Without springs "
-    "to both walls they show no gain at all.",
+    equivalent="The gain of another cart's sensor, because the data show only ratios of gains. "
+    "With springs to both walls, the data of two carts show no gain at all.",
 )

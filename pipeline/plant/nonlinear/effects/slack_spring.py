@@ -1,11 +1,11 @@
-"""A spring that changes past a stretch."""
+"""A spring with a jump in its stiffness."""
 
 from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
 from pipeline.plant.nonlinear.effects.law import ContactLaw, Growth
 
 EFFECT = Effect(
     key="slack_spring",
-    title="A spring that changes past a stretch",
+    title="A spring with a jump in its stiffness",
     sentence="Beyond some stretch the spring goes slack, or its coils touch.",
     place="spring",
     law=ContactLaw("r * k * (d - s)", past="s", pulls=True),
@@ -23,10 +23,11 @@ EFFECT = Effect(
         ),
         EffectParameter("stretch", "s", "position", scale="position", typical=0.35, side=True),
     ),
-    fingerprint="Beyond some position, on one side only, the swings have another shape.",
-    deciding_run="Steps of both signs and several sizes: settled position against input is a line "
-    "with a corner.",
+    fingerprint="The swings change shape beyond some position, on one side only.",
+    deciding_run="Steps of both signs and several sizes: plotted over the input, the settled "
+    "position is a line with a corner.",
     reference="S. W. Shaw, P. J. Holmes, Journal of Sound and Vibration 90 (1983), 129-155",
     axis="stretch",
-    equivalent="On a single cart, the other wall spring with the stretch on the other side.",
+    equivalent="With only one cart, the same effect in the other wall spring at the opposite "
+    "stretch.",
 )
