@@ -457,19 +457,19 @@ MANY = ("cogging", "drive_damping", "input_delay", "slack_spring", "coulomb_fric
         (
             ("coulomb_friction",),
             ("cogging", "coulomb_friction"),
-            "with cogging of the motor and without it",
+            "the model with cogging of the motor and the one without it",
             ["with cogging of the motor", "without it"],
         ),
         (
             ("end_stop", "coulomb_friction"),
             ("end_stop", "cubic_spring"),
-            "with dry (Coulomb) friction on cart 2 and with ",
+            "the model with dry (Coulomb) friction on cart 2 and the one with ",
             ["the first model", "the second model"],
         ),
         (
             ("saturation",),
             ("saturation", *MANY),
-            "and dry (Coulomb) friction on cart 2 and without them",
+            "and dry (Coulomb) friction on cart 2 and the one without them",
             ["with these effects", "without them"],
         ),
     ],
