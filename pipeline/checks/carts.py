@@ -153,8 +153,8 @@ def _ask_if_there(name: str, *, bench: Bench) -> str:
     if read.symbol == "c":
         alone = f", carts = [{i}]" if n > 1 else ""
         return (
-            f"Do the recordings show the damping of cart {i}? A decay of that cart would: add one "
-            f'to submission.toml, [[experiments]] with kind = "decay"{alone}.'
+            f"Do the recordings show the damping of cart {i}? A decay of that cart would show "
+            f'it: add one to submission.toml, [[experiments]] with kind = "decay"{alone}.'
         )
     if read.symbol == "m":
         fewer = f"carts = {n - 1}, or " if n > 1 else ""

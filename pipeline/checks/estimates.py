@@ -62,7 +62,7 @@ def _advice(row: ParameterRow) -> str:
         seen = (
             "a steady sine of amplitude A gives ζ + 2d/(πA)"
             if response
-            else "it adds more to the damping ratio of small swings"
+            else "it increases the damping ratio of small swings more"
         )
         return (
             f" Dry friction makes damping ratios differ: {seen}. Check which of the two methods "

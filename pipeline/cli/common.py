@@ -42,7 +42,8 @@ Model = Annotated[
 Hide = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="EFFECT[:key=value,…]", help="Hide an effect (see `cartlab effects`); may repeat."
+        metavar="EFFECT[:key=value,…]",
+        help="Hide an effect (see `cartlab effects`); may be repeated.",
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]

@@ -31,10 +31,12 @@ def emulate(
         list[str] | None,
         typer.Option(
             metavar="KIND=RATE",
-            help="Disturb the line: drop=0.01, delay@5, …; may repeat.",
+            help="Disturb the line: drop=0.01, delay@5, …; may be repeated.",
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of noise, hands and faults.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Random seed for noise, hand movements and faults.")
+    ] = 0,
     remote: Annotated[
         bool, typer.Option("--remote", help="Listen to other computers too.")
     ] = False,

@@ -27,7 +27,7 @@ def grade(
         list[Path],
         typer.Argument(metavar="PATH…", help="Submission folders, trees of them, or zip files."),
     ],
-    rubric: Annotated[Path, typer.Option(metavar="FILE", help="A rubric, or a shipped name.")],
+    rubric: Annotated[Path, typer.Option(metavar="FILE", help="A rubric file or shipped name.")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Output folder with the gradebook.")],
     jobs: Annotated[int, typer.Option(min=1, help="Processes; default: one per core.")] = (
         os.cpu_count() or 1
@@ -35,8 +35,12 @@ def grade(
     cluster: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, tcp://HOST:PORT.")
     ] = None,
-    time_limit: Annotated[float, typer.Option(min=1, help="For each submission, s.")] = 120.0,
-    memory_limit: Annotated[float, typer.Option(min=0.1, help="For each submission, GB.")] = 1.0,
+    time_limit: Annotated[
+        float, typer.Option(min=1, help="Time limit for each submission, s.")
+    ] = 120.0,
+    memory_limit: Annotated[
+        float, typer.Option(min=0.1, help="Memory limit for each submission, GB.")
+    ] = 1.0,
     figures: Annotated[
         bool, typer.Option("--figures/--no-figures", help="Draw the figures of the feedback.")
     ] = True,
@@ -220,12 +224,13 @@ def _erase(grades: str, teams: list[str], assignment: str | None) -> None:
     deleted.
     """
     from pipeline.grading.publish.export import remove_exports
+    from pipeline.words.numbers import count
 
     with _changing(grades, assignment) as book:
         gone = book.erase(teams)
     say(f"erased: {', '.join(gone)}")
     if (folder := Path(grades)).is_dir() and (files := remove_exports(folder)):
-        say(f"deleted, as they had them too: {len(files)} exported files; export again")
+        say(f"deleted {count(len(files), 'exported file')} that also contained them; export again")
     say("not erased: the submitted folders, backups, and files that you copied elsewhere")
 
 
@@ -345,7 +350,7 @@ def survey(
 
 @app.command("check-rubric")
 def check_rubric(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A rubric, or a shipped name.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A rubric file or shipped name.")],
     as_json: AsJson = False,
 ) -> None:
     """Validate a rubric and show what it requires."""

@@ -17,7 +17,7 @@ def plan(
     ] = False,
     number: Annotated[
         int | None,
-        typer.Option("--next", min=1, max=20, help="Choose this many, the most informative first."),
+        typer.Option("--next", min=1, max=20, help="Choose this many new experiments, best first."),
     ] = None,
     goal: Annotated[
         str | None,

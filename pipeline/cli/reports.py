@@ -213,7 +213,7 @@ def check(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """List your numbers that disagree with your recordings; asked again, say where to look.
+    """List your numbers that disagree with your recordings; if asked again, say where to look.
 
     It never shows the right value. DIR/checks.jsonl, part of your submission, counts the checks.
     """

@@ -31,7 +31,8 @@ from pipeline.workflow import analyse
 
 _ALONE = 4  # number of planned recordings whose own benefit is listed
 STATISTICAL = (
-    f"these errors count noise alone: no bench is calibrated to better than {100 * CALIBRATION:g} %"
+    "these errors include only noise; no bench is calibrated to better than "
+    f"{100 * CALIBRATION:g} %"
 )
 
 
@@ -227,7 +228,10 @@ def why_useless(recording: Recording, known: Knowledge, *, limits: PlanLimits) -
         return "the carts are identified from records with all of them free"
     most = known.at_its_limits(recording, limits=limits, share=1.0)
     if abs(recording.amplitude) > most:
-        return f"it would be stopped at the travel limit: an amplitude up to {most:.2g} would not"
+        return (
+            f"it would be stopped at the travel limit; with an amplitude up to {most:.2g} it would "
+            "not be stopped"
+        )
     return ""
 
 
@@ -260,7 +264,7 @@ def _decisive(submission: Submission, limits: PlanLimits) -> tuple[Recording, fl
     of = (found.bench.n, found.bench.units.position, found.bench.units.input)
     here = (system.carts, system.position.unit, system.input.unit)
     if of != here or found.provenance.files != read_data(submission).files:
-        raise ConfigError(f"--for gap: gap/gap.json is of other data: run {command} again")
+        raise ConfigError(f"--for gap: gap/gap.json was made from other data: run {command} again")
     kept = found.proposal.limits
     # gap.json has only ten digits.
     if not all(isclose(kept.get(name, 0.0), limit, rel_tol=1e-9) for name, limit in limits):

@@ -48,7 +48,7 @@ _CHECK = """\
 # CHECK these two limits before you switch the motor on. A run that passes one is stopped; then
 # divide its amplitude by four and record it again.
 #   input    {input}. The largest input of the motor.
-#   travel   {position}. The largest distance of a cart from where it was zeroed; runs aim at 40 %.
+#   travel   {position}. The largest distance of a cart from its zero; runs aim at 40 % of it.
 """
 
 

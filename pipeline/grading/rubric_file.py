@@ -295,7 +295,7 @@ def _contradictions(
             yield ("criteria", i, "id"), f"{id_!r} was used before"
         for parent in criterion.requires:
             if parent not in seen and (parent in ids or parent not in lost):
-                where = "comes later" if parent in ids else "is no criterion"
+                where = "comes later" if parent in ids else "is not a criterion"
                 known = "" if parent in ids else nearest(parent, known_ids)
                 yield ("criteria", i, "requires"), f"{parent!r} {where}{known}"
         seen.add(id_)

@@ -140,7 +140,7 @@ def _sign(system: System, data: Ingested, *, failed: Sequence[Check]) -> Iterato
     if wrong:
         support, reason = "contradicted", wrong
     elif told:
-        but = f"; the opposite sign: {abridge(others)}"
+        but = f"; the opposite sign is shown by {abridge(others)}"
         support, reason = "supported", f"shown by {abridge(told)}{but if others else ''}"
     else:
         reason = "no recording shows it"

@@ -435,7 +435,9 @@ def _unsure(found: Found, n: int) -> Iterator[str]:
     if found.inspection.guessed:
         yield from (f"columns: {doubt}" for doubt in found.inspection.doubts)
     if found.kind == "closed_loop":
-        yield "what ran: controller = { type = … }" + (", controlled_cart = …" if n > 1 else "")
+        yield "which controller ran? controller = { type = … }" + (
+            ", controlled_cart = …" if n > 1 else ""
+        )
     positions = found.inspection.positions
     for cart in (cart for cart in found.carts if cart > n):
         renamed = ", or columns = { x1 = … }" if n == 1 else ""

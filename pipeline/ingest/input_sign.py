@@ -104,8 +104,8 @@ def _say_signs(
         text += f", but {-usual:+d} in {abridge(others, most=FEW_NAMES)}"
     if unsure := [name for name in searched if not found.get(name)]:
         text += (
-            f"; taken from the others where the data do not show it: "
-            f"{abridge(unsure, most=FEW_NAMES)}"
+            f"; the data of {abridge(unsure, most=FEW_NAMES)} do not show it, so it is taken "
+            "from the other recordings"
         )
     return [text]
 

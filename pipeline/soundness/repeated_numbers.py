@@ -255,7 +255,7 @@ def _check(
         runs = ", ".join(f"{reading.run} ({reading.value:.4g})" for reading in off)
         outcome, said = "fail", f"contradict each other ({apart}). {runs} is left out"
     elif np.any(_contradictions(readings)):
-        outcome, said = "fail", f"give values {apart} that depend on the step, as if a cart sticks"
+        outcome, said = "fail", f"give values {apart} that depend on the step, as if a cart stuck"
     elif spread > readings[0].tolerance:
         outcome, said = "skip", f"give values {apart}; their standard errors allow this difference"
     else:

@@ -66,7 +66,9 @@ def collect_dwells(points: Sequence[SinePoint]) -> tuple[FrequencyResponse, ...]
     """
     usable = [p for p in points if not dwell_fault(p)]
     if not usable:
-        raise DataError("frequency response: dwells need a sinusoidal input, found none with one")
+        raise DataError(
+            "frequency response: dwells need a sinusoidal input, found no dwell with one"
+        )
     return tuple(
         _collect_cart([p for p in usable if p.cart == cart], cart=cart)
         for cart in sorted({p.cart for p in usable})

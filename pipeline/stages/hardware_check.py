@@ -303,7 +303,7 @@ def _another_cart(
         return ""
     return (
         f"controlled_cart = {cart}, but cart {there[0]} comes to rest at the reference and cart "
-        f"{cart} {100 * off[cart]:.0f} % from it"
+        f"{cart} comes to rest {100 * off[cart]:.0f} % away from it"
     )
 
 

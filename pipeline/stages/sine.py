@@ -136,7 +136,7 @@ class Dwell:
             raise DataError(
                 f"{record.id}: a sine dwell needs an input of one frequency, found an amplitude of "
                 f"{abs(drive.z):.3g} at {omega / (2 * np.pi):.4g} Hz and {drive.rms:.3g} (rms) "
-                "besides"
+                "at other frequencies"
             )
         amplitude, input_amplitude = abs(position.z), abs(drive.z)
         held = _held(t, omega=omega) if record.hold == "zero_order" else 1.0
@@ -323,7 +323,7 @@ def _driven(record: Record) -> slice:
     u = record.u
     if u is None:
         raise DataError(
-            f"{record.id}: a sine dwell needs the input beside the positions, found no input "
+            f"{record.id}: a sine dwell needs the input as well as the positions, found no input "
             "column: export it too, or name it under `columns`"
         )
     if np.ptp(u) == 0:

@@ -121,8 +121,8 @@ def _constant_parts(record: Record) -> list[tuple[int, int, float]]:
     u = record.u
     if u is None:
         raise DataError(
-            f"{record.id}: step gain needs the input beside the positions, found no input column: "
-            "export it too, or name it under `columns`"
+            f"{record.id}: step gain needs the input as well as the positions, found no input "
+            "column: export it too, or name it under `columns`"
         )
     # Halves of a constant stretch differ by less than 0.5 % of the input's range.
     creep = 0.005 * float(np.ptp(u))
@@ -137,7 +137,8 @@ def _constant_parts(record: Record) -> list[tuple[int, int, float]]:
     if share < 0.6 or not any(value for _, _, value in parts):
         raise DataError(
             f"{record.id}: step gain needs an input that steps and then stays, found it constant "
-            f"and not zero for {100 * share if any(p[2] for p in parts) else 0:.0f} % of the record"
+            f"and nonzero for only {100 * share if any(p[2] for p in parts) else 0:.0f} % of the "
+            "record"
         )
     return parts
 
@@ -353,7 +354,10 @@ def _notes(
         if edge not in moving
     ]
     if any(p.level and p.level.extrapolated for p in found):
-        notes.append("the cart still oscillates where a level ends: a fitted oscillation gives it")
+        notes.append(
+            "the cart still oscillates at the end of a level, so the level comes from a fitted "
+            "oscillation"
+        )
     if any(p.level is None for p in found):
         notes.append("edges after which the cart never settles are left out")
     return notes

@@ -177,7 +177,7 @@ class Experiment(TomlTable):
         description="Hz, of a sine; if left out, found from the data",
     )
     window: tuple[Finite, Finite] | None = Field(
-        default=None, title="Use only", description="from, to, in s"
+        default=None, title="Use only", description="start and end, in s"
     )
     note: str = Field(default="", max_length=2_000, title="Note")
     input: InputOverride | None = None

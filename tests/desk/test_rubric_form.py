@@ -246,7 +246,7 @@ def test_a_preview_shows_each_team_before_anything_is_written(tmp_path, lab):
         assert load_rubric(lab).late.percent_per_day == 50
         after = visitor.get(saved.headers["location"]).text
         assert 'action="/grades/0/regrade"' in after
-        assert "Grade graded again with it" in after
+        assert "Grade graded again with this rubric" in after
 
 
 def test_a_preview_tells_what_needs_the_recordings(tmp_path, lab):

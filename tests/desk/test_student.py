@@ -380,7 +380,7 @@ def test_only_a_report_of_these_files_says_what_was_assumed(filled):
     os.utime(folder / load_submission(folder).experiments[0].file, (1e9, 1e9))
     page = visitor.get(HERE + "hand-in").text
     assert "system.springs" not in page
-    assert page.count("Known when the report of these files is made.") == 2
+    assert page.count("You will see them once the report of these files is made.") == 2
 
 
 def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
@@ -390,7 +390,9 @@ def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
     page = handed_in(visitor)
     assert "is a link" in page
     assert "There is no report yet, so the zip will not contain one." in page
-    assert page.count("Known when the report of these files is made.") == 2  # not: none, nothing
+    assert (
+        page.count("You will see them once the report of these files is made.") == 2
+    )  # not: none, nothing
     assert "report/report.pdf" not in zipped(visitor).namelist()
 
 

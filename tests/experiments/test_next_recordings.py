@@ -258,7 +258,7 @@ def test_a_proposal_that_makes_the_fit_worse_is_reported(analysis):
         ({"kind": "decay", "wave": "delta", "amplitude": 0.0, "release": 1}, "this is a decay"),
         ({"kind": "sine", "wave": "sine"}, "from steps and sweeps here, but this is a dwell"),
         ({"carts": (1,)}, "all of them free"),
-        ({"amplitude": 0.5}, "stopped at the travel limit: an amplitude up to"),
+        ({"amplitude": 0.5}, "stopped at the travel limit; with an amplitude up to"),
     ],
 )
 def test_a_useless_proposal_gets_a_reason(known, change, words):

@@ -93,7 +93,8 @@ def test_a_late_hand_in_by_itself_keeps_the_class(school, tmp_path):
     done = grade(school / "A" / "team-1", out=parts)
     assert (done.total, done.sharing) == (1, 2)
     assert done.remarks == (
-        "not in this run, kept as they were: B-team-1 and team-2 (cartlab remove takes one off)",
+        "not in this run, kept as they were: B-team-1 and team-2 (to take one off the list, use "
+        "cartlab remove)",
     )
     for file in (parts / "feedback").glob("*/grade.json"):
         assert_fits("grade", file.read_text(encoding="utf-8"))

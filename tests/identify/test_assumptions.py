@@ -130,4 +130,4 @@ def test_a_held_cart_that_was_not_measured_is_open(tmp_path):
     sign = found["system.input.sign"]
     assert (sign.value, sign.origin, sign.support) == (-1.0, "data", "supported")
     assert "pid" not in sign.experiments  # the log's sign is opposite
-    assert "the opposite sign: pid" in sign.reason
+    assert "the opposite sign is shown by pid" in sign.reason

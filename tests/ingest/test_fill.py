@@ -64,7 +64,7 @@ def test_a_folder_of_files_becomes_a_submission(tmp_path):
         "loop": (1,), "pull": (1,), "run-2": (1, 2), "run-10": (1, 2),
     }  # fmt: skip
     text = (tmp_path / "submission.toml").read_text(encoding="utf-8")
-    assert "# unsure: what ran: controller" in text
+    assert "# unsure: which controller ran? controller" in text
     assert "#[design]" in text  # a comment of the file that `cartlab new` writes
     assert len(read_data(submission).records) == 4
 

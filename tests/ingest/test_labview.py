@@ -114,10 +114,10 @@ def test_comments_beside_rows_are_said_not_read():
 BAD_LVM = {
     "twice": (GOOD + "\r\n" + lvm_segment(COLUMNS), r"line 66: a segment begins again at 0 s"),
     "other channels": (
-        GOOD + "\r\n" + lvm_segment({"time": TIME + 1, "x1": X1}), r"line 66: other channels",
+        GOOD + "\r\n" + lvm_segment({"time": TIME + 1, "x1": X1}), r"line 66: the channels differ",
     ),
     "two clocks": (multi(TIME + 0.001), r"line 18: the channels were sampled at different times"),
-    "two intervals": (no_times(Delta_X=["0.1", "0.2"]), r"states Delta_X, but channels differ"),
+    "two intervals": (no_times(Delta_X=["0.1", "0.2"]), r"states Delta_X differently for"),
     "no interval": (no_times(Delta_X=["a", "b"]), r"states Delta_X 'a, b', which is not a number"),
     "no number": (GOOD.replace("0.030000", "0.03x"), r"line 22: 'time' is not a number: '0.03x'"),
     "a gap": (GOOD.replace("\r\n0.030000\t", "\r\n0.030000\t\t"), r"line 22: 'input' is empty"),

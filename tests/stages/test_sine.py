@@ -223,7 +223,7 @@ def test_a_motion_that_is_no_sine_is_mentioned():
 def test_without_an_input_the_error_says_what_to_do():
     """A file without the input is refused, since amplitude and phase are relative to it."""
     run, _ = dwell(sampled(9.0))
-    with pytest.raises(DataError, match=r"needs the input beside the positions.*`columns`"):
+    with pytest.raises(DataError, match=r"needs the input as well as the positions.*`columns`"):
         fit_sine(replace(run, u=None), cart=1)
 
 

@@ -105,12 +105,12 @@ def test_an_exploration_is_watched_and_steered(show, tmp_path):
         chosen = re.search(r"The next recording is (\S+):", thought.inner_text())
         assert chosen is not None
         window.get_by_role("button", name="Veto").click()
-        window.get_by_text("Add an experiment of your own").click()
+        window.get_by_text("Add your own experiment").click()
         window.get_by_label("Amplitude").fill("20")
         window.get_by_role("button", name="Add it to the plan").click()
         expect(window.get_by_role("alert")).to_contain_text("amplitude: expected at most the limit")
         window.get_by_label("Amplitude").fill("0.02")
-        window.get_by_label("How long").fill("120")
+        window.get_by_label("Duration").fill("120")
         window.get_by_role("button", name="Add it to the plan").click()
         expect(window.get_by_text("step-5 is in the plan")).to_be_visible()
         expect(window.locator("#plan .now b")).to_have_text("step-5")
@@ -200,7 +200,9 @@ def test_a_rubric_is_begun_changed_previewed_and_saved_by_keyboard(show, tmp_pat
         with window.expect_navigation():
             window.keyboard.press("Enter")
         expect(window.locator(".now .chip")).to_have_text("Saved")
-        expect(window.get_by_role("heading", name="Grade graded again with it")).to_be_visible()
+        expect(
+            window.get_by_role("heading", name="Grade graded again with this rubric")
+        ).to_be_visible()
         assert fits(window)
         rubric = load_rubric(path)
         assert (rubric.late.percent_per_day, rubric.students.see) == (50, "check")

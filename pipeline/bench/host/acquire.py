@@ -135,7 +135,7 @@ class _Acquisition:
         for sentence in (*cart_remarks(submission, bench), *scale_remarks(submission, bench)):
             self._observer.remark(sentence)
         for file in save_left_over(self._folder, carts=submission.system.carts):
-            self._observer.remark(f"{file} is the data of an interrupted session")
+            self._observer.remark(f"{file} holds the data of an interrupted session")
         plan = self._plan(submission, line)
         session = Session(
             line,

@@ -200,7 +200,7 @@ def _write_new(folder: Path, bench: Description) -> None:
     new_folder(folder).mkdir(parents=True, exist_ok=True)
     there = ", ".join(["true"] * (bench.carts + 1))
     names = ", ".join(spring_names(bench.carts))
-    springs = f"springs = [{there}]  # check: {names}; false if it is missing"
+    springs = f"springs = [{there}]  # check: {names}; false for a missing spring"
     sections = [
         toml_section("", {"version": 1, "title": f"Recorded on the bench {bench.name}"}),
         toml_section("[system]", system).rstrip() + f"\n{springs}\n",

@@ -167,7 +167,7 @@ class Session:
         self._swings_out = watch.is_too_far
         watch.forward(stream.finish())
         if not partial and recording.controller is None and stream.widest <= _STILL:
-            partial = "no free cart moved: is it held, is its encoder plugged in, is the motor on?"
+            partial = "no free cart moved: is one held, is an encoder unplugged, is the motor off?"
         fit = stream.fit()
         if stream.lines > 1000 and not partial:  # enough to determine the period of a clock
             self._say_other_period(fit.period)
@@ -250,7 +250,7 @@ class Session:
                     raise Runaway(f"stopped: at rest, {why}")
                 self._zero_at_rest(recording)
                 return ""
-        swings = ", ".join(f"cart {cart} by {swing} counts" for cart, swing in moving.items())
+        swings = ", ".join(f"cart {cart} moved by {swing} counts" for cart, swing in moving.items())
         return f"not at rest when the run began: {swings} within half a second"
 
     def _look_on(self, nothing: Order, watch: LineWatch) -> None:

@@ -319,7 +319,7 @@ class LiveState(ShownSession):
         if self._instruction:
             return "Waiting for you."
         if self._phase == "thinking":
-            return f"Asking the data: {self._stage}."
+            return f"Analysing the data: {self._stage}."
         if self._phase == "settling" and self._now:
             return f"Waiting for the carts to come to rest before {self._now.id}."
         if self._phase == "recording" and self._now:

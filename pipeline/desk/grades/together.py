@@ -93,7 +93,7 @@ def _undo(ask: Ask) -> Response:
     if undone.kept:
         names = {team.submission: name for name, team in shown.teams.items()}
         kept = ", ".join(sorted(names.get(one, STRANGER) for one in undone.kept))
-        said += f" Kept, because changed since: {kept}."
+        said += f" Kept, because they changed since: {kept}."
     if not ask.query("criterion"):  # the button was in the list on the class page
         return ask.back(f"{ask.here}#sets", said, place=_DONE)
     return ask.back(_address(ask, done=undone.at if undone.back else ""), said, place=_DONE)
@@ -136,7 +136,7 @@ def _wish(ask: Ask, shown: Class, asked: Criterion, name: str, *, typed: str) ->
     team = shown.teams[name]
     points = None if typed == _SAME else read_points(typed)
     if typed == _SAME and asked.id not in team.line.judged:
-        raise ConfigError(f"{name}: has no points here yet, so a comment needs points")
+        raise ConfigError(f"{name}: has no points here yet; give points with the comment")
     if points is not None and not 0 <= points <= asked.points:
         raise ConfigError(f"expected 0 to {asked.points:g} points, found {points:g}")
     return WantedPoints(

@@ -60,7 +60,9 @@ class Summary:
     def counted(self) -> str:
         """Sentence with the counts."""
         shared = (
-            f", {self.sharing} with recordings that another also contains" if self.sharing else ""
+            f", {self.sharing} with recordings that another submission also contains"
+            if self.sharing
+            else ""
         )
         return f"{self.total - len(self.failed)} of {self.total} graded{shared}"
 
@@ -229,7 +231,10 @@ def _class_messages(batch: Batch, book: Gradebook, *, shown: Callable[[str], str
     if not batch.kept:
         return
     kept = sorted(map(shown, batch.kept))
-    yield f"not in this run, kept as they were: {_names(kept)} (cartlab remove takes one off)"
+    yield (
+        f"not in this run, kept as they were: {_names(kept)} (to take one off the list, use "
+        "cartlab remove)"
+    )
     if others := sorted(map(shown, set(book.by_other_rubrics()) & set(batch.kept))):
         yield f"graded with an earlier version of the rubric; grade them again: {_names(others)}"
 

@@ -160,7 +160,7 @@ class Grader:
             plain = self._process.do(asdict(task), limit=self._setup.time_limit, stop=stop)
         except Ended as end:
             if end.how == "start":
-                last = end.said.strip().splitlines() or ["nothing was said"]
+                last = end.said.strip().splitlines() or ["they gave no reason"]
                 raise ConfigError(f"the grading processes do not start: {last[-1]}") from None
             reasons = {"memory": too_large, "crash": f"the grader crashed ({end.status})"}
             return self._failed(task, reasons.get(end.how, str(end)), detail=end.said)

@@ -78,8 +78,8 @@ def export(
         if sent:
             remarks.append(
                 Remark(
-                    text="matched only by their authors' ids; with a roster also by the number "
-                    f"in the file name: {', '.join(sent)}"
+                    text="matched only by their authors' ids; give a roster to match them also "
+                    f"by the number in the file name: {', '.join(sent)}"
                 )
             )
     else:

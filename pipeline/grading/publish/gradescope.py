@@ -61,7 +61,7 @@ def _grade_lines(grade: Grade, *, by_hand: bool, hidden: bool) -> list[str]:
     ----------
     hidden : show no computed number.
     """
-    how = " automatically, points were given by hand" if by_hand else ""
+    how = " automatically, so points were given by hand" if by_hand else ""
     failed = grade.status == "failed"
     said = [f"Could not be graded{how}: {grade.reason}"] if failed else []
     if hidden:

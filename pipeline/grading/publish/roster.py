@@ -169,7 +169,7 @@ class Roster:
         if by_number:
             remarks.append(
                 Remark(
-                    text="matched by the number in the file name, so the same person as one of "
+                    text="matched by the number in the file name, and therefore taken to be one of "
                     f"the authors: {', '.join(by_number)}"
                 )
             )

@@ -234,7 +234,7 @@ def _stated(tag: str, segment: _Segment, dialect: _Dialect) -> float | None:
         raise SubmissionError(f"{place} {first_few(said, 3)[:60]!r}, which is not a number")
     found = set(map(float, numbers))
     if len(found) > 1 or not all(map(np.isfinite, found)):
-        raise SubmissionError(f"{place}, but channels differ: {first_few(said, 3)[:60]}")
+        raise SubmissionError(f"{place} differently for each channel: {first_few(said, 3)[:60]}")
     return found.pop() if found else None
 
 
@@ -248,7 +248,9 @@ def _join(tables: Sequence[FileTable], *, notes: Sequence[str]) -> FileTable:
         if before.cut is not None:
             raise SubmissionError(f"{first.source} {before.cut}")
         if after.names != first.names:
-            raise SubmissionError(f"{place}: other channels than before; keep one measurement")
+            raise SubmissionError(
+                f"{place}: the channels differ from those before; keep one measurement"
+            )
         has_time = first.names[0].startswith("time")
         if has_time and after.values[0, 0] <= before.values[0, -1]:
             raise SubmissionError(

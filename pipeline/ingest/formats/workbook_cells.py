@@ -87,7 +87,7 @@ class Book:
             self._archive = zipfile.ZipFile(_Bounded(raw))
             self._members = {info.filename: info for info in self._archive.infolist()}
             if len(self._members) < len(self._archive.infolist()):
-                raise _Broken("two parts of one name")
+                raise _Broken("two parts with the same name")
             self._open()
 
     def _open(self) -> None:
@@ -233,7 +233,7 @@ class Book:
         if info.flag_bits & 1:
             raise SubmissionError(f"{self._source}: locked by a password; save it without one")
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise _Broken("packed as no spreadsheet program does")
+            raise _Broken("packed in a way that no spreadsheet program uses")
         with self._archive.open(info) as file:
             while chunk := file.read(_CHUNK):
                 self._bytes -= len(chunk)

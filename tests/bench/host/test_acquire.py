@@ -337,7 +337,7 @@ def test_a_killed_host_leaves_a_readable_file_and_a_motor_that_is_off(tmp_path, 
     notes = Notes()
     *_, outcome = acquire(work, port=fast.address, observers=[notes], only=["dwell"])
     assert outcome.partial == ""
-    assert "data/dwell.partial.txt is the data of an interrupted session" in notes.remarks
+    assert "data/dwell.partial.txt holds the data of an interrupted session" in notes.remarks
 
 
 def test_a_stuck_encoder_is_said(tmp_path):

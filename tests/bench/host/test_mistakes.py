@@ -50,7 +50,7 @@ def test_a_run_in_which_nothing_moves_is_not_recorded(tmp_path):
     dead = ("--fault", "stuck=1@0", "--fault", "stuck=2@0")
     with emulator("--speed", "20", *dead) as bench:
         outcomes = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
-    assert [o.partial[:26] for o in outcomes] == ["no free cart moved: is it "] * 3
+    assert [o.partial[:26] for o in outcomes] == ["no free cart moved: is one "] * 3
     assert load_submission(work).experiments == ()
 
 
