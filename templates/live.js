@@ -76,7 +76,7 @@
     $('thought').textContent = `${text.replace(/^[a-z]/, (first) => first.toUpperCase())}.`;
     for (const whole of document.querySelectorAll('#whole, [for="whole"]')) whole.hidden = true; // nobody knows how long it takes
     $('skip').textContent = 'Veto';
-    $('skip').title = 'Not this one: have another chosen';
+    $('skip').title = 'Do not record this one: choose another';
     const diary = $('diary');
     if (!diary) return;
     diary.closest('section').hidden = false;

@@ -775,7 +775,7 @@ def test_to_undo_a_decision_leaves_what_came_after_it(ta, grades):
     assert f"{len(names)} teams" in shown.text.split('id="sets"')[1]
     ta.post(ROOM + "together", do="undo", set=shown.value("set"))
     page = ta.get(ROOM).text
-    assert f"{len(names) - 1} teams undone. Kept, because changed since: {names[0]}." in page
+    assert f"{len(names) - 1} teams undone. Kept, because they changed since: {names[0]}." in page
     with Gradebook(grades) as book:
         given = {name: book.entry(name).overrides for name in names}
     assert {name: own["laws"].why for name, own in given.items() if own} == {

@@ -115,7 +115,12 @@ def test_a_pattern_is_written_out(tmp_path):
         ('"K_*"]\n\n[[r', '"K_9"]\n\n[[r', 9, r"required\.final: no parameter 'K_9'"),
         ('parameters = ["K_*"]', 'parameters = ["L_*"]', 18, r"no parameter 'L_\*'"),
         ('kind = "step"', 'kind = "stop"', 12, r"kind: expected .*did you mean 'step'"),
-        ('requires = ["gains"]', 'requires = ["gians"]', 24, r"'gians' is no criterion; did you"),
+        (
+            'requires = ["gains"]',
+            'requires = ["gians"]',
+            24,
+            r"'gians' is not a criterion; did you",
+        ),
         ('id = "model"', 'id = "gains"', 21, r"'gains' was used before"),
         ("[false, true, true]", "[true]", 5, r"expected 3 values \(wall-1, 1-2, 2-wall\), found 1"),
         ("version = 1", "version = 2", 1, r"version: expected 1, found 2"),

@@ -450,7 +450,7 @@ def test_signs_may_differ_between_experiments(tmp_path):
     (said,) = data.warnings
     assert said == (
         "sign of the input found from the data: +1, but -1 in step; "
-        "taken from the others where the data do not show it: blind"
+        "the data of blind do not show it, so it is taken from the other recordings"
     )
     assert list(data.files) == sorted(f"{name}.csv" for name in runs)
 

@@ -201,11 +201,11 @@ def test_a_format_that_is_no_date_changes_nothing(code):
 
 BAD = {
     "empty": (changed(C7=None), r"sheet 'Sheet' cell C7: 'x1' is empty"),
-    "text": (changed(C7="stuck"), r"cell C7: 'x1' is no number: 'stuck'"),
-    "thousands": (changed(C7="1,234,5"), r"cell C7: 'x1' is no number"),
-    "nan": (changed(C7="nan"), r"cell C7: 'x1' is no number"),
-    "fault": (changed(C7="#DIV/0!"), r"cell C7: 'x1' is no number: '#DIV/0!'"),
-    "truth": (changed(C7=True), r"cell C7: 'x1' is no number: 'TRUE'"),
+    "text": (changed(C7="stuck"), r"cell C7: 'x1' is not a number: 'stuck'"),
+    "thousands": (changed(C7="1,234,5"), r"cell C7: 'x1' is not a number"),
+    "nan": (changed(C7="nan"), r"cell C7: 'x1' is not a number"),
+    "fault": (changed(C7="#DIV/0!"), r"cell C7: 'x1' is not a number: '#DIV/0!'"),
+    "truth": (changed(C7=True), r"cell C7: 'x1' is not a number: 'TRUE'"),
     "formula": (changed(C7="=A2+1"), r"cell C7: 'x1' is a formula without its value: open"),
     "formulas": (
         changed(**{f"C{i}": "=A2" for i in range(2, N + 2)}),
@@ -216,8 +216,11 @@ BAD = {
         r"cell C7: 'x1' is a date .* such as 1\.5",
     ),
     "huge": (changed(C7=1e60), r"row 7: 'x1' is too large"),
-    "mean": (changed(A42="mean", B42=0.5), r"cell A42: 'time' is no number: 'mean'"),
-    "marker": (changed(A30="here", B30=None, C30=None), r"cell A30: 'time' is no number: 'here'"),
+    "mean": (changed(A42="mean", B42=0.5), r"cell A42: 'time' is not a number: 'mean'"),
+    "marker": (
+        changed(A30="here", B30=None, C30=None),
+        r"cell A30: 'time' is not a number: 'here'",
+    ),
     "twice": (changed(C1="input"), r"row 1: the heading 'input' appears twice"),
     "no headings": (sheet(lambda ws: [ws.append(r) for r in ROWS]), r"no sheet has a row of head"),
     "nothing": (sheet(lambda ws: None), r"no sheet has a row of headings .*'Sheet'"),
@@ -234,7 +237,7 @@ BAD = {
 
 @pytest.mark.parametrize(("raw", "said"), BAD.values(), ids=BAD.keys())
 def test_a_cell_that_is_no_measurement_is_named(raw, said):
-    """A cell that is no number gives one line of error with sheet, cell and column."""
+    """A cell that is not a number gives one line of error with sheet, cell and column."""
     with pytest.raises(SubmissionError, match=said) as caught:
         table(raw)
     assert "\n" not in str(caught.value)

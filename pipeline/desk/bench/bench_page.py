@@ -174,7 +174,7 @@ def _read_recording(typed: Mapping[str, str], submission: Submission) -> Recordi
     carts = submission.system.carts
     wanted = WantedRecording(
         kind=kind,
-        seconds=read_number(typed["seconds"], name="how long"),
+        seconds=read_number(typed["seconds"], name="duration"),
         amplitude=read_number(typed["amplitude"], name="amplitude"),
         frequency=read_number(typed["frequency"], name="frequency"),
         frequency_end=read_number(typed["frequency_end"], name="to") or None,

@@ -110,7 +110,7 @@ def _show_questions(
     return ask.page(
         "questions",
         status=status,
-        title=f"Questions to {folder.name}",
+        title=f"Questions about {folder.name}",
         room=room,
         questions=questions,
         signs=_list_signs(room),

@@ -229,7 +229,7 @@ class _Sheet:
             return
         at = int(np.setdiff1d(rows, own)[0]), column
         text = self._texts.get(at)
-        what = self._wrong.get(at) or (f"no number: {text[:30]!r}" if text else "empty")
+        what = self._wrong.get(at) or (f"not a number: {text[:30]!r}" if text else "empty")
         raise SubmissionError(f"{self._where} cell {_cell(*at)}: {name!r} is {what}")
 
     def _times(

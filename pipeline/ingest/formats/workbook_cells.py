@@ -383,7 +383,7 @@ class _Sheet:
                 self.cells.texts[at] = text
         else:  # "e" an error, "b" a truth value, "d" a date as text
             words = {"b": {"0": "FALSE", "1": "TRUE"}.get(value, value)}.get(self._kind, value)
-            self.cells.wrong[at] = f"no number: {words[:30]!r}"
+            self.cells.wrong[at] = f"not a number: {words[:30]!r}"
 
     def _merge(self, reference: str) -> None:
         first, _, last = reference.partition(":")

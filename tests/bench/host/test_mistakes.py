@@ -50,7 +50,7 @@ def test_a_run_in_which_nothing_moves_is_not_recorded(tmp_path):
     dead = ("--fault", "stuck=1@0", "--fault", "stuck=2@0")
     with emulator("--speed", "20", *dead) as bench:
         outcomes = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
-    assert [o.partial[:26] for o in outcomes] == ["no free cart moved: is one "] * 3
+    assert [o.partial[:27] for o in outcomes] == ["no free cart moved: is one "] * 3
     assert load_submission(work).experiments == ()
 
 
@@ -137,7 +137,7 @@ def test_a_new_submission_says_what_the_bench_does_not_know(tmp_path):
     assert prepare_submission(folder, bench, stock=False).authors == ()
     path = folder / "submission.toml"
     text = path.read_text(encoding="utf-8")
-    assert "springs = [true, true, true]  # check: wall-1, 1-2, 2-wall; false if" in text
+    assert "springs = [true, true, true]  # check: wall-1, 1-2, 2-wall; false for" in text
     path.write_text(re.sub(r"(?m)^#(?! )", "", text), encoding="utf-8")
     submission = load_submission(folder)
     assert [author.id for author in submission.authors] == ["s1024"]

@@ -522,7 +522,7 @@ def test_points_by_hand_are_not_asked_for_again():
     assert "Set by hand" in text
     assert "hand it in again" not in text
     told = json.loads(results_text(by_hand, rubric=RUBRIC, by_hand=True))["output"]
-    assert told.startswith("Could not be graded automatically, points were given by hand: ")
+    assert told.startswith("Could not be graded automatically, so points were given by hand: ")
 
 
 @pytest.mark.parametrize("grades", [[], [failed_grade("a", "broken")]])
