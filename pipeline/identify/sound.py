@@ -29,10 +29,10 @@ def identify_from_sound(
     bench: Bench,
     progress: Progress,
 ) -> tuple[Identified, list[LeftOut]]:
-    """Identify the carts; leave out records that the carts or repeats show to be wrong.
+    """Identify the carts; leave out records that contradict these carts or their own repeats.
 
-    Records with a constant reading are used only if the carts found from the other records confirm
-    it.
+    A record with a constant reading is used only if carts identified from the other records would
+    have this reading too.
     """
     driven = [r for r in data.records if r.kind in ("step", "sweep")]
     # Faults that input or encoder show by themselves stay, because later rounds do not see these

@@ -158,7 +158,7 @@ def test_the_exchange_finds_the_best_of_all_sets(mean):
 
 
 def test_the_goals_are_errors_of_what_they_name(known, analysis):
-    """The goal of a parameter is its relative standard error; `worst` is the largest of them."""
+    """A goal is a parameter's relative standard error; `worst` is the largest of these."""
     fitted = {name: e.std / e.value for name, e in analysis.fit.parameters.items()}
     for name in ("zeta_2", "K_1"):
         goal = find_goal(name, known, feedback=None)

@@ -31,7 +31,7 @@ def sample_times(count: int, interval: float) -> Array:
 def simulate(
     tables: Tables, t, u, *, x0=None, v0=None, free=None, refine=1.0, guided=None, knots=None
 ):
-    """Return the readings (n, samples) of one run with a single start."""
+    """Return the readings (n, samples) of one run, simulated from one initial state."""
     n = tables.cart.shape[0]
     x0, v0 = (np.zeros((1, n)) if one is None else np.array([one]) for one in (x0, v0))
     moving = [free is None or i + 1 in free for i in range(n)]

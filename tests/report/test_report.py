@@ -523,7 +523,7 @@ def test_a_poor_result_is_called_so(tmp_path):
     assert "±" not in text
     assert "K_1 (+23.4 %)" in text
     assert "1 of 2 checks failed" in text
-    assert "Record sine-04 again and longer" in text
+    assert "Record sine-04 again for a longer time" in text
     assert "Find out what the linear model misses" in text
 
 

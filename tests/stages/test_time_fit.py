@@ -100,7 +100,7 @@ def test_the_jacobian_is_that_of_the_misfit(zeta, at_rest):
 def test_a_band_limited_input_is_used_as_such():
     """If an input is declared band-limited, its response is computed to 1e-4 of the motion.
 
-    Read as held, it would not be.
+    If the input were treated as held between samples, the error would be larger.
     """
     chain, rng = PRESETS["throne-2dof"], np.random.default_rng(2)
     t = np.arange(600) / 113.0

@@ -167,7 +167,7 @@ def test_two_at_once_see_what_the_other_did(show):
                     window.get_by_role("link", name="team-04", exact=True).click()
                 signed(window, name)
                 with window.expect_navigation():
-                    window.get_by_role("link", name="The final table is one").click()
+                    window.get_by_role("link", name="The final table is possible").click()
             for name, window in windows.items():
                 number = {"Ada": "1", "Bob": "2"}[name]
                 window.get_by_label("Another number of points").fill(number)

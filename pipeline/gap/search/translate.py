@@ -40,7 +40,7 @@ def values_of(effect: Effect, columns: Mapping[IntEnum, float]) -> tuple[float, 
 def as_model(
     follow: Follow, *, springs: Sequence[bool], catalogue: Iterable[Effect], runs: Sequence[GapRun]
 ) -> GapModel:
-    """Return the model with the effects for these laws; richer effects are tried first."""
+    """Return the model whose effects express the laws found; richer effects are tried first."""
     by_size = sorted(catalogue, key=lambda effect: -len(filled(effect)))
     chain = follow.laws.chain(follow.p)
     candidates: list[Candidate] = []

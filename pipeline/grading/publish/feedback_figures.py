@@ -26,7 +26,7 @@ _LARGEST = 1e9  # largest gain and frequency in a figure; the reciprocal is the 
 
 
 def draw_figures(analysis: Analysis, reported: Reported | None) -> tuple[tuple[str, str], ...]:
-    """Return the measured response of each cart with the curve of the reported final table.
+    """Return the measured response of each cart with that computed from the final table.
 
     Each figure is a pair of file name and SVG text. The curve is left out if the table is
     incomplete or gives no valid response.
@@ -43,7 +43,8 @@ def draw_figures(analysis: Analysis, reported: Reported | None) -> tuple[tuple[s
                 reported=curve,
                 units=Page(analysis).units,
             )
-            told = "the curve of the reported final table" if curve else "no complete final table"
+            reported = "the response computed from the reported final table"
+            told = reported if curve else "no complete final table"
             alt = f"Measured frequency response of cart {response.cart}, its fit, and {told}."
             name = f"{_RESPONSE}-{response.cart}"
             drawn.append((f"{name}.svg", to_svg(figure, name=name, alt=alt)))

@@ -259,7 +259,7 @@ class EquationsOfMotion:
     def to_control(self) -> "control.NonlinearIOSystem":
         """Return the python-control system: input `u`, outputs `x1`, … as the sensors read them.
 
-        Its parameter `stop` is the time in s in which dry friction stops a slow cart.
+        Its parameter `stop`, in s, smooths dry friction: a cart near rest stops in about this time.
         """
         import control
 

@@ -34,8 +34,9 @@ class Simulated:
     Attributes
     ----------
     y : readings (n,), NaN where nothing is simulated.
-    nrmse : root mean square of measured minus simulated position, divided by that of the measured
-        position about its rest; both over the simulated samples.
+    nrmse : the error, divided by the motion. The error is the root mean square of measured minus
+        simulated position, the motion that of measured minus rest position. Both are taken over
+        the simulated samples.
     """
 
     model: ModelName
