@@ -78,8 +78,7 @@ def fit_bode(
     if data.size + data.n_phases <= len(P.names):
         raise DataError(
             f"Bode fit: {n} cart{'s'[: n > 1]} with {len(P.names)} parameters need more "
-            f"than {len(P.names)} amplitudes and phases in all, found {data.size} amplitudes and "
-            f"{data.n_phases} phases"
+            f"than {len(P.names)} amplitudes and phases, found {data.size} and {data.n_phases}"
         )
     known = {name: value for name, value in (initial or {}).items() if value > 0}
     like = _stand_in(data, known, bench=bench)
