@@ -43,8 +43,8 @@ def draw_figures(analysis: Analysis, reported: Reported | None) -> tuple[tuple[s
                 reported=curve,
                 units=Page(analysis).units,
             )
-            reported = "the response computed from the reported final table"
-            told = reported if curve else "no complete final table"
+            computed = "the response computed from the reported final table"
+            told = computed if curve else "no complete final table"
             alt = f"Measured frequency response of cart {response.cart}, its fit, and {told}."
             name = f"{_RESPONSE}-{response.cart}"
             drawn.append((f"{name}.svg", to_svg(figure, name=name, alt=alt)))

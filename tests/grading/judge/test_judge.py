@@ -331,5 +331,5 @@ def test_numbers_that_are_judged_loosely_are_said_to_be(hide, loosely):
     criteria = {c.id: c for c in student(1, hide=hide).grade().criteria}
     for name in ("final-gains", "final-frequencies", "final-dampings"):
         message = criteria[name].message
-        assert ("a person should look at these numbers" in message) is loosely
+        assert ("A person should look at these numbers" in message) is loosely
         assert ("Your values agree with your own recordings." in message) is not loosely
