@@ -20,7 +20,8 @@ def _toml(value: Value) -> str:
     if isinstance(value, TypedNumber):
         return value
     if isinstance(value, str | bool):
-        return json.dumps(value, ensure_ascii=False)  # valid in TOML as well
+        # JSON's text is valid in TOML too, except that TOML escapes the delete character.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
     if isinstance(value, Sequence):
