@@ -69,6 +69,8 @@ def test_a_signal_that_ends_the_desk_is_named(name, tmp_path):
 
     The log also says when the desk started.
     """
+    if signal.getsignal(getattr(signal, name)) is signal.SIG_IGN:
+        pytest.skip(f"the tests were started with {name} ignored, as by nohup")
     with a_desk(tmp_path) as (desk, url, ended):
         desk.send_signal(getattr(signal, name))
         status, said, kept = ended()
