@@ -289,6 +289,20 @@ def test_the_same_analysis_gives_the_same_bytes(folders, tmp_path):
         assert path.read_bytes() == again.read_bytes(), path.name
 
 
+def test_an_interrupted_report_leaves_the_earlier_one_whole(tmp_path, monkeypatch):
+    """Ctrl-C while a report is made leaves every file of the earlier report as it was."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    render_report(make_analysis(1), tmp_path)
+    before = {path: path.read_bytes() for path in sorted(tmp_path.rglob("*.*"))}
+    monkeypatch.setattr("pipeline.report.render.write.print_pages", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        render_report(make_analysis(2), tmp_path)
+    assert {path: path.read_bytes() for path in sorted(tmp_path.rglob("*.*"))} == before
+
+
 def test_the_pdf_is_archival_and_navigable(folders):
     """The PDF follows PDF/A-2a and PDF/UA-1 and has bookmarks, title, authors and page numbers."""
     reader = pypdf.PdfReader(folders[3] / "report.pdf")

@@ -54,14 +54,15 @@ def make_report(
     analysis, gap = with_gap(analyse(submission, progress=progress), submission.folder)
     changes = compared(analysis)
     out.mkdir(parents=True, exist_ok=True)
+    tables = own_folder(out, "tables")
+    render_report(analysis, out, gap=gap, changes=changes, files=files, progress=progress)
     write_file(out / "results.json", json_text(analysis))
     clear_files(out, "results.mat")  # left by an earlier report
-    clear_files(own_folder(out, "tables"), "*.csv")
+    clear_files(tables, "*.csv")
     if files.tables:
         from pipeline.exchange.saved import save_tables  # imported late, because it loads pandas
 
         save_tables(analysis, out)
-    render_report(analysis, out, gap=gap, changes=changes, files=files, progress=progress)
     return analysis, changes
 
 
@@ -84,10 +85,10 @@ def render_report(
         analysis = replace(analysis, warnings=(*analysis.warnings, warning))
         progress(warning)
     document = build_document(analysis, gap=gap, changes=changes, progress=progress)
-    clear_files(out, PLOTS)  # left by an earlier report
     if files.plots:
         document = replace(document, plots=PLOTS)
     write_document(document, out, name="report", pdf=files.pdf)
+    clear_files(out, PLOTS)  # left by an earlier report
     if files.plots:
         from pipeline.report.plots.page import write_plots  # loads the catalogue of effects
 

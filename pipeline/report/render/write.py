@@ -11,16 +11,23 @@ from pipeline.report.render.pdf import lay_out, print_pages
 
 
 def write_document(document: Document, out: Path, *, name: str, pdf: bool) -> None:
-    """Write a document as `name.html`, `name.pdf` and `figures/*.svg` into the folder `out`."""
+    """Write a document as `name.html`, `name.pdf` and `figures/*.svg` into the folder `out`.
+
+    Everything is made before the first file is written: an interrupted run leaves an earlier
+    document complete.
+    """
     figures = own_folder(out, "figures")
+    with ThreadPoolExecutor(max_workers=1) as beside:  # typst runs without the interpreter's lock
+        layout = beside.submit(lay_out, document) if pdf else None
+        drawn = {f"{picture.name}.svg": plain_svg(picture.svg) for picture in document.pictures()}
+        printed = beside.submit(lambda: print_pages(document, layout.result())) if layout else None
+        html = render_html(document)
+        pages = printed.result() if printed else None
     figures.mkdir(parents=True, exist_ok=True)
     clear_files(figures, "*.svg")
     clear_files(out, f"{name}.pdf")
-    with ThreadPoolExecutor(max_workers=1) as beside:  # typst runs without the interpreter's lock
-        layout = beside.submit(lay_out, document) if pdf else None
-        for picture in document.pictures():
-            write_file(figures / f"{picture.name}.svg", plain_svg(picture.svg))
-        printed = beside.submit(lambda: print_pages(document, layout.result())) if layout else None
-        write_file(out / f"{name}.html", render_html(document))
-        if printed:
-            write_file(out / f"{name}.pdf", printed.result())
+    for file, svg in drawn.items():
+        write_file(figures / file, svg)
+    write_file(out / f"{name}.html", html)
+    if pages:
+        write_file(out / f"{name}.pdf", pages)
