@@ -1,1 +1,1 @@
-"""Grading one submission: rubric, checks against the student's own data, named mistakes."""
+"""Grade lab submissions, one at a time or a whole class."""

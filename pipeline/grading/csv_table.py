@@ -1,4 +1,4 @@
-"""Read CSV tables that learning platforms and people write."""
+"""Read CSV tables written by learning platforms or by people."""
 
 import csv
 import io
@@ -17,12 +17,13 @@ _MOST_ROWS, _MOST_COLUMNS = 100_000, 2_000  # more than any class or questionnai
 def read_table(path: Path) -> "pd.DataFrame":
     """Return the cells of a CSV file as text, one row per record.
 
-    The index is the line of the file on which the row ends. Separators are commas, semicolons or
-    tabs. Empty rows are left out, short rows are padded, and cells beyond the heading are dropped.
+    The index of a row is the line of the file on which the row ends. Separators are commas,
+    semicolons or tabs. Empty rows are left out, short rows are padded with empty cells, and cells
+    beyond the heading are dropped.
 
     Raises
     ------
-    ConfigError : the file is not such a table, or it is too large.
+    ConfigError : the file cannot be read, is not a CSV table, or is too large.
     """
     import pandas as pd
 
@@ -35,7 +36,7 @@ def read_table(path: Path) -> "pd.DataFrame":
     except UnicodeDecodeError:
         raise ConfigError(f"{path.name}: is not UTF-8 text; save it as CSV UTF-8") from None
     delimiter = max(",;\t", key=text.partition("\n")[0].count)
-    # Messages need the line of each row, which the reader of pandas does not report.
+    # Messages need the line of each row, which pandas' own reader does not report.
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
     head: list[str] = []
     rows: dict[int, list[str]] = {}

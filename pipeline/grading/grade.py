@@ -42,7 +42,8 @@ class GradeTable(BaseModel):
 class Criterion(GradeTable):
     """The result of one criterion.
 
-    The outcome is `skip` if a criterion that it depends on failed, or if nothing could be judged.
+    The outcome is `skip` if the criterion depends on another one that failed, or if nothing could
+    be judged.
     """
 
     id: str
@@ -51,17 +52,17 @@ class Criterion(GradeTable):
     points: float
     out_of: float
     message: str
-    expected: Annotated[Values, Field(description="by parameter or entry")]
-    found: Annotated[Values, Field(description="by parameter or entry")]
+    expected: Annotated[Values, Field(description="expected values, by name")]
+    found: Annotated[Values, Field(description="values in the submission, by name")]
 
 
 class Flag(GradeTable):
-    """A named mistake, with its place and the evidence for it."""
+    """A mistake that the grader names, with its place and evidence."""
 
     code: Code
     parameters: Annotated[
         tuple[str, ...],
-        Field(description="the numbers it explains, the missing items, or the runs concerned"),
+        Field(description="numbers that the mistake explains, missing items, or runs concerned"),
     ]
     message: str
     evidence: Values
@@ -82,26 +83,28 @@ class Grade(GradeTable):
 
     schema_: Annotated[Literal["cartlab-grade/1"], Field(alias="schema")] = "cartlab-grade/1"
     submission: str
-    authors: Annotated[tuple[str, ...], Field(description="none if names are left out")]
+    authors: Annotated[tuple[str, ...], Field(description="empty if names are left out")]
     status: Literal["graded", "failed"]
     points: float
     out_of: float
     days_late: float = 0.0
     deducted: Annotated[
-        float, Field(description="for lateness, already subtracted from `points`")
+        float, Field(description="deduction for lateness, already subtracted from `points`")
     ] = 0.0
     reason: Annotated[
-        str, Field(description="why it could not be graded, one line per reason, or empty")
+        str,
+        Field(description="why the submission could not be graded, one line per reason, or empty"),
     ] = ""
     criteria: tuple[Criterion, ...] = ()
     flags: tuple[Flag, ...] = ()
     notes: tuple[str, ...] = ()
     units: Annotated[
-        Units | None, Field(description="of the numbers in the criteria; none if not judged")
+        Units | None,
+        Field(description="units of the numbers in the criteria; null if nothing was judged"),
     ] = None
     springs: Annotated[
         tuple[str, ...],
-        Field(description="that the recordings need and the rubric lacks"),
+        Field(description="springs that the recordings need and the rubric lacks"),
     ] = ()
     overrides: tuple[GradeOverride, ...] = ()
 
@@ -127,7 +130,7 @@ class Grade(GradeTable):
         )
 
     def with_flags(self, *flags: Flag) -> "Grade":
-        """Return the grade with further flags; all flags are sorted by the order of `Code`."""
+        """Return the grade with further flags; all flags are sorted in the order of `Code`."""
         together = sorted((*self.flags, *flags), key=lambda flag: CODES.index(flag.code))
         return self.model_copy(update={"flags": tuple(together)})
 

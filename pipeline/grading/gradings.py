@@ -15,15 +15,16 @@ class Member:
 
     Attributes
     ----------
-    submission : its id, unique in the batch.
-    owner : the account that submitted it, as the learning platform names it, or "".
+    submission : id of the submission, unique in the batch.
+    owner : account on the learning platform that submitted the files, such as "Jane Doe (moodle
+        1024)", or "".
     key : hash of everything that affects the grade (submitted files, rubric, code, name and
         lateness), a hyphen, and the hash of the files alone.
-    fingerprints : noise patterns of its recordings, to find them in other submissions; see
-        `shared.py`.
-    reason : why it could not be graded, in one line, or "".
-    grading : the number of its grading in the gradebook.
-    of_class : whether it belongs to the assignment being graded.
+    fingerprints : noise patterns of the recordings, by which copies are found; see
+        `similarity.prints`.
+    reason : why the submission could not be graded, one cause per line, or "".
+    grading : number of the grading in the gradebook.
+    of_class : whether the submission belongs to the assignment that is being graded.
     """
 
     submission: str
@@ -37,7 +38,7 @@ class Member:
 
     @cached_property
     def people(self) -> set[str]:
-        """The authors, with ids in a normal form."""
+        """The authors' ids in a normal form; see `person`."""
         return set(map(person, self.authors))
 
     @property
@@ -48,17 +49,17 @@ class Member:
 
 @dataclass(frozen=True, kw_only=True)
 class Grading(Member):
-    """The result of one submission, before it is compared with the others.
+    """The result of grading one submission, before it is compared with the others.
 
     Attributes
     ----------
     status : `failed` if it could not be graded.
-    settled : False if a limit or a crash ended the grading; the next run tries again.
-    grade : text of `grade.json`, without shared data and overrides.
+    settled : False if the next run must grade the submission again, for example after a crash.
+    grade : text of `grade.json`, without the flag for shared data and without overrides.
     findings : results of the checks, as `judge.reweigh` stores them; "" if grading failed.
-    figures : file names and SVG texts for the feedback.
+    figures : file name and SVG text of each figure in the feedback.
     detail : for developers: the traceback of an error in the grader, or "".
-    is_disk_full : the disk was full. This concerns only this run; the gradebook does not keep it.
+    is_disk_full : whether the disk was full; the gradebook does not store this.
     """
 
     status: Literal["graded", "failed"]
@@ -82,9 +83,9 @@ def person(author: str) -> str:
 
 
 def go_with(given: tuple[str, ...], authors: tuple[str, ...]) -> bool:
-    """Return whether points given to some people still apply to a submission of these authors.
+    """Return whether points given to the people `given` apply to a submission of `authors`.
 
-    A submission that cannot be read has no authors. Then points given under its name apply.
+    A submission that cannot be read has no authors. Points given under its name then apply.
     """
     if not authors or not given:
         return True
@@ -97,12 +98,12 @@ class Batch:
 
     Attributes
     ----------
-    keys : of the gradings, in the order of the submissions' ids.
-    shared : by submission, the flag for recordings that another submission also contains.
-    failed : submission and reason, for those that could not be graded.
-    unsettled : number of failed submissions that the next run tries again.
-    is_disk_full : number of submissions that failed because the disk was full.
-    kept, moved, taken_over : changes since the last class list; see `so_far.SoFar`.
+    keys : keys of the gradings, in the order of the submission ids.
+    shared : flag for recordings that another submission also contains, by submission.
+    failed : name and reason for each submission that could not be graded.
+    unsettled : failed submissions that the next run grades again.
+    is_disk_full : submissions that failed because the disk was full.
+    kept, moved, taken_over : changes to the class list; see `so_far.SoFar`.
     """
 
     keys: tuple[str, ...]

@@ -1,1 +1,1 @@
-"""A zip that makes Gradescope grade each submission when it is uploaded."""
+"""Make Gradescope grade each submission with cartlab when a student uploads it."""

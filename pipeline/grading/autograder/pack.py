@@ -1,7 +1,7 @@
 """Write the zip that Gradescope builds an autograder from.
 
-The zip contains the source files of cartlab. Gradescope's machines can install packages from the
-index, but cartlab is not there; and plain files need no build tool on the instructor's computer.
+The zip contains cartlab's source files, because Gradescope's machines cannot install cartlab from
+the package index. Source files also need no build tool on the instructor's computer.
 """
 
 import io
@@ -22,20 +22,20 @@ from pipeline.output import write_file
 from pipeline.resources import TEMPLATES
 
 _SCRIPTS = TEMPLATES / "gradescope"
-_FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # so that the same files give the same bytes
+_FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # a fixed time, so that the same files give the same zip
 _PROGRAM, _FILE = 0o100755 << 16, 0o100644 << 16  # file modes, in the format of zip files
 
 
 def write_autograder(rubric_file: Path, out: Path) -> tuple[str, ...]:
-    """Write the zip; return what the instructor must do on Gradescope's side.
+    """Write the zip; return the instructor's next steps on Gradescope, one phrase each.
 
     Parameters
     ----------
-    rubric_file : a file, or the name of a shipped rubric.
+    rubric_file : path of a rubric, or the name of a rubric that comes with cartlab.
 
     Raises
     ------
-    ConfigError : the rubric has mistakes, or `out` is no name for a zip file.
+    ConfigError : the rubric is not valid, or `out` is a folder or does not end in `.zip`.
     """
     if out.suffix.lower() != ".zip" or out.is_dir():
         raise ConfigError(f"{out}: an autograder is one zip file; name it with --out")
@@ -55,12 +55,12 @@ def write_autograder(rubric_file: Path, out: Path) -> tuple[str, ...]:
 
 
 def _files(text: str, rubric: Rubric) -> Iterator[tuple[str, bytes]]:
-    """Yield name and content of each file in the zip."""
+    """Yield the name and content of each file in the zip."""
     for script in _SCRIPTS.iterdir():
         yield (
             script.name,
             script.read_bytes().replace(b"\r\n", b"\n"),
-        )  # bash refuses line ends with \r
+        )  # bash cannot read Windows line ends
     yield "python-version", f"{sys.version_info.major}.{sys.version_info.minor}\n".encode()
     head = f"# cartlab {pipeline.__version__} was installed with:"
     yield "requirements.txt", "\n".join([head, *pin_requirements(), ""]).encode()

@@ -1,4 +1,4 @@
-"""List the installed versions of all packages that cartlab needs, as a `requirements.txt`."""
+"""List the installed versions of all packages that cartlab needs, for a `requirements.txt`."""
 
 import importlib.metadata as installed
 from collections.abc import Set
@@ -10,7 +10,7 @@ from packaging.version import Version
 
 from pipeline.errors import ConfigError
 
-# The environment of Gradescope's machines, even if this computer runs another system.
+# Gradescope's machines run Linux; this computer may run another system.
 _LINUX: dict[str, str | Set[str]] = {
     "os_name": "posix",
     "sys_platform": "linux",
@@ -20,14 +20,14 @@ _LINUX: dict[str, str | Set[str]] = {
 
 
 def pin_requirements(package: str = "cartlab") -> list[str]:
-    """Return `name==version` of a package's requirements on Linux, direct and indirect, sorted.
+    """Return `name==version` for each direct and indirect requirement of a package on Linux.
 
-    A package that is needed only on Linux is left out if this computer does not have it. On Linux,
-    pip then chooses its version.
+    A requirement that is not installed on this computer is left out. On Gradescope, pip then
+    chooses its version.
 
     Raises
     ------
-    ConfigError : the package itself is not installed.
+    ConfigError : `package` is not installed.
     """
     pinned: dict[str, str] = {}
     seen: set[tuple[str, str]] = set()

@@ -1,6 +1,6 @@
-"""Grade the submission in a Gradescope container: the script `run_autograder` calls this.
+"""Grade the submission in a Gradescope container; the script `run_autograder` runs this module.
 
-The folder names below the root are those of Gradescope's *Autograder Specifications*.
+Gradescope's *Autograder Specifications* prescribe the names of the folders.
 """
 
 import sys
@@ -27,7 +27,7 @@ def grade_upload(root: Path) -> str:
         setup = Setup(rubric=rubric, scratch=Path(scratch), time_limit=_TIME_LIMIT)
         grader = Grader(setup)
         try:
-            # Gradescope itself deducts for lateness, because it knows the extensions.
+            # The task has no lateness: Gradescope knows the extensions and deducts points itself.
             task = Task(id="submission", key="", sources=(str(root / "submission"),))
             grading = grader.run(task)
         finally:

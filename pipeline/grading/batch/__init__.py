@@ -1,1 +1,1 @@
-"""Grade a whole class: workers, isolation, cluster."""
+"""Grade a whole class, on this machine or on a cluster."""

@@ -1,7 +1,7 @@
-"""Run the grading tasks on a Dask cluster; submissions are sent with the tasks.
+"""Run grading tasks on a Dask cluster; each task carries the submitted files.
 
-Each Dask worker keeps worker processes, as a single machine does (`runner.Grader`). A submission
-that crashes or hangs ends one of these processes, never the Dask worker.
+Each Dask worker starts separate grading processes (`runner.Grader`). A submission that crashes or
+hangs ends only its grading process, not the Dask worker.
 """
 
 import tempfile
@@ -22,22 +22,22 @@ from pipeline.grading.gradings import Grading
 from pipeline.grading.intake.files import packed, unpacked
 
 _CONNECT_LIMIT = 20  # s
-_AHEAD = 2  # tasks sent ahead for each thread: threads never wait, and memory use stays small
+_AHEAD = 2  # tasks under way per thread: enough to keep threads busy, without using much memory
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
 def run_on(address: str) -> Executor:
-    """Return a function that runs tasks on the cluster of a Dask scheduler.
+    """Return a function that runs grading tasks on a Dask cluster.
 
     Parameters
     ----------
-    address : of the scheduler, `tcp://HOST:PORT` or `tls://HOST:PORT`.
+    address : address of the cluster's scheduler, `tcp://HOST:PORT` or `tls://HOST:PORT`.
 
     Raises
     ------
-    ConfigError : the address is on another machine and not encrypted (a scheduler runs any code
-        that it receives), nobody answers, certificates are missing, or the cluster runs another
-        version.
+    ConfigError : the address is not valid, belongs to another machine but has no encryption, or
+        needs certificates that are missing. The returned function raises it if no scheduler or
+        worker answers, or if the cluster runs another version of cartlab.
     """
     parts = urlsplit(address)
     if parts.scheme not in ("tcp", "tls") or not parts.hostname:
@@ -81,14 +81,14 @@ class Graders(WorkerPlugin):
         self._code = code_version()
 
     def setup(self, worker: DaskWorker) -> None:
-        """Make a folder for submissions; each process starts when a task needs it."""
+        """Make a folder for submissions; grading processes start later, when tasks need them."""
         self._folder = tempfile.TemporaryDirectory(prefix="cartlab-", ignore_cleanup_errors=True)
         self._idle: SimpleQueue[Grader] = SimpleQueue()
         self._all: list[Grader] = []
         self.same_code = self._code == code_version()
 
     def teardown(self, worker: DaskWorker) -> None:
-        """End the grading processes."""
+        """End the grading processes and remove the folder."""
         for process in self._all:
             process.close()
         self._folder.cleanup()
@@ -111,7 +111,7 @@ class Graders(WorkerPlugin):
 
 
 def _grade(task: Task, archive: bytes, plugin: str) -> Grading:
-    """Grade a task; this function runs on a Dask worker, whose plugin grades it."""
+    """Grade a task on a Dask worker, with the plugin `Graders` of that worker."""
     graders = get_worker().plugins[plugin]
     assert isinstance(graders, Graders)
     if not graders.same_code:
@@ -120,7 +120,7 @@ def _grade(task: Task, archive: bytes, plugin: str) -> Grading:
 
 
 def _threads(client: Client) -> int:
-    """Return how many tasks the cluster can run at once now; workers may come and go."""
+    """Return how many tasks the cluster can run at once; this changes as workers come and go."""
     workers = client.scheduler_info(n_workers=-1)["workers"]
     return sum(worker["nthreads"] for worker in workers.values())
 
@@ -128,7 +128,10 @@ def _threads(client: Client) -> int:
 def _grade_all(
     client: Client, tasks: Sequence[Task], *, graders: str, out_of: float
 ) -> Iterator[Grading]:
-    """Yield each outcome when it is ready; if a worker is lost, Dask moves its tasks to another."""
+    """Yield each outcome when it is ready;
+
+    Dask repeats the tasks of a lost worker on another one.
+    """
     waiting = list(reversed(tasks))
     under_way: dict[str, Task] = {}
     answers = as_completed(loop=client.loop)

@@ -31,21 +31,21 @@ from pipeline.submission.load import NAME
 from pipeline.words.numbers import count, listing
 
 _SCRATCH = re.compile(r"\.scratch(-\d+)?")
-_NAMED = 8  # submissions named in one message
+_NAMED = 8  # most submissions named in one message
 
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """The counts of a run and its messages.
+    """The counts and messages of a run of `cartlab grade`.
 
     Attributes
     ----------
-    failed : submission and reason, for those that could not be graded.
-    sharing : number of submissions with recordings that another one also contains.
-    unsettled : number of failed submissions that the next run tries again.
+    failed : name and reason for each submission that could not be graded.
+    sharing : number of submissions that contain the same recordings as another one.
+    unsettled : number of failed submissions that the next run grades again.
     is_disk_full : number of submissions that failed because the disk was full.
-    remarks : further messages for the command line.
-    changes : differences from the last class list.
+    remarks : other messages for the command line.
+    changes : differences from the previous class list, one phrase each.
     """
 
     total: int
@@ -58,7 +58,7 @@ class Summary:
 
     @property
     def counted(self) -> str:
-        """Sentence with the counts."""
+        """The counts in words, such as `12 of 13 graded`."""
         shared = (
             f", {self.sharing} with recordings that another submission also contains"
             if self.sharing
@@ -69,18 +69,19 @@ class Summary:
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options for grading a class.
+    """Options of `cartlab grade`.
 
     Attributes
     ----------
-    jobs : processes on this machine.
-    cluster : address of a Dask scheduler, used instead of `jobs`.
-    time_limit : for each submission, in s.
-    memory_limit : for each submission, in bytes.
-    figures : draw the figures of the feedback.
-    anonymous : leave names out of all files; a rubric may also require this.
-    gradebook : a database URL; default: `gradebook.sqlite` in the output folder.
-    lateness : path of a table of late submissions.
+    jobs : number of grading processes on this machine.
+    cluster : address of a Dask scheduler, whose cluster then grades instead of this machine.
+    time_limit : time limit for one submission, in s.
+    memory_limit : memory limit for one submission, in bytes.
+    figures : whether to draw figures for the feedback.
+    anonymous : whether to leave names out of all files; a rubric may also require this.
+    gradebook : file or database URL of the gradebook; default: `gradebook.sqlite` in the output
+        folder.
+    lateness : path of a table with the days late of each submission.
     """
 
     jobs: int = 1
@@ -93,7 +94,7 @@ class Options:
     lateness: Path | None = None
 
     def setup(self, rubric: Rubric, *, scratch: Path) -> Setup:
-        """Return the options that concern the grading of each submission."""
+        """Return the settings that are passed to the grading processes."""
         return Setup(
             rubric=rubric,
             scratch=scratch,
@@ -115,8 +116,8 @@ def grade_class(
 
     Raises
     ------
-    ConfigError : the rubric, the late table, a path, the folder or the cluster cannot be used; the
-        folder holds another class; or another run is writing there.
+    ConfigError : the rubric, the late table, a path, the folder `out` or the cluster cannot be
+        used; `out` holds another class; or another run is writing into `out`.
     """
     rubric = load_rubric(rubric_file)
     late_table = read_late_table(options.lateness) if options.lateness else {}
@@ -130,8 +131,7 @@ def grade_class(
         passed: list[str] = []
         found = find_hand_ins(paths, scratch=scratch, skip=[out], known=known, say=passed.append)
         hand_ins, unknown = settle_lateness(found, late=rubric.late, table=late_table)
-        # The rubric's file name identifies the assignment, because its title may be corrected
-        # later.
+        # The file name of the rubric identifies the assignment, because the title may change later.
         with Gradebook(place, assignment=rubric_file.stem, create=True) as book:
             shown = _pseudonyms(book) if hidden else str
             batch = grade_batch(
@@ -156,7 +156,7 @@ def grade_class(
             doubles = write_outputs(book, out, progress=lambda what: progress(total, total, what))
     return Summary(
         total=total,
-        failed=tuple(sorted(failed)),  # sorted, because the order of grading would reveal the names
+        failed=tuple(sorted(failed)),  # sorted, so that their order does not reveal hidden names
         sharing=len(batch.shared),
         unsettled=len(batch.unsettled),
         is_disk_full=len(batch.is_disk_full),
@@ -166,7 +166,7 @@ def grade_class(
 
 
 def _refuse_submission(out: Path) -> None:
-    """Refuse to write into the folder of a submission, because that would change the submission."""
+    """Raise a ConfigError if `out` is inside a submission, which the output would change."""
     for folder in (out.resolve(), *out.resolve().parents):
         if (folder / NAME).is_file():
             raise ConfigError(
@@ -175,7 +175,7 @@ def _refuse_submission(out: Path) -> None:
 
 
 def _refuse_another_class(out: Path, *, assignment: str) -> None:
-    """Refuse to overwrite a class of another rubric, because its overrides would be lost."""
+    """Raise a ConfigError if `out` holds another class, whose points by hand would be lost."""
     try:
         with Gradebook(out) as book:
             before = book.assignment
@@ -190,7 +190,10 @@ def _refuse_another_class(out: Path, *, assignment: str) -> None:
 
 
 def _pseudonyms(book: Gradebook) -> Callable[[str], str]:
-    """Return a function from names to pseudonyms; call it only after the class list is stored."""
+    """Return a function that turns names into pseudonyms.
+
+    When it is first called, it reads the class list, which must have been stored before.
+    """
     names = cache(lambda: pseudonyms_in(book))
     return lambda name: names().get(name, STRANGER)
 
@@ -248,7 +251,7 @@ def _names(names: Sequence[str]) -> str:
 
 
 def _names_so_far(place: Path | str, *, assignment: str) -> list[str]:
-    """Return the submissions of the current class list; if there is no gradebook, create none."""
+    """Return the names on the current class list, or no names if there is no gradebook."""
     try:
         with Gradebook(place, assignment=assignment) as book:
             return [member.submission for member in book.listed()]
@@ -267,15 +270,15 @@ def _executor(options: Options) -> Executor:
 
 
 def _example_prints(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:
-    """Yield fingerprints of recordings that several teams may use: those of example submissions.
+    """Yield the fingerprints of example recordings, which several teams may submit.
 
-    These are the rubric's own examples, and the examples of cartlab with the same number of carts.
+    The examples are those of the rubric, and those of cartlab with the rubric's number of carts.
 
     Raises
     ------
     ConfigError : an example of the rubric cannot be read.
     """
-    from pipeline.ingest.read import read_data  # loads all readers of files
+    from pipeline.ingest.read import read_data  # imported late: it loads all file readers
 
     for example in rubric.examples:
         try:
@@ -296,7 +299,7 @@ def _example_prints(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:
 def scratch_in(out: Path) -> Iterator[Path]:
     """Make a scratch folder and remove it at the end; the caller must hold the lock of `out`.
 
-    Scratch folders that stopped runs left in `out` are removed first.
+    Scratch folders left over from interrupted runs are removed first.
     """
     for left in sorted(out.iterdir()):
         if _SCRATCH.fullmatch(left.name) and left.is_dir() and not left.is_symlink():

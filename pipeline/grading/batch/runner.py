@@ -39,19 +39,20 @@ def grade_batch(
     examples: Callable[[], Iterable[bytes]] = tuple,
     progress: Progress = silent,
 ) -> Batch:
-    """Grade the submissions that the gradebook does not know; store each outcome at once.
+    """Grade the submissions that are new to the gradebook, and store each outcome at once.
 
-    Recordings are compared across the whole class that the gradebook lists. So submissions that are
-    not in `hand_ins` keep their grades, and their recordings are compared too.
+    The recordings of the whole class are compared. Submissions on the class list that are not in
+    `hand_ins` keep their grades and are compared too.
 
-    A run that is stopped and started again gives the same result.
+    A run that is interrupted and started again gives the same result.
 
     Parameters
     ----------
-    execute : runs the tasks: `run_here(jobs=…)` or `cluster.run_on(address)`.
-    examples : returns the fingerprints of recordings given out with the assignment; called only if
-        submissions share recordings.
-    progress : called with the number done, the total, and the last submission done.
+    execute : function that runs the tasks: `run_here(jobs=…)` or `cluster.run_on(address)`.
+    examples : function that returns the fingerprints of recordings handed out with the assignment;
+        it is called only if submissions share recordings.
+    progress : function that is called with the number of submissions done, the total, and the last
+        submission or step.
     """
     rows, new = _known_and_new(hand_ins, setup=setup, book=book)
     unsettled, no_room = set[str](), set[str]()
@@ -84,9 +85,9 @@ def grade_batch(
 def _known_and_new(
     hand_ins: Sequence[HandIn], *, setup: Setup, book: Gradebook
 ) -> tuple[dict[str, Member], list[Task]]:
-    """Split the hand-ins into known outcomes and tasks that must run.
+    """Return the known outcomes by submission, and the tasks that must run.
 
-    A hand-in that cannot be opened is stored as failed. It counts as known.
+    A hand-in that cannot be opened is stored as failed and counts as known.
     """
     basis = code_version(), setup.rubric.model_dump_json(), setup.figures
     rows, new = {}, []
@@ -110,8 +111,7 @@ def run_here(*, jobs: int) -> Executor:
         waiting: queue.SimpleQueue[Task] = queue.SimpleQueue()
         for task in tasks:
             waiting.put(task)
-        # A short queue: each worker waits until its last outcome is stored, so memory use stays
-        # flat.
+        # With a short queue, workers wait until outcomes are stored, and memory use stays flat.
         answers: queue.Queue[Grading | Exception] = queue.Queue(maxsize=jobs)
         stop = threading.Event()
         graders = [Grader(setup) for _ in range(min(jobs, len(tasks)))]
@@ -136,7 +136,7 @@ def run_here(*, jobs: int) -> Executor:
 
 
 class Grader:
-    """A grading process; if it crashes or exceeds a limit, the submission gets a failed outcome."""
+    """A grading process; a submission that crashes it or exceeds a limit gets a failed outcome."""
 
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
@@ -149,7 +149,7 @@ class Grader:
         self._process = Supervisor(module, memory=setup.memory_limit, setup=given)
 
     def run(self, task: Task, *, stop: threading.Event | None = None) -> Grading:
-        """Return the outcome of a task.
+        """Run a task and return its outcome.
 
         Raises
         ------
@@ -204,15 +204,15 @@ def _work(
             return grader.close()
         try:
             answers.put(grader.run(task, stop=stop))
-        except Exception as error:  # the thread that collects the outcomes raises it again
+        except Exception as error:  # raised again in the thread that collects the outcomes
             answers.put(error)
             return
 
 
 def code_version() -> str:
-    """Return a hash of code, texts and library versions.
+    """Return a hash of cartlab's code and texts and of library versions.
 
-    It changes whenever a grade might change.
+    The hash changes whenever a grade might change.
     """
     root = Path(pipeline.__file__).parent
     computes_with = (f"{name} {version(name)}" for name in ("numpy", "scipy", "h5py"))
@@ -226,7 +226,7 @@ def code_version() -> str:
 def _task(hand_in: HandIn, *, basis: tuple[str, str, bool]) -> Task:
     """Return the task that grades a hand-in.
 
-    Its key is a hash of everything that affects the outcome.
+    The task's key is a hash of everything that affects the outcome.
     """
     files = digest(hand_in.sources)
     plain = asdict(hand_in) | {"sources": files}
@@ -245,14 +245,14 @@ def _task(hand_in: HandIn, *, basis: tuple[str, str, bool]) -> Task:
 def _shared(
     rows: Sequence[Member], book: Gradebook, *, examples: Callable[[], Iterable[bytes]]
 ) -> dict[str, Flag]:
-    """Return a flag for each submission of the batch that shares recordings with another one.
+    """Return a flag for each submission in `rows` that shares recordings with another submission.
 
-    The other one may be in this batch or in an earlier one.
+    The other submission may be in an earlier batch.
     """
     batch = [row for row in rows if row.fingerprints]
     names = {prints.submission: prints for prints in batch}
-    # Earlier gradings of the same data by the same team under another name are left out: a team may
-    # rename its submission.
+    # Earlier submissions of the same recordings by the same authors are left out, because a team
+    # may rename its submission.
     here = {(prints.authors, prints.fingerprints) for prints in batch}
     earlier = [
         prints
@@ -268,10 +268,10 @@ def _shared(
 
 
 def _is_before(earlier: Member, now: Member | None) -> bool:
-    """Return whether `earlier` is an earlier version of `now`, so that sharing data is no copying.
+    """Return whether `earlier` is an earlier version of the submission `now`.
 
-    It is one if the team is the same. Within the same assignment, the same recordings are enough,
-    because authors may have corrected their ids.
+    It is if the teams are the same. Within one assignment, the same recordings are enough, because
+    authors may have corrected their ids. Shared recordings are then not a sign of copying.
     """
     if now is None:
         return False

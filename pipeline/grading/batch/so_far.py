@@ -1,7 +1,7 @@
-"""Compare a run with the current class list: which submissions are unchanged, renamed or replaced?
+"""Compare a run with the current class list: which submissions are missing, renamed or replaced?
 
-A name does not identify a submission: the person who packs a folder chooses its name, and equal
-names are extended. So a submission is also recognised by its account number on the learning
+A name alone does not identify a submission, because whoever packs a folder chooses its name, and
+cartlab extends equal names. A submission is also recognised by its account number on the learning
 platform, its files, its authors and their recordings.
 """
 
@@ -20,10 +20,10 @@ class SoFar:
 
     Attributes
     ----------
-    kept : submissions of the list that are not in this run.
-    moved : for each renamed submission, its old and its new name.
-    taken_over : (submission, authors before, authors now), for names that now belong to other
-        people; these people do not inherit points given by hand.
+    kept : submissions on the class list that are not in this run, by name.
+    moved : new name of each renamed submission, by old name.
+    taken_over : for each name that now belongs to other people: the name, the authors before, and
+        the authors now. Points given by hand do not pass to the new authors.
     """
 
     kept: Mapping[str, Member]
@@ -43,7 +43,7 @@ def class_so_far(rows: Mapping[str, Member], book: Gradebook) -> SoFar:
             left[line.submission] = line
         else:
             del new[name]
-            if name != line.submission:  # for example, if only the capitals differ
+            if name != line.submission:  # the names differ only in upper and lower case
                 moved[line.submission] = name
     before = {one.submission: one for one in book.prints([one.grading for one in left.values()])}
     moved |= _matched(before, new)
@@ -60,7 +60,7 @@ def class_so_far(rows: Mapping[str, Member], book: Gradebook) -> SoFar:
 
 
 def _others(before: Member, now: Member) -> bool:
-    """Return whether a submission now has another team (False if authors are unknown)."""
+    """Return whether a submission now has another team; False if authors are unknown."""
     return _strangers(before, now) and not same_number(before.owner, now.owner)
 
 
@@ -71,7 +71,7 @@ def _strangers(before: Member, now: Member) -> bool:
 def _matched(before: Mapping[str, Member], now: Mapping[str, Member]) -> dict[str, str]:
     """Return the new name of each renamed submission.
 
-    The pairs with most evidence are matched first.
+    The pairs with the strongest evidence are matched first.
     """
     pairs = [
         (evidence, old, new)
@@ -87,13 +87,13 @@ def _matched(before: Mapping[str, Member], now: Mapping[str, Member]) -> dict[st
 
 
 def _in_common(before: Member, now: Member) -> tuple[bool, ...]:
-    """Return the evidence that two entries are the same submission, strongest first."""
+    """Return for each kind of evidence, strongest first, whether it shows the same submission."""
     if _others(before, now):
         return ()
     both = before.people & now.people
     names = [f"-{row.submission}" for row in (before, now)]
     # Several teams without author ids may submit the same files, such as those of `cartlab new`. So
-    # equal files count only with a common author or a similar name.
+    # equal files count only if the submissions have a common author or similar names.
     kin = both or any(a.endswith(b) for a, b in (names, names[::-1]))
     prints = before.fingerprints and now.fingerprints
     (_, was, number), (_, is_, number_now) = (read_owner(r.owner) for r in (before, now))
@@ -102,6 +102,6 @@ def _in_common(before: Member, now: Member) -> tuple[bool, ...]:
         bool(kin) and before.content == now.content != "",
         bool(both and prints) and same_recordings(before, now),
         # Equal author ids are weak evidence, because anybody can type another person's id. They do
-        # not count against a different account number on the same platform.
+        # not count if the account numbers on the same platform differ.
         bool(both) and before.people == now.people and (was != is_ or number == number_now),
     )

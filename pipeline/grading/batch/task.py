@@ -1,4 +1,4 @@
-"""What goes to a grading process and comes back; it loads nothing that only grading needs."""
+"""The data sent to and from a grading process; importing this module loads no grading code."""
 
 import base64
 from collections.abc import Mapping, Sequence
@@ -20,9 +20,9 @@ class Setup:
     Attributes
     ----------
     scratch : folder for copies of the submissions during grading.
-    time_limit : for each submission, in s.
-    memory_limit : for each submission, in bytes beyond the worker's own need.
-    figures : draw the figures of the feedback.
+    time_limit : time limit for one submission, in s.
+    memory_limit : memory limit for one submission, in bytes, beyond the memory of an idle process.
+    figures : whether to draw figures for the feedback.
     """
 
     rubric: Rubric
@@ -38,10 +38,10 @@ class Task:
 
     Attributes
     ----------
-    id, owner, days_late : see `intake.HandIn`.
+    id, owner, days_late : as in `intake.hand_ins.HandIn`.
     key : hash of everything that affects the outcome; see `gradings.Member`.
-    sources : paths of the submitted files.
-    digest : the hash of the files that the key contains; "" if it need not be checked.
+    sources : paths of the submitted folder or files.
+    digest : expected hash of the submitted files; "" to skip this check.
     """
 
     id: str
@@ -65,10 +65,10 @@ def failed(
 
     Parameters
     ----------
-    reason : one reason per line.
-    out_of : points of the rubric.
-    settled : whether the outcome is final; if not, the next run tries again.
-    detail : traceback of an error in the grader.
+    reason : why it could not be graded, one cause per line.
+    out_of : full points of the rubric.
+    settled : whether the outcome is final; if not, the next run grades the submission again.
+    detail : traceback, if the grader itself failed.
     """
     lines = (" ".join(line.split()) for line in reason.split("\n"))
     reason = "".join(c if c.isprintable() or c == "\n" else "�" for c in "\n".join(lines))
@@ -94,7 +94,7 @@ def plain_grading(outcome: Grading) -> dict[str, Any]:
 
 
 def read_grading(plain: Mapping[str, Any]) -> Grading:
-    """Return the outcome from a dictionary that `plain_grading` made and JSON stored."""
+    """Return the outcome that `plain_grading` turned into a dictionary."""
     return Grading(
         **{
             **plain,

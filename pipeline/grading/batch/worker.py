@@ -1,4 +1,4 @@
-"""The process that grades one submission after another and can be stopped at a limit."""
+"""The process that grades one submission after another; it is stopped if it exceeds a limit."""
 
 import re
 import tempfile
@@ -23,7 +23,7 @@ from pipeline.submission import Submission, load_submission
 from pipeline.submission.complaints import quote
 from pipeline.submission.load import MAX_TOML_BYTES, NAME
 
-_DETAIL = 20_000  # characters of a traceback
+_DETAIL = 20_000  # most characters of a traceback that are kept
 _TABLE = re.compile(r"\s*\[+\s*([\w.-]+)")
 _ID = re.compile(r"""\s*id\s*=\s*["'“”„]?([^"'“”#]+)""")
 
@@ -83,7 +83,9 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
 
 
 def named_authors(folder: Path) -> tuple[str, ...]:
-    """Read the ids under `[[authors]]` line by line, even if the file has mistakes elsewhere.
+    """Return the author ids in `submission.toml`, even if the file has mistakes.
+
+    The file is read line by line, not as TOML.
 
     Raises
     ------
@@ -103,7 +105,7 @@ def named_authors(folder: Path) -> tuple[str, ...]:
 def _figures(
     submission: Submission, graded: Graded, rubric: Rubric
 ) -> tuple[tuple[tuple[str, str], ...], str]:
-    """Return the figures of the feedback, and a traceback if drawing failed.
+    """Return the figures of the feedback, and a traceback if drawing failed, or "".
 
     A drawing error leaves the grade unchanged.
     """

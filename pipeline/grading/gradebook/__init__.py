@@ -1,1 +1,1 @@
-"""The gradebook: gradings, changes, and who made them."""
+"""The gradebook: a database of all gradings and of all points given by hand."""

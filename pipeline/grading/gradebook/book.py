@@ -1,8 +1,7 @@
 """The gradebook: all gradings, the current class list, and points given by hand.
 
-Each submission is stored when it is graded, in its own transaction. When a batch is complete, it
-becomes the class list. Grades contain no dates; the gradebook has the dates, and `cartlab history`
-shows them.
+Each grading is stored as soon as it is done, in its own transaction. A complete batch becomes the
+class list. Grades contain no dates, but the gradebook does, and `cartlab history` shows them.
 """
 
 import json
@@ -67,9 +66,9 @@ class Gradebook:
     Parameters
     ----------
     place : a folder, a SQLite file or any SQLAlchemy URL.
-    assignment : selects one of several class lists in the database; default: the last one graded.
-    create : create the gradebook if it is missing.
-    now : the clock for the times of entries.
+    assignment : name of the assignment whose class list is used; default: the one graded last.
+    create : whether to create a missing gradebook.
+    now : function that returns the current time, which is stored with each entry.
 
     Raises
     ------
@@ -103,17 +102,17 @@ class Gradebook:
     def known(self, key: str, *, figures: bool = True) -> Grading | None:
         """Return the newest grading with this key, or None.
 
-        `figures` tells whether to read its figures.
+        The figures of the grading are read only if `figures` is true.
         """
         with self._database.reading() as connection:
             return known_grading(connection, key, assignment=self._assignment or "", drawn=figures)
 
     def put(self, grading: Grading) -> None:
-        """Store a grading; when this returns, it is on disk.
+        """Store a grading; it is on disk when this method returns.
 
         Raises
         ------
-        ValueError : its grade is not valid.
+        ValueError : `grading.grade` is not valid.
         """
         grade = read_grade(grading.grade)
         with self._database.writing() as connection:
@@ -137,21 +136,22 @@ class Gradebook:
                 add_row(connection, findings, kept)
 
     def prints(self, numbers: Sequence[int] | None = None) -> Iterator[Member]:
-        """Return the different fingerprints of recordings, with the submissions that contain them.
+        """Return all submissions with the fingerprints of their recordings, without repetitions.
 
-        Replaced versions of a submission count too, because their recordings may have been passed
+        Earlier versions of submissions are included, because their recordings may have been passed
         on.
 
         Parameters
         ----------
-        numbers : of the gradings to read, as in `Entry.grading`; default: all gradings.
+        numbers : numbers of the gradings to read, as in `Entry.grading`; default: all gradings that
+            have fingerprints.
         """
         return read_prints(self._database, numbers, assignment=self._assignment or "")
 
     def listed(self) -> Iterator[Member]:
         """Yield the submissions of the current class list, without fingerprints.
 
-        Before the first batch the list is empty.
+        The list is empty until a batch is complete.
         """
         with self._database.reading() as connection:
             last = self._newest(connection)
@@ -161,19 +161,19 @@ class Gradebook:
     def finish(
         self, batch: Batch, *, rubric: Rubric, shown: Callable[[str], str] = str
     ) -> list[str]:
-        """Make a complete batch the new class list, unless that changes nothing.
+        """Store a complete batch as the new class list, unless nothing has changed.
 
-        Returns the differences from the last class list, one phrase each, beginning with the
-        rubric.
+        Returns the differences from the previous class list, one phrase each; those of the rubric
+        come first.
 
         Parameters
         ----------
-        shown : returns the name of a submission as the phrases show it; called after the list is
-            made.
+        shown : function that returns the name under which the phrases show a submission; it is
+            called after the new list is stored.
 
         Raises
         ------
-        KeyError : an outcome of the batch is not in the gradebook.
+        KeyError : a grading of the batch is not in the gradebook.
         """
         listed, points, by_hand = [], {}, set()
         with self._database.writing() as connection:
@@ -206,7 +206,7 @@ class Gradebook:
             before = {batch.moved.get(name, name): had for name, had in before.items()}
         return told + points_changes(before, points, by_hand=by_hand, shown=shown)
 
-    # ---------------------------------------------------------------- what counts now
+    # ---------------------------------------------------------------- current class list
 
     @property
     def assignment(self) -> str:
@@ -231,7 +231,10 @@ class Gradebook:
             return read_rubric(self._last(connection))
 
     def entries(self) -> Iterator[Entry]:
-        """Yield the class list in order; only a page of it is in memory at a time."""
+        """Yield the entries of the class list in order;
+
+        only some of them are in memory at a time.
+        """
         with self._database.reading() as connection:
             last = self._last(connection)
             of_batch = select(entries.c.position).where(entries.c.batch_id == last.id)
@@ -245,7 +248,7 @@ class Gradebook:
             yield from found
 
     def entry(self, team: str) -> Entry:
-        """Return the class-list entry of a submission, found by its id or by one of its authors.
+        """Return the class-list entry of the submission whose id or author is `team`.
 
         Raises
         ------
@@ -283,7 +286,7 @@ class Gradebook:
 
         Raises
         ------
-        ConfigError : there is no such submission, or there are several.
+        ConfigError : no submission matches, or several do.
         """
         with self._database.reading() as connection:
             row = self._find_ever(connection, team)
@@ -296,7 +299,7 @@ class Gradebook:
 
         Raises
         ------
-        ConfigError : a name matches no submission of the class list, or several.
+        ConfigError : a name matches no submission on the class list, or more than one.
         """
         with self._database.writing() as connection:
             found = [self._find(connection, team) for team in teams]
@@ -317,7 +320,7 @@ class Gradebook:
 
         Raises
         ------
-        ConfigError : there is no such submission, there are several, or the database user may not
+        ConfigError : a name matches no submission or several, or the database user has no right to
             delete.
         """
         with self._database.erasing() as connection:
@@ -329,24 +332,24 @@ class Gradebook:
     def override(
         self, team: str, criterion: str, points: float | None, *, why: str, by: str
     ) -> HandPoints:
-        """Give a criterion points by hand, which later gradings keep; None removes them.
+        """Set the points of a criterion by hand, also for later gradings; None removes such points.
 
         Raises
         ------
-        ConfigError : there is no such submission or criterion, the points are not possible, or the
-            name of the person or the reason is missing.
+        ConfigError : the submission or criterion does not exist, the points are out of range, or
+            `why` or `by` is empty.
         """
         with self._database.writing() as connection:
             last, row = self._find(connection, team)
             asked = WantedPoints(submission=team, criterion=criterion, points=points, why=why)
             return self._give(connection, row, asked, by=by, rubric=read_rubric(last))
 
-    # ----------------------------------------------------------------------- in parts
+    # ----------------------------------------------------------------------- helpers
 
     def _give(
         self, connection: Connection, row: Row, asked: WantedPoints, *, by: str, rubric: Rubric
     ) -> HandPoints:
-        """Store an override of a submission; `row` is its line in the class list."""
+        """Store points or a comment for a submission; `row` is the submission's class-list line."""
         criterion, points = asked.criterion, asked.points
         why, by = asked.why.strip(), by.strip()
         if not why or not by:
@@ -390,7 +393,7 @@ class Gradebook:
         return row
 
     def _find(self, connection: Connection, team: str) -> tuple[Row, Row]:
-        """Return the last complete batch, and the line of a team in its class list."""
+        """Return the last complete batch and, from its class list, the line of a team."""
         last = self._last(connection)
         names = class_list(last, submissions.c.name, gradings.c.authors)
         rows = connection.execute(names).all()
@@ -404,7 +407,7 @@ class Gradebook:
         return last, connection.execute(line).one()
 
     def _find_ever(self, connection: Connection, team: str) -> Row:
-        """Return the row of a team, from its gradings if the class list no longer has it."""
+        """Return a team's row in the class list or, if it was removed, a row from its gradings."""
         try:
             return self._find(connection, team)[1]
         except ConfigError:
@@ -429,6 +432,6 @@ class Gradebook:
 
 
 def _named(team: str, rows: Sequence[Row]) -> list[Row]:
-    """Return the rows with this submission name; if no name matches, those with this author."""
+    """Return the rows with the name `team`; if no row has it, those with the author `team`."""
     exact = [row for row in rows if row.name == team]
     return exact or [row for row in rows if person(team) in map(person, row.authors)]

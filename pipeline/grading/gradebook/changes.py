@@ -1,4 +1,4 @@
-"""Differences from the last class list: the rubric and the points."""
+"""Describe how the rubric and the points differ between two class lists."""
 
 from collections.abc import Callable, Container, Mapping
 from typing import Any
@@ -10,7 +10,7 @@ from pipeline.grading.words import points_text
 
 
 def rubric_changes(before: str, now: str) -> list[str]:
-    """Return the differences between two rubrics as phrases; both are given as JSON."""
+    """Return the differences between two rubrics, given as JSON, one phrase each."""
     if before == now:
         return []
     try:
@@ -38,13 +38,13 @@ def points_changes(
     by_hand: Container[str] = (),
     shown: Callable[[str], str] = str,
 ) -> list[str]:
-    """Return changed points and new and removed submissions, one phrase each.
+    """Return a phrase for each submission that is new, was removed, or has other points.
 
     Parameters
     ----------
-    before, now : points by submission, in the last class list and in the new one.
-    by_hand : submissions with points given by hand, which the phrase then mentions.
-    shown : returns the name of a submission as the phrase shows it.
+    before, now : points by submission in the previous and the new class list, respectively.
+    by_hand : submissions with points given by hand; their phrases mention this.
+    shown : function that returns the name under which the phrases show a submission.
     """
     in_order = sorted(now.items(), key=lambda one: shown(one[0]))
     changes = [

@@ -1,11 +1,11 @@
-"""The class as a table, with one row per submission or per submission and criterion."""
+"""The data of a class list that pages and tables show."""
 
 from collections.abc import Iterable
 from functools import cached_property
 from math import nan
 from typing import TYPE_CHECKING
 
-from typing_extensions import TypedDict  # before Python 3.12, pydantic needs this version
+from typing_extensions import TypedDict  # pydantic needs this version before Python 3.12
 
 from pipeline.grading.grade import CODES, Code, Grade, GradeOverride, GradeTable, Outcome
 from pipeline.grading.rubric import Rubric
@@ -28,7 +28,7 @@ class Judged(TypedDict):
 
 
 class Flagged(TypedDict):
-    """A named mistake."""
+    """A mistake that the grader names."""
 
     code: Code
 
@@ -36,8 +36,8 @@ class Flagged(TypedDict):
 class Line(GradeTable):
     """The parts of one `grade.json` that the pages and tables of a class need.
 
-    Numbers and messages of the criteria are left out, because for 2,000 submissions they take a
-    third of a second to read.
+    Numbers and messages of the criteria are left out, because reading them takes a third of a
+    second for 2,000 submissions.
     """
 
     submission: str
@@ -55,13 +55,13 @@ class Line(GradeTable):
 
     @classmethod
     def of(cls, grade: Grade) -> "Line":
-        """Return the parts of a grade that the line needs."""
+        """Return the line of a grade."""
         return cls.model_validate(grade.model_dump(include=set(cls.model_fields)))
 
     def sharing(self) -> "Line":
         """Return the line with the flag `shared_data`.
 
-        It says that other submissions contain the same recordings.
+        The flag says that other submissions contain the same recordings.
         """
         codes = {flag["code"] for flag in self.flags} | {"shared_data"}
         flags = tuple(Flagged(code=code) for code in CODES if code in codes)
@@ -69,7 +69,7 @@ class Line(GradeTable):
 
     @cached_property
     def judged(self) -> dict[str, Judged]:
-        """The criteria by id."""
+        """The results of the criteria, by id."""
         return {criterion["id"]: criterion for criterion in self.criteria}
 
     @property
@@ -90,7 +90,7 @@ def wrong_springs(graded: Iterable[tuple[str, ...]]) -> str:
 
     Parameters
     ----------
-    graded : for each graded submission, the springs that the rubric lacks.
+    graded : the springs that the rubric lacks, for each graded submission.
     """
     every = list(graded)
     asking = [springs for springs in every if springs]
@@ -106,12 +106,12 @@ def wrong_springs(graded: Iterable[tuple[str, ...]]) -> str:
 def class_frame(lines: Iterable[Line], *, rubric: Rubric) -> "pd.DataFrame":
     """Return the class as a table with one row per submission and criterion.
 
-    Columns of the submission: `submission`, `authors`, `status`, `days_late`, `total` (after the
-    deduction for lateness), `total_out_of`, `remarks` (codes of flags). Lists in a cell are
-    separated by spaces, as in `grades.csv`.
+    Columns about the submission: `submission`, `authors`, `status`, `days_late`, `total` (after the
+    deduction for lateness), `total_out_of`, `remarks` (codes of flags). Spaces separate the items
+    of a list, as in `grades.csv`.
 
-    Columns of the criterion: `criterion`, `outcome`, `points`, `out_of`, `by_hand`. A criterion
-    that was never judged has no outcome, and its points are NaN.
+    Columns about the criterion: `criterion`, `outcome`, `points`, `out_of`, `by_hand`. A criterion
+    that was never judged has an empty outcome, and its points are NaN.
     """
     import pandas as pd  # imported late: it takes 0.2 s, and grading does not need it
 

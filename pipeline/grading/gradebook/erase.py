@@ -21,9 +21,9 @@ NOBODY = "an erased submission"
 
 
 def erase_rows(connection: Connection, gone: Mapping[int, str]) -> None:
-    """Delete all rows about some submissions; `gone` has their names by number.
+    """Delete all rows about the submissions in `gone`, which maps their numbers to their names.
 
-    If a team shared recordings with an erased submission, the team's flag stays, without that name.
+    Teams that shared recordings with an erased submission keep the flag, without the erased name.
     """
     numbers = list(gone)
     graded = select(gradings.c.id).where(gradings.c.submission_id.in_(numbers))

@@ -27,19 +27,20 @@ FAILED = "could not be graded: "  # precedes the reason in the text of an event
 class Event:
     """One event in the history of a submission.
 
-    `graded` is a grading by the rubric alone. `listed` is an entry of a class list, with shared
-    data and overrides. `removed` is the removal from the class list. `override` has points given
-    by hand, or None if they were undone. `comment` leaves the points automatic. `asked`,
-    `answered` and `reopened` belong to a student's request to review a criterion.
+    `graded` is a grading by the rubric alone. `listed` is a new or changed entry of a class list,
+    with shared data and overrides. `removed` is the removal from the class list. `override` gives
+    points by hand, or removes them if `points` is None. `comment` leaves the points automatic.
+    `asked`, `answered` and `reopened` belong to a student's request to review a criterion.
 
     Attributes
     ----------
-    at : ISO 8601, UTC.
-    what : the kind of event.
-    points, out_of : of the submission or the criterion; an answer has points only if it changes
-        them.
-    text : flags, reason or answer.
-    by : the person who made the override or request; "" for a student who stays anonymous.
+    at : time in ISO 8601, UTC.
+    what : kind of event, explained above.
+    points : points of the submission or, for an event about one criterion, of the criterion; None
+        if the event sets no points.
+    out_of : full points of the submission; None for an event about one criterion.
+    text : codes of flags, changes, a reason, a comment or an answer.
+    by : name of the person who acted; "" if nobody did, or if a student stays anonymous.
     """
 
     at: str
@@ -58,7 +59,7 @@ def read_events(connection: Connection, submission: int, *, named: bool = True) 
 
     Parameters
     ----------
-    named : whether texts contain people and other names of the submission.
+    named : whether texts may contain names of people and other names of the submission.
     """
     found = [
         *_graded(connection, submission),
@@ -199,7 +200,7 @@ def event_words(event: Event) -> str:
 
 
 def _request_words(event: Event) -> str:
-    """Return an event of a request as text; typed text is put on one line."""
+    """Return an event of a request as one line of text."""
     by = f"by {event.by}" if event.by else "by the team"
     points = "" if event.points is None else f"{event.points:g} by hand, "
     said = " ".join(event.text.split())

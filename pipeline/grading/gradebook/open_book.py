@@ -36,9 +36,9 @@ State = tuple[int, int, int]
 
 
 class Conflict(ConfigError):
-    """A change is refused, because somebody else changed the criterion first.
+    """A change is refused, because the criterion has changed in the meantime.
 
-    `now` holds the points that the other person gave, or None.
+    `now` holds the last points given by hand, or None.
     """
 
     def __init__(self, text: str, *, now: HandPoints | None) -> None:
@@ -52,13 +52,13 @@ class Listing:
 
     Attributes
     ----------
-    line : the grade; its name is a pseudonym if the page is anonymous.
-    submission : its name in the gradebook.
-    grading : number of the grading.
-    seen : who marked the grading as reviewed, or "".
+    line : parts of the grade; on an anonymous page, its `submission` is a pseudonym.
+    submission : name of the submission in the gradebook.
+    grading : number of the grading in the gradebook.
+    seen : name of the person who marked the grading as reviewed, or "".
     shared : the flag for recordings that other submissions also contain.
-    first_key : key of the first version submitted under this name.
-    made_of : the data from which the line was computed, to tell whether it is still valid.
+    first_key : key of the first version that was submitted under this name.
+    made_of : data from which the line was computed; the line is valid until they change.
     """
 
     line: Line
@@ -84,10 +84,10 @@ class TeamNow:
 
     Attributes
     ----------
-    versions : by criterion, the version of its points; a change must name the version it is based
-        on.
-    changed : criteria that ever had points by hand.
-    seen : who marked it as reviewed, or "".
+    versions : version of the points, by criterion; a change must name the version on which it is
+        based.
+    changed : criteria to which points or a comment were ever given by hand.
+    seen : name of the person who marked the grading as reviewed, or "".
     """
 
     rubric: Rubric
@@ -100,12 +100,12 @@ class TeamNow:
 
 @dataclass(frozen=True, kw_only=True)
 class Together:
-    """A set of points that a person gave to several submissions at once.
+    """Changes that a person made to several submissions at once.
 
     Attributes
     ----------
-    at : time of all its changes, in ISO 8601, UTC, to the microsecond; it identifies the set.
-    criterion, why : of one of the changes.
+    at : time of all these changes, in ISO 8601, UTC, to the microsecond; it identifies them.
+    criterion, why : a criterion and a reason, as examples.
     teams : number of submissions changed.
     """
 
@@ -118,13 +118,13 @@ class Together:
 
 @dataclass(frozen=True, kw_only=True)
 class Undone:
-    """The result of undoing a set of changes.
+    """The result of `OpenBook.undo_all`.
 
     Attributes
     ----------
-    at : time of the set.
+    at : time at which the changes were undone; `undo_all` with this time restores them.
     back : number of changes undone.
-    kept : submissions that somebody has changed since, and that stay as they are.
+    kept : submissions that stay as they are, because somebody has changed them since.
     """
 
     at: str
@@ -134,11 +134,11 @@ class Undone:
 
 @dataclass(frozen=True, kw_only=True)
 class Tried:
-    """A submission before and after points by hand that are only tried.
+    """The grade of a submission without and with points that are tried but not stored.
 
     Attributes
     ----------
-    version : the current version of the criterion's points; a change must name it.
+    version : current version of the criterion's points, which a change must name.
     """
 
     submission: str
@@ -150,8 +150,8 @@ class Tried:
 class OpenBook(Gradebook):
     """A gradebook that several processes share.
 
-    A change must name the version that the person saw. If the data are newer, the change is
-    refused.
+    A person's change must name the version of the data that the person saw. If the data have
+    changed since, the change is refused.
     """
 
     def state(self) -> State:
@@ -166,7 +166,7 @@ class OpenBook(Gradebook):
 
         Parameters
         ----------
-        before : an earlier result; its lines that are still valid are reused.
+        before : an earlier result, whose unchanged lines are reused.
         """
         with self._database.reading() as connection:
             last = self._last(connection)
@@ -207,7 +207,7 @@ class OpenBook(Gradebook):
 
         Raises
         ------
-        ConfigError : there is no submission with this name.
+        ConfigError : no submission matches `name`, or several do.
         """
         with self._database.reading() as connection:
             last, row = self._find(connection, name)
@@ -234,13 +234,13 @@ class OpenBook(Gradebook):
         by: str,
         seen: str,
     ) -> HandPoints:
-        """Give points by hand like `override`, unless somebody else has changed them since.
+        """Set the points of a criterion by hand, unless they have changed in the meantime.
 
         If the criterion already has these points, `why` is only added as a comment.
 
         Parameters
         ----------
-        seen : the version that the person saw, from `TeamNow.versions`.
+        seen : version of the points that the person saw, from `TeamNow.versions`.
 
         Raises
         ------
@@ -279,12 +279,11 @@ class OpenBook(Gradebook):
             return self._give(connection, row, asked, by=by, rubric=read_rubric(last))
 
     def change_all(self, wishes: Sequence[WantedPoints], *, by: str) -> Together:
-        """Give points by hand to several submissions: either all changes are made or none.
+        """Give points by hand to several submissions; if one change is refused, so are all.
 
         Raises
         ------
-        ConfigError : points are not possible; the message has the line of the table, if there is
-            one.
+        ConfigError : a change is not valid; the message names its line in the table, if any.
         Conflict : a change is based on an outdated version.
         """
         new = 0
@@ -318,7 +317,7 @@ class OpenBook(Gradebook):
         return Together(at=at, by=by, teams=new)
 
     def try_all(self, wishes: Sequence[WantedPoints]) -> list[Tried]:
-        """Return each submission before and after the points of `wishes`, but change nothing.
+        """Return each submission's grade without and with the points of `wishes`; store nothing.
 
         Submissions that are not in the class are left out.
         """
@@ -333,13 +332,13 @@ class OpenBook(Gradebook):
             ]
 
     def undo_all(self, at: str, *, by: str) -> Undone:
-        """Undo a set of changes that a person made at once.
+        """Undo all changes that a person made at the same time.
 
-        A criterion that somebody has changed since stays as it is.
+        A criterion that has been changed since stays as it is.
 
         Parameters
         ----------
-        at : time of the set, from `Together.at`.
+        at : time of the changes, from `Together.at`.
         """
         back, kept = 0, []
         with self._database.changing() as connection:
@@ -358,11 +357,11 @@ class OpenBook(Gradebook):
         return Undone(at=now, back=back, kept=tuple(kept))
 
     def changed_together(self, *, least: int = 2) -> list[Together]:
-        """Return the sets of changes made at once, newest first.
+        """Return the changes that were made to several submissions at once, newest first.
 
         Parameters
         ----------
-        least : smallest number of submissions that counts as a set.
+        least : smallest number of submissions that counts as several.
         """
         with self._database.reading() as connection:
             last = self._last(connection)
@@ -382,7 +381,7 @@ class OpenBook(Gradebook):
             connection.execute(insert(looks).values(values))
 
     def changes_since(self, number: int) -> list[tuple[str, HandPoints]]:
-        """Return the overrides whose number is larger than `number`, each with its submission."""
+        """Return the overrides numbered above `number`, each with the name of its submission."""
         with self._database.reading() as connection:
             mine = _overrides().where(
                 overrides.c.id > number,
@@ -392,7 +391,7 @@ class OpenBook(Gradebook):
         return [(row.name, _read_override(row)) for row in rows]
 
     def reasons(self) -> dict[str, list[str]]:
-        """Return the reasons of overrides by criterion, the most common first."""
+        """Return the reasons for points and comments by criterion, the most common first."""
         with self._database.reading() as connection:
             mine = (
                 select(overrides.c.criterion, overrides.c.why)
@@ -413,7 +412,7 @@ class OpenBook(Gradebook):
 def _line(row: Row, given: Mapping[int, HandPoints] | None, *, rubric: Rubric) -> Line:
     """Return a line of the class list with its current grade.
 
-    Only a line with points given by hand needs the whole grade; for others, `given` is None.
+    Only a line with overrides needs the whole grade; without overrides, `given` is None.
     """
     shared = read_flag(row.shared)
     if given:
@@ -428,7 +427,7 @@ def _in_class(batch: Row) -> Select:
 
 
 def _given(connection: Connection, batch: Row) -> dict[int, dict[int, HandPoints]]:
-    """Return all overrides of a class, by number of submission and number of override."""
+    """Return all overrides of a class, by submission number and override number."""
     given: dict[int, dict[int, HandPoints]] = defaultdict(dict)
     mine = _overrides().where(overrides.c.submission_id.in_(_in_class(batch)))
     for row in connection.execute(mine):
@@ -437,7 +436,7 @@ def _given(connection: Connection, batch: Row) -> dict[int, dict[int, HandPoints
 
 
 def _seen(connection: Connection, batch: Row) -> dict[int, str]:
-    """Return who marked each grading as reviewed, by number of grading; the newest mark counts."""
+    """Return who marked each grading as reviewed, by grading number; the newest mark counts."""
     of_list = select(entries.c.grading_id).where(entries.c.batch_id == batch.id)
     mine = select(looks).where(looks.c.grading_id.in_(of_list)).order_by(looks.c.id)
     marks = {row.grading_id: row for row in connection.execute(mine)}
@@ -451,7 +450,7 @@ def _overrides() -> Select:
 
 
 def _before(earlier: Sequence[Row], team: str, criterion: str) -> WantedPoints:
-    """Return a change that gives a criterion the points it had by hand before its last change."""
+    """Return a change that restores a criterion to its state after the overrides `earlier`."""
     last = earlier[-1] if earlier else None
     if last is None or (last.points is None and not last.comment):
         return WantedPoints(submission=team, criterion=criterion, points=None, why="taken back")
@@ -465,7 +464,7 @@ def _before(earlier: Sequence[Row], team: str, criterion: str) -> WantedPoints:
 
 
 def _is_same(asked: WantedPoints, newest: Row | None) -> bool:
-    """Return whether a requested change only repeats the newest one."""
+    """Return whether a requested change only repeats the newest override."""
     if newest is None:
         return False
     given = newest.points, newest.comment, newest.why
@@ -478,12 +477,12 @@ def points_of(grade: Grade, criterion: str) -> float | None:
 
 
 def _changed_at(batch: Row, at: str) -> Select:
-    """Return the query for the overrides that were made in a class at one time."""
+    """Return the query for the overrides that were made in a class at the time `at`."""
     return _overrides().where(overrides.c.at == at, overrides.c.submission_id.in_(_in_class(batch)))
 
 
 def _try(connection: Connection, row: Row, wish: WantedPoints, *, rubric: Rubric) -> Tried:
-    """Return a submission before and after the points of a wish."""
+    """Return the grade of a submission without and with the points of a wish."""
     shared, own = read_flag(row.shared), overrides.c.submission_id == row.submission_id
     rows = connection.execute(_overrides().where(own)).all()
     ever = [_read_override(one) for one in rows]
@@ -505,7 +504,7 @@ def _read_override(row: Row) -> HandPoints:
 
 
 def newest_overrides(connection: Connection, submitted: Iterable[int]) -> dict[int, dict[str, Row]]:
-    """Return the last override of each criterion, by number of submission and by criterion."""
+    """Return the last override of each criterion, by submission number and criterion."""
     rows = connection.execute(_overrides().where(overrides.c.submission_id.in_(set(submitted))))
     newest: dict[int, dict[str, Row]] = defaultdict(dict)
     for row in rows:
@@ -514,7 +513,7 @@ def newest_overrides(connection: Connection, submitted: Iterable[int]) -> dict[i
 
 
 def name_version(row: Row, newest: Row | None) -> str:
-    """Return the version of a criterion's points: numbers of its grading and its last override."""
+    """Return the version of a criterion's points: the numbers of its grading and last override."""
     return f"{row.id}.{newest.id if newest is not None else 0}"
 
 

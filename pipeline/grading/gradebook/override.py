@@ -12,7 +12,7 @@ from pipeline.grading.gradings import go_with
 from pipeline.grading.references.tolerance import exact, late_deduction
 from pipeline.grading.rubric import Rubric
 
-_HEADS = ("submission", "criterion", "points", "why")  # columns of a table of points
+_HEADS = ("submission", "criterion", "points", "why")  # columns of a table of changes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,9 +21,9 @@ class HandPoints:
 
     Attributes
     ----------
-    points : None if the automatic points count, because points were undone or only commented.
-    at : ISO 8601, UTC.
-    authors : of the submission at that time; the points stay with these people.
+    points : points given by hand; None if the automatic points count.
+    at : time in ISO 8601, UTC.
+    authors : authors of the submission at that time, to whom the points belong.
     comment : whether `why` is only a comment for the team, while the points stay automatic.
     """
 
@@ -61,11 +61,12 @@ class WantedPoints:
 
     Attributes
     ----------
-    points : None for the automatic points.
+    points : requested points; None for the automatic points.
     comment : whether `why` is only a comment for the team.
-    line : of the table that requests the change; 0 without a table.
-    seen : the version that the person saw, from `TeamNow.versions`; "" to change any version.
-    at : the time; "" for now. Points given together have the same time.
+    line : line number in the table that requests the change; 0 without a table.
+    seen : version of the points that the person saw, from `TeamNow.versions`; "" to change any
+        version.
+    at : time of the change; "" for now. Points given together have the same time.
     """
 
     submission: str
@@ -78,9 +79,9 @@ class WantedPoints:
     at: str = ""
 
     def beside(self, earlier: Iterable[HandPoints]) -> "WantedPoints":
-        """Return what this change means, given the earlier changes of the submission.
+        """Return the change to store, given the earlier changes of the submission.
 
-        A comment on points given by hand keeps those points, and becomes their reason.
+        If the criterion has points given by hand, a comment keeps them and replaces their reason.
         """
         newest = None
         for one in earlier:
@@ -91,13 +92,13 @@ class WantedPoints:
 
 
 def read_wishes(path: Path) -> list[WantedPoints]:
-    """Read requested changes from a CSV with the columns submission, criterion, points and why.
+    """Read requested changes from a CSV file: columns submission, criterion, points and why.
 
-    Points may be "auto" for the automatic points.
+    The word "auto" in the column of points stands for the automatic points.
 
     Raises
     ------
-    ConfigError : the file is not such a table; the message has the line.
+    ConfigError : the table is not valid; the message names the line.
     """
     table = read_table(path)
     missing = [name for name in _HEADS if name not in table.columns]
@@ -137,7 +138,7 @@ def with_comments(grade: Grade, comments: Mapping[str, HandPoints]) -> Grade:
 def with_overrides(grade: Grade, overrides: Mapping[str, HandPoints], *, rubric: Rubric) -> Grade:
     """Return the grade with points given by hand and the deduction for lateness.
 
-    A submission that could not be graded has no criteria; those with points by hand are added.
+    If the submission could not be graded, it has no criteria; those with points by hand are added.
     """
     given = {key: o.points for key, o in overrides.items() if o.points is not None}
     if not given:
@@ -177,7 +178,7 @@ def _with_comment(criterion: Criterion, why: str) -> Criterion:
 
 
 def _by_hand(criterion: Criterion, points: float, *, why: str) -> Criterion:
-    points = min(points, criterion.out_of)  # the criterion may have been worth more
+    points = min(points, criterion.out_of)  # an earlier rubric may have given more points
     if points == criterion.points:
         return _with_comment(criterion, why)
     changed = {

@@ -54,7 +54,7 @@ class OwnFeedback:
 
 @dataclass(frozen=True, kw_only=True)
 class Queued:
-    """A request as TAs see it; an answer must name its `version`."""
+    """A request as teaching assistants see it; an answer must name its `version`."""
 
     entry: Entry
     request: Request
@@ -67,7 +67,7 @@ class Queue:
 
     Attributes
     ----------
-    n_waiting, n_settled : all requests of each kind; only one page of each kind is listed.
+    n_waiting, n_settled : total numbers of requests; `waiting` and `settled` hold only one page.
     """
 
     rubric: Rubric
@@ -132,8 +132,9 @@ class RequestBook(OpenBook):
 
         Parameters
         ----------
-        submission : its exact name, not that of an author.
-        assignment : the assignment that the class list must have; "" accepts any.
+        submission : exact name of the submission; the name of an author is not accepted.
+        assignment : expected assignment of the class list, or "" for any; if the class list has
+            another assignment, the result is None.
 
         Raises
         ------
@@ -155,11 +156,12 @@ class RequestBook(OpenBook):
     ) -> None:
         """Ask for a review of a criterion that lost points.
 
-        This is possible once, and again if a TA reopens the request.
+        Students can ask once, and again whenever a teaching assistant reopens the request.
 
         Raises
         ------
-        RequestRefused : a request is not possible here, or the reason is missing.
+        RequestRefused : no request is possible for this criterion now, or `why` is empty or too
+            long.
         """
         why = read_words(why, wanted="write what was judged wrongly, and why")
         with self._database.changing() as connection:
@@ -192,18 +194,18 @@ class RequestBook(OpenBook):
         by: str,
         seen: str,
     ) -> None:
-        """Answer a request and change the points if the answer gives others, in one transaction.
+        """Answer a request and, if the points change, set them by hand in the same transaction.
 
         Parameters
         ----------
-        points : None, or the current points, to keep them.
-        text : for the students; also stored as the reason for the points.
-        seen : the version that the TA saw, from `Queued.version`.
+        points : new points; None or the current points change nothing.
+        text : answer for the students; also stored as the reason for new points.
+        seen : version of the request that the person saw, from `Queued.version`.
 
         Raises
         ------
         Conflict : somebody else answered or changed the points, or the submission was graded again.
-        RequestRefused : the answer is empty, or the request is not waiting.
+        RequestRefused : the answer is empty or too long, or the request is not waiting.
         ConfigError : the criterion cannot have these points.
         """
         text = read_words(text, wanted="write an answer for the students")
@@ -231,7 +233,7 @@ class RequestBook(OpenBook):
         Raises
         ------
         Conflict : see `answer`.
-        RequestRefused : the request still waits for an answer.
+        RequestRefused : the request has no answer yet, or is already reopened.
         """
         with self._database.changing() as connection:
             _, row, request = self._find_request(connection, submission, criterion, seen=seen)
@@ -240,12 +242,12 @@ class RequestBook(OpenBook):
             reopened = RequestEvent(criterion=criterion, what="reopened", text="", by=by)
             self._add(connection, row, reopened)
 
-    # ---------------------------------------------------------------------- in parts
+    # ---------------------------------------------------------------------- helpers
 
     def _find_released(
         self, connection: Connection, submission: str, assignment: str
     ) -> tuple[Row, Row] | None:
-        """Return the class list and a submission's line in it; None if students may not read it."""
+        """Return the class list and a submission's line; None if feedback is not released."""
         last = self._newest(connection)
         if last is None or assignment not in ("", last.assignment):
             return None
@@ -264,7 +266,7 @@ class RequestBook(OpenBook):
         Raises
         ------
         ConfigError : nobody asked about this criterion.
-        Conflict : request or points are no longer in the version `seen`.
+        Conflict : the request or the points have changed since the version `seen`.
         """
         last, row = self._find(connection, submission)
         request = read_requests(connection, row.submission_id, row.authors).get(criterion)
@@ -285,13 +287,13 @@ class RequestBook(OpenBook):
 
 
 def points_lost(grade: Grade, rubric: Rubric) -> frozenset[str]:
-    """Return the rubric's criteria that lost points, including those not judged."""
+    """Return the criteria that got less than full points, including those not judged."""
     points = {criterion.id: criterion.points for criterion in grade.criteria}
     return frozenset(c.id for c in rubric.criteria if points.get(c.id, 0.0) < c.points)
 
 
 def _read_queued(connection: Connection, last: Row, events: Sequence[Row]) -> list[Queued]:
-    """Return requests, given by their newest events, in five queries."""
+    """Return the requests whose newest events are given; five queries are enough for any number."""
     positions = {event.position for event in events}
     rows = connection.execute(class_list(last).where(entries.c.position.in_(positions))).all()
     read = [(row, read_flag(row.shared)) for row in rows]

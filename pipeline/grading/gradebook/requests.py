@@ -32,11 +32,10 @@ class RequestEvent:
 
     Attributes
     ----------
-    what : `asked`, `answered` or `reopened`.
-    text : the reason or the answer; "" for `reopened`.
-    points : given with an answer; None if unchanged.
-    at : ISO 8601, UTC.
-    authors : of the submission at that time; the request stays with these people.
+    text : reason for the request, or the answer; "" for `reopened`.
+    points : points given with an answer; None if unchanged.
+    at : time in ISO 8601, UTC.
+    authors : authors of the submission at that time, to whom the request belongs.
     """
 
     criterion: str
@@ -57,7 +56,7 @@ class Request:
 
     Attributes
     ----------
-    number : of the newest event in the gradebook; an answer must name it.
+    number : number of the newest event in the gradebook, which an answer must name.
     """
 
     criterion: str
@@ -66,7 +65,7 @@ class Request:
 
     @property
     def state(self) -> Literal["asked", "answered", "reopened"]:
-        """Kind of the last event: `asked` waits for an answer.
+        """Kind of the last event; a request in the state `asked` waits for an answer.
 
         After `reopened` the team may ask again.
         """
@@ -83,7 +82,7 @@ def read_requests(
 def read_all_requests(
     connection: Connection, authors: Mapping[int, tuple[str, ...]]
 ) -> dict[int, dict[str, Request]]:
-    """Return the requests of the current authors of each submission, by criterion."""
+    """Return the requests of the current authors, by submission number and criterion."""
     mine = select(request_events.c.id, request_events.c.submission_id, *EVENT)
     mine = mine.where(request_events.c.submission_id.in_(authors))
     found: dict[int, dict[str, Request]] = {submission: {} for submission in authors}
@@ -101,7 +100,7 @@ def read_all_requests(
 
 
 def find_requests(connection: Connection, batch: Row) -> tuple[list[Row], list[Row]]:
-    """Return the newest event of each request in a class: waiting requests, then settled ones.
+    """Return the newest event of each request in a class, in two lists: waiting and settled.
 
     Each row has its number `id`, the `criterion`, and the `submission_id` and `position` of its
     submission. Waiting requests come oldest first, settled ones newest first.
@@ -140,13 +139,13 @@ def _in_class(batch: Row) -> Select:
 
 
 def hide_people(text: str, people: Iterable[str]) -> str:
-    """Return a text with the names of these people replaced."""
+    """Return a text in which the names of these people are replaced."""
     known = "|".join(re.escape(one) for one in people if one)
     return re.sub(rf"(?<!\w)(?:{known})(?!\w)", "…", text, flags=re.IGNORECASE) if known else text
 
 
 def is_released(connection: Connection, assignment: str) -> bool:
-    """Whether students may read the feedback of an assignment."""
+    """Return whether students may read the feedback of an assignment."""
     mine = select(releases.c.released).where(releases.c.assignment == assignment)
     return bool(connection.scalar(mine.order_by(releases.c.id.desc()).limit(1)))
 
@@ -156,7 +155,7 @@ def read_words(text: str, *, wanted: str) -> str:
 
     Raises
     ------
-    RequestRefused : the text is too long, or it is empty: then `wanted` is the message.
+    RequestRefused : the text is too long or empty; if it is empty, the message is `wanted`.
     """
     text = clean(text).strip()
     if not text:

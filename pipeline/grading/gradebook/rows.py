@@ -1,4 +1,4 @@
-"""Convert rows of a gradebook to objects and back."""
+"""Read and write the rows of a gradebook as objects."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ from pipeline.grading.gradebook.schema import (
 from pipeline.grading.gradings import Grading, Member
 from pipeline.grading.rubric import Rubric
 
-_PAGE = 100  # rows read at once: memory use stays flat, and writers wait only briefly
+_PAGE = 100  # rows read at once; few, so that memory use stays flat and writers wait only briefly
 # The attributes of a grading that are stored in a column of the same name.
 GRADING = [f.name for f in fields(Grading) if f.name in gradings.c]
 OVERRIDE = [overrides.c[f.name] for f in fields(HandPoints)]
@@ -45,14 +45,15 @@ class Entry:
 
     Attributes
     ----------
-    grade : with the flag for shared data, points given by hand, and the deduction for lateness.
-    automatic : automatic points by criterion.
+    grade : grade with the flag for shared data, points given by hand, and the deduction for
+        lateness.
+    automatic : automatic points, by criterion.
     overrides : current points given by hand, by criterion.
     comments : current comments, by criterion.
-    owner : the account that submitted it, as the learning platform names it, or "".
+    owner : account on the learning platform that submitted the files, or "".
     key : hash of everything that affects the grade.
-    grading : number of its grading in the gradebook.
-    first_key : key of the first version under this name, which strangers cannot guess.
+    grading : number of the grading in the gradebook.
+    first_key : key of the first version under this name; strangers cannot guess it.
     """
 
     submission: str
@@ -79,9 +80,9 @@ def pages(numbers: Sequence[int]) -> Iterator[Sequence[int]]:
 
 
 def _newest(chosen: Select, key: str, *, assignment: str) -> Select:
-    """Return the query for the newest grading of a key in an assignment.
+    """Return the query for the newest grading with a key in an assignment.
 
-    The assignment is checked too, because two assignments may have rubrics with the same text.
+    The key alone is not enough, because two assignments may have rubrics with the same text.
     """
     mine = chosen.where(gradings.c.key == key, submissions.c.assignment == assignment)
     return mine.order_by(gradings.c.id.desc()).limit(1)
@@ -95,7 +96,7 @@ def known_grading(
 ) -> Grading | None:
     """Return the newest grading with this key, or None.
 
-    `drawn` tells whether to read its figures.
+    The figures are read only if `drawn` is true.
     """
     newest = _newest(_OF_GRADING.join(submissions), key, assignment=assignment)
     row = connection.execute(newest.add_columns(gradings.c.id)).mappings().one_or_none()
@@ -123,12 +124,12 @@ def read_members(database: Database, numbers: Sequence[int]) -> Iterator[Member]
 def read_prints(
     database: Database, numbers: Sequence[int] | None = None, *, assignment: str
 ) -> Iterator[Member]:
-    """Yield the different fingerprints of recordings, with the submissions that contain them.
+    """Yield all submissions with the fingerprints of their recordings, without repetitions.
 
     Parameters
     ----------
-    numbers : of the gradings to read; default: all gradings.
-    assignment : its submissions get `of_class` true.
+    numbers : numbers of the gradings to read; default: all gradings that have fingerprints.
+    assignment : assignment whose submissions have a true `of_class`.
     """
     chosen = select(*_MEMBER, gradings.c.fingerprints, submissions.c.assignment)
     chosen = chosen.join(submissions).order_by(gradings.c.id)
@@ -163,7 +164,7 @@ _ENTRY = (
 
 
 def newest_of(connection: Connection, key: str, *, assignment: str) -> Row:
-    """Return the newest grading of a key.
+    """Return the newest grading with a key in an assignment.
 
     Raises
     ------
@@ -181,7 +182,7 @@ def class_list(batch: Row, *columns: ColumnElement) -> Select:
 
     Parameters
     ----------
-    columns : the columns to read; default: those of the line and its grading.
+    columns : columns to read besides position and flag; default: those in `_ENTRY`.
     """
     joined = entries.join(gradings, entries.c.grading_id == gradings.c.id).join(
         submissions, entries.c.submission_id == submissions.c.id
@@ -192,7 +193,7 @@ def class_list(batch: Row, *columns: ColumnElement) -> Select:
 
 
 def final_entry(connection: Connection, row: Row, *, shared: Flag | None, rubric: Rubric) -> Entry:
-    """Return a line of the class list with its current grade; the overrides are read here."""
+    """Return a line of the class list with its current grade; this reads the overrides."""
     return final_entries(connection, [(row, shared)], rubric=rubric)[0]
 
 
@@ -226,7 +227,7 @@ def final_entries(
 
 
 def first_keys(connection: Connection, submitted: Iterable[int] | Select) -> dict[int, str]:
-    """Return the key of the first version of each submission, by number of submission."""
+    """Return the key of each submission's first version, by submission number."""
     firsts = select(func.min(gradings.c.id)).where(gradings.c.submission_id.in_(submitted))
     firsts = firsts.group_by(gradings.c.submission_id)
     keys = select(gradings.c.submission_id, gradings.c.key).where(gradings.c.id.in_(firsts))
@@ -291,7 +292,7 @@ def add_list(
 def by_other_rubrics(connection: Connection, batch: Row) -> list[str]:
     """Return the submissions of a class list that were graded with a different rubric.
 
-    A grading belongs to the rubric of the first class list that contains it.
+    A grading was made with the rubric of the first class list that contains it.
     """
     mine = select(entries.c.grading_id).where(entries.c.batch_id == batch.id)
     first = (
@@ -315,12 +316,12 @@ def by_other_rubrics(connection: Connection, batch: Row) -> list[str]:
 
 
 def _asked(rubric: str) -> dict:
-    """Return the parts of a stored rubric that affect a grade, not its title or anonymity."""
+    """Return a stored rubric without the title and the anonymity, which do not affect a grade."""
     return json.loads(rubric) | {"title": "", "anonymous": False}
 
 
 def last_named(connection: Connection, submission: int) -> tuple[str, ...]:
-    """Return the last known authors of a submission, because a broken version names none."""
+    """Return the last known authors of a submission; its newest version may name none."""
     named = select(gradings.c.authors).where(
         gradings.c.submission_id == submission, gradings.c.authors != ()
     )
@@ -330,7 +331,7 @@ def last_named(connection: Connection, submission: int) -> tuple[str, ...]:
 def carry_over(connection: Connection, moved: Mapping[str, str], *, assignment: str) -> None:
     """Copy overrides and requests of renamed submissions to their new names.
 
-    Only missing rows are copied, so nothing is doubled when a name changes back.
+    Rows that the new name already has are not copied, so nothing is doubled if a name changes back.
     """
     named = select(submissions.c.name, submissions.c.id).where(
         submissions.c.assignment == assignment,
@@ -359,7 +360,7 @@ def read_rubric(batch: Row) -> Rubric:
 
     Raises
     ------
-    ConfigError : another version of cartlab wrote it.
+    ConfigError : another version of cartlab wrote the rubric.
     """
     try:
         return Rubric.model_validate_json(batch.rubric)

@@ -1,7 +1,7 @@
 """The tables of a gradebook, and the connection to its database.
 
-Every table is append-only: gradings, overrides and lists stay. On SQLite and PostgreSQL, triggers
-refuse to change or delete a row. The newest row counts.
+Rows are only added: on SQLite and PostgreSQL, triggers refuse to change or delete a row. If several
+rows are about the same thing, the newest counts.
 """
 
 import json
@@ -48,7 +48,7 @@ from pipeline.output import OWNER_ONLY
 from pipeline.submission.complaints import quote
 
 FILE = "gradebook.sqlite"
-_SUFFIXES = (".sqlite", ".sqlite3", ".db")  # of SQLite files; any other path is a folder
+_SUFFIXES = (".sqlite", ".sqlite3", ".db")  # suffixes of SQLite files; any other path is a folder
 _VERSION = "1"
 _TURN = 0x6361_7274  # number of PostgreSQL's advisory lock, chosen so that no other program uses it
 _PATIENCE = 60.0  # s to wait for a lock of another process; a commit takes milliseconds
@@ -63,7 +63,7 @@ _NO_ADDRESS = (
 
 
 class Words(TypeDecorator):
-    """Text in a form that every database accepts: without NUL and unpaired surrogates."""
+    """Text that every database accepts, without NUL characters and unpaired surrogates."""
 
     impl, cache_ok = Text, True
 
@@ -151,7 +151,7 @@ figures = Table(
     Column("svg", Deflated, nullable=False),
 )
 
-# The results of a grading's checks. With them, points under a changed rubric are computed without
+# Results of the checks in a grading. From them, points under a changed rubric are computed without
 # grading again.
 findings = Table(
     "findings",
@@ -279,8 +279,8 @@ class Database:
 
     Parameters
     ----------
-    place : a folder with `gradebook.sqlite`, such a file, or any SQLAlchemy URL.
-    create : create missing tables; otherwise the gradebook must exist.
+    place : a folder that holds `gradebook.sqlite`, an SQLite file, or any SQLAlchemy URL.
+    create : whether to create missing tables; otherwise the gradebook must exist.
 
     Raises
     ------
@@ -307,7 +307,7 @@ class Database:
 
     @property
     def name(self) -> str:
-        """The place as messages show it, without any password."""
+        """The file or URL for messages, without any password."""
         url = self._engine.url
         if url.get_backend_name() == "sqlite":
             return url.database or ""
@@ -327,7 +327,7 @@ class Database:
 
     @contextmanager
     def changing(self) -> Iterator[Connection]:
-        """Write while nobody else can, so that what was read stays true until the end."""
+        """Read and write while nobody else can write, so that the data read stay valid."""
         with self.writing() as connection:
             _take_turns(connection)
             yield connection
@@ -336,7 +336,7 @@ class Database:
     def erasing(self) -> Iterator[Connection]:
         """Delete and update while nobody else can write.
 
-        Then rewrite the database without old data.
+        At the end, the database is rewritten without the erased data.
         """
         with self.changing() as connection:
             sqlite = connection.dialect.name == "sqlite"
@@ -448,7 +448,11 @@ def _prepare_sqlite(connection, _record) -> None:
 
 
 def _begin_sqlite(connection: Connection) -> None:
-    """Take the write lock at once; two readers that later want to write would deadlock."""
+    """Begin a transaction.
+
+    A writing transaction takes the write lock at once: two readers that later wanted to write would
+    deadlock.
+    """
     options = connection.get_execution_options()
     if options.get("isolation_level") == "AUTOCOMMIT":
         return
