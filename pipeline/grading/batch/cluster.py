@@ -158,6 +158,6 @@ def _grade_all(
         elif isinstance(error := future.exception(), ConfigError):
             raise error
         else:
-            reason = f"the cluster gave up on it: {error}"
+            reason = f"the cluster could not grade it: {error}"
             outcome = failed(task, reason, out_of=out_of, settled=False)
             yield replace(outcome, is_disk_full=isinstance(error, OSError) and is_disk_full(error))

@@ -99,7 +99,8 @@ def wrong_springs(graded: Iterable[tuple[str, ...]]) -> str:
     names = ", ".join(dict.fromkeys(name for springs in asking for name in springs))
     return (
         f"the recordings of {len(asking)} of {len(every)} submissions need springs that the "
-        f"rubric lacks ({names}), and were judged with them: does its [system] match the benches?"
+        f"rubric lacks ({names}), and were judged with these springs: does the rubric's [system] "
+        "match the benches?"
     )
 
 
