@@ -1,1 +1,1 @@
-"""Turn archives, folders and platforms' downloads into submissions."""
+"""Turn archives, folders and downloads from learning platforms into submissions."""

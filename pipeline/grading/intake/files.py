@@ -1,7 +1,7 @@
 """Copy the files of a hand-in to a private folder and find the submission in it.
 
-The copy is what this machine or a cluster grades. It has only regular files, not the targets of
-links, so that the same files are hashed, sent and graded.
+The copy is graded, on this machine or on a cluster. Only regular files are copied, and links are
+not followed, so that the same files are hashed, sent and graded.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ from pipeline.submission.complaints import quote
 from pipeline.submission.load import NAME
 from pipeline.words.numbers import first_few
 
-_DEEPEST = 12  # nested folders that are searched in a hand-in
+_DEEPEST = 12  # levels of folders that are searched in a hand-in
 _ARCHIVES_IN_ARCHIVES = 3
 _CHUNK = 1 << 20
 _FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # so that the same files give the same archive
@@ -38,13 +38,13 @@ class Changed(Exception):
 
 
 def digest(sources: Sequence[Path], *, without: Collection[str] = ()) -> str:
-    """Return the SHA-256 of all files in a hand-in that could be graded.
+    """Return the SHA-256 hash of those files of a hand-in that are graded.
 
-    If a file cannot be read, the error is hashed instead; the outcome of the hand-in reports it.
+    If a file cannot be read, the error is hashed instead; grading then reports the error.
 
     Parameters
     ----------
-    without : names of files that are left out.
+    without : names of files to leave out.
     """
     total = hashlib.sha256()
     try:
@@ -81,18 +81,18 @@ def unpacked(archive: bytes, into: Path) -> None:
 def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") -> Path:
     """Copy or unpack a hand-in into a folder; return the folder with `submission.toml`.
 
-    Archives in the hand-in are opened if there is no `submission.toml` next to them.
+    Archives in the hand-in are opened only if there is no `submission.toml` outside them.
 
     Parameters
     ----------
-    digest : what `digest` must return for the copy; "" to accept any files.
+    digest : expected hash of the copied files, as returned by `digest`; "" to accept any files.
 
     Raises
     ------
     SubmissionError : there is no submission, there are several, there are too many files, or an
         archive is bad.
     OSError : this computer cannot read or copy a file.
-    Changed : the copy has another digest.
+    Changed : the copied files do not have the expected hash.
     """
     into.mkdir(parents=True, exist_ok=True)
     total = hashlib.sha256()
@@ -129,14 +129,14 @@ def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") ->
 
 
 def _files(sources: Sequence[Path]) -> Iterator[tuple[str, Path]]:
-    """Yield (name below the hand-in, path) of the files to grade, sorted by name, each once.
+    """Yield each file to grade as (name relative to the hand-in, path), sorted by name.
 
-    If the files together are too large, the smallest are kept, because data files are small and
-    films are not. `submission.toml` is always kept if its size allows.
+    If the files together are too large, the largest are left out, because data files are small and
+    films are not. `submission.toml` is left out only if it is too large itself.
 
     If there are too many files, one more than the limit is kept, so that every machine refuses the
-    hand-in. A recording above the size limit is kept too: it is then refused, not reported as
-    missing. Invalid bytes in names are replaced.
+    hand-in. A recording that is too large to be read is kept too, so that it is refused and not
+    reported as missing. Invalid bytes in names are replaced.
     """
     found: list[tuple[int, str, Path]] = []
     for source in sources:
@@ -171,7 +171,7 @@ def _walk(folder: Path, below: PurePosixPath) -> Iterator[tuple[int, str, Path]]
 
 
 def _less(limits: UnpackLimits, folder: Path) -> UnpackLimits:
-    """Return the limits minus the files that are already in a folder."""
+    """Return the limits that remain after the files in a folder have been unpacked."""
     sizes = [path.stat().st_size for path in _below(folder)]
     return replace(limits, members=limits.members - 1 - len(sizes), total=limits.total - sum(sizes))
 
@@ -181,7 +181,7 @@ def _below(folder: Path) -> list[Path]:
 
     Raises
     ------
-    OSError : a folder cannot be read; `rglob` would treat it as empty.
+    OSError : a folder cannot be read. (`rglob` would treat such a folder as empty.)
     """
 
     def refuse(error: OSError) -> None:
@@ -212,9 +212,9 @@ def _the_one(tomls: Sequence[Path], into: Path) -> Path:
 
 
 def _gather_loose(folder: Path) -> None:
-    """Copy the files next to `submission.toml` into `data/`, if there is no such folder.
+    """Copy the files next to `submission.toml` into a new folder `data/`, unless it exists.
 
-    Some platforms take single files and lose their folders.
+    Some platforms accept only single files, so that the folders are lost.
     """
     data = folder / "data"
     if not os.path.lexists(data):

@@ -40,17 +40,17 @@ _RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")
 
 @dataclass(frozen=True, kw_only=True)
 class HandIn:
-    """The files that one team submitted, not opened yet.
+    """The files that one team submitted, before they are opened.
 
     Attributes
     ----------
-    id : unique in the batch, and valid as a folder name.
+    id : id that is unique in the batch and valid as a folder name.
     sources : one folder, or several files, which may be archives.
-    owner : the account that submitted it, with the platform's name and number: "Jane Doe (moodle
-        1024)"; or "".
-    handed_in : the time in ISO 8601, if the platform gives it; or "".
-    problem : why it cannot be opened, if already known; or "".
-    parent : name of the folder around it; needed until its id is unique.
+    owner : account that submitted the files, with platform and account number, such as "Jane Doe
+        (moodle 1024)"; or "".
+    handed_in : time of the hand-in in ISO 8601, or "" if the platform does not give it.
+    problem : why the files cannot be opened, if this is already known; or "".
+    parent : name of the parent folder, which is needed until the id is unique.
     """
 
     id: str
@@ -84,10 +84,10 @@ def find_hand_ins(
     ----------
     scratch : folder where archives of a whole class are unpacked.
     skip : folders that are not hand-ins, such as the output folder.
-    known : ids in the current class. A folder `team-1` with the longer id `a-team-1` there keeps
-        it, even if this run has no other `team-1`.
-    say : called with a message for each folder that is skipped because it holds results of a
-        grading.
+    known : ids of the current class. If a folder `team-1` has the longer id `a-team-1` in the
+        class, it keeps that id, even if this run has no other `team-1`.
+    say : function that is called with a message for each folder that is skipped because it holds
+        results of a grading.
 
     Raises
     ------
@@ -132,8 +132,8 @@ def _with_refused(
 ) -> list[HandIn]:
     """Return the hand-ins of an archive, including those with refused files.
 
-    A hand-in gets the reason as its problem if some of its files were refused. If all were refused,
-    it is added here.
+    If some files of a hand-in were refused, the reason becomes its `problem`. If all its files were
+    refused, the hand-in is added here.
     """
     whose = {
         source.relative_to(folder).parts: i for i, one in enumerate(found) for source in one.sources
@@ -154,7 +154,7 @@ def _with_refused(
 
 
 def _holds_a_class(archive: Path) -> bool:
-    """Return whether an archive contains many hand-ins, not only one student's."""
+    """Return whether an archive contains many hand-ins, not just that of one student."""
     whole = member_names(archive, limits=CLASS)
     names = whole or names_in_pieces(archive)
     tops = {part for path in names for part in path.parts[:2]}
@@ -211,7 +211,7 @@ def _looked_into(folder: Path, *, walk: _Walk, top: bool, depth: int) -> list[Ha
             without.append(_single(entry))
     if not found and any(entry.name.lower() == _DATA for entry in entries):
         return [_single(folder)]  # a submission that lacks its `submission.toml`
-    # Next to submissions, a folder without one holds a student's own pictures or drafts.
+    # Below the top level, folders beside a single submission hold only the student's own files.
     return found + without if top or len(found) > 1 else found
 
 
@@ -269,8 +269,8 @@ def _archive(path: Path) -> HandIn:
 def _folder_inside(archive: Path) -> str:
     """Return the name of the one folder in an archive that holds the submission.
 
-    Returns "" if the submission is at the top level, or if several folders are possible, or if the
-    archive cannot be read now. The outcome of the hand-in then reports the read error.
+    Returns "" if the submission is at the top level, if several folders are possible, or if the
+    archive cannot be read. A read error is reported later, when the hand-in is graded.
     """
     try:
         tomls = [path for path in member_names(archive) if path.name == NAME]
@@ -286,7 +286,7 @@ def _folder_inside(archive: Path) -> str:
 
 def _from_platform(folder: Path, uploads: dict[Path, Upload], *, top: bool) -> list[HandIn]:
     """Return one hand-in per student, from any number of uploaded files."""
-    # Only metadata at the top level are the platform's; further down they may be a student's file.
+    # Only a metadata file at the top level is the platform's; one further down may be a student's.
     metadata = gradescope_metadata(folder) if top else {}
     by_student: dict[tuple[str, str, str], dict[Path, Upload]] = defaultdict(dict)
     for path, upload in uploads.items():
@@ -315,7 +315,7 @@ def _from_platform(folder: Path, uploads: dict[Path, Upload], *, top: bool) -> l
 
 
 def _name_inside(sources: Sequence[Path]) -> str:
-    """Return the name of the folder that the student packed or uploaded; "" without a folder."""
+    """Return the name of the folder that the student packed or uploaded, or "" without a folder."""
     for source in sources:
         if source.is_dir():
             tomls = [path for path in sorted(source.rglob(NAME)) if path.parent != source]
@@ -337,7 +337,8 @@ def _with_ids(found: Sequence[HandIn], *, known: Iterable[str] = ()) -> list[Han
 
     Parameters
     ----------
-    known : ids in the current class; a hand-in that had its parent as a prefix there keeps it.
+    known : ids of the current class. A hand-in whose id in the class has the parent's prefix keeps
+        that id.
     """
     names = [_fit(one.id) for one in found]
     longer = [_fit(f"{one.parent}-{one.id}") for one in found]

@@ -1,7 +1,7 @@
 """Find how late each hand-in is, from the rubric's deadline or from a table.
 
-The table has the columns `submission` and `days_late`. It replaces the computed lateness, so it can
-also grant extensions.
+The table has the columns `submission` and `days_late`. Its values replace the computed lateness, so
+they can also grant extensions.
 """
 
 from collections.abc import Iterable, Mapping
@@ -21,7 +21,7 @@ _LONGEST = 3_650.0  # days; a larger number must be a typing error
 
 
 def read_late_table(path: Path) -> dict[str, float]:
-    """Return the days late of each submission; names are in lower case.
+    """Return the days late by submission name; the names are in lower case.
 
     Raises
     ------

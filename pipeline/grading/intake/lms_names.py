@@ -1,12 +1,12 @@
 """Read owner and lateness from the file names of learning platforms.
 
-Canvas (`lib/content_zipper.rb`): `doejane_LATE_1024_77001_lab3.zip`; with anonymous grading
-`LATE_anon_x7Yb2_77001_lab3.zip`; for a file that was submitted again `lab3-1.zip`.
+Canvas (`lib/content_zipper.rb`) uses `doejane_LATE_1024_77001_lab3.zip` or, with anonymous grading,
+`LATE_anon_x7Yb2_77001_lab3.zip`. A file that is submitted again is called `lab3-1.zip`.
 
-Moodle (`mod/assign/classes/downloader.php`): `Jane Doe_1024_assignsubmission_file_` as a folder or
-at the beginning of a file's name; for a group, its name and number.
+Moodle (`mod/assign/classes/downloader.php`) uses `Jane Doe_1024_assignsubmission_file_` as a folder
+name or at the beginning of a file name. For a group, the name and number are those of the group.
 
-Gradescope: a folder `submission_77001` next to `submission_metadata.yml`.
+Gradescope uses a folder `submission_77001`, next to a file `submission_metadata.yml`.
 """
 
 import re
@@ -19,8 +19,8 @@ from typing import Literal
 
 Platform = Literal["canvas", "moodle", "gradescope"]
 
-# The last group takes all remaining characters, including line ends. A pattern that always matches
-# to the end needs no backtracking.
+# A last group `.+` or `.*` takes all remaining characters, including line ends. A pattern that
+# always matches to the end needs no backtracking.
 _CANVAS = re.compile(
     r"(?P<owner>.+?)(?P<late>_LATE)?_(?P<user>\d+)_(?P<upload>\d+)_(?P<file>.+)", re.DOTALL
 )
@@ -41,7 +41,7 @@ _OWNER = re.compile(
 )
 _TIME = re.compile(r"(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(?:\.\d*)? ?(Z|UTC|[+-]\d\d:?\d\d)")
 _METADATA = re.compile(r"(?:submission_)?metadata\.ya?ml")
-_MOST_METADATA = 10_000_000  # bytes of the metadata file
+_MOST_METADATA = 10_000_000  # most bytes of the metadata file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +50,8 @@ class Upload:
 
     Attributes
     ----------
-    user : the platform's number of the account.
-    number : the platform's number of this upload; later uploads have larger numbers.
+    user : number of the account on the platform.
+    number : number of this upload on the platform; later uploads have larger numbers.
     """
 
     platform: Platform
@@ -109,7 +109,7 @@ def current(uploads: Mapping[Path, Upload]) -> list[Path]:
 def owner_text(name: str, platform: Platform, user: str) -> str:
     """Return the owner as the gradebook stores it: "Jane Doe (moodle 1024)".
 
-    It includes the platform, because two platforms may use the same number.
+    The text includes the platform, because two platforms may use the same number.
     """
     return f"{name} ({platform} {user})" if user.isdigit() else name
 
@@ -129,14 +129,14 @@ def same_number(a: str, b: str) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Sent:
-    """Gradescope's metadata of a submission: names, and the time in ISO 8601 or ""."""
+    """Gradescope's metadata of a submission: students' names, and time in ISO 8601 or ""."""
 
     names: str
     at: str
 
 
 def gradescope_metadata(folder: Path) -> dict[str, Sent]:
-    """Return the metadata by folder name (`submission_…`); empty without a metadata file."""
+    """Return Gradescope's metadata by folder name; empty if there is no metadata file."""
     import yaml  # imported late: only a Gradescope download needs it
 
     sent: dict[str, Sent] = {}
@@ -166,7 +166,7 @@ def gradescope_metadata(folder: Path) -> dict[str, Sent]:
 
 
 def _time(text: str) -> str:
-    """Return a time that Ruby wrote as ISO 8601; "" if the text is not a time."""
+    """Convert a time written by Ruby to ISO 8601; return "" if the text is not a time."""
     found = _TIME.fullmatch(text)
     if found is None:
         return ""

@@ -22,17 +22,16 @@ from pipeline.submission.complaints import quote
 
 _CHUNK = 1 << 16
 _RATIO_FROM = 1_000_000  # bytes; the ratio of smaller files is not limited
-# Bytes at the end of a zip file that can contain its end record and a comment. They are read at
-# once.
+# The end record of a zip file and its comment are within this number of bytes from the end.
 _END_OF_ZIP = 66_000
-# The end record of a zip file (section 4.3.16) has the place of the table of contents at the first
-# of these offsets. If it has the second number instead, a 64-bit record gives the place.
+# The end record (APPNOTE.TXT 4.3.16) states the position of the table of contents at the offset
+# `_PLACE`. If the position is `_ELSEWHERE`, a 64-bit record states it.
 _PLACE, _ELSEWHERE = 16, 0xFFFFFFFF
 DEEPEST = 40  # nested folders; a submission needs three
 _AGAIN = ": send or download it once more"
 _UTF8_NAME, _ENCRYPTED = 0x800, 0x1
 # Each file in an archive begins with a header (APPNOTE.TXT 4.3.7). The group in the pattern is the
-# length of its name.
+# length of the file's name.
 _HEAD = 30  # bytes
 _MEMBER = re.compile(rb"PK\x03\x04.{22}(..)..", re.DOTALL)
 
@@ -51,11 +50,11 @@ class UnpackLimits:
 
     Attributes
     ----------
-    members : number of files.
-    total : bytes of all unpacked files.
-    ratio : unpacked size of a file divided by its packed size.
-    directory : bytes of the table of contents, which is read at once.
-    whole : one bad file refuses the whole archive; otherwise only that file is refused.
+    members : largest number of files.
+    total : largest number of bytes of all unpacked files together.
+    ratio : largest ratio of a file's unpacked size to its packed size.
+    directory : largest number of bytes of the table of contents.
+    whole : whether one bad file makes the whole archive bad; if not, only that file is refused.
     """
 
     members: int = 2_000
@@ -94,13 +93,14 @@ def is_debris(path: PurePosixPath) -> bool:
 
 
 def unpack(archive: Path, into: Path, *, limits: UnpackLimits) -> dict[PurePosixPath, str]:
-    """Unpack a zip archive into a new folder; return the refused files and the reasons.
+    """Unpack a zip archive into a new folder; return which files were refused, and why.
 
     Only regular files are written.
 
     Raises
     ------
-    SubmissionError : not a zip archive, broken, encrypted, or larger than the limits; one line.
+    SubmissionError : the file is not a zip archive, or it is broken, encrypted or too large; the
+        message has one line.
     OSError : this computer cannot read or write, for example because its disk is full.
     """
     shown = quote(archive.name)
@@ -117,7 +117,7 @@ def unpack(archive: Path, into: Path, *, limits: UnpackLimits) -> dict[PurePosix
 
 
 def member_names(archive: Path, *, limits: UnpackLimits = HAND_IN) -> list[PurePosixPath]:
-    """Return the files that may be unpacked; empty if it is not an archive.
+    """Return the names of the files that may be unpacked; empty if the file is not an archive.
 
     Files that macOS or Windows created are left out.
 
@@ -143,8 +143,8 @@ def member_names(archive: Path, *, limits: UnpackLimits = HAND_IN) -> list[PureP
 def names_in_pieces(archive: Path) -> list[PurePosixPath]:
     """Return the names of files in an archive whose table of contents is missing.
 
-    They are found by searching for the headers of files. Files of archives inside the archive are
-    found too, so the names are good enough to recognise the archive, not to unpack it.
+    The names are found by searching for the headers of files. Files in archives inside the archive
+    are found too, so the names are good enough to recognise the archive, but not to unpack it.
     """
     if not archive.is_file() or not archive.stat().st_size:
         return []
@@ -156,7 +156,7 @@ def names_in_pieces(archive: Path) -> list[PurePosixPath]:
 
 
 class _Refused(Exception):
-    """A file in an archive must not be unpacked."""
+    """A file in an archive is refused."""
 
 
 class _TooLarge(_Refused):
@@ -230,9 +230,9 @@ def _opened(archive: Path, *, limits: UnpackLimits) -> Iterator[zipfile.ZipFile]
 def _is_cut(file: IO[bytes], contents: int) -> bool:
     """Return whether the end of the archive is cut off.
 
-    Then `zipfile` may find the complete table of contents of another archive inside this one. The
-    place that this table states is wrong. In a self-extracting archive the place is wrong too, but
-    such a file starts with a program.
+    If it is cut off, `zipfile` may find the table of contents of another archive inside this one. The
+    position that the end record states for that table is then wrong. A self-extracting archive also
+    states a wrong position, but begins with a program.
     """
     file.seek(0)
     if not _MEMBER.match(file.read(_HEAD)):
