@@ -150,8 +150,14 @@ def _short(titles: Sequence[str], *, most: int) -> list[str]:
 
 
 def shorten(text: str, *, most: int) -> str:
-    """Return a text with at most so many characters; an ellipsis marks a cut."""
-    return text if len(text) <= most else f"{text[: most - 1]}…"
+    """Return a text with at most so many characters; an ellipsis replaces its middle.
+
+    Names of recordings differ at their ends: `sweep_cart1_low`, `sweep_cart1_high`.
+    """
+    if len(text) <= most:
+        return text
+    head = (most - 1) // 2
+    return f"{text[:head]}…{text[head + 1 - most :]}"
 
 
 def name_rows(ax: Axes, rows: Sequence[tuple[str, str]]) -> None:
