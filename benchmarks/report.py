@@ -17,7 +17,8 @@ import tomlkit
 from matplotlib.figure import Figure
 
 from benchmarks.page import Table, installed, missing, spread
-from pipeline.report.figures.style import MODEL, SECOND, legend_above, panels
+from pipeline.report.figures.colours import MODEL, SECOND
+from pipeline.report.figures.style import legend_above, panels
 from pipeline.resources import EXAMPLES
 from pipeline.simulated.submission import write_submission
 from pipeline.submission.load import NAME

@@ -37,7 +37,7 @@ def explore(
     from pipeline.bench.live.terminal import Terminal
     from pipeline.experiments.exploring.at_bench import explore_bench
     from pipeline.experiments.exploring.error_goal import read_error_goal, read_time
-    from pipeline.report.exploration.diary import NAME
+    from pipeline.report.exploration import NAME
 
     goal, seconds = read_error_goal(until), read_time(limit)
     if ask and not sys.stdin.isatty():

@@ -19,9 +19,9 @@ from matplotlib.text import Text
 from pipeline.plant.linear.chain import Chain
 from pipeline.report.document import Picture
 from pipeline.report.figures.bode import bode_figure, overview_figure, plot_phase
+from pipeline.report.figures.colours import CARTS
 from pipeline.report.figures.grading import distribution_figure
 from pipeline.report.figures.style import (
-    CARTS,
     drawing,
     panels,
     plot_measured,

@@ -1,4 +1,7 @@
-"""The bench's room: plan, acquire, explore, watch. The acquiring process decides what runs."""
+"""The bench's room: plan, acquire, explore, watch. The acquiring process decides what runs.
+
+Some modules are imported late, because they load the estimators.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -15,20 +18,10 @@ from pipeline.desk.benches import BenchSession
 from pipeline.desk.served_files import serve_file
 from pipeline.desk.typed import read_number, read_whole_number
 from pipeline.errors import ConfigError, PipelineError
-from pipeline.experiments.by_hand import (
-    KINDS,
-    NEEDED,
-    TYPED,
-    WantedRecording,
-    add_recording,
-    make_recording,
-)
 from pipeline.experiments.exploring.error_goal import read_error_goal
-from pipeline.experiments.goal import WORST
 from pipeline.experiments.plan import Recording
-from pipeline.experiments.propose import current_plan
 from pipeline.names import read_name
-from pipeline.report.exploration.diary import NAME as DIARY
+from pipeline.report.exploration import NAME as DIARY
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import outside
 from pipeline.words.text import with_symbols
@@ -72,6 +65,8 @@ def explore(ask: Ask) -> Response:
 
 def add(ask: Ask) -> Response:
     """Add a recording to the plan; if an exploration is running, it records this next."""
+    from pipeline.experiments.by_hand import add_recording
+
     folder, typed = ask.folder(), {name: ask.text(name) for name in _TYPED}
     try:
         before = plan_ids(folder)
@@ -84,6 +79,8 @@ def add(ask: Ask) -> Response:
 
 def weigh(ask: Ask) -> Response:
     """Show what a recording would improve, next to the one that the program would choose."""
+    from pipeline.experiments.goal import WORST
+
     folder, typed = ask.folder(), {name: ask.text(name) for name in _TYPED}
     try:
         wanted = _read_recording(typed, load_submission(folder)).model_dump(mode="json")
@@ -149,7 +146,7 @@ def _show_page(
         ports=list_ports(ask),
         has_report=outside(folder, "report/report.html") is None,
         kinds=_KINDS,
-        kind=kind if kind in KINDS else KINDS[0],
+        kind=kind if kind in dict(_KINDS) else _KINDS[0][0],
         kind_asked=bool(ask.query("kind")),
         diary=outside(folder, DIARY) is None,
         typed={name: typed.get(name, "") for name in _TYPED},
@@ -166,6 +163,9 @@ def _note_plan(ask: Ask) -> None:
 
 def _read_recording(typed: Mapping[str, str], submission: Submission) -> Recording:
     """Return the custom recording of the form."""
+    from pipeline.experiments.by_hand import KINDS, NEEDED, TYPED, WantedRecording, make_recording
+    from pipeline.experiments.propose import current_plan
+
     if typed["kind"] not in KINDS:
         raise ConfigError(f"kind: expected {', '.join(KINDS)}, found {typed['kind']!r}")
     kind = KINDS[KINDS.index(typed["kind"])]

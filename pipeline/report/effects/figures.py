@@ -12,15 +12,8 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.augmented import rest_positions, simulate_augmented
 from pipeline.plant.nonlinear.effects import AugmentedChain, Effect, EffectTerm
 from pipeline.report.effects.catalogue import INPUT, POSITION
-from pipeline.report.figures.style import (
-    MODEL,
-    QUIET,
-    SECOND,
-    SECOND_LINE,
-    legend_above,
-    panels,
-    position_label,
-)
+from pipeline.report.figures.colours import MODEL, QUIET, SECOND, SECOND_LINE
+from pipeline.report.figures.style import legend_above, panels, position_label
 from pipeline.words.numbers import subscript
 
 # Hz; fast enough to compute velocities and accelerations as differences of positions.

@@ -12,7 +12,9 @@ from pipeline.gap.types import Gap
 from pipeline.names import read_name
 from pipeline.output import write_file
 from pipeline.report.document import Block, Heading, Tile, Tiles, Tone, paragraph
-from pipeline.report.figures.style import QUIET, SECOND, legend_above, panels
+from pipeline.report.exploration import NAME
+from pipeline.report.figures.colours import QUIET, SECOND
+from pipeline.report.figures.style import legend_above, panels
 from pipeline.report.gap.story import before_after_picture, deciding_trace
 from pipeline.report.gap.verdict import error_board, verdict_blocks, verdict_title
 from pipeline.report.render.html import render_html
@@ -23,7 +25,6 @@ from pipeline.words.phrases import phrases
 from pipeline.words.spans import spans
 from pipeline.words.text import capital, clean, name_span, rich, symbol_text
 
-NAME = "exploration.html"
 _WORDS = phrases("exploration")
 
 

@@ -11,16 +11,8 @@ from matplotlib.ticker import MultipleLocator
 from pipeline.arrays import Array
 from pipeline.names import mode_suffixes
 from pipeline.plant.linear.chain import Chain
-from pipeline.report.figures.style import (
-    CARTS,
-    MEASURED,
-    MODEL,
-    QUIET,
-    legend_above,
-    log_frequency_axis,
-    panels,
-    plot_line,
-)
+from pipeline.report.figures.colours import CARTS, MEASURED, MODEL, QUIET
+from pipeline.report.figures.style import legend_above, log_frequency_axis, panels, plot_line
 from pipeline.report.figures.svg import tell
 from pipeline.results import FrequencyResponse
 from pipeline.set_up import Units

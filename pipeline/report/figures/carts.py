@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, Rectangle
 
-from pipeline.report.figures.style import MEASURED, MODEL, QUIET, WIDTH
+from pipeline.report.figures.colours import MEASURED, MODEL, QUIET
+from pipeline.report.figures.style import WIDTH
 from pipeline.words.numbers import subscript
 
 # Inches:

@@ -10,18 +10,8 @@ from matplotlib.ticker import MaxNLocator
 from pipeline.arrays import Array
 from pipeline.plant.linear.chain import Chain
 from pipeline.report.figures.bode import bode_panels
-from pipeline.report.figures.style import (
-    MEASURED,
-    MODEL,
-    SECOND,
-    SECOND_LINE,
-    SHADE,
-    THIRD,
-    legend_above,
-    panels,
-    plot_line,
-    shorten,
-)
+from pipeline.report.figures.colours import MEASURED, MODEL, SECOND, SECOND_LINE, SHADE, THIRD
+from pipeline.report.figures.style import legend_above, panels, plot_line, shorten
 from pipeline.report.figures.svg import tell
 from pipeline.report.figures.time import decay_figure, step_figure
 from pipeline.results import FrequencyResponse, LogDecrement, Record, StepGain

@@ -19,28 +19,12 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
 from pipeline.arrays import Array
+from pipeline.report.figures.colours import MEASURED, MODEL, QUIET, SECOND_LINE, Look
 from pipeline.report.figures.svg import tell
 from pipeline.words.numbers import subscript
 from pipeline.words.text import clean
 
 WIDTH = 5.2  # inches: as wide as the text of a page, three quarters of this on a phone
-MEASURED = "#222222"
-MODEL = "#0072b2"  # the blue and vermillion of Okabe and Ito; they also differ in grey
-SECOND = "#d55e00"
-THIRD = "#009e73"
-QUIET = "#8a8a8a"
-SHADE = "#ececec"
-# For carts in the same panel: colour, line style, marker of single points, and the marker's name.
-CARTS = (
-    (MODEL, "-", "o", "circles"),
-    (SECOND, "--", "s", "squares"),
-    (THIRD, "-.", "^", "triangles"),
-    (MEASURED, ":", "D", "diamonds"),
-)
-
-Look = dict[str, Any]  # options of a line for matplotlib, such as colour, style and width (points)
-SECOND_LINE: Look = {"color": SECOND, "ls": "--", "lw": 1.0}
-
 _LIFT = 0.22  # inches from the titles of panels to a legend above
 _STYLE: dict[Any, Any] = {
     "font.family": ["DejaVu Sans"],  # this font comes with matplotlib, so the PDF has it too

@@ -10,11 +10,11 @@ from matplotlib.ticker import MaxNLocator, MultipleLocator, NullLocator
 from matplotlib.transforms import ScaledTranslation
 
 from pipeline.arrays import Array
+from pipeline.report.figures.colours import GRID
 
 # Parts that a page moves or draws again when it zooms: grids, tick labels, letters that mark a
 # place.
 TAGS = ("grid-x", "grid-y", "tick-x", "tick-y", "mark")
-GRID = "#e4e4e4"
 _SIZE = 7.5  # points; size of the labels
 
 

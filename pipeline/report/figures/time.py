@@ -8,14 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipeline.arrays import Array
+from pipeline.report.figures.colours import CARTS, MEASURED, MODEL, QUIET, SECOND_LINE, SHADE, THIRD
 from pipeline.report.figures.style import (
-    CARTS,
-    MEASURED,
-    MODEL,
-    QUIET,
-    SECOND_LINE,
-    SHADE,
-    THIRD,
     keep_in_sight,
     legend_above,
     panels,

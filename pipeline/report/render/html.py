@@ -16,8 +16,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from pipeline.report.document import Block, Document, Picture, Table, Tiles, flat
-from pipeline.report.figures.style import MEASURED, MODEL, QUIET, SECOND, SHADE, THIRD
-from pipeline.report.figures.ticks import GRID
+from pipeline.report.figures.colours import GRID, MEASURED, MODEL, QUIET, SECOND, SHADE, THIRD
 from pipeline.resources import TEMPLATES
 from pipeline.words.math import Term, to_mathml
 from pipeline.words.numbers import unbroken

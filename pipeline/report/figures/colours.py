@@ -1,0 +1,21 @@
+"""The colours and line styles of figures and pages, readable without matplotlib."""
+
+from typing import Any
+
+MEASURED = "#222222"
+MODEL = "#0072b2"  # the blue and vermillion of Okabe and Ito; they also differ in grey
+SECOND = "#d55e00"
+THIRD = "#009e73"
+QUIET = "#8a8a8a"
+SHADE = "#ececec"
+GRID = "#e4e4e4"
+# For carts in the same panel: colour, line style, marker of single points, and the marker's name.
+CARTS = (
+    (MODEL, "-", "o", "circles"),
+    (SECOND, "--", "s", "squares"),
+    (THIRD, "-.", "^", "triangles"),
+    (MEASURED, ":", "D", "diamonds"),
+)
+
+Look = dict[str, Any]  # options of a line for matplotlib, such as colour, style and width (points)
+SECOND_LINE: Look = {"color": SECOND, "ls": "--", "lw": 1.0}
