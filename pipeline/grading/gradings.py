@@ -53,7 +53,7 @@ class Grading(Member):
 
     Attributes
     ----------
-    status : `failed` if it could not be graded.
+    status : `graded`, or `failed` if the submission could not be graded.
     settled : False if the next run must grade the submission again, for example after a crash.
     grade : text of `grade.json`, without the flag for shared data and without overrides.
     findings : results of the checks, as `judge.reweigh` stores them; "" if grading failed.

@@ -1,6 +1,6 @@
 """Grade the submission in a Gradescope container; the script `run_autograder` runs this module.
 
-Gradescope's *Autograder Specifications* prescribe the names of the folders.
+Gradescope's *Autograder Specifications* prescribe the names of the folders below `root`.
 """
 
 import sys

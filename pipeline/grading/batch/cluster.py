@@ -35,9 +35,9 @@ def run_on(address: str) -> Executor:
 
     Raises
     ------
-    ConfigError : the address is not valid, belongs to another machine but has no encryption, or
-        needs certificates that are missing. The returned function raises it if no scheduler or
-        worker answers, or if the cluster runs another version of cartlab.
+    ConfigError : the address is not valid, is a `tcp://` address of another machine (without
+        encryption), or needs certificates that are missing. The returned function raises this error
+        if no scheduler or worker answers, or if the cluster runs another version of cartlab.
     """
     parts = urlsplit(address)
     if parts.scheme not in ("tcp", "tls") or not parts.hostname:
@@ -128,7 +128,7 @@ def _threads(client: Client) -> int:
 def _grade_all(
     client: Client, tasks: Sequence[Task], *, graders: str, out_of: float
 ) -> Iterator[Grading]:
-    """Yield each outcome when it is ready;
+    """Yield each outcome when it is ready.
 
     Dask repeats the tasks of a lost worker on another one.
     """

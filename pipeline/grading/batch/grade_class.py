@@ -41,7 +41,7 @@ class Summary:
     Attributes
     ----------
     failed : name and reason for each submission that could not be graded.
-    sharing : number of submissions that contain the same recordings as another one.
+    sharing : number of submissions that share recordings with another submission.
     unsettled : number of failed submissions that the next run grades again.
     is_disk_full : number of submissions that failed because the disk was full.
     remarks : other messages for the command line.
@@ -192,7 +192,7 @@ def _refuse_another_class(out: Path, *, assignment: str) -> None:
 def _pseudonyms(book: Gradebook) -> Callable[[str], str]:
     """Return a function that turns names into pseudonyms.
 
-    When it is first called, it reads the class list, which must have been stored before.
+    The function reads the class list when it is first called, so the list must be stored by then.
     """
     names = cache(lambda: pseudonyms_in(book))
     return lambda name: names().get(name, STRANGER)
@@ -272,7 +272,7 @@ def _executor(options: Options) -> Executor:
 def _example_prints(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:
     """Yield the fingerprints of example recordings, which several teams may submit.
 
-    The examples are those of the rubric, and those of cartlab with the rubric's number of carts.
+    The examples are those of the rubric, and those of cartlab that have as many carts.
 
     Raises
     ------

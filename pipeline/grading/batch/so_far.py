@@ -87,7 +87,10 @@ def _matched(before: Mapping[str, Member], now: Mapping[str, Member]) -> dict[st
 
 
 def _in_common(before: Member, now: Member) -> tuple[bool, ...]:
-    """Return for each kind of evidence, strongest first, whether it shows the same submission."""
+    """Return, for each kind of evidence, whether it shows that both submissions are the same.
+
+    The strongest kind comes first. The result is empty if the teams differ.
+    """
     if _others(before, now):
         return ()
     both = before.people & now.people

@@ -65,7 +65,7 @@ def failed(
 
     Parameters
     ----------
-    reason : why it could not be graded, one cause per line.
+    reason : why the submission could not be graded, one cause per line.
     out_of : full points of the rubric.
     settled : whether the outcome is final; if not, the next run grades the submission again.
     detail : traceback, if the grader itself failed.

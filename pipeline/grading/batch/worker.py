@@ -105,7 +105,7 @@ def named_authors(folder: Path) -> tuple[str, ...]:
 def _figures(
     submission: Submission, graded: Graded, rubric: Rubric
 ) -> tuple[tuple[tuple[str, str], ...], str]:
-    """Return the figures of the feedback, and a traceback if drawing failed, or "".
+    """Return the figures of the feedback, and the traceback of a drawing error or "".
 
     A drawing error leaves the grade unchanged.
     """

@@ -168,8 +168,8 @@ class Gradebook:
 
         Parameters
         ----------
-        shown : function that returns the name under which the phrases show a submission; it is
-            called after the new list is stored.
+        shown : function that returns the name to show for a submission; it is called after the new
+            list is stored.
 
         Raises
         ------
@@ -231,9 +231,9 @@ class Gradebook:
             return read_rubric(self._last(connection))
 
     def entries(self) -> Iterator[Entry]:
-        """Yield the entries of the class list in order;
+        """Yield the entries of the class list in order.
 
-        only some of them are in memory at a time.
+        Only some of the entries are in memory at a time.
         """
         with self._database.reading() as connection:
             last = self._last(connection)

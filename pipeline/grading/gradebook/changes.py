@@ -44,7 +44,7 @@ def points_changes(
     ----------
     before, now : points by submission in the previous and the new class list, respectively.
     by_hand : submissions with points given by hand; their phrases mention this.
-    shown : function that returns the name under which the phrases show a submission.
+    shown : function that returns the name to show for a submission.
     """
     in_order = sorted(now.items(), key=lambda one: shown(one[0]))
     changes = [

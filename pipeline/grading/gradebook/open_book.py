@@ -105,7 +105,7 @@ class Together:
     Attributes
     ----------
     at : time of all these changes, in ISO 8601, UTC, to the microsecond; it identifies them.
-    criterion, why : a criterion and a reason, as examples.
+    criterion, why : a criterion and a reason from these changes, as examples.
     teams : number of submissions changed.
     """
 
@@ -279,7 +279,7 @@ class OpenBook(Gradebook):
             return self._give(connection, row, asked, by=by, rubric=read_rubric(last))
 
     def change_all(self, wishes: Sequence[WantedPoints], *, by: str) -> Together:
-        """Give points by hand to several submissions; if one change is refused, so are all.
+        """Give points by hand to several submissions; if one change is refused, all are.
 
         Raises
         ------

@@ -12,7 +12,7 @@ from pipeline.grading.gradings import go_with
 from pipeline.grading.references.tolerance import exact, late_deduction
 from pipeline.grading.rubric import Rubric
 
-_HEADS = ("submission", "criterion", "points", "why")  # columns of a table of changes
+_HEADS = ("submission", "criterion", "points", "why")  # columns of a table of requested changes
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -287,7 +287,7 @@ class RequestBook(OpenBook):
 
 
 def points_lost(grade: Grade, rubric: Rubric) -> frozenset[str]:
-    """Return the criteria that got less than full points, including those not judged."""
+    """Return the criteria without full points, including those that were not judged."""
     points = {criterion.id: criterion.points for criterion in grade.criteria}
     return frozenset(c.id for c in rubric.criteria if points.get(c.id, 0.0) < c.points)
 

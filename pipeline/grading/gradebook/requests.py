@@ -139,7 +139,7 @@ def _in_class(batch: Row) -> Select:
 
 
 def hide_people(text: str, people: Iterable[str]) -> str:
-    """Return a text in which the names of these people are replaced."""
+    """Return a text in which the names in `people` are replaced."""
     known = "|".join(re.escape(one) for one in people if one)
     return re.sub(rf"(?<!\w)(?:{known})(?!\w)", "…", text, flags=re.IGNORECASE) if known else text
 

@@ -129,7 +129,7 @@ def read_prints(
     Parameters
     ----------
     numbers : numbers of the gradings to read; default: all gradings that have fingerprints.
-    assignment : assignment whose submissions have a true `of_class`.
+    assignment : assignment whose submissions have `of_class` set.
     """
     chosen = select(*_MEMBER, gradings.c.fingerprints, submissions.c.assignment)
     chosen = chosen.join(submissions).order_by(gradings.c.id)

@@ -307,7 +307,7 @@ class Database:
 
     @property
     def name(self) -> str:
-        """The file or URL for messages, without any password."""
+        """The file or URL to show in messages, without any password."""
         url = self._engine.url
         if url.get_backend_name() == "sqlite":
             return url.database or ""
@@ -327,7 +327,7 @@ class Database:
 
     @contextmanager
     def changing(self) -> Iterator[Connection]:
-        """Read and write while nobody else can write, so that the data read stay valid."""
+        """Read and write while nobody else can write, so that the data just read stay valid."""
         with self.writing() as connection:
             _take_turns(connection)
             yield connection

@@ -337,8 +337,8 @@ def _with_ids(found: Sequence[HandIn], *, known: Iterable[str] = ()) -> list[Han
 
     Parameters
     ----------
-    known : ids of the current class. A hand-in whose id in the class has the parent's prefix keeps
-        that id.
+    known : ids of the current class. A hand-in whose id in the class begins with the parent folder
+        keeps that id.
     """
     names = [_fit(one.id) for one in found]
     longer = [_fit(f"{one.parent}-{one.id}") for one in found]

@@ -54,7 +54,7 @@ class UnpackLimits:
     total : largest number of bytes of all unpacked files together.
     ratio : largest ratio of a file's unpacked size to its packed size.
     directory : largest number of bytes of the table of contents.
-    whole : whether one bad file makes the whole archive bad; if not, only that file is refused.
+    whole : whether one bad file makes cartlab refuse the whole archive, not only that file.
     """
 
     members: int = 2_000
@@ -210,7 +210,7 @@ class _Bounded(io.BufferedReader):
 
     def read(self, size: int | None = -1, /) -> bytes:
         if size is not None and size > self._most:
-            raise _TooLarge(f"a table of contents of {size:,} bytes")
+            raise _TooLarge(f"its table of contents of {size:,} bytes is too large")
         # `zipfile` asks for -1 bytes to read the end of the file with its comment.
         return super().read(size)
 
@@ -230,9 +230,9 @@ def _opened(archive: Path, *, limits: UnpackLimits) -> Iterator[zipfile.ZipFile]
 def _is_cut(file: IO[bytes], contents: int) -> bool:
     """Return whether the end of the archive is cut off.
 
-    If it is cut off, `zipfile` may find the table of contents of another archive inside this one. The
-    position that the end record states for that table is then wrong. A self-extracting archive also
-    states a wrong position, but begins with a program.
+    If it is cut off, `zipfile` may find the table of contents of another archive inside this one.
+    The position that the end record states for that table is then wrong. A self-extracting archive
+    also states a wrong position, but begins with a program.
     """
     file.seek(0)
     if not _MEMBER.match(file.read(_HEAD)):
