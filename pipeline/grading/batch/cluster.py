@@ -110,7 +110,7 @@ class Graders(WorkerPlugin):
             self._idle.put(process)
 
 
-def _grade(task: Task, archive: bytes, plugin: str) -> Grading:
+def _grade_on_worker(task: Task, archive: bytes, plugin: str) -> Grading:
     """Grade a task on a Dask worker, with the plugin `Graders` of that worker."""
     graders = get_worker().plugins[plugin]
     assert isinstance(graders, Graders)
@@ -146,7 +146,7 @@ def _grade_all(
                 yield failed(task, reason, out_of=out_of, settled=False)
                 continue
             key = f"{graders}-{task.key}"
-            future = client.submit(_grade, task, archive, graders, key=key, pure=False)
+            future = client.submit(_grade_on_worker, task, archive, graders, key=key, pure=False)
             under_way[str(future.key)] = task
             answers.add(future)
         if not under_way:

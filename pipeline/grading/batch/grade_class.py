@@ -127,7 +127,7 @@ def grade_class(
     if options.gradebook is None:
         _refuse_another_class(out, assignment=rubric_file.stem)
     with alone_in(out, private=True), scratch_in(out) as scratch:
-        known = _names_so_far(place, assignment=rubric_file.stem)
+        known = _listed_names(place, assignment=rubric_file.stem)
         passed: list[str] = []
         found = find_hand_ins(paths, scratch=scratch, skip=[out], known=known, say=passed.append)
         hand_ins, unknown = settle_lateness(found, late=rubric.late, table=late_table)
@@ -140,7 +140,7 @@ def grade_class(
                 book=book,
                 execute=_executor(options),
                 examples=lambda: list(_example_prints(rubric, folder=rubric_file.parent)),
-                progress=_nameless(progress, hand_ins) if hidden else progress,
+                progress=_without_names(progress, hand_ins) if hidden else progress,
             )
             now = rubric.model_copy(update={"anonymous": hidden})
             changes = book.finish(batch, rubric=now, shown=shown)
@@ -198,7 +198,7 @@ def _pseudonyms(book: Gradebook) -> Callable[[str], str]:
     return lambda name: names().get(name, STRANGER)
 
 
-def _nameless(progress: Progress, hand_ins: Sequence[HandIn]) -> Progress:
+def _without_names(progress: Progress, hand_ins: Sequence[HandIn]) -> Progress:
     """Return a progress function that leaves out the names of submissions."""
     names = {hand_in.id for hand_in in hand_ins}
     return lambda done, total, last: progress(done, total, "" if last in names else last)
@@ -250,7 +250,7 @@ def _names(names: Sequence[str]) -> str:
     return listing(names, most=_NAMED)
 
 
-def _names_so_far(place: Path | str, *, assignment: str) -> list[str]:
+def _listed_names(place: Path | str, *, assignment: str) -> list[str]:
     """Return the names on the current class list, or no names if there is no gradebook."""
     try:
         with Gradebook(place, assignment=assignment) as book:

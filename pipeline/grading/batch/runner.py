@@ -259,7 +259,7 @@ def _shared(
         for prints in book.prints()
         if prints.fingerprints
         and (prints.authors, prints.fingerprints) not in here
-        and not _is_before(prints, names.get(prints.submission))
+        and not _is_earlier_version(prints, names.get(prints.submission))
     ]
     found = find_shared(batch, earlier=earlier)
     if found and (handed_out := tuple(examples())):
@@ -267,7 +267,7 @@ def _shared(
     return {submission: shared_flag(records) for submission, records in found.items()}
 
 
-def _is_before(earlier: Member, now: Member | None) -> bool:
+def _is_earlier_version(earlier: Member, now: Member | None) -> bool:
     """Return whether `earlier` is an earlier version of the submission `now`.
 
     This is so if the teams are the same. Within one assignment, the same recordings are enough,

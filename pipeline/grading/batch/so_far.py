@@ -39,14 +39,14 @@ def class_so_far(rows: Mapping[str, Member], book: Gradebook) -> SoFar:
     lines = list(book.listed())
     for line in lines:
         name = now.get(line.submission.casefold())
-        if name is None or _others(line, rows[name]):
+        if name is None or _is_other_team(line, rows[name]):
             left[line.submission] = line
         else:
             del new[name]
             if name != line.submission:  # the names differ only in upper and lower case
                 moved[line.submission] = name
     before = {one.submission: one for one in book.prints([one.grading for one in left.values()])}
-    moved |= _matched(before, new)
+    moved |= _match_renamed(before, new)
     return SoFar(
         kept={n: r for n, r in before.items() if n not in moved and n.casefold() not in now},
         moved=moved,
@@ -54,21 +54,21 @@ def class_so_far(rows: Mapping[str, Member], book: Gradebook) -> SoFar:
             (line.submission, line.authors, rows[name].authors)
             for line in lines
             if (name := moved.get(line.submission) or now.get(line.submission.casefold()))
-            and _strangers(line, rows[name])
+            and _has_only_new_authors(line, rows[name])
         ),
     )
 
 
-def _others(before: Member, now: Member) -> bool:
+def _is_other_team(before: Member, now: Member) -> bool:
     """Return whether a submission now has another team; False if authors are unknown."""
-    return _strangers(before, now) and not same_number(before.owner, now.owner)
+    return _has_only_new_authors(before, now) and not same_number(before.owner, now.owner)
 
 
-def _strangers(before: Member, now: Member) -> bool:
+def _has_only_new_authors(before: Member, now: Member) -> bool:
     return bool(before.people and now.people) and before.people.isdisjoint(now.people)
 
 
-def _matched(before: Mapping[str, Member], now: Mapping[str, Member]) -> dict[str, str]:
+def _match_renamed(before: Mapping[str, Member], now: Mapping[str, Member]) -> dict[str, str]:
     """Return the new name of each renamed submission.
 
     The pairs with the strongest evidence are matched first.
@@ -77,7 +77,7 @@ def _matched(before: Mapping[str, Member], now: Mapping[str, Member]) -> dict[st
         (evidence, old, new)
         for old in before
         for new in now
-        if any(evidence := _in_common(before[old], now[new]))
+        if any(evidence := _evidence(before[old], now[new]))
     ]
     moved: dict[str, str] = {}
     for _, old, new in sorted(pairs, key=lambda pair: ([not e for e in pair[0]], *pair[1:])):
@@ -86,12 +86,12 @@ def _matched(before: Mapping[str, Member], now: Mapping[str, Member]) -> dict[st
     return moved
 
 
-def _in_common(before: Member, now: Member) -> tuple[bool, ...]:
+def _evidence(before: Member, now: Member) -> tuple[bool, ...]:
     """Return, for each kind of evidence, whether it shows that both submissions are the same.
 
     The strongest kind comes first. The result is empty if the teams differ.
     """
-    if _others(before, now):
+    if _is_other_team(before, now):
         return ()
     both = before.people & now.people
     names = [f"-{row.submission}" for row in (before, now)]

@@ -171,8 +171,9 @@ class OpenBook(Gradebook):
         with self._database.reading() as connection:
             last = self._last(connection)
             rubric = read_rubric(last)
-            given, keys = _given(connection, last), first_keys(connection, _in_class(last))
-            seen = _seen(connection, last)
+            given = _class_overrides(connection, last)
+            keys = first_keys(connection, _in_class(last))
+            seen = _reviewers(connection, last)
             known = before.listings if before and before.rubric == rubric else ()
             made = {listing.made_of: listing for listing in known}
             columns = gradings.c.id, gradings.c.submission_id
@@ -275,7 +276,7 @@ class OpenBook(Gradebook):
             rows = connection.execute(_overrides().where(*own)).all()
             if not rows:
                 raise ConfigError(f"{criterion}: nothing was changed by hand")
-            asked = _before(rows[:-1], team, criterion)
+            asked = _restoring_change(rows[:-1], team, criterion)
             return self._give(connection, row, asked, by=by, rubric=read_rubric(last))
 
     def change_all(self, wishes: Sequence[WantedPoints], *, by: str) -> Together:
@@ -351,7 +352,7 @@ class OpenBook(Gradebook):
                 if newest.id != row.id:
                     kept.append(row.name)
                     continue
-                wish = replace(_before(before, row.name, row.criterion), at=now)
+                wish = replace(_restoring_change(before, row.name, row.criterion), at=now)
                 self._give(connection, row, wish, by=by, rubric=rubric)
                 back += 1
         return Undone(at=now, back=back, kept=tuple(kept))
@@ -426,7 +427,7 @@ def _in_class(batch: Row) -> Select:
     return select(entries.c.submission_id).where(entries.c.batch_id == batch.id)
 
 
-def _given(connection: Connection, batch: Row) -> dict[int, dict[int, HandPoints]]:
+def _class_overrides(connection: Connection, batch: Row) -> dict[int, dict[int, HandPoints]]:
     """Return all overrides of a class, by submission number and override number."""
     given: dict[int, dict[int, HandPoints]] = defaultdict(dict)
     mine = _overrides().where(overrides.c.submission_id.in_(_in_class(batch)))
@@ -435,7 +436,7 @@ def _given(connection: Connection, batch: Row) -> dict[int, dict[int, HandPoints
     return given
 
 
-def _seen(connection: Connection, batch: Row) -> dict[int, str]:
+def _reviewers(connection: Connection, batch: Row) -> dict[int, str]:
     """Return who marked each grading as reviewed, by grading number; the newest mark counts."""
     of_list = select(entries.c.grading_id).where(entries.c.batch_id == batch.id)
     mine = select(looks).where(looks.c.grading_id.in_(of_list)).order_by(looks.c.id)
@@ -449,7 +450,7 @@ def _overrides() -> Select:
     return select(*columns, *OVERRIDE).join(submissions).order_by(overrides.c.id)
 
 
-def _before(earlier: Sequence[Row], team: str, criterion: str) -> WantedPoints:
+def _restoring_change(earlier: Sequence[Row], team: str, criterion: str) -> WantedPoints:
     """Return a change that restores a criterion to its state after the overrides `earlier`."""
     last = earlier[-1] if earlier else None
     if last is None or (last.points is None and not last.comment):

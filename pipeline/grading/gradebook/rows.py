@@ -310,12 +310,12 @@ def by_other_rubrics(connection: Connection, batch: Row) -> list[str]:
         .where(batches.c.rubric != batch.rubric)
     )
     rows = connection.execute(joined).all()
-    now = _asked(batch.rubric)
-    others = {text for text in {row.rubric for row in rows} if _asked(text) != now}
+    now = _relevant_parts(batch.rubric)
+    others = {text for text in {row.rubric for row in rows} if _relevant_parts(text) != now}
     return sorted(row.name for row in rows if row.rubric in others)
 
 
-def _asked(rubric: str) -> dict:
+def _relevant_parts(rubric: str) -> dict:
     """Return a stored rubric without the title and the anonymity, which do not affect a grade."""
     return json.loads(rubric) | {"title": "", "anonymous": False}
 

@@ -120,9 +120,9 @@ def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") ->
             if refused:
                 raise SubmissionError(f"{quote(path.name)}: {next(iter(refused.values()))}")
             path.unlink()
-            left = _less(left, folder)
+            left = _remaining_limits(left, folder)
     if tomls := _submissions(into):
-        folder = _the_one(tomls, into)
+        folder = _only_submission(tomls, into)
         _gather_loose(folder)
         return folder
     raise SubmissionError(_nothing_in(into))
@@ -170,7 +170,7 @@ def _walk(folder: Path, below: PurePosixPath) -> Iterator[tuple[int, str, Path]]
                 yield entry.stat(follow_symlinks=False).st_size, str(name), Path(entry.path)
 
 
-def _less(limits: UnpackLimits, folder: Path) -> UnpackLimits:
+def _remaining_limits(limits: UnpackLimits, folder: Path) -> UnpackLimits:
     """Return the limits that remain after the files in a folder have been unpacked."""
     sizes = [path.stat().st_size for path in _below(folder)]
     return replace(limits, members=limits.members - 1 - len(sizes), total=limits.total - sum(sizes))
@@ -203,7 +203,7 @@ def _archives(folder: Path) -> list[Path]:
     return [path for path in _below(folder) if path.suffix.lower() == ".zip"]
 
 
-def _the_one(tomls: Sequence[Path], into: Path) -> Path:
+def _only_submission(tomls: Sequence[Path], into: Path) -> Path:
     if len(tomls) > 1:
         names = " and ".join(quote(path.relative_to(into).as_posix()) for path in tomls[:2])
         more = f" and {len(tomls) - 2} more" if len(tomls) > 2 else ""

@@ -96,7 +96,7 @@ def find_hand_ins(
     walk = _Walk(skip={path.resolve() for path in skip} | {scratch.resolve()}, say=say)
     found: list[HandIn] = []
     for number, path in enumerate(dict.fromkeys(path.resolve() for path in paths)):
-        here = _at(path, scratch=scratch / f"class-{number}", walk=walk)
+        here = _find_at(path, scratch=scratch / f"class-{number}", walk=walk)
         if not here:
             raise ConfigError(
                 f"{path}: nothing to grade: it has no folder or zip file with a {NAME}"
@@ -105,7 +105,7 @@ def find_hand_ins(
     return tuple(sorted(_with_ids(found, known=known), key=lambda hand_in: hand_in.id))
 
 
-def _at(path: Path, *, scratch: Path, walk: _Walk) -> list[HandIn]:
+def _find_at(path: Path, *, scratch: Path, walk: _Walk) -> list[HandIn]:
     if path.name == NAME:
         path = path.parent
     if path.is_dir():
@@ -175,25 +175,25 @@ def _holds_a_class(archive: Path) -> bool:
 def _in_folder(folder: Path, *, walk: _Walk, top: bool = True, depth: int = 0) -> list[HandIn]:
     """Return the hand-ins in a folder; an unreadable folder counts as one hand-in."""
     try:
-        return _looked_into(folder, walk=walk, top=top, depth=depth)
+        return _search_folder(folder, walk=walk, top=top, depth=depth)
     except OSError as error:
         problem = f"cannot be read ({error.strerror or error})"
         return [HandIn(id=folder.name, parent=folder.parent.name, problem=problem)]
 
 
-def _looked_into(folder: Path, *, walk: _Walk, top: bool, depth: int) -> list[HandIn]:
+def _search_folder(folder: Path, *, walk: _Walk, top: bool, depth: int) -> list[HandIn]:
     if _is_submission(folder) or depth > DEEPEST:
         return [HandIn(id=folder.name, parent=folder.parent.name, sources=(folder,))]
     entries = [
         entry
         for entry in sorted(folder.iterdir())
-        if entry not in walk.skip and not _is_passed_over(entry, walk=walk)
+        if entry not in walk.skip and not _is_skipped(entry, walk=walk)
     ]
     uploads = {entry: upload for entry in entries if (upload := parse_name(entry.name))}
     if uploads:
-        rest = [entry for entry in entries if entry not in uploads and _may_be_one(entry)]
+        rest = [entry for entry in entries if entry not in uploads and _may_be_hand_in(entry)]
         return _from_platform(folder, uploads, top=top) + [_single(entry) for entry in rest]
-    entries = [entry for entry in entries if _may_be_one(entry)]
+    entries = [entry for entry in entries if _may_be_hand_in(entry)]
     if len(entries) == 1 and entries[0].is_dir() and not entries[0].is_symlink():
         deeper = _in_folder(entries[0], walk=walk, top=top, depth=depth + 1)
         if deeper or not top:
@@ -220,7 +220,7 @@ def _is_submission(folder: Path) -> bool:
     return toml.is_symlink() or toml.exists()
 
 
-def _is_passed_over(entry: Path, *, walk: _Walk) -> bool:
+def _is_skipped(entry: Path, *, walk: _Walk) -> bool:
     """Return whether to skip an entry: system files, results of a grading, or hidden folders.
 
     A hidden folder that contains `submission.toml` is not skipped.
@@ -242,7 +242,7 @@ def _is_passed_over(entry: Path, *, walk: _Walk) -> bool:
     return True
 
 
-def _may_be_one(entry: Path) -> bool:
+def _may_be_hand_in(entry: Path) -> bool:
     return (
         entry.is_dir() or entry.is_symlink() or entry.suffix.lower() in (".zip", *STRANGE_ARCHIVES)
     )
