@@ -53,7 +53,6 @@ class Grading(Member):
 
     Attributes
     ----------
-    status : `graded`, or `failed` if the submission could not be graded.
     settled : False if the next run must grade the submission again, for example after a crash.
     grade : text of `grade.json`, without the flag for shared data and without overrides.
     findings : results of the checks, as `judge.reweigh` stores them; "" if grading failed.
@@ -102,7 +101,6 @@ class Batch:
     shared : flag for recordings that another submission also contains, by submission.
     failed : name and reason for each submission that could not be graded.
     unsettled : failed submissions that the next run grades again.
-    is_disk_full : submissions that failed because the disk was full.
     kept, moved, taken_over : changes to the class list; see `so_far.SoFar`.
     """
 

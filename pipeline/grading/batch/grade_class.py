@@ -44,7 +44,6 @@ class Summary:
     sharing : number of submissions that share recordings with another submission.
     unsettled : number of failed submissions that the next run grades again.
     is_disk_full : number of submissions that failed because the disk was full.
-    remarks : other messages for the command line.
     changes : differences from the previous class list, one phrase each.
     """
 
@@ -77,7 +76,6 @@ class Options:
     cluster : address of a Dask scheduler, whose cluster then grades instead of this machine.
     time_limit : time limit for one submission, in s.
     memory_limit : memory limit for one submission, in bytes.
-    figures : whether to draw figures for the feedback.
     anonymous : whether to leave names out of all files; a rubric may also require this.
     gradebook : file or database URL of the gradebook; default: `gradebook.sqlite` in the output
         folder.

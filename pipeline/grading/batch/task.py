@@ -22,7 +22,6 @@ class Setup:
     scratch : folder for copies of the submissions during grading.
     time_limit : time limit for one submission, in s.
     memory_limit : memory limit for one submission, in bytes, beyond the memory of an idle process.
-    figures : whether to draw figures for the feedback.
     """
 
     rubric: Rubric
@@ -40,7 +39,6 @@ class Task:
     ----------
     id, owner, days_late : as in `intake.hand_ins.HandIn`.
     key : hash of everything that affects the outcome; see `gradings.Member`.
-    sources : paths of the submitted folder or files.
     digest : expected hash of the submitted files; "" to skip this check.
     """
 
@@ -66,9 +64,7 @@ def failed(
     Parameters
     ----------
     reason : why the submission could not be graded, one cause per line.
-    out_of : full points of the rubric.
     settled : whether the outcome is final; if not, the next run grades the submission again.
-    detail : traceback, if the grader itself failed.
     """
     lines = (" ".join(line.split()) for line in reason.split("\n"))
     reason = "".join(c if c.isprintable() or c == "\n" else "�" for c in "\n".join(lines))

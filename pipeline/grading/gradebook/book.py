@@ -67,7 +67,6 @@ class Gradebook:
     ----------
     place : a folder, a SQLite file or any SQLAlchemy URL.
     assignment : name of the assignment whose class list is used; default: the one graded last.
-    create : whether to create a missing gradebook.
     now : function that returns the current time, which is stored with each entry.
 
     Raises

@@ -49,7 +49,6 @@ class Entry:
         lateness.
     automatic : automatic points, by criterion.
     overrides : current points given by hand, by criterion.
-    comments : current comments, by criterion.
     owner : account on the learning platform that submitted the files, or "".
     key : hash of everything that affects the grade.
     grading : number of the grading in the gradebook.
