@@ -1,11 +1,12 @@
-"""The error classes, one for each person or thing that must act.
+"""The error classes; each says where to look for the fault.
 
-Every message is one line: where the fault is, what was needed, what was found.
+Every message is one line that says where the fault is, what was expected and what was found.
 """
 
 import errno
 
-# Errors that a bad file name can cause: too long, a wrong kind of file, taken, not encodable.
+# File errors caused by a name that is too long, already taken, not encodable, or of a file of the
+# wrong kind.
 _OF_A_NAME = frozenset(
     {
         errno.ENAMETOOLONG,
@@ -16,7 +17,7 @@ _OF_A_NAME = frozenset(
         errno.EILSEQ,
     }
 )
-# Errors that a user's own file can cause as well: missing, a loop of links, no permission.
+# The same, and errors of a user's own file: it is missing, in a loop of links, or not permitted.
 _OF_A_FILE = _OF_A_NAME | {errno.ENOENT, errno.ELOOP, errno.EACCES, errno.EPERM}
 _OF_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 

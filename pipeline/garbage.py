@@ -1,11 +1,11 @@
-"""Set how often Python looks for garbage: seldom, as the libraries' objects live to the end."""
+"""Make Python's garbage collection run seldom, because most objects live until the end."""
 
 import atexit
 import gc
 
 # Number of new containers that triggers a search for garbage. With Python's default of 700, a
-# report searches a few hundred thousand objects 500 times. That takes a tenth of its time and frees
-# nothing.
+# report searches a few hundred thousand objects 500 times. This takes a tenth of the report's time
+# and frees nothing.
 _MADE = 300_000
 _OF_A_SERVER = 30_000  # the same for a process that runs for hours
 
@@ -21,9 +21,9 @@ def collect_seldom() -> None:
 
 
 def collect_for_hours() -> None:
-    """Search for cycles of dead objects more often again, in a process that runs for hours.
+    """Search for dead objects more often than `collect_seldom`, in a process that runs for hours.
 
-    Each row saved in a desk leaves some thousand dead objects. With `collect_seldom`, 120 rows used
-    30 MB before the first search.
+    Each row saved in a desk creates about a thousand dead objects. With `collect_seldom` alone, 120
+    rows filled 30 MB before the first search.
     """
     gc.set_threshold(_OF_A_SERVER)

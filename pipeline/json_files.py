@@ -1,8 +1,8 @@
 """Write types to JSON files and read them back.
 
-A result type marks the fields that go into its file by `written`, and derived values by `computed`.
-These marks give the file (`json_text`), its JSON Schema (`json_schema`) and the way to read it back
-(`read_json`). The keys have the order of the class body.
+A result type marks its fields with `written` and derived values with `computed`. The functions
+`json_text`, `json_schema` and `read_json` follow these marks. The keys have the order of the class
+body.
 """
 
 import json
@@ -34,14 +34,14 @@ T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
 _ORDER = count()
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
-_SIGNIFICANT = 10  # digits. Further digits depend on the processor and the library versions
+_SIGNIFICANT = 10  # significant digits; further ones depend on processor and library versions
 
 
 # --------------------------------------------------------------------- marking a type
 
 
 class InFile(NamedTuple):
-    """The type that a value has in the file, as part of its annotation."""
+    """Part of an annotation that gives the type of the value in the file."""
 
     type: Any
 
@@ -77,7 +77,7 @@ def written(
     ----------
     description : text for the JSON Schema.
     key : the key in the file. By default the field's name.
-    part : if the field holds a `result`, the keys of it to write, in this order. By default all.
+    part : the keys to write if the field holds a `result`, in this order; all by default.
     older : the value to assume for a file of an earlier version, which lacks the key.
     default, default_factory : as for a dataclass field.
     """
@@ -106,7 +106,7 @@ def result(*, eq: bool = True) -> Callable[[type[T]], type[T]]:
 
 @dataclass(frozen=True, kw_only=True)
 class WrittenMember:
-    """The content of one key in a type's file; `stored` is false for a property."""
+    """One member that is written to a type's file; `stored` is false for a property."""
 
     name: str
     key: str
@@ -119,7 +119,7 @@ class WrittenMember:
 
 @cache
 def members(cls: type, part: tuple[str, ...] = ()) -> tuple[WrittenMember, ...]:
-    """Return what a type writes, in the order of the file; with `part` only those keys."""
+    """Return the written members of a type in file order; `part` selects some by their keys."""
     hints = get_type_hints(cls, include_extras=True)
     marks = {
         own.name: (own.metadata["written"], hints[own.name])
@@ -164,8 +164,8 @@ def json_text(value: Any) -> str:
 def plain(value: Any, *, digits: int = _SIGNIFICANT, part: tuple[str, ...] = ()) -> Any:
     """Return a value as plain JSON types: floats rounded to `digits`, NaN and infinity as None.
 
-    A `result` becomes a dict of its written members (with `part`, only those keys), a pydantic
-    model a dict of its fields.
+    A `result` becomes a dict of its written members, or only of the keys in `part`. A pydantic
+    model becomes a dict of its fields.
     """
     match value:
         case None | bool() | str() | int():
@@ -219,7 +219,7 @@ def file_model(cls: type, part: tuple[str, ...] = ()) -> type[BaseModel]:
     """
     if issubclass(cls, BaseModel):
         return cls
-    # Of the docstring, only the text before `Attributes` describes the written fields.
+    # Only the docstring's text before `Attributes` describes the written fields.
     about = (getdoc(cls) or "").partition("\n\nAttributes\n")[0]
     found: dict[str, Any] = {
         f"{own.name}_": (
@@ -266,9 +266,9 @@ Readers = Mapping[type, Callable[[str], Any]]
 def read_json(cls: type[T], text: str | bytes, *, readers: Readers | None = None) -> T:
     """Return the value that a file of type `cls` holds; unwritten fields get their defaults.
 
-    `readers` gives, for each type that is written as a name, the function that finds the object of
-    that name. If the fields differ from what is written, the type has a class method
-    `from_written`, which takes all written members.
+    `readers` maps each type that is written as a name to the function that finds the object by
+    name. A type whose fields differ from its written members needs a class method `from_written`,
+    which takes all written members.
 
     Raises
     ------

@@ -10,23 +10,24 @@ from filelock import FileLock, Timeout
 from pipeline.errors import ConfigError
 from pipeline.output import LOCK, OWNERS_FOLDER, TURN
 
-_PATIENCE = 30.0  # s to wait for a turn. A turn takes less than one
+_PATIENCE = 30.0  # s to wait for another program, which needs less than 1 s
 _AGAIN = 0.02  # s between attempts
 
 
 @contextmanager
 def alone_in(out: Path, *, private: bool = False) -> Iterator[None]:
-    """Make a folder and keep other runs out of it; remove it if it stays empty.
+    """Create a folder if needed, and keep other cartlab programs out of it.
 
-    The operating system holds the lock and releases it when the process ends, however it ends.
+    The operating system holds the lock and releases it when the process ends, however it ends. A
+    new folder is removed again if it stays empty.
 
     Parameters
     ----------
-    private : if the folder is made here, only its owner may enter it.
+    private : whether only the owner may enter a new folder.
 
     Raises
     ------
-    ConfigError : another run is using the folder.
+    ConfigError : another cartlab program is using the folder.
     """
     new, lock = not out.exists(), out / LOCK
     out.mkdir(OWNERS_FOLDER if private else 0o777, parents=True, exist_ok=True)
@@ -41,14 +42,14 @@ def alone_in(out: Path, *, private: bool = False) -> Iterator[None]:
 
 @contextmanager
 def turn_in(folder: Path) -> Iterator[None]:
-    """Wait until no other program is changing a file of this folder, then hold the turn.
+    """Wait until no other program is changing files of this folder, then keep others out.
 
-    This lock is separate from `alone_in`: a session on a bench holds that one for an hour, and
-    `submission.toml` may change during the session.
+    This lock is separate from that of `alone_in`, which a bench session may hold for an hour while
+    `submission.toml` changes.
 
     Raises
     ------
-    ConfigError : another program has held the turn for half a minute, or the folder is not
+    ConfigError : another program has held the lock for half a minute, or the folder is not
         writable.
     """
     with _locked(folder / TURN, patience=_PATIENCE):
@@ -77,8 +78,8 @@ def _locked(path: Path, *, patience: float) -> Iterator[None]:
         lock.release()
 
 
-# The lock file holds a blank, then the process number: on Windows, only the holder of the lock can
-# read the first byte.
+# In the lock file, a blank precedes the process number, because on Windows only the holder of the
+# lock can read the first byte.
 
 
 def _sign(file: int) -> None:

@@ -1,9 +1,9 @@
-"""Names of parameters, as in the paper's Tables 1-3; only this module takes names apart.
+"""Names of parameters, as in Tables 1-3 of the paper. Only this module splits names into parts.
 
 `K_1` is the static gain of cart 1. `omega_2` and `zeta_2` belong to cart 2 with the other carts
-held. `omega_a`, `omega_b`, … are resonances; `omega_x` and `omega_y` are the nulls of cart 1 with
-three carts. One cart has no index: `K`, `omega_n`, `zeta`. One cart without a spring has `mass` and
-`damping`.
+held. `omega_a`, `omega_b`, … are resonances. With three carts, `omega_x` and `omega_y` are the
+nulls of cart 1. A single cart has no index: `K`, `omega_n`, `zeta`. A single cart without a spring
+has `mass` and `damping`.
 """
 
 from collections.abc import Iterable
@@ -18,39 +18,39 @@ NULLS = "xy"  # frequencies at which cart 1 of three hardly moves
 
 @dataclass(frozen=True)
 class Name:
-    """A parameter's name in its parts: "omega_a" is the symbol "omega" with the suffix "a"."""
+    """A parameter's name in two parts: "omega_a" has the symbol "omega" and the suffix "a"."""
 
     symbol: str
     suffix: str
 
     @property
     def is_gain(self) -> bool:
-        """Whether it is a static gain; its unit combines the position and the input unit."""
+        """Whether the parameter is a static gain; its unit is position per input."""
         return self.symbol == "K"
 
     @property
     def is_frequency(self) -> bool:
-        """Whether it is a frequency, rad/s."""
+        """Whether the parameter is a frequency, rad/s."""
         return self.symbol == "omega"
 
     @property
     def is_ratio(self) -> bool:
-        """Whether it is a damping ratio."""
+        """Whether the parameter is a damping ratio."""
         return self.symbol == "zeta"
 
     @property
     def is_damping(self) -> bool:
-        """Whether it is a damping ratio or coefficient; estimates of these are less precise."""
+        """Whether the parameter is a damping ratio or coefficient; these are harder to estimate."""
         return self.symbol in ("zeta", "damping")
 
     @property
     def is_mode(self) -> bool:
-        """Whether it belongs to a resonance of all carts together."""
+        """Whether the parameter belongs to a resonance of all carts together."""
         return self.suffix == "n" or (self.suffix != "" and self.suffix in MODES)
 
     @property
     def is_null(self) -> bool:
-        """Whether it belongs to a null of cart 1, with three carts."""
+        """Whether the parameter belongs to a null of cart 1, with three carts."""
         return self.suffix != "" and self.suffix in NULLS
 
     @property
@@ -133,7 +133,7 @@ def omega_names(suffixes: Iterable[str]) -> list[str]:
 
 
 def parameter_names(n: int, *, rigid: bool = False) -> list[str]:
-    """Return the names of all parameters of n carts, in the order of the tables."""
+    """Return the names of all parameters of n carts, in the order of the paper's tables."""
     if n == 1:
         return ["mass", "damping"] if rigid else ["K", "omega_n", "zeta"]
     carts = [str(cart) for cart in range(1, n + 1)]

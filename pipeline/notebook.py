@@ -58,7 +58,7 @@ class Lab:
 
     Attributes
     ----------
-    results : the same results in cartlab's own types (`pipeline.results`).
+    results : all results, in cartlab's own types (`pipeline.results`).
     """
 
     results: Analysis
@@ -113,7 +113,7 @@ class Lab:
 
     @cached_property
     def closed_loop(self) -> "control.StateSpace":
-        """The designed loop from the set point `r` to the positions, sampled with `dt` in s.
+        """The designed loop from set point `r` to the positions, a discrete system with `dt` in s.
 
         Its states are `x1, v1, …` and `u`, the input computed one sample earlier.
         """
@@ -154,7 +154,7 @@ class Lab:
 
     @cached_property
     def records(self) -> "dict[str, pd.DataFrame]":
-        """The measured data by experiment: tables with index `time` and columns `u`, `x1`, …"""
+        """The measured data by experiment, as tables with index `time` and columns `u`, `x1`, …"""
         records = self.results.records
         return {r.id: frames.record_frame(r, analysis=self.results) for r in records}
 
@@ -162,7 +162,7 @@ class Lab:
 
     @property
     def questions(self) -> dict[str, str]:
-        """The questions that these data raise, by the id under which `notes.md` answers them."""
+        """The questions that the data raise, by the id that `notes.md` uses for the answer."""
         return {question.id: with_symbols(question.text) for question in ask(self.results)}
 
     @property
@@ -198,8 +198,8 @@ class ExplainedGap:
 
     Attributes
     ----------
-    results : the same results in cartlab's own types (`pipeline.gap.types`).
-    analysis : the analysis of the submission. The tables take their units from it.
+    results : the results of the gap analysis, in cartlab's own types (`pipeline.gap.types`).
+    analysis : the analysis of the submission, which gives the tables their units.
     """
 
     results: Gap
@@ -207,12 +207,12 @@ class ExplainedGap:
 
     @property
     def verdict(self) -> str:
-        """`named`, `partial`, `none`, `ambiguous` or `unexplained`."""
+        """The verdict: `named`, `partial`, `none`, `ambiguous` or `unexplained`."""
         return self.results.verdict
 
     @cached_property
     def effects(self) -> "pd.DataFrame":
-        """The effects in the order found, one row each, with the keys of `gap.json` as columns."""
+        """The effects in the order found, one row each; the columns are the keys of `gap.json`."""
         return gap_frames.effects(self.results)
 
     @cached_property
@@ -237,15 +237,15 @@ class ExplainedGap:
 
     @property
     def records(self) -> tuple[str, ...]:
-        """The recordings that were used and that `simulate` accepts."""
+        """The recordings that the gap analysis used; `simulate` accepts them."""
         return tuple(sorted({trace.experiment for trace in self.results.traces}))
 
     def simulate(self, record: str) -> "pd.DataFrame":
-        """Return a recording by `time`, with `measured`, `linear` and `with_effects` for each cart.
+        """Return a table by `time` with `measured`, `linear` and `with_effects` for each cart.
 
         Raises
         ------
-        ConfigError : this recording was not used.
+        ConfigError : the gap analysis did not use this recording.
         """
         if record not in self.records:
             known = ", ".join(self.records)
@@ -296,19 +296,19 @@ class CheckedNumbers:
 
     Attributes
     ----------
-    answer : the entry of `checks.jsonl`. It contains no estimated value.
+    answer : the line of `checks.jsonl`, which contains no estimated value.
     """
 
     answer: CheckAnswer
 
     @property
     def disagree(self) -> tuple[str, ...]:
-        """The numbers that disagree, by key: "final.K"."""
+        """The keys of the numbers that disagree with the recordings, such as "final.K"."""
         return self.answer.disagree
 
     @property
     def agree(self) -> tuple[str, ...]:
-        """The numbers that agree, by key."""
+        """The keys of the numbers that agree with the recordings."""
         return self.answer.agree
 
     def share(self, *numbers: str) -> float:
@@ -327,17 +327,17 @@ def check(
     reported: Mapping[str, Any] | None = None,
     rubric: Path | str | None = None,
 ) -> CheckedNumbers:
-    """Say which numbers disagree with a submission's recordings, as `cartlab check` does.
+    """Find which reported numbers disagree with the recordings, as `cartlab check` does.
 
     A second call without changes says where to look. The answer never contains the right value.
     Each answer is appended to the submission's `checks.jsonl`.
 
     Parameters
     ----------
-    reported : numbers in tables, `{"final": {"K": 24.3}}`. A text such as "0.10" keeps its digits.
-        None: the numbers of `submission.toml`.
-    rubric : the file or shipped name of the rubric with the tolerances. None: the shipped rubric
-        for this number of carts.
+    reported : numbers by table, as in `{"final": {"K": 24.3}}`. A string such as "0.10" keeps its
+        trailing zeros. By default the numbers in `submission.toml`.
+    rubric : file, or name of a shipped rubric, that sets the tolerances. By default the shipped
+        rubric for this number of carts.
 
     Raises
     ------

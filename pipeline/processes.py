@@ -30,9 +30,9 @@ from pipeline.words.progress import Progress, silent
 _GLANCE = 0.05  # s between checks of time, memory and stop requests
 _START_LIMIT = 120.0  # s. A cold start on a busy machine takes ten
 _STARTS = 3  # attempts. The system may end a new process to free memory
-# tasks of one worker process, which is then replaced, because libraries keep taking memory
+# tasks after which a worker process is replaced, because libraries use more and more memory
 _TASKS_EACH = 500
-_GRACE = 30.0  # s. A task without a parent may run past its limit for so long.
+_GRACE = 30.0  # s by which a task may exceed its limit after its parent has ended
 _LAST_WORDS = 300  # characters of a process's last output, or of an internal error.
 _LUMP = 65_536  # bytes to read at once
 # Only one thread computes. The other one only listens and does not need its own heap, which takes
@@ -49,10 +49,10 @@ class Ended(Failed):
 
     Attributes
     ----------
-    how : why it ended. `start` means that it ended by itself before it was ready, `crash` that it
-        did so later.
-    status : its exit status or signal, in words.
-    said : the end of what it wrote to stderr.
+    how : why the process ended: `start` if it failed before it was ready, `crash` if it failed
+        later.
+    status : exit status or signal of the process, in words.
+    said : the last part of what the process wrote to stderr.
     """
 
     def __init__(
@@ -88,9 +88,9 @@ class Supervisor:
 
         Parameters
         ----------
-        limit : time limit in s, without the start of the process.
+        limit : time limit in s, not counting the start of the process.
         stop : event that cancels the task when it is set.
-        tell : function that is called with each stage of the task.
+        tell : function that is called with the name of each stage of the task.
 
         Raises
         ------
@@ -293,8 +293,8 @@ def serve(prepare: Callable[..., Callable[[Any, Progress], Any]]) -> None:
 
     Parameters
     ----------
-    prepare : called with the settings by name. It returns the function that does a task, which
-        takes the task and a function to report its stages.
+    prepare : called with the settings as keyword arguments. It returns a function that takes a task
+        and a function to report its stages, and does the task.
     """
     collect_seldom()
     say = answering()
@@ -316,7 +316,7 @@ def serve(prepare: Callable[..., Callable[[Any, Progress], Any]]) -> None:
 
 
 def attempt(work: Callable[[], Any]) -> Any:
-    """Do a task and turn any of its errors into `Failed`, so that the process lives on.
+    """Do a task and turn any error into `Failed`, so that the process keeps running.
 
     Raises
     ------
@@ -355,7 +355,8 @@ def answering() -> Callable[..., None]:
 def lines_sent() -> Iterator[bytes]:
     """Yield the lines that the parent sends to a worker process, until the parent is gone.
 
-    They are not read through `sys.stdin`: Python aborts if it ends while a thread waits for that.
+    This function does not use `sys.stdin`: Python aborts if it exits while a thread waits for
+    `sys.stdin`.
     """
     rest = b""
     while lump := os.read(0, _LUMP):
@@ -386,7 +387,7 @@ def _environment() -> dict[str, str]:
 def _listen(sent: "queue.SimpleQueue[bytes]") -> None:
     for line in lines_sent():
         sent.put(line)
-    os._exit(0)  # it may interrupt a write, but files are written whole or not at all
+    os._exit(0)  # this may interrupt a write, but files are written whole or not at all
 
 
 def _json_line(value: Any) -> bytes:

@@ -24,7 +24,7 @@ def schema_text(name: str) -> str:
 
     Raises
     ------
-    ConfigError : there is no such file.
+    ConfigError : there is no such schema.
     """
     if name not in MODELS:
         raise ConfigError(f"{name}: no such schema; there are {', '.join(MODELS)}")

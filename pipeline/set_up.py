@@ -61,18 +61,22 @@ class Bench:
 
     @property
     def rigid(self) -> bool:
-        """Whether it is one cart without a spring, which has a mass but no static gain."""
+        """Whether the bench is one cart without a spring, which has a mass but no static gain."""
         return self.n == 1 and not any(self.springs)
 
     @property
     def tied(self) -> bool:
-        """Whether a spring ties the carts to a wall; without one a constant input has no rest."""
+        """Whether a spring ties the carts to a wall.
+
+        If not, a constant input never lets them rest.
+        """
         return self.springs[0] or self.springs[-1]
 
     @property
     def stiff(self) -> tuple[bool, ...]:
         """(n + 1,) whether each stiffness can be identified.
 
-        Of one cart's two springs only the sum can; it counts as the first.
+        For a single cart, only the sum of the two springs can be identified; it counts as the
+        first.
         """
         return (any(self.springs), False) if self.n == 1 else self.springs

@@ -1,7 +1,7 @@
 """The workflow from a submission to its analysis.
 
-`identify/carts.py` lists the stages that measure the carts, `identify/fit.py` their fits. The steps
-after that are here.
+`identify/carts.py` lists the stages that measure the carts, and `identify/fit.py` lists the fits.
+The later steps are in this module.
 """
 
 from dataclasses import replace
@@ -44,7 +44,7 @@ def analyse(
 ) -> Analysis:
     """Run every stage that the submission's data support; skip the others and record why.
 
-    Without `design` no controller is designed; see `reference_design`.
+    Without `design`, no controller is designed; see `reference_design`.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def analyse(
 
 
 def _read(submission: Submission, *, log: Log) -> tuple[Ingested, tuple[Intervention, ...]]:
-    """Return the measured data, and the stretches in which an unmeasured force moved a cart."""
+    """Return the data, and the intervals in which an unmeasured force moved a cart."""
     data = read_data(submission)
     for name, reason in data.unreadable.items():
         log.skip(Stage.READING, reason, run=name)
@@ -117,7 +117,7 @@ def _read(submission: Submission, *, log: Log) -> tuple[Ingested, tuple[Interven
 def _with_loops(
     analysis: Analysis, submission: Submission, *, design: bool, progress: Progress, log: Log
 ) -> Analysis:
-    """Return the analysis with the designed loop, the loops that ran and the log's notes."""
+    """Add the designed loop, the checks of recorded loops and the log's notes to the analysis."""
     fit, feedback, checks = analysis.fit, None, list(analysis.checks)
     if design:
         progress("state feedback")
@@ -145,7 +145,7 @@ def _with_loops(
 
 
 def reference_design(submission: Submission, fit: ChainFit | None) -> FeedbackDesign:
-    """Return the state feedback that the submission's task asks for, for the identified carts.
+    """Design the state feedback that the submission asks for, for the identified carts.
 
     Raises
     ------

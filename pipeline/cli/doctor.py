@@ -59,7 +59,8 @@ class Health:
         missing.
     programs : the path of each program of the system; "" if it was not found.
     compiled : the folder of the compiled simulator; "" if no folder can be written.
-    fresh : whether it is compiled for this version; otherwise the first simulation compiles it.
+    fresh : whether the simulator is compiled for this version; if not, the first simulation
+        compiles it.
     log : the file in which the desk notes why it ended.
     """
 

@@ -22,11 +22,11 @@ def find_hidden(out: Path, *, progress: Progress) -> list[str]:
     return [*(f"hidden: {sentence}" for sentence in hidden.effect_sentences), *told]
 
 
-def _end_with_the_first() -> None:
+def _end_with_parent() -> None:
     os.read(0, 1)  # returns when the process that started this one has ended
     os._exit(1)  # safe at any time, because files are written whole or not at all
 
 
 if __name__ == "__main__":
-    threading.Thread(target=_end_with_the_first, daemon=True).start()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     json.dump(find_hidden(Path(sys.argv[1]), progress=silent), sys.stdout)

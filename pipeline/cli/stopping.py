@@ -11,10 +11,10 @@ from pipeline.cli import INTERRUPTED
 
 @contextmanager
 def ctrl_c_says(say: Callable[[], None]) -> Iterator[Callable[[], None]]:
-    """Call `say` when Ctrl-C is pressed; yield a function that ends the work if it was pressed.
+    """Call `say` when Ctrl-C is pressed; yield a function that then ends the work.
 
-    A library may turn an interrupt into an error of its own. Python itself drops one that arrives
-    in the callback of a weak reference, as can happen during any import. Then the next call of the
+    A library may turn an interrupt into an error of its own, and Python drops an interrupt in the
+    callback of a weak reference, as during an import. In both cases the next call of the yielded
     function ends the work.
     """
     pressed = False

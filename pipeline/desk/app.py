@@ -52,7 +52,7 @@ def _start(task: str, title: str, *, then: str = "") -> Handler:
     Parameters
     ----------
     task : name of a function in `tasks.py`.
-    then : end of the address to which the page then goes.
+    then : end of the address that the page opens next.
     """
 
     def start(ask: Ask) -> Response:

@@ -32,7 +32,7 @@ NOTHING_KNOWN: dict[str, Any] = {
     "kind": None, "format": "", "duration": None, "remarks": [], "unusable": [], "unsure": [],
     "lines": [], "fractions": False, "frequency": None, "needs": [], "hardly": [], "still": {},
 }  # fmt: skip
-# Time of change, size, and columns as stated in submission.toml.
+# Time of change and size of a data file, and its columns as stated in submission.toml.
 Stamp = tuple[int, int, dict[str, str | int]]
 
 
@@ -42,7 +42,7 @@ class Said:
 
     Attributes
     ----------
-    tone : done; changed (done, but not exactly as asked); or refused.
+    tone : `done`, `changed` (done, but not exactly as asked) or `refused`.
     """
 
     text: str
@@ -58,8 +58,8 @@ class Desk:
 
     Attributes
     ----------
-    root : the folder from which the person at this computer chooses folders in a list.
-    said : messages still to be shown, by person and room.
+    root : the top folder of the list in which the person at this computer chooses a folder.
+    said : messages still to be shown, by person and address.
     """
 
     root: Path = field(default_factory=find_root)
@@ -76,7 +76,7 @@ class Desk:
     def looks(
         self, folder: Path, stated: Callable[[str], dict[str, str | int]]
     ) -> dict[str, dict[str, Any]]:
-        """Return what each data file of a submission contains, by name; read only changed files.
+        """Return what each data file of a submission contains, by name; reread only changed files.
 
         Parameters
         ----------
@@ -98,7 +98,7 @@ class Desk:
     def keep_shown(self, text: str, *, digest: str, to: str) -> None:
         """Keep the text that a page shows, to find later which values of its form were changed.
 
-        Each person has texts of their own, so that many others cannot push them out.
+        Each person has a separate store, so that texts of other people cannot displace theirs.
 
         Parameters
         ----------
@@ -165,10 +165,7 @@ class Ask:
         return place
 
     def place_or_404(self) -> Place:
-        """Return the place of the address, a folder or a database.
-
-        Refuse the request without one.
-        """
+        """Return the place of the address, a folder or a database; refuse a request without one."""
         if self.place is None:
             raise HTTPException(404, "you have no access to anything here")
         return self.place
@@ -191,7 +188,7 @@ class Ask:
     def job(self) -> Job | None:
         """The last job in the place of the address.
 
-        Its text is hidden if this person may not read it.
+        The job's text is hidden if this person may not read it.
         """
         place = self.place
         if not isinstance(place, Path):
@@ -219,7 +216,10 @@ class Ask:
         return "/".join(self.request.url.path.split("/")[:3]).rstrip("/") + "/"
 
     def _room(self, place: str = "") -> tuple[str, str]:
-        """The key for messages of this room: person and address, or person and part of a page."""
+        """Return the key for messages:
+
+        the person, and the address with the part of the page, if any.
+        """
         return self.user.name, self.here + place
 
     @property
@@ -240,7 +240,7 @@ class Ask:
         return self.request.query_params.get(name, "")
 
     def page(self, template: str, *, status: int = 200, **context: Any) -> Response:
-        """Return a page made from a template; it also shows the job in its folder."""
+        """Return a page made from a template, with the state of its folder's job."""
         folder = self.place if isinstance(self.place, Path) else None
         everywhere = {
             "user": self.user,
@@ -250,7 +250,7 @@ class Ask:
             "version": __version__,
             "folder": folder,
             "job": self.job,
-            # The template removes its messages, so that they are shown only once.
+            # Reading the messages removes them, so that they are shown only once.
             "said": lambda place="": self.desk.said.pop(self._room(place), []),
         }
         text = _environment().get_template(f"{template}.html.j2").render(everywhere | context)
@@ -261,12 +261,12 @@ class Ask:
     def go(self, to: str) -> Response:
         """Return an answer that makes htmx open another page.
 
-        No proxy adds the prefix to its address.
+        The address gets the prefix here, because no proxy adds it to this header.
         """
         return Response(headers={"HX-Redirect": self.request.scope.get("prefix", "") + to})
 
     def back(self, to: str, *said: str | Said, place: str = "") -> Response:
-        """Return to a page, which shows messages once: at its top, or at its part `place`."""
+        """Return to a page that shows messages once, at its top or at its part `place`."""
         if said:
             lines = [Said(one) if isinstance(one, str) else one for one in said]
             self.desk.said.setdefault(self._room(place), []).extend(lines)
@@ -297,10 +297,7 @@ def _environment() -> Environment:
 
 
 def prepare_pages() -> None:
-    """Compile all templates now.
-
-    For a large class this is a fifth of the time of its first page.
-    """
+    """Compile all templates now, so that the first page opens faster."""
     for name in _environment().list_templates(extensions=["j2"]):
         _environment().get_template(name)
 

@@ -1,1 +1,1 @@
-"""Acquisition: the line, the session, and the files it writes."""
+"""Acquisition on a bench: the serial line, sessions, and the files that they write."""

@@ -30,7 +30,7 @@ from pipeline.submission.load import NAME
 from pipeline.submission.toml_file import Value
 
 _USUAL_BAUD = 115_200
-_TRIES = 3  # tries of one recording; a fault that occurs three times is no accident
+_TRIES = 3  # attempts per recording; a fault that occurs three times is no accident
 
 
 def acquire(
@@ -41,26 +41,27 @@ def acquire(
     only: Collection[str] = (),
     buttons: Buttons | None = None,
 ) -> tuple[RunOutcome, ...]:
-    """Record what is missing from the plan; return how each run ended.
+    """Record the planned experiments that the submission lacks; return how each run ended.
 
-    Every complete run is entered in submission.toml at once. So a session that is interrupted can
-    continue. Data of a run that ended early are saved separately, and it is recorded again.
+    Every complete run is entered in submission.toml at once, so an interrupted session can be
+    continued. The data of a run that ended early are saved separately, and the run is repeated.
 
     Parameters
     ----------
-    port : of the bench, as pyserial names it.
-    observers : they show the session; the first one asks a person for work at the bench.
-    only : ids to record; () for the whole plan, to which recordings are added if new data allow
-        them.
-    buttons : what a person wants to do with the current run.
+    port : name of the serial port, or a URL that pyserial knows.
+    observers : displays of the session. The first one also asks a person to do the work at the
+        bench.
+    only : ids of the recordings to make. By default the whole plan, which is extended if new data
+        allow it.
+    buttons : the buttons with which a person ends or repeats a run.
 
     Raises
     ------
     Stopped : a signal or a button ended the session; call again to continue it.
     HardwareError : no bench answers.
     Runaway : the motor of the bench was on between runs.
-    ConfigError : another session writes to the folder, or plan or submission do not fit the bench.
-        If only one recording does not fit, its outcome says why, and the session continues.
+    ConfigError : another session writes to the folder, or the plan or submission does not fit the
+        bench. If only one recording does not fit, its outcome says why, and the session continues.
     """
     with stopping_on_signals(), alone_in(folder):
         work = _Acquisition(
@@ -104,7 +105,10 @@ class _Acquisition:
         self._failed: dict[str, int] = {}  # number of failed tries of each recording
 
     def outcomes(self) -> Iterator[RunOutcome]:
-        """Record until nothing is left; yield how each run ended. A lost line is opened again."""
+        """Record until nothing is missing;
+
+        yield how each run ended. Reopen a line that was lost.
+        """
         lost = True
         while lost:
             with open_line(self._port, baud=self._baud()) as line:
@@ -184,8 +188,7 @@ class _Acquisition:
     def _wish(self, run: "_Run") -> Wish:
         """Return what to do with a run that ended early.
 
-        After an unsafe run it is to skip the recording. Otherwise a button or the answer of a
-        person decides.
+        After an unsafe run, the recording is skipped. Otherwise, a person decides.
         """
         name, partial = run.outcome.recording.id, run.outcome.partial
         unsafe = run.outcome.is_unsafe
@@ -211,7 +214,7 @@ class _Acquisition:
         return wish
 
     def _answer(self, run: "_Run") -> Wish:
-        """Ask a person whether to record it again, unless it has failed too often."""
+        """Ask a person whether to repeat a recording, unless it has failed too often."""
         name = run.outcome.recording.id
         self._failed[name] = self._failed.get(name, 0) + 1
         if self._failed[name] >= _TRIES:
@@ -232,7 +235,7 @@ class _Acquisition:
         outcome = replace(run.outcome, partial="", remarks=(*run.outcome.remarks, remark))
         with signals_held():
             self._note(replace(run, outcome=outcome))
-            # The data file that was just written has the same lines.
+            # The new data file has the same lines as the partial one.
             (self._folder / run.file).unlink()
         self._observer.finished(outcome)
         return outcome
@@ -302,11 +305,11 @@ class _Acquisition:
             return self._refused(RunOutcome(recording=recording, lines=0, partial=str(error)), path)
         try:
             restless = session.prepare(order)
-            # No signal ends the program before a complete run is entered.
+            # Signals wait until a complete run is entered in submission.toml.
             with signals_held() as let_in:
                 outcome = self._run(session, order, path, submission, let_in)
                 remarks = [restless] if restless else []
-                # Late lines have right time stamps, so they do not matter to a reader of the data.
+                # Late lines have correct time stamps, so they do not harm the data.
                 if (spoilt := str(replace(outcome.anomalies, late=0))) != "none":
                     remarks.append(spoilt)
                 run = _Run(
@@ -365,13 +368,13 @@ class _Acquisition:
 
 @dataclass(frozen=True, kw_only=True)
 class _Run:
-    """One try of a recording.
+    """One attempt at a recording.
 
     Attributes
     ----------
-    path : of its raw file, which exists if the run began.
-    file : name of the data file, if the run ended early and has one; or "".
-    controller : of a closed loop, as written in submission.toml.
+    path : path of the raw file, which exists if the run began.
+    file : name of the data file of a run that ended early; "" if there is none.
+    controller : controller of a closed loop, as written in submission.toml.
     """
 
     outcome: RunOutcome

@@ -1,4 +1,4 @@
-"""Add an experiment, a scale or a new file to submission.toml; existing text is kept."""
+"""Add experiments and scales to submission.toml, whose text is kept, or write a new file."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -30,7 +30,7 @@ _TO_ADD = """\
 
 
 def add_experiment(submission: Submission, entry: Mapping[str, Value]) -> Submission:
-    """Add an `[[experiments]]` table to the file; existing text and comments are kept.
+    """Add an `[[experiments]]` table to submission.toml; existing text and comments are kept.
 
     Raises
     ------
@@ -74,13 +74,14 @@ def check_files(plan: Plan, submission: Submission) -> None:
 
 
 def prepare_submission(folder: Path, bench: Description, *, stock: bool) -> Submission:
-    """Return the submission with its scales, either its own or those that the bench states.
+    """Write the bench's scales into a submission that lacks them; return the submission.
 
-    If the folder has no submission, one is made from the bench's description.
+    A folder without a submission gets one, made from the bench's description.
 
     Raises
     ------
-    ConfigError : a scale is missing, units differ, or the bench has too few carts.
+    ConfigError : the bench has too few carts, states a scale in another unit, or sends no
+        description for a new submission.
     """
     if not (folder / NAME).exists():
         if stock:
@@ -142,12 +143,12 @@ def cart_remarks(submission: Submission, bench: Description) -> list[str]:
 
 
 def limit_words(limits: PlanLimits, submission: Submission, bench: Description) -> str:
-    """Return the limits of a plan as text, next to encoder counts and full scale of the bench.
+    """Return the limits of a plan as text, also in encoder counts and beside the full scale.
 
     Raises
     ------
-    ConfigError : the input limit is above full scale, so that amplitudes given as its shares would
-        be too large.
+    ConfigError : the input limit is above the bench's full scale, so the plan was made for another
+        bench.
     """
     system = submission.system
     unit, position = system.input.unit, system.position.unit

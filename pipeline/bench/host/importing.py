@@ -22,7 +22,7 @@ from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import MAX_DATA_BYTES
 from pipeline.submission.toml_file import Value
 
-LOOK_EVERY = 0.5  # s between two looks at the folder
+LOOK_EVERY = 0.5  # s between two scans of the folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,9 +31,9 @@ class Imported:
 
     Attributes
     ----------
-    file : its original name.
-    experiment : its id in the submission.
-    planned : whether it is the next recording of the plan.
+    file : original name of the file.
+    experiment : id of the file's experiment in the submission.
+    planned : whether the file is the next recording of the plan.
     remarks : what to check before a report is made.
     """
 
@@ -61,9 +61,9 @@ class Importer:
         self._plan: Plan | None = (
             load_plan(self._submission) if plan_path(self._submission).exists() else None
         )
-        self._seen: dict[Path, tuple[int, int]] = {}  # size and time at the last look
+        self._seen: dict[Path, tuple[int, int]] = {}  # size and time at the last scan
         self._looks: dict[Path, int] = {}
-        self._over: set[Path] = set()  # imported, refused, or already there
+        self._over: set[Path] = set()  # imported, refused, or already in the submission
         self._locked: set[Path] = set()  # locked files that were reported
         if self._plan:
             self._observer.planned(self._plan, self._done)
@@ -103,10 +103,10 @@ class Importer:
             self._observer.remark(f"next: {recording.id}, a {recording.kind}{hertz}; {held}")
 
     def _complete(self, *, at_once: bool) -> list[Path]:
-        """Return the files that are complete because they no longer change, the oldest first."""
+        """Return the files that no longer change and so are complete, oldest first."""
         ready = []
         for path in self._source.iterdir():
-            # Hidden, or temporary files of a running program.
+            # Hidden files, or temporary files of a running program.
             hidden = path.name.startswith((".", "~"))
             if path in self._over or hidden or self._is_other(path) or not self._opens(path):
                 continue
@@ -122,7 +122,7 @@ class Importer:
         return sorted(ready, key=lambda path: (self._seen[path][1], path.name))
 
     def _is_other(self, path: Path) -> bool:
-        """Return whether a path cannot be a data file, and report that."""
+        """Return whether a path cannot be a data file; if so, report it."""
         if path.is_dir():
             why = "a folder"
         elif path.suffix.casefold() not in ENDINGS:
@@ -145,24 +145,24 @@ class Importer:
         return True
 
     def _try(self, path: Path, *, final: bool) -> Imported | None:
-        """Import a file; one that is locked or vanishes is tried again later."""
+        """Import a file; if it is locked or vanishes, it is tried again later."""
         try:
             return self._take(path, final=final)
         except OSError:
             if path.exists() and self._opens(path):
-                raise  # reading the file is not what failed: the submission's folder is
+                raise  # the file can be read, so writing to the submission failed
             self._over.discard(path)
             self._looks[path] = 0
             return None
 
     def _take(self, path: Path, *, final: bool) -> Imported | None:
-        """Copy a file into the submission and enter it; None if it is refused or known.
+        """Copy a file into the submission and enter it; return None if it is refused or known.
 
-        A file whose last line is not complete may still grow.
+        A file with an incomplete last line may still grow, so it is tried again later.
 
         Parameters
         ----------
-        final : this is the last look, so the file will not grow.
+        final : whether this is the last scan, so that a file cannot be tried again.
         """
         self._over.add(path)
         if path.stat().st_size > MAX_DATA_BYTES:
@@ -219,7 +219,7 @@ class Importer:
         return any(copy.is_file() and filecmp.cmp(copy, path, shallow=False) for copy in copies)
 
     def _match(self, inspection: Inspection) -> Recording | None:
-        """Return the next recording of the plan, if the file can be of this recording."""
+        """Return the next recording of the plan if the file fits it."""
         recording = self._next
         if recording is None:
             return None

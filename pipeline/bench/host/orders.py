@@ -34,11 +34,10 @@ class Order:
 
     Attributes
     ----------
-    commands : to send in this order; the last one starts the run.
-    scales : from counts to units.
-    input_unit, position_unit : these units.
-    most_duty : limit for every line, in duty counts.
-    most_counts : limit for every line, in encoder counts.
+    commands : commands for the bench in the order to send; the last one starts the run.
+    scales : factors from counts to `input_unit` and `position_unit`.
+    most_duty : largest duty that a line may report, in duty counts.
+    most_counts : largest distance of a cart from its zero, in encoder counts.
     """
 
     recording: Recording
@@ -50,7 +49,7 @@ class Order:
     most_counts: float
 
     def rest(self) -> "Order":
-        """Return an order in which nothing moves while the carts settle; it has the same limits."""
+        """Return an order to rest while the carts settle, with the same limits."""
         settle = self.recording.settle
         return replace(
             self,
@@ -59,9 +58,9 @@ class Order:
         )
 
     def strays(self, reading: Reading, *, period: float) -> bool:
-        """Return whether a line has another target than ordered, as after a digit was changed.
+        """Return whether a line's target is not as ordered, for example after a digit was changed.
 
-        A jump may come one `period` (in ms) early or late, and a target may be rounded up or down.
+        A jump may come one `period` (in ms) early or late, and rounding may change a target by one.
         """
         start = self.commands[-1]
         assert isinstance(start, Start)
@@ -77,7 +76,7 @@ class Order:
         return not min(near) - 1 <= reading.target <= max(near) + 1
 
     def drives_off(self, reading: Reading, *, before: Reading) -> bool:
-        """Return whether the motor's duty differs from the target; in open loop they are equal.
+        """Return whether the motor's duty differs from the target, which is a fault in open loop.
 
         A jump may take effect one line later.
         """
@@ -146,7 +145,7 @@ def make_order(
 
     Parameters
     ----------
-    gains : of the controller, for a closed loop.
+    gains : gains of the controller, for a closed loop.
 
     Raises
     ------
@@ -170,7 +169,7 @@ def make_order(
 def _count_amplitude(
     recording: Recording, *, limits: PlanLimits, scales: CountScales, system: System
 ) -> int:
-    """Return the amplitude in counts: of the duty in open loop, of the encoder in closed loop."""
+    """Return the amplitude, in duty counts for an open loop or encoder counts for a closed loop."""
     closed = recording.controller is not None
     limit, unit, per_count = (
         (limits.travel, system.position.unit, scales.position)
@@ -203,8 +202,8 @@ def _list_commands(
     if gains is not None:
         if isinstance(gains, StateGains):
             _check_known("f", "state feedback", bench)
-        # If a byte of the gains is lost on the line, the bench drops them. It then uses the zeros
-        # sent before, not the gains of an earlier run.
+        # If a byte of the gains is lost on the line, the bench rejects the gains. It then uses the
+        # zeros sent before, not the gains of an earlier run.
         commands += [PidGains(kp=0.0, ki=0.0, kd=0.0), gains]
     if recording.wave == "chirp":
         _check_known("c", "chirp", bench)

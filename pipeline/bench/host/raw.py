@@ -1,8 +1,8 @@
 """The raw file of a run: one line of description, then the bytes exactly as they arrived.
 
-`<name>.raw` contains one line of JSON and the bytes of the port. `<name>.times` next to it has
-sixteen bytes for each chunk: the position of its end, and its time. Both files are written as the
-bytes arrive and only grow. So they can be read even if the program is killed.
+`<name>.raw` contains one line of JSON and then the bytes from the port. `<name>.times` beside it
+has sixteen bytes for each chunk: the position of the chunk's end, and its time. Both files only
+grow, so they can be read even if the program is killed.
 """
 
 import json
@@ -30,10 +30,10 @@ class RawHeader:
 
     Attributes
     ----------
-    recording, limits : as in the plan.
-    commands : sent to the bench to start the run, in order.
-    bench : its own description; for a stock bench only the known facts.
-    begun : local time with its offset from UTC.
+    recording, limits : copies of the recording and the limits in the plan.
+    commands : commands that started the run, in the order sent.
+    bench : the bench's description of itself; for a stock bench, only the known facts.
+    begun : local time of the start, with its offset from UTC.
     """
 
     recording: Recording
@@ -70,8 +70,7 @@ class RawWriter:
         # Without a buffer, the system has the bytes when each write returns.
         self._bytes = path.open("xb", buffering=0)
         times = path.with_suffix(".times")
-        # If a deleted raw file has left its times, remove them. If they are a link, its target
-        # stays.
+        # Remove the times of a raw file that was deleted. If the path is a link, its target stays.
         times.unlink(missing_ok=True)
         self._times = times.open("xb", buffering=0)
         self._bytes.write(header.to_json().encode() + b"\n")
@@ -99,7 +98,7 @@ class RawRun:
     Attributes
     ----------
     content : the bytes as they arrived; the last line may be incomplete.
-    arrivals : (end of the chunk in `content`, s since the run began), ascending.
+    arrivals : the end of each chunk in `content`, and its time in s since the run began.
     """
 
     header: RawHeader
@@ -121,7 +120,7 @@ def read_raw(path: Path) -> RawRun:
 
     Raises
     ------
-    DataError : it is not a raw file, or its header is incomplete.
+    DataError : the file is not a raw file, or its header is incomplete.
     """
     raw = path.read_bytes()
     head, newline, content = raw.partition(b"\n")
@@ -153,7 +152,7 @@ def _header(line: bytes, *, name: str) -> RawHeader:
 
 
 def free_raw_path(folder: Path, recording: Recording) -> Path:
-    """Return a name that is still free; each try of a recording has its own raw file."""
+    """Return an unused path for a raw file; each attempt at a recording has its own."""
     parent = own_folder(folder, FOLDER)
     number = 1
     while (path := parent / f"{recording.id}-{number}.raw").exists():

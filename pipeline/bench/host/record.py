@@ -19,7 +19,7 @@ def data_file(recording: Recording, *, partial: bool = False) -> str:
 
 
 def readings_of(run: RawRun) -> tuple[Reading, ...]:
-    """Return the valid lines of a run in order.
+    """Return the valid lines of a run in order, judged as they were during the run.
 
     They are judged in the same way as during the run.
     """
@@ -52,11 +52,11 @@ def save_record(raw_path: Path, *, folder: Path, carts: int, partial: bool = Fal
 
 
 def log_text(readings: Sequence[Reading], *, carts: int, reference: bool) -> str:
-    """Return a bench log with counts and time stamps (in s, rounded to ms) as they arrived.
+    """Return a bench log with the counts and time stamps (in s, to the ms) that arrived.
 
     Parameters
     ----------
-    reference : add the target as a column, in encoder counts.
+    reference : whether to add the target as a column, in encoder counts.
     """
     encoders = min(carts, len(readings[0].counts))
     heading = ["Sample", "Time", *(f"Encoder {i + 1} Pos" for i in range(encoders))]
@@ -70,17 +70,17 @@ def log_text(readings: Sequence[Reading], *, carts: int, reference: bool) -> str
 
 
 def save_left_over(folder: Path, *, carts: int) -> list[str]:
-    """Save partial records of raw files that have no data file; return their names."""
+    """Save a partial record of each raw file that has no data file; return the new names."""
     saved = []
     for path in sorted((folder / FOLDER).glob("*.raw")):
         try:
             recording = read_raw(path).header.recording
-            # The file was renamed, or the id is a path to another folder.
+            # Skip a file that was renamed, and an id that is a path to another folder.
             if path.stem.rpartition("-")[0] != recording.id:
                 continue
             made = [folder / data_file(recording, partial=partial) for partial in (False, True)]
             if not any(file.exists() for file in made):
                 saved.append(save_record(path, folder=folder, carts=carts, partial=True))
-        except DataError:  # cut off within its first lines
+        except DataError:  # the raw file was cut off within its first lines
             continue
     return saved

@@ -1,4 +1,4 @@
-"""Check arriving lines against limits and wave, during a run and during the rest before it."""
+"""Check arriving lines against the limits and the wave, during a run and the rest before it."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -69,17 +69,17 @@ class LineWatch:
 
 
 class _InARow:
-    """Tell a condition that lasts two or more lines from a single garbled line."""
+    """Distinguish a condition that lasts two or more lines from a single garbled line."""
 
     def __init__(self) -> None:
         self._since: int | None = None  # ms of the first line with the condition
 
     def lasts(self, shows: bool, *, ms: int) -> bool:
-        """Return whether the condition has lasted.
+        """Return whether the condition has lasted for two or more lines.
 
         Parameters
         ----------
-        shows : whether this line shows it.
+        shows : whether this line meets the condition.
         ms : stamp of this line.
         """
         if not shows:
@@ -116,7 +116,7 @@ class RunWatch(LineWatch):
         self._let_in()
         self._batch += batch
         if trouble := super().check(batch):
-            return trouble  # the stop is sent first, before any observer is informed
+            return trouble  # the stop must be sent before any observer is informed
         now = time.monotonic()
         if now - self._forwarded > 0.05:
             self._forwarded = now
@@ -124,14 +124,14 @@ class RunWatch(LineWatch):
         return ""
 
     def forward(self, batch: Sequence[Reading]) -> None:
-        """Pass the waiting lines and these lines to the observer."""
+        """Pass the waiting lines and a new batch to the observer."""
         waiting, self._batch = [*self._batch, *batch], []
         if waiting:
             self._observer.readings(waiting, self._stream.anomalies())
 
 
 class RestWatch(LineWatch):
-    """Check the lines of a rest, and keep the last ones.
+    """Check the lines while the carts come to rest, and keep the last ones.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ class RestWatch(LineWatch):
 
     @property
     def last(self) -> Reading | None:
-        """The last line kept."""
+        """The last line, or None if there is none."""
         return self._readings[-1] if self._readings else None
 
     @property

@@ -1,7 +1,7 @@
 """The serial line to a bench: open it, identify the bench, send, receive.
 
-No other module uses a port. Every arriving line is checked: by the session during a run, and at any
-other time by `overhear` here, because the motor must then be off.
+No other module uses a port. Every arriving line is checked: during a run by the session, and
+between runs, when the motor must be off, by `overhear`.
 """
 
 import re
@@ -27,12 +27,12 @@ from pipeline.bench.protocol.messages import (
 )
 from pipeline.errors import DataError, HardwareError
 
-# Tries, and s between them; a bench just plugged in takes a moment to appear.
+# Attempts to open the port, and s between them; a bench just plugged in takes a moment to appear.
 _TRIES, _BETWEEN = 5, 0.4
-LUMP = 8192  # largest number of bytes read at once; many times those between two heartbeats
+LUMP = 8192  # bytes to read at most at once; far fewer arrive between two heartbeats
 # Queries, and s to wait for each answer; some boards restart for two seconds when opened.
 _QUERIES, _ANSWER = 4, 0.6
-_LOOK = 0.005  # s between two looks at the port
+_LOOK = 0.005  # s between two reads of the port
 FIRST_LINE = 2.0  # s that a bench may take to send the first line
 _NETWORK = re.compile(r"[\w.-]+:\d+|\d+|\[.*\]:\d+")  # a host and a port, or only a port
 _QUIET = 0.05  # s without a byte, after which all bytes have arrived
@@ -47,7 +47,7 @@ class SerialLine:
 
     Attributes
     ----------
-    bench : its description; for a bench that sends none, that of a stock bench.
+    bench : description of the bench; one that sends no description counts as a stock bench.
     resets : number of resets sent; each sets all counts to zero.
     """
 
@@ -74,7 +74,7 @@ class SerialLine:
         """Close the port."""
         socket = getattr(self._port, "_socket", None)
         self._port.close()
-        if socket is not None:  # pyserial forgets it if the other end has closed the connection
+        if socket is not None:  # pyserial does not close it if the other end has hung up
             socket.close()
 
     def knows(self, letter: str) -> bool:
@@ -125,13 +125,13 @@ class SerialLine:
     def overhear(self) -> bytes:
         """Return the bytes that arrived between runs; if the motor is on, stop it.
 
-        Until `clear` is called, the motor may be on for harmless reasons: lines of the last run may
-        still arrive, and a stop may have been lost. So the bench is only stopped again.
+        Before `clear`, the motor may seem to be on for a harmless reason: lines of the last run may
+        still arrive, or a stop was lost. Then the bench is only stopped again.
 
         Raises
         ------
         HardwareError : the line is gone.
-        Runaway : the motor is on between runs.
+        Runaway : the motor is on between runs, after `clear`.
         """
         with self._lock:
             data = self.receive()
@@ -144,7 +144,10 @@ class SerialLine:
             return data
 
     def _run_away(self, why: str) -> None:
-        """Raise an error because the bench acted without an order, and keep it for later starts."""
+        """Raise `Runaway`, because the bench acted without an order;
+
+        later starts raise it again.
+        """
         self._runaway = Runaway(f"stopped: the bench {why}; switch its motor off and find out why")
         raise self._runaway
 
@@ -222,8 +225,7 @@ class SerialLine:
             if data:
                 heard += data
                 quiet_at = now + _QUIET
-            # The time is from before the look at the port, because this computer may pause in
-            # between.
+            # `now` was read before the port, because this computer may pause between the two.
             if now > min(end, quiet_at):
                 return bytes(heard)
             time.sleep(_LOOK)
@@ -231,8 +233,9 @@ class SerialLine:
     def clear(self, *, queries: int = _QUERIES) -> None:
         """Discard all that the bench has sent, so that the next bytes answer the next command.
 
-        Silence is no proof, because a busy computer may hold bytes back. But bytes that follow the
-        answer to a query were sent after it. A stock bench does not answer queries.
+        A silent line proves nothing, because a busy computer may hold bytes back. But bytes that
+        follow the answer to a query were sent after the query. A stock bench does not answer
+        queries.
 
         Raises
         ------
@@ -288,12 +291,12 @@ class SerialLine:
     def _answer(self, beginning: bytes = b"?") -> bytes | None:
         """Send a query; return the last answer, or None.
 
-        Answers to earlier queries may arrive first. If some arrive and then none for a while, the
-        others are lost.
+        Answers to earlier queries may arrive first. If no further answer arrives for a while, the
+        missing ones count as lost.
 
         Parameters
         ----------
-        beginning : with which the line of an answer begins.
+        beginning : first bytes of a line that is an answer.
         """
         self.send(Signal.QUERY)
         self._asked += 1
@@ -304,8 +307,7 @@ class SerialLine:
             lines = [line for line in heard.split(b"\n")[:-1] if line.startswith(beginning)]
             if len(lines) > len(answers):
                 answers, end = lines, now + _ANSWER
-            # The time is from before the look at the port, because this computer may pause in
-            # between.
+            # `now` was read before the port, because this computer may pause between the two.
             elif now > end:
                 break
             else:
@@ -319,7 +321,7 @@ class SerialLine:
         """Let a stock bench send lines for a moment, to count its encoders."""
         # A run of 0.1 s without motion makes a stock bench send lines.
         self.send(Start(wave=Wave.DELTA, frequency=1 / 0.1, amplitude=0))
-        self._in_run, self._is_cleared = False, True  # this is no run in which the motor may be on
+        self._in_run, self._is_cleared = False, True  # the motor must stay off in this run
         heard, end = b"", time.monotonic() + FIRST_LINE
         while not heard and time.monotonic() < end:
             time.sleep(_LOOK)

@@ -34,12 +34,11 @@ from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.experiments.plan_words import hold_words
 
 SILENCE = 0.5  # s without a byte during a run, after which the bench counts as gone
-# Milliseconds around the planned end: silence that begins earlier is a fault, and so are lines
-# that come later.
+# ms of tolerance around the planned end: earlier silence is a fault, and so are later lines.
 _NEARLY = 100.0
-# Counts; a resting cart may flicker by so many, and in a valid run a free cart moves more.
+# Counts by which a resting cart may flicker; in a valid run a free cart moves more.
 _STILL = 4
-_LOOK = 0.003  # s between two looks at the port
+_LOOK = 0.003  # s between two reads of the port
 _AFTER_END = 0.02  # s within which the last lines arrive
 
 
@@ -56,13 +55,13 @@ def _no_collection() -> Iterator[None]:
 
 
 class Session:
-    """Runs on one bench; it remembers which carts are held, and the bench's true period.
+    """Carries out runs on one bench; remembers which carts are held and the bench's true period.
 
     Parameters
     ----------
-    carts : number of carts in the submission; a bench that describes itself may have more, and
+    carts : number of carts in the submission. A bench that describes itself may have more carts;
         their travel is watched too.
-    buttons : read before anything moves and at every look at the port.
+    buttons : a person's buttons, checked before anything moves and at every read of the port.
 
     Attributes
     ----------
@@ -93,12 +92,12 @@ class Session:
         self.wish: Wish | None = None
 
     def prepare(self, order: Order) -> str:
-        """Have the right carts held and released, and wait until all rest; return a problem, or "".
+        """Have the carts held and released as ordered, and wait for rest; return a problem, or "".
 
         Raises
         ------
-        HardwareError : the carts do not come to rest, or nobody can confirm it.
-        Runaway : the motor is on, or a cart is too far out, without an order.
+        HardwareError : the carts do not come to rest, or nobody can confirm that they are held.
+        Runaway : without an order, the motor is on or a cart is too far out.
         """
         recording = order.recording
         self.wish = None
@@ -128,13 +127,13 @@ class Session:
     ) -> RunOutcome:
         """Carry out one run and write its raw file.
 
-        A limit, a fault of the line, Ctrl-C or a signal may end it early. In any case the bench is
-        stopped and the data are in the file. Interrupts are raised again.
+        A limit, a fault of the line, Ctrl-C or a signal may end the run early. In any case the
+        bench is stopped and the data are in the file. Interrupts are raised again.
 
         Parameters
         ----------
-        let_in : called while lines arrive; it raises an interrupt that is being held. Once the last
-            line has arrived, the run is complete, and interrupts wait.
+        let_in : called while lines arrive; raises an interrupt that was held back. After the last
+            line the run is complete, and interrupts wait.
         """
         recording = order.recording
         stream = self._stream(recording.carts, closed=recording.controller is not None)
@@ -197,7 +196,7 @@ class Session:
         return self._period if self._line.bench.commands else None
 
     def _say_other_period(self, period: float) -> None:
-        """Report, once, a bench whose period (ms) is not the stated one."""
+        """Report once if the measured `period` of the bench (ms) differs from the stated one."""
         stated = 1e3 * self._line.bench.period
         if not self._line.bench.commands or abs(self._period / stated - 1) > OTHER_PERIOD:
             return
@@ -220,9 +219,9 @@ class Session:
         )
 
     def _rest(self, order: Order) -> str:
-        """Wait until the carts rest, watching them in a run without motion.
+        """Wait until the carts rest, and watch them by a run without motion.
 
-        Returns a message if they still move, or "".
+        Returns a message if the carts still move, or "".
         """
         recording = order.recording
         if recording.settle <= 0:
@@ -259,7 +258,7 @@ class Session:
         Raises
         ------
         HardwareError : the rest ended early.
-        Runaway : it ended early because the bench acted without an order.
+        Runaway : the rest ended early because the bench acted without an order.
         """
         settle = nothing.recording.settle
         trouble = self._carry_out(nothing, self._stream(()), seconds=settle, watch=watch)
@@ -275,9 +274,9 @@ class Session:
     def _zero_at_rest(self, recording: Recording) -> None:
         """Set the counts to zero before the motor's first run on this line, while the carts rest.
 
-        When the line was opened, for example after it was lost, the carts may have been swinging.
-        The positions of that moment are no zero for the travel limit. Before a run by hand the
-        counts are not set to zero, because a cart held by hand never rests exactly.
+        The carts may have been swinging when the line was opened, so the positions of that moment
+        are no zero for the travel limit. Before a run by hand the counts are not set to zero,
+        because a cart held by hand never rests exactly.
         """
         if self._zeroed or not recording.amplitude:
             return
@@ -355,10 +354,10 @@ class Session:
         )
 
     def _stop(self, *, always: bool) -> None:
-        """Stop the bench and discard later lines, which nobody asked for.
+        """Stop the bench and discard the lines that still arrive.
 
-        On a stock bench, stopping also sets the counts to zero. So it is done only if the run ended
-        early.
+        On a stock bench, a stop also sets the counts to zero, so it is sent only after a run that
+        ended early.
         """
         try:
             try:

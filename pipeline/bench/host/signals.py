@@ -38,7 +38,7 @@ def stopping_on_signals() -> Iterator[None]:
 def signals_held() -> Iterator[Callable[[], None]]:
     """Hold Ctrl-C and similar signals until the end of the block.
 
-    Yields a function that raises a signal that has arrived.
+    Yields a function that raises `Stopped` if a signal has arrived.
     """
     waiting: list[int] = []
 
@@ -54,7 +54,7 @@ def signals_held() -> Iterator[Callable[[], None]]:
         waiting.append(number)
 
     numbers = [getattr(signal, name) for name in ("SIGINT", *_ENDING) if hasattr(signal, name)]
-    # A signal that is ignored, or that ends the program at once, is left alone.
+    # Leave alone a signal that is ignored or that ends the program at once.
     before = {n: signal.signal(n, hold) for n in numbers if callable(signal.getsignal(n))}
     try:
         yield let_in

@@ -2,7 +2,7 @@
 
 A line is judged when the next line has arrived. The bench's clock never runs backwards, and no cart
 jumps out and back within two lines. So a readable line that differs from both neighbours was
-garbled. This delays each line by one, and loses no valid line.
+garbled. Each line is delayed by one line, but no valid line is lost.
 """
 
 from array import array
@@ -14,23 +14,22 @@ from pipeline.bench.live.observer import Anomalies
 from pipeline.bench.protocol.messages import FULL_SCALE, Reading, parse_reading
 from pipeline.bench.protocol.stamps import StampFit, even_period, fit_stamps
 
-# An encoder is stuck if it moved in one window (first number, in ms) and stands still in the next,
-# although the motor drives as hard. With less than the second number of duty counts, carts may
-# stand still. An encoder that never moved is stuck if its cart is driven, or if its neighbour
-# moves.
+# _WINDOW is in ms, _DRIVEN in duty counts. An encoder is stuck if it moved in one window and stands
+# still in the next, although the motor still drives. Below _DRIVEN, carts may stand still. An
+# encoder that never moved is stuck if the motor drives its cart, or if another cart moves.
 _WINDOW, _DRIVEN = 1000, 8
 
 
 class Stream:
-    """The lines of one run.
+    """The valid lines of one run, and the number of faults.
 
     Parameters
     ----------
     encoders : number of encoder counts in a line.
     period : expected ms between lines.
-    stated : the bench itself stated this period.
-    free : the carts that can move; their encoders are watched.
-    closed : the loop is closed, so that the duty may jump for a single line when an encoder
+    stated : whether the bench itself stated the period.
+    free : carts that can move; their encoders are watched.
+    closed : whether the loop is closed. Then the duty may jump for a single line when an encoder
         flickers.
 
     Attributes
@@ -62,8 +61,8 @@ class Stream:
         self._late = 0
         self._resets = 0
         self.broken = ""
-        # The smallest difference between arrival and time stamp, in s: of the last second, and of
-        # this one.
+        # The smallest difference between arrival and time stamp, in s: in the last second, and in
+        # the current one.
         self._lead, self._new_lead, self._lead_from = float("inf"), float("inf"), float("-inf")
         self._watch = _EncoderWatch(cart for cart in free if cart <= encoders)
 
@@ -86,7 +85,7 @@ class Stream:
     def fit(self) -> StampFit:
         """Return the clock that explains the time stamps.
 
-        It takes too long to be used during a run.
+        This takes too long to be done during a run.
         """
         return fit_stamps(np.array(self._stamps), period=self._expected, stated=self._stated)
 
@@ -112,9 +111,9 @@ class Stream:
         Parameters
         ----------
         data : new bytes from the port.
-        since : time in s when the port was last found empty; data that waited while this computer
-            was busy are not late.
-        now : time in s, of the same clock.
+        since : time in s when the port was last found empty. Data that waited while this computer
+            was busy do not count as late.
+        now : current time in s, from the same clock as `since`.
         """
         *lines, self._tail = (self._tail + data).split(b"\n")
         if len(self._tail) > 512:  # bytes without a line end are noise
@@ -130,7 +129,7 @@ class Stream:
         return valid
 
     def finish(self) -> list[Reading]:
-        """Return the last line of the run, which waited for a next line to be judged."""
+        """Return the last line of the run, which no later line can confirm."""
         last, self._held = self._held, None
         if last is None or (self._before is not None and last.ms < self._before.ms):
             return []
@@ -183,8 +182,8 @@ class Stream:
         self._keep(held)
         if self.lines > 500:
             went_on = held.ms - self._stamps[-501]
-            # If 500 lines take half of the expected time, the period may be another. If they take a
-            # quarter, the clock stands still.
+            # If 500 lines take half of the expected time, the true period may be shorter. If they
+            # take less than a quarter, the clock is at fault.
             if went_on < 0.25 * 500 * self._expected:
                 self._break(f"the bench's clock hardly moves: {went_on} ms in 500 lines")
         return [held]
@@ -210,12 +209,12 @@ class Stream:
 
 
 def _stands_out(before: Reading, held: Reading, after: Reading, *, closed: bool) -> bool:
-    """Return whether a line contradicts both neighbours, while these agree with each other."""
+    """Return whether a line contradicts both neighbours although the neighbours agree."""
     if before.ms <= after.ms and not before.ms <= held.ms <= after.ms:
         return True
     if held.ms < before.ms:
         return True
-    # A cart that hits an end stop moves by at most so many counts in a ms.
+    # A cart that hits an end stop moves by at most 32 counts in 1 ms.
     room = 32 * max(1, after.ms - before.ms)
     signals = [*zip(before.counts, held.counts, after.counts, strict=True)]
     signals.append((before.target, held.target, after.target))
@@ -227,10 +226,10 @@ def _stands_out(before: Reading, held: Reading, after: Reading, *, closed: bool)
 class _MissingSoFar:
     """An estimate of the missing lines, second by second.
 
-    Even without a loss, the clock skips a time stamp now and then. If one regular clock explains
-    the stamps of a second, no line is missing in it, and the period of this clock is used for other
-    seconds. Until there is such a second, the smallest mean spacing of any second is used. It is
-    nearest to the true period if few lines are lost.
+    Even without a loss, the time stamps skip a value now and then. If a regular clock explains all
+    stamps of one second, no line is missing in that second, and its period is used for other
+    seconds. Before the first such second, the smallest mean spacing serves as the period, because
+    lost lines only increase the spacing.
     """
 
     def __init__(self, period: float) -> None:
@@ -249,7 +248,7 @@ class _MissingSoFar:
             self._period, self._seen_even = even, True
         else:
             measured = span / count
-            # Relative error of a clock that is still plausible.
+            # Relative deviation that is plausible for a clock.
             near = abs(measured / self._expected - 1) < 0.005
             first = self._period == self._expected
             if near and not self._seen_even and (first or measured < self._period):

@@ -1,9 +1,8 @@
 """A page in the browser that shows a session at the bench while it runs.
 
-The desk shows the same content on its own pages. `cartlab acquire --web` serves this page alone,
-and only to visitors on this computer who have the address, which contains a secret. Requests from
-other pages are refused. The server looks for news a few times a second, so a slow browser never
-delays the acquisition.
+The desk shows the same content on its own pages. `cartlab acquire --web` serves only this page, and
+only to visitors on this computer whose address contains the secret. Requests from other pages are
+refused. The server checks for changes itself, so a slow browser never delays the acquisition.
 """
 
 import asyncio
@@ -41,18 +40,18 @@ _FILES = {
 def stream_news(
     session: ShownSession, *, is_over: Callable[[], bool], last_words: str = ""
 ) -> Response:
-    """Return the news of a session as a stream of events.
+    """Return the changes of a session as a stream of events.
 
     Parameters
     ----------
-    is_over : whether the session has ended.
-    last_words : the event that reports the end.
+    is_over : function that returns whether the session has ended.
+    last_words : event that is sent when the session has ended.
     """
     if session.viewers >= 8:  # each open page costs a little computing time
         return PlainTextResponse("too many pages show this session", status_code=503)
 
     async def news() -> AsyncIterator[str]:
-        """Yield changes when they happen; a slow page gets fewer of them, not later ones."""
+        """Yield changes as they happen; a slow page gets fewer events, not late ones."""
         session.viewers += 1
         try:
             said, over = time.monotonic(), is_over()
@@ -86,21 +85,21 @@ def press_button(session: ShownSession, wish: str, number: str) -> int:
 
 
 def live_view() -> str:
-    """Return the HTML of a session's view with its buttons, which live.js fills in."""
+    """Return the HTML of a session's view and buttons, which live.js fills in."""
     return (TEMPLATES / "live-view.html").read_text(encoding="utf-8")
 
 
 class LivePage(LiveState):
-    """An observer that serves a page in the browser; a context manager.
+    """An observer that serves a page to the browser; use it as a context manager.
 
     Parameters
     ----------
-    folder : of the submission.
-    port : to listen at; 0: any free port.
+    port : port to listen at; 0 for any free port.
 
     Attributes
     ----------
-    url : of the page, with the secret. Show it only to the person; write it to no file or log.
+    url : address of the page, with the secret. Show it only to the person; write it to no file or
+        log.
     """
 
     def __init__(self, folder: Path, *, port: int = 0) -> None:
@@ -145,7 +144,7 @@ class LivePage(LiveState):
         return Response(text.replace("<!-- the view -->", live_view()), media_type=kind)
 
     async def _press(self, request: Request) -> Response:
-        """Handle a pressed button; its number says which instruction or turn it is for."""
+        """Handle a pressed button; its number says for which instruction or turn it was pressed."""
         if int(request.headers.get("content-length", _LARGEST_ANSWER + 1)) > _LARGEST_ANSWER:
             return PlainTextResponse("too long", status_code=413)
         try:
@@ -160,7 +159,7 @@ class LivePage(LiveState):
 
 
 class _SecretPath:
-    """Admit visitors who have the secret, with which every address begins."""
+    """Admit visitors whose address begins with the secret."""
 
     arrivals = False
 
@@ -169,7 +168,7 @@ class _SecretPath:
         self._secret = f"{secret}/"  # the slash makes relative links of the page work
 
     def site(self, headers: Headers) -> str:
-        """Return the name of this computer that the request uses."""
+        """Return the name by which the request addresses this computer."""
         return find_site(self._sites, headers)
 
     def enter(self, scope: Scope, headers: Headers) -> dict[str, Any] | Response:

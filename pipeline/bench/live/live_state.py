@@ -24,15 +24,15 @@ from pipeline.submission import (
 )
 
 Phase = Literal["waiting", "settling", "recording", "thinking", "over"]
-FRAME = 1 / 30  # s between two looks for news
+FRAME = 1 / 30  # s between two checks for changes
 
 _APART = 5  # ms between points; a screen that shows ten seconds cannot show more
 
 
 class ShownSession(ABC):
-    """What pages show of a session, and their buttons.
+    """The state of a session that pages show, and the buttons of the pages.
 
-    One thread writes it and another reads it.
+    One thread writes the state and another reads it.
 
     Attributes
     ----------
@@ -44,9 +44,9 @@ class ShownSession(ABC):
         self.version = self.viewers = 0
         self._lock = threading.Lock()
         self._run = 0
-        # The points of the last 12 s. A page that connects later does not get earlier ones.
+        # The points of the last 12 s. A page that connects later does not get earlier points.
         self._points: deque[Sequence[float]] = deque(maxlen=2400)
-        self._end = 0  # points of this run, including those dropped
+        self._end = 0  # number of points of this run, including those dropped
         self._counters: Mapping[str, int] = _count(0, Anomalies())
 
     @abstractmethod
@@ -60,7 +60,7 @@ class ShownSession(ABC):
         Parameters
         ----------
         wish : `done`, or one of the buttons of a run.
-        number : of the instruction that is done, or of the turn in which the page showed the
+        number : number of the instruction that is done, or of the turn in which the page showed the
             button.
         """
 
@@ -82,11 +82,11 @@ class ShownSession(ABC):
             }
 
     def follow(self, *, version: int = 0) -> Iterator[list[tuple[str, Mapping[str, Any]]]]:
-        """Yield, whenever it is resumed, the changes since the last time: kind of news and content.
+        """Yield at each step the changes since the last step, as pairs of a kind and its content.
 
         Parameters
         ----------
-        version : of the state that the reader already has.
+        version : version of the state that the reader already has.
         """
         run = start = 0
         while True:
@@ -117,12 +117,12 @@ class LiveState(ShownSession):
 
     Parameters
     ----------
-    folder : of the submission, whose units are shown; it need not exist before the plan is
-        announced.
+    folder : folder of the submission, whose units are shown. The submission need not exist before
+        `planned` is called.
 
     Attributes
     ----------
-    buttons : those pressed on the page, for the acquisition.
+    buttons : the buttons pressed on the page, for the acquisition.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -150,7 +150,7 @@ class LiveState(ShownSession):
     # ------------------------------------------------------------- by the acquisition
 
     def planned(self, plan: Plan, done: frozenset[str]) -> None:
-        """Announce the recordings, and the ids of those that exist."""
+        """Announce the planned recordings, and the ids of those already made."""
         submission = load_submission(self._folder)
         with self._lock:
             self._submission, self._plan, self._done = submission, plan, set(done)
@@ -238,7 +238,7 @@ class LiveState(ShownSession):
             self.version += 1
 
     def _point(self, reading: Reading) -> tuple[float, ...]:
-        """Return a line as a point in the submission's units, or in counts without units."""
+        """Return a line as a point in the submission's units, or in counts if no scale is known."""
         position, drive, carts = 1.0, 1.0, len(reading.counts)
         if self._submission is not None:
             system = self._submission.system
@@ -253,7 +253,7 @@ class LiveState(ShownSession):
     # ------------------------------------------------------------------ by the server
 
     def answer(self, number: int) -> bool:
-        """Confirm the instruction with this number; one with another number does not count."""
+        """Confirm the current instruction if it has this number; return whether it has."""
         with self._lock:
             if self._instruction is None or self._instruction[0] != number:
                 return False
@@ -342,7 +342,7 @@ class LiveState(ShownSession):
 
 
 def _unit(scale: InputScale | PositionScale | None) -> str:
-    """Return the unit into which counts are converted; without a scale it is "count"."""
+    """Return the unit into which counts are converted; "counts" without a scale."""
     return scale.unit if scale and scale.per_count else "counts"
 
 

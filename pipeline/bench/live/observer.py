@@ -14,15 +14,15 @@ WISHES: tuple[Wish, ...] = get_args(Wish)
 
 @dataclass(frozen=True, kw_only=True)
 class Anomalies:
-    """The number of faults on the line.
+    """The numbers of faults on the line.
 
     Attributes
     ----------
-    lost : lines that never arrived, by their time stamps.
-    garbled : lines that could not be read, and merged ones.
-    late : lines that arrived together, long after they were due.
+    lost : lines that never arrived, judged by the time stamps.
+    garbled : lines that could not be read or had merged.
+    late : lines that arrived long after they were due.
     resets : restarts of the bench's clock during the run.
-    stuck : encoders that did not move although the motor did.
+    stuck : encoders that did not move although the motor was driving.
     """
 
     lost: int = 0
@@ -50,11 +50,11 @@ class RunOutcome:
     Attributes
     ----------
     lines : number of valid lines.
-    partial : why it ended early; "" if it did not.
+    partial : why the run ended early; "" if it did not.
     remarks : notes for the person, one sentence each.
     is_astray : the bench acted without an order, so it gets no more orders.
     is_unsafe : it was not safe to continue, so the same recording is not tried again.
-    wish : the button that ended it; None if no button did.
+    wish : the button that ended the run; None if no button did.
     """
 
     recording: Recording
@@ -71,7 +71,7 @@ class Observer(Protocol):
     """Receives the events of an acquisition; every method returns at once, except `confirm`."""
 
     def planned(self, plan: Plan, done: frozenset[str]) -> None:
-        """Announce the recordings, and the ids of those that exist."""
+        """Announce the planned recordings, and the ids of those already made."""
         ...
 
     def confirm(self, instruction: str) -> None:
@@ -119,7 +119,7 @@ class Observers:
         self._observers = tuple(observers)
 
     def planned(self, plan: Plan, done: frozenset[str]) -> None:
-        """Announce the recordings, and the ids of those that exist."""
+        """Announce the planned recordings, and the ids of those already made."""
         for observer in self._observers:
             observer.planned(plan, done)
 
@@ -167,13 +167,12 @@ class Observers:
 class Buttons:
     """The button that a person pressed for the current run.
 
-    It is pressed in one thread and acted on in another. A button does nothing by itself. The
-    acquisition states which buttons it accepts now, checks in every turn of its loop which one was
-    pressed, and decides what to do.
+    One thread presses buttons and another reads them. A button does nothing by itself: the
+    acquisition sets which buttons it accepts, checks which one was pressed, and decides what to do.
 
     Attributes
     ----------
-    turn : number of the current offer; a press that was meant for another turn does not count.
+    turn : number of calls of `begin` so far; a press meant for another turn does not count.
     offered : buttons accepted now, apart from "stop", which is always accepted.
     """
 
@@ -197,10 +196,7 @@ class Buttons:
                 self._pressed = None
 
     def offer(self, *wishes: Wish) -> None:
-        """Set which buttons are accepted.
-
-        One that was already pressed in this turn stays pressed.
-        """
+        """Set which buttons are accepted; a button already pressed in this turn stays pressed."""
         with self._lock:
             self.offered = wishes
 

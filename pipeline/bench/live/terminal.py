@@ -26,7 +26,7 @@ class Terminal:
 
     Parameters
     ----------
-    yes : take everything that a person is asked to do as done.
+    yes : whether everything that a person is asked to do counts as done.
     """
 
     def __init__(self, *, yes: bool = False, console: Console | None = None) -> None:
@@ -101,7 +101,7 @@ class Terminal:
 
         Parameters
         ----------
-        keys : the keys to choose from.
+        keys : text that names the keys to choose from.
 
         Raises
         ------
@@ -205,7 +205,7 @@ class _View:
 
 
 def _forget_keys() -> None:
-    """Discard keys typed before the question; they do not answer it, and a motor may start."""
+    """Discard keys typed before the question, because an answer may start the motor."""
     try:
         import termios
     except ImportError:  # on Windows

@@ -1,1 +1,1 @@
-"""The messages between host and bench, and the clock that their time stamps come from."""
+"""The messages between host and bench, and the clock of the bench."""

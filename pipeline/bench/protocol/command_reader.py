@@ -30,17 +30,17 @@ _WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
 class CommandReader:
     """Split the bytes that arrive at a bench into commands; count and drop anything else.
 
-    A field that does not fit ends the command before it, and may begin another one. To never miss a
-    stop after a lost byte, two kinds of field count as a stop or reset:
+    A field that does not fit breaks off the current command, and may begin another one. So that a
+    lost byte never hides a stop, two kinds of field also count as a stop or reset:
 
     - A field that ends in the letter of a stop or a reset, whatever noise precedes the letter.
-    - An `s` that was read as the wave of a start, if that start then breaks off.
+    - An `s` that was read as the wave of a start, if the next field of this start does not fit.
 
     Parameters
     ----------
-    encoders : of the bench; state feedback has two gains for each.
-    extensions : letters of the commands that the stock bench does not know; without any, there is
-        no query either.
+    encoders : number of encoders of the bench; state feedback has two gains for each.
+    extensions : letters of the commands that the stock bench does not know. Without any, the bench
+        has no query either.
     """
 
     def __init__(self, *, encoders: int, extensions: Collection[str] = EXTENSIONS) -> None:

@@ -1,8 +1,8 @@
 """The messages between host and bench: commands, and lines of text in reply.
 
-docs/protocol.md specifies them in words. A command consists of fields that each end in a semicolon;
-its first letter decides which fields follow. The stock bench knows `d`, `g` and `z`. A bench that
-answers `?;` lists its extensions.
+docs/protocol.md specifies the messages in words. A command consists of fields that each end in a
+semicolon; its first letter decides which fields follow. The stock bench knows `d`, `g` and `z`. A
+bench that answers `?;` lists its extensions.
 """
 
 import math
@@ -55,10 +55,10 @@ class Start:
 
     Attributes
     ----------
-    encoder : 1 or 2, the one that a PID controller follows; None: open loop.
-    frequency : in Hz.
+    encoder : the encoder that the controller follows, 1 or 2; None in open loop.
+    frequency : frequency of the wave, in Hz.
     amplitude : duty counts in open loop, encoder counts in closed loop.
-    cycles : periods of the wave.
+    cycles : number of periods of the wave.
     """
 
     wave: Wave
@@ -110,8 +110,8 @@ class Tone:
     Attributes
     ----------
     harmonic : multiple of the wave's frequency.
-    share : its amplitude relative to the wave's.
-    phase : in rad, at the start.
+    share : amplitude of the sine, relative to that of the wave.
+    phase : phase at the start, in rad.
     """
 
     harmonic: int
@@ -125,8 +125,7 @@ class Hands:
 
     Attributes
     ----------
-    held : the held carts.
-    released : the cart that is pulled out and released; 0: no cart.
+    released : the cart that is pulled out and released; 0 for none.
     """
 
     held: tuple[int, ...] = ()
@@ -181,9 +180,9 @@ class Reading:
 
     Attributes
     ----------
-    counts : of the encoders, two or three.
+    counts : the counts of two or three encoders.
     target : duty counts in open loop, encoder counts in closed loop.
-    duty : duty counts applied from now on.
+    duty : duty counts that drive the motor from this line on.
     ms : whole milliseconds since the start of the run.
     """
 
@@ -200,7 +199,7 @@ def format_reading(reading: Reading) -> bytes:
 
 
 def parse_reading(line: bytes) -> Reading | None:
-    """Return the content of a line, with or without its end; None if it is no such line."""
+    """Return the content of a line, with or without its end; None for any other text."""
     text = line.decode("latin-1").rstrip("\r\n")
     if not _LINE.fullmatch(text):
         return None
@@ -214,13 +213,13 @@ class Description:
 
     Attributes
     ----------
-    name : one word.
+    name : name of the bench, one word.
     encoders : number of encoder counts in a line, two or three.
     carts : number of encoders that are on carts.
     period : nominal s between lines.
-    baud : of the line.
-    commands : letters of the commands beyond the stock ones; `c` also means that it knows the
-        chirp, `m` the multisine.
+    baud : baud rate of the line.
+    commands : letters of the commands beyond the stock ones. With `c` the bench also knows the wave
+        chirp, and with `m` the multisine.
     input_unit, input_per_count : unit of the input, and its value per duty count.
     position_unit, position_per_count : unit of the positions, and its value per encoder count.
     """
@@ -258,7 +257,7 @@ def parse_description(line: bytes) -> Description:
 
     Raises
     ------
-    DataError : it is no description, or one of a version that this program does not know.
+    DataError : the line is not a description, or has a version that this program does not know.
     """
     text = line.decode("ascii", "replace").strip()
     head, *words = text.split(" ")
@@ -292,7 +291,7 @@ def parse_description(line: bytes) -> Description:
 def _scaled(text: str) -> tuple[float, str]:
     """Split text such as "0.00227cm" into number and unit."""
     digits = len(text.rstrip("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ/%"))
-    # Such a number makes no useful limit.
+    # A scale of zero or infinity gives no useful limit.
     if not 0.0 < abs(number := float(text[:digits])) < math.inf:
         raise ValueError(repr(text))
     return number, text[digits:]

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 Stamps = NDArray[np.int64]
 
-OTHER_PERIOD = 0.02  # share of the stated period; a clock that differs more has another period
-_SLOW = 1.5  # ms; from this period on, every gap shows a lost line
+OTHER_PERIOD = 0.02  # relative difference from the stated period that shows another period
+_SLOW = 1.5  # ms; with this period or a longer one, every gap shows a lost line
 _MOST_ABSENT = 0.2  # share of the stamps; if more are missing, the clock is slower than 1 kHz
-# Stamps between skips of a clock with a period of 1.05 ms; no bench for 1 kHz is slower.
+# Number of stamps between skips of a clock with a period of 1.05 ms; no bench for 1 kHz is slower.
 _CLOSEST_TEETH = 20
 _TOOTH_SLACK = 1  # ms by which a tooth may be off, because stamps are rounded
-_FIRST_TEETH, _SECOND_TEETH = 60, 120  # missing stamps that are tried as first and as second tooth
+_FIRST_TEETH, _SECOND_TEETH = 60, 120  # numbers of stamps tried as first and second tooth
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,9 +45,9 @@ def fit_stamps(stamps: Stamps, *, period: float, stated: bool = False) -> StampF
 
     Parameters
     ----------
-    stamps : (n,) in ms, never falling.
-    period : expected, in ms.
-    stated : whether the bench itself stated this period.
+    stamps : (n,) time stamps in ms, never falling.
+    period : expected period, in ms.
+    stated : whether the bench itself stated the period.
     """
     n = stamps.size
     if n < 2 or stamps[-1] == stamps[0]:
@@ -69,7 +69,7 @@ def fit_stamps(stamps: Stamps, *, period: float, stated: bool = False) -> StampF
     if span + 1 - np.unique(stamps).size > _MOST_ABSENT * span:  # or the clock has jumped
         if stated or period >= 1 / (1 - _MOST_ABSENT):
             return StampFit(period=period, missing=missing)
-        # This bench has another period than expected.
+        # The period of this bench is not the expected one.
         return StampFit(period=span / (n - 1), missing=0)
     if not 1.0 <= period < 1.0 + 1.0 / _CLOSEST_TEETH:
         return StampFit(period=period, missing=missing)
@@ -90,15 +90,15 @@ def even_period(stamps: Stamps) -> float | None:
     """Return the period if one regular clock explains all stamps without a lost line, else None."""
     i = np.arange(stamps.size) - (stamps.size - 1) / 2
     slope = float(i @ stamps / (i @ i))
-    # Stamps of a regular clock lie within 1 ms of a straight line; a lost line makes it 1.5 ms or
-    # more.
+    # Stamps of a regular clock lie within 1 ms of a straight line; with a lost line they spread
+    # over 1.5 ms or more.
     return slope if slope > 0 and np.ptp(stamps - slope * i) < 1.25 else None
 
 
 def _other_period(stamps: Stamps, stated: float) -> StampFit | None:
-    """Return the clock that most pieces of the run have, if it differs from the stated one.
+    """Return the clock of the pieces without a lost line, if it differs from the stated one.
 
-    Only pieces without a lost line count; if many lines are lost, there are too few such pieces.
+    If many lines are lost, there are too few such pieces, and the result is None.
     """
     long = 200  # lines in a piece; if one line in a hundred is lost, most pieces lack some
     pieces = [stamps[i : i + long + 1] for i in range(0, stamps.size - long, long)]
@@ -118,23 +118,23 @@ def _other_period(stamps: Stamps, stated: float) -> StampFit | None:
 
 
 def _comb(absent: Sequence[int]) -> list[int]:
-    """Return those missing stamps (ascending) that are skips of the clock: the longest comb.
+    """Return the longest comb among the missing stamps (ascending): the skips of the clock.
 
-    Every tooth of the comb must be among them, from the first missing stamps to the last.
+    Each of its teeth, up to the last missing stamp, must be a missing stamp.
     """
     there = frozenset(absent)
     best: list[int] = []
     for i, first in enumerate(absent[:_FIRST_TEETH]):
         for second in absent[i + 1 : i + 1 + _SECOND_TEETH]:
-            # No tooth may be absent, so a comb with close teeth is rarely found by chance. The comb
-            # with most teeth wins.
+            # Because every tooth must be a missing stamp, a comb with close teeth is rarely found
+            # by chance. The comb with most teeth wins.
             teeth = _follow(first, second, there=there, last=absent[-1])
             best = max(best, teeth, key=len)
     return best
 
 
 def _follow(first: int, second: int, *, there: frozenset[int], last: int) -> list[int]:
-    """Return the teeth that continue the first two; [] if one is absent before the end."""
+    """Return the teeth that continue the first two; [] if a tooth before `last` is lacking."""
     if second - first < _CLOSEST_TEETH:
         return []
     teeth = [first, second]

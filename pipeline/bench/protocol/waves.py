@@ -13,8 +13,8 @@ def target_at(
 
     Parameters
     ----------
-    chirp_end : end frequency of a chirp, in Hz; None: `CHIRP_SPAN` times its start frequency.
-    tones : of a multisine.
+    chirp_end : end frequency of a chirp, in Hz; by default `CHIRP_SPAN` times the start frequency.
+    tones : sines of a multisine.
     """
     return nearest_count(start.amplitude * shape_at(start, t, chirp_end=chirp_end, tones=tones))
 
