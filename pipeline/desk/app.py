@@ -74,20 +74,20 @@ def _stop(ask: Ask) -> Response:
 
 
 async def _tell_news(ask: Ask) -> Response:
-    """Return a stream with news of the work in the place of the address."""
+    """Return a stream of events that report the work in the place of the address."""
     return StreamingResponse(_news(ask, ask.place_or_404()), media_type="text/event-stream")
 
 
 async def _news(ask: Ask, place: Any) -> AsyncIterator[str]:
-    """Yield a line for every new stage of the work; a slow reader gets only the latest stage."""
-    seen, quiet, frame = -1, 0.0, 0.2  # `frame` is the time in s between two looks for news
+    """Yield an event for every new stage of the work; a slow reader gets only the latest stage."""
+    seen, quiet, frame = -1, 0.0, 0.2  # `frame` is the time in s between two checks for changes
     while (job := ask.desk.jobs.of(place)) is not None:
         if job.news != seen:
             seen, quiet = job.news, 0.0
             shown = ask.job or job
             said = " ".join(ask.user.without_folders(shown.said).split())
             yield f"event: {'end' if job.over else 'stage'}\ndata: {said}\n\n"
-        elif quiet > 5.0:  # s without news; the line sent then keeps the connection open
+        elif quiet > 5.0:  # s without an event; the line sent then keeps the connection open
             quiet = 0.0
             yield ": still here\n\n"
         if job.over:
@@ -98,7 +98,7 @@ async def _news(ask: Ask, place: Any) -> AsyncIterator[str]:
 
 
 # Address, method, handler. Every change is a POST from a form that works without scripts. Handlers
-# of streams are coroutines. If each took a thread, no threads would soon be left to answer
+# of streams are coroutines, because a thread for each stream would soon leave no thread to answer
 # requests.
 ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/", "GET", show_home),
@@ -183,7 +183,7 @@ class DeskServer:
     Parameters
     ----------
     folder : the folder that the person at this computer sees first.
-    port : to listen at; 0: any free port.
+    port : port to listen at; 0 for any free port.
     host : address to listen at, on a lab server.
     users : file that states who may do what, on a lab server.
     jupyter : the secret of the Jupyter server that starts the desk and forwards requests to it.

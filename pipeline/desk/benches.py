@@ -1,4 +1,4 @@
-"""The acquisitions that the desk has started; each is a process of its own."""
+"""The acquisitions that the desk has started; each runs in its own process."""
 
 import json
 import queue
@@ -21,8 +21,8 @@ class BenchSession(ShownSession):
 
     Attributes
     ----------
-    said : how it ended; "" while it runs.
-    failed : whether it ended with an error.
+    said : how the session ended; "" while it runs.
+    failed : whether the session ended with an error.
     ended : set when the process has ended.
     """
 
@@ -42,10 +42,7 @@ class BenchSession(ShownSession):
 
     @property
     def is_shown(self) -> bool:
-        """Whether there is a state to show.
-
-        Before the first one, it may be that no bench answers.
-        """
+        """Whether the process has reported a state; if not, no bench may have answered yet."""
         return self.version > 0
 
     def snapshot(self) -> dict[str, Any]:
@@ -53,7 +50,7 @@ class BenchSession(ShownSession):
         return self._state
 
     def heed(self, wish: str, number: int) -> bool:
-        """Send a pressed button to the process; return whether it fits what the page shows.
+        """Send a pressed button to the process; return whether it fits the current state.
 
         The process itself decides whether to act on it.
         """
@@ -68,10 +65,7 @@ class BenchSession(ShownSession):
         return counts
 
     def press(self, wish: str, number: str) -> int:
-        """Send a pressed button to the process.
-
-        Return the HTTP status, 503 if the process has ended.
-        """
+        """Send a pressed button to the process; return the HTTP status, 503 if it was not sent."""
         if not self.is_shown and wish != "stop":
             return 503
         try:
@@ -85,7 +79,7 @@ class BenchSession(ShownSession):
             self.heed("stop", 0)
 
     def stream(self) -> Response:
-        """Return a stream of the session's news, ended by the news of its end."""
+        """Return a stream of the session's events; the last one reports its end."""
         ended = "event: ended\ndata:\n\n"
         if self.ended.is_set():
             return Response(ended, media_type="text/event-stream")
@@ -96,7 +90,7 @@ class BenchSession(ShownSession):
 
         Parameters
         ----------
-        by : when to stop waiting, in s of the monotonic clock.
+        by : time of the monotonic clock, in s, at which to stop waiting.
         """
         if not self.ended.wait(max(0.0, by - time.monotonic())):
             self._process.close()
@@ -143,7 +137,7 @@ class Benches:
 
     Attributes
     ----------
-    planned : for each folder, the ids of its plan before recordings were last added; None if there
+    planned : for each folder, the ids of the plan before recordings were last added; None if there
         was no plan.
     """
 
@@ -168,7 +162,7 @@ class Benches:
 
         Parameters
         ----------
-        only : ids to acquire; () for the whole plan.
+        only : ids of the recordings to acquire; () for the whole plan.
         explore : goal and time limit of an exploration, as `cartlab explore` takes them.
         """
         with self._lock:

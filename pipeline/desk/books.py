@@ -17,7 +17,7 @@ from pipeline.grading.rubric import Rubric
 
 @dataclass(frozen=True)
 class Class:
-    """A class as pages show it; if it is anonymous, with pseudonyms and in their order."""
+    """A class as pages show it; an anonymous class has pseudonyms and is sorted by them."""
 
     now: ClassNow
     state: State
@@ -45,10 +45,7 @@ class Class:
 
     @cached_property
     def lost(self) -> Mapping[str, set[str]]:
-        """For each criterion, the teams without full points.
-
-        A criterion that was not judged has 0.
-        """
+        """For each criterion, the teams without full points; not judged counts as no points."""
         lost: dict[str, set[str]] = {asked.id: set() for asked in self.rubric.criteria}
         whole = {asked.id: asked.points for asked in self.rubric.criteria}
         for name, team in self.teams.items():
@@ -100,8 +97,7 @@ class Books:
     def n_waiting(self, place: Path | str) -> int:
         """Return how many requests wait in a gradebook; 0 if it cannot be read now.
 
-        Every page asks this. So a database that is not open yet is not opened here, which could
-        take long.
+        Every page calls this function, so it never opens a database, which could take long.
         """
         if isinstance(place, str) and place not in self._books:
             return 0

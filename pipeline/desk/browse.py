@@ -23,7 +23,7 @@ class Found:
 
     Attributes
     ----------
-    inside : its path relative to the root; "." for the root itself.
+    inside : path of the folder relative to the root; "." for the root itself.
     kind : "grading", "submission", "empty" (without visible entries), or "folder" for any other.
     """
 
@@ -38,9 +38,8 @@ class FolderList:
 
     Attributes
     ----------
-    here : the folder itself.
+    here : the folder whose content is listed.
     above : name and path relative to the root of each folder above it.
-    found : the folders inside it.
     left_off : whether there are more folders than listed.
     """
 
@@ -70,7 +69,7 @@ def list_folders(root: Path, inside: str) -> FolderList:
 
     Raises
     ------
-    ConfigError : it is not a folder that this list may show.
+    ConfigError : `inside` is not a folder that the list may show.
     """
     root = root.resolve()
     folder = read_path(inside or ".", wanted="choose a folder", inside=root)

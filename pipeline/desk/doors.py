@@ -30,9 +30,9 @@ MOST_FORM = 2_000_000  # bytes of a request that is not an upload
 class SecretDoor:
     """Let in the person at this computer: the first one to open the address that was printed.
 
-    The secret in that address works once. From then on a cookie identifies the person. Scripts
-    cannot read it, and other sites cannot send it. So no secret stays in an address, where the
-    browser's history or a screenshot could keep it.
+    The secret in the address works once. From then on a cookie identifies the person. Scripts
+    cannot read the cookie, and other sites cannot send it. So no secret stays in an address, where
+    the browser's history or a screenshot could keep it.
     """
 
     arrivals = False  # a person who arrives from another site does not send the cookie yet
@@ -68,7 +68,7 @@ class SecretDoor:
     def _knows(self, sent: bytes) -> bool:
         """Return whether one of the cookies sent is right.
 
-        Other pages may have set some with this name.
+        Other pages may have set cookies of the same name.
         """
         return any([_is_same(found[1], self._session) for found in self._sent.finditer(sent)])
 
@@ -103,7 +103,7 @@ class ProxyDoor:
 class JupyterDoor:
     """Let in the owner of a Jupyter server, which forwards requests and adds a secret.
 
-    The browser's addresses begin with a prefix. Jupyter removes it, and states it in a header.
+    The browser's addresses begin with a prefix, which Jupyter removes and states in a header.
     """
 
     arrivals = True  # people come from the page of a login
@@ -112,7 +112,7 @@ class JupyterDoor:
         self._user, self._secret = user, secret
 
     def site(self, headers: Headers) -> str:
-        """Return the address under which the browser asks Jupyter, from the headers.
+        """Return the address at which the browser reaches Jupyter, from the headers.
 
         A page of another site has another origin, so it is refused.
         """

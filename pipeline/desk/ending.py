@@ -21,11 +21,11 @@ from pipeline.output import OWNERS_FOLDER
 
 
 class Ending:
-    """Report what ends the desk; a context manager around the server.
+    """Report what ends the desk; use it as a context manager around the server.
 
     Parameters
     ----------
-    say : writes a line to stderr.
+    say : function that writes a line to stderr.
 
     Attributes
     ----------
@@ -37,7 +37,8 @@ class Ending:
         self.asked = threading.Event()
         self.log = find_log()
         self._say, self._why = say, "no reason was given"
-        # It runs in a session of its own, so that closing the terminal does not end it too.
+        # The watching process has a session of its own, so that closing the terminal does not end
+        # it.
         self._watch = subprocess.Popen(
             [sys.executable, "-I", watch.__file__, str(self.log), str(os.getpid())],
             stdin=subprocess.PIPE,

@@ -41,7 +41,7 @@ def look_at_exercise(
 
 
 def draw_effect(bench: Mapping[str, str], hide: str, *, progress: Progress) -> str:
-    """Return the picture of an effect on a bench: its fingerprint, as a run with and without it."""
+    """Return the picture of an effect's fingerprint on a bench: a run with and without it."""
     from pipeline.report.effects.gallery import effect_picture
     from pipeline.report.figures.style import drawing
     from pipeline.report.figures.svg import plain_svg
@@ -145,8 +145,7 @@ def _describe_parameter(
 ) -> dict[str, Any]:
     """Return one parameter for the form, with the slider and the number in agreement.
 
-    A slider that was moved decides the value. Otherwise the typed number does, and otherwise the
-    usual one.
+    A moved slider decides the value. Otherwise the typed number does, or else the usual value.
     """
     none = parameter.neutral or 0.0
     value = typed.get("value", "") if typed.get("value") != typed.get("usual") else ""

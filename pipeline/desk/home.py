@@ -75,7 +75,7 @@ def enter(user: User, folder: Path) -> str:
 
     Raises
     ------
-    ConfigError : it is a file, or the folder cannot be created.
+    ConfigError : `folder` is a file, or it cannot be created.
     """
     folder = folder.resolve()
     if folder.name == FILE and folder.is_file():

@@ -13,7 +13,7 @@ from typing import Any, Literal
 from pipeline.errors import PipelineError
 from pipeline.processes import Failed, Supervisor
 
-_GLANCE = 0.1  # s between two looks at whether a job may start or must stop
+_GLANCE = 0.1  # s between two checks whether a job may start or must stop
 _SHORT_WORKERS = 3  # number of processes for short tasks; each takes 150 MB
 _WAITING = 8  # requests that may wait for one folder; each holds one of the server's 40 threads
 
@@ -21,7 +21,7 @@ State = Literal["waiting", "running", "done", "failed", "stopped"]
 
 
 class Busy(PipelineError):
-    """A task was not started, because others are running; the message says which."""
+    """A task was not started, because the folder is busy; the message says why."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -30,9 +30,9 @@ class Job:
 
     Attributes
     ----------
-    place : the folder that it works in.
+    place : the folder that the job works in.
     asked : name and arguments of the task.
-    said : its current stage; at the end the task's answer if that is a text, or the error.
+    said : the current stage; at the end the error, or the answer of the task if it is a text.
     news : number that grows with every change of state or stage.
     """
 
@@ -160,7 +160,7 @@ class WorkerPool:
 
         Raises
         ------
-        Failed : with the reason; a file that ends its process does not affect the next task.
+        Failed : the task failed; the text says why. The next task is not affected.
         Busy : too many requests already wait for the folder.
         """
         with self._turn(given.get("folder")):
@@ -176,7 +176,7 @@ class WorkerPool:
                     self._replace(process)
 
     def start(self) -> None:
-        """Start all processes in the background, if many people will use the desk soon."""
+        """Start all processes in the background, for a desk that many people will use soon."""
         for _ in range(_SHORT_WORKERS):
             self._replace(self._free.get())
 

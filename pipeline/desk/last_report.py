@@ -25,7 +25,7 @@ PLOTS_OF = "report/plots.json"  # state of the sources of the plots
 def stat_sources(folder: Path) -> dict[str, list[int]]:
     """Return time and size of every file from which a report is made.
 
-    If a file was deleted or replaced by an older one, the result differs too.
+    The result also changes if a file is deleted or replaced by an older one.
     """
     data = (path.relative_to(folder).as_posix() for path in (folder / "data").rglob("*"))
     named = (str(table.get("file", "")) for table in list_experiments(_read_document(folder)))
@@ -75,7 +75,7 @@ def read_told(folder: Path) -> dict[str, Any]:
 
 
 def _pick_assumptions(found: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return the assumptions about the bench, each as texts and with its `value`."""
+    """Return the assumptions about the bench: their texts, and the `value` of each."""
     texts = _pick_texts(found, ("key", "about", "support", "taken", "why"))
     return [{**one, "value": raw.get("value")} for one, raw in zip(texts, found, strict=True)]
 
@@ -102,7 +102,7 @@ def read_notes(folder: Path) -> str:
 
     Raises
     ------
-    SubmissionError : it cannot be read.
+    SubmissionError : `notes.md` cannot be read.
     """
     if not (folder / NOTES).exists():
         return ""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pipeline.desk.books import Books
 from pipeline.desk.users import Place, User, name_place
 
-_BESIDE = 3  # other open places that every page links; the first page lists all
+_BESIDE = 3  # other open places to which every page has a link; the first page lists all
 _OF_FOLDERS = ("student", "bench", "solution")
 _WHOLE = {"exercises": "Exercises", "rubric": "Rubric", "effects": "Effects"}
 
@@ -16,7 +16,7 @@ class Room:
 
     Attributes
     ----------
-    beside : it leads to another place than the current one; small screens hide it.
+    beside : whether the link leads away from the current place; small screens hide such links.
     """
 
     address: str

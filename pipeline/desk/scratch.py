@@ -1,4 +1,4 @@
-"""Scratch folders of the desk; those that a killed desk left are removed at the next start."""
+"""Scratch folders of the desk; the next start removes those of a desk that was killed."""
 
 import os
 import platform
@@ -11,8 +11,8 @@ from pathlib import Path
 
 import psutil
 
-# The computer's name is part of it, because a process number of another container has no meaning
-# here.
+# The name contains the computer's name, because a process number of another container has no
+# meaning here.
 _OWN = f"cartlab-{re.sub('[^A-Za-z0-9]+', '', platform.node())}"
 
 

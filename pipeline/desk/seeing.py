@@ -26,8 +26,9 @@ REFUSED = (
 def sees_check(user: User, folder: Place | None) -> bool:
     """Return whether the room of a folder shows the check instead of the report.
 
-    On a lab server, the rubric in the list of users decides. Without one, `[students] see` of the
-    submission does. That is only an agreement, because a student with the folder can change it.
+    On a lab server, the rubric in the list of users decides. Without a rubric there, `[students]
+    see` in submission.toml decides. This is only an agreement, because a student can change the
+    file.
     """
     if user.role == "instructor" or not isinstance(folder, Path):
         return False
@@ -55,7 +56,7 @@ def is_refused(path: str, user: User, folder: Place | None) -> bool:
 def show_job(job: Job | None, user: User, folder: Path) -> Job | None:
     """Return the job in a folder as the person may see it.
 
-    Its stages are hidden if they could show numbers, because others may make a report in the
+    The job's stages are hidden if they could show numbers, because others may make a report in the
     folder.
     """
     if job is None or job.asked[0] in _TELLS_NONE or not sees_check(user, folder):

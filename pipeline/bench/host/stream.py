@@ -272,7 +272,7 @@ class _EncoderWatch:
 
     @property
     def stuck(self) -> int:
-        """The number of encoders that stopped while driven, or never moved although they had to."""
+        """The number of encoders that stopped while driven, or never moved although they should."""
         moved = {encoder: seen.width for encoder, seen in self._overall.items()}
         pushed = self._driven.width >= _DRIVEN
         never = {

@@ -1,4 +1,4 @@
-"""The bench's room: plan, acquire, explore, watch. The acquiring process decides what runs.
+"""The bench's room: plan, acquire, explore, watch.
 
 Some modules are imported late, because they load the estimators.
 """
@@ -43,7 +43,7 @@ def plan(ask: Ask) -> Response:
 
 
 def acquire(ask: Ask) -> Response:
-    """Start to acquire the recordings that are ticked, or the whole plan without ticks."""
+    """Start to acquire the ticked recordings, or the whole plan if none is ticked."""
     only = [value for value in ask.form.getlist("only") if isinstance(value, str)]
     port = read_port(ask)
     _note_plan(ask)
@@ -64,9 +64,8 @@ def explore(ask: Ask) -> Response:
 
 
 def add(ask: Ask) -> Response:
-    """Add a recording to the plan; if an exploration is running, it records this next."""
+    """Add a recording to the plan; a running exploration records it next."""
     from pipeline.experiments.by_hand import add_recording
-
     folder, typed = ask.folder(), {name: ask.text(name) for name in _TYPED}
     try:
         before = plan_ids(folder)
@@ -78,9 +77,8 @@ def add(ask: Ask) -> Response:
 
 
 def weigh(ask: Ask) -> Response:
-    """Show what a recording would improve, next to the one that the program would choose."""
+    """Show what a recording would improve, beside what the program's own choice would improve."""
     from pipeline.experiments.goal import WORST
-
     folder, typed = ask.folder(), {name: ask.text(name) for name in _TYPED}
     try:
         wanted = _read_recording(typed, load_submission(folder)).model_dump(mode="json")
@@ -112,7 +110,7 @@ def press(ask: Ask) -> Response:
 
 
 async def stream(ask: Ask) -> Response:
-    """Stream the news of the session; if it has ended already, say only that."""
+    """Return a stream of the session's events; if the session has ended, it reports only that."""
     return _find_session(ask).stream()
 
 
@@ -128,9 +126,9 @@ def _show_page(
 
     Parameters
     ----------
-    typed : the form of a custom recording.
-    refused : why this recording is not possible.
-    weighed : its predicted benefit.
+    typed : fields of the form for a custom recording.
+    refused : why the custom recording is not possible.
+    weighed : predicted benefit of the custom recording.
     """
     folder = ask.folder()
     session = ask.desk.benches.of(folder)
@@ -157,7 +155,7 @@ def _show_page(
 
 
 def _note_plan(ask: Ask) -> None:
-    """Remember the recordings of the current plan; later ones are then shown as new."""
+    """Remember the recordings of the current plan, so that later ones are shown as new."""
     ask.desk.benches.planned[ask.folder()] = plan_ids(ask.folder())
 
 
@@ -184,7 +182,7 @@ def _read_recording(typed: Mapping[str, str], submission: Submission) -> Recordi
 
 
 def _scale_bars(found: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the three errors in percent, with the lengths of their error bars on one scale."""
+    """Return the three errors in percent, and the lengths of their bars on one scale."""
     rows = {
         "now": found["now"],
         "after yours": found["proposed"],

@@ -28,12 +28,12 @@ def plan_ids(folder: Path) -> frozenset[str] | None:
 def read_plan(
     folder: Path, *, session: BenchSession | None, before: Collection[str] | None
 ) -> dict[str, Any]:
-    """Return the plan for the page, the runs still to record, and the problems of its rows.
+    """Return what the page shows of the plan: its rows, the time still needed, what is wrong.
 
     Parameters
     ----------
     session : the last session in the folder; it knows why a run ended early.
-    before : ids of the plan before recordings were last added; None: no recording is new.
+    before : ids of the plan before recordings were last added; None if no recording is new.
     """
     found = {"sound": False, "rows": [], "left": "", "wrong": "", "units": None, "parameters": []}
     found |= {"carts": 0, "recorded": 0}

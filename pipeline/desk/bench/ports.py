@@ -80,7 +80,7 @@ def _remember(folder: Path, port: str) -> None:
 
 
 def _read_memory() -> dict[str, str]:
-    """Return the last port used in each folder, the folder used last at the end."""
+    """Return the last port used in each folder; the folder used last comes last."""
     try:
         read = json.loads(_find_memory().read_text(encoding="utf-8"))
     except (OSError, ValueError):

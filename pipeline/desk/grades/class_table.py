@@ -37,7 +37,7 @@ _MOST_SETS = 20
 
 @dataclass(frozen=True, kw_only=True)
 class Counted:
-    """A flag or criterion, and the number of teams that have the flag or lost points there."""
+    """A flag or criterion, and the number of teams that have the flag or lost points for it."""
 
     key: str
     title: str

@@ -37,10 +37,10 @@ class Item:
 
     Attributes
     ----------
-    id : of the criterion, or the code of the flag.
-    lost : points lost before points by hand, so that a criterion keeps its row after a decision.
-    doubt : whether a person should look or has looked: points were lost, it was not judged, or it
-        has a flag or points by hand.
+    id : id of the criterion, or code of the flag.
+    lost : points lost in the automatic grading, so that points by hand do not move the row.
+    doubt : whether a person should look or has looked: points were lost, the criterion was not
+        judged, or there is a flag or points by hand.
     """
 
     id: str
@@ -55,7 +55,10 @@ class Item:
 
 
 def list_items(grade: Grade, now: TeamNow) -> list[Item]:
-    """Return the rows for criteria and flags; those that need a look and lost most come first."""
+    """Return the rows for criteria and flags;
+
+    doubtful rows come first, then the most points lost.
+    """
     judged = {criterion.id: criterion for criterion in grade.criteria}
     items = [
         Item(id=flag.code, is_remark=True, title=capital(WORDS.text(f"title_{flag.code}")))
@@ -83,9 +86,9 @@ def list_items(grade: Grade, now: TeamNow) -> list[Item]:
 
 
 def point_steps(out_of: float, *, step: float) -> list[float]:
-    """Return at most nine points that a criterion can be given by a key, including none and all.
+    """Return up to nine amounts of points, one for each key, including none and all.
 
-    They are the steps of the rubric if these are few, otherwise quarters rounded to a step.
+    These are the steps of the rubric if there are few, otherwise quarters rounded to a step.
     """
     whole = exact(out_of)
     fine = [n * exact(step) for n in range(MOST_STEPS) if n * exact(step) < whole]
@@ -106,7 +109,7 @@ def describe_criterion(
 
     Parameters
     ----------
-    typed : fields of its form that were refused (points, other, why), and the reason (wrong).
+    typed : refused fields of the criterion's form (points, other, why), and the reason (wrong).
     """
     own = next((c for c in grade.criteria if c.id == asked.id), None)
     given = now.entry.overrides.get(asked.id) or now.entry.comments.get(asked.id)
@@ -163,7 +166,7 @@ def show_figures(
 
     Parameters
     ----------
-    drawn : file names and SVG.
+    drawn : file name and SVG of each figure.
     own : the judged criterion, with its numbers.
     first : file that the person wants to see first.
     """
@@ -174,7 +177,7 @@ def show_figures(
 
 
 def _belongs(file: str, asked: Asked | None, own: Criterion | None) -> bool:
-    """Return whether a figure belongs to a criterion; figures of recordings do by their numbers."""
+    """Return whether a figure belongs to a criterion."""
     numbers = numbers_in(file)
     if asked is None:
         return not numbers and not is_response(file)
@@ -206,7 +209,7 @@ def _is_positive(value: Any) -> bool:
 
 
 def _shows(file: str, name: str) -> bool:
-    """Return whether a figure shows a number: by its recording, or by the response of its cart."""
+    """Return whether a figure shows a number's recording, or the response of its cart."""
     if is_response(file):
         return bool(name) and file.endswith(f"-{read_name(name).cart}.svg")
     return name in numbers_in(file)

@@ -1,4 +1,4 @@
-"""Which teams of a class a page shows, and in which order; all of it is in the page's address."""
+"""The filter and the order of the teams on a page; the page's address contains both."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +29,7 @@ class Filter:
     flag : only teams with this flag.
     lost : only teams that lost points in this criterion.
     state : only teams in one of the `_STATES`.
-    seen : "yes" for reviewed teams only, "no" for the others.
+    seen : only reviewed teams ("yes"), or only teams not yet reviewed ("no").
     q : only teams with this text in their name or authors.
     """
 
@@ -55,9 +55,9 @@ class Filter:
         return [team for team in self.ordered(shown) if self._takes(team, shown)]
 
     def beside(self, shown: Class, name: str) -> tuple[str, str]:
-        """Return the names before and after a team among those that pass the filter, or "".
+        """Return the names of the teams before and after a team, among those that pass the filter.
 
-        The team itself need not pass.
+        The team itself need not pass. A name is "" if there is no team.
         """
         before, after, passed = "", "", False
         for team in self.ordered(shown):

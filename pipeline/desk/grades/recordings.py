@@ -18,8 +18,8 @@ _ADDED = (PLOTS, PLOTS_OF, f"{Path(PLOTS).parent.name}/{LOCK}")
 def find_recordings(ask: Ask, shown: Class, entry: Entry) -> Path | None:
     """Return the folder that was graded; None if it is not found or not for this person.
 
-    Its files must be those of the grading, because a later version would show other recordings.
-    Plots that were made there since do not count.
+    The folder's files must be those that were graded, because a later version would show other
+    recordings. Plots that were added since do not matter.
     """
     if not ask.user.owns or shown.names is not None:
         return None

@@ -1,4 +1,4 @@
-"""The requests of a class for a review: waiting ones with a form for the answer, then others."""
+"""The requests for a review in a class: first the waiting ones, with a form for the answer."""
 
 from typing import Any
 from urllib.parse import urlencode
@@ -25,7 +25,7 @@ from pipeline.words.text import capital, with_symbols
 
 
 def show(ask: Ask) -> Response:
-    """Show the requests, of the class or of one team."""
+    """Show the requests of the class or of one team."""
     return _show_page(ask)
 
 
@@ -53,7 +53,7 @@ def act(ask: Ask) -> Response:
 
 
 def _read_points(typed: str) -> float | None:
-    """Return the chosen points, None if they stay."""
+    """Return the typed points; None if the points stay as they are."""
     if not typed:
         return None
     points = read_points(typed)
@@ -92,7 +92,7 @@ def _describe(ask: Ask, queued: Queued, shown: Class, name: str, *, wrong: str) 
 
     Parameters
     ----------
-    wrong : why its answer was refused, or "".
+    wrong : why the answer was refused, or "".
     """
     rubric, request = shown.rubric, queued.request
     asked = next((c for c in rubric.criteria if c.id == request.criterion), None)
@@ -150,5 +150,5 @@ def _show_conflict(ask: Ask, shown: Class, conflict: Conflict) -> Response:
 
 
 def _write_address(ask: Ask, of: str) -> str:
-    """Return the address of the requests, of the class or of one team."""
+    """Return the address of the requests of the class or of one team."""
     return f"{ask.here}again" + (f"?{urlencode({'of': of})}" if of else "")

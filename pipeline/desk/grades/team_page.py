@@ -133,7 +133,7 @@ def _show_page(ask: Ask, *, wrong: str = "", status: int = 200) -> Response:
 def _find_chosen(ask: Ask, items: Sequence[Item], rubric: Rubric) -> Item:
     """Return the criterion or flag that the address or the form names.
 
-    If they name none, return the first one to look at, or the first that has a figure.
+    If none is named, return the first row that is in doubt or has a figure.
     """
     criterion = ask.text("criterion") or ask.query("criterion")
     for wanted, is_remark in ((criterion, False), (ask.query("remark"), True)):

@@ -33,9 +33,9 @@ class Row:
 
     Attributes
     ----------
-    ticked : whether it will be changed.
-    version : of the criterion's points; sent along with the change.
-    moved : whether somebody changed it after the list was shown.
+    ticked : whether the team will be changed.
+    version : version of the criterion's points, which is sent along with the change.
+    moved : whether somebody has changed the points since the list was shown.
     now, after : points of the criterion.
     total_now, total_after : points of the submission.
     said : the current message of the criterion.
@@ -198,7 +198,7 @@ def _name_set(wanted: Filter) -> str:
 def _widen(ask: Ask, shown: Class, wanted: Filter) -> tuple[str, int] | None:
     """Return a link to all teams with the flag, and their number.
 
-    Returns None if the page shows all of them already.
+    Returns None if the page already shows all teams with the flag.
     """
     if not (wanted.flag and wanted.lost):
         return None

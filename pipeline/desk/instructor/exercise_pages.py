@@ -81,7 +81,7 @@ def show_made(ask: Ask) -> Response:
     if job is None or job.asked[0] != "make_exercises":
         raise HTTPException(404, "no exercise was made there")
     given = job.asked[1]
-    # Named as the job names them; a stopped job has made only the first ones.
+    # The job numbers its folders in this order; a stopped job has made only the first ones.
     folders = [out] if len(given["seeds"]) == 1 else sorted(out.glob("*/"))
     made = [
         (folder, seed)

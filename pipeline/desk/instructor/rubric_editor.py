@@ -30,7 +30,7 @@ _NEW = "new"  # version in a form whose file does not exist yet
 def show(ask: Ask) -> Response:
     """Show a rubric in the editor, or the list of rubrics if the request names no rubric.
 
-    A file that does not exist begins with a shipped rubric, or empty.
+    The text of a new file is a shipped rubric, or empty.
     """
     start = ask.text("start")
     if not start and not ask.text("file"):
@@ -117,11 +117,11 @@ def _classes_of(ask: Ask, path: Path) -> list[tuple[int, str, dict[str, str]]]:
 
 
 def read_rubric_path(ask: Ask) -> Path:
-    """Return the path of the rubric that the request names, or a free one for a new rubric.
+    """Return the path of the rubric that the request names, or an unused one for a new rubric.
 
     Raises
     ------
-    ConfigError : it is not a TOML file in an existing folder that this person may use.
+    ConfigError : the path is not a TOML file in an existing folder that this person may use.
     """
     typed = ask.text("file")
     if not typed and ask.request.method == "GET":

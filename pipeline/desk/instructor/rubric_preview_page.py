@@ -18,7 +18,7 @@ from pipeline.report.figures.svg import plain_svg, to_svg
 from pipeline.report.render.html import render_drawing
 
 _BARS = re.compile(r"[0-9]{1,5}(\.[0-9]{1,5}){1,49}")  # the bars in an address: "0.2.5.1"
-_ROWS = 30  # rows shown at once; the others are folded
+_ROWS = 30  # rows shown at once; the other rows are folded
 
 
 def preview(ask: Ask) -> Response:

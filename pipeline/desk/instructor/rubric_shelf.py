@@ -14,7 +14,7 @@ from pipeline.resources import RUBRICS
 _MOST = 40  # files listed
 _LOOKED_AT = 2_000  # TOML files of a folder that are checked
 _MARK = "[[criteria]]"
-_START = 200_000  # a rubric has one of its keys within this many characters
+_START = 200_000  # a rubric contains _MARK within this many characters
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +23,7 @@ class ShelvedRubric:
 
     Attributes
     ----------
-    rubric : None if the file has mistakes.
+    rubric : content of the file; None if it has mistakes.
     """
 
     name: str
@@ -43,7 +43,7 @@ def shipped_rubrics() -> list[ShelvedRubric]:
 
 
 def own_rubrics(user: User) -> list[ShelvedRubric]:
-    """Return the rubrics in a user's workshop; for the owner, those where they work."""
+    """Return the rubrics in a user's workshop; for the owner, those near the open folders."""
     found: dict[Path, ShelvedRubric] = {}
     for root in _roots(user):
         for path in _toml_files(root):

@@ -17,7 +17,7 @@ from pipeline.grading.rubric_form import (
     with_values,
 )
 
-_AROUND = 2  # lines shown before and after a wrong one
+_AROUND = 2  # lines shown before and after a wrong line
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,10 +34,10 @@ class TypedRubric:
 
     Attributes
     ----------
-    text : as it would be saved, with the numbers of the form inserted.
-    edited : as the editor shows it; without these numbers if they cannot be inserted.
-    rubric : None if something is wrong.
-    form : the numbers of the edited text; None if that text is wrong itself.
+    text : text as it would be saved, with the numbers of the form inserted.
+    edited : text as the editor shows it, without the form's numbers if they cannot be inserted.
+    rubric : the parsed rubric; None if something is wrong.
+    form : the form with the numbers of the edited text; None if this text has a mistake.
     typed : by name, the numbers of the form that are not in the edited text.
     wrong : by name, what is wrong with a number of the form.
     """
@@ -52,10 +52,7 @@ class TypedRubric:
 
     @property
     def shown(self) -> str:
-        """The numbers that the page shows, as JSON.
-
-        With them the next request finds the changed ones.
-        """
+        """The numbers that the page shows, as JSON, so that the next request finds changed ones."""
         if self.form is None:
             return json.dumps(dict.fromkeys(self.typed, ""))
         return json.dumps({field.name: field.value for field in self.form.fields()})
@@ -90,7 +87,7 @@ def typed_rubric(edited: str, typed: Mapping[str, str]) -> TypedRubric:
 
     Parameters
     ----------
-    edited : the text.
+    edited : text of the rubric.
     typed : by name, the changed numbers of the form.
     """
     rubric, mistakes = _parsed(edited)
@@ -148,7 +145,7 @@ def _changed(sent: FormData) -> dict[str, str]:
 
 
 def _read_text(sent: FormData) -> str:
-    """Return the text with line ends as in a file, because forms send others."""
+    """Return the text with line ends as in a file, because forms send different ones."""
     text = sent.get("text")
     plain = text.replace("\r\n", "\n") if isinstance(text, str) else ""
     return plain.rstrip() + "\n"
