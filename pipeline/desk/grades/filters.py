@@ -95,7 +95,7 @@ class Filter:
         )
 
     def fields(self, shown: Class) -> list[dict]:
-        """Return the fields of the form, each with its choices and the number of teams of each."""
+        """Return the fields of the form, with their choices and the number of teams for each."""
         teams = list(shown.teams.values())
         flags = Counter(code for team in teams for code in team.line.codes)
         common = sorted(flags, key=lambda code: (-flags[code], CODES.index(code)))

@@ -210,7 +210,7 @@ def _link_others(ask: Ask, shown: Class, flag: Flag) -> list[tuple[str, str]]:
 def _link_together(
     ask: Ask, shown: Class, grade: Grade, one: dict[str, Any], flags: Sequence[Flag]
 ) -> list[tuple[str, str]]:
-    """Return links to apply the same points to all teams with the same flag, with their text."""
+    """Return links, with their text, to apply the same points to all teams with the same flag."""
     lost = one["id"] if one["lost"] else ""
     codes = dict.fromkeys(flag.code for flag in flags)
     sets = [(Filter(flag=code, lost=lost), WORDS.text(f"title_{code}")) for code in codes]

@@ -9,7 +9,7 @@ from pipeline.submission import Submission, load_submission
 
 
 def tell_state(folder: Path) -> Stands:
-    """Return the state of the check and a word for it: done, needs, old or none."""
+    """Return the state of the check (done, needs, old or none), and a word for it."""
     submission, problems = load_if_sound(folder)
     try:
         answers = read_answers(folder)

@@ -63,7 +63,7 @@ def _list_springs(field: Field, unknown: Sequence[int]) -> tuple[Answer, ...]:
 
     Parameters
     ----------
-    unknown : numbers of these springs, from 1.
+    unknown : numbers of the springs that the data do not determine, from 1.
     """
     if not unknown:
         return (Answer(label="The ticks are right", value=field.value),)

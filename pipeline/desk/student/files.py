@@ -94,7 +94,7 @@ class _Room:
         self._files, self._bytes = len(sizes), sum(sizes)
 
     def check(self, raw: bytes) -> None:
-        """Refuse a file for which there is no room; count one that is not refused."""
+        """Refuse a file for which there is no room; otherwise count it."""
         if len(raw) > MAX_DATA_BYTES:
             raise SubmissionError(f"larger than {MAX_DATA_BYTES:,} bytes")
         if self._files >= HAND_IN.members or self._bytes + len(raw) > HAND_IN.total:
@@ -105,7 +105,7 @@ class _Room:
 
 
 def _take(given: str, raw: bytes, folder: Path, *, room: _Room) -> Said | None:
-    """Store a file, under another name if its own is taken or not valid; return a message if so."""
+    """Store a file. If its name is taken or not valid, use another name and return a message."""
     last = PurePosixPath(given.replace("\\", "/")).name
     if last in _TEXTS:
         _check_text(raw, last)
@@ -146,7 +146,7 @@ def _holds(path: Path, raw: bytes) -> bool:
 
 
 def _list_names(path: Path) -> Iterator[Path]:
-    """Yield a path, then further ones with a number added to the name."""
+    """Yield a path, then further paths with a number added to the name."""
     yield path
     for number in count(2):
         yield path.with_name(f"{path.stem}-{number}{path.suffix}")
@@ -159,7 +159,7 @@ def put_aside(file: str, folder: Path) -> str:
 
     Raises
     ------
-    SubmissionError : the recording does not exist any more.
+    SubmissionError : the recording no longer exists.
     """
     aside = own_folder(folder, _ASIDE)
     aside.mkdir(exist_ok=True)

@@ -2,7 +2,7 @@
 
 Typed values are written into the file unchanged, with all their digits. The usual check of a
 submission then reports mistakes, so nothing is checked twice. The model of a submission also
-supplies help and type of each field.
+supplies the help and the type of each field.
 """
 
 import re
@@ -25,7 +25,7 @@ from pipeline.submission.load import InvalidSubmission, list_experiments, spring
 from pipeline.submission.models import MOST_CARTS
 from pipeline.words.text import symbol_text
 
-# The groups of the form: key, title, keys of the file. Before the last group comes one for the
+# The groups of the form: key, title, keys of the file. Before the last group comes a group for the
 # parameters, whose names depend on the number of carts.
 _GROUPS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("who", "Who and what", ("title", "section", "authors")),
@@ -69,20 +69,20 @@ class Answer:
 
 @dataclass(frozen=True, kw_only=True)
 class Field:
-    """One key of the file.
+    """One key of `submission.toml` as a field of the form.
 
     Attributes
     ----------
-    path : of the key in the file.
+    path : path of the key in the file.
     kind : text, number, numbers, rows (of numbers, one per line), flags, authors, columns, or words
         (a text of several lines).
     choices : the possible values; "" means that the key is left out.
-    names : of the flags.
-    value : as stored or typed.
+    names : names of the flags.
+    value : the value as stored or typed.
     wrong : what is wrong with the value.
     asked : question about a value that is doubtful but possible.
-    answers : to this question.
-    symbol : of the parameter, if the value is one.
+    answers : possible answers to the question.
+    symbol : symbol of the parameter, if the value is a parameter.
     """
 
     path: str
@@ -163,7 +163,8 @@ def fill_form(document: Mapping[str, Any]) -> list[Group]:
 def fill_experiment(document: Mapping[str, Any], index: int) -> tuple[Field, ...]:
     """Return the fields of one experiment, filled in from its table.
 
-    Only fields for its kind and controller are returned, and others that the table contains.
+    Only the fields for the experiment's kind and controller are returned, and any others that the
+    table contains.
     """
     table = f"experiments.{index}"
     kind = _find(document, f"{table}.kind")
@@ -177,11 +178,11 @@ def fill_experiment(document: Mapping[str, Any], index: int) -> tuple[Field, ...
 
 
 def sign_fields(document: Mapping[str, Any], signs: Mapping[str, int]) -> list[Field]:
-    """Return the fields of input signs that tables do not state, filled in.
+    """Return the fields, filled in, of the input signs that the tables do not state.
 
     Parameters
     ----------
-    signs : by experiment, the sign.
+    signs : sign of the input, by experiment.
     """
     return [
         replace(_describe_field(path), value=f"{signs[table['id']]:d}")
@@ -202,9 +203,9 @@ def find_changes(fields: Iterable[Field], form: Mapping[str, Any], values: Any) 
     Parameters
     ----------
     form : typed text by path; a field without an entry was not shown.
-    values : function that returns all values of a form field. For a field of flags they are the
-        numbers of those that are on. For `answer` they are "path=value", one for each question
-        answered.
+    values : function that returns all values of a form field. For a field of flags, these are the
+        numbers of the flags that are on. For `answer`, they are texts "path=value", one for each
+        answered question.
     """
     changed = []
     answered = dict(one.partition("=")[::2] for one in values("answer"))
@@ -388,7 +389,7 @@ def write_fields(document: tomlkit.TOMLDocument, changed: Iterable[Field]) -> No
             empty = not field.value and field.path not in ("title", "section")
             _set(document, field.path.split("."), None if empty else _make_item(field))
             _settle(document, field.path)
-        # With another number of carts, the default is that all springs are present.
+        # After a change of the number of carts, all springs count as present again.
         if field.path == "system.carts":
             _set(document, ["system", "springs"], None)
 
@@ -402,7 +403,7 @@ def _settle(document: tomlkit.TOMLDocument, path: str) -> None:
 
 
 def clear_marks(document: tomlkit.TOMLDocument, index: int, doubts: Iterable[str]) -> None:
-    """Remove the comments that mark these doubts from the table of an experiment."""
+    """Remove the comments that mark the given doubts from the table of an experiment."""
     texts = {f"# {_mark(doubt)}" for doubt in doubts}
     body: Any = document.get("experiments")
     if isinstance(body, AoT) and index < len(body):
@@ -495,7 +496,7 @@ def _set(document: Any, parts: Sequence[str], item: Any) -> None:
 
 
 def _set_authors(document: tomlkit.TOMLDocument, text: str) -> None:
-    """Write the authors, one per line; a table that stays keeps everything that was not changed."""
+    """Write the authors, one per line of text; an existing table keeps what was not changed."""
     lines = [line.partition(",")[::2] for line in text.splitlines() if line.strip()]
     people = [(id_.strip(), name.strip()) for id_, name in lines]
     if not people:

@@ -21,7 +21,7 @@ def pack(folder: Path, *, report: bool = True) -> bytes:
 
     Parameters
     ----------
-    report : include the report if it is up to date.
+    report : whether to include the report if it is up to date.
 
     Raises
     ------

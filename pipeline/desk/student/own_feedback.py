@@ -77,8 +77,8 @@ def _read(ask: Ask) -> OwnFeedback | None:
 
     Raises
     ------
-    ConfigError : it cannot be read. The message gives no reason, because the reason may contain
-        paths of the server.
+    ConfigError : the feedback cannot be read. The message gives no reason, because the reason may
+        contain paths of the server.
     """
     own = _find_own(ask)
     try:
@@ -129,7 +129,7 @@ def _describe_criteria(
     Parameters
     ----------
     refused : by criterion, a reason as typed and why it was refused.
-    hidden : show no number that the student must find.
+    hidden : whether to show no number that the student must find.
     """
     judged = {criterion.id: criterion for criterion in grade.criteria}
     lost = points_lost(grade, found.rubric)
@@ -170,7 +170,7 @@ def _show_why(asked: Asked, grade: Grade, found: OwnFeedback, *, hidden: bool) -
 
     Parameters
     ----------
-    hidden : show only the titles of flags, and reasons for points by hand.
+    hidden : whether to show only the titles of flags and the reasons for points by hand.
     """
     own = next((c for c in grade.criteria if c.id == asked.id), None)
     if own is None or not hidden:

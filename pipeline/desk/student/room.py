@@ -27,9 +27,9 @@ class Room:
 
     Attributes
     ----------
-    text : of `submission.toml`; "" without the file.
-    rows : one for each recording.
-    groups : of the set-up; empty if the file cannot be read.
+    text : text of `submission.toml`; "" if the file is missing.
+    rows : one row for each recording.
+    groups : groups of the set-up; empty if the file cannot be read.
     wrong : problems of the file that belong to no field.
     told : what the last report asked, assumed and found.
     facts : what decides the state of the steps.

@@ -44,9 +44,8 @@ class Row:
     Attributes
     ----------
     look : what the file contains; see `tasks.look_at_file`.
-    index : of its table; None without one.
-    id : of the experiment.
-    problems : why it needs a person.
+    index : index of the table in the file; None without a table.
+    problems : why the row needs a person.
     remarks : things worth knowing.
     """
 
@@ -78,7 +77,7 @@ class Row:
 
     @property
     def lacks_controller(self) -> bool:
-        """Whether it is a closed loop without a stated controller."""
+        """Whether this is a closed loop without a stated controller."""
         return _lacks_controller(self.fields)
 
     @property
@@ -88,7 +87,7 @@ class Row:
 
     @property
     def needs_a_person(self) -> bool:
-        """Whether a person must look at it."""
+        """Whether a person must look at the row."""
         return bool(self.problems) or any(f.wrong or f.asked for f in self.fields)
 
 
@@ -133,7 +132,7 @@ def list_rows(
 
     Parameters
     ----------
-    doubts : for each table, what it marks as unsure.
+    doubts : for each table, the doubts that the table marks as unsure.
     """
     # Further tables are not shown; their number is a problem that the page reports.
     listed = list_experiments(document)[:MOST_EXPERIMENTS]
@@ -225,9 +224,9 @@ def _question(
     carts: Sequence[int],
     marked: Sequence[str],
 ) -> Field:
-    """Return a field; that of free carts has a question if a cart hardly moves.
+    """Return a field; the field of free carts gets a question if a cart hardly moves.
 
-    The question is not asked once the table states the free carts.
+    The question is asked until the table states the free carts and marks no doubt about them.
     """
     if not field.path.endswith(".carts"):
         return field

@@ -47,7 +47,7 @@ def show(ask: Ask) -> Response:
 
 
 def upload(ask: Ask) -> Response:
-    """Store uploaded files, and add tables for them to the file."""
+    """Store uploaded files, and add tables for them to `submission.toml`."""
     folder, items = ask.folder(), ask.form.getlist("files")
     sent = [(i.filename, i.file) for i in items if isinstance(i, UploadFile) and i.filename]
     said = take_uploads(sent, folder, workers=ask.desk.workers)
@@ -73,14 +73,14 @@ def fill(ask: Ask) -> Response:
 
 
 def save(ask: Ask) -> Response:
-    """Write the form into the file."""
+    """Write the form into `submission.toml`."""
     fields = [field for group in fill_form(_read_shown(ask)) for field in group.fields]
     changed = find_changes(fields, ask.form, ask.form.getlist)
     return _edit(ask, lambda document: write_fields(document, changed), changed, place=_SET_UP)
 
 
 def save_experiment(ask: Ask) -> Response:
-    """Write one row of the table of recordings into the file, or remove its table."""
+    """Write one row of the list of recordings into `submission.toml`, or remove its table."""
     index = ask.request.path_params["index"]
     if ask.text("remove"):
         return _edit(ask, lambda document: remove_experiment(document, index), (), place=_FILES)
@@ -160,7 +160,7 @@ def download_hand_in(ask: Ask) -> Response:
 
 
 def _read_shown(ask: Ask) -> dict[str, Any]:
-    """Return the version of the file that the form was filled in from; differences were typed."""
+    """Return the version of `submission.toml` from which the form was filled in."""
     text = ask.desk.shown(ask.text("seen"), to=ask.user.name)
     return read_document(submission_text(ask.folder()) if text is None else text)
 
@@ -226,12 +226,12 @@ def _edit(
     *,
     place: str,
 ) -> Response:
-    """Change the file; show typed values again if they are not valid or the page is out of date.
+    """Change `submission.toml`; show typed values again if they are invalid or outdated.
 
     Parameters
     ----------
-    change : changes the document.
-    changed : the fields that it writes.
+    change : function that changes the document.
+    changed : the fields that `change` writes.
     place : part of the page from which the request came.
     """
     folder = ask.folder()

@@ -43,7 +43,7 @@ class Step:
 
     Attributes
     ----------
-    address : of its page, relative to the room.
+    address : address of the page, relative to the room.
     word : text shown for the state.
     """
 
@@ -134,7 +134,7 @@ def find_steps(facts: Facts) -> tuple[Step, ...]:
 def next_step(steps: Sequence[Step]) -> Step:
     """Return the first step that is not done, or the last step.
 
-    Files that need a person are passed over once there is a report of them, or a check that agrees.
+    Files that need a person are skipped once there is a report, or a check that agrees.
     """
     has_result = any(s.state == "done" for s in steps if s.key in ("report", "check"))
     open_ = [s for s in steps if s.state != "done" and not (has_result and s.key == "files")]
