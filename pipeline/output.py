@@ -1,4 +1,4 @@
-"""Write results: whole files or none, and never through a link that a submission brought.
+"""Write result files whole or not at all, and never through a link in a submission.
 
 Tables are written so that a spreadsheet does not run any formula that a student wrote.
 """
@@ -26,7 +26,7 @@ _FORMULA = re.compile(r"(^|;)(?=[ \"']*[=+\-@＝＋－＠﹦﹢﹣﹫])")
 
 
 def check_folder(out: Path) -> Path:
-    """Return the folder, which may exist or not.
+    """Return an output folder, which may exist or not.
 
     Raises
     ------
@@ -42,8 +42,8 @@ def named_folder(out: Path) -> Path:
 
     Raises
     ------
-    ConfigError : its path is taken by something that is not a folder, or it looks like a file's
-        name although several files are written.
+    ConfigError : its path is taken by something that is not a folder, or the name looks like a
+        file's although several files are written.
     """
     files = (".html", ".pdf", ".json", ".csv", ".xlsx", ".zip", ".db", ".sqlite")
     if not out.is_dir() and out.suffix.lower() in files:
@@ -56,7 +56,7 @@ def new_folder(out: Path) -> Path:
 
     Raises
     ------
-    ConfigError : the folder holds files, which the new submission would mix with.
+    ConfigError : the folder contains files already.
     """
     if named_folder(out).is_dir() and any(path.name not in (LOCK, TURN) for path in out.iterdir()):
         raise ConfigError(f"{out}: is not empty; choose a new folder with --out")
@@ -83,7 +83,7 @@ def write_file(path: Path, content: str | bytes, *, private: bool = False) -> No
 
     Parameters
     ----------
-    private : only its owner may read it, if the system supports owners.
+    private : whether only its owner may read the file, if the system supports owners.
     """
     raw = content.encode() if isinstance(content, str) else content
     _clear_left_over(path.parent)
@@ -101,10 +101,10 @@ def _for_the_owner(path: str, flags: int) -> int:
     return os.open(path, flags, OWNER_ONLY)
 
 
-# Once per folder: searching thousands of files takes as long as writing one.
+# This runs once per folder, because searching thousands of files takes as long as writing one.
 @lru_cache(maxsize=1000)
 def _clear_left_over(folder: Path) -> None:
-    an_hour_ago = time.time() - 3600.0  # longer than any write takes or clocks differ
+    an_hour_ago = time.time() - 3600.0  # longer than any write takes, and more than clocks differ
     for part in folder.glob(".*.part"):
         with suppress(OSError):  # another process has just removed it
             ours = re.fullmatch(r"\.[0-9a-f]{16}\.part", part.name)

@@ -12,7 +12,7 @@ _WHOLE = {"exercises": "Exercises", "rubric": "Rubric", "effects": "Effects"}
 
 @dataclass(frozen=True, kw_only=True)
 class Room:
-    """One of these links.
+    """A link at the top of a page.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Tasks that the desk runs in another process; only there does it read files from other people."""
+"""Tasks that the desk runs in worker processes; only these read files from other people."""
 
 import json
 import os
@@ -56,7 +56,7 @@ def look_at_file(
 
     Parameters
     ----------
-    columns : of the file, as `submission.toml` states them.
+    columns : columns of the file, as `submission.toml` states them.
     """
     if leaves(Path(folder), file):
         raise SubmissionError(f"{file}: is outside the folder")
@@ -70,11 +70,11 @@ def list_files(folder: str, *, progress: Progress) -> list[str]:
 
 
 def list_not_read(folder: str, named: list[str], *, progress: Progress) -> list[dict[str, str]]:
-    """Return the files that are not read, and what to do about each.
+    """Return the files that are not read, with the reason and what to do about each.
 
     Parameters
     ----------
-    named : files that have a table.
+    named : files that have a table in `submission.toml`.
     """
     found = passed_over(Path(folder), named=named)
     return [{"file": one.file, "reason": one.remarks[0], "advice": one.advice} for one in found]
@@ -96,7 +96,7 @@ def list_doubts(folder: str, *, progress: Progress) -> dict[str, Any]:
 
 
 def fill_tables(folder: str, *, progress: Progress) -> list[dict[str, Any]]:
-    """Add tables for the files in `data/`; return messages."""
+    """Add tables for the files in `data/`; return what was found in each file."""
     return [_describe(found) for found in fill_folder(Path(folder)).files]
 
 
@@ -192,7 +192,7 @@ def make_plots(folder: str, *, progress: Progress) -> None:
 
 
 def check_numbers(folder: str, rubric: str, where: list[str], *, progress: Progress) -> None:
-    """Check the numbers, or find where to look for some; the answer is stored in checks.jsonl."""
+    """Check the reported numbers, or find where to look for some; checks.jsonl gets the answer."""
     from pipeline.grading.rubric_file import load_rubric
     from pipeline.grading.self_check.check import check_numbers as check
 
@@ -222,7 +222,7 @@ def propose_recordings(folder: str, stock: bool, *, progress: Progress) -> str:
 def weigh_recording(
     folder: str, recording: dict[str, Any], goal: str, *, progress: Progress
 ) -> dict[str, Any]:
-    """Return what a recording would improve, and what the best choice would."""
+    """Return what a recording would improve, and what the best choice would improve."""
     from pipeline.bench.host.raw import known_commands
     from pipeline.experiments.plan import Recording
     from pipeline.experiments.plan_words import what_words
@@ -308,7 +308,7 @@ def preview_rubric(folder: str, text: str, *, progress: Progress) -> dict[str, A
 
     Parameters
     ----------
-    text : of the rubric.
+    text : text of the other rubric.
     """
     from pipeline.grading.gradebook.book import Gradebook
     from pipeline.grading.publish.rubric_preview import preview_rubric as preview
@@ -386,7 +386,7 @@ def _draw_lines(rows: Sequence[Array]) -> list[str]:
 
 
 def _write_points(row: Array) -> str:
-    """Return a row of values from 0 to 1 as points: the least and the largest of each stretch."""
+    """Return values from 0 to 1 as points: the largest or, in every second stretch, the least."""
     stretches = np.array_split(row, min(row.size, _ACROSS))
     heights = [(s.max(), s.min())[i % 2] for i, s in enumerate(stretches)]
     step = _ACROSS / max(len(heights) - 1, 1)

@@ -11,8 +11,8 @@ def read_path(typed: str, *, wanted: str, inside: Path | None = None) -> Path:
 
     Parameters
     ----------
-    wanted : message if nothing was typed.
-    inside : folder to which the path is relative and which it may not leave; None: any path.
+    wanted : message that asks for a path, if nothing was typed.
+    inside : folder to which the path is relative and which it may not leave; None for any path.
 
     Raises
     ------
@@ -38,11 +38,11 @@ def read_whole_number(typed: str, *, name: str, least: int, most: int) -> int:
 
     Parameters
     ----------
-    name : of the field, for the message.
+    name : name of the field, for the message.
 
     Raises
     ------
-    ConfigError : it is not a whole number from `least` to `most`.
+    ConfigError : the text is not a whole number from `least` to `most`.
     """
     number = typed if typed.isascii() and typed.isdecimal() else ""
     # The length is checked first, because converting thousands of digits would take long.
@@ -59,7 +59,7 @@ def read_number(
 
     Raises
     ------
-    ConfigError : it is not a number between `above` and `below`.
+    ConfigError : the text is not a number between `above` and `below`.
     """
     try:
         value = float(typed.replace(",", ".") or 0)

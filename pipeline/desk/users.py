@@ -1,4 +1,4 @@
-"""Who may see what: the person at this computer sees everything, others what a file lists."""
+"""Who may see what: the person at this computer sees everything, others see what a file lists."""
 
 import os
 import stat
@@ -44,8 +44,8 @@ class OwnGrade:
     Attributes
     ----------
     gradebook : the output folder of a grading, or the address of a database.
-    submission : its exact name in the gradebook.
-    assignment : that of the class list; needed if a database holds several; "" for a folder.
+    submission : exact name of the submission in the gradebook.
+    assignment : assignment of the class list, needed if a database holds several; "" for a folder.
     """
 
     gradebook: Place
@@ -60,13 +60,13 @@ class User:
     Attributes
     ----------
     folders : the submissions that they may see. An address contains the index in this list, so no
-        address leads to those of others. An owner's list grows when they open a folder.
+        address leads to submissions of others. An owner's list grows when they open a folder.
     gradebooks : the output folders of gradings, or addresses of databases, that they may see.
     grades : their own grades, if they are a student.
     workshop : the folder in which they make exercises and rubrics; an owner may use any.
     ports : the benches at which they may record; an owner may use any.
-    rubric : of a student's lab; the check uses its tolerances.
-    see : what this rubric lets them see; None: what their submission states.
+    rubric : rubric of a student's lab; the check uses its tolerances.
+    see : what this rubric lets them see; None if their submission decides.
     """
 
     name: str
@@ -87,7 +87,7 @@ class User:
 
     @property
     def sees_places(self) -> bool:
-        """Return whether they may see the paths of folders on this computer."""
+        """Whether they may see the paths of folders on this computer."""
         return self.role not in ("student", "ta")
 
     def without_folders(self, text: str) -> str:
@@ -114,9 +114,9 @@ _HEADER = r"^[A-Za-z0-9-]+$"
 class Proxy(TomlTable):
     """The reverse proxy of a lab server, which identifies each person."""
 
-    address: Annotated[str, Field(min_length=1)]  # of the proxy; no other computer may connect
-    header: Annotated[str, Field(pattern=_HEADER)]  # of requests; it contains the person's name
-    secret_header: Annotated[str, Field(pattern=_HEADER)]  # of requests; it contains the secret
+    address: Annotated[str, Field(min_length=1)]  # the proxy's; no other computer may connect
+    header: Annotated[str, Field(pattern=_HEADER)]  # contains the person's name
+    secret_header: Annotated[str, Field(pattern=_HEADER)]  # contains the secret
     # Known only to the proxy and the desk.
     secret: Annotated[str, Field(pattern=r"^[!-~]{24,200}$")]
     # The address that browsers use; they write it in lower case.
@@ -143,7 +143,7 @@ class Listed(TomlTable):
     grades: tuple[ListedGrade, ...] = ()
     workshop: str = ""
     ports: tuple[str, ...] = ()
-    rubric: str = ""  # of a student's lab; its [students] decides what they see
+    rubric: str = ""  # rubric of a student's lab; its [students] decides what they see
 
 
 class Users(TomlTable):
@@ -158,7 +158,7 @@ def read_users(path: Path) -> tuple[Proxy, dict[str, User]]:
 
     Raises
     ------
-    ConfigError : one line with file, key, what was expected and what was found.
+    ConfigError : the list is not valid; the message names the file, the key and the mistake.
     """
     text = read_text(path, where=str(path), limit=1_000_000, error=ConfigError)
     document = parse_toml(text, where=str(path), error=ConfigError)
@@ -216,7 +216,7 @@ def _refuse_open_to_all(path: Path) -> None:
 
 
 def _find_wrong(found: Users, root: Path) -> Iterator[str]:
-    """Yield each statement that cannot be right, as a message."""
+    """Yield a message for each statement that cannot be right."""
     proxy, names = found.proxy, [user.name for user in found.users]
     try:
         ip_address(proxy.address)

@@ -21,7 +21,7 @@ COUNT = 0.00227  # cm
 # A hand trembles by hundredths of a millimetre at these rates, so it does not hold like a clamp.
 _TREMOR_HZ = np.array([1.3, 4.1, 8.7])
 _TREMOR_AMPLITUDE = np.array([4e-3, 2e-3, 1e-3])  # as a share of the distance from rest
-_SHORTEST_STEP = 1e-5  # s of simulator time. With it, a session takes half an hour to simulate
+_SHORTEST_STEP = 1e-5  # s; with steps this short, a session takes half an hour to simulate
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,9 +30,10 @@ class ReleasingHand:
 
     Attributes
     ----------
-    position : where it holds the cart, position units from rest.
-    release, fade : s. At `release` its force starts to fall linearly, and is zero after `fade`.
-    tremor : (3,) phases of its trembling, rad.
+    position : where the hand holds the cart, in position units from rest.
+    release, fade : in s. At `release` the hand's force starts to fall linearly; after `fade` it is
+        zero.
+    tremor : (3,) phases of the hand's trembling, rad.
     """
 
     cart: int
@@ -51,15 +52,15 @@ class ReleasingHand:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BenchRun:
-    """One run: the input, the free carts and hands.
+    """One run: its input, its free carts and its hand.
 
     Attributes
     ----------
-    t, u : (n,) s and input, held between the samples. In closed loop the bench computes u itself.
-    free : the carts free to move.
-    frequency : of a sine dwell, Hz.
-    reference, controller, input_limit : of a closed loop. The controlled cart is `cart`.
-    keep_from : s. The recording starts here, and its clock too.
+    t, u : (n,) time in s, and input, which is held between samples. In closed loop the bench
+        computes u itself.
+    frequency : frequency of a sine dwell, Hz.
+    reference, controller, input_limit : settings of a closed loop; the controlled cart is `cart`.
+    keep_from : time in s at which the recording and its clock start.
     """
 
     id: str
@@ -79,9 +80,9 @@ class BenchRun:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrueMotion:
-    """The true input (n,) and positions (n_carts, n) from the springs' rest.
+    """The true input (n,) and the positions (n_carts, n) relative to the springs' rest.
 
-    If a sensor has its own scale, positions are scaled by it.
+    If a sensor has its own scale, the positions are scaled by it.
     """
 
     u: Array
@@ -94,16 +95,17 @@ class SimulatedBench:
 
     Attributes
     ----------
-    name : of the preset or the model's file. May be empty.
+    name : name of the preset or of the model's file; may be empty.
     effects : effects beyond the linear chain. Without effects nothing is compiled.
-    effect_sentences : one for each effect, with its parameters. Never written into the submission.
-    travel : intended motion of the carts. Position units.
-    count : the encoder step. Position units.
-    input_limit : the largest input. Input units.
-    sample_time : s, of the controller, the input and the log.
-    noise_counts : standard deviation of a free cart's encoder noise. With 0.2 its reading flickers
+    effect_sentences : one sentence for each effect, with its parameters. The submission never
+        contains them.
+    travel : intended motion of the carts, in position units.
+    count : encoder step, in position units.
+    input_limit : largest input, in input units.
+    sample_time : sample time of the controller, the input and the log, in s.
+    noise_counts : standard deviation of a free cart's encoder noise. With 0.2, the reading flickers
         between two counts.
-    zero_error_counts : encoders are zeroed by hand, within so many counts of the carts' rest.
+    zero_error_counts : largest error of an encoder's zero, which is set by hand, in counts.
     """
 
     chain: Chain
@@ -120,11 +122,11 @@ class SimulatedBench:
     zero_error_counts: float = 2.0
 
     def refuse_endless(self) -> None:
-        """Refuse stiff effects or small masses that would make the simulation endless.
+        """Refuse effects so stiff, or masses so small, that the simulation would take too long.
 
         Raises
         ------
-        ConfigError : the simulation would never end.
+        ConfigError : the simulation would take too long.
         """
         if not self.effects:
             return

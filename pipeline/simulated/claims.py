@@ -13,7 +13,7 @@ from pipeline.submission.toml_section import TypedNumber
 
 # Typical errors of a fit to some twenty dwells, as relative standard deviations.
 _FIT_ERROR_SPRING_OR_MASS = 0.005
-# For initial estimates from steps and decays, by ruler, cursor and peak-picking.
+# Typical error of initial estimates that are read from plots of steps and decays.
 _HAND_ERROR = 0.007
 _GUESSED_ZETA = TypedNumber(
     "0.10"
@@ -55,7 +55,7 @@ def initial_estimates(
 
 
 def final_estimates(believed: Chain) -> dict[str, Value]:
-    """Return the students' fitted parameters; they agree, because they come from one chain."""
+    """Return the students' fitted parameters, which agree because they come from one chain."""
     return {name: _significant(value) for name, value in believed.parameters().items()}
 
 

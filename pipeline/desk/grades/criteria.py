@@ -105,7 +105,7 @@ def list_steps(out_of: float, rubric: Rubric) -> list[str]:
 def describe_criterion(
     asked: Asked, grade: Grade, now: TeamNow, *, typed: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Return what the page shows of a criterion, which may never have been judged.
+    """Return what the page shows of a criterion, even if it was never judged.
 
     Parameters
     ----------

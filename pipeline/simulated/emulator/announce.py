@@ -1,4 +1,4 @@
-"""List the virtual benches that run on this computer, by one file each."""
+"""Announce the virtual benches that run on this computer, by one file each."""
 
 import json
 import os
@@ -15,12 +15,7 @@ from pipeline.output import OWNERS_FOLDER
 
 @dataclass(frozen=True, kw_only=True)
 class RunningBench:
-    """A virtual bench of the same user.
-
-    Attributes
-    ----------
-    address : the address that a host opens.
-    """
+    """A virtual bench of the same user."""
 
     name: str
     address: str
@@ -32,7 +27,7 @@ def announced(bench: RunningBench) -> Iterator[None]:
     folder, pid = _find_folder(), os.getpid()
     path = folder / f"{pid}.json"
     told = {"name": bench.name, "address": bench.address, "began": _began(pid)}
-    with suppress(OSError):  # without a folder, its address can still be typed
+    with suppress(OSError):  # without a folder, the bench's address can still be typed
         folder.mkdir(OWNERS_FOLDER, exist_ok=True)
         if _is_own(folder):
             _clear_stale(folder)
@@ -61,7 +56,7 @@ def _find_folder() -> Path:
 
 
 def _is_own(folder: Path) -> bool:
-    """Whether the folder exists and belongs to this user alone."""
+    """Return whether the folder exists and belongs to this user alone."""
     if folder.is_symlink() or not folder.is_dir():
         return False
     info = folder.stat()
@@ -82,7 +77,7 @@ def _read(path: Path) -> RunningBench | None:
 def _began(pid: int) -> float:
     """Return when a process began, s; 0 if there is no such process.
 
-    The system may give the number to a new process, which then has another time.
+    If the system gives the number to a new process, that process has another time.
     """
     try:
         return psutil.Process(pid).create_time()

@@ -12,7 +12,7 @@ from pipeline.plant.nonlinear.effects import AugmentedChain
 from pipeline.simulated.bench import ReleasingHand, SimulatedBench, before_stop
 
 TRUE_PERIOD = 1.0024e-3  # s between ticks, although the controller assumes 1 ms
-REACH = 12.0  # full duty moves the carts by this many travels, so 1 cm is some 300 counts
+REACH = 12.0  # full duty moves the carts by this many travels, so 1 cm is some 300 duty counts
 FEWEST_ENCODERS = 2  # a line has two counts, even for a single cart
 
 _NOISE = 0.2  # counts of noise on a free cart's encoder, which flickers between two counts
@@ -23,7 +23,7 @@ class VirtualCarts:
 
     Parameters
     ----------
-    seed : of the encoders' noise, the hands' tremor and the times of release.
+    seed : seed of the encoders' noise, the hands' tremor and the times of release.
     period : s between ticks.
 
     Attributes
@@ -54,7 +54,7 @@ class VirtualCarts:
         return (*np.rint(exact).astype(int).tolist(), *(0,) * spare)
 
     def move(self, duty: int) -> None:
-        """Advance by one tick under a duty.
+        """Advance by one tick under the motor's duty.
 
         Raises
         ------
@@ -108,7 +108,7 @@ class VirtualCarts:
         force = self._plant.let_go(cart, velocity=float(hand.hold(held)[1][0]))
         ticks = math.ceil(hand.fade / self._period)
         for tick in range(ticks):
-            # The force of a tick is the mean of a linear fall.
+            # The force of a tick is the mean of the linear fall over this tick.
             push = force * (1.0 - (tick + 0.5) / ticks)
             self._plant.push(cart, push)
             yield self._plant.step(0.0, following=0.0, interval=self._period)
@@ -122,7 +122,7 @@ def input_per_count(bench: SimulatedBench) -> float:
     """Return input units per duty count: full scale is 5 times a power of ten.
 
     Full-scale input holds the carts some ten travels out, so one travel is hundreds of duty counts.
-    If full scale were always 5 V, it would be only 28.
+    If full scale were always 5 V, one travel could be only 28 counts.
     """
     hold = bench.travel / float(np.max(np.abs(bench.chain.static_gains())))
     return 5.0 * 10.0 ** round(math.log10(REACH * hold / 5.0)) / FULL_SCALE

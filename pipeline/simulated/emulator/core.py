@@ -1,6 +1,6 @@
 """A bench's controller between serial line and motor: a state machine with one step per period.
 
-docs/protocol.md specifies it in words and formulas.
+docs/protocol.md specifies the state machine in words and formulas.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ class Core(Protocol):
     """
 
     def receive(self, data: bytes) -> None:
-        """Take bytes from the line; they act at the next tick."""
+        """Take bytes from the line; their commands act at the next tick."""
         ...
 
     def tick(self, counts: Sequence[int], *, stamp: int, now: int) -> int:
@@ -45,9 +45,10 @@ class Core(Protocol):
 
         Parameters
         ----------
-        counts : encoder counts since power-on. A reset makes the next ones zero.
-        stamp : time of the bench's clock in whole ms. Used for lines, waves and run times.
-        now : wall time in whole ms. Used only for the watchdog, as an emulation may run faster.
+        counts : encoder counts since power-on. After a reset, the next counts become the zero.
+        stamp : time of the bench's clock in whole ms, used for lines, waves and run times.
+        now : wall time in whole ms, used only for the watchdog, because an emulation may run faster
+            than real time.
         """
         ...
 
@@ -61,8 +62,8 @@ class ReferenceCore:
 
     Parameters
     ----------
-    description : the answer to a query. The control laws use its period. Without `commands` it is
-        the stock bench, which gives no answer.
+    description : the bench's answer to a query. The control laws use its period. A description
+        without `commands` is that of the stock bench, which does not answer.
     """
 
     def __init__(self, description: Description) -> None:
@@ -73,7 +74,7 @@ class ReferenceCore:
         self._reset()
 
     def receive(self, data: bytes) -> None:
-        """Take bytes from the line; they act at the next tick."""
+        """Take bytes from the line; their commands act at the next tick."""
         self._commands += self._reader.feed(data)
 
     def take(self) -> bytes:
@@ -168,7 +169,7 @@ class _OpenLoop:
 
 
 class _Pid:
-    """The PID law of `pipeline.plant.loop.sampled_loop`, which acts at once."""
+    """The PID law of `pipeline.plant.loop.sampled_loop`, which acts in the same tick."""
 
     def __init__(self, gains: PidGains, *, row: int, period: float) -> None:
         self._gains, self._row, self._period = gains, row, period
@@ -183,7 +184,7 @@ class _Pid:
 
 
 class _StateFeedback:
-    """The state feedback of `pipeline.plant.loop.sampled_loop` without model, one tick later."""
+    """The state feedback of `pipeline.plant.loop.sampled_loop` without a model, one tick later."""
 
     def __init__(self, gains: StateGains, *, period: float) -> None:
         self._gains, self._period = gains, period
