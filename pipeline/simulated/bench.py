@@ -26,7 +26,7 @@ _SHORTEST_STEP = 1e-5  # s; with steps this short, a session takes half an hour 
 
 @dataclass(frozen=True, kw_only=True)
 class ReleasingHand:
-    """A hand that holds one cart off its rest and lets it go.
+    """A hand that holds one cart away from its rest and lets it go.
 
     Attributes
     ----------

@@ -25,10 +25,10 @@ from pipeline.submission.complaints import nearest, quote
 from pipeline.submission.toml_file import read_text
 
 _PER_CM = {"cm": 1.0, "mm": 10.0, "m": 0.01, "in": 1 / 2.54, "count": 1 / COUNT}
-_SLOWEST, _FASTEST = 0.01, 1e4  # rad/s. From ten minutes to far beyond any sampling
+_SLOWEST, _FASTEST = 0.01, 1e4  # rad/s: periods from ten minutes to far below any sample time
 # Beyond any physical number in any unit, yet safe to multiply.
 _SMALLEST, _LARGEST = 1e-30, 1e30
-_INPUT_RESERVE = 4.0  # times the input that holds a cart at its travel
+_INPUT_RESERVE = 4.0  # multiple of the input that holds a cart at its travel
 
 
 def prepare_bench(
@@ -38,12 +38,12 @@ def prepare_bench(
 
     Parameters
     ----------
-    hide : each is `EFFECT` or `EFFECT:key=value,…`. The keys are `cart` or `spring` and the
-        parameters of the law. Omitted parameters get a clearly visible size.
+    hide : effects to hide, each as `EFFECT` or `EFFECT:key=value,…`. The keys are `cart` or
+        `spring` and the parameters of the law. Omitted parameters get a clearly visible size.
 
     Raises
     ------
-    ConfigError : neither or both of preset and model are given, or one of the texts is wrong.
+    ConfigError : neither or both of `preset` and `model` are given, or a given value is wrong.
     """
     if (preset is None) == (model is None):
         raise ConfigError("name a bench: either --preset or --model")
@@ -193,7 +193,7 @@ def _refuse_weak_hold(effect: Effect, values: Mapping[str, float], *, where: str
 
 
 def _refuse_second(term: EffectTerm, present: Sequence[EffectTerm], *, where: str) -> None:
-    """Refuse an effect if the same one, or one of its family, is already hidden at its place."""
+    """Refuse an effect if it, or another of its family, is already hidden at the same place."""
     for other in present:
         related = other.effect.family and other.effect.family == term.effect.family
         if other.place == term.place and (other.effect is term.effect or related):
@@ -205,9 +205,10 @@ def _refuse_second(term: EffectTerm, present: Sequence[EffectTerm], *, where: st
 def _session_scales(
     effect: Effect, chain: Chain, *, place: int, travel: float
 ) -> tuple[PlaceScales, float]:
-    """Return typical sizes at a place in a session, and the side of its larger step.
+    """Return the typical sizes of motion at a place in a session, and the side of the larger step.
 
-    The sizes are those of the step. A spring is stretched further by the release of a cart.
+    The sizes are those of the larger step. A spring counts as stretched at least by the travel, as
+    when a cart is released.
     """
     # The step goes to 0.9 of the travel, like the larger steps of a session.
     u = 0.9 * travel / float(np.max(np.abs(chain.static_gains())))
@@ -341,7 +342,7 @@ def _stored_effect(entry: object, bench: SimulatedBench, *, where: str) -> Effec
     at = _mapping(fields.get("where", {}), where=f"{where}.where").get(effect.place, 0)
     place = _place(effect, bench.chain, _number(str(at), where=f"{where}.where"), where=where)
     usual = default_values(effect, bench.chain, place=place, travel=bench.travel)
-    for parameter in effect.parameters:  # null, because a fit could not determine it
+    for parameter in effect.parameters:  # those not in the file are not refused
         size = values.get(parameter.name, 1.0)
         unsigned = not (parameter.signed or parameter.side)
         if unsigned and (size < 0.0 or (size == 0.0 and parameter.lower > 0.0)):

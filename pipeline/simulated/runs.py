@@ -22,20 +22,20 @@ INPUT_DECIMALS = 5  # the input is set in steps of 10 µV, so that the log holds
 FIGURE_FREQUENCY = 4.0  # Hz, the dwell of the paper's Figures 12-14
 
 _LETTERS = "abcdefgh"
-_REST = 0.5  # s of rest before a step, also of a set point
+_REST = 0.5  # s of rest before a step of the input or of the set point
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedSession:
-    """A bench, and the size of the session at it.
+    """A bench, with the number and the length of the runs to record on it.
 
     Attributes
     ----------
     repeats : number of repeats of every decay and of every step size.
     n_dwells : approximate number of dwell frequencies.
-    transients : whether every dwell is recorded from rest. Otherwise most dwells begin when
-        settled, which gives smaller files.
-    sweep_time : s.
+    transients : whether every dwell is recorded from rest. If not, most dwells are recorded only
+        after the transient, which gives smaller files.
+    sweep_time : duration of the sweep, s.
     """
 
     bench: SimulatedBench
@@ -62,7 +62,7 @@ class SimulatedSession:
 
 
 def plan_decays(session: SimulatedSession, rng: np.random.Generator) -> list[BenchRun]:
-    """Return releases of each cart by hand, with the others held, several times.
+    """Return releases of each cart by hand, with the other carts held, several times.
 
     Carts without a spring are skipped.
     """

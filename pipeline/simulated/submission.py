@@ -22,13 +22,14 @@ from pipeline.submission.toml_section import toml_section
 
 @dataclass(frozen=True, kw_only=True)
 class Students:
-    """The people who measured a simulated bench, and the text with their numbers.
+    """The people who measured a simulated bench, and what they write.
 
     Attributes
     ----------
-    authors : their ids. By default two that depend on the seed, so that a class has no duplicates.
-    title : of the submission. By default the bench and the seed.
-    springs : the springs that they declare. By default those of the chain.
+    authors : ids of the authors. By default two ids that depend on the seed, so that a class has no
+        duplicates.
+    title : title of the submission. By default it names the bench and the seed.
+    springs : whether they declare each spring as present. By default as in the chain.
     time_decimals : decimals of the log's time stamps. 3 gives rounded stamps as in an ECP export.
     notes : text of `notes.md`. Without a text there is no file.
     """
@@ -56,15 +57,15 @@ def write_submission(
 
     Parameters
     ----------
-    folder : made if necessary. Files of the same names are replaced.
-    bench : the true plant, or a preset's name.
-    compact : whether to record less. There are fewer repeats and dwells, most of them without their
+    folder : folder to write; it is made if necessary. Files of the same names are replaced.
+    bench : the true plant, or the name of a preset.
+    compact : whether to record less: fewer repeats and dwells, and most dwells without their
         transient, for half the size.
-    reported : whether to add the numbers that honest students report, `[reported]`.
+    reported : whether to add `[reported]`, the numbers that honest students report.
 
     Raises
     ------
-    ConfigError : there is no such preset, or the simulation would never end.
+    ConfigError : there is no such preset, or the simulation would take too long.
     DataError : the chain never settles, has no static gain, or diverges with its effects.
     """
     bench = preset_bench(bench) if isinstance(bench, str) else bench
@@ -172,7 +173,7 @@ def _csv_text(
 ) -> str:
     """Return the log of one run: time, input, reference (in a closed loop), and x1 … xn.
 
-    `y` (n_carts, n) are whole counts in position units. They are written with one digit more than
+    `y` (n_carts, n) holds whole counts in position units. They are written with one digit more than
     is needed to distinguish counts.
     """
     kept = run.t >= run.keep_from

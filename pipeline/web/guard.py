@@ -46,9 +46,8 @@ class Guard:
 
     Parameters
     ----------
-    app : the application.
-    door : the rules.
-    headers : added to every answer, unless the page itself sets them.
+    door : the rules for who may send requests.
+    headers : security headers added to every answer, unless the page itself sets them.
     """
 
     def __init__(self, app: ASGIApp, door: Door, *, headers: Mapping[str, str] = HEADERS) -> None:
@@ -85,7 +84,7 @@ def list_own_names(port: int) -> frozenset[str]:
 
 
 def find_site(sites: Collection[str], headers: Headers) -> str:
-    """Return the one of these addresses that a request uses, or "" if it uses none."""
+    """Return the address in `sites` that a request uses, or "" if it uses none."""
     host = headers.get("host", "")
     return next((site for site in sites if site.partition("://")[2] == host), "")
 

@@ -1,8 +1,8 @@
 """A server in its own thread, without an access log.
 
 Anybody on this computer can connect. Connections that are not yet admitted share a fixed number of
-places, so the server never runs out of file descriptors. The limits of uvicorn do not ensure this.
-It keeps every idle connection, and its `limit_concurrency` refuses all later ones.
+places, so the server never runs out of file descriptors. The limits of uvicorn do not ensure this:
+it keeps every idle connection, and its `limit_concurrency` refuses all later ones.
 """
 
 import asyncio
@@ -15,8 +15,9 @@ from uvicorn import Config, Server
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 _BACKLOG = 32  # connections accepted in one turn of the loop, before any can be closed
-# Most connections that are not admitted; a new one closes the oldest. A request that arrives with
-# its connection reaches the application three turns later, so it is never closed before that.
+# Largest number of connections that are not admitted; a new one closes the oldest. A request that
+# arrives with its connection reaches the application three turns later, so it is never closed
+# before that.
 _MOST_STRANGERS = 4 * _BACKLOG
 _STRANGER_STAYS = 5.0  # s
 

@@ -59,7 +59,7 @@ class Row:
 
     @property
     def kind(self) -> str:
-        """The kind in its table; "" without a valid one."""
+        """The kind stated in the table; "" without a valid kind."""
         kind = next((f.value for f in self.fields if f.path.endswith(".kind")), "")
         return kind if kind in dict(_KINDS) else ""
 

@@ -1,8 +1,8 @@
 """Deliberate faults on a serial line, inserted into the lines that a bench sends.
 
 A fault is written `KIND=RATE`, `KIND@SECONDS` or, for an encoder, `stuck=ENCODER@SECONDS`. The
-first form affects a random share of the lines. The others occur once, when the bench has streamed
-for so many seconds in all its runs.
+first form affects a random share of the lines. The other forms occur once, after so many seconds of
+streaming in all runs together.
 """
 
 import re
@@ -27,7 +27,7 @@ KINDS = {
     "stuck": "from then on the encoder no longer changes",
 }
 _SYNTAX = re.compile(r"(?P<kind>[a-z]+)(?:=(?P<value>[0-9.e-]+))?(?:@(?P<at>[0-9.]+))?")
-_NOISE = b"#?xZ~ \x80\xff"  # no reading has these, so a garbled line is never taken for one
+_NOISE = b"#?xZ~ \x80\xff"  # no line has these, so a garbled line is always recognised
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,8 +37,8 @@ class LineFault:
     Attributes
     ----------
     rate : share of the lines affected.
-    at : s of streaming after which it occurs once. None for random faults.
-    encoder : the encoder that is stuck. Zero for other faults.
+    at : time of streaming in s after which the fault occurs once; None for random faults.
+    encoder : the encoder that is stuck; 0 for other faults.
     """
 
     kind: str
@@ -96,7 +96,7 @@ class Faults:
         self._rng = np.random.default_rng(seed)
         self.injected: Counter[str] = Counter()
         self._period, self._streamed = period, 0.0  # s
-        self._stuck: dict[int, bytes | None] = {}  # frozen readings; None: freeze at the next
+        self._stuck: dict[int, bytes | None] = {}  # frozen readings; None: freeze the next one
         self._ms = -1  # stamp of the last line
         self._clock_began = 0  # ms of the run, at the last reset
         self._open = False  # whether the last line has lost its end
@@ -108,7 +108,7 @@ class Faults:
 
         Parameters
         ----------
-        clock : s of the bench's clock.
+        clock : time of the bench's clock, s.
         """
         kind = self._choose()
         self._open = kind == "merge"
@@ -136,7 +136,7 @@ class Faults:
         return self._hold(data, clock=clock)
 
     def _hold(self, data: bytes, *, clock: float) -> bytes:
-        """Return the bytes to send now: the held data with this, or nothing yet."""
+        """Return the bytes to send now: the held data and the new data, or nothing yet."""
         self._held += data
         if not self._held or clock < self._until:
             return b""
@@ -158,7 +158,7 @@ class Faults:
         draw = self._rng.random()
         for fault in self._random:
             if draw < fault.rate:
-                if fault.kind == "delay" and self._held:  # it is late already
+                if fault.kind == "delay" and self._held:  # the line is late already
                     return ""
                 self.injected[fault.kind] += 1
                 return fault.kind

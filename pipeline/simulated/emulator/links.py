@@ -17,7 +17,7 @@ _CHUNK = 65_536  # bytes
 
 
 class Link(Protocol):
-    """A bench's end of its line; hosts connect one after the other, and the next one waits.
+    """A bench's end of a line; one host is connected at a time, and the next one waits.
 
     Attributes
     ----------
@@ -62,8 +62,8 @@ def open_link(port: str, *, remote: bool = False) -> Link:
 
     Raises
     ------
-    ConfigError : the port has another form or is taken, or others could reach it although `remote`
-        is False.
+    ConfigError : the port has another form or is taken, or other computers could reach it although
+        `remote` is False.
     """
     if port == "pty":
         return _open_pty()
@@ -220,7 +220,7 @@ class _PtyLink:
                 del self._unsent[: os.write(self._master, self._unsent[:_CHUNK])]
 
     def hang_up(self) -> None:
-        """Forget the data of a host, which keeps the pseudo-terminal open."""
+        """Drop the unsent data; the host still has the pseudo-terminal open."""
         self._unsent.clear()
 
     def close(self) -> None:

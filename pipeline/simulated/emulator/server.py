@@ -34,11 +34,11 @@ class EmulatorOptions:
     Attributes
     ----------
     port, remote : as in `open_link`.
-    speed : factor over real time, as far as the computer can. At least in the long run.
-    period : true s between ticks. The controller assumes whole ms.
-    stock : whether it has no extension of the protocol and answers no query.
-    faults : the faults, each as in `read_fault`.
-    seed : of noise, hands and faults.
+    speed : speed relative to real time, if the computer can keep up.
+    period : true time between ticks, s; the controller assumes whole ms.
+    stock : whether the bench has no extension of the protocol and answers no query.
+    faults : faults to inject, each written as for `read_fault`.
+    seed : random seed of noise, hands and faults.
     """
 
     port: str = "socket://127.0.0.1:0"
@@ -56,17 +56,17 @@ class Server:
     Parameters
     ----------
     core : function that makes the controller for a description.
-    tell : called with each event when it happens.
+    tell : function that is called with each event as it happens.
 
     Attributes
     ----------
-    description : of the bench, its answer to a query.
-    events : each has `event`: "client" (connected), "run" (lines, ended and the faults injected),
-        "motor off" (ms_after_heartbeat).
+    description : the bench's answer to a query.
+    events : all events so far. `event` is "client" (with `connected`), "run" (with `lines`, `ended`
+        and `injected`, the faults) or "motor off" (with `ms_after_heartbeat`).
 
     Raises
     ------
-    ConfigError : port or fault are invalid, or the simulation would never end.
+    ConfigError : the port or a fault is invalid, or the simulation would take too long.
     DataError : no spring ties the carts to a wall, or hidden effects make the simulation diverge.
     """
 
@@ -107,8 +107,8 @@ class Server:
         self.events: list[dict] = []
         self._ticks = 0
         self._still_since = 0.0  # s of the bench's clock
-        self._start = Start(wave=Wave.DELTA, frequency=1.0, amplitude=0)  # the last one received
-        self._ending = ""  # why its run will end; "" by itself
+        self._start = Start(wave=Wave.DELTA, frequency=1.0, amplitude=0)  # the last start received
+        self._ending = ""  # why the run will end; "" if by itself
         self._lines = 0  # lines sent in this run
         self._heard: float | None = None  # s of wall time of the last heartbeat
         self._injected_before: Counter[str] = Counter()  # at the end of the last run
@@ -117,7 +117,7 @@ class Server:
 
     def serve(self, *, until: Callable[[], bool]) -> None:
         """Keep the bench running until `until` returns true."""
-        gc.freeze()  # otherwise a search for garbage would delay it by 0.1 s
+        gc.freeze()  # otherwise a search for garbage would stop the bench for 0.1 s
         owed, last = 0.0, time.monotonic()
         while not until():
             asleep = self._is_asleep()
@@ -155,8 +155,8 @@ class Server:
         return self._ticks * self._period
 
     def _is_asleep(self) -> bool:
-        """Whether nothing moves and no host would see it."""
-        # 10 s of its clock after the motor goes off, everything is at rest.
+        """Return whether nothing moves and no host is connected."""
+        # 10 s of the bench's clock after the motor goes off, everything is at rest.
         resting = self._clock - self._still_since > 10.0
         return resting and not self._connected and not self._lines
 
