@@ -66,6 +66,7 @@ def explore(ask: Ask) -> Response:
 def add(ask: Ask) -> Response:
     """Add a recording to the plan; a running exploration records it next."""
     from pipeline.experiments.by_hand import add_recording
+
     folder, typed = ask.folder(), {name: ask.text(name) for name in _TYPED}
     try:
         before = plan_ids(folder)
@@ -79,6 +80,7 @@ def add(ask: Ask) -> Response:
 def weigh(ask: Ask) -> Response:
     """Show what a recording would improve, beside what the program's own choice would improve."""
     from pipeline.experiments.goal import WORST
+
     folder, typed = ask.folder(), {name: ask.text(name) for name in _TYPED}
     try:
         wanted = _read_recording(typed, load_submission(folder)).model_dump(mode="json")
