@@ -14,8 +14,8 @@ from pipeline.results import EXPLAINED, ChainFit, Check, passed
 from pipeline.set_up import Bench
 from pipeline.stages.compare import SIGMA_LIMIT
 
-_REDUNDANCY = 1e-9  # relative. One number computed in two ways, without rounding.
-_BELOW_ZERO = 2.0  # standard errors. A mass, damping or spring may be this far below zero.
+_REDUNDANCY = 1e-9  # relative difference of one number computed in two ways, without rounding
+_BELOW_ZERO = 2.0  # standard errors by which a mass, damping or spring may be below zero
 # A parameter below this share of its larger neighbour may not exist: on no bench do masses, dampers
 # or springs differ by a factor of 50. If a spring is missing, dry friction and loose screws look
 # like a spring of up to 1 % of its neighbour.
@@ -23,7 +23,7 @@ NEGLIGIBLE = 0.02
 
 
 def check_carts(fit: ChainFit | None, *, bench: Bench) -> list[Check]:
-    """Check the fit, and the chain against laws of a real one: signs, redundancies, orders."""
+    """Check the fit, and whether the chain has the signs, redundancies and orders of real carts."""
     if fit is None:
         message = "No model was identified. The list of what was skipped has the reasons."
         return [Check(kind="fit", part="identified", outcome="fail", message=message)]
@@ -103,8 +103,8 @@ def physical_values(chain: Chain, *, bench: Bench) -> dict[str, float]:
 def check_vanishing(fit: ChainFit, *, bench: Bench) -> list[Check]:
     """Fail for each mass, damping or spring that may not exist.
 
-    Its value is zero within its standard error, or negligible beside its larger neighbour of the
-    same kind.
+    A parameter may not exist if its value is zero within its standard error, or negligible beside
+    its larger neighbour of the same kind.
     """
     if not fit.converged:
         return []
@@ -138,7 +138,7 @@ def check_vanishing(fit: ChainFit, *, bench: Bench) -> list[Check]:
 
 
 def _larger_neighbour(name: str, values: Mapping[str, float]) -> str:
-    """Return the name of the larger of a parameter's positive neighbours of its kind, or ""."""
+    """Return the name of the larger positive neighbour of a parameter, of the same kind; or ""."""
     read = read_name(name)
     assert read.cart is not None
     beside = [f"{read.symbol}_{read.cart + step}" for step in (-1, 1)]
@@ -215,7 +215,7 @@ def _gain_order_check(values: Mapping[str, float], *, chain: Chain) -> Check:
 def _frequency_order_checks(values: Mapping[str, float], *, n: int) -> list[Check]:
     """Check the order of resonances, nulls and the carts' own frequencies.
 
-    Heavy damping may change the order, so then it is not checked.
+    With heavy damping, a wrong order is no failure, because damping may change the order.
     """
     damped = any(v > HEAVY_DAMPING for name, v in values.items() if read_name(name).is_ratio)
     checks = []

@@ -21,7 +21,10 @@ from pipeline.words.numbers import abridge
 
 
 def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
-    """Check that two estimates of a parameter agree; a wide standard error is no agreement."""
+    """Check that two estimates of each parameter agree.
+
+    Estimates that are too uncertain to compare are skipped.
+    """
     verdicts: dict[bool | None, tuple[CheckOutcome, str]] = {
         True: ("pass", "agree"),
         False: ("fail", "disagree"),
@@ -51,7 +54,7 @@ def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
 
 
 def _advice(row: ParameterRow) -> str:
-    """Return which recordings to look at, of those that the two estimates use."""
+    """Return advice on where to look in the recordings that the two estimates use."""
     name, before, after = read_name(row.name), row.initial, row.final
     assert before is not None
     assert after is not None

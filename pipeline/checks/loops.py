@@ -13,9 +13,8 @@ from pipeline.plant.loop.margins import Margins, stability_margins
 from pipeline.plant.loop.sampled_loop import discretise
 from pipeline.results import Check, CheckOutcome, FeedbackDesign, HardwareCheck
 
-# Relative difference up to which two loops are the same: coefficients of their polynomials, each
-# divided by its binomial coefficient. Rounding leaves 1e-13 on realistic plants, and gains from
-# another program up to 1e-8.
+# Largest difference between the polynomials of two loops that count as the same. Rounding leaves
+# 1e-13 on realistic plants, and gains from another program up to 1e-8.
 _SAME_LOOP = 1e-6
 _LAST_DIGIT = 12  # decimals; rounding beyond them depends on the linear algebra library
 
@@ -40,10 +39,10 @@ def design_margins(chain: Chain, design: FeedbackDesign) -> Margins:
 def verify_design(chain: Chain, design: FeedbackDesign) -> Check:
     """Check that the designed gains give the requested loop.
 
-    The check's value is the largest relative difference between coefficients of two polynomials in
-    z, or the relative error of the static gain if that is larger. One polynomial belongs to the
-    designed loop. The other one belongs to the requested poles or, with LQR, to the loop that
-    scipy's Riccati solver gives.
+    The check's value is the largest difference between coefficients of two polynomials in z, or the
+    relative error of the static gain if that is larger. One polynomial belongs to the designed
+    loop. The other one belongs to the requested poles or, with LQR, to the loop that scipy's
+    Riccati solver gives.
     """
     asked = "the requested poles" if design.Q is None else "the loop of scipy's Riccati solver"
     try:
@@ -101,7 +100,7 @@ def _loops(chain: Chain, design: FeedbackDesign) -> tuple[Array, Array, float]:
 
 
 def _riccati_gains(phi: Array, gamma: Array, *, Q: Array, R: float) -> Array:
-    """Return the LQR gains by scipy's Riccati solver, independently of the design."""
+    """Return the LQR gains from scipy's Riccati solver, independently of the design."""
     cost = solve_discrete_are(phi, gamma[:, None], Q, R)
     return (gamma @ cost @ phi) / (R + gamma @ cost @ gamma)
 

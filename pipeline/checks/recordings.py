@@ -1,4 +1,4 @@
-"""Checks of the recordings: were they read, do they match their description, were they used."""
+"""Check that the recordings were read, match their description, and were used."""
 
 from collections.abc import Container, Mapping, Sequence
 from itertools import groupby
@@ -25,7 +25,7 @@ from pipeline.words.numbers import abridge
 from pipeline.words.phrases import phrases
 
 _WORDS = phrases("checks")
-_SPELT_OUT = 3  # a whole kind of up to so many records is listed by name
+_SPELT_OUT = 3  # up to so many records are listed by name, even if they are a whole kind
 _PLURAL = {"sine": "dwells", "step": "steps", "decay": "decays", "sweep": "sweeps"}
 
 
@@ -37,7 +37,7 @@ def check_recordings(
     late: Sequence[LateChannel],
     bench: Bench,
 ) -> list[Check]:
-    """Return every check of the recordings; the one that spoils most numbers comes first."""
+    """Return all checks of the recordings, first those whose failure spoils most numbers."""
     return [
         *check_signs(data.signs, without={one.experiment for one in left_out if one.is_wrong}),
         *check_files(data.unreadable),
@@ -65,7 +65,7 @@ def check_files(unreadable: Mapping[str, str]) -> list[Check]:
 
 
 def check_units(records: Sequence[Record], *, bench: Bench) -> list[Check]:
-    """Fail if a unit is unknown, or differs from headings or numbers."""
+    """Fail if a unit is unknown, or if headings or numbers contradict it."""
     counted = is_count(bench.units.position)
     fractions = [r.id for r in records if counted and _has_fractions_of_a_count(r)]
     checks = []
@@ -131,8 +131,9 @@ def check_scales(records: Sequence[Record], *, bench: Bench) -> list[Check]:
 def check_signs(signs: Signs, *, without: Container[str]) -> list[Check]:
     """Return a failed check if records contradict the stated sign of the input.
 
-    `without` are records that do not hold what happened, so their sign means nothing. A bench has
-    only one sign: if just a few dwells contradict it, the cause is a long delay.
+    `without` are records that do not show what happened, so their sign means nothing. A bench has
+    only one sign. So if just a few dwells contradict it, the cause is a long delay, and the check
+    does not fail.
     """
     says, wrong = [], 0
     for sign in (1, -1):
@@ -186,7 +187,7 @@ def check_left_out(left_out: Sequence[LeftOut], *, records: Sequence[Record]) ->
 
 
 def _named(names: Sequence[str], records: Sequence[Record]) -> str:
-    """Return the names of records in words, with complete kinds: "all 29 dwells, step-2"."""
+    """Return the names of records in words, or the whole kind: "all 29 dwells, step-2"."""
     said: list[str] = []
     for kind in dict.fromkeys(record.kind for record in records):
         alike = [record.id for record in records if record.kind == kind]

@@ -25,7 +25,7 @@ class RequiredRuns(TomlTable):
 
     Attributes
     ----------
-    carts : those free to move; default: all.
+    carts : the carts that are free to move; default: all.
     """
 
     kind: Kind
@@ -36,7 +36,7 @@ class RequiredRuns(TomlTable):
 class Required(TomlTable):
     """The items that a submission must have: recordings, parameters and further tables.
 
-    In the names of parameters, `K_*` is a pattern.
+    Names of parameters may be patterns such as `K_*`.
     """
 
     experiments: tuple[RequiredRuns, ...] = ()
@@ -51,9 +51,10 @@ class Late(TomlTable):
 
     Attributes
     ----------
-    due : the deadline; it counts if the platform gives submission times.
-    percent_per_day : of the points earned, for each day begun after the days of grace.
-    most_percent : the largest deduction.
+    due : the deadline; it applies if the platform gives submission times.
+    percent_per_day : the deduction for each day begun after the days of grace, in percent of the
+        earned points.
+    most_percent : the largest deduction, in percent of the earned points.
     """
 
     due: AwareDatetime | None = None
@@ -79,7 +80,8 @@ class FlagCosts(
     one wrong entry of A or B makes the whole model wrong, although it is a small share of the
     entries.
 
-    `shared_data` has no cost: only a person decides whether it is a copy, and sets points by hand.
+    `shared_data` has no cost, because a person must decide whether a recording was copied, and set
+    points by hand.
     """
 
     def of(self, code: Code) -> float:
@@ -92,7 +94,7 @@ class _Criterion(TomlTable):
 
     Attributes
     ----------
-    requires : criteria that must not have failed.
+    requires : ids of criteria that must have been passed, at least partly.
     """
 
     id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,59}$")]
@@ -116,13 +118,13 @@ class _Graded(_Criterion):
 
 
 class RequiredPieces(_Criterion):
-    """Check that everything in `[required]` is present; points are given by the share that is."""
+    """Check how many of the items in `[required]` are present; points are in proportion."""
 
     check: Literal["required"]
 
 
 class DataQuality(_Criterion):
-    """Check the recordings; points are given by the share without problems."""
+    """Check the recordings; points are in proportion to the number without problems."""
 
     check: Literal["data"]
 
@@ -150,8 +152,9 @@ class Laws(_Criterion):
     """Check the redundancies and inequalities that the final table of real carts satisfies.
 
     A law holds if some table within the rounding of the typed one satisfies it. If laws fail, the
-    worst one counts: a quarter of the points is lost if it holds only within the percentages below,
-    half if it holds only within twice as much, and all from four times as much.
+    worst one counts. A quarter of the points is lost if the numbers must change by
+    `frequency_percent` and `damping_percent` for it to hold, half if they must change by twice as
+    much, and all if by four times as much.
     """
 
     check: Literal["laws"]
@@ -166,9 +169,10 @@ class StateModel(_Graded):
 
 
 class Gains(_Criterion):
-    """Simulate the gains on the carts: stable, with overshoot and settling time within the goal.
+    """Simulate the gains on the carts: they must be stable and meet the design goal.
 
-    Errors are percentage points of overshoot, and percent of settling time, above the goal.
+    The errors are the overshoot above the goal, in percentage points, and the settling time above
+    the goal, in percent.
     """
 
     check: Literal["gains"]
@@ -179,7 +183,7 @@ class Gains(_Criterion):
 
 
 class Claims(_Criterion):
-    """Compare reported overshoot (in points) and settling time (in percent) with a simulation."""
+    """Compare the reported overshoot and settling time with a simulation of the reported gains."""
 
     check: Literal["claims"]
     overshoot_full: Percent = 5.0
@@ -227,13 +231,14 @@ class Rubric(TomlTable):
 
     Attributes
     ----------
-    system : replaces the submission's own.
-    design : replaces the submission's own, if given.
-    step : points are rounded to it.
-    anonymous : names are left out of all files unless requested.
+    system : the bench; it replaces the submission's own.
+    design : the design goal; if given, it replaces the submission's own.
+    step : step to which points are rounded.
+    anonymous : whether names are left out of all files unless requested.
     examples : submission folders given out with the assignment, relative to the rubric's folder;
         any submission may contain their recordings.
-    students : what students see at the desk of a lab server whose list of users names the rubric.
+    students : what students see on the desk of a lab server, if its list of users names this
+        rubric.
     """
 
     version: Literal[1]
@@ -251,7 +256,7 @@ class Rubric(TomlTable):
 
     @property
     def names(self) -> list[str]:
-        """The parameter names of the system, in the order of the paper's tables."""
+        """The parameter names of the system, in the order of the tables in Throne's paper."""
         return parameter_names(self.system.carts, rigid=self.system.bench.rigid)
 
     @property
@@ -261,5 +266,5 @@ class Rubric(TomlTable):
 
 
 def matching(patterns: tuple[str, ...], names: list[str]) -> list[str]:
-    """Return the names that match at least one pattern, in their order."""
+    """Return the names that match at least one pattern, in the order of `names`."""
     return [n for n in names if any(fnmatchcase(n, pattern) for pattern in patterns)]

@@ -36,7 +36,7 @@ _CHECKS: dict[str, type[BaseModel]] = {
     for check in get_args(model.model_fields["check"].annotation)
 }
 _OF_CRITERIA = tuple(rubric.DataQuality.model_fields)  # keys that every criterion has
-# Valid values that replace wrong or missing ones, so that the other mistakes can be found.
+# Valid values that replace wrong or missing ones, so that further mistakes can be found.
 _HARMLESS: dict[str | int, Any] = {"version": 1, "points": 1.0, "id": "criterion", "kind": "step"}
 _HEADER = re.compile(r"\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
 _ID = re.compile(r"^\s*id\s*=\s*[\"']([^\"']*)", re.MULTILINE)
@@ -48,8 +48,7 @@ def load_rubric(path: Path) -> Rubric:
 
     Raises
     ------
-    ConfigError : the rubric has mistakes: one line for each, with file, line, key and what was
-        expected.
+    ConfigError : the rubric has mistakes; the message has a line for each.
     """
     path = find_rubric(path)
     return parse_rubric(rubric_source(path), where=path.name)
@@ -82,7 +81,7 @@ def rubric_source(path: Path) -> str:
 
     Raises
     ------
-    ConfigError : it cannot be read.
+    ConfigError : the file cannot be read.
     """
     return read_text(path, where=path.name, limit=_MAX_BYTES, error=ConfigError)
 
@@ -92,7 +91,8 @@ class InvalidRubric(ConfigError):
 
     Attributes
     ----------
-    problems : line and problem, in the order of the file; line 0 means the whole file.
+    problems : pairs of line number and problem, in the order of the file; line 0 means the whole
+        file.
     """
 
     def __init__(self, where: str, problems: Sequence[tuple[int, str]]) -> None:
@@ -109,7 +109,7 @@ def parse_rubric(text: str, *, where: str) -> Rubric:
 
     Raises
     ------
-    InvalidRubric : with every mistake, its line, its key and what was expected.
+    InvalidRubric : the rubric has mistakes; all of them are listed.
     """
     read = read_toml(text, root=Rubric)
     problems = list(read.slips)
@@ -128,11 +128,11 @@ def parse_rubric(text: str, *, where: str) -> Rubric:
 
 @dataclass(frozen=True, kw_only=True)
 class _Complaint:
-    """A problem and the place of the document where it is.
+    """A problem, and its place in the document.
 
     Attributes
     ----------
-    missing : the place is empty, because a key is missing.
+    missing : whether the problem is a missing key.
     """
 
     at: Location

@@ -1,7 +1,7 @@
 """Show the values of a rubric as a form, and write changed values back into its text.
 
-Only a changed value is replaced in the text, or a line with it is added. Comments, order and
-everything else stay byte for byte.
+A changed value is replaced in its line, or added as a new line. Everything else in the text stays
+byte for byte.
 """
 
 import re
@@ -45,9 +45,9 @@ class RubricField:
 
     Attributes
     ----------
-    name : of the HTML input; it contains the id of the criterion.
+    name : name of the HTML input; it contains the id of the criterion.
     key : path of the value in the rubric.
-    value : as shown; a share is shown in percent.
+    value : the value as shown; a share is shown in percent.
     choices : the possible words; empty for a number.
     """
 
@@ -64,7 +64,7 @@ class CriterionFields:
 
     Attributes
     ----------
-    tolerances : by their keys, in the order of the rubric.
+    tolerances : the field of each tolerance by its key, in the order of the rubric.
     """
 
     id: str
@@ -82,7 +82,7 @@ class RubricForm:
     ----------
     late : fields of the late policy, by key.
     costs : cost of each flag, by code.
-    step : rounding of points.
+    step : step to which points are rounded.
     see : what students see.
     """
 
@@ -113,7 +113,7 @@ class WrongFields(ConfigError):
 
     Attributes
     ----------
-    problems : by the name of the field.
+    problems : the problem of each wrong field, by the name of the field.
     """
 
     def __init__(self, problems: Mapping[str, str]) -> None:
@@ -194,11 +194,11 @@ def changed_fields(form: RubricForm, typed: Mapping[str, str]) -> dict[Key, Valu
 
     Parameters
     ----------
-    typed : by the name of the field; missing fields are unchanged.
+    typed : what was typed, by the name of the field; fields that are not in it stay unchanged.
 
     Raises
     ------
-    WrongFields : some have wrong values, or are not fields of this rubric.
+    WrongFields : some fields have wrong values, or are not fields of this rubric.
     """
     fields = {field.name: field for field in form.fields()}
     changed: dict[Key, Value] = {}

@@ -1,4 +1,4 @@
-"""Find recordings that do not hold what happened, by comparing them with the identified carts.
+"""Find recordings that do not show what happened, by comparing them with the identified carts.
 
 The faults are a dead or swapped channel, a wrong clock, or a truncated file. A constant reading is
 not always a fault: friction may hold a cart, a held cart should not move, and a coarse encoder does
@@ -28,9 +28,9 @@ from pipeline.results import Record, StepGain
 from pipeline.soundness.fault import SAME, SIGMAS, RecordingFault
 from pipeline.soundness.other_readings import find_other_readings
 
-# A reading is suspicious if it is constant while the input changes over half its range, and for
-# this share of the record afterwards. It is a fault if the identified carts move meanwhile by this
-# many encoder steps and by three tenths of their motion. A delay or play holds a cart only briefly.
+# A reading is suspicious if it is constant while the input changes by half its range, and for this
+# share of the record afterwards. It is a fault if the identified carts meanwhile move by this many
+# encoder steps and by three tenths of their motion. A delay or play holds a cart only briefly.
 _STILL, _SEEN_COUNTS = 0.2, 5.0
 _FEWEST_CYCLES = 1.5  # cycles of a dwell; with fewer there is no steady state at any damping
 
@@ -47,13 +47,13 @@ def standing_still(records: Sequence[Record]) -> set[str]:
 def find_faults(
     records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, Followed]
 ) -> dict[str, RecordingFault]:
-    """Return the records that do not hold what happened, by id, each with its fault.
+    """Return the records that do not show what happened, by id, each with its fault.
 
     Parameters
     ----------
-    chain : the carts as identified from the undoubted records. None if that failed; then only
-        faults are found that no carts could cause.
-    fits : how the records follow it, from `follow`.
+    chain : the carts identified from records that are not in doubt. None if this failed;
+        then only faults are found that no carts could cause.
+    fits : how each record follows the chain, from `follow`.
     """
     readings = find_other_readings(records, chain=chain, fits=fits)
     misread = readings.mistaken
@@ -72,7 +72,8 @@ def find_faults(
         )
         for cart in {cart for fit in fits.values() for cart in fit.lost}
     }
-    # This uses all records: no bench samples some recordings a thousand times more slowly.
+    # All records are compared here, because no bench samples some of them a thousand times more
+    # slowly.
     clocks = [record.sample_time for record in records]
     usual_clock = min((dt for dt in clocks if dt >= FASTEST), default=0.0)
     found: dict[str, RecordingFault] = {}
@@ -127,7 +128,7 @@ def _edges(y: np.ndarray) -> np.ndarray:
 
 
 def _still(record: Record, cart: int) -> Iterator[slice]:
-    """Yield stretches of constant reading during which the input changes far."""
+    """Yield stretches of constant reading while the input changes by half its range."""
     u, y = record.u, record.position(cart)
     if u is None:
         return
@@ -150,8 +151,8 @@ def _dead_channels(
 ) -> Iterator[RecordingFault]:
     """Yield a fault for each free cart with a constant reading although the cart must have moved.
 
-    For each cart, `friction` is the largest that the records allow, and `steps` the encoder step.
-    `moving` are the carts that any input ever moved.
+    For each cart, `friction` is the largest friction that the records allow, and `steps` the
+    encoder step. `moving` are the carts that any input ever moved.
     """
     for cart in measured(record):
         y = record.position(cart)
@@ -183,9 +184,9 @@ def _frozen(
 ) -> Iterator[RecordingFault]:
     """Yield a fault for each reading that is constant for a while although the carts moved it far.
 
-    The stretch has ten samples or more, and the cart moves by at least a fifth of its motion.
-    Before and after it the reading follows the carts. Meanwhile the force on the cart exceeds any
-    friction.
+    The reading is constant for ten samples or more, while the identified carts move by at least a
+    fifth of their motion and the force on the cart exceeds any friction. Before and after that, the
+    reading follows the carts.
     """
     for cart, missed in fit.missed.items():
         y = record.position(cart)
@@ -206,7 +207,7 @@ def _frozen(
                 continue
             elsewhere = float(np.mean(rest**2))
             follows = elsewhere < FOLLOWED * float(np.var(np.delete(y, part)))
-            # The reading follows the carts if its error elsewhere is below a quarter of that
+            # The reading follows the carts if its error elsewhere is below a quarter of the missed
             # motion.
             if follows and np.sqrt(elsewhere) < 0.25 * moved:
                 said = _span(record, part)
@@ -219,7 +220,7 @@ def _span(record: Record, part: slice) -> dict[str, str]:
 
 
 def _must_move(record: Record, chain: Chain, still: slice, *, cart: int, step: float) -> bool:
-    """Whether the input moves a cart far during these samples, from rest and in steady state."""
+    """Whether the input moves a cart far meanwhile, both from rest and in steady state."""
     assert record.u is not None
     free = tuple(sorted(record.free))
     y = simulate_linear(chain, record.t, record.u, free=free, hold=record.hold)[free.index(cart)]
@@ -278,8 +279,8 @@ def _strays(
 ) -> Iterator[RecordingFault]:
     """Yield the records that do not follow carts similar to those of most records.
 
-    It is enough if one cart follows: another may be near its null and hardly move. A cart that
-    moves less than it should proves nothing, because friction may hold it.
+    It is enough if one cart follows, because another one may be near its null and hardly move. A
+    cart that moves less than it should proves nothing, because friction may hold it.
     """
     if chain is None or not most_follow(fits):
         return

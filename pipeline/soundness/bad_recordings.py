@@ -11,12 +11,13 @@ from pipeline.soundness.fault import RecordingFault, say, sound_ones
 from pipeline.soundness.late_channels import late_experiments
 from pipeline.soundness.stated import find_other_scales, find_wrong_setups, why_other_frequency
 
-# Relative. A stated frequency further from that of the input belongs to another run.
+# Relative difference between a stated frequency and that of the input. A larger one means that the
+# file belongs to another run.
 _OTHER_RUN = 0.08
 
 
 def find_bad_recordings(analysis: Analysis) -> dict[str, str]:
-    """Return the recordings that do not hold what they should, each with its fault."""
+    """Return the recordings with a fault, each with the fault in words."""
     found = dict(analysis.unreadable)
     found |= {one.experiment: one.reason for one in analysis.left_out if one.is_wrong}
     sound = sound_ones(analysis.records, analysis.left_out)

@@ -17,9 +17,9 @@ def find_other_units(
     """Find the records whose encoder step is the usual one in another unit, by id.
 
     The usual step is that of most kinds of experiment, not of most records. A dozen dwells may have
-    been exported together, and so may all be wrong. Steps of 0.01 and 0.001 only differ in the
-    number of decimals. For a decay any unit of length is good; decays are searched separately, with
-    `decays`.
+    been exported together, and so may all be wrong. Steps of 0.01 and 0.001 differ only in the
+    number of decimals. For a decay, any unit of length will do; so decays are searched separately,
+    with `decays`.
     """
     found: dict[str, RecordingFault] = {}
     for cart in sorted({cart for record in records for cart in record.carts}):
@@ -56,8 +56,9 @@ def _is_decimal(step: float) -> bool:
 def find_stuck(records: Sequence[Record]) -> dict[str, RecordingFault]:
     """Return the records in which the encoder of a free cart was stuck, by id.
 
-    Static friction stops only a slow cart, far below the fastest 2 % of its moves between samples.
-    It does not stop a fast cart. And a cart that moves on starts from where it stopped.
+    Static friction stops only a cart that is already slow, and the cart then starts from where it
+    stopped. So the encoder was stuck if the reading stops while the cart is fast, or if it jumps
+    when it changes again.
     """
     found: dict[str, RecordingFault] = {}
     for record in records:

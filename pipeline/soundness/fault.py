@@ -15,23 +15,25 @@ _WORDS = phrases("soundness")
 
 # Independent records, or kinds of record, that must agree. A single one may be wrong by chance.
 WITNESSES = 2
-SIGMAS = 4.0  # standard errors. By chance one number in 16,000 is as far off
-# Relative difference of an encoder step, a clock or a length that a program sets for all.
+SIGMAS = 4.0  # standard errors; by chance, one number in 16,000 is as far off
+# Relative difference up to which encoder steps, clocks or lengths are equal, if a program sets them
+# for all recordings.
 SAME = 0.02
-SAME_SIZE = 0.2  # relative difference of two step sizes that friction affects equally
+SAME_SIZE = 0.2  # relative difference up to which friction affects two step sizes equally
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingFault:
-    """A fault of a recording, or its contradiction to others.
+    """A fault of a recording, or a contradiction between it and other recordings.
 
     Attributes
     ----------
-    code : its kind, the key of its sentence.
-    run, cart : where it is. Without a cart it concerns the whole recording.
+    code : kind of the fault, which is also the key of its sentence.
+    run, cart : the recording and the cart. Without a cart, the fault concerns the whole recording.
     said : values for the sentence, as text.
-    value, limit : the number that shows the fault, and its largest allowed value. None without one.
-    is_wrong : whether the recording does not hold what happened. Otherwise it only differs from
+    value, limit : the number that shows the fault, and its largest allowed value. None if there is
+        no such number.
+    is_wrong : whether the recording does not show what happened. Otherwise it only differs from
         others.
     """
 
@@ -67,11 +69,11 @@ class RecordingFault:
 
 
 def say(key: str, **values: str) -> str:
-    """Return part of a fault's sentence, or a sentence that contains others."""
+    """Return the sentence, or part of a sentence, with this key."""
     return _WORDS.text(key, **values)
 
 
 def sound_ones(records: Sequence[Record], left_out: Sequence[LeftOut]) -> list[Record]:
-    """Return the records that hold what happened, even if they differ from others."""
+    """Return the records that show what happened, even if they differ from others."""
     wrong = {one.experiment for one in left_out if one.is_wrong}
     return [record for record in records if record.id not in wrong]

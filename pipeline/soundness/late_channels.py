@@ -9,10 +9,10 @@ from pipeline.results import LateChannel, Record
 from pipeline.soundness.fault import RecordingFault
 
 _LATE, _SURE = 2.0, 4.0  # samples, and standard errors: a late channel exceeds both
-# Correcting the delay must lower the residual of the carts' own law by this factor. Friction, stops
-# and stiff springs on benches of every kind look like delays, but lower it by 1.7 times at most.
-# Correcting 44 ms lowers it by 8 times with much friction. Without friction it is thousands of
-# times.
+# Correcting the delay must lower the residual of the carts' equation of motion by this factor.
+# Friction, stops and stiff springs on benches of every kind look like delays, but correcting these
+# lowers it by 1.7 times at most. Correcting a delay of 44 ms lowers it 8 times with much friction,
+# and thousands of times without friction.
 _BETTER = 5.0
 
 
@@ -27,7 +27,7 @@ def find_late_channels(records: Sequence[Record], *, carts: int) -> tuple[LateCh
         alike = [record for record in records if record.kind == kind]
         if alike:
             late += _late_in(alike, kind=kind, carts=carts)
-    # A right channel looks early in comparison with a late one, so drop these.
+    # Compared with a late channel, a right one looks early, so such results are dropped.
     named = {one.cart for one in late if one.than == 1}
     return tuple(one for one in late if one.than not in named)
 
@@ -45,8 +45,8 @@ def _late_in(records: Sequence[Record], *, kind: str, carts: int) -> list[LateCh
         if _shows(link, sample=sample):
             delay, limit = delay + link.delay, max(limit, _limit(link, sample=sample))
         elif abs(link.delay) + _SURE * link.std > _LATE * sample:
-            # This channel shows neither a delay nor its absence, so the comparison starts again
-            # here.
+            # A delay of this channel is neither certain nor ruled out, so the comparison starts
+            # again here.
             first, delay, limit = cart, 0.0, 0.0
         if abs(delay) > max(limit, _LATE * sample):
             found.append(

@@ -47,10 +47,10 @@ def _is_sine(t: Array, u: Array) -> bool:
 
 
 def _cut(record: Record, records: Sequence[Record]) -> Iterator[RecordingFault]:
-    """Yield files that look truncated: all repeats have the same duration, over twice as long.
+    """Yield a fault if a file looks truncated: most repeats are equally long, over twice as long.
 
-    If a person stops recordings by hand, the durations differ. If the clock is in another unit, the
-    repeat is longer without having more samples.
+    Recordings that a person stops by hand differ in duration, so they are not compared. If the
+    clock is in another unit, the repeat is longer without having more samples.
     """
     if record.kind not in ("decay", "step"):
         return

@@ -1,7 +1,8 @@
-"""Find records that follow the carts only after a correction, and decide who made the mistake.
+"""Find records that follow the carts only after a correction, and decide which of them are wrong.
 
-A wrong unit or clock applies to everything that one program logged. A single record that moves a
-tenth as far is only odd: an amplifier at its limit, a dead zone or friction can cause that too.
+A wrong unit or clock applies to everything that one program logged. A single record with a tenth of
+the motion is only odd, because an amplifier at its limit, a dead zone or friction can cause this
+too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,11 +18,11 @@ from pipeline.soundness.fault import SAME, SAME_SIZE, WITNESSES, RecordingFault
 
 @dataclass(frozen=True, kw_only=True)
 class OtherReadings:
-    """The records that follow only after a correction, by id.
+    """The records that follow the chain only after a correction, by id.
 
     Attributes
     ----------
-    mistaken : records that do not hold what happened.
+    mistaken : records that do not show what happened.
     odd : records in which the bench may have done something that no chain does.
     """
 
@@ -34,7 +35,8 @@ def find_other_readings(
 ) -> OtherReadings:
     """Find the records that follow the chain only after a correction.
 
-    If most records of a kind need it, those of the kind that show it less clearly count too.
+    If most records of a kind need a correction, weaker evidence is enough for the other records of
+    this kind.
     """
     if chain is None:
         return OtherReadings()
@@ -65,7 +67,7 @@ def find_other_readings(
 def without_lone_factors(
     found: Mapping[str, Misread], records: Sequence[Record], *, fits: Mapping[str, Followed]
 ) -> dict[str, Misread]:
-    """Return the corrections, without factors that not every record of their kind needs.
+    """Return the corrections, without the factors that only some records of a kind need.
 
     Parameters
     ----------
@@ -104,8 +106,8 @@ def _may_be_a_limit(
 ) -> bool:
     """Whether these records may be due to an amplifier at its limit.
 
-    Their inputs must have one size, because a limit gives the same factor only then. And no record
-    with such a large input may follow the chain.
+    Their inputs must have one size, because only then does a limit give the same factor. And no
+    record with such a large input may follow the chain.
     """
     sizes = [_size(record) for record in sharing]
     follows = [_size(r) for r in records if r not in sharing and fits[r.id].belongs]

@@ -1,8 +1,8 @@
 """Compare numbers measured more than once: whether the runs agree, which are odd, and why.
 
 If two runs give a frequency or a gain 10 % apart, beyond their standard errors, one of the runs is
-wrong. The fit decides which one, else the majority; otherwise it stays undecided. Runs that agree
-may share a mistake. It shows if they contradict dwells that one chain explains.
+wrong. The fit decides which one. Without a fit, the majority decides, or it stays undecided. Runs
+that agree may share a mistake, which shows if they contradict dwells that one chain explains.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from pipeline.names import gain_name, own_omega, own_zeta, read_name
 from pipeline.results import Check, Estimate, LogDecrement, StepGain
 from pipeline.soundness.fault import SAME_SIZE, SIGMAS, RecordingFault
 
-_LIKE_THE_FIT = 0.15  # relative. Usual difference of initial and final estimates (Throne 2005)
+_LIKE_THE_FIT = 0.15  # relative; the usual difference of initial and final estimates (Throne 2005)
 # Factors by which friction, play or a soft hold may change a gain or a frequency.
 _BY_THE_BENCH = {"K": 1.6, "omega": 1.3}
 
@@ -27,9 +27,9 @@ class Repeats:
 
     Attributes
     ----------
-    checks : one for each number that was measured more than once.
+    checks : one check for each number that was measured more than once.
     odd : the runs that differ, by id, each with its fault.
-    undecided : the numbers whose runs contradict each other. Nothing shows which runs are right.
+    undecided : the numbers whose runs contradict each other, if nothing shows which runs are right.
     """
 
     checks: tuple[Check, ...] = ()
@@ -41,8 +41,8 @@ class Repeats:
 class _Reading:
     """The value from one run, its interval, and the size of the step that gave it.
 
-    `tolerance` is the difference between runs, in percent, that is not a contradiction. With dry
-    friction, repeats differ by some percent.
+    `tolerance` is the largest difference between runs, in percent, that is no contradiction. With
+    dry friction, repeats differ by some percent.
     """
 
     run: str
@@ -66,7 +66,8 @@ def compare_repeats(
     Parameters
     ----------
     fitted : the parameters of a fit that explains most records. Empty without such a fit.
-    dwells : the parameters of a fit to dwells alone that explains them. Empty without such a fit.
+    dwells : the parameters of a fit that uses only dwells and explains them. Empty without such a
+        fit.
     """
     readings = _readings(decays, steps, carts=carts)
     # Dampings of a fit are not used, because they may come from the decays.

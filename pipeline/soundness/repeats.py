@@ -9,23 +9,23 @@ from pipeline.arrays import Array
 from pipeline.results import Record
 from pipeline.soundness.fault import RecordingFault
 
-_MATERIAL = 0.05  # of the response. A smaller difference does not matter
-# A repeat is odd if it differs by this many times the spread of the others; the keys are the number
-# of repeats. If all repeats differ by chance (along one shape, normally distributed), this flags 5
-# % of the sets. It flags far fewer if they differ in several ways. With three repeats the spread
-# comes from a single difference, so the factor is large.
+_MATERIAL = 0.05  # share of the response; a smaller difference does not matter
+# A repeat is odd if it differs from the others by this many times their spread; the keys are
+# numbers of repeats. If repeats differ by normally distributed multiples of one shape, 5 % of the
+# sets are flagged by chance; if they differ in several ways, far fewer are. With three repeats, the
+# spread comes from a single difference, so the factor is large.
 _SPREADS, _SPREADS_OF_MANY = {3: 30.0, 4: 8.0}, 5.0
 _AMPLIFICATION = 2.0  # factor by which a lightly damped chain amplifies a difference of the inputs
-_START_SAMPLES = 3  # samples for the start. Their median ignores a spike
+_START_SAMPLES = 3  # samples whose median is the start, so that a spike is ignored
 
 
 def find_outlier_repeats(records: Sequence[Record], *, unit: str) -> dict[str, RecordingFault]:
     """Find the repeats that do not belong with the others, by id.
 
-    Repeats have the same kind, free and measured carts, and nearly the same input (in closed loop
-    the same set point). Decays are not compared: a hand never releases twice from the same place.
-    One of two repeats is never flagged, nor are half of them or more. `unit` is that of the
-    positions.
+    Repeats have the same kind, free and measured carts, and nearly the same input (in closed loop,
+    the same set point). Decays are not compared, because a hand never releases a cart twice from
+    the same place. Fewer than half of the repeats can be flagged, and none of two. `unit` is the
+    unit of positions.
     """
     outliers: dict[str, RecordingFault] = {}
     for group in _groups(records):
@@ -74,7 +74,7 @@ def _is_repeat(first: Record, other: Record) -> bool:
         return False
     t = _common_times(first, other)
     u = np.concatenate([_at(t, record, _excitation(record)) for record in (first, other)])
-    # An edge that is one sample early gives 8 %, the next usual amplitude 33 %.
+    # An edge that is one sample early differs by 8 %, the next usual amplitude by 33 %.
     return bool(_rms(u[0] - u[1]) <= 0.2 * _rms(u))
 
 
@@ -96,8 +96,8 @@ def _rms(signal: Array) -> float:
 def _differences(group: Sequence[Record]) -> tuple[Array, Array]:
     """Return the differences (n, n) of the responses of each pair, and the allowed differences.
 
-    They are root-mean-squares over carts and time. Positions count from the start of the record, as
-    encoders need not start at zero. The final rest is part of the response.
+    The differences are root-mean-squares over carts and time. Positions count from the start of the
+    record, because encoders need not start at zero. The final rest is part of the response.
     """
     t = _common_times(*group)
     u = np.concatenate([_at(t, record, _excitation(record)) for record in group])  # (n, n_t)

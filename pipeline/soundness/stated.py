@@ -10,8 +10,8 @@ from pipeline.results import Record
 from pipeline.set_up import Bench
 from pipeline.soundness.fault import RecordingFault, say
 
-OTHER_DWELL = 0.1  # relative. A dwell this far from its stated frequency is another dwell
-# Share of a held cart's swing. If a cart that should be free moves less, it is not the free one.
+OTHER_DWELL = 0.1  # relative; a dwell this far from its stated frequency is another dwell
+# Share of a held cart's swing. If a cart that should be free moves less, it is not free.
 LEAST_SHARE = 0.2
 # Share of the free carts' swing. A cart that is held firmly moves less.
 _HELD_FIRMLY = 0.05
@@ -70,7 +70,7 @@ def find_loose_holds(records: Sequence[Record]) -> list[RecordingFault]:
 
 
 def find_other_scales(records: Sequence[Record], *, bench: Bench) -> list[RecordingFault]:
-    """Find positions or inputs larger than on any bench: they must be in another unit.
+    """Find positions or inputs that are larger than on any bench, and so must be in another unit.
 
     Examples are counts in place of a length, and millivolts in place of volts. A fit to such
     records looks as good as a fit to right ones; only the gains are wrong.

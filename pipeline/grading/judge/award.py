@@ -1,4 +1,4 @@
-"""Turn verdicts into points: required criteria, costs of flags, rounding to the rubric's step."""
+"""Turn verdicts into points: apply required criteria, costs of flags, and the rubric's rounding."""
 
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
@@ -49,7 +49,7 @@ def _waiting(parent: Criterion) -> Verdict:
 
 
 def _outcome(share: Fraction | None, points: Fraction, *, out_of: Fraction) -> Outcome:
-    """Return the outcome of a criterion by its rounded points."""
+    """Return the outcome of the rounded points; `skip` if nothing was judged."""
     if share is None:
         return "skip"
     return "pass" if points == out_of else "fail" if points == 0 else "partial"

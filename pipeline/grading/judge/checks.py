@@ -29,7 +29,7 @@ _NAMED = 4  # largest number of parameters or laws in one message
 
 
 def judge(criterion: asked.Criterion, work: Work) -> Verdict:
-    """Judge one criterion by itself; `award.py` handles `requires`."""
+    """Judge one criterion, without regard to the criteria that it requires; see `award.py`."""
     return _JUDGES[criterion.check](criterion, work)
 
 
@@ -71,7 +71,7 @@ def _data(_: asked.DataQuality, work: Work) -> Verdict:
 def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
     """Judge the reported parameters against those from the recordings.
 
-    A missing one earns nothing.
+    A parameter that is not reported earns nothing.
     """
     table: Mapping[str, Decimal] = getattr(work.reported, criterion.check)
     known: Mapping[str, Reference] = getattr(work.references, criterion.check)
@@ -127,9 +127,10 @@ def _deviation(error: Fraction, name: str) -> Deviation:
 
 
 def _initial_final(criterion: asked.InitialFinal, work: Work) -> Verdict:
-    """Judge whether initial and final table agree within their rounding.
+    """Judge how well the initial and the final table agree, after allowing for rounding.
 
-    Dampings that the recordings do not give are left out, because students guess them.
+    Dampings that the recordings do not determine are left out, because students can only guess
+    them.
     """
     initial, final = work.reported.initial, work.reported.final
     names = matching(criterion.parameters, work.rubric.names)
@@ -159,7 +160,7 @@ def _initial_final(criterion: asked.InitialFinal, work: Work) -> Verdict:
 def between(initial: Decimal, final: Decimal) -> Fraction:
     """Return how far two typed numbers differ, in percent, beyond the rounding of each.
 
-    Two negative numbers can agree, because another check reports a wrong sign.
+    Two negative numbers can agree; their wrong sign is reported by another check.
     """
     if initial * final <= 0:
         return NO_CREDIT

@@ -33,11 +33,11 @@ def _loop(work: Work) -> tuple[Controller, Array] | Verdict:
 
 @dataclass(frozen=True, kw_only=True)
 class _Best:
-    """The response on the model for which the gains earn most, and that share of the points.
+    """The response that earns most, among those on all models, and its share of the points.
 
     Attributes
     ----------
-    models : errors of the response on every model.
+    models : for each model, the errors of the response.
     """
 
     share: Fraction
@@ -60,7 +60,7 @@ def _best(
 def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
     """Judge the gains by simulation against the design goal.
 
-    The model with the best result counts.
+    If several models are acceptable, the one with the best result counts.
     """
     loop = _loop(work)
     if isinstance(loop, Verdict):
@@ -108,7 +108,7 @@ def _claimable(numbers: LoopNumbers) -> dict[str, float | None]:
 
 
 def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
-    """Judge reported overshoot and settling time against a simulation with the reported gains."""
+    """Judge the reported overshoot and settling time by a simulation with the reported gains."""
     loop = _loop(work)
     if isinstance(loop, Verdict):
         return loop

@@ -1,4 +1,4 @@
-"""The least cost of a flag: a share of its criterion's points, set by the rubric."""
+"""The least that a flag costs: a share of its criterion's points, set by the rubric."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -12,8 +12,8 @@ from pipeline.grading.references.tolerance import exact
 from pipeline.grading.rubric import Rubric, matching
 from pipeline.grading.words import WORDS
 
-# The check that each flag concerns. Flags that are not listed concern the check of a parameter
-# table; their evidence names the table.
+# The check that each flag concerns. Other flags concern the parameter table that their evidence
+# names.
 _ABOUT: Mapping[Code, str] = {
     "initial_final_disagree": "initial_final",
     "wrong_state_space": "state_space",
@@ -22,15 +22,15 @@ _ABOUT: Mapping[Code, str] = {
     "missing": "required",
     "data_problem": "data",
 }
-_REDUCED = "data"  # the check of recordings, which includes tables that students reduced themselves
+_REDUCED = "data"  # the check that a flag concerns if its evidence names no parameter table
 
 
 def charge(
     verdict: Verdict, criterion: asked.Criterion, flags: Sequence[Flag], *, rubric: Rubric
 ) -> Verdict:
-    """Return a verdict reduced by the most expensive flag on its criterion.
+    """Return a verdict with its share limited by the most expensive flag on its criterion.
 
-    Several flags on one criterion cost as much as the most expensive one, not their sum.
+    Only this flag counts, not the sum of all flags. A share that is already lower stays.
     """
     mine = [flag for flag in flags if concerns(flag, criterion, names=rubric.names)]
     dearest = max(mine, key=lambda flag: rubric.flags.of(flag.code), default=None)
@@ -71,5 +71,5 @@ def find_remarks(grade: Grade, criterion: asked.Criterion, rubric: Rubric) -> li
 
 
 def is_about(flag: Flag, criterion: asked.Criterion, rubric: Rubric) -> bool:
-    """Return whether a flag concerns a criterion; shared recordings concern no criterion."""
+    """Return whether a flag concerns a criterion; the flag for shared recordings concerns none."""
     return flag.code != "shared_data" and concerns(flag, criterion, names=rubric.names)

@@ -31,9 +31,9 @@ class Deviation:
 
     Attributes
     ----------
-    error : in the unit of the tolerance (percent, or percentage points).
-    by : name of the tolerance. `exact` is for a zero or a one of a state model: a right one does
-        not count, because it is no achievement, and a wrong one counts like any other number.
+    error : the error in percent, or in percentage points for an overshoot.
+    by : name of the tolerance. `exact` is for an entry of a state model that must be 0 or 1. Such
+        an entry counts only if it is wrong, because a right one is no achievement.
     """
 
     error: Fraction
@@ -49,7 +49,8 @@ def earned_by(criterion: asked.Criterion, deviation: Deviation) -> Fraction:
 def earned(criterion: asked.Criterion, deviations: Sequence[Deviation]) -> Fraction:
     """Return the share of the criterion's points that one or more numbers earn together.
 
-    Gains must meet the whole goal, so the worst number counts. In other criteria all count equally.
+    Gains must meet the whole goal, so the worst number counts. In other criteria, all numbers count
+    equally.
     """
     shares = [earned_by(criterion, deviation) for deviation in deviations]
     if isinstance(criterion, asked.Gains):

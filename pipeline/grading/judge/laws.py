@@ -3,9 +3,10 @@
 Two carts have eight transfer-function parameters but seven physical ones, three carts fifteen but
 ten. So the extra parameters must agree with the others.
 
-Rounding allows each number an interval, and so the table a box. A law is an equation or an
-inequality. It holds if it is true at one corner of the box, or if its two sides change order
-between corners. All corners are evaluated at once.
+Because of rounding, each number stands for an interval, and the whole table for a box. An
+inequality holds if it is true at one corner of the box. An equation holds if its left side is at
+least the right side at one corner, and at most the right side at another. All corners are evaluated
+at once.
 """
 
 from collections.abc import Mapping
@@ -21,8 +22,8 @@ from pipeline.names import parameter_names, read_name
 from pipeline.plant.linear.laws import orders
 from pipeline.plant.linear.recovery import recover_from_parameters
 
-MOST_WIDENING = 4  # tolerances; a law that fails even in a box widened by so many is broken
-_PER_TOLERANCE = 2  # steps in which the box is widened by one tolerance
+MOST_WIDENING = 4  # tolerances; a law that needs this much widening earns no points
+_PER_TOLERANCE = 2  # steps of widening per tolerance
 _REDUNDANT = (2, 3)  # numbers of carts whose parameters are redundant
 
 
@@ -33,7 +34,7 @@ class Law:
     Attributes
     ----------
     meaning : the law in words.
-    widening : in tolerances; 0 if the law holds within rounding.
+    widening : the least widening for which the law holds, in tolerances; 0 if rounding is enough.
     """
 
     name: str
@@ -44,12 +45,13 @@ class Law:
 def judge_laws(
     final: Mapping[str, Decimal], *, n: int, frequency_percent: float, damping_percent: float
 ) -> list[Law] | None:
-    """Judge every law of a final table; None if the table is incomplete.
+    """Judge every law of a final table; return None if the table is incomplete.
 
     Parameters
     ----------
     n : number of carts.
-    frequency_percent, damping_percent : tolerances by which the box is widened.
+    frequency_percent, damping_percent : tolerances that widen the box; the first also applies to
+        gains.
     """
     names = parameter_names(n)
     if any(name not in final for name in names):
@@ -87,7 +89,7 @@ def _evaluate(
 
     Parameters
     ----------
-    half : by parameter, half the width of the box.
+    half : half the width of the box for each parameter.
     """
     results: dict[str, tuple[str, bool]] = {}
     value = {name: float(typed) for name, typed in final.items()}
@@ -121,7 +123,7 @@ def _evaluate(
 
 
 def _corners(value: Mapping[str, float], half: Mapping[str, float], *, n: int) -> dict[str, Array]:
-    """Return the independent parameters at every corner of the box, each with shape (2^p,)."""
+    """Return the p independent parameters at every corner of the box, each with shape (2^p,)."""
     own = [f"{symbol}_{cart}" for symbol in ("omega", "zeta") for cart in range(1, n)]
     names = [name for name in parameter_names(n) if name not in own]
     bits = np.arange(2 ** len(names)) >> np.arange(len(names))[:, None] & 1

@@ -1,8 +1,8 @@
 """Compute points under a changed rubric from stored errors, without reading recordings.
 
-The gradebook stores the error of each number exactly, as a fraction. The usual code then applies
-the new points, tolerances, costs of flags, lateness and step. If the errors themselves change,
-recordings must be graded again; `needs_recordings` finds such changes.
+The gradebook stores the error of each number as an exact fraction. The usual code applies the new
+points, tolerances, costs of flags, lateness and step to these errors. If a change of the rubric
+alters the errors, recordings must be graded again; `needs_recordings` finds such changes.
 """
 
 import json
@@ -17,13 +17,14 @@ from pipeline.grading.judge.work import Verdict
 from pipeline.grading.references.tolerance import late_deduction
 from pipeline.grading.rubric import Rubric
 
-# Keys of a rubric that change the errors themselves. If one changes, the recordings are needed.
+# Keys of a rubric that change the errors themselves. If one changes, the recordings must be graded
+# again.
 _OF_RUBRIC = ("system", "design", "required", "examples")
 _OF_CRITERION = ("check", "parameters", "sigmas", "frequency_percent", "damping_percent")
 
 
 def findings_text(verdicts: Mapping[str, Verdict]) -> str:
-    """Return verdicts by criterion as JSON, without messages.
+    """Return the verdicts on all criteria as JSON, without messages.
 
     The same verdicts give the same bytes.
     """
@@ -39,7 +40,7 @@ def findings_text(verdicts: Mapping[str, Verdict]) -> str:
 
 
 def read_findings(text: str) -> dict[str, Verdict]:
-    """Return the verdicts from a text that `findings_text` made; they have no messages."""
+    """Return the verdicts in a text from `findings_text`; their messages are empty."""
     return {
         id_: Verdict(
             share=None if plain["share"] is None else Fraction(plain["share"]),
@@ -57,8 +58,8 @@ def read_findings(text: str) -> dict[str, Verdict]:
 def reweigh(grade: Grade, findings: Mapping[str, Verdict], *, rubric: Rubric) -> Grade:
     """Return a grade with its points under another rubric, without points given by hand.
 
-    Outcomes and points equal those of grading again, but messages are empty. Criteria without
-    stored verdicts are left out.
+    Outcomes and points are the same as if the recordings were graded again, but messages are empty.
+    Criteria without stored verdicts are left out.
     """
     if grade.status == "failed":
         nothing = {"out_of": rubric.out_of, "points": 0.0, "deducted": 0.0, "overrides": ()}
@@ -80,7 +81,7 @@ def reweigh(grade: Grade, findings: Mapping[str, Verdict], *, rubric: Rubric) ->
 
 
 def _weighed(wanted: asked.Criterion, finding: Verdict) -> Verdict:
-    """Return a stored verdict with the share that the criterion's tolerances now give."""
+    """Return a stored verdict with the share that the criterion's new tolerances give."""
     if not finding.models:
         return Verdict(share=finding.share, message="")
     best = max(earned(wanted, model) for model in finding.models)
@@ -90,8 +91,8 @@ def _weighed(wanted: asked.Criterion, finding: Verdict) -> Verdict:
 def needs_recordings(before: Rubric, now: Rubric) -> list[str]:
     """Return the changed keys of a rubric that take effect only if recordings are graded again.
 
-    `criteria.ID` means a criterion that was never judged. `criteria.ID.KEY` means a criterion for
-    which this key now asks for other errors.
+    `criteria.ID` names a criterion that was never judged. `criteria.ID.KEY` names a key whose new
+    value changes the errors.
     """
     found = [key for key in _OF_RUBRIC if getattr(before, key) != getattr(now, key)]
     if before.late.due != now.late.due:
@@ -103,7 +104,7 @@ def needs_recordings(before: Rubric, now: Rubric) -> list[str]:
             continue
         was = old[criterion.id]
         for key in _OF_CRITERION:
-            # Only the check of laws has `damping_percent` and `frequency_percent`.
+            # Not every criterion has every one of these keys.
             if getattr(was, key, None) != getattr(criterion, key, None):
                 found.append(f"criteria.{criterion.id}.{key}")
     return found

@@ -1,6 +1,6 @@
 """Grade one submission against a new analysis of its own recordings.
 
-The results that students computed are judged, never used.
+Numbers that students computed are judged, but the analysis does not use them.
 """
 
 from collections.abc import Mapping
@@ -42,9 +42,9 @@ class Graded:
 
     Attributes
     ----------
-    analysis : of the student's recordings; None if the grading failed.
-    verdicts : by criterion, including those that earn nothing because a required one was not
-        passed; empty if the grading failed.
+    analysis : analysis of the student's recordings; None if the grading failed.
+    verdicts : verdict on each criterion, even if a criterion that it requires was not passed; empty
+        if the grading failed.
     """
 
     grade: Grade
@@ -63,8 +63,8 @@ def grade_submission(
     """Analyse the recordings of a submission and grade what it reports.
 
     The analysis uses the rubric's system. Recordings that cannot be read are flagged. If none can
-    be read, or the number of carts differs from the rubric's, the grade is `failed` with the
-    reason.
+    be read, or the number of carts differs from the rubric's, the grade has the status `failed` and
+    the reason.
     """
 
     def failed(reason: str) -> Graded:
@@ -91,12 +91,12 @@ def grade_submission(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Analysed:
-    """A submission with the system of its rubric, and the analysis of its recordings.
+    """A submission with the rubric's system, and the analysis of its recordings.
 
     Attributes
     ----------
     springs : springs that the recordings show but the rubric lacks.
-    notes : the settings of the submission that the rubric replaced, one sentence each.
+    notes : one note for each setting of the submission that the rubric replaced.
     """
 
     submission: Submission
@@ -112,7 +112,7 @@ def analyse_under(
 
     Raises
     ------
-    SubmissionError : no recording can be read, or the submission has another number of carts.
+    SubmissionError : no recording can be read, or the number of carts differs from the rubric's.
     """
     count = submission.system.carts
     if count != rubric.system.carts:
@@ -134,11 +134,11 @@ def grade_analysis(
     name: str,
     days_late: float = 0.0,
 ) -> Graded:
-    """Grade a submission against the analysis of its own recordings; neither read nor write files.
+    """Grade a submission against the analysis of its own recordings, without any file access.
 
     Parameters
     ----------
-    submission : with the rubric's system; see `under_rubric`.
+    submission : submission that has the rubric's system, as `under_rubric` returns it.
     """
     work, flags, signed = prepare_work(submission, analysis, rubric=rubric)
     verdicts = {criterion.id: judge(criterion, work) for criterion in rubric.criteria}
@@ -164,9 +164,10 @@ def grade_analysis(
 def prepare_work(
     submission: Submission, analysis: Analysis, *, rubric: Rubric
 ) -> tuple[Work, tuple[Flag, ...], tuple[str, ...]]:
-    """Return the input of the checks, all flags in the order of their codes, and notes.
+    """Return the input of the checks, all flags in the order of `CODES`, and notes.
 
-    The notes say where a reported sign was reversed, because the recordings have the opposite sign.
+    The notes say whether reported signs were reversed, because the recordings have the opposite
+    sign.
     """
     reported, signed = turned_round(submission.reported or Reported(), analysis.records)
     submission = submission.model_copy(update={"reported": reported})
@@ -198,7 +199,7 @@ def _prepare(
     if diagnosis.corrected != tables[0]:
         tables.append(diagnosis.corrected)
     if chain is None and not diagnosis.possible:
-        tables = []  # a model can be right although its table was copied wrongly
+        tables = []  # the typed table is impossible, but the student's model may be right
     digits = {n: float(rounding(typed) / abs(Fraction(typed))) for n, typed in positive.items()}
     work = Work(
         submission=submission,
@@ -218,9 +219,9 @@ def _prepare(
 def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tuple[str, ...]]:
     """Return a submission with the rubric's system, and notes on what was replaced.
 
-    If the rubric leaves the sign or the calibration open, those of the submission stay. Another
+    If the rubric states no sign or no calibration, that of the submission stays. The submission's
     unit of length also stays, because the students' numbers use it; the rubric's calibration is
-    converted.
+    converted to this unit.
     """
     own, set_ = submission.system, rubric.system
     notes = []
@@ -230,7 +231,7 @@ def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tu
         unit = own.position.unit
         per_count = None if per_count is None else per_count * factor
         notes.append(f"lengths are in {unit}, as submitted; the rubric has {set_.position.unit}")
-    # On one cart only the sum of the springs matters.
+    # For a single cart, only the sum of the springs matters.
     if own.springs != set_.springs and set_.carts > 1:
         notes.append("the springs are the rubric's, not those of the submission")
     system = System(
@@ -275,8 +276,8 @@ def _under_calibration(experiment: Experiment, system: System) -> Experiment:
 def _flags(work: Work) -> list[Flag]:
     """Return the flags that do not concern the parameter tables.
 
-    On a nonlinear bench no single chain fits the table, and the results depend on the method. Then
-    only numbers that no chain can have are called wrong.
+    On a nonlinear bench, no single chain reproduces all recordings. Then only the zeros and ones of
+    A and B are judged, and the controller is not.
     """
     flags, space, linear = [], work.reported.state_space, is_linear(work.analysis)
     if space is not None and space.A:

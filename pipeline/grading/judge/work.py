@@ -28,7 +28,7 @@ class Work:
     controller : the reported controller, with the models to simulate it on.
     state_models : acceptable values of [A B].
     bad : recordings with a problem, and the problem of each.
-    named : by table, the numbers that a known mistake explains.
+    named : for each table, the parameters whose errors a known mistake explains.
     """
 
     submission: Submission
@@ -47,7 +47,10 @@ class Work:
 
     @cached_property
     def entries(self) -> list[MatrixEntry]:
-        """The reported entries of A and B with their acceptable values; empty without A and B."""
+        """The reported entries of A and B with their acceptable values.
+
+        Empty if A is not reported.
+        """
         space = self.reported.state_space
         n = self.rubric.system.carts
         return compare_entries(space, models=self.state_models, n=n) if space and space.A else []
@@ -64,13 +67,13 @@ class Verdict:
 
     Attributes
     ----------
-    share : None if nothing could be judged; then `message` says why.
-    explained : a known mistake explains all lost points, so that its flag replaces the rubric's
-        advice.
+    share : share of the points; None if nothing could be judged, and then `message` says why.
+    explained : whether a known mistake explains all lost points; its flag then replaces the
+        rubric's advice.
     models : for each acceptable model, the errors of the numbers; the best model counts. Empty if
         the share does not depend on tolerances.
     most : the largest possible share, whatever the tolerances.
-    agrees : for each number that is judged alone, whether it loses no points.
+    agrees : for each number that is judged by itself, whether it earns all its points.
     """
 
     share: Fraction | None
@@ -85,7 +88,8 @@ class Verdict:
 
 # --------------------------------------------------------------------- required items
 
-# Kinds of recording that satisfy a requirement for single carts: a step rings down like a decay.
+# Kinds of recording that meet a requirement for only some of the carts. A step also counts as a
+# decay, because the carts ring down after it.
 _SERVES = {"decay": ("decay", "step"), "sine": ("sine",), "step": ("step",)}
 
 
@@ -152,7 +156,7 @@ def _pieces(submission: Submission | None, rubric: Rubric) -> dict[str, bool]:
 
 
 def run_name(runs: RequiredRuns) -> str:
-    """Return the name of a required run: "decay of cart 2", "12 sine"."""
+    """Return the name of a required run, such as "decay of cart 2" or "12 sine"."""
     carts = f" of cart {', '.join(map(str, runs.carts))}" if runs.carts else ""
     return f"{runs.at_least} {runs.kind}{carts}" if runs.at_least > 1 else f"{runs.kind}{carts}"
 

@@ -27,22 +27,22 @@ Numbers = Mapping[str, Reference]
 
 @dataclass(frozen=True, kw_only=True)
 class Mistake:
-    """One mistake or two at once, and the numbers of a table that they would give.
+    """One mistake, or two combined, and the numbers that they would give in a table.
 
     Attributes
     ----------
-    codes : of the flags.
-    said : keys of the sentences of advice, in `words`.
-    predicted : by parameter name, the bounds of the mistaken number.
-    tolerance : relative, around those bounds.
-    periods : the number counted, and the true one.
-    whole : credible only if all reported numbers match its predictions.
-    least : credible only if it explains at least this many numbers.
-    table_wide : it also explains every other wrong number of the table.
-    tries : number of variants tried; more variants match more easily by chance.
-    beside : numbers that must be right for this mistake to be credible.
-    from_time_records : it comes from reading a decay or a step, so it is in a final table only if
-        that was copied from the initial one.
+    codes : codes of the flags.
+    said : keys of the advice in `templates/words/grading.toml`.
+    predicted : for each parameter, the bounds of the number that the mistake gives.
+    tolerance : relative distance from these bounds within which a number still matches.
+    periods : the number of periods counted, and the true number.
+    whole : whether the mistake is credible only if all reported numbers are near its predictions.
+    least : the mistake is credible only if at least this many numbers match.
+    table_wide : whether the mistake also explains every other wrong number of the table.
+    tries : number of variants tried; with more variants, a match by chance is more likely.
+    beside : parameters that must be right for this mistake to be credible.
+    from_time_records : whether the mistake is made when reading a decay or a step. A final table
+        then has it only if its numbers were copied from the initial table.
     """
 
     codes: tuple[Code, ...]
@@ -71,11 +71,11 @@ class Mistake:
         return "".join(WORDS.text(key, counted=counted, there=there, **values) for key in self.said)
 
     def together_with(self, code: Code, said: str, predicted: dict[str, Reference]) -> "Mistake":
-        """Return both mistakes as one: this one, and another made on top of it.
+        """Return this mistake combined with a second one.
 
         Parameters
         ----------
-        predicted : the numbers that both together give.
+        predicted : for each parameter, the bounds of the number that both mistakes together give.
         """
         codes, sentences = (*self.codes, code), (*self.said, said)
         return replace(self, codes=codes, said=sentences, predicted=predicted)
@@ -84,9 +84,8 @@ class Mistake:
 def _may_be_log10(name: str, reference: Reference, reported: Reported) -> bool:
     """Return whether a damping can show that log10 was taken instead of ln.
 
-    Without friction it always can. With friction the bounds of the reference are so wide that any
-    ratio fits; then the final value decides. If it agrees with the initial one, the logarithm was
-    right.
+    Without friction, it always can. With friction, the bounds of the reference are so wide that any
+    ratio fits. Then log10 is ruled out if the final damping is at most 1.5 times the initial one.
     """
     if reference.high <= limits.BLURRED_DAMPING * reference.low:
         return True
@@ -186,7 +185,7 @@ def _times(references: Numbers, factor: float) -> dict[str, Reference]:
 def _miscounts(omegas: Numbers, zetas: Numbers, every_zeta: Numbers) -> Iterator[Mistake]:
     """Yield mistakes in counting periods: one too many or too few.
 
-    The frequency is then wrong by the ratio of counted to true periods, the decrement by the
+    The frequency is then wrong by the ratio of counted to true periods, and the decrement by its
     inverse.
     """
     for counted, there in _COUNTS:
@@ -217,9 +216,9 @@ def _miscounts(omegas: Numbers, zetas: Numbers, every_zeta: Numbers) -> Iterator
 
 
 def _with_slack(zeta: Reference) -> Reference:
-    """Return a damping with bounds widened by its tolerance.
+    """Return a damping with bounds widened by the tolerance of dampings.
 
-    It can then be combined with numbers that need a closer match.
+    So a mistake can have a closer tolerance for its other numbers.
     """
     return zeta.widened(1 + limits.DAMPING)
 
@@ -227,7 +226,7 @@ def _with_slack(zeta: Reference) -> Reference:
 def _miscounted_damping(zeta: Reference, factor: float) -> Reference:
     """Return the bounds of a damping from miscounted periods.
 
-    They end halfway to the right damping, so that a right number does not match.
+    They end halfway to the right damping, so that the right damping does not match.
     """
     mistaken, middle = _with_slack(zeta.times(factor)), zeta.times(math.sqrt(factor))
     if factor < 1:
@@ -267,9 +266,10 @@ def _gain_mistakes(gains: Numbers, analysis: Analysis) -> Iterator[Mistake]:
 
 
 def _peaks(turns: Mapping[str, StepTurns]) -> Iterator[Mistake]:
-    """Yield peaks of steps that were read as settled levels: of one edge, or the mean of all edges.
+    """Yield the mistake of reading the peak of a step as its settled level.
 
-    A step moves all carts, so the mistake is predicted for every cart.
+    The peak is that of one edge, or the mean of all edges. A step moves all carts, so the mistake
+    is predicted for every cart.
     """
     edges = set.intersection(*({*t.by_edge} for t in turns.values())) if turns else set()
     peaks = [{n: t.peak(edge) for n, t in turns.items()} for edge in sorted(edges)]
@@ -312,7 +312,7 @@ def _count(name: str, analysis: Analysis) -> float:
 
 
 def _in_counts(mistakes: Sequence[Mistake]) -> Iterator[Mistake]:
-    """Yield the mistakes in reading gains, combined with positions in counts."""
+    """Yield the mistakes in reading gains, combined with positions in encoder counts."""
     counted = [m for m in mistakes if m.codes == ("counts_for_length",)]
     twice = next(m for m in mistakes if m.codes == ("peak_to_peak",))
     for mistake in mistakes if counted else ():

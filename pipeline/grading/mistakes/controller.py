@@ -34,15 +34,17 @@ class Controller:
 
     Attributes
     ----------
-    gains : (2n,) as reported; None if not reported.
-    ran : (2n,) gains that a closed-loop run states; None if no run does.
-    models : the carts on which gains are simulated: the reference, and the student's own tables.
-    goal : of the design; if both the reference design and these gains miss it, the easier goal that
-        the reference design reaches.
-    blurred : friction makes the gains of the reference uncertain.
-    own : the student's table is complete, so that their own model is known.
-    reference : the carts from the recordings, first of the models; None if not identified.
-    doubt : relative error of the prefilter that errors of the models can cause.
+    gains : the reported gains, shape (2n,); None if not reported.
+    ran : the gains that a closed-loop run states, shape (2n,); None if no run states any.
+    models : the chains on which gains are simulated: from the recordings, and from the student's
+        tables.
+    goal : the design goal. If both the reference design and the reported gains miss it, this is the
+        easier goal that the reference design reaches.
+    blurred : whether friction makes the static gains from the recordings uncertain.
+    own : whether the student's table is complete, so that their own model is known.
+    reference : the chain from the recordings, which is also the first of the models; None if the
+        carts were not identified.
+    doubt : relative error of the prefilter that may come from errors of the models.
     """
 
     gains: Array | None
@@ -58,7 +60,7 @@ class Controller:
     doubt: float = 0.0
 
     def numbers(self, gains: Array) -> list[LoopNumbers]:
-        """Return the simulated loop of some gains on each model."""
+        """Return the simulated loop with some gains, one for each model."""
         found = [self._on(chain, gains) for chain in self.models]
         return [numbers for numbers in found if numbers is not None]
 
@@ -95,12 +97,12 @@ class Controller:
         overshoot: float = limits.OVERSHOOT,
         settling: float = limits.SETTLING,
     ) -> bool:
-        """Return whether a loop nearly meets the goal; by default, so well that it is not wrong.
+        """Return whether a loop meets the goal, or misses it by less than the allowed excess.
 
         Parameters
         ----------
-        overshoot : allowed excess, in percentage points.
-        settling : allowed factor on the settling time.
+        overshoot : allowed overshoot above the goal, in percentage points.
+        settling : allowed factor on the goal's settling time.
         """
         return (
             numbers.stable
@@ -124,7 +126,7 @@ class Controller:
     def is_of_other_gains(self, numbers: LoopNumbers) -> bool:
         """Return whether the claimed settling time must be that of other gains.
 
-        It then differs from the simulated one by more than a factor of 2.5.
+        This is so if it differs from the simulated one by more than a factor of 2.5.
         """
         if self.settling is None or self.settling <= 0 or numbers.settling_time is None:
             return False
@@ -136,8 +138,7 @@ class Controller:
 
         Parameters
         ----------
-        sharp : use the close tolerance even with friction, because the student's own numbers are
-            precise.
+        sharp : whether to use the close tolerance even with friction.
         """
         if self.prefilter is None:
             return True
@@ -157,8 +158,8 @@ def reported_controller(
 
     Parameters
     ----------
-    chain : the carts from the recordings, if they were identified.
-    tables : the student's final table, as typed and with its known mistakes corrected.
+    chain : the chain from the recordings; None if the carts were not identified.
+    tables : the student's final table: as typed, and with known mistakes corrected.
     """
     feedback = submission.reported.feedback if submission.reported else None
     n = submission.system.carts
@@ -190,10 +191,10 @@ def reported_controller(
 
 
 def _doubt(controller: Controller, submission: Submission, analysis: Analysis) -> float:
-    """Return the relative error of a prefilter that errors of the models can cause.
+    """Return the relative error of the prefilter that may come from errors of the models.
 
-    The models have errors of fitting or of typed digits. Gains that cancel much of the springs'
-    stiffness amplify these errors.
+    The models have errors from the fit or from the rounding of typed numbers. Gains that cancel
+    much of the springs' stiffness amplify these errors.
     """
     chain, gains, cart = controller.models[0], controller.gains, controller.goal.cart
     if gains is None or gains.size != 2 * chain.n:
@@ -226,7 +227,10 @@ def _by_rounding(typed: Mapping[str, Decimal], gains: Array, *, cart: int) -> fl
 
 
 def _reachable(goal: Design, submission: Submission, analysis: Analysis) -> Design:
-    """Return the goal, or the easier one that the reference design reaches if it misses it."""
+    """Return the goal, or an easier one if the reference design misses it.
+
+    The easier goal is what the reference design reaches.
+    """
     try:
         design = reference_design(submission, analysis.fit)
     except DataError:
@@ -262,7 +266,7 @@ def diagnose_controller(controller: Controller) -> list[Flag]:
     told = controller.overshoot is not None or controller.settling is not None
     slip, intended = ("", None) if meets and told and claimed else _slip(controller)
     ran = controller.ran
-    # If other gains ran on the bench, they show which reported number does not fit the others.
+    # If the bench ran with other gains, they show which of the reported numbers is wrong.
     other_ran = ran is not None and not same_gains(ran, controller.gains)
     sharply = any(controller.prefilter_fits(one, sharp=True) for one in numbers)
     wrong = not meets or (slip and not (fits and claimed)) or (not claimed and not sharply)

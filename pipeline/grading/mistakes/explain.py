@@ -14,8 +14,9 @@ from pipeline.grading.references.tolerance import Typed
 from pipeline.names import read_name
 
 _SLIP, _KNOWN_SLIP = math.log(limits.ONE_IN_OFF), math.log(limits.ONE_IN_KNOWN)
-# With little damping, a step peaks at twice its level. So reading the peak and reading peak to peak
-# give the same number. In a first estimate, the sentence about the peak is true in both cases.
+# With little damping, the response to a step peaks at twice its settled level. So reading the peak
+# and reading peak to peak give the same number. In a first estimate, the advice about the peak is
+# true in both cases.
 _TRUE_ANYWAY: Code = "peak_for_steady_state"
 
 Table = Mapping[str, Decimal]
@@ -70,10 +71,9 @@ def explain(
 
     Parameters
     ----------
-    known : by parameter, the number from the recordings.
-    off : parameters with a wrong number.
-    mistakes : those to try.
-    believed : codes of mistakes that cost no likelihood, because the other table has them.
+    known : for each parameter, the number from the recordings.
+    off : parameters whose numbers are wrong.
+    believed : codes of mistakes found in the other table; here they cost no likelihood.
     """
     typed = {name: Typed.of(number) for name, number in table.items()}
     ways = _by_way([_Tried.on(m, typed, label) for m in mistakes if not m.beside.intersection(off)])
@@ -93,7 +93,7 @@ def explain(
             for c in covers
             if not best.codes <= c.codes
             and best.explained & c.explained
-            # In e-folds: a mistake that is less likely than this is no rival.
+            # A mistake whose likelihood is lower by two e-folds is no rival.
             and score[id(c)] > score[id(best)] - 2
         ]
         rival = None
@@ -138,7 +138,7 @@ class _Cover:
 
     @property
     def explained(self) -> frozenset[str]:
-        """The wrong numbers that are explained."""
+        """The wrong numbers that the mistake explains."""
         return frozenset(name for _, names in self.fits for name in names)
 
 
@@ -148,7 +148,7 @@ class _Tried:
 
     Attributes
     ----------
-    errors : by parameter, the difference between table and prediction, in percent.
+    errors : for each parameter, the difference between table and prediction, in percent.
     """
 
     mistake: Mistake
@@ -165,9 +165,9 @@ class _Tried:
         return cls(mistake=mistake, label=label, errors=errors)
 
     def explains(self, remaining: Sequence[str]) -> list[str]:
-        """Return the remaining wrong numbers that the mistake gives, if it is credible.
+        """Return the remaining wrong numbers that the mistake explains; none if it is not credible.
 
-        At least half of the numbers near its predictions must match. The others may differ as much
+        Of the numbers near its predictions, at least half must match. The others may differ as much
         as honest numbers do.
         """
         mistake = self.mistake
@@ -178,12 +178,12 @@ class _Tried:
         if mistake.whole and len(near) < len(self.errors):
             return []
         wrong = [name for name in remaining if name in near]
-        # If carts are swapped, both numbers are wrong. One number that is near the other cart's is
-        # no swap.
+        # If carts are swapped, at least two numbers are wrong. A single number that is near that of
+        # another cart shows no swap.
         return [] if "carts_swapped" in mistake.codes and len(wrong) < mistake.least else wrong
 
     def off_by(self, name: str) -> float:
-        """Return the error of a number as a multiple of its tolerance."""
+        """Return the error of a number divided by the mistake's tolerance."""
         return self.errors[name] / (100 * self.mistake.tolerance)
 
     def _is_near(self, name: str) -> bool:
@@ -194,7 +194,7 @@ class _Tried:
 
 
 def _by_way(tried: Sequence[_Tried]) -> list[list[_Tried]]:
-    """Group variants of the same mistake, which concern different numbers."""
+    """Group the variants of each mistake; they concern different numbers."""
     ways: dict[tuple, list[_Tried]] = {}
     for one in tried:
         ways.setdefault((one.mistake.said, one.mistake.periods), []).append(one)
@@ -204,7 +204,7 @@ def _by_way(tried: Sequence[_Tried]) -> list[list[_Tried]]:
 def _cover(way: Sequence[_Tried], remaining: Sequence[str]) -> _Cover:
     """Explain as many numbers as possible by one mistake.
 
-    The variant that explains most comes first.
+    Variants are added one by one, first the one that explains most numbers.
     """
     fits: list[tuple[Mistake, list[str]]] = []
     open_ = list(remaining)
@@ -231,7 +231,7 @@ def _score(
 
     Parameters
     ----------
-    off : parameters with a wrong number.
+    off : parameters whose numbers are wrong.
     free : codes of mistakes that cost no likelihood.
     """
     predicted: dict[str, Reference] = dict(known)
@@ -272,7 +272,7 @@ def _log_density(typed: Typed, reference: Reference, name: str) -> float:
         usual = limits.USUAL_DAMPING
     elif read.is_by_eye:
         usual = limits.USUAL_BY_EYE
-    # The student's intermediate result probably had as many digits.
+    # The student's intermediate result probably had as many digits as the typed number.
     digits = 10.0 ** (1 - typed.digits) / 4
     usual = math.hypot(usual, digits, reference.std / reference.value)
     outside = max(math.log(low / value), math.log(value / high)) - half

@@ -1,6 +1,6 @@
 """A table of mistakes that multiply a number by a factor. Add a row for a new mistake.
 
-The code of the mistake is in `pipeline/grading/grade.py`, its sentences are in
+The codes of the mistakes are in `pipeline/grading/grade.py`, their sentences in
 `templates/words/grading.toml`.
 """
 
@@ -16,7 +16,7 @@ LOG10 = math.log10(math.e)
 # Relative tolerance for numbers of a table that the students reduced themselves.
 MISREAD_RATIO = 0.06
 Of = Literal[
-    "frequencies",  # all that the recordings give with close bounds
+    "frequencies",  # those that the recordings give with close bounds
     "all frequencies",  # including those with wide bounds
     "gains",
     "sharp gains",  # those not made uncertain by friction
@@ -31,14 +31,13 @@ Of = Literal[
 
 @dataclass(frozen=True, kw_only=True)
 class Factor:
-    """A row: the reported number is the right one times a factor.
+    """A row of the table: a mistake that multiplies the right number by a factor.
 
     Attributes
     ----------
-    code : of the flag.
-    said : key of its advice in the words of grading.
+    said : key of the advice in `templates/words/grading.toml`.
     of : the group of numbers that the mistake can affect.
-    tolerance : relative, around the number from the recordings times the factor.
+    tolerance : relative tolerance around the predicted number.
     whole, least, tries, from_time_records : see `Mistake`.
     """
 
@@ -84,7 +83,7 @@ def _reduced(code: Code, said: str, factor: float, *, of: Of) -> Factor:
 
 FACTORS = (
     _frequency("hertz", 1 / TURN),
-    # Needs a second number, which may be one with close bounds.
+    # With wide bounds, one frequency proves nothing, so a second number must match.
     _frequency("hertz", 1 / TURN, of="all frequencies", least=2),
     _frequency("hertz_twice", TURN),
     # A team that reads peak to peak does so for every cart. For one cart alone, only a precise
@@ -102,8 +101,8 @@ FACTORS = (
         whole=True,
         from_time_records=True,
     ),
-    # A decrement over half a period, or over two. It must be the only wrong number, without
-    # friction.
+    # The decrement was taken over half a period, or over two. The frequency of the decay must be
+    # right, and there must be no friction.
     _decrement("half_decrement", 0.5),
     _decrement("twice_decrement", 2.0),
     # A column with the heading Hz contains rad/s, or vice versa.

@@ -32,10 +32,10 @@ class BrokenOrder:
 
     @property
     def is_plain(self) -> bool:
-        """Return whether the law is obvious to students: for gains and resonances.
+        """Return whether the law is obvious to students, as it is for gains and resonances.
 
-        For nulls and for frequencies of single carts it is not; then the number from the recordings
-        helps more.
+        Laws about nulls and about frequencies of single carts are not obvious. Then the number from
+        the recordings helps the student more.
         """
         return self.is_of_gains or all(read_name(name).is_mode for name in self.names)
 
@@ -72,7 +72,7 @@ def broken_orders(table: Mapping[str, Decimal], *, initial: bool) -> list[Broken
 
     Parameters
     ----------
-    initial : whether it is the initial table, whose numbers are read off plots.
+    initial : whether this is the initial table, whose numbers are read off plots.
     """
     # Numbers from a fit are right within a few percent; first estimates are less precise.
     slack = 1.2 if initial else 1.1

@@ -10,7 +10,7 @@ from pipeline.plant.linear import step_response
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.sampled_loop import discretise
 
-_SAMPLE_TIME = 0.00884  # s; the ECP controller's, used if the design states none
+_SAMPLE_TIME = 0.00884  # s; that of the ECP controller, for a design that states none
 _HORIZON = 6.0  # simulated time, as a multiple of the required settling time
 _MOST_SAMPLES = 60_000
 _BLOWN_UP = 1e6  # a response this many times the reference counts as diverged
@@ -18,14 +18,16 @@ _BLOWN_UP = 1e6  # a response this many times the reference counts as diverged
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LoopNumbers:
-    """The simulated closed loop, sampled, with its delay of one sample predicted.
+    """Numbers of the simulated closed loop, which is sampled.
+
+    The controller makes up for its delay of one sample by predicting the state.
 
     Attributes
     ----------
-    poles : as continuous equivalents, in rad/s.
-    overshoot : in percent.
-    settling_time : in s; None if the loop does not settle in the simulated time.
-    prefilter : reciprocal of the loop's static gain; it makes the steady state right.
+    poles : poles of the equivalent continuous loop, in rad/s.
+    overshoot : overshoot in percent; infinite if the loop is unstable.
+    settling_time : settling time in s; None if the loop does not settle in the simulated time.
+    prefilter : reciprocal of the loop's static gain, so that the cart settles at the reference.
     """
 
     stable: bool
@@ -38,7 +40,7 @@ class LoopNumbers:
 def loop_numbers(
     chain: Chain, gains: Array, *, cart: int, settling: float, sample_time: float | None
 ) -> LoopNumbers | None:
-    """Return the closed loop of gains (2n,) on a chain; None on numerical overflow."""
+    """Simulate the loop with gains (2n,) on a chain; return None if it cannot be computed."""
     T = sample_time or _SAMPLE_TIME
     row, size = 2 * (cart - 1), 2 * chain.n
     with np.errstate(all="ignore"):
@@ -57,7 +59,7 @@ def loop_numbers(
         poles = np.asarray(np.log(z) / T, dtype=np.complex128)
         stable = bool(np.abs(z).max() < 1)
         samples = int(_HORIZON * settling / T) + 2
-        # Fast controllers need only every `stride`-th sample.
+        # With a very short sample time, only every `stride`-th sample is computed.
         stride = math.ceil(samples / _MOST_SAMPLES)
         count = math.ceil(samples / stride)
         y = _step(*_together(loop, gamma / static[row], stride), row=row, count=count)
@@ -77,7 +79,7 @@ def loop_numbers(
 
 
 def _together(loop: Array, drive: Array, stride: int) -> tuple[Array, Array]:
-    """Return L^k and the matching d of x_{i+1} = L x_i + d for `stride` = k samples at once."""
+    """Return the L and d with which x_{i+1} = L x_i + d advances by `stride` samples at once."""
     size = drive.size
     one = np.eye(size + 1)
     one[:size, :size], one[:size, size] = loop, drive
@@ -86,7 +88,10 @@ def _together(loop: Array, drive: Array, stride: int) -> tuple[Array, Array]:
 
 
 def _step(loop: Array, drive: Array, *, row: int, count: int) -> Array:
-    """Return the response to a unit step, shape (count,); the first sample is the delay."""
+    """Return the response to a unit step, shape (count,).
+
+    Because of the delay, it begins with 0.
+    """
     states = np.zeros((drive.size, 1))
     power, offset = loop, drive[:, None]
     # x_{k+1} = L x_k + d. Each pass doubles the number of known samples.

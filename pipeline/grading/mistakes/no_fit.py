@@ -14,13 +14,13 @@ from pipeline.submission import Reported
 def copied_final(reported: Reported, *, references: References) -> list[str]:
     """Return the final estimates that equal the initial ones, if this is no coincidence.
 
-    Students may honestly keep the numbers of single carts. So the equal numbers must include those
-    that only a fit can give. The strongest evidence is an equal damping that was first guessed.
-    Tables typed with single digits are ignored, because they agree by rounding.
+    Students may honestly keep the numbers of single carts. So the equal numbers must include most
+    of those that only a fit can give. The strongest evidence is a damping that was guessed at first
+    and did not change. Tables typed with single digits are ignored, because they agree by rounding.
     """
     both = [name for name in reported.final if name in reported.initial]
     same = [n for n in both if _same(reported, n)]
-    most = 0.75  # share of the numbers that are in both tables
+    most = 0.75  # least share of equal numbers
     if not both or len(same) < most * len(both):
         return []
     if 2 * sum(is_vague(reported.final[name]) for name in same) > len(same):
@@ -31,7 +31,7 @@ def copied_final(reported: Reported, *, references: References) -> list[str]:
     chance = 1.0
     for name in same:
         chance *= _coincidence(reported.final[name], references.final.get(name), name)
-    return same if chance < 3e-3 else []  # a fit reproduces so many numbers only by rare chance
+    return same if chance < 3e-3 else []  # a fit rarely reproduces so many numbers by chance
 
 
 def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> float:

@@ -1,7 +1,7 @@
 """Check a table of amplitude ratios that students reduced themselves from their dwells.
 
 A mistake in this table affects every number fitted to it. If the dwells are submitted too, they
-show the mistake. Otherwise steps and decays do, because they disagree with the fit.
+show the mistake. Otherwise, steps and decays show it, because they disagree with the fit.
 """
 
 from collections.abc import Iterator
@@ -55,11 +55,11 @@ def diagnose_reduced(analysis: Analysis) -> list[Flag]:
 
 
 def _rows(analysis: Analysis, *, stretch: float) -> _Rows | None:
-    """Match rows of the table with dwells; None if fewer than four match.
+    """Match rows of the table with dwells; return None if fewer than four match.
 
     Parameters
     ----------
-    stretch : factor on the frequencies of the table before they are compared.
+    stretch : factor by which the frequencies of the table are multiplied before the comparison.
     """
     matched: list[tuple[int, float, SinePoint]] = []
     for table in analysis.tables:

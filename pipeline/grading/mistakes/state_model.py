@@ -34,7 +34,7 @@ class StateMatrices:
     Attributes
     ----------
     right : the right entries; NaN if unknown.
-    slack : their uncertainty.
+    slack : uncertainty of each entry.
     """
 
     right: Array
@@ -47,10 +47,10 @@ class MatrixEntry:
 
     Attributes
     ----------
-    typed : as the student typed it.
+    typed : the number as the student typed it.
     right : the acceptable values, one per model.
-    error : difference beyond the uncertainty of the models, in percent.
-    bare : difference without that allowance, in percent.
+    error : difference in percent, beyond the uncertainty of the models.
+    bare : difference in percent, without allowance for this uncertainty.
     """
 
     name: str
@@ -76,7 +76,8 @@ def compare_entries(
 ) -> list[MatrixEntry]:
     """Compare every reported entry with the acceptable [A B].
 
-    The nearest acceptable value counts. So an A that follows from a wrong table is right.
+    The nearest acceptable value counts. So an A that follows from the student's own wrong table is
+    right.
     """
     kinds, entries = _kinds(n), []
     for (i, j), number in _matrix(space, n).items():
@@ -112,16 +113,16 @@ def state_models(
     """Return the acceptable [A B]: from the recordings and from the student's tables.
 
     A table gives a cart's own terms directly, but its couplings only as differences of large
-    numbers. So the errors of the table are propagated. The model from the recordings gets the same
-    uncertainty, because students compute their entries from a similar table.
+    numbers, in which small errors matter. So the uncertainty of [A B] is computed from that of the
+    table. The model from the recordings gets the same uncertainty, because students compute their
+    entries from a similar table.
 
     Parameters
     ----------
-    tables : the student's final table, as typed and with known mistakes corrected.
-    rounding : by parameter, the relative error that rounding may have caused.
-    known : final parameters from the recordings; their bounds of dampings are better than the
-        chain's.
-    chain : the carts from the recordings, if they were identified.
+    tables : the student's final table: as typed, and with known mistakes corrected.
+    rounding : for each parameter, the relative error that rounding may have caused.
+    known : final parameters from the recordings; their bounds replace the dampings of the chain.
+    chain : the chain from the recordings; None if the carts were not identified.
     """
     models = []
     reference = chain.parameters() if chain is not None and chain.is_tied and n <= _NAMED else None
@@ -170,7 +171,7 @@ def _own_names(i: int, n: int) -> tuple[str, str]:
 def _implied(values: Mapping[str, float], n: int) -> Array | None:
     """Return the [A B] of the chain that a table's transfer functions imply.
 
-    None if there is no such chain.
+    Returns None if there is no such chain.
     """
     chain = own_chain(values, n=n)
     return None if chain is None else _matrices(chain)
@@ -197,8 +198,8 @@ def _by_own_frequencies(values: Mapping[str, float], n: int) -> Array | None:
     """Return the [A B] of two or three carts, with each cart's own frequency as reported.
 
     The transfer functions determine these frequencies too; if they disagree with the reported ones,
-    the couplings differ. Let T_i be the product of the squared frequencies of carts i to n without
-    the carts before i. Then T_i = ω_i² T_i+1 − κ_i+1 T_i+2.
+    the couplings differ. Let T_i be the product of the squared natural frequencies of carts i to n
+    while the carts before them are held. Then T_i = ω_i² T_i+1 − κ_i+1 T_i+2.
     """
     if n not in (2, 3) or not {*parameter_names(n)} <= values.keys():
         return None
@@ -223,11 +224,11 @@ def _spread(
     rounding: Mapping[str, float],
     n: int,
 ) -> Array:
-    """Return the uncertainty of [A B] that errors in the numbers of a table cause.
+    """Return the uncertainty of [A B] that comes from errors in the numbers of a table.
 
     Parameters
     ----------
-    make : computes [A B] from a table.
+    make : function that computes [A B] from a table.
     right : [A B] of the table as it is.
     """
     variance = np.zeros_like(right)
@@ -245,8 +246,8 @@ def _spread(
 def own_chain(values: Mapping[str, float], *, n: int) -> Chain | None:
     """Return the chain of n carts that a student's final table implies, or None.
 
-    The number of carts is given, because a table of three carts that lacks a gain looks like one of
-    two.
+    The number of carts is given, because a table of three carts that lacks a gain looks like a
+    table of two carts.
     """
     try:
         with np.errstate(all="ignore"):
@@ -304,7 +305,7 @@ def model_harm(
     n: int,
     tied: bool,
 ) -> Harm | None:
-    """Return how wrong entries would make the model behave in an impossible way, or None.
+    """Return in which impossible way wrong entries would make the model behave, or None.
 
     `unstable`: the motion grows without limit. `wrong_way`: a positive input drives a cart to the
     negative side. Imprecise entries are replaced by right ones first, because honest errors in a
@@ -312,7 +313,7 @@ def model_harm(
 
     Parameters
     ----------
-    tied : a spring holds the carts to a wall, so that a constant input moves them to a level.
+    tied : whether a spring ties the carts to a wall, so that they settle under a constant input.
     """
     wrong = {entry.name for entry in entries if entry.wrong}
     whole = [one.right for one in models if np.all(np.isfinite(one.right))]
@@ -332,7 +333,7 @@ def model_harm(
 
 def _grows(A: Array) -> bool:
     found = np.linalg.eigvals(A)
-    # Smaller eigenvalues are rounding errors: those of a free body are zero.
+    # Smaller values are rounding errors, because the eigenvalues of a free body are zero.
     return bool(found.real.max() > 1e-6 * float(np.abs(found).max()))
 
 
@@ -366,7 +367,7 @@ def diagnose_state_space(
     models: Sequence[StateMatrices],
     n: int,
 ) -> list[Flag]:
-    """Return a flag if entries are wrong; it names the mistake that explains all, if there is one.
+    """Return a flag if entries are wrong, with the known mistake that explains all of them, if any.
 
     A known mistake that gives all of A and B is evidence even if the table is too uncertain to
     judge single entries.
@@ -396,7 +397,7 @@ def diagnose_state_space(
 
 
 def _slip(space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int) -> str:
-    """Return the first mistake, in words, that makes the right [A B] the reported one, or ""."""
+    """Return the first mistake, in words, that turns the right [A B] into the reported; or ""."""
     typed, kinds = _matrix(space, n), _kinds(n)
     A = {at: number for at, number in typed.items() if at[1] < 2 * n}
     B = {at: number for at, number in typed.items() if at[1] == 2 * n}
@@ -423,7 +424,7 @@ def _met(
 
     Parameters
     ----------
-    typed : by row and column.
+    typed : the typed entries, by row and column.
     slipped : the [A B] that the mistake gives.
     """
     return all(

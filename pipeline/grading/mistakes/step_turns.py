@@ -11,7 +11,7 @@ from pipeline.names import read_name
 from pipeline.results import Analysis, Record, StepGain
 
 _TURNS = 3  # the peak, the trough after it, and the second peak
-_DIGITS = 2  # significant digits to which edges of the same size must agree
+_DIGITS = 2  # significant digits; edges whose sizes agree to so many digits count as equal
 
 Edge = tuple[int, float]  # number of the edge in its recording, and its size
 
@@ -23,8 +23,8 @@ class StepTurns:
     Attributes
     ----------
     by_edge : for each edge, and each recording that repeats it, the first three turning points.
-    furthest : for each edge, the largest displacements; when two motions beat, this is not the
-        first turning point.
+    furthest : for each edge, the largest displacement in each recording. When two motions beat,
+        this is not the first turning point.
     """
 
     by_edge: dict[Edge, list[list[float]]]
@@ -36,9 +36,9 @@ class StepTurns:
         return _spread([float(np.mean(peaks))]) if peaks else None
 
     def turn(self, edge: Edge, number: int) -> Reference | None:
-        """Return the turning point with this number after an edge, as the range over the repeats.
+        """Return turning point `number` after an edge, as a range over the repeats.
 
-        Returns None if a turning point up to this number is missing or not positive.
+        Returns None if this or an earlier turning point is missing or not positive.
         """
         repeats = [one for one in self.by_edge.get(edge, ()) if len(one) > number]
         if not repeats or min(min(one[: number + 1]) for one in repeats) <= 0:
@@ -51,7 +51,7 @@ class StepTurns:
 
 
 def step_turns(name: str, analysis: Analysis) -> StepTurns:
-    """Return the turning points in the steps of a gain's cart (`K` or `K_i`)."""
+    """Return the turning points after steps, for the cart of a gain (`K` or `K_i`)."""
     cart = read_name(name).cart or 1
     records = {record.id: record for record in analysis.records}
     found: dict[Edge, list[list[float]]] = {}

@@ -128,7 +128,7 @@ def disagreement_flag(reported: Reported, apart: Sequence[tuple[float, str]]) ->
 
     Parameters
     ----------
-    apart : difference and parameter name, the largest difference first.
+    apart : pairs of difference and parameter name, the largest difference first.
     """
     _, worst = apart[0]
     initial, final = reported.initial[worst], reported.final[worst]

@@ -32,7 +32,7 @@ class Diagnosis:
 
     Attributes
     ----------
-    named : by table, the numbers that a known mistake explains.
+    named : for each table, the parameters whose errors a known mistake explains.
     possible : whether the corrected final table can belong to real carts.
     """
 
@@ -102,7 +102,7 @@ def diagnose_tables(
 
 
 def _explain_both(judged: Mapping[Label, "_Judged"]) -> dict[Label, Explanation]:
-    """Explain both tables; a mistake found in one table is then tried in the other at no cost."""
+    """Explain both tables; a mistake found in one table costs no likelihood in the other."""
     alone = {label: one.explain() for label, one in judged.items()}
     return {
         label: one.explain(believed=alone[OTHER[label]].codes)
@@ -119,12 +119,12 @@ class _Judged:
     Attributes
     ----------
     known : the numbers from the recordings, by parameter.
-    errors : in percent, of every number that the recordings give and that has no flag yet.
-    suspect : wrong or doubtful enough to look for a known mistake.
+    errors : the error, in percent, of each number that the recordings give and that has no flag
+        yet.
+    suspect : numbers that are wrong or doubtful enough to look for a known mistake.
     unordered : gains that may each be right, but whose order is impossible.
-    mistakes : those to try.
     laws : laws of order that the table breaks.
-    flags : problems that do not depend on the recordings.
+    flags : flags that do not depend on the recordings.
     """
 
     label: Label
@@ -138,7 +138,7 @@ class _Judged:
     flags: list[Flag]
 
     def broken_laws(self, off: set[str]) -> list[BrokenOrder]:
-        """Return the broken laws of order that numbers in `off` explain.
+        """Return the broken laws of order for which wrong numbers are responsible.
 
         Parameters
         ----------
@@ -183,8 +183,8 @@ def _judge(
     }
     suspect = [n for n, e in errors.items() if e > min(limit(n, label), limits.SUSPECT_DAMPING)]
     if label == "initial":
-        # With friction the bounds are wide, but the student's own final number is right and
-        # contradicts the initial one.
+        # With friction, the bounds are too wide to show that a first estimate is wrong. But it is
+        # wrong if it contradicts a final number that is right.
         apart = _disagreements(reported, references, blurred=False)
         apart = [name for _, name in apart if read_name(name).is_gain]
         suspect += [n for n in apart if n in errors and _agrees(reported.final[n], references, n)]
@@ -198,7 +198,7 @@ def _judge(
         mistakes = [m for m in mistakes if _may_be_final(m, reported)]
         if len(suspect) >= min(2, analysis.bench.n):
             mistakes += transient_fits(analysis, table, known)
-    # An obvious contradiction is reported rather than a guess.
+    # If gains are in an impossible order, this is reported rather than a guess at the mistake.
     if any(law.is_of_gains for law in laws):
         mistakes = [m for m in mistakes if m.whole or not _is_of_gains(m)]
     return _Judged(
@@ -244,7 +244,7 @@ def _near(a: Decimal, b: Decimal) -> bool:
 
 
 def _may_be_final(mistake: Mistake, reported: Reported) -> bool:
-    """Return whether a final table can have a mistake.
+    """Return whether a mistake is possible in a final table.
 
     Mistakes in reading decays and steps affect only copied numbers, because a fit does not use such
     readings.
@@ -270,11 +270,11 @@ def _corrected(
 def _disagreements(
     reported: Reported, references: References, *, blurred: bool
 ) -> list[tuple[float, str]]:
-    """Return difference and name of numbers that contradict between the tables, worst first.
+    """Return the numbers that differ between the tables, as (difference, name), worst first.
 
     Parameters
     ----------
-    blurred : allow as much difference as between readings of the recordings.
+    blurred : whether to allow as large a difference as between readings of the recordings.
     """
     apart: list[tuple[float, str]] = []
     for name, final in reported.final.items():

@@ -1,4 +1,4 @@
-"""The mistake of reading amplitudes before the steady state, and of fitting a table to them."""
+"""The mistake of reading amplitudes before the steady state, and fitting a table to them."""
 
 from collections.abc import Callable, Iterator, Mapping
 from decimal import Decimal
@@ -20,7 +20,7 @@ Reading = Callable[[Record, Array], float]
 def transient_fits(
     analysis: Analysis, table: Mapping[str, Decimal], known: Mapping[str, Reference]
 ) -> list[Mistake]:
-    """Return variants of this mistake, one for each way of reading an amplitude too early."""
+    """Return the variants of the mistake, one for each way of reading an amplitude too early."""
     runs = {r.id: r for r in analysis.records if r.kind == "sine" and r.u is not None}
     if analysis.fit is None or not runs or len(runs) < len(analysis.sine_points) / analysis.bench.n:
         return []
@@ -51,7 +51,7 @@ def transient_fits(
 
 
 def _is_new(name: str, ratio: float) -> bool:
-    # After a smaller change, the right number would match too.
+    # If the mistake changes a number less than this, the right number would match too.
     return abs(np.log(ratio)) > np.log1p(0.5 if read_name(name).is_damping else 0.12)
 
 

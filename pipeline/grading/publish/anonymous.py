@@ -18,7 +18,7 @@ KEY_FILE = "anonymous-key.csv"
 _PREFIX = "anon-"
 _SHORTEST = 6  # characters: rarely too few, even for a thousand submissions
 STRANGER = "another submission"
-# Name of an archive at the beginning of a reason.
+# The name of an archive with which a reason begins.
 _ARCHIVE = re.compile(r"^.*?\.zip\W?: ", re.IGNORECASE)
 
 
@@ -27,8 +27,8 @@ def pseudonyms(first_keys: Mapping[str, str]) -> dict[str, str]:
 
     Parameters
     ----------
-    first_keys : by submission, the hash of its first version. Later versions keep it, and a
-        stranger who knows the name cannot compute it.
+    first_keys : for each submission, the hash of its first version. So later versions keep the
+        pseudonym, and nobody can compute it from the name.
     """
     hashes = {
         name: b32encode(hashlib.sha256(f"anonymous {key}".encode()).digest()).decode().lower()
@@ -53,10 +53,9 @@ def is_pseudonym(name: str) -> bool:
 def anonymise(grade: Grade, names: Mapping[str, str]) -> Grade:
     """Return the grade without the names of submissions and authors.
 
-    Besides its own fields, these names occur in two places: in the flag for shared data, and in the
-    reason why a submission could not be graded. There they precede file names, because platforms
-    put the student's name into the name of an archive. The students' own names of runs and files
-    stay.
+    These names also occur in two texts: in the flag for shared data, and in the reason why a
+    submission could not be graded. In the reason they precede file names, because platforms put the
+    student's name into the name of an archive. Names that students gave to runs and files stay.
     """
     hidden = _hidden_names(grade, names) | {
         "flags": tuple(
@@ -117,7 +116,7 @@ def meant(book: Gradebook, team: str) -> str:
 def history_of(book: Gradebook, team: str) -> tuple[str, list[Event]]:
     """Return the history of a team, under the name that was asked for.
 
-    If this is a pseudonym, the events have no other names.
+    If `team` is a pseudonym, the events contain no real names.
 
     Raises
     ------

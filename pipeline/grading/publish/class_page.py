@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _OUTCOMES = ("pass", "partial", "fail", "skip")
-_NAMED = 8  # submissions or recordings named in one row
+_NAMED = 8  # largest number of submissions or recordings in one row
 
 
 def class_page(

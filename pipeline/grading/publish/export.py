@@ -52,13 +52,13 @@ def export(
     Parameters
     ----------
     out : a folder, existing or new; or a .csv file, to write only the table.
-    title : of the assignment on the platform; default: the rubric's title.
-    roster : the table that the platform exports.
+    title : title of the assignment on the platform; default: the rubric's title.
+    roster : the table of students that the platform exports.
 
     Raises
     ------
-    ConfigError : the roster is not the platform's table, or has another maximum grade; or `out` has
-        the name of another kind of file.
+    ConfigError : the roster is not the platform's table, or has another maximum grade; or the name
+        of `out` is that of another kind of file.
     """
     table = out if out.suffix.lower() == ".csv" and not out.is_dir() else None
     folder = table.parent if table else named_folder(out)

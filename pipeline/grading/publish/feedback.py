@@ -298,7 +298,8 @@ def _value(name: str, value: Any) -> str:
 def _difference(name: str, found: Any, expected: Any) -> str:
     """Return the difference of two numbers in words.
 
-    The difference of two percentages is in percentage points, any other is a share of `expected`.
+    The difference of two percentages is in percentage points; any other difference is relative to
+    `expected`.
     """
     if not (_is_number(found) and _is_number(expected)):
         return NOTHING

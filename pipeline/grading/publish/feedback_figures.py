@@ -26,7 +26,7 @@ _LARGEST = 1e9  # largest gain and frequency in a figure; the reciprocal is the 
 
 
 def draw_figures(analysis: Analysis, reported: Reported | None) -> tuple[tuple[str, str], ...]:
-    """Return the measured response of each cart with that computed from the final table.
+    """Draw the measured response of each cart, with the curve that the final table gives.
 
     Each figure is a pair of file name and SVG text. The curve is left out if the table is
     incomplete or gives no valid response.
@@ -52,14 +52,14 @@ def draw_figures(analysis: Analysis, reported: Reported | None) -> tuple[tuple[s
 
 
 def draw_records(analysis: Analysis, criteria: Iterable[Criterion]) -> tuple[tuple[str, str], ...]:
-    """Return recordings that show why numbers of the initial table lost points.
+    """Draw the recordings that show why numbers of the initial table lost points.
 
     Each figure is a pair of file name and SVG text. If several recordings show the same number, the
     most precise one is drawn. The file name contains the numbers; `numbers_in` reads them.
 
     Parameters
     ----------
-    criteria : those about the initial table.
+    criteria : the criteria about the initial table.
     """
     off = [c for c in criteria if c.outcome in ("partial", "fail")]
     pairs = {

@@ -59,7 +59,7 @@ def _grade_lines(grade: Grade, *, by_hand: bool, hidden: bool) -> list[str]:
 
     Parameters
     ----------
-    hidden : show no computed number.
+    hidden : whether to show no computed number.
     """
     how = " automatically, so points were given by hand" if by_hand else ""
     failed = grade.status == "failed"
@@ -77,8 +77,8 @@ def _criterion_text(judged: Criterion, grade: Grade, rubric: Rubric, *, hidden: 
 
     Parameters
     ----------
-    hidden : show only the outcome, the titles of the flags, and the reasons for points given by
-        hand.
+    hidden : whether to show only the outcome, the titles of the flags, and the reasons for points
+        given by hand.
     """
     outcome = WORDS.text(f"outcome_{judged.outcome}")
     if not hidden:

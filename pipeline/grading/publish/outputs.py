@@ -36,9 +36,9 @@ _AFTER = ("remarks", "by_hand", "reason")
 def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) -> list[Double]:
     """Write the output files of a gradebook into a folder.
 
-    Returns the people who are authors of several submissions. An `anonymous` rubric leaves out all
-    names; then `anonymous-key.csv` has them. Feedback of submissions that are no longer in the
-    class is removed; other files stay.
+    Returns the people who are authors of several submissions. If the rubric is `anonymous`, all
+    names are left out, and `anonymous-key.csv` has them. Feedback of submissions that are no longer
+    in the class is removed; other files stay.
     """
     rubric = book.rubric
     names = _names(book, out) if rubric.anonymous else None
@@ -104,8 +104,8 @@ def doubles_of(
 
     Parameters
     ----------
-    authors, gradings : of each submission: its authors, and the number of its grading.
-    names : pseudonyms by submission, if the result must have no names.
+    authors, gradings : for each submission, its authors and the number of its grading.
+    names : pseudonyms by submission; None to show real names.
     """
     found = find_doubles(authors)
     concerned = dict.fromkeys(name for double in found for name in double.submissions)

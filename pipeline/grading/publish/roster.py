@@ -42,7 +42,7 @@ class Roster:
 
         Raises
         ------
-        ConfigError : it is not a table, lacks the columns that identify a student, or has two
+        ConfigError : the file is not a table, lacks the columns that identify a student, or has two
             columns of the same name.
         """
         table = read_table(path)
@@ -87,7 +87,8 @@ class Roster:
 
         Parameters
         ----------
-        columns : by title, the value of a student; a column that is missing is added at the end.
+        columns : for each column title, the function that gives a student's value; a missing column
+            is added at the end.
         keep : other columns to keep; default: all.
         possible : the maximum points, for Canvas' first row.
         """
@@ -124,8 +125,8 @@ class Roster:
         Parameters
         ----------
         matched : each student with the row found, or None.
-        found : by row, the students that match it.
-        settled : by row, the student whose grade is filled in.
+        found : for each row, the students that match it.
+        settled : for each row, the student whose grade is filled in.
         """
         index, shared = self._index
         # An account without a row is no problem: it belongs to one of the authors, who have their
@@ -190,7 +191,7 @@ class Roster:
 
     @cached_property
     def _index(self) -> tuple[dict[tuple[str, str], Any], set[Any]]:
-        """Return the row of each text that identifies a student, and texts of several rows."""
+        """Return the row of each identifying text, and the texts that are in several rows."""
         import pandas as pd
 
         words = []

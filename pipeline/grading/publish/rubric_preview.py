@@ -23,7 +23,7 @@ class CriterionChange:
 
     Attributes
     ----------
-    before, after : points under each rubric; None if it lacks the criterion.
+    before, after : points under each rubric; None if the rubric lacks the criterion.
     """
 
     id: str
@@ -62,7 +62,7 @@ class RubricPreview:
     Attributes
     ----------
     assignment : name of the class's rubric file, without `.toml`.
-    teams : those whose points are known under both rubrics, the largest change first.
+    teams : teams whose points are known under both rubrics, the largest change first.
     bars_before, bars_after : number of teams in each tenth of the total points.
     unknown : submissions without stored results of the checks.
     failed : number of submissions that could not be graded.

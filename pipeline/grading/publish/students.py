@@ -20,11 +20,11 @@ class Student:
 
     Attributes
     ----------
-    id : as the submission names the author; or "".
-    name, number : of the account that submitted, on the platform for which grades are exported; or
-        "".
-    uploader : this entry is the account that submitted, because it is unknown which of several
-        authors it belongs to.
+    id : id of the author in the submission; or "".
+    name, number : name and number of the account that submitted, on the platform for which grades
+        are exported; or "".
+    uploader : whether this is the account that submitted, and it is unknown to which of several
+        authors it belongs.
     by_hand : the criteria whose points were given by hand.
     undecided : message that names the submissions, if the student is in several with different
         points.
@@ -42,8 +42,8 @@ class Student:
     def points(self) -> str:
         """The points as text.
 
-        "" if the submission was not graded, because a zero would look like a grade; also "" if a
-        person must decide which of several submissions counts.
+        Empty if the submission was not graded, because a zero would look like a grade. Also empty
+        if a person must decide which of several submissions counts.
         """
         ungraded = self.grade.status == "failed" and not self.by_hand
         return "" if ungraded or self.undecided else points_text(self.grade.points)
@@ -60,7 +60,7 @@ class Remark:
 
     Attributes
     ----------
-    left_out : a student with points is missing from the table.
+    left_out : whether a student with points is missing from the table.
     """
 
     text: str
@@ -124,9 +124,9 @@ def not_exported(why: str, students: Sequence[Student]) -> Remark:
 
 
 def _students(entry: Entry, *, platform: Platform) -> list[Student]:
-    """Return the authors of a submission, and its account if that may be another person.
+    """Return the authors of a submission, plus its account if it matches no single author.
 
-    If a broken submission names no authors, those of its points by hand are used.
+    If a submission names no authors, those named with its points by hand are used.
     """
     name, of, number = read_owner(entry.owner)
     number = number if of in ("", platform) else ""

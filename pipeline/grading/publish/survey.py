@@ -1,9 +1,9 @@
-"""Make the paper's Tables 4 and 5 from the answers to a questionnaire.
+"""Make Tables 4 and 5 of Throne's paper from the answers to a questionnaire.
 
-A row of the CSV is one student, a column one question. A column is an opinion (Table 4) if all
-answers are on the scale of that table. It is about a concept (Table 5) if its heading says when and
-what was asked: `Pre knowledge: Bode plots`, `Post-course confidence [Bode plots]`. Other columns
-are left out.
+Each row of the CSV is one student, and each column is one question. A column is an opinion (Table
+4) if all answers are on the scale of that table. A column is about a concept (Table 5) if its
+heading says when and what was asked: `Pre knowledge: Bode plots`, `Post-course confidence [Bode
+plots]`. Other columns are left out.
 """
 
 import re
@@ -43,10 +43,10 @@ class Survey:
     Attributes
     ----------
     students : number of students.
-    opinions : Table 4, one row per question: how many students gave each answer; columns `SCALE`.
-    means : Table 5, one row per concept: the mean scores (1 to 4), rounded to two decimals, halves
-        up; NaN if nobody answered; columns `LEVELS`.
-    answers : how many answers each mean has.
+    opinions : Table 4: for each question, how many students gave each answer of `SCALE`.
+    means : Table 5: for each concept, the mean scores (1 to 4) for each of `LEVELS`, rounded to two
+        decimals, halves up; NaN if nobody answered.
+    answers : number of answers in each mean.
     left_out : headings of columns that belong to neither table.
     """
 
@@ -58,7 +58,7 @@ class Survey:
 
     @property
     def percents(self) -> "pd.DataFrame":
-        """Table 4 in whole percents of those who answered, halves rounded up, as in the paper."""
+        """Table 4 in whole percent of those who answered, halves rounded up, as in the paper."""
         total = self.opinions.sum(axis="columns")
         return (200 * self.opinions).add(total, axis="index").floordiv(2 * total, axis="index")
 

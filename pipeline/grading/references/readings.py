@@ -10,10 +10,11 @@ from pipeline.results import Analysis, StepEdge, StepGain
 
 
 def readings(name: str, analysis: Analysis) -> list[float]:
-    """Return the readings of a gain, frequency or damping of a single cart; students may quote any.
+    """Return all values that students may read off for a cart's own gain, frequency or damping.
 
-    The damping of a decay is read twice: with dry friction subtracted, and without. Friction need
-    not be certain, because with little damping even a trace of it matters.
+    The damping of a decay is read twice: with dry friction subtracted, and without subtracting it.
+    This is done even if friction is not certain, because with little damping even a trace of it
+    matters.
     """
     read = read_name(name)
     if read.is_by_eye:
@@ -73,10 +74,10 @@ def _held(cart: int, analysis: Analysis) -> float:
 
 
 def _shortest(edge: StepEdge, *, held: float) -> float:
-    """Return the gain of an edge if friction kept the cart too far out.
+    """Return the smallest gain that fits an edge, if friction held the cart too far out.
 
     Parameters
     ----------
-    held : the friction, as the input that it can hold.
+    held : the largest input that friction can hold.
     """
     return abs((edge.level_after - edge.level_before) / (abs(edge.u_after - edge.u_before) + held))

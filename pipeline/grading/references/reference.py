@@ -23,7 +23,7 @@ class Reference:
     Attributes
     ----------
     value : the estimate that is shown.
-    low, high : an honest reading of these recordings is between them.
+    low, high : bounds between which an honest reading of these recordings lies.
     std : standard error of the bounds.
     source : the method of the estimate.
     """
@@ -73,7 +73,7 @@ class Reference:
 class References:
     """The references of both tables, by parameter name.
 
-    Guesses and parameters that the recordings do not determine are left out.
+    Parameters that were guessed, or that the recordings do not determine, are left out.
     """
 
     initial: dict[str, Reference]
@@ -81,14 +81,14 @@ class References:
 
 
 def off_scale(analysis: Analysis) -> set[str]:
-    """Return which scales contradict those stated in the submission: positions, input or both."""
+    """Return the scales (of positions, input or both) that contradict the submission's."""
     return {c.kind for c in analysis.checks if c.kind in ("position_scale", "input_scale")}
 
 
 def in_scale(
     references: References, chain: Chain | None, *, analysis: Analysis, per_count: float | None
 ) -> tuple[References, Chain | None]:
-    """Return references and chain in the required units, if the recordings are in other units.
+    """Return references and chain in the stated units, even if the recordings are in other units.
 
     Positions in counts are converted by the stated length per count. Numbers whose scale is unknown
     are left out.
@@ -113,8 +113,9 @@ def in_scale(
 def recompute(analysis: Analysis) -> References:
     """Return the references of both tables.
 
-    If a number can be measured in several ways, its bounds include the results of all, in both
-    tables. Dry friction adds to every damping ratio; a damping without that part is right too.
+    If a number can be measured in several ways, its bounds include the results of all of them, in
+    both tables. Dry friction adds to every damping ratio, but a damping ratio without this part is
+    right too.
     """
     chain = trusted_chain(analysis)
     trusted, tables = chain is not None, _by_decays(chain, analysis) if chain else []
@@ -145,7 +146,7 @@ def recompute(analysis: Analysis) -> References:
             for table in (initial, final):
                 if row.name in table:
                     table[row.name] = table[row.name].widened(limits.STUCK)
-    # Without a fit, a peak in the dwells may be another resonance than assumed.
+    # Without a trusted fit, a peak in the dwells may be another resonance than assumed.
     for table in (initial, final) if not trusted else ():
         for name in [n for n, r in table.items() if r.source == "frequency_response"]:
             del table[name]
@@ -156,7 +157,7 @@ def trusted_chain(analysis: Analysis) -> Chain | None:
     """Return the fitted chain; None if the fit cannot be trusted, for example because of friction.
 
     A fit that does not explain the data is trusted only if it determines the frequencies and gains,
-    and agrees with those measured without it.
+    and agrees with values measured without a fit.
     """
     if analysis.fit is None or is_explained(analysis):
         return analysis.chain
@@ -179,7 +180,7 @@ def trusted_chain(analysis: Analysis) -> Chain | None:
 def is_explained(analysis: Analysis) -> bool:
     """Return whether a linear chain and noise explain the data.
 
-    Without a fit, assume that they do.
+    Without a fit, this is assumed.
     """
     return analysis.fit is None or analysis.fit.explains_data
 
@@ -187,9 +188,9 @@ def is_explained(analysis: Analysis) -> bool:
 def is_followed(analysis: Analysis) -> bool:
     """Return whether nearly all driven recordings agree with a simulation of the fitted chain.
 
-    This can hold although the fit does not explain the measured response. Near a sharp resonance, a
-    coarse encoder hides the end of a dwell's transient; the point of that dwell is then wrong by
-    several standard errors.
+    This is possible even if the fit does not explain the measured response. Near a sharp resonance,
+    a coarse encoder hides the end of a dwell's transient, so that the point of this dwell is wrong
+    by several standard errors.
     """
     bad = {one.experiment for one in analysis.left_out}
     left = [share for name, share in analysis.unexplained.items() if name not in bad]
@@ -208,10 +209,10 @@ def is_linear(analysis: Analysis) -> bool:
 
 
 def in_doubt(references: References, *, analysis: Analysis) -> References:
-    """Return the references with the bounds that may count against a student.
+    """Return the references with bounds beyond which a number counts against the student.
 
-    On a nonlinear bench the bounds are widened. A first estimate still belongs to its own
-    recording, but a fit means little, whether it is cartlab's or the student's.
+    On a nonlinear bench, the bounds are widened. They are widened more for a final gain than for an
+    initial one, because a fit means little on such a bench.
     """
     if is_linear(analysis):
         return references
@@ -237,14 +238,14 @@ def in_doubt(references: References, *, analysis: Analysis) -> References:
 
 
 def _birge_ratio(symbol: str, analysis: Analysis) -> float:
-    """Return by how much the fit's errors of gains or frequencies are too small, at least 1.
+    """Return by which factor (at least 1) the fit underestimates errors of gains or frequencies.
 
     Gains from steps and frequencies from decays do not use the fit. The ratio is the root mean
     square of their differences from the fit, in standard errors (Birge, Physical Review 40, 1932).
 
     Parameters
     ----------
-    symbol : "K" or "omega".
+    symbol : kind of parameter: "K" for gains, "omega" for frequencies.
     """
     apart = []
     for row in analysis.rows:
@@ -264,11 +265,11 @@ def _final(
     *,
     scale: float,
 ) -> Reference | None:
-    """Return the bounds of a final number: from the fit, and from all measurements without it.
+    """Return a final number, with bounds from the fit and from all measurements without a fit.
 
-    The standard errors of the fit are multiplied by `scale`. A fit that stops at its bound, zero
-    damping, does not measure the damping. A fit that explains neither the response nor the
-    recordings does not count if there is no other measurement.
+    The standard errors of the fit are multiplied by `scale`. A fit that stops at zero damping does
+    not measure the damping. If there is no other measurement, a fit that explains neither the
+    response nor the recordings does not count.
     """
     fitted, read_off = row.final, readings(row.name, analysis)
     if read_name(row.name).is_damping:
@@ -279,9 +280,9 @@ def _final(
             spread = limits.READ_BY_EYE if row.initial.source == "frequency_response" else 1.0
             measured += [row.initial.value / spread, row.initial.value * spread]
     told = fitted is not None and not (read_name(row.name).is_damping and _undamped(analysis))
-    # Readings that disagree with the fit are left out, except dampings: they depend on no unit,
-    # sign or clock. Dry friction adds to dampings, more in dwells than in decays, and a fit to few
-    # dwells looks good in spite of it.
+    # Readings may disagree with the fit because of a wrong unit, sign or clock, and are then left
+    # out. Dampings stay, because they depend on none of these. Dry friction adds to dampings, more
+    # in dwells than in decays, and a fit to few dwells looks good in spite of it.
     if fitted and told and not read_name(row.name).is_damping and is_explained(analysis):
         measured = [value for value in measured if _agrees(value, fitted)]
     read = row.initial.source if row.initial and not read_off else "log_decrement"
@@ -300,7 +301,8 @@ def _final(
 def _agrees(value: float, fitted: Estimate) -> bool:
     """Return whether a reading agrees with a fit that explains the data.
 
-    If not, its recording contains something else, and it is not used as a bound.
+    A reading that does not agree is not used as a bound, because its recording must show something
+    else.
     """
     slack, factor = limits.SIGMAS * (fitted.std or 0.0), 1 + GAIN_AND_FREQUENCY_LIMIT / 100
     least, most = fitted.value / factor, fitted.value * factor
@@ -308,15 +310,15 @@ def _agrees(value: float, fitted: Estimate) -> bool:
 
 
 def _undamped(analysis: Analysis) -> bool:
-    """Return whether the fit stopped at its bound, zero damping, and so measured no damping."""
+    """Return whether the fit stopped at zero damping and so measured no damping."""
     return analysis.chain is not None and not np.all(analysis.chain.c > 0)
 
 
 def _by_decays(chain: Chain, analysis: Analysis) -> list[dict[str, float]]:
     """Return two tables of the fitted chain: with the least and the largest dampings of the decays.
 
-    A cart without decays has the damping of the fit. If the fit found zero damping, no table is
-    returned.
+    A cart without decays keeps the damping of the fit. No tables are returned without decays, for
+    carts that no spring ties to a wall, or if the least damping is not positive.
     """
     decays = [readings(f"zeta_{cart}", analysis) for cart in range(1, chain.n + 1)]
     if not any(decays) or not chain.is_tied:

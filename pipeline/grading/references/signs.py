@@ -9,16 +9,16 @@ from pipeline.results import Record
 from pipeline.submission import Reported, ReportedFeedback, ReportedStateSpace
 
 _NOTE = (
-    "a positive input drives these carts towards negative x: reported values with that sign are "
-    "read with the input reversed"
+    "a positive input drives these carts towards negative x, so reported values with the opposite "
+    "sign are read with the input reversed"
 )
 
 
 def turned_round(reported: Reported, records: Sequence[Record]) -> tuple[Reported, tuple[str, ...]]:
-    """Return the reported numbers for a positive bench, and a note if that changed them.
+    """Return the reported numbers as for a bench that is not reversed, and a note if any changed.
 
-    On a reversed bench, gains, B and the controller have the opposite sign in the logged data.
-    Numbers with the signs of the log are right, and so are their absolute values.
+    On a reversed bench, gains, B and the controller have the opposite sign in the log. Students may
+    report them with this sign or as positive numbers; both are right.
     """
     if not is_reversed(records):
         return reported, ()

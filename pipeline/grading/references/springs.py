@@ -17,11 +17,11 @@ def with_all_springs(
     *,
     progress: Progress = silent,
 ) -> tuple[Analysis, tuple[str, ...]]:
-    """Return the analysis with all springs, and the added ones, if the recordings need them.
+    """Return the analysis with all springs, and the names of added springs, if the data need them.
 
-    If they do not, the analysis is returned unchanged. All springs are tried at once: one that does
-    not exist is fitted with zero stiffness, so no other set explains more. On a single cart only
-    the sum of the springs matters.
+    Otherwise, the analysis is returned unchanged. All springs are tried at once, because a spring
+    that does not exist is fitted with zero stiffness. So no other choice explains more. On a single
+    cart, nothing is tried, because only the sum of the springs matters.
     """
     fit, springs = analysis.fit, submission.system.springs
     if analysis.bench.n == 1 or all(springs) or (fit is not None and is_explained(analysis)):
@@ -36,8 +36,8 @@ def with_all_springs(
     if other.fit is None or not (
         is_explained(other)
         or (
-            # Friction and similar effects remain with any springs. Only a missing spring makes χ²
-            # many times larger.
+            # Friction and similar effects increase χ² with any springs. Only a missing spring makes
+            # it many times larger.
             fit is not None
             and fit.method == other.fit.method
             and fit.chi_square_per_dof > 10 * other.fit.chi_square_per_dof

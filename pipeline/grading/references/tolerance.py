@@ -1,6 +1,6 @@
 """The error of a number and the points it earns.
 
-The arithmetic is exact, so that a number exactly at a limit is judged right.
+The arithmetic is exact, so that a number exactly at a limit is judged correctly.
 """
 
 import math
@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 Number = TypeVar("Number", float, Fraction)
 
 NO_CREDIT = Fraction(10**6)  # percent; the error of a number that is zero or has the wrong sign
-# The largest error that rounding may excuse, as a share: that of two digits, 10 for 10.5. One digit
-# says too little about the measurement, and "0e2" says nothing.
+# The largest error that rounding may excuse, as a share of the number. It is that of a number with
+# two digits, such as 10 for 10.5. One digit says too little about the measurement, and "0e2" says
+# nothing.
 _MOST_ROUNDING = Fraction(1, 20)
 
 
@@ -71,7 +72,7 @@ class Typed:
 
     Attributes
     ----------
-    excused : change that rounding may have caused.
+    excused : the largest error that is excused as rounding.
     hidden : half a unit of the last digit, as a share of the number.
     digits : number of typed digits.
     """
@@ -83,7 +84,7 @@ class Typed:
 
     @classmethod
     def of(cls, typed: Decimal) -> "Typed":
-        """Return a typed number in this form."""
+        """Return a typed number as `Typed`."""
         return cls(
             value=float(typed),
             excused=float(rounding(typed)),
@@ -94,7 +95,7 @@ class Typed:
     def percent_off(self, reference: "Reference", *, sigmas: float) -> float:
         """Return the same as the function `percent_off`, in floating point.
 
-        Not for exact limits.
+        The result is not exact enough to judge a number at a limit.
         """
         slack = sigmas * reference.std
         low, high = reference.low - slack, reference.high + slack
@@ -109,8 +110,8 @@ def _apart(
 
     Parameters
     ----------
-    nothing : the result if they overlap.
-    worst : the largest result, and that for an interval that reaches zero.
+    nothing : the result if the intervals overlap.
+    worst : the largest result, and the result for an interval that reaches zero.
     """
     if most < low:
         above, below = low, most
@@ -136,7 +137,7 @@ def credit(error: Fraction, *, full: float, none: float) -> Fraction:
 
 
 def to_step(points: Fraction, step: float) -> Fraction:
-    """Round points to the rubric's step, halves up; exact, so that more points stay more."""
+    """Round points to the rubric's step, halves up, with exact arithmetic."""
     return math.floor(points / exact(step) + Fraction(1, 2)) * exact(step)
 
 

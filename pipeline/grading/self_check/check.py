@@ -29,7 +29,7 @@ from pipeline.results import Analysis
 from pipeline.submission import Reported, Submission
 from pipeline.words.progress import Progress, silent
 
-# For each check that compares a table with the recordings: the table under `[reported]`.
+# The table under `[reported]` that each check judges.
 _TABLE = {
     "initial": "initial",
     "final": "final",
@@ -49,14 +49,14 @@ def check_numbers(
 ) -> CheckAnswer:
     """Find the reported numbers that disagree with the recordings.
 
-    If the same numbers were checked before, the answer also has hints where to look. It is written
-    into the submission's `checks.jsonl` before it is returned.
+    If the same numbers were checked before, the answer also has hints on where to look. The answer
+    is written into the submission's `checks.jsonl` before it is returned.
 
     Parameters
     ----------
-    rubric : sets the tolerances; None: the shipped rubric for this number of carts, with the
-        submission's own system.
-    where : the numbers to give hints for; None: all that may have one.
+    rubric : rubric that sets the tolerances; None for the shipped rubric for this number of carts,
+        with the submission's own system.
+    where : the numbers to give hints for; None for all numbers that may have a hint.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def judge_numbers(submission: Submission, analysis: Analysis, *, rubric: Rubric)
 
     Parameters
     ----------
-    submission : with the rubric's system; see `analyse_under`.
+    submission : submission that has the rubric's system; see `analyse_under`.
     """
     work, flags, _ = prepare_work(submission, analysis, rubric=rubric)
     agrees: dict[str, bool] = {}
@@ -133,8 +133,8 @@ def next_answer(
     Parameters
     ----------
     before : the earlier answers.
-    basis : hash of everything whose change withdraws hints; see `find_basis`.
-    where : the numbers to give hints for; None: all that may have one.
+    basis : hash of everything that must stay the same for hints to be given; see `find_basis`.
+    where : the numbers to give hints for; None for all numbers that may have a hint.
     """
     known: Collection[str] = ()
     if before and before[-1].basis == basis:

@@ -1,4 +1,4 @@
-"""Give a hint about a wrong number: the kind of mistake and the part of the recording.
+"""Give a hint about a wrong number: the kind of mistake, and the part of a recording that shows it.
 
 A hint must not reveal a value. There are only six parts of a recording, so a part does not reveal a
 period or a settling time. All sine dwells are named together, because the one nearest to a
@@ -15,7 +15,7 @@ from pipeline.names import read_name
 from pipeline.results import Analysis, Kind
 
 _TABLES = ("initial", "final")
-# Mistakes in reading a decay or a step. If a final table has one, the hint names those recordings.
+# Mistakes in reading a decay or a step. If a final table has one, the hint names decays and steps.
 _OF_TIME_RECORDS: tuple[Slip, ...] = ("peak_count", "log10_for_ln", "peak_for_steady_state")
 # Mistakes that no part of a recording can show.
 _OF_NO_RECORD: tuple[Slip, ...] = ("physically_impossible", "no_fit_done")
@@ -33,8 +33,8 @@ def find_hint(number: str, work: Work, flags: Sequence[Flag]) -> Hint:
 
     Parameters
     ----------
-    number : its key under `[reported]`, such as "final.K_1".
-    flags : of the whole submission, in the order of their codes.
+    number : key of the number under `[reported]`, such as "final.K_1".
+    flags : all flags of the submission, in the order of `CODES`.
     """
     table, _, name = number.partition(".")
     if table == "feedback":

@@ -25,7 +25,7 @@ Slip = Code | Literal["claims_off"]
 
 
 class Stretch(GradeTable):
-    """The same part of some recordings of one kind.
+    """A part of a recording, or the same part of several recordings of one kind.
 
     All sine dwells are named, because a single one would reveal a resonance.
     """

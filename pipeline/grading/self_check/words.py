@@ -12,7 +12,7 @@ from pipeline.words.phrases import phrases
 from pipeline.words.text import symbol_text
 
 WORDS = phrases("check")
-_NAMED = 4  # recordings named one by one; of a longer list, only the first and the last
+_NAMED = 4  # largest number of recordings named one by one; of more, only the first and last
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ def result_words(answer: CheckAnswer) -> str:
 
 
 def asked_words(times: int) -> str:
-    """Return a sentence with the number of checks, and who sees it."""
+    """Return a sentence that says how often the numbers were checked, and who sees this."""
     return WORDS.text("asked", times=count(times, "time"))
 
 

@@ -17,11 +17,11 @@ _NAMED = 8  # submissions named for one person
 
 @dataclass(frozen=True, kw_only=True)
 class Double:
-    """People who are authors of the same several submissions.
+    """People who are all authors of the same two or more submissions.
 
     Attributes
     ----------
-    authors : each is "" if names are left out.
+    authors : ids of the people; each is "" if names are left out.
     recordings : the largest number of recordings that one of the submissions shares with the
         others.
     compared : whether all of the submissions have readable recordings.
@@ -51,7 +51,7 @@ def find_doubles(authors: Mapping[str, Sequence[str]]) -> list[Double]:
 
     Parameters
     ----------
-    authors : of each submission.
+    authors : authors of each submission.
     """
     typed: dict[str, str] = {}
     found: dict[str, dict[str, None]] = {}

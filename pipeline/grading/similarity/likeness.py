@@ -22,7 +22,7 @@ _LEAST_SIGMAS = 4.5
 _SPREAD = 2.5  # standard deviations by which the slope of a copy may differ from one
 # Each recording that is used to explain another one needs this many samples.
 _SAMPLES_EACH = 10
-# Share of a recording's power; without it, copies among the others would make this singular.
+# Share of a recording's power; without it, copies among the others would make the matrix singular.
 _RIDGE = 1e-6
 _LEAST_PART = 1e-9  # share of a recording's power that the others must leave unexplained
 # Smallest noise from which the scale between two recordings is estimated.
@@ -41,8 +41,8 @@ class Likeness:
     ----------
     experiments : names of the two recordings.
     times : start and end of the compared or equal part, in s, in each recording.
-    slope : of one noise on the other, after subtracting what the class explains.
-    sigmas : standard deviations above chance.
+    slope : slope of one noise on the other, after subtracting what the class explains.
+    sigmas : agreement of the noise, in standard deviations above chance.
     equal_rows : number of consecutive rows that are equal up to a factor; 0 if not significant.
     different : number of different readings in these rows.
     """
@@ -61,7 +61,7 @@ class Likeness:
 
     @property
     def is_whole(self) -> bool:
-        """Return whether it is sure, and the slope is that of a full copy."""
+        """Return whether the similarity is sure, and the slope is that of a full copy."""
         return self.is_sure and (1 - self.slope) * self.sigmas <= _SPREAD * self.slope
 
 
@@ -72,7 +72,7 @@ def compare(
 
     Parameters
     ----------
-    shift : sample i of `a` corresponds to sample i + shift of `b`.
+    shift : shift between the recordings: sample i of `a` corresponds to sample i + shift of `b`.
     others : recordings of other teams, each with its own shift relative to `a`.
     """
     first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)

@@ -19,12 +19,13 @@ from pipeline.estimation.noise import MEDIAN_TO_SIGMA
 from pipeline.results import Record
 
 # The filter passes frequencies above 0.4 of the Nyquist frequency. On a bench logged at 113 Hz,
-# motion is below 12 Hz. A Kaiser window of 7 lets less than 1e-3 of the motion through.
+# motion is below 12 Hz. A Kaiser window with β = 7 lets less than 1e-3 of the motion through.
 PASSED = 0.6  # share of the band
 _TAPS, _WINDOW = 41, 7.0
 MARGIN = _TAPS // 2  # samples lost at each end of a recording
 
-# Fine enough to keep a sensor's noise in a recording with much larger knocks.
+# Residuals are stored in steps this fine, to keep a sensor's noise in a recording with much larger
+# knocks.
 STEPS_PER_SIGMA = 100.0
 _STORED = np.dtype("<i2")
 _MOST_STEPS = np.iinfo(_STORED).max
@@ -35,10 +36,10 @@ _JUMP = 30.0  # standard deviations; only an input that jumps has a larger resid
 _NOTHING = 1e-7  # share of the travel; a smaller residual is a rounding error of the filter
 
 _LEAST_SWING = 0.25  # share of the largest swing; noise affects smaller ones
-# If a motion has at most this many turns, these parts of each swing are used as anchors.
+# If a motion has at most this many turning points, these parts of each swing are used as anchors.
 _FEW_TURNS, _PARTS = 5, (0.5, 0.3, 0.7)
-_MOST_ANCHORS = 12  # anchors from the motion of one recording
-# Anchors from the noise, and the samples by which they must be apart.
+_MOST_ANCHORS = 12  # most anchors from the motion of one recording
+# Most anchors from the noise, and the fewest samples between two of them.
 _NOISE_ANCHORS, _APART = 12, 5
 _FEWEST_SAMPLES = 60
 _EVERY = 8  # the motion is stored at every 8th sample
@@ -54,13 +55,15 @@ class Print:
     Attributes
     ----------
     group : the kind of run; only recordings of the same group are compared.
-    residual : (n_rows, n) whole numbers; one row for each free cart, and one for the input of a
-        closed loop.
-    step : (n_rows,) value of 1 in the recording's position unit or input unit.
+    residual : the filtered signals as whole numbers, shape (n_rows, n), with one row for each free
+        cart, and one for the input of a closed loop.
+    step : what 1 in each row of the residual means, in the recording's position or input unit;
+        shape (n_rows,).
     anchors : lists of samples that can be found again in a copy, the surest first; they give the
         shift of the copy. One list has midpoints between two extrema of the motion, which noise
         does not affect. The others have maxima of the noise, which cutting does not affect.
-    motion : of the first cart at every few samples; it gives the scale between two recordings.
+    motion : motion of the first cart at every few samples, from which the scale between two
+        recordings is found.
     start : time of the first sample, in s.
     interval : time between samples, in s.
     """
@@ -156,7 +159,7 @@ def unpack(packed: bytes) -> tuple[Print, ...]:
 
 
 def _prints(record: Record, *, most: int) -> Iterator[Print]:
-    """Yield the fingerprint of a recording, unless a cart does not move or it is too short.
+    """Yield the fingerprint of a recording, unless it is too short or a cart does not move.
 
     In closed loop the controller passes the noise of the measured positions to the input. If
     somebody adds noise to the positions later, the input still has the old noise.
@@ -198,7 +201,7 @@ def _prints(record: Record, *, most: int) -> Iterator[Print]:
 def _sigma(noise: Array, *, travel: float) -> float:
     """Return the standard deviation of the nonzero samples of a residual (n,); 0 if they are few.
 
-    A cart at rest has a residual of zero for as long as it rests, which is not its noise.
+    While a cart is at rest, its residual is zero, which says nothing about the noise.
     """
     there = np.abs(noise[np.abs(noise) > _NOTHING * travel])
     return MEDIAN_TO_SIGMA * float(np.median(there)) if there.size >= _FEWEST_SAMPLES else 0.0
@@ -224,7 +227,7 @@ def _noise_anchors(loudness: Array) -> list[int]:
 def _motion_anchors(motion: Array) -> list[int]:
     """Return the samples at which the motion (n,) passes through the middle of its larger swings.
 
-    If there are few swings, two more samples of each are returned.
+    If there are few swings, two more samples of each swing are returned.
     """
     turns = _turning_points(motion, least=_LEAST_SWING * float(np.ptp(motion)))
     parts = (0.5,) if turns.size > _FEW_TURNS else _PARTS

@@ -1,8 +1,8 @@
 """Find recordings that two submissions share, by comparing their noise.
 
 Equal noise is evidence if it goes beyond what the class shares. But if other pairs of the class
-have partly equal noise, it proves nothing. Equal rows are always evidence. In a class of fewer than
-five teams, only equal rows count.
+have partly equal noise, it proves nothing. Rows that are equal up to a factor are always evidence.
+In a class of fewer than five teams, only equal rows count.
 """
 
 from collections import Counter, defaultdict
@@ -29,31 +29,34 @@ from pipeline.grading.similarity.prints import PASSED, Print, unpack
 from pipeline.words.numbers import first_few
 
 _WIDTH = 512  # samples around an anchor that the first comparison uses
-_BEFORE = 128  # those of them that precede the anchor
-# The best anchors of each recording, with which all others are compared.
+_BEFORE = 128  # number of these samples that precede the anchor
+# Number of best anchors of each recording, with which all anchors are compared.
 _FIRST_IN_MOTION, _FIRST_IN_NOISE = 2, 1
-# Levels into which noise is rounded in the first comparison; finer levels would show rounding.
+# Levels per standard deviation to which noise is rounded in the first comparison, and the largest
+# level. Finer levels would show rounding.
 _PER_SIGMA, _LEVELS = 1.5, 5.0
 _BLOCK = 2048  # anchors compared in one matrix product
 _WORTH_A_LOOK = 3.2  # sigmas in the first comparison; chance reaches this once in a thousand
-# These limits let the further work grow with the number of recordings, not with its square. With
-# 4,000 recordings of one kind, chance gives this many candidates. Two honest teams with 20
-# recordings each need a tenth of the limit on comparisons.
-# Most similar candidates kept for each anchor; recordings of the lab are kept in addition.
+# With the next two limits, the further work grows with the number of recordings, not with its
+# square. The first one is the number of most similar candidates kept for each anchor, besides
+# recordings of the lab. With 4,000 recordings of one kind, chance gives as many.
 _MOST_ALIKE = 16
-_MOST_COMPARED = 10  # comparisons of two submissions, as a multiple of their recordings of one kind
+# Comparisons of two submissions, as a multiple of their recordings of one kind. Two honest teams
+# with 20 recordings each need a tenth of this.
+_MOST_COMPARED = 10
 _COUNTS = 4.5  # sigmas that a recording needs to count together with others
 # Sigmas that a single recording needs. In a class of 200 (1e9 comparisons) chance reaches 6.1.
 _ALONE = 6.5
-# Sigmas that several recordings need together: the root of the sum of their squares.
+# Sigmas that several recordings need together, as the root of the sum of their squares.
 _TOGETHER = 7.5
 # Suppose two honest runs have the same motion and encoder zero, and noise of 1/25 count. Then one
 # reading in 22 is rounded differently, so 22 equal readings have a probability of 1/e.
 _TO_A_ROUNDING = 22
-_MOST_ALIGNED = 60  # recordings of other teams that are aligned
+_MOST_ALIGNED = 60  # most recordings of other teams that are aligned with a recording
 _MOST_OTHERS = 24  # aligned recordings that are used to explain a recording
-_FEWEST_TEAMS = 3  # teams from which these recordings must come
-# Share of the other teams that is left out. They are the most similar; they may have the same copy.
+_FEWEST_TEAMS = 3  # fewest teams from which these recordings must come
+# Share of the other teams that is left out, the most similar first, because they may have the same
+# copy.
 _COPIES = 1 / 3
 _MOST_IN_PART = 1  # pairs with partly equal noise that are tolerated: two knocks may coincide once
 # For each 10 pairs with fully equal noise, one more pair with partly equal noise is tolerated.
@@ -66,7 +69,7 @@ class SharedRecord:
 
     Attributes
     ----------
-    experiment : its name in this submission.
+    experiment : name of the recording in this submission.
     submission, other_experiment : the other submission, and the recording's name there.
     sigmas : agreement of the noise, in standard deviations above chance.
     equal_rows : number of consecutive rows that are equal up to one factor per column; 0 if this is
@@ -106,7 +109,8 @@ def find_shared(
     Parameters
     ----------
     batch : submissions of the current class.
-    earlier : submissions of earlier batches; compared only with the batch, not with each other.
+    earlier : submissions of earlier batches; they are compared only with the batch, not with each
+        other.
     examples : packed fingerprints of recordings that the lab gave out; everybody may have them.
     """
     everyone = [*batch, *earlier]
@@ -149,7 +153,7 @@ def find_shared(
 
 
 def _by_group(owners: Iterable[Member]) -> dict[str, list[_Entry]]:
-    """Group fingerprints that may come from the same recording; each owner has each only once."""
+    """Group fingerprints that may come from the same recording, without duplicates of one owner."""
     groups: dict[str, list[_Entry]] = defaultdict(list)
     for owner, prints in enumerate(owners):
         once: dict[tuple[str, bytes], Print] = {}
@@ -190,7 +194,8 @@ def shared_message(recordings: Sequence[Mapping[str, Any]], others: Iterable[str
 
     Parameters
     ----------
-    recordings : those of a flag's evidence; an older gradebook may have some without times.
+    recordings : the recordings in the evidence of a flag; some from an older gradebook have no
+        times.
     """
     experiments = list(dict.fromkeys(one["experiment"] for one in recordings))
     are = "is" if len(experiments) == 1 else "are"
@@ -215,8 +220,8 @@ def student_message(flag: Flag) -> str:
 def same_team(a: Member, b: Member) -> bool:
     """Return whether two submissions are from the same team.
 
-    They are if they have an author or an account number in common. If one names no authors, equal
-    names are enough.
+    They are from the same team if they have an author or an account number in common. If one of
+    them names no authors, equal names of the submissions are enough.
     """
     if same_number(a.owner, b.owner):
         return True
@@ -283,7 +288,8 @@ def _matches(
     def same(a: int, b: int) -> bool:
         return same_team(owners[a], owners[b])
 
-    # Recording and submission: the recording there that is certainly a copy.
+    # For a recording and another submission, the recording in that submission that is certainly a
+    # copy.
     partner: dict[tuple[int, int], int] = {}
     compared: Counter[tuple[int, int]] = Counter()
     recordings = Counter(entry.owner for entry in entries)
@@ -347,8 +353,8 @@ def _others(aligned: Sequence[_Aligned]) -> list[tuple[Print, int]]:
 def _candidates(entries: Sequence[_Entry], *, everyone: int) -> Iterator[tuple[int, int, int, int]]:
     """Yield anchors with similar noise around them: (entry, anchor, other entry, other anchor).
 
-    Motion and noise have separate anchors, and each yields the most similar pairs first. All
-    anchors are compared with the best ones of each recording. An index would not be faster than
+    Motion and noise have separate anchors, and each kind yields the most similar pairs first. All
+    anchors are compared with the best anchors of each recording. An index would not be faster than
     this product, because a copy with six times its noise added is hardly more similar than chance.
 
     Recordings that the lab gave out (owners from `everyone` on) are always candidates.
