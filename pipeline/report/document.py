@@ -14,9 +14,9 @@ from pipeline.words.math import Math
 from pipeline.words.numbers import at_decimal
 from pipeline.words.spans import Span, Spans, plain, spans
 
-_MUCH = 24  # characters of a cell that takes most of the width of a phone
-_LONG = 16  # characters of a value that makes its tile wide
-_WIDE_TILES, _MOST_TILES = 3, 5  # side by side in one row
+_MUCH = 24  # a cell with more characters takes most of a phone's width
+_LONG = 16  # a tile whose value has more characters is wide
+_WIDE_TILES, _MOST_TILES = 3, 5  # tiles in one row
 
 Tone = Literal["", "good", "bad", "quiet"]
 
@@ -85,9 +85,9 @@ class Cell:
 
     Attributes
     ----------
-    tone : colour, in addition to what the text says.
-    parts : in a column aligned on the decimal mark: the text before the mark, and the text from it
-        on.
+    tone : colour of the cell; the text says the same in words.
+    parts : the text before the decimal mark and the text from the mark on, in a column aligned on
+        the decimal mark.
     """
 
     text: Spans
@@ -102,8 +102,8 @@ class Table:
     Attributes
     ----------
     align : one letter for each column: l, c, r or d (on the decimal mark).
-    finder : readers of the page can search and sort the table.
-    small : set in small print, for readers who look something up.
+    finder : whether readers of the page can search and sort the table.
+    small : whether the table is in small print, for reference.
     """
 
     number: int
@@ -119,7 +119,7 @@ class Table:
     def told(self) -> bool:
         """Return whether cells contain long text.
 
-        A phone then shows each row as lines, not columns.
+        If they do, a phone shows each row as lines instead of columns.
         """
         if self.finder or self.small:
             return False
@@ -132,9 +132,9 @@ class Picture:
 
     Attributes
     ----------
-    name : of its file in `figures/`.
-    draw : returns it as SVG; called once, when `svg` is first used.
-    blank : an empty SVG of its size, with which pages are laid out before it is drawn.
+    name : file name in `figures/`.
+    draw : function that returns the figure as SVG; called when `svg` is first used.
+    blank : an empty SVG of the figure's size, for laying out pages before the figure is drawn.
     """
 
     number: int
@@ -157,7 +157,7 @@ class Tile:
 
     Attributes
     ----------
-    url : address of the section about it.
+    url : address of the section on this fact.
     """
 
     label: Spans
@@ -169,7 +169,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class Tiles:
-    """A board of facts to take in at a glance."""
+    """A board of the most important facts."""
 
     tiles: tuple[Tile, ...]
     across: int = field(init=False)
@@ -189,7 +189,7 @@ class Tiles:
 
 @dataclass(frozen=True)
 class Details:
-    """Blocks that a page shows only when a reader opens them; in print they are always shown."""
+    """Blocks that a page hides until a reader opens them; in print they are always shown."""
 
     title: Spans
     blocks: tuple["Block", ...]
@@ -227,7 +227,7 @@ class Section:
 
     Attributes
     ----------
-    id : its anchor.
+    id : the section's anchor on the page.
     """
 
     id: str
@@ -241,7 +241,7 @@ class Document:
 
     Attributes
     ----------
-    plots : address of the page with plots of all recordings; "" without one.
+    plots : address of the page with plots of all recordings; "" if there is no such page.
     """
 
     title: str
@@ -304,7 +304,7 @@ def make_table(
     rows: Iterable[Sequence[Cell | str | Spans]],
     align: str,
 ) -> Table:
-    """Return a table; cells may be given as plain text.
+    """Return a table; each cell is a `Cell` or plain text.
 
     Parameters
     ----------

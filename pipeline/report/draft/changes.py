@@ -1,6 +1,6 @@
 """Compare an earlier `results.json` with the current analysis.
 
-Only numbers that changed and checks that now fail are listed, because people look at these.
+The section lists only numbers that changed and checks that fail now but did not before.
 """
 
 from collections.abc import Iterator, Mapping
@@ -23,7 +23,7 @@ from pipeline.words.phrases import phrases
 from pipeline.words.text import capital, clean, name_span, rich
 
 _WORDS = phrases("report")
-_MOST_BYTES = 20_000_000  # bytes of a results.json; real files have some ten thousand
+_MOST_BYTES = 20_000_000  # limit for results.json; a real file has about ten thousand bytes
 Draft = Mapping[str, Any]  # the content of a results.json
 
 
@@ -42,8 +42,8 @@ class Change:
 
     Attributes
     ----------
-    what : what the number is about.
-    before, after : None if that draft lacks the number.
+    what : the part of the draft: "final", "initial", "feedback" or "hardware".
+    before, after : the number in the earlier and in the current draft; None if the draft lacks it.
     """
 
     what: str
@@ -73,7 +73,7 @@ class Change:
         if self.before is None or self.after is None:
             return self.before is not self.after
         old, new = self.before.value, self.after.value
-        # Numbers in the file have ten digits. Two computers may differ by this share of a number.
+        # The file has ten digits. Two computers may give numbers that differ by this fraction.
         return abs(new - old) > 1e-8 * max(abs(old), abs(new))
 
 
@@ -83,8 +83,8 @@ class DraftChanges:
 
     Attributes
     ----------
-    numbers : those that changed.
-    failed : messages of the checks that fail now but did not before, by id.
+    numbers : the numbers that changed.
+    failed : message of each check that fails now but did not before, by the check's id.
     """
 
     numbers: tuple[Change, ...]
@@ -99,7 +99,7 @@ def read_results(path: Path) -> Draft:
 
     Raises
     ------
-    ConfigError : the file cannot be read, or cartlab did not write it.
+    ConfigError : the file cannot be read, or is not a `results.json` of cartlab.
     """
     try:
         if path.stat().st_size > _MOST_BYTES:
@@ -114,11 +114,11 @@ def read_results(path: Path) -> Draft:
 
 
 def check_comparable(before: Draft, *, bench: Bench) -> None:
-    """Refuse an earlier draft that has no number in common with this bench.
+    """Refuse an earlier draft that cannot be compared with this bench.
 
     Raises
     ------
-    ConfigError : the earlier draft is of another number of carts or in other units.
+    ConfigError : the earlier draft has another number of carts or other units.
     """
     then, units = before["submission"], Units(**before["submission"]["units"])
     if (then["carts"], units) != (bench.n, bench.units):
@@ -155,7 +155,10 @@ def compare_drafts(before: Draft, analysis: Analysis) -> DraftChanges:
 
 
 def _numbers(draft: Draft) -> Iterator[tuple[str, str, DraftNumber]]:
-    """Yield the numbers of a draft: subject, name and value of estimates, feedback and hardware."""
+    """Yield all numbers of a draft;
+
+    the two texts are the part of the draft and the number's name.
+    """
     for which in ("final", "initial"):
         for row in draft["parameters"]:
             value, std = row.get(which), row.get(f"{which}_std")
@@ -227,7 +230,7 @@ def _number_row(change: Change) -> list[Cell]:
 
 
 def _moved(change: Change, *, between: str = " (") -> str:
-    """Return a change as text: "+2.0 % (1.4 σ)", or with other text than " (" between the two."""
+    """Return a change as text, such as "+2.0 % (1.4 σ)"; `between` replaces " ("."""
     text = percent(change.percent, signed=True)
     if change.sigmas is None:
         return text

@@ -60,8 +60,9 @@ def build_document(
     Parameters
     ----------
     gap : the gap analysis of the same data, if there is one.
-    worked : sections with derivations, in place of the section on the model.
-    answer : returns the model answer to a question; the students' notes are then left out.
+    worked : sections with derivations; they replace the section on the model.
+    answer : function that returns the model answer to a question; if given, the students' notes are
+        left out.
     changes : differences from an earlier draft.
     """
     page = Page(analysis)
@@ -136,10 +137,13 @@ def _model(page: Page) -> list[Block]:
 
 
 def _about_gap(gap: "Gap | None") -> tuple[Blocks, Blocks, Blocks]:
-    """Return what shows a gap analysis: one paragraph, runs simulated with it, and its section."""
+    """Return three functions that build blocks on the gap:
+
+    one paragraph, runs, and the whole section.
+    """
     if gap is None:
         return _nothing, _nothing, _nothing
-    from pipeline.report.gap import section  # loads the catalogue of effects
+    from pipeline.report.gap import section  # late: loads the catalogue of effects
 
     return (
         lambda _: section.gap_in_short(gap),

@@ -49,7 +49,8 @@ def make_report(
 
     Parameters
     ----------
-    compared : returns the differences from an earlier draft; called before that is overwritten.
+    compared : function that returns the differences from an earlier draft; called before
+        `results.json` is overwritten.
     """
     analysis, gap = with_gap(analyse(submission, progress=progress), submission.folder)
     changes = compared(analysis)
@@ -77,8 +78,8 @@ def render_report(
 ) -> None:
     """Write `report.html`, `figures/*.svg` and the other requested files into the folder `out`.
 
-    The same analysis gives the same bytes. Both the report and `progress` warn of characters that
-    the PDF's fonts lack. `progress` is also called with the name of each section.
+    The same analysis gives the same bytes. Both the report and `progress` name the characters that
+    the PDF's fonts lack. `progress` also receives the name of each section.
     """
     if files.pdf and (lost := missing_characters(_students_text(analysis))):
         warning = f"report.pdf: its fonts lack {lost}; report.html shows them"
@@ -90,13 +91,13 @@ def render_report(
     write_document(document, out, name="report", pdf=files.pdf)
     clear_files(out, PLOTS)  # left by an earlier report
     if files.plots:
-        from pipeline.report.plots.page import write_plots  # loads the catalogue of effects
+        from pipeline.report.plots.page import write_plots  # late: loads the catalogue of effects
 
         write_plots(analysis, out, gap=gap, progress=progress)
 
 
 def _students_text(analysis: Analysis) -> str:
-    """Return all text in the report that students wrote."""
+    """Return all text in the report that was written by students."""
     authors = (part for author in analysis.authors for part in author)
     records = (record.id for record in analysis.records)
     units = vars(analysis.bench.units).values()

@@ -8,7 +8,7 @@ from pipeline.plant.nonlinear.effects import Effect, EffectParameter
 from pipeline.words.math import to_tex, to_text
 from pipeline.words.numbers import unit_text
 
-POSITION, INPUT = "cm", "V"  # the units of the presets; other benches may have others
+POSITION, INPUT = "cm", "V"  # units of the presets; other benches may have other units
 
 _WIDTH = 100
 _WHERE = {

@@ -16,15 +16,15 @@ from pipeline.report.figures.colours import MODEL, QUIET, SECOND, SECOND_LINE
 from pipeline.report.figures.style import legend_above, panels, position_label
 from pipeline.words.numbers import subscript
 
-# Hz; fast enough to compute velocities and accelerations as differences of positions.
+# Hz; fast enough to compute velocities and accelerations as differences of positions
 _RATE = 1000.0
 _DURATION = 4.0  # s
-_STEP = (0.1, 2.1)  # s; the input is switched on and off at these times
+_STEP = (0.1, 2.1)  # s; times at which the input is switched on and off
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Run:
-    """One run of the bench, simulated twice.
+    """One run of the bench, simulated with and without an effect.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class _Run:
     with_it: Array
 
     def rate(self) -> Array:
-        """Return the velocities (n_carts, n) with the effect."""
+        """Return the carts' velocities (n_carts, n) with the effect."""
         return np.gradient(self.with_it, self.t, axis=1)
 
     def residual_force(self, chain: Chain) -> Array:
@@ -52,7 +52,7 @@ class _Run:
 
 
 def effect_figure(term: EffectTerm, chain: Chain) -> Figure:
-    """Return a figure with the fingerprint of an effect, and the run in which it shows best."""
+    """Return a figure of an effect's fingerprint, and of the run in which the effect shows best."""
     cart = _cart(term, chain)
     runs = _runs(term, chain, cart=cart)
     shown = max(runs, key=lambda run: _difference(run, cart))
@@ -75,7 +75,10 @@ def scales_readings(effect: Effect) -> bool:
 
 
 def _window(run: _Run, cart: int) -> slice:
-    """Return the samples to show: all; or a second around the largest difference if it is small."""
+    """Return the samples to show:
+
+    all, or one second around the largest difference if that is brief.
+    """
     if _difference(run, cart) > 0.1:
         return slice(None)
     largest = int(np.argmax(np.abs(run.with_it[cart - 1] - run.without[cart - 1])))
@@ -85,7 +88,7 @@ def _window(run: _Run, cart: int) -> slice:
 
 
 def _cart(term: EffectTerm, chain: Chain) -> int:
-    """Return the cart to show: that of the effect, the right one of a spring, or the driven one."""
+    """Return the cart to show: the effect's own cart, the cart right of its spring, or cart 1."""
     return min(max(term.place, 1), chain.n)
 
 
@@ -95,15 +98,15 @@ def _difference(run: _Run, cart: int) -> float:
 
 
 def _runs(term: EffectTerm, chain: Chain, *, cart: int) -> list[_Run]:
-    """Return a step on and off.
+    """Return a run in which the input is switched on and off and, if useful, a decay.
 
-    If the effect is not in the drive, also a decay of the cart alone.
+    The decay of a single cart is added unless the effect is in the drive.
     """
     t = np.arange(0.0, _DURATION, 1 / _RATE)
     # Slightly less than the input that holds a cart at the end of its travel.
     size = 0.95 / float(np.max(np.abs(chain.static_gains())))
     everyone = tuple(range(1, chain.n + 1))
-    # If the effect acts only to one side, the step goes to that side.
+    # If the effect acts in one direction only, the step goes in that direction.
     side = next(
         (np.sign(v) for p, v in zip(term.effect.parameters, term.values, strict=True) if p.side),
         1.0,
@@ -157,7 +160,7 @@ def _fingerprint(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart: i
 
 
 def _against_motion(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart: int) -> None:
-    """Plot the force that the linear chain leaves over the quantity on which it depends."""
+    """Plot the force that the linear chain does not explain over its cause."""
     motion = run.rate() if term.effect.axis == "velocity" else run.with_it
     force, seen, word = run.residual_force(chain)[cart - 1], motion[cart - 1], f"of cart {cart}"
     if term.effect.place == "spring":
@@ -179,7 +182,7 @@ def _against_motion(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart
 
 
 def _against_input(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart: int) -> None:
-    """Plot the force on cart 1 over the input; the input is slow enough to show the law."""
+    """Plot the force on cart 1 over the input, which changes slowly enough to show the law."""
     size = float(np.max(np.abs(run.u)))
     u = size * np.sin(2 * np.pi * run.t / _DURATION)
     slow = _run("ramp", AugmentedChain(chain=chain, terms=(term,)), run.t, u, free=run.free)
@@ -190,7 +193,7 @@ def _against_input(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart:
 
 
 def _about_an_edge(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart: int) -> None:
-    """Plot the force on cart 1 around an edge of the input."""
+    """Plot the force on cart 1 around a jump of the input."""
     near = (run.t > _STEP[1] - 0.02) & (run.t < _STEP[1] + 0.08)
     milliseconds = 1e3 * (run.t[near] - _STEP[1])
     arriving = run.residual_force(chain)[0] + run.u
@@ -201,11 +204,11 @@ def _about_an_edge(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart:
 
 
 def _over_frequency(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart: int) -> None:
-    """Plot the cart's response over frequency, computed from its response to a short pulse."""
-    t = np.arange(0.0, 12.0, 1 / _RATE)  # s; until the response to the pulse has ended
+    """Plot the cart's frequency response, computed from its response to a short pulse."""
+    t = np.arange(0.0, 12.0, 1 / _RATE)  # s; by then the response to the pulse has ended
     padded = 2 * t.size
     u = np.zeros(t.size)
-    u[20:40] = 1.0  # short compared with every period
+    u[20:40] = 1.0  # short compared with every period of oscillation
     model = AugmentedChain(chain=chain, terms=(term,))
     pulse = _run("pulse", model, t, u, free=tuple(range(1, chain.n + 1)))
     hertz, omega = np.fft.rfftfreq(padded, 1 / _RATE), np.abs(chain.poles) / (2 * np.pi)
@@ -229,7 +232,10 @@ def _against_truth(ax: Axes, run: _Run, *, cart: int) -> None:
 
 
 def _cloud(ax: Axes, x: Array, y: Array) -> None:
-    """Plot points; the axes leave out the spikes that differences cause at a jump."""
+    """Plot points;
+
+    the axes leave out the spikes that numerical differentiation causes at a jump.
+    """
     shown = np.linspace(0, x.size - 1, min(x.size, 500)).astype(int)
     ax.plot(x[shown], y[shown], ".", color=MODEL, ms=2.6, mew=0)
     low, high = np.quantile(y, [0.002, 0.998])

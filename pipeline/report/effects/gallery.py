@@ -23,7 +23,7 @@ BENCH = "throne-2dof"  # the smallest preset with a spring between two carts
 
 
 def render_effects(effects: Sequence[Effect], out: Path, *, progress: Progress = silent) -> None:
-    """Write `effects.html` and `figures/*.svg` into the folder `out`; the same bytes each time."""
+    """Write `effects.html` and `figures/*.svg` into `out`; repeated calls write the same bytes."""
     write_document(build_gallery(effects, progress=progress), out, name="effects", pdf=False)
 
 
@@ -97,7 +97,7 @@ def hiding_command(term: EffectTerm) -> str:
 
 
 def hiding_option(term: EffectTerm) -> str:
-    """Return the option of that command."""
+    """Return the option `--hide` of that command."""
     place = [f"{term.effect.place}={term.place}"] if term.place else []
     pairs = zip(term.effect.parameters, term.values, strict=True)
     sizes = [f"{p.name}={value:.3g}" for p, value in pairs if p.reported]

@@ -1,9 +1,9 @@
 """Equations as text: shown as mathematics, worked out with numbers, and checked by tests.
 
-A derivation is a list of `Equation`s. Each side is a line of Python arithmetic ("K_2/K_1*w_2"). So
-the same text is shown to readers, computed with numbers, and given to a computer algebra system in
-the tests. Names are shown in usual notation: `w_2` is the square of omega_2, `left_2` is the ratio
-k_2/m_2.
+A derivation is a list of `Equation`s. Each side is a line of Python arithmetic, such as
+"K_2/K_1*w_2". The same text is shown to readers, computed with numbers, and checked in the tests by
+a computer algebra system. Names are shown in usual notation: `w_2` is the square of omega_2,
+`left_2` is the ratio k_2/m_2.
 """
 
 import ast
@@ -26,8 +26,8 @@ from pipeline.words.math import (
 )
 from pipeline.words.numbers import significant
 
-DIGITS = 5  # digits shown; calculations use all
-_IN_S = ("Delta", "N", "R", "P", "X", "U")  # names of functions of s
+DIGITS = 5  # digits shown; all digits are used in calculations
+_IN_S = ("Delta", "N", "R", "P", "X", "U")  # names that are functions of s
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,12 @@
 All equations are text that `algebra` shows and computes. The tests check each of them against the
 impedance matrix with a computer algebra system.
 
-Delta(s) is the monic characteristic polynomial of the whole chain. N(s) is that of carts 2 to n,
-and R(s) that of carts 3 to n, with the carts before them held. P_i(s) is that of cart i alone. The
-paper's common denominator is Delta(s) divided by its constant term. With three carts, the paper's
-numerator of cart 1 is N(s) divided by its own. Coefficients are d_0, d_1, …; n_0, …; r_0, ….
+Delta(s) is the monic characteristic polynomial of the whole chain. N(s) is the characteristic
+polynomial of carts 2 to n while cart 1 is held. R(s) is that of carts 3 to n while carts 1 and 2
+are held. P_i(s) is that of cart i while all other carts are held. The paper's common denominator is
+Delta(s) divided by its constant term. With three carts, the paper's numerator of cart 1 is N(s)
+divided by its constant term. Coefficients are d_0, d_1, … for Delta, n_0, … for N, and r_0, … for
+R.
 """
 
 from collections.abc import Sequence
@@ -15,7 +17,7 @@ from itertools import product
 from pipeline.plant.linear.chain import Chain
 from pipeline.report.equations.algebra import Equation, work_out
 
-MOST_CARTS = 4  # there are no letters for the polynomials of more carts
+MOST_CARTS = 4  # The polynomials of longer chains have no letters.
 _LETTERS = "dnr"  # letters of the coefficients
 _POLYNOMIALS = ("Delta", "N", "R")
 _MODES = "abcd"
@@ -26,7 +28,7 @@ _NULLS = "xy"
 
 
 def newton(springs: Sequence[bool]) -> list[Equation]:
-    """Return Newton's law of every cart, with each force as it acts on the free body."""
+    """Return Newton's law for every cart, with each force as it acts on the free body."""
     n = len(springs) - 1
     return [
         Equation(f"{of_cart('m', i, n)}*ddx_{i}", "+".join(_forces(i, springs)).replace("+-", "-"))
@@ -48,7 +50,7 @@ def _forces(i: int, springs: Sequence[bool]) -> list[str]:
 
 
 def laplace(springs: Sequence[bool]) -> list[Equation]:
-    """Return the Laplace transforms of Newton's laws at rest, sorted by position."""
+    """Return the Laplace transforms of Newton's laws (start from rest), with X_i on the left."""
     n = len(springs) - 1
     equations = []
     for i in range(1, n + 1):
@@ -81,7 +83,7 @@ def of_cart(letter: str, i: int, n: int) -> str:
 
 
 def single_carts(springs: Sequence[bool]) -> list[Equation]:
-    """Return the equations for frequency and damping of each cart alone."""
+    """Return equations for frequency and damping of each cart while the others are held."""
     n = len(springs) - 1
     equations = []
     for i in range(1, n + 1):
@@ -112,9 +114,9 @@ def tail(i: int, n: int) -> str:
 
 
 def elimination(n: int) -> list[Equation]:
-    """Return the steps that eliminate carts from the last to the first.
+    """Return the steps that eliminate the carts, from the last to the first.
 
-    Each step expresses a cart by the one before it.
+    Each step expresses the position of a cart by that of the cart before it.
     """
     equations = []
     for i in range(n, 1, -1):
@@ -143,7 +145,7 @@ def transfer(n: int) -> list[Equation]:
 
 
 def static_gains(n: int) -> list[Equation]:
-    """Return the gains at s = 0, each computed from the one before."""
+    """Return the static gains, each computed from the gain of the cart before it."""
     first = Equation("K_1", f"inverse_m_1*({_constant(2, n)}/d_0)")
     return [first] + [
         Equation(
@@ -197,7 +199,7 @@ def _coefficient(modes: str, order: int) -> str:
 
 
 def carts_alone(n: int) -> list[Equation]:
-    """Return each cart's own damping and frequency, from the last cart to the first, and kappa."""
+    """Return the damping g_i and squared frequency w_i of each cart while the others are held."""
     equations = [Equation(f"g_{n}", f"2*zeta_{n}*omega_{n}"), Equation(f"w_{n}", f"omega_{n}**2")]
     for i in range(n - 1, 0, -1):
         whole, rest = _named(i, n), _named(i + 1, n)
@@ -233,12 +235,12 @@ def couplings(n: int) -> list[Equation]:
 
 
 def given(chain: Chain) -> dict[str, float]:
-    """Return the values from which the steps start: the parameters of a chain tied to a wall."""
+    """Return the values with which the derivation starts, for a chain that is tied to a wall."""
     return chain.parameters() | unnamed(chain)
 
 
 def unnamed(chain: Chain) -> dict[str, float]:
-    """Return coefficients in place of parameters, because the inner carts of four have no names."""
+    """Return the coefficients that four carts need in addition to the named parameters."""
     found = {}
     for i in range(2, chain.n) if chain.n > 3 else ():
         falling = chain.tails()[i - 1]
@@ -250,7 +252,7 @@ def unnamed(chain: Chain) -> dict[str, float]:
 
 
 def work_state_model(chain: Chain) -> dict[str, float]:
-    """Return all quantities between the named parameters and the entries of A and B."""
+    """Return the values of all quantities that lead from the named parameters to A and B."""
     return work_out(state_steps(chain.n), given(chain))
 
 
@@ -283,10 +285,10 @@ def physical(springs: Sequence[bool]) -> list[Equation]:
 
 
 def redundancies(n: int) -> list[Equation]:
-    """Return the laws that a table must satisfy; the consistency checks call them R1, R2, …
+    """Return the relations that a parameter table must satisfy; the checks call them R1, R2, …
 
-    There are more transfer-function parameters than physical ones. Each relation that the steps
-    above did not use is a check on the table.
+    A table has more parameters than the carts have masses, dampings and springs. Each relation that
+    the steps above did not use is a check on the table.
     """
     laws = []
     for i in range(n - 1, 0, -1):

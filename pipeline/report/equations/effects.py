@@ -10,16 +10,16 @@ from pipeline.report.document import Formula
 from pipeline.report.equations.model import equations_of_motion, formula
 from pipeline.words.math import WIDE_SPACE, Math, Term, dot, row, sub, upright
 
-_LINEAR_PART = ("k", "d", "+")  # part of a spring's law that the linear chain already has
+_LINEAR_PART = ("k", "d", "+")  # start of a spring's law that is already part of the linear chain
 _ACTS = ("f", "=")
 _COMMAND = sub("u", "command")
 _MOTOR_MASS = sub("m", "m")
 
 
 def in_order(terms: Sequence[EffectTerm]) -> list[int]:
-    """Return the indices of the effects in the order of their letters.
+    """Return the indices of the effects in the order in which they get their letters.
 
-    That is their own order, except that changes of the input follow each other as in the simulator.
+    This is the order of `terms`, except that effects on the input follow the simulator's order.
     """
     steps = input_steps(terms)
     after = iter(steps)
@@ -29,9 +29,9 @@ def in_order(terms: Sequence[EffectTerm]) -> list[int]:
 def augmented_equations(springs: Sequence[bool], terms: Sequence[EffectTerm]) -> Formula:
     """Return Newton's law of every cart, in which each effect adds a force.
 
-    The forces have the letters a, b, … in the order of the effects. The first cart feels the input
-    after its last change. With a play it feels the contact's force; the mass of the motor is part
-    of its mass and is subtracted.
+    The forces are named by the letters a, b, … of the effects. Cart 1 is driven by the input as
+    changed by all effects on the input. If there is play between the motor and cart 1, the force of
+    the contact drives the cart, and the motor's mass is subtracted from the cart's mass.
     """
     n = len(springs) - 1
     letters = _letters(terms)
@@ -59,8 +59,8 @@ def augmented_equations(springs: Sequence[bool], terms: Sequence[EffectTerm]) ->
 def law(terms: Sequence[EffectTerm], index: int) -> Formula:
     """Return the law of one effect, with its letter in the equations of motion.
 
-    A change of the input starts from the change before it. A force that depends on the input
-    depends on the input after its last change.
+    An effect on the input starts from the output of the previous effect on the input. A force that
+    depends on the input uses the input after all these effects.
     """
     term, letter = terms[index], _letters(terms)[index]
     effect, parts = term.effect, term.effect.formula.parts
@@ -107,24 +107,24 @@ def _letters(terms: Sequence[EffectTerm]) -> dict[int, str]:
 
 
 def _arriving(terms: Sequence[EffectTerm], *, before: EffectTerm | None = None) -> Term:
-    """Return the symbol of the input after its last change, or before one of its changes."""
+    """Return the symbol of the input after all effects on it, or just before one of them."""
     steps = input_steps(terms)
     done = steps if before is None else steps[: steps.index(before)]
     return sub("u", _letters(terms)[terms.index(done[-1])]) if done else "u"
 
 
 def _play(terms: Sequence[EffectTerm]) -> int | None:
-    """Return the index of the play between motor and cart 1, or None."""
+    """Return the index of the effect that is a play between motor and cart 1, or None."""
     return next((i for i, term in enumerate(terms) if term.effect.has_play), None)
 
 
 def _on_motor(term: EffectTerm) -> bool:
-    """Return whether the force acts on the motor if there is a play."""
+    """Return whether the force acts on the motor when there is play between motor and cart 1."""
     return isinstance(term.effect.law, ForceLaw) and term.effect.law.on_motor
 
 
 def _replaced(terms: Sequence[Term], by: Mapping[Term, Term]) -> list[Term]:
-    """Return terms with other symbols, at any depth."""
+    """Return the terms with symbols replaced, also inside nested terms."""
     return [
         by[term]
         if term in by

@@ -31,11 +31,11 @@ from pipeline.words.math import (
 from pipeline.words.numbers import significant
 
 _DIGITS = 4
-_ALL_DIGITS = 10  # as in results.json
+_ALL_DIGITS = 10  # the same number as in results.json
 
 
 def formula(math: Math, *, copy: str = "") -> Formula:
-    """Return a displayed equation with its text alternative."""
+    """Return a displayed equation; its text alternative is made from it."""
     return Formula(math=math, alt=to_text(math), copy=copy)
 
 
@@ -49,7 +49,7 @@ def equations_of_motion(
 
     Parameters
     ----------
-    forces : the right-hand side for each cart; default: the input on the first cart.
+    forces : the right-hand side of each cart's equation; by default, the input acts on cart 1.
     """
     n = len(springs) - 1
     equations = []
@@ -129,9 +129,9 @@ def _side_by_side(terms: Sequence[Math]) -> Math:
 
 
 def symbolic_transfer_functions(springs: Sequence[bool]) -> Formula | None:
-    """Return X_i/U as in the paper; None if the parameters have no names.
+    """Return X_i/U as in the paper, or None if the parameters have no names.
 
-    They have names for one to three carts of which a spring ties at least one to a wall.
+    Parameters have names if the chain has one to three carts and is tied to a wall by a spring.
     """
     n = len(springs) - 1
     if n > 3 or not all(springs[1:-1]) or not (springs[0] or springs[-1]):
@@ -146,7 +146,7 @@ def symbolic_transfer_functions(springs: Sequence[bool]) -> Formula | None:
 def numeric_transfer_functions(chain: Chain) -> Formula:
     """Return X_i/U with numbers: as static gain and quadratic factors, or as polynomials.
 
-    A chain that is tied to no wall has no static gain, so its polynomials are shown.
+    A chain without a spring to a wall has no static gain, so its polynomials are shown.
     """
     if not chain.is_tied:
         return formula(lines(_polynomial_ratio(chain, i) for i in range(chain.n, 0, -1)))
@@ -159,7 +159,7 @@ def numeric_transfer_functions(chain: Chain) -> Formula:
 def _over_common_denominator(
     gains: Sequence[Term], above: Sequence[Sequence[Math]], below: Sequence[Math]
 ) -> Formula:
-    """Return every X_i/U over D(s), the last cart first, and then D(s), which all share."""
+    """Return every X_i/U, the last cart first, and then the common denominator D(s)."""
     D = row("D", parens("s"))
     equations = [
         row(_ratio(i), "=", fraction(gains[i - 1], D), *map(parens, above[i - 1]))
@@ -194,7 +194,7 @@ def _numeric_factors(roots: ComplexArray) -> list[Math]:
 
 
 def _factor(*terms: Term) -> Math:
-    """Return a quadratic factor in the paper's form: the terms plus one."""
+    """Return a quadratic factor in the paper's form, in which the constant term is one."""
     return row(total([*terms, "1"]))
 
 
@@ -212,7 +212,7 @@ def _polynomial(coefficients: Array) -> Term:
     degree = coefficients.size - 1
     terms: list[Term] = []
     for exponent, value in zip(range(degree, -1, -1), coefficients, strict=True):
-        # A coefficient below this limit is zero, apart from rounding errors.
+        # A coefficient below this limit is a rounding error of zero.
         if abs(value) <= 1e-12 * np.abs(coefficients).max() and degree > 0:
             continue
         s: list[Term] = (

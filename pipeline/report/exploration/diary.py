@@ -1,4 +1,4 @@
-"""`exploration.html`: first what is known, then how it was found, turn by turn."""
+"""The page `exploration.html`: first what is known, then how it was found, turn by turn."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +30,7 @@ _WORDS = phrases("exploration")
 
 @dataclass(frozen=True, kw_only=True)
 class WeighedExplanation:
-    """One explanation of the gap: its effects in words, and its weight among the competing ones."""
+    """One explanation of the gap: its effects in words, and its weight among all explanations."""
 
     name: str
     weight: float
@@ -42,18 +42,18 @@ class Turn:
 
     Attributes
     ----------
-    seconds : time at the bench so far, including rests.
+    seconds : time at the bench up to the end of this turn, including rests.
     recorded : ids of the recordings made in this turn.
     errors : relative standard error of each parameter, by name; None if unknown.
-    verdict : of the gap analysis; "" if it was not possible.
-    explanations : the competing ones, first the one in the model; only the named one if there is no
-        competition; empty if the linear chain is enough.
-    left : error of the model as a share of the motion; None if unknown.
+    verdict : verdict of the gap analysis; "" if the analysis was not possible.
+    explanations : the competing explanations, the one in the model first; if nothing competes, only
+        the named explanation; empty if the linear chain is enough.
+    left : the model's error as a share of the motion; None if unknown.
     floor : the noise floor as a share of the motion; None if unknown.
-    reached : all requested parameters are known, and the gap is named or absent.
+    reached : whether all requested parameters are known and the gap is named or absent.
     said : results, doubts and the reason for the next recording, as sentences.
-    gap : the gap analysis of this turn, or None; for an earlier turn only with the trace that the
-        diary shows.
+    gap : the gap analysis of this turn, or None. For an earlier turn, it keeps only the trace that
+        the diary shows.
     """
 
     seconds: float
@@ -68,10 +68,10 @@ class Turn:
     gap: Gap | None = None
 
     def without_other_traces(self) -> "Turn":
-        """Return the turn with only the trace that its part of the diary shows.
+        """Return the turn without the traces that the diary does not show.
 
-        Each gap analysis has the traces of all runs so far. If all were kept, memory use would grow
-        with the square of the number of turns.
+        Each gap analysis has the traces of all runs so far. If they were all kept, memory use would
+        grow with the square of the number of turns.
         """
         if self.gap is None:
             return self
@@ -85,7 +85,7 @@ def write_diary(turns: Sequence[Turn], analysis: Analysis, folder: Path, *, want
 
     Parameters
     ----------
-    wanted : the requested relative error.
+    wanted : requested relative standard error of the parameters.
     """
     page = Page(analysis)
     sections = page.sections(
@@ -147,7 +147,7 @@ def _tone(gap: Gap | None) -> Tone:
 
 
 def _story(page: Page, turns: Sequence[Turn]) -> list[Block]:
-    """Return each turn: time, recordings, decision, and the run that led to it."""
+    """Return each turn: time, recordings, decision, and the deciding run if there is one."""
     blocks: list[Block] = []
     for number, turn in enumerate(turns, start=1):
         recorded = listing(turn.recorded) or _WORDS.text("nothing_new")
@@ -167,7 +167,7 @@ def _errors(page: Page, turns: Sequence[Turn], wanted: float) -> list[Block]:
     rows = [[name_span(name), *(_known(turn.errors.get(name)) for turn in turns)] for name in names]
     head = ["", *(f"{turn.seconds:.0f} s" for turn in turns)]
     table = page.headed_table(_WORDS.text("errors_table"), head, rows, "l" + "r" * len(turns))
-    if len(turns) < 2:  # there is no progress to draw yet
+    if len(turns) < 2:  # progress can be drawn from the second turn on
         return [table]
     figure = _shrinking(turns, names, wanted)
     return [page.picture("shrinking", figure, _WORDS, "shrinking", wanted=_known(wanted)), table]
@@ -190,7 +190,7 @@ def _shrinking(turns: Sequence[Turn], names: Sequence[str], wanted: float) -> Fi
     # Errors above 100 % count as unknown and may leave the axis.
     _whole_axes(ax, turns, [100 * wanted, *(min(e, 100.0) for e in every)])
     ax.set_ylabel("standard error [%]")
-    # The legend is next to the axes, because three carts have a dozen lines.
+    # The legend is beside the axes, because three carts need a dozen lines.
     box = ax.get_position()
     ax.set_position((box.x0, box.y0, box.width - 0.09, box.height))
     ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderpad=0.0, handlelength=1.6)
@@ -208,7 +208,7 @@ def _whole_axes(ax: Axes, turns: Sequence[Turn], values: Sequence[float]) -> Non
 
 
 def _explained(turn: Turn) -> list[str]:
-    """Return the competing explanations with their weights; without competition, no weight."""
+    """Return the competing explanations with their weights; a single explanation has no weight."""
     if len(turn.explanations) < 2:
         return [one.name for one in turn.explanations]
     weights = [
@@ -222,7 +222,7 @@ def _explained(turn: Turn) -> list[str]:
 
 
 def _gap(page: Page, turns: Sequence[Turn]) -> list[Block]:
-    """Return what the model left unexplained over time, and the explanations still possible."""
+    """Return a table and a figure of what the model left unexplained after each turn."""
     looked = [turn for turn in turns if turn.left is not None and turn.floor is not None]
     if not looked:
         return []

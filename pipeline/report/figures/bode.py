@@ -32,7 +32,7 @@ def bode_figure(response: FrequencyResponse, *, chain: Chain | None, units: Unit
 
 
 def bode_panels(response: FrequencyResponse, *, chain: Chain | None, units: Units) -> Figure:
-    """Return the figure without a legend, for callers that draw more into it."""
+    """Return the figure without a legend, so that callers can draw more into it."""
     response = _positive(response)
     has_phase = response.phase is not None
     heights = [1.3, *([0.8] if has_phase else []), *([0.5] if chain else [])]
@@ -101,7 +101,10 @@ def plot_magnitude(
 
 
 def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) -> None:
-    """Plot the phase in degrees; measured values are on the branch nearest to the fit."""
+    """Plot the phase in degrees;
+
+    each measured value is shifted by full turns to be nearest to the fit.
+    """
     assert response.phase is not None
     phase = np.unwrap(response.phase)
     if chain:
@@ -153,11 +156,11 @@ def _positive(response: FrequencyResponse) -> FrequencyResponse:
 
 
 def _points(ax: Axes, x: Array, y: Array, error: Array | None, *, label: str = "") -> None:
-    """Plot diamonds with error bars; all bars are one path.
+    """Plot diamonds with error bars; all bars together are one path.
 
     Parameters
     ----------
-    error : (n,), or (2, n) for below and above; None: no bars.
+    error : (n,), or (2, n) for the parts below and above the point; None draws no bars.
     """
     (drawn,) = ax.plot(
         x, y, "D", ms=3.2, mew=0.8, mfc="white", color=MEASURED, label=label or None, zorder=3
@@ -170,15 +173,15 @@ def _points(ax: Axes, x: Array, y: Array, error: Array | None, *, label: str = "
 
 
 def _fitted(response: FrequencyResponse, chain: Chain) -> tuple[Array, Array]:
-    """Return frequencies, and the chain's magnitudes there in decibels."""
+    """Return frequencies, and the magnitude of the fitted chain at each of them in decibels."""
     omega = _dense(response.omega, chain)
     magnitude = np.abs(chain.frequency_response(omega)[response.cart - 1])
-    highest = 100.0 * float(response.magnitude.max())  # without damping, a peak would have no limit
+    highest = 100.0 * float(response.magnitude.max())  # without damping, a peak would be infinite
     return omega, _decibel(np.minimum(magnitude, highest))
 
 
 def _dense(omega: Array, chain: Chain) -> Array:
-    """Return a fine grid that includes every resonance, so that sharp peaks are drawn fully."""
+    """Return a fine grid that includes every resonance, so that no sharp peak is cut off."""
     low, high = 0.9 * float(omega.min()), 1.1 * float(omega.max())
     modes = np.abs(chain.poles)
     grid = np.geomspace(low, high, 300)

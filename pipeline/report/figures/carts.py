@@ -10,15 +10,15 @@ from pipeline.report.figures.style import WIDTH
 from pipeline.words.numbers import subscript
 
 # Inches:
-_CART = 0.54  # width and height of a cart
-_GAP = 0.05  # between an arrow and its name
+_CART = 0.54  # width and height of a cart in the drawing
+_GAP = 0.05  # distance between an arrow and its name
 _ROW = 0.9  # height of the figure for each cart
 
 
 def free_body_figure(springs: Sequence[bool]) -> Figure:
     """Draw each cart alone with the forces on it and the positive direction.
 
-    They are drawn on the figure itself, without axes, because there is nothing to zoom into.
+    The figure has no axes, because there is nothing to zoom into.
     """
     n = len(springs) - 1
     figure = Figure(figsize=(WIDTH, _ROW * n))
@@ -55,7 +55,7 @@ def _draw_cart(figure: Figure, i: int, springs: Sequence[bool], *, y: float) -> 
 
 
 def _left_forces(i: int, springs: Sequence[bool]) -> list[str]:
-    """Return the forces towards negative x when the cart is right of its rest and moves right."""
+    """Return the forces to the left while the cart is right of its rest and moves right."""
     n = len(springs) - 1
     index = "" if n == 1 else subscript(i)
     forces = []

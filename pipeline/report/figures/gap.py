@@ -1,4 +1,4 @@
-"""Figures of the gap: before and after in time, run by run, and as a force over its cause."""
+"""Figures of the gap: motion before and after, errors run by run, and force over its cause."""
 
 from collections.abc import Sequence
 
@@ -27,8 +27,8 @@ from pipeline.words.text import clean
 
 # Name of the model that has effects besides masses, dampings and springs.
 ADDED = "with the effects"
-_RESIDUALS = 1.0  # inches: height of the residuals' panel
-_SEEN = 3.0  # points: a narrower band is hidden by the lines of the residuals
+_RESIDUALS = 1.0  # height of the panel of residuals in inches
+_SEEN = 3.0  # points; a narrower band is hidden by the lines of the residuals
 
 
 # ---------------------------------------------------------------------- in time
@@ -47,7 +47,7 @@ def before_after_figure(
     Parameters
     ----------
     added : name of the model with effects; "" if it has no effects.
-    touched : times and readings of stretches next to the run in which a hand moved a cart.
+    touched : times and readings just before or after the run, while the cart was moved by hand.
     """
     models = _models(trace, added)
     figure, (above, below) = panels(1.5, _RESIDUALS)
@@ -70,7 +70,7 @@ def before_after_figure(
 
 
 def band_shows(trace: Trace, *, noise: float, added: str = ADDED) -> bool:
-    """Return whether the band of the noise is wide enough to be seen behind the residuals."""
+    """Return whether the noise band is wide enough to be seen behind the residuals."""
     largest = max(float(np.ptp(trace.measured - y)) for y in _models(trace, added).values())
     return 4 * noise * 72.0 * _RESIDUALS > _SEEN * max(largest, 4 * noise)
 
@@ -84,7 +84,7 @@ def _models(trace: Trace, added: str) -> dict[str, Array]:
 def predicted_figure(
     prediction: Prediction, *, names: tuple[str, str], position_unit: str
 ) -> Figure:
-    """Return the predictions of two explanations for a recording, and their difference."""
+    """Return a figure of a recording as predicted by two explanations, and of their difference."""
     figure, (above, below) = panels(1.5, 1.0)
     first, second = prediction.positions[list(prediction.pair)]
     one, other = names
@@ -102,7 +102,7 @@ def predicted_figure(
 
 
 def by_record_figure(rows: Sequence[RecordGap], *, added: str = ADDED) -> Figure:
-    """Return the error of every run and cart before and after, and its noise.
+    """Return a figure of the error before and after in every run, cart by cart, next to the noise.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def by_record_figure(rows: Sequence[RecordGap], *, added: str = ADDED) -> Figure
 
 
 def plot_by_record(ax: Axes, rows: Sequence[RecordGap], *, added: str = ADDED) -> None:
-    """Plot, for each run and cart, a bar from the error before to that after, and a noise tick."""
+    """Plot a bar from the error before to the error after for each run and cart, and the noise."""
     y = -np.arange(len(rows), dtype=float)
     before, after, noise = (
         100 * np.array([getattr(row, name) for row in rows])
@@ -146,7 +146,7 @@ def force_figure(
     units: tuple[str, str],
     added: str = ADDED,
 ) -> Figure | None:
-    """Return the force that the linear part leaves, over the quantity on which the effect depends.
+    """Return a figure of the force that the linear part does not explain, over its cause.
 
     Returns None if no run shows it, because a neighbouring cart was not measured or the effect
     changes only the timing.
@@ -196,7 +196,7 @@ def force_figure(
 def plot_force(
     ax: Axes, shown: Sequence[tuple[Array, Array, Array]], *, added: str = ADDED
 ) -> None:
-    """Plot the measured points and, smaller, those of the model.
+    """Plot the measured points and, with smaller marks, the model's points.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def plot_force(
 
 
 def force_left_figure(residual: Residual) -> Figure:
-    """Return the force left on a cart over each quantity, with the curve of the formula."""
+    """Plot the unexplained force on a cart over each quantity, with the fitted formula."""
     figure, axes = panels(*(1.6 for _ in residual.against), share_x=False)
     for ax, shown in zip(axes, residual.against, strict=True):
         bars = [0.0 if spread is None else spread for spread in shown.spread]
@@ -231,7 +231,7 @@ def force_left_figure(residual: Residual) -> Figure:
 def timing_figure(
     forces: Sequence[ResidualForce], *, drive: str, added: str = ADDED
 ) -> Figure | None:
-    """Return the force on cart 1 around the sharpest edge of the input."""
+    """Return a figure of the force on cart 1 around the sharpest jump of the input."""
     own = [f for f in forces if f.cart == 1 and np.ptp(f.u) > 0]
     if not own:
         return None
@@ -269,7 +269,7 @@ def spectrum_figure(traces: Sequence[Trace], *, position_unit: str, added: str =
             pooled[i] += np.abs(spectrum / window.sum()) ** 2
     motion, before, after = np.sqrt(pooled)
     total = np.cumsum(motion**2)
-    # Show frequencies up to 1.5 times the one below which nearly all of the motion lies.
+    # Show frequencies up to 1.5 times the one below which 99.5 % of the motion lies.
     end = 1.5 * f[np.searchsorted(total, 0.995 * total[-1])]
     shown = (f > 0) & (f <= max(end, 8 * f[1]))
     step = max(1, int(np.count_nonzero(shown) / 600))

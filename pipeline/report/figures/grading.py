@@ -1,4 +1,4 @@
-"""Figures of a graded class, and of reported numbers next to the recordings."""
+"""Figures for a graded class, and figures of reported numbers next to the recordings."""
 
 from collections.abc import Sequence
 
@@ -41,7 +41,7 @@ def two_distributions_figure(before: Sequence[int], after: Sequence[int]) -> Fig
 
     Parameters
     ----------
-    before, after : number of submissions in each tenth of the points, from the lowest on.
+    before, after : number of submissions in each tenth of the points, starting from zero points.
     """
     edges = np.linspace(0.0, 100.0, len(before) + 1)
     width = 0.42 * (edges[1] - edges[0])
@@ -60,7 +60,7 @@ def two_distributions_figure(before: Sequence[int], after: Sequence[int]) -> Fig
 
 
 def difficulty_figure(titles: Sequence[str], shares: Array) -> Figure:
-    """Return the mean share of the points earned in each criterion, as a bar below its title.
+    """Return a bar for each criterion: the mean share of its points that was earned.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def reported_bode_figure(
 
     Parameters
     ----------
-    reported : the transfer functions of the reported parameters; None draws no curve.
+    reported : transfer functions of the reported parameters; None draws no curve.
     """
     figure = bode_panels(response, chain=chain, units=units)
     ax = figure.axes[0]
@@ -118,11 +118,11 @@ def reported_bode_figure(
 def reported_step_figure(
     gain: StepGain, *, record: Record, reported: float, title: str, position_unit: str
 ) -> Figure:
-    """Return a step recording with the level that the reported gain would give.
+    """Return a step recording with the level that the reported gain predicts.
 
     Parameters
     ----------
-    title : the number as reported and as the recording gives it.
+    title : the reported number and the measured one.
     """
     figure = step_figure([[gain]], records=[record], position_unit=position_unit)
     (ax,) = figure.axes
@@ -141,18 +141,18 @@ def reported_decay_figure(
     title: str,
     position_unit: str,
 ) -> Figure:
-    """Return a decay with the curve that the reported numbers would give from the same start.
+    """Return a decay with the curve that the reported numbers predict for the same start.
 
     Parameters
     ----------
-    reported : natural frequency (rad/s) and damping ratio; a curve that would swing too fast to be
-        visible, or would not swing, is not drawn.
-    title : the numbers as reported and as the recording gives them.
+    reported : natural frequency (rad/s) and damping ratio. The curve is not drawn if it would be
+        too fast to be visible or would not oscillate.
+    title : the reported numbers and the measured ones.
     """
     figure = decay_figure([decay], records=[record], position_unit=position_unit)
     (ax,) = figure.axes
     omega, zeta = reported
-    # Draw it even if hertz and rad/s were confused, which is a factor of 6.3.
+    # Draw the curve even if hertz and rad/s were confused, which is a factor of 6.3.
     if 0 <= zeta < 1 and 0 < omega < 10.0 * decay.omega_n:
         t = np.linspace(decay.peak_t[0], decay.fit_t[-1], 2000)
         rest = (decay.envelope_upper[-1] + decay.envelope_lower[-1]) / 2

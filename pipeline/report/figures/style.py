@@ -1,7 +1,7 @@
 """The style of all figures.
 
-Measured data are points (dark; single values are diamonds) and models are lines (blue). So figures
-are clear in grey and to colour-blind readers. Text stays text, which can be searched and selected.
+Measured data are dark points, and single values are diamonds. Models are blue lines. So figures are
+clear in grey and to colour-blind readers. Text stays text that can be searched and selected.
 """
 
 import warnings
@@ -24,10 +24,10 @@ from pipeline.report.figures.svg import tell
 from pipeline.words.numbers import subscript
 from pipeline.words.text import clean
 
-WIDTH = 5.2  # inches: as wide as the text of a page, three quarters of this on a phone
-_LIFT = 0.22  # inches from the titles of panels to a legend above
+WIDTH = 5.2  # inches; as wide as the text of a page (a phone shows three quarters)
+_LIFT = 0.22  # inches between the titles of panels and a legend above them
 _STYLE: dict[Any, Any] = {
-    "font.family": ["DejaVu Sans"],  # this font comes with matplotlib, so the PDF has it too
+    "font.family": ["DejaVu Sans"],  # matplotlib comes with this font, so the PDF has it too
     "font.size": 8.5,
     "axes.titlesize": 8.5,
     "axes.labelsize": 8.5,
@@ -49,7 +49,7 @@ _STYLE: dict[Any, Any] = {
 def drawing() -> Iterator[None]:
     """Draw in the report's style, whatever the user's own matplotlib settings are."""
     with matplotlib.rc_context(), warnings.catch_warnings():
-        # matplotlib's font may lack a name's characters, such as Chinese; the reader's browser has
+        # matplotlib's font may lack characters of a name, such as Chinese; the reader's browser has
         # them.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         matplotlib.rcdefaults()
@@ -66,8 +66,8 @@ def panels(
 ) -> tuple[Figure, list[Axes]]:
     """Return a figure with rows of the given heights (inches), and its axes row by row.
 
-    Margins are set in inches. If matplotlib computed them, it would draw every figure twice. Panels
-    that do not share their time axis each get room for tick labels and a title.
+    Margins are set in inches; if matplotlib computed them, it would draw every figure twice. Panels
+    with separate time axes each get room for tick labels and a title.
     """
     left, right, bottom = 0.62, 0.12, 0.47  # inches for tick labels and axis titles
     top = 0.26 + (_LIFT if titled else 0.0)  # for a legend
@@ -97,7 +97,8 @@ def panels(
                 sharex=first if share_x else None,
                 sharey=first if share_y else None,
             )
-            # Fixed positions line the labels up, and save a search among all tick labels.
+            # Axis labels at fixed positions are aligned, and matplotlib need not measure the tick
+            # labels.
             ax.yaxis.set_label_coords(-0.46 / width, 0.5)
             ax.xaxis.set_label_coords(0.5, -0.31 / heights[row])
             axes.append(ax)
@@ -107,26 +108,26 @@ def panels(
 def small_multiples(
     titles: Sequence[str], *, height: float, share_y: bool
 ) -> tuple[Figure, list[Axes]]:
-    """Return a panel below each title, with a common time axis, so that repeats can be compared."""
+    """Return a panel for each title, all with the same time axis, to compare repeats."""
     columns = 2 if len(titles) == 4 else min(len(titles), 3)
     rows = -(-len(titles) // columns)
     figure, axes = panels(*[height] * rows, columns=columns, share_y=share_y, titled=True)
     for spare in axes[len(titles) :]:
         figure.delaxes(spare)
-    # The titles of a row together have room for 60 characters.
+    # The titles in one row have room for 60 characters in total.
     for ax, title in zip(axes, _short(titles, most=60 // columns), strict=False):
         ax.set_title(title, loc="left", y=1.0)
     return figure, axes[: len(titles)]
 
 
 def _short(titles: Sequence[str], *, most: int) -> list[str]:
-    """Return titles with at most so many characters.
+    """Return titles with at most `most` characters.
 
-    A common beginning of long titles is cut off.
+    If a title is too long, the beginning that all titles share is cut off.
     """
     titles = [clean(title) for title in titles]
     if len(titles) > 1 and max(map(len, titles)) > most:
-        # The first and the last title in alphabetical order share only what all titles share.
+        # What the first and last title in alphabetical order share, all titles share.
         pairs = zip(min(titles), max(titles), strict=False)
         same = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
         titles = [f"…{title[same:]}" for title in titles] if same > 1 else titles
@@ -134,7 +135,7 @@ def _short(titles: Sequence[str], *, most: int) -> list[str]:
 
 
 def shorten(text: str, *, most: int) -> str:
-    """Return a text with at most so many characters; an ellipsis replaces its middle.
+    """Return a text with at most `most` characters; an ellipsis replaces the middle.
 
     Names of recordings differ at their ends: `sweep_cart1_low`, `sweep_cart1_high`.
     """
@@ -162,7 +163,7 @@ def log_frequency_axis(ax: Axes, omega: Array) -> None:
 
 
 def legend_above(ax: Axes, *, columns: int = 4) -> None:
-    """Put the legend above the axes and their title, where it covers no data."""
+    """Put the legend above the axes and the title, where it covers no data."""
     figure = ax.get_figure(root=True)
     assert figure is not None
     tall = ax.get_position().height * figure.get_size_inches()[1]
@@ -186,9 +187,9 @@ def legend_above(ax: Axes, *, columns: int = 4) -> None:
 def thin(t: Array, y: Array) -> tuple[Array, Array]:
     """Keep the smallest and largest value of each stretch of a long line, in order of time.
 
-    So every peak stays visible, and also the envelope of oscillations too fast to be seen.
+    So every peak stays visible, and so does the envelope of a fast oscillation.
     """
-    buckets = 240  # a line gets at most twice as many points, which is finer than print
+    buckets = 240  # A line gets at most twice as many points, which is finer than print.
     if t.size <= 2 * buckets:
         return t, y
     starts = np.linspace(0, t.size, buckets + 1).astype(int)[:-1]
@@ -220,13 +221,13 @@ def plot_points(
 ) -> None:
     """Draw a time series as points, at most `most` of them, evenly spread.
 
-    More points would hide the line of the model. The points are drawn below models, whose lines are
-    thinner, so that both are visible where they agree.
+    More points would hide the model's line. The points are drawn below the thinner line of the
+    model, so that both are visible where they agree.
     """
     shown = np.linspace(0, t.size - 1, min(t.size, most)).astype(int)
-    # Points are drawn as very short strokes with round ends, all in one path. This takes a fifth of
-    # the time and a third of the text of markers. Some viewers leave out strokes of zero length.
-    # Adding the path as an artist saves matplotlib a loop over all strokes.
+    # Points are drawn as very short strokes with round ends, all in one path. This needs a fifth of
+    # the time and a third of the text that markers need. Some viewers leave out strokes of zero
+    # length. Adding the path as an artist saves matplotlib a loop over all strokes.
     points = np.column_stack([t[shown], y[shown]])
     strokes = points.repeat(2, axis=0)
     strokes[1::2, 0] += 1e-4 * (points[-1, 0] - points[0, 0])
@@ -235,13 +236,16 @@ def plot_points(
     tell(dots, t, y, name=name)
     ax.add_artist(dots)
     ax.update_datalim(points)
-    ax.autoscale_view()  # a patch does not do this by itself, and this may be the only artist
+    ax.autoscale_view()  # A patch does not do this by itself, and it may be the only artist.
 
 
 def plot_line(
     ax: Axes, t: Array, y: Array, look: Look, *, name: str, in_legend: bool = True
 ) -> None:
-    """Draw a long line, thinned to what the eye can resolve; a reader who zooms sees all of it."""
+    """Draw a long line, thinned to what the eye can resolve;
+
+    a reader who zooms in sees every sample.
+    """
     (line,) = ax.plot(*thin(t, y), label=name if in_legend else None, **look)
     tell(line, t, y, name=name)
 
@@ -252,7 +256,7 @@ def plot_model(ax: Axes, t: Array, y: Array, *, label: str = "model") -> None:
 
 
 def plot_second(ax: Axes, t: Array, y: Array, *, label: str) -> None:
-    """Draw the model with which another one is compared, for example the one without effects."""
+    """Draw the model with which the main model is compared, for example the one without effects."""
     plot_line(ax, t, y, SECOND_LINE, name=label)
 
 
@@ -261,7 +265,7 @@ def plot_residuals(ax: Axes, t: Array, residuals: Mapping[str, Array]) -> None:
 
     Parameters
     ----------
-    residuals : by the name of the model.
+    residuals : the residuals of each model, by the model's name.
     """
     ax.axhline(0.0, color=QUIET, lw=0.6)
     looks = ({"color": MODEL, "lw": 0.8}, SECOND_LINE | {"lw": 0.8})
@@ -270,9 +274,9 @@ def plot_residuals(ax: Axes, t: Array, residuals: Mapping[str, Array]) -> None:
 
 
 def keep_in_sight(ax: Axes, measured: Array) -> None:
-    """Limit the axis to the measured range plus its span.
+    """Limit the axis to the measured range, extended on both sides by its span.
 
-    An unstable model may leave this range.
+    The motion of an unstable model may leave this range.
     """
     low, high = float(np.min(measured)), float(np.max(measured))
     span = high - low or 1.0

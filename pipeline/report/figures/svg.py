@@ -17,25 +17,25 @@ from pipeline.arrays import Array
 from pipeline.report.figures.ticks import TAGS, draw_ticks
 
 _POINTS = 72.0  # units of the drawing per inch
-_SAME = 1e-6  # share of the size of the figure; closer positions are equal
+_SAME = 1e-6  # positions that differ by less than this share of the figure's size count as equal
 
-# Ids that matplotlib gives to groups. Nothing refers to them, and on a page they would not be
-# unique.
+# Ids that matplotlib gives to groups. Nothing refers to them, and they would repeat on a page with
+# several figures.
 _GROUP_ID = re.compile(r' id="[a-zA-Z0-9.]+_\d+"')
 _TAG = re.compile(rf' id="({"|".join(TAGS)})"')
 _TOLD = re.compile(r""" id=(["'])(\{.*?\})\1""")
 
 
 def tell(artist: Artist, x: Array, y: Array, *, name: str) -> None:
-    """Give a drawn series a name and its complete data; the drawing itself may be thinned out."""
+    """Give a drawn series a name and its complete data; the drawing may be thinned out."""
     artist.set_gid(json.dumps({"name": name, "x": packed_time(x), "y": _packed(y)}))
 
 
 def to_svg(figure: Figure, *, name: str, alt: str) -> str:
-    """Return the figure as an SVG element with its text alternative; the same bytes each time.
+    """Return the figure as an SVG element with its text alternative, always in equal bytes.
 
-    Panels have their limits and series their data in `data-` attributes, which `plain_svg` removes.
-    The canvas is called directly, because `savefig` would draw everything twice.
+    Limits of panels and data of series are in `data-` attributes, which `plain_svg` removes. The
+    canvas is called directly, because `savefig` would draw everything twice.
     """
     for ax in figure.axes:
         # Panels that share an axis have labels only at the bottom of a column and at the left of a
@@ -70,7 +70,7 @@ def to_svg(figure: Figure, *, name: str, alt: str) -> str:
 
 
 def blank_svg(figure: Figure) -> str:
-    """Return an empty drawing of the size that `to_svg` writes, in matplotlib's digits."""
+    """Return an empty drawing of the size that `to_svg` writes, in the same number format."""
     width, height = (f"{_POINTS * float(inches):f}" for inches in figure.get_size_inches())
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}pt" height="{height}pt" '
@@ -100,14 +100,14 @@ def _panel(ax: Axes, *, x_label: str, y_label: str) -> dict[str, object]:
 
 
 def _packed(values: Array) -> str:
-    """Return numbers as base64 of little-endian float32: seven digits in five characters."""
+    """Return numbers as base64 of little-endian float32, which has seven digits."""
     # Larger numbers do not fit into float32; only an unstable model has them.
     shown = np.clip(np.asarray(values, dtype=float), -1e38, 1e38)
     return b64encode(shown.astype("<f4").tobytes()).decode()
 
 
 def packed_time(values: Array) -> str:
-    """Return evenly spaced numbers as "first last", and others packed."""
+    """Return times as "first last" if they are evenly spaced, and otherwise as packed numbers."""
     if values.size < 2:
         return _packed(values)
     even = np.linspace(values[0], values[-1], values.size)

@@ -1,6 +1,6 @@
 """Draw ticks as one grid line and a few texts for each axis.
 
-matplotlib makes seven objects for every tick, which takes half the time of a figure.
+matplotlib makes seven objects for every tick, which takes half the time of drawing a figure.
 """
 
 import numpy as np
@@ -12,10 +12,9 @@ from matplotlib.transforms import ScaledTranslation
 from pipeline.arrays import Array
 from pipeline.report.figures.colours import GRID
 
-# Parts that a page moves or draws again when it zooms: grids, tick labels, letters that mark a
-# place.
+# Parts that a page redraws when a reader zooms: grids, tick labels, letters that mark a place.
 TAGS = ("grid-x", "grid-y", "tick-x", "tick-y", "mark")
-_SIZE = 7.5  # points; size of the labels
+_SIZE = 7.5  # size of the tick labels in points
 
 
 def draw_ticks(ax: Axes, *, label_x: bool, label_y: bool = True) -> None:
@@ -29,9 +28,9 @@ def draw_ticks(ax: Axes, *, label_x: bool, label_y: bool = True) -> None:
             continue
         low, high = sorted((ax.get_xlim, ax.get_ylim)[direction]())
         scale = (ax.get_xscale, ax.get_yscale)[direction]()
-        most = max(2, int(size / (0.45, 0.18)[direction]))  # smallest distance of ticks in inches
+        most = max(2, int(size / (0.45, 0.18)[direction]))  # smallest distances of ticks in inches
         own = axis.get_major_locator()
-        # A figure may set some ticks itself: right angles, whole numbers.
+        # A figure may choose some ticks itself, such as right angles or whole numbers.
         if type(own) in (MultipleLocator, MaxNLocator):
             ticks = np.asarray(own())
             ticks = ticks[(ticks >= low) & (ticks <= high)]
@@ -87,7 +86,7 @@ def linear_ticks(low: float, high: float, *, most: int) -> Array:
 
 
 def log_ticks(low: float, high: float) -> Array:
-    """Return 1, 2, 5, 10 … between two limits; fewer over many decades, more within one."""
+    """Return 1, 2, 5, 10 … between two limits; fewer over many decades, more within one decade."""
     exponents = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
     factors = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0) if high <= 7 * low else (1.0, 2.0, 5.0)
     factors = (1.0,) if high > 200 * low else factors
@@ -97,15 +96,15 @@ def log_ticks(low: float, high: float) -> Array:
 
 
 def tick_labels(ticks: Array) -> list[str]:
-    """Return the numbers with the same number of decimals, and with a true minus sign."""
+    """Return the numbers as text with equal numbers of decimals and with a true minus sign."""
     if ticks.size == 0:
         return []
     step = np.min(np.diff(ticks)) if ticks.size > 1 else abs(ticks[0]) or 1.0
     decimals = max(0, -int(np.floor(np.log10(step) + 1e-9)))
-    # Numbers like these are clearer as powers of ten.
+    # Very large and very small numbers are clearer as powers of ten.
     if decimals > 4 or np.abs(ticks).max() >= 1e6:
         texts = [f"{tick + 0.0:.3g}" for tick in ticks]
-    elif decimals and np.ptp(np.diff(ticks)) > 0.5 * step:  # ticks of a logarithmic axis
+    elif decimals and np.ptp(np.diff(ticks)) > 0.5 * step:  # the ticks of a logarithmic axis
         texts = [f"{tick:g}" for tick in ticks]
     else:
         texts = [f"{tick + 0.0:.{decimals}f}" for tick in ticks]

@@ -1,4 +1,4 @@
-"""Recordings over time: decays, steps, sine dwells (Figures 12-14), closed loops (15-17)."""
+"""Figures of recordings over time: decays, steps, dwells (paper: 12-14), closed loops (15-17)."""
 
 from collections.abc import Sequence
 from itertools import cycle
@@ -35,9 +35,9 @@ from pipeline.set_up import Units
 from pipeline.words.numbers import subscript
 from pipeline.words.text import clean
 
-_CYCLES_SHOWN = 10  # cycles of the steady part; few enough to see each
+_CYCLES_SHOWN = 10  # cycles shown of the steady part; few enough to tell them apart
 _LOOPS = {"closed": "loop model", "open": "model on measured input"}
-_SMALL = 1.15  # inches; height of one panel among many
+_SMALL = 1.15  # height in inches of each of many small panels
 
 
 # --------------------------------------------------------------------- decays
@@ -59,7 +59,7 @@ def decay_figure(
 
 
 def plot_decay(ax: Axes, decay: LogDecrement, *, record: Record) -> None:
-    """Plot one decay: recording, fit, envelope, and the extrema used."""
+    """Plot one decay: recording, fit, envelope, and the extrema used for the estimate."""
     fit_t, zero = decay.fit_t - decay.release, decay.release
     t, length = record.t - zero, fit_t[-1] - fit_t[0]
     shown = (t >= min(fit_t[0], 0.0) - 0.15 * length) & (t <= fit_t[-1] + 0.25 * length)
@@ -76,7 +76,7 @@ def plot_decay(ax: Axes, decay: LogDecrement, *, record: Record) -> None:
 
 
 def damping_figure(decays: Sequence[LogDecrement], *, position_unit: str) -> Figure:
-    """Return damping ratio over amplitude: a panel for each cart, a marker for each recording."""
+    """Plot damping ratio over amplitude: one panel for each cart, one marker for each recording."""
     carts = sorted({decay.cart for decay in decays})
     figure, axes = panels(1.35, columns=len(carts), share_x=False)
     for ax, cart in zip(axes, carts, strict=True):
@@ -108,7 +108,7 @@ def step_figure(
 ) -> Figure:
     """Return step recordings in small panels.
 
-    Each entry of `steps` has the carts of one recording.
+    Each entry of `steps` has the gains of all carts in one recording.
     """
     swings = [
         max(float(np.ptp(record.position(gain.cart))) for gain in gains)
@@ -125,9 +125,9 @@ def step_figure(
 
 
 def plot_step(ax: Axes, gains: Sequence[StepGain], *, record: Record) -> None:
-    """Plot the positions of all carts in a step recording, and the levels that were read.
+    """Plot the positions of all carts in a step recording, and the levels between which they move.
 
-    A level is a dashed line over the window from which it was read, behind the points.
+    A dashed line shows each level over the window in which it was measured.
     """
     for gain in gains:
         _plot_cart_points(ax, record.t, record.position(gain.cart), cart=gain.cart)
@@ -143,20 +143,20 @@ def plot_step(ax: Axes, gains: Sequence[StepGain], *, record: Record) -> None:
 
 
 def _plot_cart_points(ax: Axes, t: Array, y: Array, *, cart: int) -> None:
-    """Plot the points of one of several carts in a panel.
+    """Plot a cart's measured points in a panel that it shares with other carts.
 
-    Some of the points have the cart's marker.
+    Some points have the cart's marker.
     """
     style, name = (cart - 1) % len(CARTS), f"x{subscript(cart)}"
     colour, _, mark, _ = CARTS[style]
     plot_points(ax, t, y, most=400, name=name, color=colour)
-    # Each cart has 16 markers, at times of its own; otherwise equal motions would hide each other.
+    # Each cart has 16 markers at times of its own, so that equal motions do not hide each other.
     at = np.linspace(0, t.size - 1, 16 * len(CARTS)).astype(int)[style :: len(CARTS)]
     ax.plot(t[at], y[at], mark, ms=3.6, mfc="white", mec=colour, mew=0.9, label=name)
 
 
 def _plot_cart(ax: Axes, t: Array, y: Array, *, cart: int, lw: float = 1.0) -> None:
-    """Plot the line of one of several carts in a panel, in the cart's colour and line style."""
+    """Plot a cart's line, in its own style, in a panel that it shares with other carts."""
     colour, ls, *_ = CARTS[(cart - 1) % len(CARTS)]
     plot_line(ax, t, y, {"color": colour, "ls": ls, "lw": lw}, name=f"x{subscript(cart)}")
 
@@ -178,7 +178,7 @@ def sine_figure(points: Sequence[SinePoint], *, record: Record, position_unit: s
 
 
 def plot_sine(ax: Axes, point: SinePoint, *, record: Record) -> None:
-    """Plot the motion of one cart.
+    """Plot the motion of one cart in a dwell.
 
     The transient is shaded, and two lines show the steady amplitude.
     """
@@ -189,7 +189,7 @@ def plot_sine(ax: Axes, point: SinePoint, *, record: Record) -> None:
     plot_line(ax, t, y, {"color": QUIET, "lw": 0.7}, name="record", in_legend=False)
     plot_measured(ax, t, y, most=300)
     ax.axvspan(float(t[0]), point.steady_from, color=SHADE, lw=0, label="transient")
-    # The mean of the samples is near enough to the middle of the swing over ten cycles.
+    # Over ten cycles, the mean of the samples is close enough to the middle of the oscillation.
     middle = float(np.mean(y[steady])) if np.any(steady) else float(np.mean(y))
     for k, level in enumerate((middle - point.amplitude, middle + point.amplitude)):
         ax.plot((point.steady_from, float(t[-1])), (level, level), color=MODEL, lw=1.1,
@@ -205,12 +205,12 @@ def hardware_figure(
     record: Record | None,
     units: Units,
 ) -> Figure:
-    """Return one run: each cart with its set point, then the residuals, then the input.
+    """Return a figure of one run: each cart with its set point, the residuals, and the input.
 
     Parameters
     ----------
-    checks : for each cart, its comparison with one or two models.
-    record : None leaves out the input.
+    checks : comparison of the measurement with one or two models, for each cart.
+    record : the recording with the input; None leaves the input out.
     """
     driven = record if record is not None and record.u is not None else None
     figure, axes = panels(*[0.9, 0.62] * len(checks), *([0.6] if driven else []))
@@ -243,7 +243,7 @@ def plot_effort(ax: Axes, record: Record, *, model: Array | None) -> None:
 
 
 def plot_hardware(ax: Axes, checks: Sequence[HardwareCheck]) -> None:
-    """Plot measured points, the simulated loop, and the model driven by the measured input."""
+    """Plot the measurement, the simulated closed loop, and the model on the measured input."""
     plot_measured(ax, checks[0].t, checks[0].measured)
     for check, plot in zip(checks, (plot_model, plot_second), strict=False):
         plot(ax, check.t, check.model, label=_LOOPS[check.loop])
@@ -251,7 +251,7 @@ def plot_hardware(ax: Axes, checks: Sequence[HardwareCheck]) -> None:
 
 
 def design_figure(design: FeedbackDesign, *, units: Units) -> Figure:
-    """Return the simulated step of the designed loop: positions above, input below."""
+    """Return the simulated step of the designed loop, with the positions above the input."""
     figure, (above, below) = panels(1.5, 0.8)
     plot_design(above, design)
     above.set_ylabel(f"position [{units.position}]")
@@ -263,7 +263,7 @@ def design_figure(design: FeedbackDesign, *, units: Units) -> Figure:
 
 
 def plot_design(ax: Axes, design: FeedbackDesign) -> None:
-    """Plot the positions of all carts, and for the controlled cart the goal and its 2 % band."""
+    """Plot the positions of all carts, and the 2 % band around the controlled cart's set point."""
     r = design.reference
     ax.axhspan(r - 0.02 * abs(r), r + 0.02 * abs(r), color=SHADE, lw=0)
     ax.axhline(r, color=QUIET, lw=0.8)
@@ -277,7 +277,7 @@ def plot_design(ax: Axes, design: FeedbackDesign) -> None:
 
 
 def _alike(swings: Sequence[float]) -> bool:
-    """Return whether motions are similar enough in size to share one scale."""
+    """Return whether the motions are similar enough in size to share one scale."""
     return max(swings) < 4.0 * min(swings)
 
 

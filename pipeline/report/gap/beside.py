@@ -1,4 +1,4 @@
-"""The gap analysis that lies beside the data of a report."""
+"""Read the gap analysis that is stored beside the data of a report."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +16,7 @@ _MOST_BYTES = 10_000_000  # ten times the size for three carts and a hundred run
 
 
 def with_gap(analysis: Analysis, folder: Path) -> tuple[Analysis, "Gap | None"]:
-    """Return the analysis, and the gap analysis of the same data from its folder.
+    """Return the analysis and, if its folder has one, the gap analysis of the same data.
 
     A gap analysis of other data, or one that cannot be read, becomes a warning.
     """
@@ -31,7 +31,7 @@ def _find(folder: Path, analysis: Analysis) -> "tuple[Gap | None, str]":
         path = folder / place
         if not path.is_file():
             continue
-        from pipeline.gap.types import read_gap  # loads the catalogue of effects
+        from pipeline.gap.types import read_gap  # late: loads the catalogue of effects
 
         try:
             text = read_text(path, where=place, limit=_MOST_BYTES, error=ConfigError)

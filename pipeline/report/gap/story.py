@@ -56,10 +56,10 @@ from pipeline.words.progress import Progress, silent
 from pipeline.words.spans import Spans, plain
 from pipeline.words.text import capital, clean
 
-_MOST_ROWS = 28  # runs in the overview; gap.json has all
-LEGEND = 46  # characters of two names that fit above a figure
-_MOST_NAMES = 3  # effects named in a caption; the text above names all
-_MORE_TRACES = 3  # traces drawn after the one in the summary
+_MOST_ROWS = 28  # most runs in the overview; gap.json has all runs
+LEGEND = 46  # two names with more characters do not fit above a figure
+_MOST_NAMES = 3  # most effects named in a caption; the text above it names all
+_MORE_TRACES = 3  # traces drawn in addition to the one in the summary
 
 
 def render_gap(
@@ -144,7 +144,10 @@ def _where(page: Page, gap: Gap) -> list[Block]:
 
 
 def before_after_picture(page: Page, gap: Gap, trace: Trace, *, number: int) -> Block:
-    """Return one cart in one run: measured and both models above, the residuals below."""
+    """Return a picture of one cart in one run:
+
+    the measurement and both models, and the residuals.
+    """
     row = _row(gap, trace)
     noise = 0.0
     if row is not None and row.final > 0:
@@ -197,7 +200,7 @@ def _effect(page: Page, gap: Gap, index: int, *, forces: Sequence[ResidualForce]
 
 
 def _step(gap: Gap, found: FoundEffect) -> Spans:
-    """Return what an effect is, and the error before and after it and those kept with it."""
+    """Return a sentence on an effect, with the error before and after its group was added."""
     group = next(group for group in kept_together(gap.effects) if found in group)
     said = {
         "sentence": found.effect.sentence,
@@ -220,7 +223,10 @@ def _step(gap: Gap, found: FoundEffect) -> Spans:
 def _evidence(
     page: Page, gap: Gap, found: FoundEffect, *, forces: Sequence[ResidualForce], number: int
 ) -> list[Block]:
-    """Return the figure that shows an effect: its force over the cause, or its timing."""
+    """Return the figure that shows an effect:
+
+    its force over its cause, its timing, or a spectrum.
+    """
     axis, added = found.effect.axis, added_name(gap)
     if axis == "frequency":
         held_out = [trace for trace in gap.traces if trace.held_out]
@@ -259,7 +265,7 @@ def _runs(page: Page, gap: Gap, worst: Sequence[Trace]) -> list[Block]:
 
 
 def _force_left(page: Page, gap: Gap) -> list[Block]:
-    """Return the force that the model leaves unexplained, for each cart, with a formula for it."""
+    """Return, for each cart, the force that the model does not explain, with a formula for it."""
     if not gap.residual:
         return []
     model = whole_model(gap) if gap.effects else WORDS.text("linear_model")
@@ -294,7 +300,7 @@ def _interventions(page: Page, gap: Gap) -> list[Block]:
 
 
 def _touched(page: Page, gap: Gap, trace: Trace) -> list[tuple[Array, Array]]:
-    """Return the stretches just before and after a run in which a hand moved a cart."""
+    """Return the stretches just before and after a run during which a cart was moved by hand."""
     record = page.records.get(trace.experiment)
     if record is None:
         return []
@@ -377,9 +383,9 @@ def _distinct_effects(
 def _apart_names(
     first: Sequence[str], second: Sequence[str], *, most: int | None = None
 ) -> tuple[str, str]:
-    """Return names of two models from the effects that only one of them has.
+    """Return names for two models, made from the effects that only one of them has.
 
-    A second model without effects of its own is "without it" or "without them".
+    If the first model has all effects of the second, the second is "without it" or "without them".
     """
     one = f"with {listing(first, most=most)}"
     if second:
@@ -428,9 +434,9 @@ def _method(gap: Gap) -> list[Block]:
 
 
 def deciding_trace(gap: Gap, recorded: Collection[str]) -> Trace | None:
-    """Return the cart that the linear model describes worst in the new runs.
+    """Return the trace of the new runs that the linear model describes worst.
 
-    Without new runs, all runs count. Returns None if there are no runs.
+    If there are no new runs, all runs are considered. Returns None if there are no traces.
     """
 
     def size(trace: Trace) -> float:
@@ -442,13 +448,13 @@ def deciding_trace(gap: Gap, recorded: Collection[str]) -> Trace | None:
 
 
 def _worst_first(gap: Gap) -> list[Trace]:
-    """Return the held-out runs, the largest error before first, with one cart for each run."""
+    """Return one trace of each held-out run; the linear model's largest error comes first."""
 
     def size(trace: Trace) -> float:
         row = _row(gap, trace)
         return row.baseline if row else 0.0
 
-    # In ascending order, so that for each run the cart with the largest error is kept.
+    # In ascending order, so that the trace with the largest error of each run is kept.
     held_out = sorted((trace for trace in gap.traces if trace.held_out), key=size)
     worst = {trace.experiment: trace for trace in held_out}
     return sorted(worst.values(), key=size, reverse=True)

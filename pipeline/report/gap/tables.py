@@ -33,14 +33,14 @@ def window_table(page: Page, windows: Sequence[GapWindow], *, model: str) -> Tab
 
     Parameters
     ----------
-    model : its name, for example "the linear model".
+    model : name of the model, such as "the linear model".
     """
     rows = [(*_stretch(w), phase(w.what), percent(100 * w.share)) for w in windows]
     return page.table(WORDS, "window_table", rows, "lcddld", model=model)
 
 
 def intervention_table(page: Page, interventions: Sequence[Intervention]) -> Table:
-    """Return the stretches of time in which a hand moved a cart."""
+    """Return the stretches of time during which a cart was moved by hand."""
     rows = [(*_stretch(one), one.what) for one in interventions]
     return page.table(WORDS, "intervention_table", rows, "lcddl")
 
@@ -67,7 +67,7 @@ def effect_parameter_table(page: Page, found: FoundEffect) -> Table:
 
 
 def rival_table(page: Page, found: FoundEffect, gap: Gap) -> Table:
-    """Return the effects tried instead of this one, each fully fitted, with their scores."""
+    """Return the effects that were fully fitted in place of this one, with their scores."""
 
     def line(name: str, error: float, confidence: float, tone: Tone = "") -> list[Cell]:
         weight = f"{100 * confidence:.1f} %" if confidence >= 5e-4 else "< 0.1 %"

@@ -38,8 +38,8 @@ def verdict_title(gap: Gap) -> str:
 def error_board(gap: Gap) -> Tiles:
     """Return the errors on held-out runs: before, after, and from noise alone.
 
-    The final model has the colour of the verdict. If two explanations are possible, it has no
-    colour.
+    The final model's tile has the colour of the verdict, or no colour if two explanations are
+    possible.
     """
     tones: dict[str, Tone] = {"none": "good", "named": "good", "ambiguous": ""}
     tiles = [_tile("linear", gap.baseline)]
@@ -79,8 +79,8 @@ def scope_blocks(gap: Gap, *, position: str, drive: str) -> list[Block]:
     """Return what a sufficient linear model covers, and how large a hidden effect could be."""
     repeats = AS_REPEATS * (gap.repeatability or 0.0)
     noise = float(np.sqrt(AT_FLOOR)) * gap.noise_floor
-    # The search for effects begins only when the error exceeds both. Errors of noise and of a
-    # hidden effect add as squares.
+    # The search for effects begins only when the error exceeds both limits. Errors of noise and of
+    # a hidden effect add as squares.
     hidden = float(np.sqrt(max(noise, repeats) ** 2 - gap.noise_floor**2))
     lost = WORDS.text("lost_in_repeats" if repeats > noise else "lost_in_noise")
     blocks: list[Block] = [
@@ -90,7 +90,7 @@ def scope_blocks(gap: Gap, *, position: str, drive: str) -> list[Block]:
     for trace in gap.traces:
         far = float(np.max(np.abs(trace.measured - trace.zero)))
         reach[trace.cart] = max(far, reach.get(trace.cart, 0.0))
-    if not reach:  # not known, because the analysis was read from a file
+    if not reach:  # unknown if the analysis was read from a file
         return blocks
     said = [
         f"cart {cart} up to {significant(far, digits=3)} {position}"
@@ -187,7 +187,7 @@ def _suspicion(gap: Gap) -> str:
 
 
 def shares(gap: Gap | RecordGap) -> dict[str, str]:
-    """Return the errors before and after, and the noise, as text; of all runs or of one."""
+    """Return the errors before and after, and the noise, as text, for all runs or for one."""
     errors = {"baseline": gap.baseline, "final": gap.final, "noise_floor": gap.noise_floor}
     return {name: share(error) for name, error in errors.items()}
 
@@ -222,12 +222,12 @@ def _times_left(times: float) -> str:
 
 
 def contenders(gap: Gap) -> tuple[FoundEffect, Rival | None]:
-    """Return the chosen effect and the rival that the data cannot distinguish from it."""
+    """Return the chosen effect, and the rival (if any) that the data cannot distinguish from it."""
     close = [
         (rival.confidence, i, found, rival)
         for i, found in enumerate(gap.effects)
         for rival in found.rivals
-        if rival.nrmse_after <= 1.15 * gap.final  # nearly as good as the chosen one
+        if rival.nrmse_after <= 1.15 * gap.final  # nearly as good as the final model
         and rival.effect.grows_from != found.effect.key
     ]
     if not close:
@@ -237,9 +237,9 @@ def contenders(gap: Gap) -> tuple[FoundEffect, Rival | None]:
 
 
 def kept_together(effects: Sequence[FoundEffect]) -> list[tuple[FoundEffect, ...]]:
-    """Return the effects in their order, in groups of which each lowers the held-out error.
+    """Return the effects in their order, in groups such that each group lowers the held-out error.
 
-    A group has one effect, unless the error falls only with the next ones.
+    A group has several effects only if the first of them do not lower the error without the others.
     """
     groups: list[tuple[FoundEffect, ...]] = []
     group: tuple[FoundEffect, ...] = ()
@@ -277,7 +277,7 @@ def sizes_text(parameters: Mapping[str, NamedValue]) -> str:
 
 
 def _sizes_there(found: FoundEffect, *, several: bool) -> str:
-    """Return the sizes of one effect; if there are several effects, with its cart or spring."""
+    """Return the sizes of one effect, with its cart or spring if there are several effects."""
     place = place_name(found.where) if several else ""
     return sizes_text(found.parameters) + (f" on {place}" if place else "")
 

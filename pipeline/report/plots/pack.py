@@ -14,16 +14,15 @@ from pipeline.report.plots.runs import ComparedCart, ComparedRun
 from pipeline.report.plots.spectrum import amplitude_spectrum, thin_lines
 from pipeline.words.text import clean
 
-MOST_WHOLE = 4_000  # samples of a run that is shown completely
-# A longer run is divided into so many stretches; each keeps its ends and the extremes of its
-# signals.
+MOST_WHOLE = 4_000  # most samples of a run that is shown completely
+# A longer run is divided into this number of stretches; each keeps its ends and extremes.
 _STRETCHES = 1_000
-_LEVELS = 65_534  # levels of a number; the one below them all marks a missing number
-_SMALLEST = 1e-12  # share of the largest amplitude
+_LEVELS = 65_534  # levels of a packed number; the level below them marks a missing number
+_SMALLEST = 1e-12  # share of the largest amplitude; smaller amplitudes are drawn at this level
 
 
 def pack_run(run: ComparedRun) -> dict[str, Any]:
-    """Return a run as the page's script reads it.
+    """Return a run in the form that the page's script reads.
 
     Positions and residuals are packed separately, so that residuals keep all digits. The script
     computes each model as position minus residual.
@@ -89,10 +88,10 @@ def pack(values: Array) -> list[Any]:
 
 
 def _spectra(run: ComparedRun) -> tuple[Array, Any]:
-    """Return frequencies (k,), and an iterator over packed spectra in the order of the page.
+    """Return frequencies (k,), and an iterator over the packed spectra in the page's order.
 
-    Spectra are logarithms to base ten. If a model is simulated only from a later sample on, all
-    spectra begin there.
+    Spectra are logarithms to base ten. If the simulation of a model starts later than the run, all
+    spectra start with it.
     """
     signals = [signal for cart in run.carts for signal in _signals_of(cart)]
     first = max((int(np.argmax(np.isfinite(one))) for one in signals), default=0)

@@ -1,4 +1,4 @@
-"""The page with interactive plots: one file with its data inside, which also shows a picture.
+"""The page with interactive plots: one file that contains its data and a still picture.
 
 Without scripts, readers see the picture and the table of errors.
 """
@@ -100,13 +100,13 @@ def render_page(
 
 
 def _write_address(run: str, cart: int, model: str) -> str:
-    """Return the part of the address after "#" that makes the page show a residual."""
+    """Return the part of the address after "#" that makes the page show a model's residual."""
     lines = [("line", "measured"), ("line", model)]
     return urlencode([("run", run), ("cart", cart), *lines, ("show", "residual")])
 
 
 def _find_worst(runs: Sequence[ComparedRun]) -> tuple[str, int, float] | None:
-    """Return the run and cart that the linear model describes worst, and its error."""
+    """Return the run and cart that the linear model describes worst, and the error there."""
     found = [
         (clean(run.id), cart.cart, one.nrmse)
         for run in runs
@@ -126,7 +126,7 @@ def _tell_result(runs: Sequence[ComparedRun]) -> str:
 
 
 def _group_runs(runs: Sequence[ComparedRun]) -> list[tuple[str, list[str]]]:
-    """Return the names of the runs of each kind."""
+    """Return the ids of the runs of each kind."""
     groups = [(kind, [clean(run.id) for run in runs if run.kind == kind]) for kind in _KINDS]
     return [(_WORDS.text(f"kind_{kind}"), ids) for kind, ids in groups if ids]
 
@@ -134,7 +134,7 @@ def _group_runs(runs: Sequence[ComparedRun]) -> list[tuple[str, list[str]]]:
 def _list_errors(
     runs: Sequence[ComparedRun], names: dict[str, str]
 ) -> list[tuple[str, str, str, dict[int, str]]]:
-    """Return rows with run, model, name of the model, and each cart's error."""
+    """Return a row for each run and model, with the error for each cart."""
     rows = []
     for run in runs:
         for model in _MODELS:

@@ -34,9 +34,8 @@ class Simulated:
     Attributes
     ----------
     y : readings (n,), NaN where nothing is simulated.
-    nrmse : the error, divided by the motion. The error is the root mean square of measured minus
-        simulated position, the motion that of measured minus rest position. Both are taken over
-        the simulated samples.
+    nrmse : root mean square of measured minus simulated position, divided by that of measured minus
+        rest position, over the simulated samples.
     """
 
     model: ModelName
@@ -59,7 +58,7 @@ class ComparedRun:
 
     Attributes
     ----------
-    note : why a model is missing, or what readers must know.
+    note : why a model is missing, or what else a reader must know.
     """
 
     id: str
@@ -131,7 +130,7 @@ def _compare(record: Record, analysis: Analysis, gap: Gap | None) -> ComparedRun
 def _driven(
     record: Record, analysis: Analysis, chain: Chain, gap: Gap | None
 ) -> tuple[dict[int, list[Simulated]], str]:
-    """Return, by cart, a run simulated with the measured input and with the loop that ran.
+    """Return the simulations of each cart: on the measured input, and in the closed loop if any.
 
     The text is a note for the reader of the plot.
     """
@@ -154,10 +153,10 @@ def _driven(
 def _with_effects(
     record: Record, opened: Sequence[HardwareCheck], gap: Gap, *, springs: tuple[bool, ...]
 ) -> dict[int, Simulated]:
-    """Return, by cart, the model with effects driven by the measured input.
+    """Return, for each cart, the model with effects simulated on the measured input.
 
-    It starts from rest or from a state fitted to the run, whichever is nearer to the measurement,
-    because a dwell begins in motion.
+    The simulation starts from rest or from a state fitted to the run, whichever agrees better with
+    the measurement. A dwell, for example, begins in motion.
     """
     replays = replay_driven(record, opened, gap.model)
     found = {one.check.cart: one.model for one in replays}
@@ -195,7 +194,7 @@ def _simulated(check: HardwareCheck) -> Simulated:
 def _released(
     record: Record, analysis: Analysis, chain: Chain, gap: Gap | None
 ) -> tuple[dict[int, list[Simulated]], str]:
-    """Return, by cart, a decay simulated by the models from the moment of release; and a note."""
+    """Return the simulations of each cart in a decay from the moment of release, and a note."""
     springs = analysis.bench.springs
     run = prepare_run(record, springs=springs)
     linear = released_run(_motion_alone(run), chain)
@@ -215,7 +214,7 @@ def _released(
 
 
 def _motion_alone(run: GapRun) -> Record:
-    """Return the record of a run without the samples before its first one."""
+    """Return the record of a run from the run's first sample on."""
     record, n = run.record, run.t.size
     return replace(
         record,

@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 
-MOST_LINES = 400  # lines of a spectrum on a logarithmic axis; finer than a screen
+MOST_LINES = 400  # lines on a logarithmic axis; finer than a screen can show
 
 
 def amplitude_spectrum(t: Array, y: Array) -> tuple[Array, Array]:
     """Return frequencies (f,) in rad/s, without zero, and amplitudes (…, f) of signals (…, n).
 
-    The mean is subtracted. A Hann window reduces leakage from the ends, and its gain is corrected:
-    a sine in the middle of a line has its own amplitude there. Samples that are not evenly spaced
-    are interpolated.
+    The mean is subtracted. A Hann window reduces leakage from the ends; it is scaled so that a sine
+    at the frequency of a line has its true amplitude. Samples that are not evenly spaced are
+    interpolated.
     """
     even = np.linspace(t[0], t[-1], t.size)
     if np.max(np.abs(even - t)) > 1e-6 * (t[-1] - t[0]):
@@ -30,10 +30,10 @@ def amplitude_spectrum(t: Array, y: Array) -> tuple[Array, Array]:
 
 
 def thin_lines(amplitudes: Sequence[Array]) -> tuple[NDArray[np.intp], list[Array]]:
-    """Return which lines (k,) of spectra (f,) are kept, and the value of each spectrum there, (k,).
+    """Return the indices (k,) of the lines to keep, and each spectrum's values (k,) at these lines.
 
-    Neighbouring lines on the logarithmic axis are replaced by one with their largest value, so that
-    every peak stays. It is at the frequency where the first spectrum is largest.
+    Neighbouring lines on the logarithmic axis are replaced by one line with their largest value, so
+    that every peak stays. Its frequency is the one at which the first spectrum is largest.
     """
     count = amplitudes[0].size
     if count <= MOST_LINES:

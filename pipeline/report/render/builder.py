@@ -30,7 +30,7 @@ class PageBuilder:
     def sections(
         self, parts: Iterable[Part], *, doing: str = "", progress: Progress = silent
     ) -> tuple[Section, ...]:
-        """Return the sections that have something to show; `progress` is called before each."""
+        """Return the sections that are not empty; `progress` is called before each one."""
         found = []
         with drawing():
             for id_, title, blocks_of in parts:
@@ -53,8 +53,8 @@ class PageBuilder:
         Parameters
         ----------
         words : the texts of the page.
-        key : of its caption; `key_head` is that of its headings.
-        said : values that caption and headings contain.
+        key : key of the caption; the headings have the key `{key}_head`.
+        said : values that are inserted into the caption and the headings.
         """
         head = [rich(text) for text in words.cells(f"{key}_head", **said)]
         return self.headed_table(words.text(key, **said), head[: len(align)], rows, align)
@@ -66,7 +66,7 @@ class PageBuilder:
         rows: Iterable[Sequence[Cell | str | Spans]],
         align: str,
     ) -> Table:
-        """Return a table with the next number whose headings are not fixed texts."""
+        """Return a table with the next number, with the given caption and headings."""
         return make_table(next(self._tables), caption, head, rows, align)
 
     def picture(
@@ -84,11 +84,11 @@ class PageBuilder:
 
         Parameters
         ----------
-        name : of its file.
+        name : file name.
         words : the texts of the page.
-        key : of its caption.
-        alt : key of its text alternative; default: `key_alt`.
-        said : values that these texts contain.
+        key : key of the caption.
+        alt : key of the text alternative, by default `{key}_alt`.
+        said : values that are inserted into the caption and the text alternative.
         """
         alt = clean(words.text(alt or f"{key}_alt", **said))
         return Picture(

@@ -29,7 +29,7 @@ _ROLES = {
 }  # fmt: skip
 ALWAYS, EXPLORE, FINDER = "page.js", "explore.js", "finder.js"
 _SOMETIMES = (EXPLORE, FINDER)
-PLOTS = ("uplot.min.js", "plots.js")  # scripts of the page of plots; other pages do not have them
+PLOTS = ("uplot.min.js", "plots.js")  # scripts that only the page of plots has
 _TITLE = re.compile(r"<title>.*?</title>", re.DOTALL)
 _NARROW = " .,()"  # characters that are half as wide as a digit
 _WIDE = "±×%"  # characters that are wider than a digit
@@ -130,14 +130,14 @@ def _environment() -> Environment:
 
 
 def _mathml(term: Term, display: bool = False, alt: str = "") -> Markup:
-    mathml = to_mathml(term, display=display)  # all its text is escaped
+    mathml = to_mathml(term, display=display)  # `to_mathml` escapes all text
     return Markup(mathml.replace("<math", f'<math alttext="{escape(alt)}"', 1))
 
 
 def _svg(picture: Picture) -> Markup:
     """Return the drawing in the colours of the page; matplotlib has escaped its text.
 
-    Its title becomes a label, because browsers show a title wherever the pointer rests.
+    The drawing's title becomes a label, because browsers show a title wherever the pointer rests.
     """
     named = f'<svg aria-label="{escape(picture.alt)}" '
     svg = _TITLE.sub("", picture.svg, count=1).replace("<svg ", named, 1)
@@ -152,7 +152,7 @@ def _coloured(svg: str) -> str:
 
 
 def _tails(table: Table) -> list[str]:
-    """Return the width from the decimal mark on, for each column; "" for other columns."""
+    """Return each column's width from the decimal mark on; "" if it is not aligned on the mark."""
     columns = zip(*table.rows, strict=True)
     return [
         f"{math.ceil(max(_digits_wide(cell.parts[1]) for cell in column))}ch" if how == "d" else ""
@@ -166,7 +166,10 @@ def _heads(table: Table) -> list[str]:
 
 
 def _board(board: Tiles) -> str:
-    """Return the layout of a board: characters of its longest value, and tiles side by side."""
+    """Return the style of a board:
+
+    characters of its longest value, and number of tiles in a row.
+    """
     return f"--least:{board.longest}ch;--across:{board.across}"
 
 
@@ -176,5 +179,5 @@ def _digits_wide(text: str) -> float:
 
 @cache
 def _math_font() -> str:
-    """Return the font of the formulas; the fonts of many phones lack large brackets."""
+    """Return the font for formulas; the fonts of many phones lack large brackets."""
     return base64.b64encode((TEMPLATES / "fonts" / "mathematics.woff").read_bytes()).decode()

@@ -28,7 +28,7 @@ class Layout:
 
     Attributes
     ----------
-    text : its content as JSON.
+    text : the document's content as JSON.
     choices : changes to the default layout.
     """
 
@@ -37,12 +37,12 @@ class Layout:
 
 
 def render_pdf(document: Document) -> bytes:
-    """Return the PDF (archival A-2a, accessible UA-1), which uses only its own fonts."""
+    """Return the PDF (archival A-2a, accessible UA-1), which uses only the fonts of cartlab."""
     return print_pages(document, lay_out(document))
 
 
 def lay_out(document: Document) -> Layout:
-    """Lay out the pages, which takes most of the time; figures need not be drawn before."""
+    """Lay out the pages, before the figures need to be drawn; this takes most of the time."""
     text = json.dumps(_printable(as_json(document)), ensure_ascii=False, allow_nan=False)
     blanks = {_file(one): (one.blank or one.svg).encode() for one in document.pictures()}
     choices = fill_pages(lambda choices: _try(_parts(text, choices, blanks)))
@@ -52,7 +52,7 @@ def lay_out(document: Document) -> Layout:
 def print_pages(document: Document, layout: Layout) -> bytes:
     """Return the PDF of a document whose layout is known.
 
-    It is fast, because typst keeps its results for files that have not changed.
+    This is fast, because typst keeps its results for files that have not changed.
     """
     drawn = {_file(one): _printable(plain_svg(one.svg)).encode() for one in document.pictures()}
     pdf = typst.compile(

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 _GAP = 28.0  # points between the end of a block and a block that follows it
 _WHITE = 0.3  # share of a page; less white space is accepted
 _LEAST = 0.75  # smallest scale of a figure; its labels are then still 6 points high
-_MOST_TRIES = 8  # layouts tried; each takes a quarter of the time of the first one
+_MOST_TRIES = 8  # most layouts tried; each takes a quarter of the time of the first one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,7 +20,7 @@ class Choices:
 
     Attributes
     ----------
-    shares : scale of figures, by number.
+    shares : scale of each changed figure, by the figure's number.
     whole : numbers of the tables that must not break across pages.
     """
 
@@ -34,11 +34,12 @@ class End:
 
     Attributes
     ----------
-    page : its page.
-    y : points from the top of the page.
-    picture, table : its number, or 0; a table has a second entry for the end of its caption.
+    page : number of the page on which the block ends.
+    y : distance from the top of the page, in points.
+    picture, table : number of the figure or table, or 0. A table has a second `End` for its
+        caption.
     share : scale of a figure, 1 by default.
-    height : of a figure, in points.
+    height : height of a figure, in points.
     """
 
     page: int
@@ -55,7 +56,7 @@ class Pages:
 
     Attributes
     ----------
-    ends : where its blocks end.
+    ends : ends of the blocks of the document.
     top, bottom : limits of the text on every page, in points.
     """
 
@@ -92,14 +93,14 @@ class Pages:
 
 
 def fill_pages(lay_out: Callable[[Choices], Pages]) -> Choices:
-    """Return the changes to the layout that leave least white space.
+    """Return the changes to the layout that leave the least white space.
 
     Pages are filled from first to last. A change may leave white space on a later page, which is
     then filled in its turn. In the end, the best of all layouts is returned.
 
     Parameters
     ----------
-    lay_out : returns the layout of the document with some changes.
+    lay_out : function that returns the layout of the document with the given changes.
     """
     chosen = best = Choices()
     pages = lay_out(chosen)

@@ -13,9 +13,8 @@ from pipeline.words.spans import Span, Spans, spans
 from pipeline.words.text import clean, names_spans, rich
 
 _WORDS = phrases("summary")
-_MOST_TOLD = 3  # messages shown for one group of checks
-# Groups of checks, the most serious first: those that spoil every number, those that spoil some,
-# and effects that the linear model lacks. Groups that are not listed come before `_LAST`.
+_MOST_TOLD = 3  # most messages shown for one group of checks
+# Groups of checks, the most serious first. Other groups come between these and `_LAST`.
 _WORST_FIRST = (
     "input_sign",
     "data",
@@ -41,7 +40,8 @@ _LAST = ("fit_explains_data", "step", "decay")
 _AT_THE_TOP = ("input_sign", "position_unit", "input_unit")  # problems that make every number wrong
 # The summary already shows the messages of these groups.
 _TOLD_ELSEWHERE = (*_AT_THE_TOP, "fit_identified")
-_ALIKE = ("initial_final", "step", "decay")  # of these groups, one message represents all
+# one message of such a group represents all its messages
+_ALIKE = ("initial_final", "step", "decay")
 
 
 def next_steps(analysis: Analysis) -> Items:
@@ -70,10 +70,10 @@ def _failed(analysis: Analysis) -> Iterator[Spans]:
 
 
 def _group(check: Check) -> str:
-    """Return the group of checks to which one action belongs.
+    """Return the group of checks to which a failed check belongs; each group has its own action.
 
-    It is the kind of the check. Checks of the fit and of the input ask for different actions, so
-    they are grouped by their part too.
+    The group is the kind of the check. For checks of the fit and of the input it includes the part,
+    because the parts ask for different actions.
     """
     return f"{check.kind}_{check.part}" if check.kind in ("fit", "input") else check.kind
 
@@ -86,7 +86,7 @@ def _place(group: str) -> tuple[int, int]:
 
 
 def _excess(check: Check) -> float:
-    """Return by what factor a check exceeds its limit; 0 if this is not known."""
+    """Return the ratio of a check's value to its limit; 0 if the ratio is unknown."""
     if check.value is None or not check.limit:
         return 0.0
     return abs(check.value / check.limit)
@@ -106,7 +106,7 @@ def _action(group: str, checks: Sequence[Check], analysis: Analysis) -> Spans:
 
 
 def _to_identify(analysis: Analysis) -> Spans:
-    """Return what to record so that the carts can be identified, or why they cannot."""
+    """Return what to record to identify the carts, or why they cannot be identified."""
     for skip in reversed(analysis.skipped):
         if skip.stage is Stage.FINAL_ESTIMATES:
             if skip.missing:
@@ -145,8 +145,8 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
     to_run = design is not None and not any(r.kind == "closed_loop" for r in analysis.records)
     if to_run:
         yield say("next_run")
-    # Advice on missing recordings comes only when the carts are identified and no recording must be
-    # fixed.
+    # Missing recordings are mentioned only if the carts are identified and no recording needs
+    # fixing.
     if fit is not None and not asked & {"data", "record"}:
         run = {Stage.HARDWARE_CHECK} if to_run else frozenset[Stage]()
         lacking = [skip for skip in analysis.skipped if skip.stage not in run]
@@ -158,7 +158,7 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
 
 
 def _may_lack_springs(analysis: Analysis) -> bool:
-    """Return whether steps contradict a fit that lacks springs, without signs of dry friction."""
+    """Return whether a spring may be missing from the model."""
     fit, dry = analysis.fit, any(d.friction and d.friction.present for d in analysis.log_decrements)
     off = any(row.consistent is False and read_name(row.name).is_gain for row in analysis.rows)
     may_be_whole = fit is None or fit.explains_data or all(analysis.bench.springs)

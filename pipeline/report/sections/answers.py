@@ -35,8 +35,8 @@ def with_answer(notes: str, id_: str, answer: str) -> str:
 
     Raises
     ------
-    SubmissionError : a heading in the answer would end it early, or open Markdown in it would
-        include other answers.
+    SubmissionError : a heading in the answer would end the answer early, or an unclosed code block
+        or comment would merge it with other answers.
     """
     text = answer.replace("\r\n", "\n").strip()
     lines = _lines(notes)
@@ -78,7 +78,7 @@ def _span(notes: str, id_: str) -> tuple[int, int, int, int] | None:
 
 
 def _bodies(notes: str) -> dict[str, tuple[int, str]]:
-    """Return, by id, the line of the heading and the text up to the next heading."""
+    """Return the line of each answer's heading and the text up to the next heading, by id."""
     lines, headings = _lines(notes), _headings(notes)
     found: dict[str, tuple[int, str]] = {}
     for i, (_, at, start, text) in enumerate(headings):
@@ -88,7 +88,7 @@ def _bodies(notes: str) -> dict[str, tuple[int, str]]:
 
 
 def _headings(markdown: str) -> list[tuple[int, int, int, str]]:
-    """Return level, first line, line after, and text of each heading outside comments."""
+    """Return level, first line, next line, and text of each heading outside comments."""
     text = COMMENT.sub(lambda found: re.sub(r"[^\n]", " ", found[0]), markdown)
     tokens = MarkdownIt("commonmark", {"html": False}).parse(text)
     found = []

@@ -20,7 +20,7 @@ OUTCOMES: dict[str, tuple[str, Tone]] = {  # in the order of the table
 
 
 def check_blocks(page: Page) -> list[Block]:
-    """Return the checks: failed ones visible, the others folded."""
+    """Return the checks; those that did not fail are folded."""
     failed = page.analysis.failed_checks
     others = [check for check in page.analysis.checks if check not in failed]
     passed = sum(check.outcome == "pass" for check in others)
@@ -49,7 +49,7 @@ def _check_table(page: Page, checks: Sequence[Check], key: str) -> Table:
 
 
 def assumption_blocks(page: Page) -> list[Block]:
-    """Return the assumptions of the analysis, with their sources and their support by the data."""
+    """Return the assumptions of the analysis, their sources, and whether the data support them."""
     assumptions = page.analysis.assumptions
     if not assumptions:
         return []
@@ -94,7 +94,7 @@ def provenance_blocks(page: Page, made: str) -> list[Block]:
 
     Parameters
     ----------
-    made : sentence with the versions.
+    made : a sentence that states the versions.
     """
     blocks: list[Block] = [paragraph(made)]
     if files := page.analysis.files:

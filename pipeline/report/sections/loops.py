@@ -12,7 +12,8 @@ from pipeline.words.phrases import phrases
 from pipeline.words.text import clean
 
 _WORDS = phrases("measurements")
-# Share of the motion (rms): a good linear model is within it; a larger error raises a question.
+# Share of the motion (rms). A good linear model has a smaller error; a larger one raises a
+# question.
 CLOSE = 0.10
 
 

@@ -15,7 +15,7 @@ from pipeline.words.spans import spans
 from pipeline.words.text import clean
 
 _WORDS = phrases("measurements")
-_MOST_PANELS = 6  # repeats drawn in one figure; the tables have all
+_MOST_PANELS = 6  # most repeats drawn in one figure; the tables have all repeats
 
 
 # ----------------------------------------------------------- frequency response
@@ -196,7 +196,7 @@ def dwell_blocks(page: Page) -> list[Block]:
     points = [p for p in page.analysis.sine_points if p.experiment in page.records]
     if not points:
         return []
-    # The settled dwell that is nearest to the 4 Hz of the paper's Figures 12-14.
+    # Show the settled dwell nearest to 4 Hz, the frequency of the paper's Figures 12-14.
     paper = 2 * np.pi * 4.0
     chosen = min(points, key=lambda p: (not p.settled, abs(float(np.log(p.omega / paper)))))
     shown = sorted((p for p in points if p.experiment == chosen.experiment), key=lambda p: p.cart)

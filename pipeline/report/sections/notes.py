@@ -17,10 +17,10 @@ from pipeline.words.text import clean
 
 _DEEPEST_HEADING = 6
 _TOP_HEADING = 3  # larger headings belong to the report
-_DEEPEST_READ = 200  # levels; the parser leaves out text that is nested deeper
+_DEEPEST_READ = 200  # most levels of nesting; the parser leaves out deeper text
 # Lists and quotations that are nested deeper are not indented further, because a page has no room.
 _DEEPEST_NESTING = 6
-# Characters without a space; longer than any address, and wider than any page.
+# so many characters without a space are longer than any address and wider than any page
 _ENDLESS = re.compile(r"\S{2000}")
 _SCHEMES = ("http", "https", "mailto")
 _ALIGN = {"text-align:center": "c", "text-align:right": "r"}
@@ -37,7 +37,7 @@ def note_blocks(markdown: str) -> tuple[Block, ...]:
 
 
 def discussion_blocks(markdown: str) -> tuple[Block, ...]:
-    """Return the notes as blocks of a section; the section already has a title."""
+    """Return the notes as blocks; a first heading "Discussion" is left out."""
     blocks = note_blocks(markdown)
     first = blocks[0] if blocks else None
     if isinstance(first, Heading) and plain(first.text).strip().lower() == "discussion":
@@ -47,7 +47,7 @@ def discussion_blocks(markdown: str) -> tuple[Block, ...]:
 
 def even_headings(blocks: Iterable[Block]) -> tuple[Block, ...]:
     """Return blocks whose headings never skip a level, as an outline needs."""
-    above: list[int] = []  # levels, as typed, of the headings above this one
+    above: list[int] = []  # levels of the headings above this one, as typed
 
     def even(block: Block) -> Block:
         match block:
@@ -95,7 +95,7 @@ def _block(node: SyntaxTreeNode, depth: int) -> list[Block]:
 def _plain(node: SyntaxTreeNode) -> str:
     """Return all text inside a node.
 
-    It uses no recursion, because there may be a thousand levels.
+    It works without recursion, because there may be a thousand levels.
     """
     return " ".join(n.content for n in node.walk() if n.type in ("text", "code_inline", "fence"))
 

@@ -94,7 +94,7 @@ def source_text(estimate: Estimate | None, *, steps: Collection[str]) -> str:
 
     Parameters
     ----------
-    steps : recordings of steps; the ringing after a step is not called a decay.
+    steps : ids of step recordings; ringing after a step is not called a decay.
     """
     if estimate is None:
         return ""
@@ -130,10 +130,10 @@ def _verdict(consistent: bool | None) -> Cell:
 
 
 def reported_table(page: Page) -> Table:
-    """Return the students' numbers next to those from their data.
+    """Return the students' numbers next to the numbers from their data.
 
-    For a number that is wrong, the table says what to look at. Rounding, three standard errors and
-    a few percent are allowed.
+    For a wrong number, the table says what to look at. A number may be off by rounding, three
+    standard errors and a few percent.
     """
     lines = [
         [
@@ -152,7 +152,7 @@ def reported_table(page: Page) -> Table:
 
 
 def _error_cells(name: str, yours: Decimal, found: Estimate | None) -> tuple[Cell, Cell]:
-    """Return the error of a number, and what to look at if it is too large."""
+    """Return the error of a number and, if the error is too large, what to look at."""
     if found is None or not found.value or found.source == "assumed":
         return cell(NOTHING, "quiet"), cell("")
     share = percent(100 * (float(yours) - found.value) / abs(found.value), signed=True)
@@ -168,8 +168,8 @@ def _is_off(name: str, yours: Decimal, found: Estimate | None) -> bool:
     if found is None or not found.value or found.source == "assumed":
         return False
     rounding = 0.5 * 10.0 ** int(yours.as_tuple().exponent)
-    # Other methods on the same data differ by a third of the limit between initial and final
-    # estimates.
+    # Other methods may give results that differ by this much: a third of the limit between initial
+    # and final estimates.
     few = change_limit(name) / 3 / 100 * abs(found.value)
     return abs(float(yours) - found.value) > rounding + SIGMA_LIMIT * (found.std or 0.0) + few
 
@@ -197,7 +197,7 @@ def _parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:
 
 
 def _staged_differences(analysis: Analysis) -> Block | None:
-    """Return how much the fit cart by cart differs from the joint fit."""
+    """Return how much the cart-by-cart fit differs from the joint fit."""
     fit = analysis.fit
     if fit is None or fit.chain.n == 1:
         return None

@@ -1,7 +1,7 @@
 """Questions that the data raise, and the students' answers from their notes.
 
-A question is in the section of its figures. It is answered in `notes.md`, after a heading that
-begins with the question's id. All other notes are the discussion.
+A question is shown in the section with the figures that it is about. It is answered in `notes.md`,
+after a heading that begins with the question's id. All other notes are the discussion.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -24,8 +24,8 @@ from pipeline.words.spans import Span, plain
 from pipeline.words.text import clean, rich
 
 _WORDS = phrases("questions")
-_MOST = 6  # a report with more questions would turn into a questionnaire
-_LISTED = 4  # runs that a question lists
+_MOST = 6  # most questions in a report; more would turn it into a questionnaire
+_LISTED = 4  # most runs that a question lists
 
 
 Kind = Literal[
@@ -40,8 +40,7 @@ class Asked:
 
     Attributes
     ----------
-    kind : what it is about.
-    section : where its figures are.
+    section : the section with the figures that the question is about.
     """
 
     kind: Kind
@@ -124,7 +123,7 @@ def _assumed(analysis: Analysis) -> Iterator[Asked]:
         for row in analysis.rows
         if row.initial is not None
         and row.final is not None
-        and row.final.source == "bode_fit"  # otherwise no points show it
+        and row.final.source == "bode_fit"  # for other sources, the figure has no points
         and row.initial.source == "assumed"
         and abs(row.change_percent or 0.0) > DAMPING_LIMIT
     ]
@@ -277,7 +276,7 @@ def placed(
 ) -> tuple[Section, ...]:
     """Return the sections with each question at the end of its own section.
 
-    If the report lacks that section, the question goes into the discussion.
+    If the report lacks that section, the question is placed in the discussion.
     """
     there = {section.id for section in sections}
     return tuple(

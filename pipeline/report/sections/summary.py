@@ -34,14 +34,14 @@ _KINDS = {  # names for kinds of recordings
     "closed_loop": "closed-loop run",
     "bode": "table of amplitude ratios",
 }
-_MOST_TOLD = 3  # findings of one kind; a summary is short
+_MOST_TOLD = 3  # most findings of one kind; a summary is short
 
 
 def summary(page: Page) -> list[Block]:
     """Return what was identified, what agrees or not, what is missing, and what to do next.
 
-    Results are shown on boards of tiles. Problems also have a sentence. One picture shows all
-    carts.
+    Results are shown on boards of tiles. Problems are also described in sentences. One picture
+    shows all carts.
     """
     analysis = page.analysis
     blocks: list[Block] = [_identified(analysis)]
@@ -116,7 +116,7 @@ def _identified(analysis: Analysis) -> Block:
 
 
 def _first_estimates(analysis: Analysis, *, fitted_to: Sequence[str]) -> str:
-    """Return the recordings from which initial estimates come; "" if nothing was measured."""
+    """Return the recordings that gave initial estimates; "" if nothing was measured."""
     runs = dict.fromkeys(
         run for row in analysis.rows if row.initial for run in row.initial.experiments
     )
@@ -130,7 +130,7 @@ def _first_estimates(analysis: Analysis, *, fitted_to: Sequence[str]) -> str:
 
 
 def _runs(analysis: Analysis, ids: Collection[str]) -> str:
-    """Return the number of recordings of each kind; tables are counted as a kind of their own."""
+    """Return the number of recordings of each kind; tables are counted as a separate kind."""
     known = {record.id: record.kind for record in analysis.records}
     kinds = Counter(known.get(id_, "bode") for id_ in dict.fromkeys(ids))
     return listing([count(kinds[kind], noun) for kind, noun in _KINDS.items() if kinds[kind]])
@@ -141,7 +141,7 @@ def _numbers_board(analysis: Analysis, *, error: str = "statistical") -> tuple[T
 
     Parameters
     ----------
-    error : key of the note on an error that is smaller than that of a calibration.
+    error : key of the note for a standard error below the accuracy of a calibration.
     """
     return tuple(
         _number_tile(
@@ -157,22 +157,22 @@ def _numbers_board(analysis: Analysis, *, error: str = "statistical") -> tuple[T
 
 
 def _is_explained(analysis: Analysis) -> bool:
-    """Return whether the standard errors are valid, because only noise is left unexplained."""
+    """Return whether the standard errors are valid, because the fit leaves only noise."""
     return analysis.fit is not None and analysis.fit.explains_data
 
 
 def _number_tile(name: str, final: Estimate, *, unit: str, is_sure: bool, error: str) -> Tile:
-    """Return a number with four digits; an error smaller than a calibration's is only a note."""
+    """Return a tile for a number; an error below the accuracy of a calibration is only a note."""
     share = (final.std or 0.0) / abs(final.value) if final.value else 1.0
     if not is_sure:
-        # The true error is unknown, so only three digits are shown.
+        # The true error is unknown, so the value has only three digits.
         value = significant(final.value, digits=3)
     elif 0 < share < CALIBRATION:
         value = significant(final.value)
         told = _WORDS.text(error, share=f"{significant(100 * share, digits=1)} %")
         unit = f"{unit}, {told}" if unit else told
     else:
-        # If the error is 1 % or more, giving it with two digits leaves the value about four.
+        # If the error is 1 % or more, two digits of it give the value about four digits.
         value = with_error(final.value, final.std, digits=2 if share >= 0.01 else 1)
     return Tile(label=spans(name_span(name)), value=spans(value), note=spans(unit))
 
@@ -224,7 +224,7 @@ def _tone(good: bool) -> Tone:
 
 
 def _assumed(analysis: Analysis) -> tuple[bool, Spans] | None:
-    """Return the assumptions that nobody stated and the data do not determine, as a finding."""
+    """Return, as a finding, the default assumptions that the data neither support nor refute."""
     taken = [a for a in analysis.assumptions if a.origin == "default" and a.support == "open"]
     if not taken:
         return None
@@ -263,9 +263,9 @@ def _same_recordings(judged: Sequence[ParameterRow]) -> Spans:
 
 
 def _undecided(analysis: Analysis) -> tuple[bool, Spans] | None:
-    """Return parameters measured twice with different results, as a finding.
+    """Return, as a finding, the parameters that were measured twice with different results.
 
-    Otherwise the number on the board would look certain.
+    Without this finding, the number on the board would look certain.
     """
     told = [
         _WORDS.text(
@@ -294,7 +294,10 @@ def _checks(analysis: Analysis) -> tuple[bool, Spans] | None:
 
 
 def _friction(analysis: Analysis) -> tuple[bool, Spans] | None:
-    """Return the runs that show dry friction (decays, ringing after a step), as a finding."""
+    """Return, as a finding, the runs that show dry friction:
+
+    decays, or the ringing after a step.
+    """
     shown = [d for d in analysis.log_decrements if d.friction and d.friction.present]
     if not shown:
         return None

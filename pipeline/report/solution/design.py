@@ -30,13 +30,14 @@ class WorkedDesign:
 
     Attributes
     ----------
-    phi : (2n, 2n), the plant over one sample.
-    gamma : (2n,), the input over one sample.
-    z : (2n,) poles of the loop in the z plane, as requested, or as the regulator gives them.
-    open_loop, closed_loop : (2n + 1,) the polynomials of phi and of z, in falling powers.
+    phi : (2n, 2n), how the plant's state changes over one sample without input.
+    gamma : (2n,), how a constant input of 1 changes the state over one sample.
+    z : (2n,) closed-loop poles in the z plane, as requested or as given by the regulator.
+    open_loop, closed_loop : (2n + 1,) characteristic polynomials without and with feedback, in
+        falling powers.
     P : (2n, 2n) cost matrix of the linear quadratic regulator; None for pole placement.
-    gains : (2n,) from the formula shown.
-    prefilter : from these gains.
+    gains : (2n,) state feedback gains from the formula in the text.
+    prefilter : prefilter for these gains.
     """
 
     phi: Array
@@ -81,7 +82,7 @@ def _polynomial_of(roots: np.ndarray) -> Array:
 
 
 def ackermann(phi: Array, gamma: Array, wanted: Array) -> Array:
-    """Return the gains that give phi - gamma G the polynomial `wanted` (falling powers).
+    """Return the gains G for which phi - gamma G has the polynomial `wanted` (in falling powers).
 
     The columns of the controllability matrix are scaled to one. The formula is the same, but
     rounding errors are smaller.
@@ -99,7 +100,7 @@ def ackermann(phi: Array, gamma: Array, wanted: Array) -> Array:
 
 
 def design_blocks(page: Page) -> list[Block]:
-    """Return the derivation of the state feedback, with all numbers that a student may compare."""
+    """Return the derivation of the state feedback, with all numbers that students compute."""
     design, chain = page.analysis.feedback, page.analysis.chain
     if design is None or chain is None:
         return []
@@ -192,7 +193,7 @@ def _numbers(letter: str, values: Array, name: str) -> Block:
 
     Parameters
     ----------
-    name : of the matrix in the copied text.
+    name : name of the matrix in the copied text.
     """
     return formula(row(letter, "=", number_matrix(values)), copy=matlab_matrix(name, values))
 

@@ -85,7 +85,7 @@ class Solution:
 
 
 def default_rubric(analysis: Analysis) -> Rubric:
-    """Return the shipped rubric for this number of carts, or one with the limits of the checks."""
+    """Return the shipped rubric for this number of carts, or one with the checks' limits."""
     if shipped := shipped_rubric(analysis.bench.n):
         return shipped
     checks = (
@@ -261,7 +261,7 @@ def solution_text(analysis: Analysis, *, rubric: Rubric | None = None) -> str:
 
     Parameters
     ----------
-    rubric : states what is accepted; default: `default_rubric`.
+    rubric : the rubric that states the ranges; `default_rubric` by default.
     """
     rubric = rubric or default_rubric(analysis)
     parameters = expected_parameters(analysis, rubric)

@@ -25,7 +25,7 @@ from pipeline.words.text import rich
 
 _WORDS = phrases("solution")
 _MOST_ADDENDS = 3  # a longer sum is not written out with numbers for each product
-_A_LINE = 7  # terms of a sum in one line
+_A_LINE = 7  # most terms of a sum in one line
 
 
 def motion_blocks(page: Page) -> list[Block]:
@@ -168,7 +168,7 @@ def worked(equations: Sequence[Equation], values: Mapping[str, float]) -> list[B
         result = value_term(evaluate(equation.right, values))
         if len(terms) == 1 and "-" not in equation.right:
             put_in = row(shown_with(equation.right, values), "≈", result)
-            # If left and right are the same symbol, such as the square of a frequency in the table,
+            # If both sides are the same symbol, such as the square of a frequency in the table,
             # show it once.
             short.append(row(left, "=", *(() if left == right else (right, row("="))), put_in))
             continue

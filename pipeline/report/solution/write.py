@@ -44,7 +44,8 @@ def make_solution(
 
     Parameters
     ----------
-    rubric : states what is accepted; default: the shipped one for this number of carts.
+    rubric : the rubric that states the ranges; by default, the shipped one for this number of
+        carts.
 
     Raises
     ------
