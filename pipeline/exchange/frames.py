@@ -1,6 +1,6 @@
-"""The results of an analysis as pandas tables, their columns named as in `results.json`.
+"""The results of an analysis as pandas tables, with columns named as in `results.json`.
 
-Units of columns are in `frame.attrs["units"]`.
+The units of the columns are in `frame.attrs["units"]`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,24 +21,27 @@ from pipeline.results import (
 )
 
 if TYPE_CHECKING:
-    import pandas as pd  # takes a fifth of a second, so it is imported on use
+    import pandas as pd  # late: importing it takes a fifth of a second
 
 
 def parameters(analysis: Analysis) -> "pd.DataFrame":
-    """Return initial and final estimates, one row per parameter; the index is its name."""
+    """Return initial and final estimates, one row per parameter;
+
+    the index is the parameter's name.
+    """
     frame = _frame(_rows(analysis.rows), keys(ParameterRow), analysis=analysis)
     frame["consistent"] = frame["consistent"].astype("boolean")  # missing values stay missing
     return frame.set_axis(frame["name"].to_list(), axis="index")
 
 
 def checks(analysis: Analysis) -> "pd.DataFrame":
-    """Return the consistency checks, one row per check; the index is its id."""
+    """Return the consistency checks, one row per check; the index is the check's id."""
     frame = _frame(_rows(analysis.checks), keys(Check), analysis=analysis)
     return frame.set_axis(frame["id"].to_list(), axis="index")
 
 
 def decays(analysis: Analysis) -> "pd.DataFrame":
-    """Return the decays, one row each; the friction test is in columns `friction_…`."""
+    """Return the decays, one row each; results of the friction test are in columns `friction_…`."""
     rows = [
         row | {f"friction_{key}": value for key, value in (row["friction"] or {}).items()}
         for row in _rows(analysis.log_decrements)
@@ -73,7 +76,7 @@ def frequency_response(analysis: Analysis) -> "pd.DataFrame":
 
 
 def tables(analysis: Analysis) -> "dict[str, pd.DataFrame]":
-    """Return every table of results by its name, without the records."""
+    """Return all tables of results by name, without the records."""
     made = (parameters, checks, decays, steps, dwells, frequency_response)
     return {make.__name__: make(analysis) for make in made}
 
@@ -98,7 +101,7 @@ def record_series(record: Record) -> dict[str, Array]:
 
 
 def _rows(results: Sequence[object]) -> list[dict[str, Any]]:
-    """Return the written members of the results, with all digits."""
+    """Return the fields of each result that are written to `results.json`, with all digits."""
     return [plain(one, digits=17) for one in results]
 
 

@@ -10,7 +10,7 @@ from pipeline.json_files import keys, plain
 from pipeline.results import Analysis
 
 if TYPE_CHECKING:
-    import pandas as pd  # takes a fifth of a second, so it is imported on use
+    import pandas as pd  # late: importing it takes a fifth of a second
 
 _PARAMETER = ("effect", "cart", "spring", "parameter", "value", "std", "unit")
 _LEFT = ("experiment", "time", "cart", "position", "velocity", "input", "force")
@@ -38,7 +38,7 @@ def parameters(gap: Gap) -> "pd.DataFrame":
 
 
 def simulated(gap: Gap, experiment: str) -> "pd.DataFrame":
-    """Return a recording by `time`: measured, and simulated by both models, for each cart."""
+    """Return a recording by `time`: for each cart, the measurement and both simulations."""
     import pandas as pd
 
     columns: dict[tuple[str, str], pd.Series] = {}
@@ -74,7 +74,7 @@ def residual(gap: Gap, *, analysis: Analysis) -> "pd.DataFrame":
     frame = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(_LEFT))
     position, drive = analysis.bench.units.position, analysis.bench.units.input
     driven = any(np.any(one.u) for one in gap.left_forces)
-    force = drive if driven else f"{position}/s^2"  # without an input, mass 1 is the unit
+    force = drive if driven else f"{position}/s^2"  # without an input, forces are divided by m_1
     frame.attrs["units"] = {
         "time": "s", "position": position, "velocity": f"{position}/s", "input": drive,
         "force": force,

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _HEADER = b"MATLAB 5.0 MAT-file".ljust(116)  # scipy's own header contains the time
-_LONGEST_NAME = 63  # characters in the name of a MATLAB variable
+_LONGEST_NAME = 63  # most characters in the name of a MATLAB variable
 _RESERVED = set(
     "break case catch classdef continue else elseif end for function global if otherwise parfor "
     "persistent return spmd switch try while".split()
@@ -29,7 +29,7 @@ _RESERVED = set(
 
 
 def save_tables(analysis: Analysis, out: Path) -> None:
-    """Write each table of results as `tables/*.csv`, and `results.mat`, into the folder `out`."""
+    """Write `results.mat`, and one file `tables/*.csv` for each table, into the folder `out`."""
     folder = own_folder(out, "tables")
     folder.mkdir(parents=True, exist_ok=True)
     for name, frame in tables(analysis).items():
@@ -57,7 +57,7 @@ def matlab_file(analysis: Analysis) -> bytes:
     - `records.ID` with `time`, `u`, `x1`, ….
     - `units`.
 
-    A number that could not be computed is NaN. A result that was not found is left out.
+    A number that could not be computed is NaN. A result that the analysis lacks is left out.
     """
     chain, design, bench = analysis.chain, analysis.feedback, analysis.bench
     variables: dict[str, Any] = {

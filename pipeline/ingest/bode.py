@@ -10,16 +10,17 @@ from pipeline.ingest.columns import Column, conversion
 from pipeline.ingest.formats.table import FileTable, refuse_extreme
 from pipeline.results import FrequencyResponse
 
-_RATIO_SPREAD = 0.01  # relative standard error of a ratio read off two plots, used without repeats
+# relative standard error of a ratio read off two plots, assumed if there are no repeats
+_RATIO_SPREAD = 0.01
 Points = dict[int, list[tuple[float, float]]]
 
 
 def read_points(table: FileTable, columns: Mapping[str, Column], *, carts: Sequence[int]) -> Points:
-    """Return (omega in rad/s, amplitude ratio) of every row, by cart.
+    """Return (omega in rad/s, amplitude ratio) for every row, by cart.
 
     Raises
     ------
-    SubmissionError : no frequency column, no ratio column, or a value that is not positive.
+    SubmissionError : the table has no frequencies or no ratios, or a value is not positive.
     """
     if "frequency" not in columns:
         raise SubmissionError(
@@ -76,8 +77,8 @@ def frequency_responses(
 ) -> tuple[tuple[FrequencyResponse, ...], str]:
     """Return one response per cart with repeats averaged, and the source of its standard errors.
 
-    Rows at one frequency are repeats: their pooled relative spread is the standard error of all
-    points. If there are too few repeats, it is 1 %.
+    Rows at one frequency are repeats. Their pooled relative spread is the standard error of all
+    points. If there are too few repeats, 1 % is assumed.
     """
     squares, freedom = 0.0, 0
     averaged: dict[int, tuple[Array, Array, Array]] = {}

@@ -36,8 +36,8 @@ def encoder_step(x: Array) -> float:
 def mirrors(reference: Array, x1: Array) -> bool:
     """Return whether a commanded position only repeats encoder 1, as in ECP's open-loop logs.
 
-    Both are in counts. The copy is read slightly before the sample itself. So it lies between that
-    sample and the one before, whereas a real reference leads or lags.
+    Both are in counts. The copy is read slightly before the encoder's own sample, so its value lies
+    between that sample and the previous one. A real reference leads or lags.
     """
     moving = np.flatnonzero(np.diff(x1)) + 1
     if moving.size < 3 or np.ptp(reference) == 0.0:
@@ -52,8 +52,8 @@ def stuck_spans(x: Array) -> list[tuple[int, int]]:
     """Return (first, last) sample of every stretch in which a moving cart's encoder was stuck.
 
     A stuck reading stops abruptly while the cart moves and continues, if at all, with a jump. A
-    cart that really stops slows down first. A coarse encoder does not show the speed. For it only
-    the jump counts, which must be far larger than any other move.
+    cart that really stops slows down first. A coarse encoder does not show the speed; then only the
+    jump counts, and it must be far larger than any other change.
     """
     moves = np.abs(np.diff(x))
     # A cart at a turning point may rest for fewer samples than this.
@@ -61,10 +61,10 @@ def stuck_spans(x: Array) -> list[tuple[int, int]]:
     moving = moves[moves > 0]
     if not still or moving.size < 3:
         return []
-    # In encoder steps per sample: no cart stops from that speed between two samples.
+    # No cart stops between two samples from a speed of five encoder steps per sample.
     abrupt = 5.0 * (encoder_step(x) or float(np.median(moving)))
     after = [last for _, last in still if last < moves.size]
-    # Relative to the fastest other move between two samples: no cart starts from rest so fast.
+    # No cart starts from rest with a change that is 1.5 times the largest other one.
     jump = max(abrupt, 1.5 * float(np.delete(moves, after).max(initial=0.0)))
 
     def is_stuck(first: int, last: int) -> bool:
@@ -88,9 +88,9 @@ def saturation(u: Array) -> float | None:
     """Return the level at which the input was clipped, or None.
 
     A clipped input reaches its extreme with a jump, stays there and leaves it with a jump. Far more
-    samples have that value than the next one. This does not hold for the crest of a sine, even if
-    it is rounded to a few digits. Nor does it hold for a controller that slowly approaches its last
-    value. An input with few levels, such as a step, is never called clipped.
+    samples have the extreme value than the next one. This does not hold for the crest of a sine,
+    even if it is rounded to a few digits. Nor does it hold for a controller that slowly approaches
+    its last value. An input with few levels, such as a step, is never called clipped.
     """
     levels, counts = np.unique(u, return_counts=True)
     # An input with few levels, such as a step, has its extremes by design.
@@ -98,8 +98,8 @@ def saturation(u: Array) -> float | None:
         return None
     for top, following in ((-1, -2), (0, 1)):
         limit, gap = levels[top], abs(levels[top] - levels[following])
-        # The limit must be five times as frequent as the next level. For a rounded sine's crest it
-        # is 1.4 times.
+        # The limit must be five times as frequent as the next level; for a rounded sine the factor
+        # is 1.4.
         if limit == 0.0 or counts[top] < 5 * counts[following]:
             continue
         at_limit = u == limit
@@ -107,21 +107,21 @@ def saturation(u: Array) -> float | None:
             entry = abs(limit - u[first - 1]) if first > 0 else np.inf
             leave = abs(limit - u[last + 1]) if last + 1 < u.size else np.inf
             m = last - first + 1
-            # Limit of the jump at both ends, in levels. The m samples of a sine's crest (a
-            # parabola) can be one level only if the next sample is within this many levels;
-            # rounding adds one.
+            # Limit of the jump at both ends, in levels. The crest of a sine is a parabola: its m
+            # samples can share one level only if the next sample is within this many levels.
+            # Rounding adds one.
             if min(entry, leave) > max(3, 4 * m / (m - 1) ** 2 + 1) * gap:
                 return abs(float(limit))
     return None
 
 
 def never_changes(name: str) -> str:
-    """Return the sentence for a position that never changes while another or the input does."""
+    """Return the sentence for a position that stays constant while another signal changes."""
     return f"{name!r} never changes: a held cart, or an encoder that is stuck"
 
 
 def channel_problems(t: Array, u: Array | None, positions: dict[str, Array]) -> list[str]:
-    """Return the faults of the input and of the positions (heading to values), in words."""
+    """Return the faults of the input and of the positions (by heading), in words."""
     problems = []
     moving = any(np.ptp(x) > 0 for x in positions.values())
     for name, x in positions.items():
@@ -130,7 +130,7 @@ def channel_problems(t: Array, u: Array | None, positions: dict[str, Array]) -> 
         problems += [
             f"{name!r} stands still while the cart moves fast, from {t[first]:.4g} s to "
             f"{t[last]:.4g} s: "
-            "the encoder stuck"
+            "the encoder was stuck"
             for first, last in stuck_spans(x)[:3]
         ]
     if u is not None and (limit := saturation(u)) is not None:

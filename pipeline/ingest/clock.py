@@ -15,16 +15,16 @@ from pipeline.errors import SubmissionError
 from pipeline.ingest.columns import Column, conversion
 from pipeline.ingest.formats.table import FileTable
 
-SLOW = 0.5  # s between samples. No bench records more slowly
+SLOW = 0.5  # s between samples; no bench records more slowly
 FEWEST_SAMPLES = 8  # fewest samples for any estimate
-_GAP = 4.0  # usual intervals. After so long without a sample, time is missing
-# Distance of a stamp from its line, in rounding steps: half a step, plus the fit's error.
+_GAP = 4.0  # time is missing where an interval is so many times the usual one
+# Largest distance of a stamp from its line, in rounding steps: half a step, plus the fit's error.
 _ROUNDING_BAND = 0.65
 # Widths of a strip around a line, in rounding steps: 1 if stamps are only rounded, more if some
 # ticks of the clock are late.
 _BANDS = (1.0, 1.02, 1.05, 1.1, 1.2, 2 * _ROUNDING_BAND)
-_HAIR = 1e-6  # error of doubles, in rounding steps
-# A smaller range of slopes is due to flickering stamps, not to time.
+_HAIR = 1e-6  # numerical error of doubles, in rounding steps
+# A smaller range of slopes does not show the period; it comes from stamps that flicker.
 _NO_ROOM = 10 * _HAIR
 
 
@@ -34,12 +34,12 @@ class Clock:
 
     Attributes
     ----------
-    t : (n,) s. Straightened unless `pieces` is 0.
-    rounding : s, the decimal step of which all stamps are multiples. Zero without such a step.
-    pieces : number of straight lines that replaced the rounded stamps. With 0 they are unchanged.
-    period : s, the interval of these lines if they share the session's. Otherwise None.
-    stopped : sample (from 0) at which time does not advance, or None.
-    gaps : samples (from 0) before which time is missing.
+    t : (n,) times in s, straightened unless `pieces` is 0.
+    rounding : decimal step in s of which all stamps are multiples; zero if there is no such step.
+    pieces : number of straight lines that replaced the rounded stamps; zero if they are unchanged.
+    period : interval of these lines in s if it is common to the session; otherwise None.
+    stopped : index (from 0) of the first sample at which time does not advance, or None.
+    gaps : indices (from 0) of the samples before which time is missing.
     """
 
     t: Array
@@ -72,8 +72,8 @@ def time_stamps(table: FileTable, column: Column | None, *, sample_rate: float |
 
     Raises
     ------
-    SubmissionError : there are too few samples, or neither a time column nor a rate (Hz), or the
-        time column has no unit of time.
+    SubmissionError : there are too few samples, the time column has no unit of time, or there is
+        neither a time column nor a rate (in Hz).
     """
     n = table.values.shape[1]
     if n < FEWEST_SAMPLES:
@@ -98,7 +98,7 @@ def time_stamps(table: FileTable, column: Column | None, *, sample_rate: float |
 def clock_notes(
     table: FileTable, column: Column, clock: Clock, *, sample_rate: float | None
 ) -> list[str]:
-    """Return notes on the clock that a time column shows.
+    """Return notes on the clock that wrote a time column.
 
     Raises
     ------
@@ -146,10 +146,10 @@ def read_clock(stamps: Array) -> Clock:
 def read_clocks(session: Sequence[Array]) -> list[Clock]:
     """Check the time stamps of every record of a session and undo their rounding.
 
-    Stamps are straightened if their rounding step matters compared with the sample interval.
-    Straight lines that stay within the rounding replace them: one line if the clock is even, more
-    if it drifts or missed a tick. All lines share one period if that explains them. If no such
-    lines explain a clock, it is really uneven, and its stamps are kept.
+    Stamps are straightened if their rounding step matters compared with the sample interval. They
+    are replaced by straight lines that differ from them by no more than the rounding: one line if
+    the clock is even, several if it drifts or missed a tick. If a single period explains all lines,
+    they share it. If no such lines explain a clock, it is really uneven, and its stamps are kept.
     """
     rounded = [_rounded(stamps) for stamps in session]
     clocks: list[Clock] = []
@@ -178,7 +178,7 @@ def _checked(t: Array, rounding: float, *, pieces: int, period: float | None) ->
 
 def decimal_step(values: Array) -> float:
     """Return the largest power of ten (1 s at most) of which all values are multiples, or 0."""
-    # A time printed beyond the nanosecond has not been rounded.
+    # A time with more digits than nanoseconds has not been rounded.
     for digits in range(10):
         step = 10.0**-digits
         multiples = values / step
@@ -208,7 +208,10 @@ class _Rounded:
     even: bool
 
     def straight(self, period: float | None) -> tuple[Array, int]:
-        """Return the times and the number of lines; without `period` each has its own slope."""
+        """Return the times and the number of lines;
+
+        without `period`, each line has its own slope.
+        """
         if self.even and period is None:
             return self.stamps, 0
         t = self.stamps.copy()
@@ -217,7 +220,7 @@ class _Rounded:
         return t, len(self.stretches)
 
     def slopes(self, band: float) -> tuple[float, float]:
-        """Return the least and greatest period that all stretches allow; least > greatest if none.
+        """Return the least and greatest period that fit all stretches; (inf, 0) if there is none.
 
         The usual stamps must be within a strip of `band` rounding steps around one line.
         """
@@ -265,11 +268,12 @@ def _stretches(stamps: Array, rounding: float) -> tuple[tuple[int, int], ...]:
 def _usual(stamps: Array, rounding: float) -> NDArray[np.bool_]:
     """Return which stamps (n,) are within the rounding of one line.
 
-    These are all stamps except for a few late ones; if more are off, none.
+    Usually these are all stamps except for a few late ones. If more are off the line, no stamp
+    counts.
     """
     off = np.abs(_line(stamps) - stamps) / rounding
     near = off <= _ROUNDING_BAND
-    # A rare stamp may be one step off, because a tick was late or missing.
+    # Very few stamps may be one step off, because a tick was late or missing.
     if off.max() <= 1.5 and near.mean() >= 0.99:
         return near
     # If a few stamps jump, a least-squares line tilts, but a strip of the rounding's width does
@@ -331,8 +335,8 @@ def _extreme_slope(index: Array, stamps: Array, *, width: float, side: int) -> f
     """Return the least (side -1) or greatest (1) slope of a strip of this width.
 
     The strip must hold all stamps. The width that they need is a convex, piecewise linear function
-    of the slope. So Newton's method from outside reaches the bound exactly. Without any such strip,
-    the result is infinite on the other side.
+    of the slope, so Newton's method from outside reaches the bound exactly. If there is no such
+    strip, the least slope is inf and the greatest is -inf.
     """
     slope = (stamps[-1] - stamps[0] + side * 2 * width) / (index[-1] - index[0])
     hair = _HAIR * width + 8 * np.finfo(np.float64).eps * np.abs(stamps).max()

@@ -18,9 +18,10 @@ _POSITION = re.compile(
 )
 _ONE_POSITION = re.compile(r"x|y|pos|position|displacement")
 _NO_ROLE = re.compile(r"|sample|samples|index|n|no|nr")  # known headings without a role
-_IN_UNITS = ("csv", "workbook", "lvm", "tdms")  # formats that hold the submission's units
+_IN_UNITS = ("csv", "workbook", "lvm", "tdms")  # formats whose values are in the submission's units
 _COUNTED = re.compile(r"\benc|counts?\b|commanded pos", re.IGNORECASE)
-# Such as "time [ms]", "x1 (cm)", "x1_cm". Not for every unit: "u_in" does not mean inches.
+# A unit as in "time [ms]", "x1 (cm)" or "x1_cm". The last form is not for every unit: "u_in" does
+# not mean inches.
 _UNIT = re.compile(
     r"[\[(]\s*([^\])]+?)\s*[\])]\s*$|(?<=[a-z0-9])_(s|ms|us|m|cm|mm|V|mV|N|counts?|Hz|dB)$"
 )
@@ -39,7 +40,7 @@ _FACTORS = {
 }
 _OF_POSITIONS = ("length", "angle")
 _OF_INPUTS = ("voltage", "current", "force", "torque")
-_PLAIN = ("count", "counts", "pulse", "pulses")  # counts of an encoder, or of a controller's output
+_PLAIN = ("count", "counts", "pulse", "pulses")  # counts of an encoder or of a controller's output
 _SHARES = ("duty", "%")  # shares of the largest input
 
 
@@ -69,7 +70,10 @@ class Column:
 
 
 def holds_counts(table: FileTable, column: Column) -> bool:
-    """Return whether a column holds counts: whole numbers, and format or heading say encoder."""
+    """Return whether a column holds counts:
+
+    whole numbers that the format or the heading calls counts.
+    """
     return table.whole[column.index] and (table.form not in _IN_UNITS or column.is_counted)
 
 

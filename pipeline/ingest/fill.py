@@ -1,4 +1,4 @@
-"""Find out what the files of a submission are, and write it into its `submission.toml`.
+"""Find out what the files of a submission are, and describe them in its `submission.toml`.
 
 Every recording in `data/` without a table gets one, and an incomplete table is completed from its
 file. Existing entries are never changed. Doubts become comments.
@@ -55,21 +55,19 @@ State = Literal[
 
 @dataclass(frozen=True, kw_only=True)
 class Found:
-    """A data file and its place in `submission.toml`.
+    """A data file and its table in `submission.toml`.
 
     Attributes
     ----------
     file : path below the submission's folder.
-    state : what happened to its table. It is new, was completed, or already existed. Without a
-        table, the file is a copy, unknown, unreadable, or its name cannot be written. A file with a
-        table may be missing. A file may also be ignored because of its name, or because it is
-        outside `data/`.
-    experiment : the id of its table. Empty without one.
-    carts : the free carts, as far as the file shows. () means all.
-    inspection : None if the file cannot be read.
-    remarks : faults of the file.
+    state : whether the table is new, was completed, or was there; or why the file is not used. It
+        may be a copy, unknown, broken, missing, refused because of its name, or not read.
+    experiment : id of the file's table; empty if there is no table.
+    carts : the free carts, as far as the file shows; () means all.
+    inspection : result of the inspection; None if the file cannot be read.
+    remarks : faults found in the file.
     unsure : questions for a person.
-    advice : what to do about a file that is not read. Empty if it may stay as it is.
+    advice : what to do about a file that is not read; empty if nothing needs to be done.
     """
 
     file: str
@@ -95,8 +93,11 @@ def data_files(folder: Path) -> list[str]:
 
 
 def passed_over(folder: Path, *, named: Collection[str] = ()) -> list[Found]:
-    """Return the files of a submission that are not inspected; those in `named` have a table."""
-    if problem := leaves(folder, "data"):  # in this case other files are ignored too
+    """Return the files of a submission that are not inspected;
+
+    the files in `named` have a table.
+    """
+    if problem := leaves(folder, "data"):  # `data` is a link that leads out of the submission
         return [Found(file="data", state="refused", remarks=(problem,))]
     names = [path.relative_to(folder).as_posix() for path in data_files_in(folder / "data")]
     closed = [one for name in names if name not in named and (one := refused(folder, name))]
@@ -113,11 +114,11 @@ def passed_over(folder: Path, *, named: Collection[str] = ()) -> list[Found]:
 
 
 def look_at(folder: Path, file: str, *, columns: Mapping[str, str | int] = {}) -> Found:
-    """Return what a file of a submission is; its `state` is "broken", or "unknown" until later.
+    """Return what a file of a submission contains; its `state` is "broken" or, so far, "unknown".
 
     Parameters
     ----------
-    columns : their roles, as far as `submission.toml` gives them.
+    columns : columns by role, as far as `submission.toml` states them.
     """
     try:
         inspection = inspect_file(folder / file, columns=columns)
@@ -152,7 +153,7 @@ def free_carts(inspection: Inspection) -> tuple[tuple[int, ...], tuple[str, ...]
 
 
 def hardly_moving(inspection: Inspection) -> tuple[int, ...]:
-    """Return the carts that move so little that a hand may have held them."""
+    """Return the carts that move so little that they may have been held."""
     if inspection.kind == "sine":  # near a null, a free cart hardly moves
         return ()
     ranges, carts = _ranges(inspection), _moving(inspection)
@@ -203,7 +204,7 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
     Raises
     ------
     ConfigError : there is no such folder, or no recording in its `data/`.
-    SubmissionError : `submission.toml` is broken, or a program cannot change it.
+    SubmissionError : `submission.toml` is broken or cannot be edited by a program.
     """
     if not folder.is_dir():
         raise ConfigError(f"{folder}: no such folder; copy your recordings into {folder / 'data'}")
@@ -225,7 +226,8 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
         if new:
             _state_units(document, looked)
         filling = _Filling(document, folder, looked)
-        missing = list(filling.missing())  # before a renamed file gets a second table
+        # done first, so that a renamed file does not get a second table
+        missing = list(filling.missing())
         found.extend(filling.add(one) for one in looked)
         found.extend(missing)
 
@@ -272,7 +274,7 @@ class _Filling:
             n=self._n,
         )
         if len(self._tables) >= MOST_EXPERIMENTS:
-            full = f"not added: {MOST_EXPERIMENTS} experiments are the most"
+            full = f"not added: at most {MOST_EXPERIMENTS} experiments are allowed"
             return replace(found, remarks=(*found.remarks, full))
         unsure = (*found.unsure, *_unsure(found, self._n))
         append_experiment(self._document, entry, remarks=[UNSURE + one for one in unsure])
@@ -321,7 +323,7 @@ class _Filling:
                 )
 
     def _same(self, file: str) -> str | None:
-        """Return another file of the submission with the same samples, perhaps in another form."""
+        """Return another file of the submission that has the same samples, in any format."""
         for name in (posix(str(table["file"])) for table in self._tables):
             other = self._folder / name
             if other.is_file() and filecmp.cmp(other, self._folder / file, shallow=False):
@@ -331,7 +333,7 @@ class _Filling:
         return None
 
     def _same_ranges(self, *files: str) -> bool:
-        """Whether files may hold the same samples, judged without reading them again."""
+        """Return whether files may hold the same samples, judged by the ranges of their columns."""
         seen = [
             one and {c.role: (one.samples, c.low, c.high) for c in one.columns if c.role}
             for one in map(self._inspections.get, files)
@@ -374,7 +376,7 @@ def has_fractions(found: Found) -> bool:
 
 
 def unit_doubt(unit: str, *, fractions: Sequence[str]) -> str:
-    """Return what contradicts a unit of the positions, or "".
+    """Return why a unit of the positions is doubtful; "" if it is not.
 
     Parameters
     ----------
@@ -466,7 +468,7 @@ def _state_units(document: tomlkit.TOMLDocument, looked: Sequence[Found]) -> Non
 
 
 def format_found(found: Sequence[Found]) -> str:
-    """Return a table with one line per file, and faults and doubts below.
+    """Return a table with one line per file, and the faults and doubts below it.
 
     Unread files are left out.
     """
@@ -493,7 +495,7 @@ def format_found(found: Sequence[Found]) -> str:
 
 
 def format_passed_over(found: Iterable[Found]) -> list[str]:
-    """Return a line for each reason why files are not read, with what to do."""
+    """Return a line for each reason why files are not read, with advice."""
     return _not_looked_into([one for one in found if one.state == "not_read"])
 
 

@@ -10,7 +10,8 @@ from pipeline.ingest.formats.recognise import ENDINGS, is_recording, read_table
 from pipeline.submission.load import outside
 from pipeline.words.numbers import first_few
 
-_DEBRIS = frozenset({"thumbs.db", "desktop.ini"})  # of operating systems; all others are hidden
+# files of operating systems whose names do not begin with a dot
+_DEBRIS = frozenset({"thumbs.db", "desktop.ini"})
 _AS_TEXT = "save the recording as .csv"
 # Formats that are not read but may hold a recording, with the advice to give.
 _FORMS = {
@@ -32,7 +33,7 @@ class NotRead:
     ----------
     file : its name, printable.
     reason : why it is not read.
-    advice : what to do if it may hold a recording. Otherwise empty.
+    advice : what to do if it may hold a recording; otherwise empty.
     """
 
     file: str
@@ -41,14 +42,15 @@ class NotRead:
 
 
 def data_files_in(folder: Path) -> list[Path]:
-    """Return the files that may hold data, in a folder and its subfolders; "2" before "10"."""
+    """Return the files that may hold data, in a folder and its subfolders; "2" is before "10"."""
     return [path for path in _entries(folder) if _is_recording(path)]
 
 
 def files_not_read(folder: Path, *, root: Path) -> list[NotRead]:
     """Return all other files of a folder and its subfolders, with advice.
 
-    Names are relative to `root`, and no link may lead out of it. Hidden files are skipped.
+    Names are relative to `root`; links that lead out of `root` are not followed. Hidden files are
+    skipped.
     """
     names = [p.relative_to(root).as_posix() for p in _entries(folder) if not _is_recording(p)]
     return [refused(root, name) or _not_read(root, name) for name in names]
@@ -84,12 +86,12 @@ def not_read_notes(found: Iterable[tuple[str, str, str]]) -> list[str]:
     about: dict[str, list[str]] = {}
     for file, reason, advice in found:
         about.setdefault("; ".join(filter(None, (reason, advice))), []).append(file)
-    # The sentence names four files, the JSON names all.
+    # The sentence names four files; the JSON output names all.
     return [f"not read: {first_few(names, 4)} ({why})" for why, names in about.items()]
 
 
 def _not_read(root: Path, name: str) -> NotRead:
-    """Return why a file is not a recording: from its ending if known, else from its content."""
+    """Return why a file is not a recording, judged by its ending or else by its content."""
     ending = Path(name).suffix.casefold()
     if ending in _FORM_OF:
         reason, advice = _FORM_OF[ending]
@@ -107,7 +109,8 @@ def _is_table(root: Path, name: str) -> bool:
         with (root / name).open("rb") as file:
             # 1000 bytes show whether a file is text.
             head = file.read(1000)
-        if b"\0" in head and not is_recording(head):  # not read whole, as a video may be large
+        # The file is not read whole, because a video may be large.
+        if b"\0" in head and not is_recording(head):
             return False
         read_table(root, name)
     except (SubmissionError, OSError):

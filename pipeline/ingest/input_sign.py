@@ -1,7 +1,7 @@
 """The sign of the input: stated, found from the data, or the same as in other records.
 
-The input, compared with the force that cart 1's motion requires, shows in which direction the motor
-pushes. The equation of motion is
+The comparison of the input with the force that cart 1's motion requires shows in which direction
+the motor pushes. The equation of motion is
 
     s u = m x_1'' + c x_1' + k x_1 + k' (x_1 - x_2),   m, c, k, k' ≥ 0,   s = ±1.
 
@@ -25,14 +25,17 @@ from pipeline.results import Record
 from pipeline.submission import Submission
 from pipeline.words.numbers import abridge
 
-_NARROWEST = 8  # samples under a bump
+_NARROWEST = 8  # fewest samples under a bump
 _BUMPS = 6  # bumps side by side in a record
 FEW_NAMES = 6  # names to list; further ones are only counted
 
 
 @dataclass(frozen=True, kw_only=True)
 class Signs:
-    """For each record the stated sign, and the sign found in its data: 0 if unclear."""
+    """For each record, the stated sign and the sign found in the data;
+
+    0 if the data are unclear.
+    """
 
     stated: Mapping[str, int]
     found: Mapping[str, int]
@@ -43,11 +46,11 @@ def with_signs(
 ) -> tuple[list[Record], list[str], Signs]:
     """Return the records with signed inputs, notes on the signs found, and the signs.
 
-    A record with an unclear sign takes the sign of most other records of its kind. Records under
-    feedback are one kind, as a controller's log may have another sign; all others are the second.
-    Without such records, it takes the sign of most others. If the sign stated for a record differs
-    from the system's, the record takes the sign of its data, or the stated one if the data are
-    unclear.
+    A record with an unclear sign takes the sign of most other records of its kind. There are two
+    kinds: records under feedback, because a controller's log may have another sign, and all others.
+    If there are no other records of its kind, it takes the sign of most others. If the sign stated
+    for a record differs from the system's sign, the record takes the sign found in its data, or the
+    stated sign if the data are unclear.
     """
     stated: dict[str, int] = {}
     disputed: set[str] = set()
@@ -120,10 +123,10 @@ class _Weighed:
     Attributes
     ----------
     drive : (3, n) the input one sample early, as logged, and one sample late.
-    motion : (n, 4) factors of m, c, k and k'.
+    motion : (n, 4) the terms that are multiplied by m, c, k and k'.
     complete : whether all terms are known. It is False if cart 2 is free and was not measured.
     decisive : whether the record may be called reversed. It is False for an incomplete dwell.
-    closed : whether it was recorded under feedback.
+    closed : whether the record was made under feedback.
     """
 
     drive: Array
@@ -137,13 +140,13 @@ class _Weighed:
 def find_signs(records: Sequence[Record], *, stated: Mapping[str, int]) -> dict[str, int]:
     """Return by record the sign of its logged input; 0 or no entry if the data are unclear.
 
-    A bench has one sign. A record gets another one only if its input is opposite to the force that
-    the others' equation gives. A signal logged under feedback may be something else. It is left out
-    of the equation if there are other records.
+    A bench has one sign. A record gets the opposite sign only if its input is opposite to the force
+    that the equation of the others gives. A signal logged under feedback may not be the input, so
+    such a record is left out of the equation if there are other records.
 
     Parameters
     ----------
-    stated : by record, its stated sign. Other records count as 1.
+    stated : stated sign of each record; records without one count as 1.
     """
     weighed = {record.id: found for record in records if (found := _weigh(record)) is not None}
     if not weighed:
@@ -151,7 +154,7 @@ def find_signs(records: Sequence[Record], *, stated: Mapping[str, int]) -> dict[
     said = {name: stated.get(name, 1) for name in weighed}
     rule = [name for name, w in weighed.items() if w.complete] or list(weighed)
     rule = [name for name in rule if not weighed[name].closed] or rule
-    # If as many records have either sign, the sign of each record by itself is the better start.
+    # If equally many records have each sign, the sign of each record by itself is the better start.
     alone = {n for n, w in weighed.items() if w.decisive and _bench([w], [said[n]])[0] < 0}
     for turned in (set[str](), alone):
         found = _settle(weighed, said, turned, rule=rule)
@@ -167,7 +170,7 @@ def _settle(
     *,
     rule: Sequence[str],
 ) -> dict[str, int]:
-    """Reverse records that contradict the equation of `rule`, until no record does.
+    """Reverse records that contradict the equation fitted to `rule`, until no record does.
 
     Return the sign of each record, as in `find_signs`; empty if no solution is found.
     """
@@ -192,10 +195,10 @@ def _settle(
 
 
 def _bench(weighed: Sequence[_Weighed], signs: Sequence[int]) -> tuple[int, Array]:
-    """Return the sign, relative to `signs`, and m, c, k, k' of the equation that explains all.
+    """Return the sign (relative to `signs`) and m, c, k, k' of the equation of all records.
 
-    The sign is 0 if the other one explains them nearly as well. It is also 0 if a log that is one
-    sample early or late would change it (under feedback, early is not tried).
+    The sign is 0 if the opposite sign explains the records nearly as well, or if a shift of the
+    inputs by one sample would change it. Under feedback, an early log is not tried.
     """
     motion = np.vstack([w.motion for w in weighed])
     size = np.linalg.norm(motion, axis=0)
@@ -206,9 +209,8 @@ def _bench(weighed: Sequence[_Weighed], signs: Sequence[int]) -> tuple[int, Arra
         drive = np.concatenate([s * w.drive[shift] for s, w in zip(signs, weighed, strict=True)])
         (ahead, left), (back, right) = (_explain(motion / size, s * drive) for s in (1, -1))
         share = np.array([left, right]) ** 2 / len(weighed)  # each record's input has norm 1
-        # A sign is excluded if more of the input's power stays unexplained with it, by this margin.
-        # The margin is far above the effect of an encoder's steps, and below that of a cart's
-        # damping.
+        # A sign is excluded if it leaves more of the input's power unexplained, by this margin. The
+        # margin is far above the effect of an encoder's steps, and below that of a cart's damping.
         sure = abs(share[0] - share[1]) > 1e-3 + 0.1 * share.min()
         found.add((1 if share[0] < share[1] else -1) if sure else 0)
         if shift == 1:
@@ -225,7 +227,7 @@ def _explain(motion: Array, drive: Array) -> tuple[Array, float]:
 
 
 def _cosine(w: _Weighed, weights: Array) -> float:
-    """Return the cosine between the logged input and the force by the equation."""
+    """Return the cosine between the logged input and the force that the equation gives."""
     force = w.motion @ weights
     size = float(np.linalg.norm(force) * np.linalg.norm(w.drive[1]))
     return float(w.drive[1] @ force) / size if size > 0 else 0.0
@@ -253,7 +255,7 @@ def _weigh(record: Record) -> _Weighed | None:
     places = np.arange(1, last, max(width // 6, last // 400, 1))
     centred = [sliding_window_view(u, width)[places + shift] @ weight for shift in (-1, 0, 1)]
     centred += [sliding_window_view(a, width)[places] @ weights for a, weights in sides]
-    early, now, late, *terms = (a - a.mean() for a in centred)  # encoder zeros cancel
+    early, now, late, *terms = (a - a.mean() for a in centred)  # offsets of the encoders cancel
     drive = np.array([early, now, late]) / np.linalg.norm(now)
     motion = np.array(terms).T / np.linalg.norm(now)
     if not (np.all(np.isfinite(drive)) and np.all(np.isfinite(motion))):

@@ -19,8 +19,8 @@ from pipeline.results import Kind
 from pipeline.words.numbers import by_note, first_few
 
 NO_CLOCK = "no time column: state `sample_rate`"
-_MOST_COLUMNS = 16  # columns to list in a sentence
-_COPIED = 0.999  # correlation. Above it, a target is the input itself
+_MOST_COLUMNS = 16  # most columns listed in a sentence
+_COPIED = 0.999  # correlation above which a target is the input itself
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,16 +45,16 @@ class Inspection:
 
     Attributes
     ----------
-    duration, interval, jitter : s. Jitter is the rms deviation of the sample interval.
-    rate : Hz. None, like the other times, if the file has no time column.
-    kind : the kind of experiment that it looks like.
-    frequency : for a sine dwell, its frequency. Hz.
+    duration, interval, jitter : times in s. Jitter is the rms deviation of the sample interval.
+    rate : sample rate in Hz; None, like these times, if the file has no time column.
+    kind : kind of experiment that the file looks like.
+    frequency : frequency in Hz if the file looks like a sine dwell.
     problems : points to check before using the file.
-    unusable : those problems because of which a report does not use the file.
-    needs : keys that its table in `submission.toml` must state. Such as "columns" or "sample_rate".
+    unusable : the problems because of which a report would not use the file.
+    needs : keys that the file's table in `submission.toml` must state, such as "sample_rate".
     variables : the variables of a binary file, read or not.
-    guessed : column numbers by role. Given if the file has no headings but the signals reveal them.
-    doubts : why a person should check these numbers.
+    guessed : column numbers by role, if the file has no headings but its signals reveal the roles.
+    doubts : reasons to check the guessed numbers.
     cut_short : whether the file seems to end in the middle of a recording.
     """
 
@@ -84,7 +84,10 @@ class Inspection:
 
     @property
     def ranges(self) -> str:
-        """The range of each column without a name, for a person who must name them; else ""."""
+        """The range of each column if the columns have no names, to help a person name them;
+
+        else "".
+        """
         if "columns" not in self.needs:
             return ""
         said = [f"{one.name} ({one.low:.4g} to {one.high:.4g})" for one in self.columns]
@@ -93,7 +96,7 @@ class Inspection:
     def to_dict(self) -> dict:
         """Return the inspection as plain values for JSON."""
         shown = asdict(self)
-        del shown["cut_short"]  # it is one of the problems
+        del shown["cut_short"]  # already listed as a problem
         return {"state": "read", **shown, "advice": ""}
 
 
@@ -102,7 +105,7 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
 
     Parameters
     ----------
-    columns : their roles, if stated. A missing column states nothing.
+    columns : columns by role, as stated; a column that the file lacks is ignored.
 
     Raises
     ------
@@ -128,7 +131,7 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
         problems.append(_name_them(told))
     elif unused and not unnamed:
         problems.append(f"not used: {', '.join(unused)}; name them in `columns` to use them")
-    # Without column names, all other things are missing too.
+    # If the columns have no names, the other problems follow from this.
     further = [] if bare and not guessed else problems
     try:
         clock = _clock(table, assigned, further) if "frequency" not in assigned else None

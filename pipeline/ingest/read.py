@@ -19,8 +19,8 @@ from pipeline.ingest.input_sign import Signs, with_signs
 from pipeline.results import FrequencyResponse, HeadingUnit, Record
 from pipeline.submission import Experiment, Submission, System
 
-_FEW_COUNTS = 10  # counts. No motor moves with so few, so smaller whole numbers are typed volts
-DUTY_COUNT = 5 / 4096  # V. The amplifier of the UCSD bench gives 5 V for 4096 counts
+_FEW_COUNTS = 10  # counts; no motor moves with so few, so smaller whole numbers are volts
+DUTY_COUNT = 5 / 4096  # V; the amplifier of the UCSD bench gives 5 V for 4096 counts
 _NEED_INPUT = ("step", "sine", "sweep")
 
 
@@ -32,9 +32,9 @@ class Ingested:
     ----------
     records : the time series, in the order of the submission.
     tables : frequency responses that the students computed, one for each cart.
-    files : SHA-256 of each data file. Sorted by path.
-    unreadable : by experiment, the reason why its file is not used. It is missing, broken, or from
-        another experiment.
+    files : SHA-256 of each data file, sorted by path.
+    unreadable : for each experiment whose file is not used, the reason: the file is missing,
+        broken, or from another experiment.
     signs : signs of the inputs, as stated and from the data.
     warnings : the warnings that concern more than one record.
     """
@@ -54,7 +54,7 @@ def read_data(submission: Submission) -> Ingested:
 
     Raises
     ------
-    SubmissionError : no file can be read; one line.
+    SubmissionError : no file can be read; the message has one line.
     """
     if not submission.experiments:
         raise SubmissionError(
@@ -102,7 +102,7 @@ def read_data(submission: Submission) -> Ingested:
 
 @contextmanager
 def _noted(experiment: Experiment, unreadable: dict[str, str]) -> Iterator[None]:
-    """Catch an error and note it for its experiment."""
+    """Note an error as the reason why the experiment's file is not used."""
     try:
         yield
     except SubmissionError as error:
@@ -115,7 +115,7 @@ def _none_readable(unreadable: Mapping[str, str]) -> str:
 
 
 def _unused_scale(records: Sequence[Record], system: System) -> list[str]:
-    """Return a warning if the stated scale of the input is used by no record."""
+    """Return a warning if no record uses the stated scale of the input."""
     per_count = system.input.per_count
     driven = [record for record in records if record.u is not None and np.any(record.u)]
     if per_count is None or not driven or any(r.input_scale == per_count for r in driven):
@@ -167,7 +167,7 @@ def _refuse_cut(table: FileTable) -> None:
 class _Opened:
     """A file with its columns identified; `positions` by cart, `stamps` (n,) in s as written.
 
-    Reading it adds `notes`, and adds the units of headings to `headed`.
+    Reading the file adds its notes to `notes` and the units of its headings to `headed`.
     """
 
     system: System
@@ -361,12 +361,12 @@ def _input(opened: _Opened) -> tuple[Array | None, float]:
 
 
 def _beyond_volts(values: Array) -> bool:
-    """Return whether values are counts, not volts: large whole numbers, even as "512.0"."""
+    """Return whether values are counts, not volts: large whole numbers, even written as "512.0"."""
     return bool(np.all(values == np.round(values)) and np.abs(values).max() > _FEW_COUNTS)
 
 
 def _reference(opened: _Opened, keep: slice) -> Array | None:
-    """Return the set point of a closed loop: the experiment's own, else the file's column."""
+    """Return the set point of a closed loop, as stated for the experiment or else from its file."""
     table, experiment, columns = opened.table, opened.experiment, opened.columns
     if experiment.kind != "closed_loop":
         return None

@@ -1,7 +1,7 @@
 """Find the roles of columns without names from their signals.
 
-Time rises evenly. An input jumps between levels, or the other columns respond to it: with it their
-accelerations follow a linear law, without it they do not. Positions never jump.
+Time rises evenly. Positions never jump. An input jumps between levels, or it moves the other
+columns: their accelerations follow a linear law only if the law includes the input.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,16 +17,17 @@ from pipeline.ingest.clock import SLOW, read_clock
 from pipeline.ingest.formats.table import FileTable
 from pipeline.submission.models import MOST_CARTS
 
-# Share of its range that a column changes between two samples; no cart moves so fast.
+# Change between two samples, as a share of the column's range; no cart moves so fast.
 _JUMP = 0.2
-_ADVANCES = 0.2  # share of samples that advance. A clock may have rounded stamps
-_EQUAL = 0.05  # relative rms difference of a position and its reference
-_ALIKE = 0.999  # correlation of one signal in two scales
-_FASTEST = 1e-5  # s between samples. No bench records faster
+# least share of samples at which time advances, because a clock may have rounded stamps
+_ADVANCES = 0.2
+_EQUAL = 0.05  # largest relative rms difference of a position and its reference
+_ALIKE = 0.999  # correlation of one signal in two units
+_FASTEST = 1e-5  # s between samples; no bench records faster
 _CLEARER = 0.5  # ratio of the unexplained shares of acceleration, best input to next best
 # Unexplained share of acceleration. It is smaller for columns that an input moves.
 _FOLLOWS = 0.5
-_PURER = 0.1  # ratio of the curvatures that are not a sine, purest column to next
+_PURER = 0.1  # ratio of the parts of the curvature that are not a sine, purest column to next
 # Unexplained share of acceleration. It is smaller for carts in free motion.
 _FREE = 0.1
 _WINDOW = 0.4  # length of a window, as a share of the fastest period
@@ -149,7 +150,7 @@ def _without_rates(values: Array, signals: Sequence[int], *, interval: float) ->
 
 
 def _find_input(table: FileTable, signals: Sequence[int]) -> tuple[int | None, int | None, str]:
-    """Return the columns of input and reference, each if there is one, and what is in doubt."""
+    """Return the columns of input and reference (or None), and a note on what is in doubt."""
     if len(signals) < 2:
         return None, None, ""
     values = table.values
@@ -226,7 +227,10 @@ def _is_stepped(column: Array) -> bool:
 
 
 def _averages(values: Array, signals: Sequence[int]) -> tuple[Array, Array, Array] | None:
-    """Return mean, slope and curvature (signals, windows) by sample; None for a short record."""
+    """Return mean, slope and curvature (signals, windows) per sample;
+
+    None if the record is short.
+    """
     n = values.shape[1]
     if not signals:
         return None

@@ -21,7 +21,7 @@ Kind = Literal["row", "fraction", "sub", "sup", "dot", "ddot", "matrix", "parens
 
 @dataclass(frozen=True)
 class Math:
-    """A node; a matrix has its parts row by row, and `columns` is its width."""
+    """A node; `columns` is the number of columns of a matrix, whose parts are in rows."""
 
     kind: Kind
     parts: tuple["Term", ...]
@@ -57,7 +57,7 @@ def dot(base: Term, *, order: int = 1) -> Math:
 
 
 def parens(*parts: Term) -> Math:
-    """Return terms in round brackets that grow with them."""
+    """Return terms in round brackets of the same height."""
     return Math("parens", parts)
 
 
@@ -81,7 +81,7 @@ def upright(words: str) -> str:
 
 
 def function(name: str, *argument: Term) -> tuple[Term, ...]:
-    """Return a function's name and its argument, with a space between unless it has brackets."""
+    """Return a function's name and its argument, separated by a space unless it is in brackets."""
     return (THIN_SPACE, name, *(argument or (THIN_SPACE,)))
 
 
@@ -127,7 +127,7 @@ _PLAIN_DIGITS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789−")
 
 
 def to_mathml(math: Term, *, display: bool = False) -> str:
-    """Return the mathematics as MathML, every leaf escaped."""
+    """Return the mathematics as MathML; every leaf is escaped."""
     mode = ' display="block"' if display else ""
     return f"<math{mode}>{_mathml(math)}</math>"
 
@@ -283,8 +283,8 @@ def _tex_row(parts: Sequence[Term]) -> str:
 
 
 def _is_called(name: Term | None, brackets: Math) -> bool:
-    """Whether these brackets hold a function's argument, rather than a product.
+    """Return whether brackets hold a function's argument rather than a factor.
 
-    They do if the name before them is a word, or if they begin with time.
+    They do if the name before them is a word, or if they begin with t for time.
     """
     return brackets.parts[0] == "t" or (isinstance(name, str) and len(name) > 1)

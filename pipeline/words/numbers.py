@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _SUBSCRIPT = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
-_PLAIN_RANGE = (1e-3, 1e5)  # sizes written without a power of ten
+_PLAIN_RANGE = (1e-3, 1e5)  # numbers of this size are written without a power of ten
 _MOST_DIGITS = 8
 _FINEST = 1e-8  # a smaller relative error belongs to exact data and does not limit the digits
 NOTHING = "–"
@@ -14,7 +14,7 @@ _TIMES = " × 10"
 _WHOLE = re.compile(r"[^\w]*\d+(?=\D|$)")
 _EXPONENT = re.compile(r"(?<![\w.])(-?\d+(?:\.\d+)?)e([+-]\d+)\b")
 _HYPHEN = re.compile(r"(?<![\w.)\]])-(?=\d)")
-# A space next to a sign of errors or powers, or between a number and its unit.
+# A space next to ± or ×, before % or °, or between a number and its unit.
 _JOINT = re.compile(
     r"(?<=[\d⁰¹²³⁴-⁹)]) (?=[±×%°σ]|(?:(?:[kmµ]?(?:Hz|V|A|N|g|m|s)|cm|rad|dB|min|h|counts?)\b))"
     r"|(?<=[±×]) (?=[\d(])"
@@ -35,7 +35,7 @@ def significant(value: float | None, *, digits: int = 4, power: bool = False) ->
 
 
 def with_errors(column: Sequence[tuple[float, float | None]]) -> list[str]:
-    """Return "value ± std" for each in a column; if one needs a power of ten, all get one."""
+    """Return "value ± std" for each pair; if one needs a power of ten, all have one."""
     texts = [with_error(value, std) for value, std in column]
     if not any(_TIMES in text for text in texts):
         return texts
@@ -43,9 +43,9 @@ def with_errors(column: Sequence[tuple[float, float | None]]) -> list[str]:
 
 
 def with_error(value: float, std: float | None, *, digits: int = 2, power: bool = False) -> str:
-    """Return "value ± std", rounded to so many digits of the standard error.
+    """Return "value ± std", rounded to `digits` digits of the standard error.
 
-    It has a power of ten if the size of the number, or `power`, requires it.
+    A power of ten is used if the number is very large or very small, or if `power` is true.
     """
     if std is None or not math.isfinite(std) or std <= 0 or not math.isfinite(value):
         return significant(value, power=power)
@@ -97,7 +97,7 @@ def count(n: int, noun: str) -> str:
 
 
 def listing(items: Sequence[str], *, most: int | None = None) -> str:
-    """Return "a", "a and b", "a, b and c"; with `most` the rest is counted, "a, b and 3 more"."""
+    """Return "a", "a and b", "a, b and c"; items beyond `most` are only counted: "a and 3 more"."""
     if most is not None and len(items) > most:
         items = [*items[:most], f"{len(items) - most} more"]
     if len(items) < 2:
@@ -106,7 +106,7 @@ def listing(items: Sequence[str], *, most: int | None = None) -> str:
 
 
 def first_few(names: Sequence[str], most: int) -> str:
-    """Return "a, b, c"; after `most` names the rest is counted, "a, b and 3 more"."""
+    """Return "a, b, c"; names beyond `most` are only counted: "a, b and 3 more"."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
 
@@ -128,7 +128,7 @@ def by_note(notes: Iterable[tuple[str, str]]) -> list[str]:
 
 
 def subscript(n: int) -> str:
-    """Return "₁" for 1, for texts without other means to write an index."""
+    """Return "₁" for 1, for plain text."""
     return str(n).translate(_SUBSCRIPT)
 
 

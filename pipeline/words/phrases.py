@@ -18,7 +18,7 @@ from pipeline.words.spans import Span, Spans
 
 _MARK = re.compile(r"\*\*(?P<strong>.+?)\*\*|`(?P<code>.+?)`|\[(?P<link>.+?)\]\((?P<url>#.+?)\)")
 _VALUE = re.compile(r"\{(\w+)\}")
-_LARGEST = 1_000_000  # bytes of a file
+_LARGEST = 1_000_000  # largest file in bytes
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Phrases:
         return tuple(span for span in _spans(self._template(key, values), values) if span.text)
 
     def _template(self, key: str, values: Mapping[str, object]) -> str:
-        """Return a sentence, after checking that it uses only these values."""
+        """Return a sentence, after checking that it uses only the given values."""
         known = f"it may name {', '.join(f'{{{v}}}' for v in sorted(values)) or 'no values'}"
         if key not in self.by_key:
             raise ConfigError(f"{self._where()}: the sentence {key} is missing; {known}")

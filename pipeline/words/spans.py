@@ -10,8 +10,8 @@ from pipeline.words.math import Term
 class Span:
     """A piece of text in one style, a link, or inline mathematics.
 
-    Links from students are http, https or mailto. cartlab's own may also lead to a place on the
-    page or to a file next to it.
+    Links from students are http, https or mailto. cartlab's own links may also lead to a place on
+    the page or to a file next to it.
     """
 
     text: str

@@ -27,7 +27,7 @@ from pipeline.plant.nonlinear.effects.law import (
 from pipeline.plant.nonlinear.simulator.laws import settling
 from pipeline.set_up import Units
 
-_PHASE = 0.05  # rad of the fastest oscillation per step. Its period is then right to 1e-4
+_PHASE = 0.05  # rad of the fastest oscillation per step, for an error of 1e-4 in its period
 _LONGEST = 2e-4  # s
 _DIGITS = 10  # as in gap.json
 
@@ -58,9 +58,9 @@ class Body:
 
     Attributes
     ----------
-    mass : an expression.
-    suffix : distinguishes its states, such as `1` in `x1`.
-    start : index (from 0) of the cart whose initial state it takes.
+    mass : the mass as an expression.
+    suffix : ending of the names of the body's states, such as `1` in `x1`.
+    start : index (from 0) of the cart whose initial state the body takes.
     """
 
     name: str
@@ -76,9 +76,9 @@ class Force:
 
     Attributes
     ----------
-    side, depth, rate : expressions of a contact. It acts while `depth` has the sign of `side`.
-        `rate` is the velocity of `depth`.
-    pulls : whether a contact may pull too.
+    side, depth, rate : expressions that describe a contact, which acts while `depth` has the sign
+        of `side`. `rate` is the velocity of `depth`.
+    pulls : whether a contact may also pull.
     """
 
     title: str
@@ -112,7 +112,7 @@ class SpringTension:
 
 @dataclass(frozen=True)
 class Bristle:
-    """A state of dry friction, the bristle's bend `z`; `force` and `rate` are linear in it."""
+    """A state of dry friction: the bend `z` of a bristle. `force` and `rate` are linear in `z`."""
 
     name: str
     title: str
@@ -151,8 +151,8 @@ class Description:
     ----------
     links : each hidden mass, with the force on its cart. The opposite force acts on the mass.
     inputs : title and law of each step from the input to the force `u`.
-    rest : (n_carts,) rest positions. Dry friction is left out.
-    turned : whether the recordings have the opposite sign of the input.
+    rest : (n_carts,) rest positions, computed without dry friction.
+    turned : whether the input has the opposite sign in the recordings.
     """
 
     units: Units
@@ -209,8 +209,8 @@ def describe(
 
     Parameters
     ----------
-    free : the carts that may move, by default all. Nothing is known of the others.
-    turned : whether the recordings have the opposite sign of the input.
+    free : the carts that may move, by default all. The parameters of other carts are unknown.
+    turned : whether the input has the opposite sign in the recordings.
 
     Raises
     ------
@@ -302,7 +302,7 @@ def _name(term: EffectTerm, parameter: str) -> str:
 
 
 def _law(term: EffectTerm, text: str, **quantities: str) -> str:
-    """Return the expression of an effect's law, with the names of its place in the model."""
+    """Return the expression of an effect's law, with the model's names of bodies and states."""
     place = f"cart_{term.place or 1}"
     known = {"x": f"x.{place}", "v": f"v.{place}", **quantities}
     if term.effect.place == "spring":
@@ -391,7 +391,7 @@ def _springs(
 
 
 def _difference(letter: str, left: str, right: str) -> str:
-    """Return the expression right minus left; "" is a wall, at zero."""
+    """Return the expression right minus left; "" means a wall, which is at zero."""
     if not (left and right):
         return f"{letter}.{right}" if right else f"-{letter}.{left}"
     return f"{letter}.{right} - {letter}.{left}"
@@ -426,8 +426,8 @@ def _link(term: EffectTerm) -> tuple[str, Force]:
 def _longest_step(model: AugmentedChain, free: Sequence[int]) -> float:
     """Return the longest time step in s: a twentieth of a radian of the fastest oscillation.
 
-    In a contact it is a tenth of a radian. cartlab's own simulator has a higher order and takes
-    steps four times as long.
+    For oscillations in a contact, it is a tenth of a radian. cartlab's own simulator has a higher
+    order and takes steps four times as long.
     """
     step = 0.25 * SteppedBench(model, free=free).shortest_step
     cart = model.tables().cart

@@ -21,8 +21,9 @@ from pipeline.exchange.model.description import Description
 from pipeline.exchange.model.sources import c_sources, render
 
 _COMPILERS = ("cc", "gcc", "clang")
-_PATIENCE = 120.0  # s. Compiling takes 0.3 s
-_EPOCH = (1980, 1, 1, 0, 0, 0)  # a zip's first date, so that the same model gives the same bytes
+_PATIENCE = 120.0  # s; compiling normally takes 0.3 s
+# earliest date in a zip file; a fixed date gives the same bytes each time
+_EPOCH = (1980, 1, 1, 0, 0, 0)
 _LIBRARY = {"linux": "so", "darwin": "dylib", "win32": "dll"}
 _SYSTEM = {"linux": "linux", "darwin": "darwin", "win32": "win"}
 

@@ -31,7 +31,7 @@ def render(
     name: str, description: Description, *, code: Callable[[str], str] = in_c, **more: Any
 ) -> str:
     """Fill in a template of `templates/model`; `code` translates expressions."""
-    import jinja2  # takes 50 ms
+    import jinja2  # late: importing it takes 50 ms
 
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES / "model"),

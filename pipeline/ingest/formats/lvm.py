@@ -177,7 +177,7 @@ def _read(segment: _Segment, dialect: _Dialect) -> FileTable:
 
 
 def _missing(segment: _Segment, found: int) -> str | None:
-    """Return why a segment seems truncated: fewer rows than its header states. Else None."""
+    """Return a note if a segment has fewer rows than its header states; otherwise None."""
     said = max((int(n) for n in segment.header.get("Samples", []) if n.isdecimal()), default=0)
     return f"line {segment.lines[-1]}: {found:,} of {said:,} samples" if found < said else None
 
@@ -196,7 +196,10 @@ def _headings(segment: _Segment, names: Sequence[str], dialect: _Dialect) -> lis
 
 
 def _with_one_clock(rows: Rows, names: Sequence[str], *, place: str) -> Rows:
-    """Return the rows with only the first of their time columns; all of these must be equal."""
+    """Return the rows with only the first of their time columns;
+
+    the time columns must all be equal.
+    """
     clocks = [i for i in range(len(rows.names)) if names[i] == "X_Value"]
     if any((rows.values[:, i] != rows.values[:, clocks[0]]).any() for i in clocks[1:]):
         raise SubmissionError(

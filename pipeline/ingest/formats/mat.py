@@ -90,7 +90,7 @@ def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariabl
     signals = [v for v in signals if v.samples > 0.1 * longest]
     sizes = first_few([str(v) for v in signals], _MOST_NAMED)
     vectors = [v for v in signals if v.is_vector]
-    if all(v.samples < longest for v in vectors):  # a matrix is longer
+    if all(v.samples < longest for v in vectors):  # the longest variable is a matrix
         vectors, signals = [], [v for v in signals if v.samples == longest]
     if len({v.samples for v in vectors}) > 1:
         raise SubmissionError(f"{source}: the vectors differ in length: {sizes}")
@@ -104,7 +104,7 @@ def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariabl
             raise SubmissionError(f"{source}: {matrices[0]} has more than {_MAX_COLUMNS} columns")
         return matrices
     if any(bench <= {v.name for v in vectors} for bench in _BENCH):
-        return vectors  # a bench log is complete; other variables are derived
+        return vectors  # a bench log is complete; other variables were computed from it
     matrices = [matrix for matrix in matrices if matrix.samples == vectors[0].samples]
     columns = len(vectors) + sum(min(matrix.size) for matrix in matrices)
     return [*vectors, *matrices] if columns <= _MAX_COLUMNS else vectors

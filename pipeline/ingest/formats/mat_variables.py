@@ -1,8 +1,9 @@
 """Read the variables of a `.mat` file: versions 4 to 7 here, version 7.3 with h5py.
 
 A hostile file can demand gigabytes, an endless loop or another file on the disk. In scipy's reader,
-a few changed bytes end the whole process. So only real matrices are read, and they are decompressed
-only to the size that a recording can have. Layout: "MAT-File Format", The MathWorks, R2023b.
+a few changed bytes can crash the whole process. So only real matrices are read, and they are
+decompressed only to the size that a recording can have. Layout: "MAT-File Format", The MathWorks,
+R2023b.
 """
 
 import math
@@ -19,7 +20,7 @@ import numpy as np
 from pipeline.errors import SubmissionError
 from pipeline.ingest.formats.table import Variable
 
-_MOST_BYTES = 200_000_000  # of all variables, decompressed
+_MOST_BYTES = 200_000_000  # largest total size of all variables, decompressed
 _MOST_VARIABLES, _LONGEST_NAME = 1000, 64  # no workspace has more
 _MOST_DIMENSIONS = 32
 _MOST_PACKED = 1_100  # largest ratio of decompressed to compressed size
@@ -44,7 +45,7 @@ _NUMBERS = frozenset(
 class MatVariable:
     """A variable: its numbers (rows, columns), or None and a description.
 
-    `bytes` is its size in the file, if its numbers are not read.
+    `bytes` is the variable's size in the file if its numbers are not read.
     """
 
     name: str
@@ -55,7 +56,7 @@ class MatVariable:
 
     @property
     def numbers(self) -> np.ndarray:
-        """The numbers of a variable that has some."""
+        """The numbers; the variable must have some."""
         assert self.values is not None
         return self.values
 
@@ -287,7 +288,7 @@ def _bytes_to_read(item: Any) -> int:
 
     Raises
     ------
-    ValueError : it has more numbers than its bytes in the file can hold.
+    ValueError : the data set claims more numbers than its bytes in the file can hold.
     """
     part = math.prod(item.chunks or ()) * item.dtype.itemsize
     if item.nbytes > max(_MOST_PACKED * item.id.get_storage_size(), _MOST_ABSENT):

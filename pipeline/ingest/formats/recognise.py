@@ -54,8 +54,8 @@ def read_table(
 ) -> tuple[FileTable, str]:
     """Return the columns of a data file and the SHA-256 of its bytes.
 
-    Messages call the file `shown`, by default its name. If it is missing, the files in `taken` are
-    not suggested.
+    Messages call the file `shown`, by default its name. If the file is missing, similar names are
+    suggested, except those in `taken`.
 
     Raises
     ------

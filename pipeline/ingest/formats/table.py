@@ -24,10 +24,10 @@ class Variable:
 
     Attributes
     ----------
-    size : rows and columns. Empty if they could not be read.
-    kind : the type of its numbers, or its description.
-    read : whether its numbers are among the columns.
-    advice : how to make it readable. Empty if it cannot hold a recording.
+    size : numbers of rows and columns; empty if they could not be read.
+    kind : type of the numbers, or a description of other content.
+    read : whether the numbers are among the columns of the table.
+    advice : how to make the variable readable; empty if it cannot hold a recording.
     """
 
     name: str
@@ -53,10 +53,10 @@ class FileTable:
     names : (n_columns,) headings as written. Without headings, the numbers "1", "2", ….
     values : (n_columns, n), all finite.
     whole : (n_columns,) whether all numbers of a column were written as whole numbers.
-    lines : (n,) line of the file for each row. None for a binary file.
-    lines_are : the unit of `lines`. It is "line", or "row" for a sheet.
-    cut : the broken last line of a truncated file. None if the file is complete.
-    notes : repairs and omissions while reading.
+    lines : (n,) line of the file in which each row is written; None for a binary file.
+    lines_are : what `lines` counts: "line", or "row" for a sheet.
+    cut : the broken last line of a truncated file; None if the file is complete.
+    notes : repairs and omissions made while reading.
     variables : the variables of a binary file, in the order of the file.
     """
 
@@ -147,7 +147,7 @@ def refuse_extreme(values: Array, *, what: str) -> None:
 
     Raises
     ------
-    SubmissionError : the message gives `what` and its file.
+    SubmissionError : there is such a number; the message begins with `what`.
     """
     largest = float(np.abs(values).max(initial=0.0))
     if largest != 0 and not _SMALLEST_MEASURED <= largest <= _LARGEST_MEASURED:

@@ -102,7 +102,7 @@ class _Channel:
 
     @property
     def numbers(self) -> Array:
-        """The numbers of a channel that has some."""
+        """The numbers; the channel must have some."""
         assert self.values is not None
         return self.values
 
@@ -242,7 +242,7 @@ class _Listener(logging.Handler):
 
 
 def _recording(channels: Sequence[_Channel], *, source: str) -> tuple[str, list[_Channel]]:
-    """Return the group that is the recording, with its channels; short ones are settings.
+    """Return the group that is the recording, and its channels; short channels are only settings.
 
     Raises
     ------
@@ -276,7 +276,7 @@ def _clock(channels: Sequence[_Channel], *, source: str) -> tuple[float, float]:
 
     Raises
     ------
-    SubmissionError : the channels state different ones.
+    SubmissionError : the channels state different intervals or first times.
     """
     stated = {(one.interval, one.start) for one in channels if one.interval > 0}
     if len(stated) > 1:

@@ -21,7 +21,7 @@ _HEADING_WORDS = re.compile(
 _TIME_HEADING = re.compile(r"(?:^|[,;\t])\W*(?:sample\s+)?(?:t|time)(?![a-z])", re.IGNORECASE)
 _OPENING = re.compile(r"^[^\S\n]*(?:[A-Za-z]\w*\s*=\s*)?\[", re.MULTILINE)
 _LONGEST_HEADING = 100  # characters
-_LONGEST_UNIT = 8  # characters: "counts", "rad/s"
+_LONGEST_UNIT = 8  # characters; enough for "counts" and "rad/s"
 QUOTES = " \"'"
 
 
@@ -30,7 +30,8 @@ def read_text(raw: bytes, *, source: str) -> FileTable:
 
     Raises
     ------
-    SubmissionError : this is not text or not a table, or a row does not fit; names the line.
+    SubmissionError : the file is not text or not a table, or a row does not fit; the message names
+        the line.
     """
     text = decode(raw, source=source).replace("\r\n", "\n").replace("\r", "\n")
     opening = _OPENING.search(text) if "[" in text else None
@@ -171,8 +172,8 @@ def checked_names(names: Sequence[str], *, place: str) -> list[str]:
 
     Raises
     ------
-    SubmissionError : there are too many, too long or repeated ones; the message begins with
-        `place`.
+    SubmissionError : there are too many headings, or a heading is too long or repeated; the message
+        begins with `place`.
     """
     if len(names) > MOST_COLUMNS:
         raise SubmissionError(f"{place}: more than {MOST_COLUMNS} columns")
@@ -239,7 +240,7 @@ def _ecp(text: str, opening: re.Match[str], source: str) -> FileTable:
 
 
 def _ecp_heading(head: str) -> tuple[list[str], int]:
-    """Return the last line before the bracket that names a time or an encoder, and its number."""
+    """Return the names in an ECP heading, and the number of its line."""
     lines = head.split("\n")
     for number in range(len(lines), 0, -1):
         line = lines[number - 1].strip().lstrip("%#").strip()
@@ -326,7 +327,7 @@ def _heading(
     """Return the headings, or None, and the index of the first row of numbers.
 
     The last comment before a table without headings may be its heading. A row of units below the
-    heading ("ms", "V") is added to the names, "time [ms]".
+    heading ("ms", "V") is added to the names: "time [ms]".
     """
     if not layout.has_heading:
         width = len(layout.fields(lines[start][1]))
@@ -342,7 +343,7 @@ def _heading(
 
 
 def with_units(names: Sequence[str], units: Sequence[str]) -> list[str] | None:
-    """Return headings with the units below them, "time [ms]"; None if these are not units."""
+    """Return headings with the units below them, "time [ms]"; None if there are no such units."""
     bare = [unit.strip(' ()[]"') for unit in units]
     words = all(re.fullmatch(rf"[^\d]{{1,{_LONGEST_UNIT}}}", unit) for unit in bare)
     if not words or len(bare) != len(names) or bare == list(names):
@@ -353,7 +354,7 @@ def with_units(names: Sequence[str], units: Sequence[str]) -> list[str] | None:
 def is_bench_log(names: Sequence[str]) -> bool:
     """Return whether the headings are those of the bench's own log.
 
-    These are ECP headings without a commanded position. The file has no brackets either.
+    These are the headings of an ECP file without a commanded position and without brackets.
     """
     words = {name.casefold() for name in names}
     return (

@@ -35,8 +35,8 @@ def read_workbook(raw: bytes, *, source: str) -> FileTable:
 
     Raises
     ------
-    SubmissionError : the file is broken or has no headings, or a cell is not a number; names the
-        cell.
+    SubmissionError : the file is broken or has no headings, or a cell is not a number; the message
+        names the cell.
     """
     book = Book(raw, source=source)
     for name in book.sheets:
@@ -65,9 +65,9 @@ class _Block:
     Attributes
     ----------
     heading : the row of the headings.
-    units : the row below the headings that holds units. Zero without one.
-    rows : the rows of numbers, from the headings to `end`.
-    end : the row of the next headings. It is not included.
+    units : row below the headings that holds units; zero if there is no such row.
+    rows : the rows of numbers, between the headings and `end`.
+    end : row of the next headings; it is not included.
     """
 
     heading: int
@@ -151,7 +151,7 @@ class _Sheet:
         ]
 
     def _names_half(self, row: int, numbers: int) -> bool:
-        """Return whether a row names at least half of the columns; a remark does not."""
+        """Return whether a row names at least half of the columns, unlike a remark."""
         columns = self._columns[slice(*np.searchsorted(self._rows, [numbers, numbers + 1]))]
         named = sum(bool(self._text(row, column)) for column in columns.tolist())
         return 2 * named >= columns.size
@@ -221,7 +221,7 @@ class _Sheet:
     def _refuse_gaps(
         self, rows: NDArray[np.int64], own: NDArray[np.int64], *, column: int, name: str
     ) -> None:
-        """Refuse a column if a cell holds no number, or if a cell occurs twice."""
+        """Refuse a column if a cell holds no number, or if the file has a cell twice."""
         if (doubled := np.flatnonzero(np.diff(own) == 0)).size:
             cell = _cell(int(own[doubled[0]]), column)
             raise SubmissionError(f"{self._where} cell {cell}: the file has it twice")
@@ -238,7 +238,7 @@ class _Sheet:
         """Return dates or times of day in seconds, with a note; None for other numbers.
 
         A spreadsheet stores them in days. A single date among numbers is an error: the spreadsheet
-        has turned "1.5" into it.
+        has turned a number such as 1.5 into a date.
         """
         looks, values = self._looks[cells], self._values[cells]
         is_time = (looks == "date") | (looks == "time")
@@ -272,7 +272,7 @@ class _Sheet:
         return [f"{len(read)} numbers that are stored as text were read{mark}"]
 
     def _left_out(self, block: _Block, used: Sequence[int]) -> list[str]:
-        """Return a note on rows and columns of the sheet that the table does not contain."""
+        """Return a note on rows and columns of the sheet that are not in the table."""
         texts = np.array([*self._texts, *self._wrong], dtype=np.int64).reshape(-1, 2)
         rows, columns = np.r_[self._rows, texts[:, 0]], np.r_[self._columns, texts[:, 1]]
         inside = (rows >= block.heading) & (rows < block.end)

@@ -1,9 +1,8 @@
 """Read the cells of an Excel workbook (.xlsx), using only the standard library.
 
 A workbook of 2 kB may name two cells a million rows apart, or declare a billion texts. Readers that
-reserve memory for what is declared then end the whole process. Here no declaration is trusted:
-parts are decompressed and parsed piece by piece, and the results are counted. Layout: ECMA-376-1,
-chapter 18.
+reserve memory for all this crash. Here no declaration is trusted: parts are decompressed and parsed
+piece by piece, and the results are counted. Layout: ECMA-376-1, chapter 18.
 """
 
 import posixpath
@@ -20,16 +19,16 @@ from xml.parsers import expat
 
 from pipeline.errors import SubmissionError
 
-_MOST_BYTES = 200_000_000  # of all parts, decompressed
+_MOST_BYTES = 200_000_000  # largest total size of all parts, decompressed
 _MOST_ELEMENTS = 6_000_000  # two per cell
 _MOST_CELLS, _MOST_TEXTS = 2_000_000, 500_000
 _MOST_DIRECTORY = 1_000_000  # bytes of the archive's table of contents
 _MOST_SHEETS = 250
 _MOST_ROWS, _MOST_COLUMNS = 1_048_576, 16_384  # limits of any sheet
 _CHUNK = 1 << 18
-_LONGEST_TOKEN = 1_000_000  # bytes. The parser expat reads a tag again until it is complete
+_LONGEST_TOKEN = 1_000_000  # bytes; the parser expat reads a tag again until it is complete
 _DEEPEST = 60  # levels of nested elements
-_LONGEST_TEXT = 200  # characters to keep of a cell
+_LONGEST_TEXT = 200  # characters kept of a cell
 _REFERENCE = re.compile(r"([A-Z]{1,3})([1-9]\d{0,6})")
 _NO_VALUE = "a formula without its value: open the file in a spreadsheet program and save it again"
 
@@ -51,7 +50,7 @@ class Cells:
     Attributes
     ----------
     rows, columns : row and column (from 1) of each number in `values`.
-    looks : the number format of each. See `Book.looks`.
+    looks : number format of each number; see `Book.looks`.
     texts : texts, by (row, column).
     wrong : contents that cannot be a measurement, by (row, column).
     merged : for each cell of a merged range, the first cell of the range.
@@ -244,7 +243,7 @@ class Book:
 
 @contextmanager
 def _reported(source: str) -> Iterator[None]:
-    """Turn every error that a broken workbook causes into one of one line."""
+    """Turn every error that a broken workbook causes into a `SubmissionError` of one line."""
     try:
         yield
     except (_Broken, zipfile.BadZipFile, zlib.error, struct.error, expat.ExpatError, EOFError,
@@ -263,7 +262,7 @@ class _Bounded(BytesIO):
 
 
 class _Full(Exception):
-    """More cells than are wanted."""
+    """There are more cells than the caller wants."""
 
 
 class _Texts:
@@ -381,7 +380,7 @@ class _Sheet:
         elif self._kind in ("str", "inlineStr"):
             if text := value.strip():
                 self.cells.texts[at] = text
-        else:  # "e" an error, "b" a truth value, "d" a date as text
+        else:  # "e" is an error, "b" a truth value, "d" a date as text
             words = {"b": {"0": "FALSE", "1": "TRUE"}.get(value, value)}.get(self._kind, value)
             self.cells.wrong[at] = f"not a number: {words[:30]!r}"
 
