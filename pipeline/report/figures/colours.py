@@ -9,7 +9,7 @@ THIRD = "#009e73"
 QUIET = "#8a8a8a"
 SHADE = "#ececec"
 GRID = "#e4e4e4"
-# For carts in the same panel: colour, line style, marker of single points, and the marker's name.
+# For carts in the same panel: colour, line style, marker, and name of the marker.
 CARTS = (
     (MODEL, "-", "o", "circles"),
     (SECOND, "--", "s", "squares"),
@@ -17,5 +17,5 @@ CARTS = (
     (MEASURED, ":", "D", "diamonds"),
 )
 
-Look = dict[str, Any]  # options of a line for matplotlib, such as colour, style and width (points)
+Look = dict[str, Any]  # matplotlib options of a line, such as colour, style and width (points)
 SECOND_LINE: Look = {"color": SECOND, "ls": "--", "lw": 1.0}

@@ -13,11 +13,11 @@ from pipeline.report.render.pdf import lay_out, print_pages
 def write_document(document: Document, out: Path, *, name: str, pdf: bool) -> None:
     """Write a document as `name.html`, `name.pdf` and `figures/*.svg` into the folder `out`.
 
-    Everything is made before the first file is written: an interrupted run leaves an earlier
+    Everything is made before the first file is written, so an interrupted run leaves an earlier
     document complete.
     """
     figures = own_folder(out, "figures")
-    with ThreadPoolExecutor(max_workers=1) as beside:  # typst runs without the interpreter's lock
+    with ThreadPoolExecutor(max_workers=1) as beside:  # typst releases Python's global lock
         layout = beside.submit(lay_out, document) if pdf else None
         drawn = {f"{picture.name}.svg": plain_svg(picture.svg) for picture in document.pictures()}
         printed = beside.submit(lambda: print_pages(document, layout.result())) if layout else None
