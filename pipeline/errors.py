@@ -17,7 +17,7 @@ _OF_A_NAME = frozenset(
         errno.EILSEQ,
     }
 )
-# The same, and errors of a user's own file: it is missing, in a loop of links, or not permitted.
+# These errors, and others of a user's file: it is missing, in a loop of links, or not permitted.
 _OF_A_FILE = _OF_A_NAME | {errno.ENOENT, errno.ELOOP, errno.EACCES, errno.EPERM}
 _OF_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 

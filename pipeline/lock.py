@@ -83,7 +83,7 @@ def _locked(path: Path, *, patience: float) -> Iterator[None]:
 
 
 def _sign(file: int) -> None:
-    """Write this process's number into the acquired lock; messages to others give it."""
+    """Write this process's number into the acquired lock file, for messages of other processes."""
     before = os.read(file, 32)
     # Up to version 0.2 a lock file was an SQLite database.
     if before.strip() and not before.strip().isdigit() and not before.startswith(b"SQLite format"):

@@ -30,7 +30,7 @@ def check_folder(out: Path) -> Path:
 
     Raises
     ------
-    ConfigError : its path is taken by something that is not a folder.
+    ConfigError : the path is taken by something that is not a folder.
     """
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out}: is a file; give a folder with --out")
@@ -42,8 +42,8 @@ def named_folder(out: Path) -> Path:
 
     Raises
     ------
-    ConfigError : its path is taken by something that is not a folder, or the name looks like a
-        file's although several files are written.
+    ConfigError : the path is taken by something that is not a folder, or looks like that of a file
+        although several files are written.
     """
     files = (".html", ".pdf", ".json", ".csv", ".xlsx", ".zip", ".db", ".sqlite")
     if not out.is_dir() and out.suffix.lower() in files:
@@ -52,7 +52,7 @@ def named_folder(out: Path) -> Path:
 
 
 def new_folder(out: Path) -> Path:
-    """Return the folder, which may not exist yet or is empty except for lock files.
+    """Return an output folder that does not exist yet, or is empty except for lock files.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def own_folder(parent: Path, name: str) -> Path:
 
     Raises
     ------
-    ConfigError : its path is taken by a file or a link. A link could lead to anybody's files.
+    ConfigError : the path is taken by a file or a link. A link could lead to anybody's files.
     """
     folder = parent / name
     if folder.is_symlink():

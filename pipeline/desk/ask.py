@@ -80,7 +80,7 @@ class Desk:
 
         Parameters
         ----------
-        stated : returns the columns that `submission.toml` states for a file.
+        stated : function that returns the columns that `submission.toml` states for a file.
         """
         found = {}
         for file in self.workers.do("list_files", folder=str(folder)):
@@ -142,7 +142,8 @@ class Ask:
     def place(self) -> Place | None:
         """The submission or gradebook of the address; None if the user has no such place.
 
-        Addresses count only the user's own places, so no address leads to those of others.
+        The number in an address counts only the user's own places, so no address leads to places of
+        others.
         """
         # A student may see only their own grade, not the gradebook.
         if self.here.startswith("/feedback/"):
@@ -216,10 +217,7 @@ class Ask:
         return "/".join(self.request.url.path.split("/")[:3]).rstrip("/") + "/"
 
     def _room(self, place: str = "") -> tuple[str, str]:
-        """Return the key for messages:
-
-        the person, and the address with the part of the page, if any.
-        """
+        """Return the key for messages: the person, and the address with the part of the page."""
         return self.user.name, self.here + place
 
     @property

@@ -22,8 +22,6 @@ class BenchSession(ShownSession):
     Attributes
     ----------
     said : how the session ended; "" while it runs.
-    failed : whether the session ended with an error.
-    ended : set when the process has ended.
     """
 
     def __init__(self, given: Mapping[str, Any]) -> None:

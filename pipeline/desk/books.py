@@ -45,7 +45,7 @@ class Class:
 
     @cached_property
     def lost(self) -> Mapping[str, set[str]]:
-        """For each criterion, the teams without full points; not judged counts as no points."""
+        """For each criterion, the teams without full points or without a judgement."""
         lost: dict[str, set[str]] = {asked.id: set() for asked in self.rubric.criteria}
         whole = {asked.id: asked.points for asked in self.rubric.criteria}
         for name, team in self.teams.items():
@@ -116,12 +116,7 @@ class Books:
         return known
 
     def drawn(self, place: Path | str, what: str, draw: Callable[[Class], Any]) -> Any:
-        """Return a drawing of a class; draw it again only after a change, one drawing at a time.
-
-        Parameters
-        ----------
-        what : name of the drawing.
-        """
+        """Return a drawing of a class; draw it again only after a change, one drawing at a time."""
         shown = self.of(place)
         with self._drawing:
             known = self._drawn.get((place, what))

@@ -1,4 +1,4 @@
-"""Tasks that the desk runs in worker processes; only these read files from other people."""
+"""Tasks that the desk runs in worker processes; only these processes read other people's files."""
 
 import json
 import os
@@ -304,12 +304,7 @@ def regrade_class(
 
 
 def preview_rubric(folder: str, text: str, *, progress: Progress) -> dict[str, Any]:
-    """Return the points of a graded class under another rubric; see `RubricPreview`.
-
-    Parameters
-    ----------
-    text : text of the other rubric.
-    """
+    """Return the points of a graded class under another rubric; see `RubricPreview`."""
     from pipeline.grading.gradebook.book import Gradebook
     from pipeline.grading.publish.rubric_preview import preview_rubric as preview
     from pipeline.grading.rubric_file import parse_rubric
@@ -386,7 +381,7 @@ def _draw_lines(rows: Sequence[Array]) -> list[str]:
 
 
 def _write_points(row: Array) -> str:
-    """Return values from 0 to 1 as points: the largest or, in every second stretch, the least."""
+    """Return values from 0 to 1 as points: in turn the largest and the least of a stretch."""
     stretches = np.array_split(row, min(row.size, _ACROSS))
     heights = [(s.max(), s.min())[i % 2] for i, s in enumerate(stretches)]
     step = _ACROSS / max(len(heights) - 1, 1)

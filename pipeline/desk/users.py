@@ -114,9 +114,9 @@ _HEADER = r"^[A-Za-z0-9-]+$"
 class Proxy(TomlTable):
     """The reverse proxy of a lab server, which identifies each person."""
 
-    address: Annotated[str, Field(min_length=1)]  # the proxy's; no other computer may connect
-    header: Annotated[str, Field(pattern=_HEADER)]  # contains the person's name
-    secret_header: Annotated[str, Field(pattern=_HEADER)]  # contains the secret
+    address: Annotated[str, Field(min_length=1)]  # only the proxy may connect
+    header: Annotated[str, Field(pattern=_HEADER)]  # states the person's name
+    secret_header: Annotated[str, Field(pattern=_HEADER)]  # states the secret
     # Known only to the proxy and the desk.
     secret: Annotated[str, Field(pattern=r"^[!-~]{24,200}$")]
     # The address that browsers use; they write it in lower case.

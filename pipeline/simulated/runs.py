@@ -46,7 +46,7 @@ class SimulatedSession:
 
     @property
     def chain(self) -> Chain:
-        """The carts."""
+        """The linear model of the carts."""
         return self.bench.chain
 
     @property

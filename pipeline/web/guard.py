@@ -46,7 +46,6 @@ class Guard:
 
     Parameters
     ----------
-    door : the rules for who may send requests.
     headers : security headers added to every answer, unless the page itself sets them.
     """
 

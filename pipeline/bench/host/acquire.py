@@ -102,13 +102,10 @@ class _Acquisition:
         self._observer = observer
         self._only = frozenset(only)
         self._buttons = buttons
-        self._failed: dict[str, int] = {}  # number of failed tries of each recording
+        self._failed: dict[str, int] = {}  # number of failed attempts at each recording
 
     def outcomes(self) -> Iterator[RunOutcome]:
-        """Record until nothing is missing;
-
-        yield how each run ended. Reopen a line that was lost.
-        """
+        """Record until nothing is missing, and reopen a lost line; yield how each run ended."""
         lost = True
         while lost:
             with open_line(self._port, baud=self._baud()) as line:
@@ -122,7 +119,7 @@ class _Acquisition:
         return load_plan(submission).baud if plan_path(submission).exists() else _USUAL_BAUD
 
     def _on_line(self, line: SerialLine) -> Generator[RunOutcome, None, bool]:
-        """Record over one line; return whether the line was lost."""
+        """Record on one open line; return whether the line was lost."""
         bench = line.bench
         new = not (self._folder / NAME).exists()
         submission = prepare_submission(self._folder, bench, stock=not bench.commands)

@@ -1,4 +1,4 @@
-"""Add experiments and scales to submission.toml, whose text is kept, or write a new file."""
+"""Add experiments and scales to submission.toml, keeping its text, or write a new file."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

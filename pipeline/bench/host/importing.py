@@ -156,7 +156,7 @@ class Importer:
             return None
 
     def _take(self, path: Path, *, final: bool) -> Imported | None:
-        """Copy a file into the submission and enter it; return None if it is refused or known.
+        """Copy a file into the submission and enter it; None if it is refused or already there.
 
         A file with an incomplete last line may still grow, so it is tried again later.
 

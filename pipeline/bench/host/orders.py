@@ -143,10 +143,6 @@ def make_order(
 ) -> Order:
     """Return the order of a recording: its commands, with amplitudes in counts.
 
-    Parameters
-    ----------
-    gains : gains of the controller, for a closed loop.
-
     Raises
     ------
     ConfigError : the amplitude exceeds the limits or full scale, or is less than half a count.

@@ -163,7 +163,7 @@ def free_raw_path(folder: Path, recording: Recording) -> Path:
 def known_commands(folder: Path) -> frozenset[str]:
     """Return the extensions of the bench that made the latest recording.
 
-    For a stock bench it is only the chirp.
+    Without a recording, assume only the chirp.
     """
     for path in sorted((folder / FOLDER).glob("*.raw"), key=lambda p: p.stat().st_mtime)[::-1]:
         try:

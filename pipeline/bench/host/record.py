@@ -19,10 +19,7 @@ def data_file(recording: Recording, *, partial: bool = False) -> str:
 
 
 def readings_of(run: RawRun) -> tuple[Reading, ...]:
-    """Return the valid lines of a run in order, judged as they were during the run.
-
-    They are judged in the same way as during the run.
-    """
+    """Return the valid lines of a run in order, judged as they were during the run."""
     stream = Stream(
         encoders=run.header.bench.encoders,
         period=1e3 * run.header.bench.period,

@@ -14,14 +14,14 @@ class LineWatch:
 
     Parameters
     ----------
-    carts : number of carts whose travel is watched; 0 if they have no true zero.
+    carts : number of carts whose travel is watched; 0 if the counts have no true zero.
     period : ms between lines; None for a stock bench, because its wave is not known to the ms.
 
     Attributes
     ----------
-    is_astray : the motor's duty was not as ordered.
-    is_too_far : a cart was farther from its zero than its limit.
-    is_unsafe : the run was stopped because it was not safe to continue.
+    is_astray : whether the motor's duty was not as ordered.
+    is_too_far : whether a cart was farther from its zero than its limit.
+    is_unsafe : whether the run was stopped because it was not safe to continue.
     """
 
     def __init__(self, order: Order, *, carts: int, period: float | None) -> None:
@@ -87,7 +87,7 @@ class _InARow:
         elif self._since is None:
             self._since = ms
         else:
-            return ms - self._since >= 4  # at least two lines; at 1 kHz five
+            return ms - self._since >= 4  # at least two lines, or five at 1 kHz
         return False
 
 
@@ -150,7 +150,7 @@ class RestWatch(LineWatch):
 
     @property
     def last(self) -> Reading | None:
-        """The last line, or None if there is none."""
+        """The last line kept; None before the first."""
         return self._readings[-1] if self._readings else None
 
     @property

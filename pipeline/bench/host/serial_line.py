@@ -144,10 +144,7 @@ class SerialLine:
             return data
 
     def _run_away(self, why: str) -> None:
-        """Raise `Runaway`, because the bench acted without an order;
-
-        later starts raise it again.
-        """
+        """Raise `Runaway`: the bench acted without an order. Later starts raise it again."""
         self._runaway = Runaway(f"stopped: the bench {why}; switch its motor off and find out why")
         raise self._runaway
 

@@ -1,9 +1,9 @@
 """Carry out runs on the bench, one at a time: rest, start, check every line, and always stop.
 
 One loop carries out a run. Every few milliseconds it reads the port, writes the bytes to the raw
-file, sends the heartbeat and checks the limits. The rest before the run works in the same way. The
-loop has no thread of its own: if the program hangs, the heartbeat ends and the bench cuts its
-motor.
+file, sends the heartbeat and checks the limits. The period of rest before a run works in the same
+way. The loop has no thread of its own: if the program hangs, the heartbeat ends and the bench cuts
+its motor.
 """
 
 import gc
@@ -219,7 +219,7 @@ class Session:
         )
 
     def _rest(self, order: Order) -> str:
-        """Wait until the carts rest, and watch them by a run without motion.
+        """Wait until the carts rest; a run without motion shows their positions.
 
         Returns a message if the carts still move, or "".
         """

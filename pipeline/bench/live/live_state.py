@@ -214,7 +214,7 @@ class LiveState(ShownSession):
     def remark(self, sentence: str) -> None:
         """Announce something that does not belong to a single run."""
         with self._lock:
-            # An exploration opens the line in every turn and repeats its remarks.
+            # An exploration opens the line again and again, and repeats its remarks.
             if sentence not in self._remarks:
                 self._remarks.append(sentence)
             self.version += 1

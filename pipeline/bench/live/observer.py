@@ -1,4 +1,4 @@
-"""The interface for those who watch a session at the bench: the terminal, a web page, a test."""
+"""The interface for displays of a session at the bench: the terminal, a web page, a test."""
 
 import threading
 from collections.abc import Sequence
@@ -52,8 +52,8 @@ class RunOutcome:
     lines : number of valid lines.
     partial : why the run ended early; "" if it did not.
     remarks : notes for the person, one sentence each.
-    is_astray : the bench acted without an order, so it gets no more orders.
-    is_unsafe : it was not safe to continue, so the same recording is not tried again.
+    is_astray : whether the bench acted without an order, so that it gets no more orders.
+    is_unsafe : whether it was unsafe to continue, so that the recording is not tried again.
     wish : the button that ended the run; None if no button did.
     """
 

@@ -217,7 +217,6 @@ class Description:
     encoders : number of encoder counts in a line, two or three.
     carts : number of encoders that are on carts.
     period : nominal s between lines.
-    baud : baud rate of the line.
     commands : letters of the commands beyond the stock ones. With `c` the bench also knows the wave
         chirp, and with `m` the multisine.
     input_unit, input_per_count : unit of the input, and its value per duty count.

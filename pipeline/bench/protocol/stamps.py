@@ -29,7 +29,6 @@ class StampFit:
     Attributes
     ----------
     period : ms from line to line.
-    missing : number of lines that are missing.
     """
 
     period: float

@@ -55,10 +55,7 @@ class Item:
 
 
 def list_items(grade: Grade, now: TeamNow) -> list[Item]:
-    """Return the rows for criteria and flags;
-
-    doubtful rows come first, then the most points lost.
-    """
+    """Return the rows for criteria and flags: first those in doubt, then by points lost."""
     judged = {criterion.id: criterion for criterion in grade.criteria}
     items = [
         Item(id=flag.code, is_remark=True, title=capital(WORDS.text(f"title_{flag.code}")))

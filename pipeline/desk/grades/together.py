@@ -36,8 +36,8 @@ class Row:
     ticked : whether the team will be changed.
     version : version of the criterion's points, which is sent along with the change.
     moved : whether somebody has changed the points since the list was shown.
-    now, after : points of the criterion.
-    total_now, total_after : points of the submission.
+    now, after : points of the criterion before and after the change.
+    total_now, total_after : points of the submission before and after the change.
     said : the current message of the criterion.
     """
 

@@ -87,7 +87,6 @@ def typed_rubric(edited: str, typed: Mapping[str, str]) -> TypedRubric:
 
     Parameters
     ----------
-    edited : text of the rubric.
     typed : by name, the changed numbers of the form.
     """
     rubric, mistakes = _parsed(edited)

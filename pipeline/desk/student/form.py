@@ -81,7 +81,6 @@ class Field:
     value : the value as stored or typed.
     wrong : what is wrong with the value.
     asked : question about a value that is doubtful but possible.
-    answers : possible answers to the question.
     symbol : symbol of the parameter, if the value is a parameter.
     """
 
@@ -296,12 +295,7 @@ def _find_kind(value: Mapping[str, Any]) -> str:
 
 
 def _list_choices(values: Sequence[Mapping[str, Any]], *, first: Sequence[Any]) -> tuple[str, ...]:
-    """Return the possible values of a field, or () if any text can be typed.
-
-    Parameters
-    ----------
-    first : values to list first.
-    """
+    """Return the possible values of a field, or () if any text can be typed."""
     every = [
         choice
         for value in values

@@ -66,7 +66,7 @@ def look_around(
     Parameters
     ----------
     changed : fields that could not be written, as typed.
-    error : why they could not be written.
+    error : why the fields could not be written.
     """
     folder, text = ask.folder(), ""
     try:

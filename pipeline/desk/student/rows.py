@@ -46,7 +46,6 @@ class Row:
     look : what the file contains; see `tasks.look_at_file`.
     index : index of the table in the file; None without a table.
     problems : why the row needs a person.
-    remarks : things worth knowing.
     """
 
     file: str

@@ -230,7 +230,6 @@ def _edit(
 
     Parameters
     ----------
-    change : function that changes the document.
     changed : the fields that `change` writes.
     place : part of the page from which the request came.
     """

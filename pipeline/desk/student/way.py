@@ -14,7 +14,6 @@ class Facts:
 
     Attributes
     ----------
-    recordings : number of recordings.
     to_look_at : number of files that need a person.
     missing : groups of the set-up in which something is missing.
     sound : whether `submission.toml` exists and is valid.

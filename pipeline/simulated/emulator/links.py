@@ -17,12 +17,7 @@ _CHUNK = 65_536  # bytes
 
 
 class Link(Protocol):
-    """A bench's end of a line; one host is connected at a time, and the next one waits.
-
-    Attributes
-    ----------
-    address : the address that a host opens.
-    """
+    """A bench's end of a line; one host is connected at a time, and the next one waits."""
 
     address: str
 
