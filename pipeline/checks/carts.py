@@ -65,10 +65,7 @@ def _fit_checks(fit: ChainFit) -> list[Check]:
 
 
 def _sign_check(fit: ChainFit, *, bench: Bench) -> Check:
-    """Check that nothing is negative by more than its standard error allows.
-
-    This covers all masses, dampings and springs.
-    """
+    """Check that no mass, damping or spring is negative by more than its standard error allows."""
     values, std = physical_values(fit.chain, bench=bench), fit.std
     below = {
         name: -value / std[name] if std.get(name) else np.inf
@@ -101,7 +98,7 @@ def physical_values(chain: Chain, *, bench: Bench) -> dict[str, float]:
 
 
 def check_vanishing(fit: ChainFit, *, bench: Bench) -> list[Check]:
-    """Fail for each mass, damping or spring that may not exist.
+    """Return a failed check for each mass, damping or spring that may not exist.
 
     A parameter may not exist if its value is zero within its standard error, or negligible beside
     its larger neighbour of the same kind.
@@ -146,7 +143,7 @@ def _larger_neighbour(name: str, values: Mapping[str, float]) -> str:
 
 
 def _ask_if_there(name: str, *, bench: Bench) -> str:
-    """Return the question to the student about a vanishing parameter, and the line to change."""
+    """Return a question to the student about a vanishing parameter, with the line to change."""
     read, n = read_name(name), bench.n
     assert read.cart is not None
     i = read.cart
@@ -195,7 +192,7 @@ def _redundancy_checks(values: Mapping[str, float]) -> list[Check]:
 
 
 def _gain_order_check(values: Mapping[str, float], *, chain: Chain) -> Check:
-    """Check that a constant input moves a cart less, the further it is from the motor."""
+    """Check that a constant input moves no cart further than the cart before it."""
     names = [gain_name(cart, n=chain.n) for cart in range(1, chain.n + 1)]
     gains = [values[name] for name in names]
     # If no spring holds the far end, all static gains are equal and rounding decides which is

@@ -1,7 +1,4 @@
-"""Checks of single estimates.
-
-They compare two estimates of one number, and decays and steps with their models.
-"""
+"""Compare two estimates of one number, and compare decays and steps with their models."""
 
 from collections.abc import Sequence
 

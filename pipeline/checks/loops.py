@@ -1,4 +1,4 @@
-"""Checks of loops: the design against its goal, and the loops that ran against their logs."""
+"""Compare the designed loop with the requested one, and loops that ran with their logs."""
 
 from collections.abc import Sequence
 

@@ -52,7 +52,7 @@ def check_recordings(
 
 
 def check_files(unreadable: Mapping[str, str]) -> list[Check]:
-    """Fail for each experiment whose file could not be read."""
+    """Return a failed check for each experiment whose file could not be read."""
     return [
         Check(
             kind="data",
@@ -65,7 +65,7 @@ def check_files(unreadable: Mapping[str, str]) -> list[Check]:
 
 
 def check_units(records: Sequence[Record], *, bench: Bench) -> list[Check]:
-    """Fail if a unit is unknown, or if headings or numbers contradict it."""
+    """Return failed checks if a unit is unknown, or if headings or numbers contradict it."""
     counted = is_count(bench.units.position)
     fractions = [r.id for r in records if counted and _has_fractions_of_a_count(r)]
     checks = []
@@ -120,7 +120,7 @@ def _has_fractions_of_a_count(record: Record) -> bool:
 
 
 def check_scales(records: Sequence[Record], *, bench: Bench) -> list[Check]:
-    """Fail if positions or inputs are larger than on any bench: they must be in another unit."""
+    """Return failed checks if positions or inputs are too large for any bench."""
     kinds: Mapping[str, CheckKind] = {
         "position_scale": "position_scale",
         "input_scale": "input_scale",
@@ -220,12 +220,12 @@ def check_setup(records: Sequence[Record]) -> list[Check]:
 
 
 def check_held(records: Sequence[Record]) -> list[Check]:
-    """Fail for each record in which a cart that should be held moves as the free carts do."""
+    """Return a failed check for each record in which a cart that should be held moves."""
     return [fault.check("held") for fault in find_loose_holds(records)]
 
 
 def check_channels(late: Sequence[LateChannel]) -> list[Check]:
-    """Fail for each cart whose position is read late."""
+    """Return a failed check for each cart whose position is read late."""
     kinds = {
         "sine": "the dwells",
         "step": "the steps",

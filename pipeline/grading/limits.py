@@ -29,7 +29,7 @@ READ_BY_EYE = 1.1  # factor: error of a resonance or null that is read off the d
 # ------------------------------------------------------ errors that are worth a remark, in percent
 
 # Careful teams on one bench differ by a few percent in gains and frequencies, and by half or more
-# in dampings. The paper's own tables differ by up to 14 %, and by 29 % at a null read by eye.
+# in dampings. The tables in Throne's paper differ by up to 14 %, and by 29 % at a null read by eye.
 OFF_FINAL, OFF_INITIAL, OFF_BY_EYE, OFF_DAMPING = 7.0, 10.0, 30.0, 80.0
 # Percent: a damping with a larger error is compared with known mistakes. It gets a flag of its own
 # only above OFF_DAMPING.
@@ -85,8 +85,8 @@ LEAST_COUNTS = 20.0  # encoder steps: smaller amplitudes cannot be read precisel
 WRONG = {"exact": 0.0, "stiffness": 20.0, "damping": 100.0}
 EXPLAINED = {"exact": 0.0, "stiffness": 12.0, "damping": 60.0}
 EXACT = 1e-6  # rounding allowed in a 0 or 1 of A: 1.2e-17 counts as zero
-# Relative standard errors of frequencies, gains and dampings in an honest table, and by how many of
-# them A and B may differ from it. Two ways to compute the same coupling differ by as much.
+# Relative standard errors of frequencies, gains and dampings in an honest table. A and B may differ
+# from the table by HONEST_SIGMAS times as much, as two ways to compute the same coupling do.
 HONEST, HONEST_DAMPING, HONEST_SIGMAS = 0.01, 0.1, 2.0
 
 # --------------------------------------------------------------- harmful models and controllers

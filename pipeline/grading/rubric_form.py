@@ -83,7 +83,6 @@ class RubricForm:
     late : fields of the late policy, by key.
     costs : cost of each flag, by code.
     step : step to which points are rounded.
-    see : what students see.
     """
 
     criteria: tuple[CriterionFields, ...]

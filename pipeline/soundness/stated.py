@@ -15,9 +15,9 @@ OTHER_DWELL = 0.1  # relative; a dwell this far from its stated frequency is ano
 LEAST_SHARE = 0.2
 # Share of the free carts' swing. A cart that is held firmly moves less.
 _HELD_FIRMLY = 0.05
-_LONGEST = 3.0  # m. No bench has a longer track
-_LONGEST_WHOLE = 0.5  # m. Limit if all readings are whole numbers, as counts are
-_LARGEST = 100.0  # V. No amplifier at a bench gives as much
+_LONGEST = 3.0  # metres; no bench has a longer track
+_LONGEST_WHOLE = 0.5  # metres; the limit if all readings are whole numbers, as counts are
+_LARGEST = 100.0  # volts; no amplifier at a bench gives as much
 
 
 def swings(record: Record) -> tuple[float, dict[int, float]]:

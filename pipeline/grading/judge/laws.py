@@ -33,7 +33,6 @@ class Law:
 
     Attributes
     ----------
-    meaning : the law in words.
     widening : the least widening for which the law holds, in tolerances; 0 if rounding is enough.
     """
 
@@ -49,7 +48,6 @@ def judge_laws(
 
     Parameters
     ----------
-    n : number of carts.
     frequency_percent, damping_percent : tolerances that widen the box; the first also applies to
         gains.
     """

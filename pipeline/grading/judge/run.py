@@ -80,8 +80,8 @@ def grade_submission(
         return failed(str(error))
     springs, notes, analysis = judged.springs, judged.notes, judged.analysis
     if springs:
-        asked = f"these recordings need springs that the rubric lacks: {', '.join(springs)}"
-        notes = (*notes, f"{asked}; judged with them")
+        lacking = "judged with springs that the recordings need but the rubric lacks"
+        notes = (*notes, f"{lacking}: {', '.join(springs)}")
     graded = grade_analysis(
         judged.submission, analysis, rubric=rubric, name=name, days_late=days_late
     )
@@ -138,7 +138,7 @@ def grade_analysis(
 
     Parameters
     ----------
-    submission : submission that has the rubric's system, as `under_rubric` returns it.
+    submission : submission with the rubric's system, from `under_rubric`.
     """
     work, flags, signed = prepare_work(submission, analysis, rubric=rubric)
     verdicts = {criterion.id: judge(criterion, work) for criterion in rubric.criteria}

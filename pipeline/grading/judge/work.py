@@ -67,7 +67,7 @@ class Verdict:
 
     Attributes
     ----------
-    share : share of the points; None if nothing could be judged, and then `message` says why.
+    share : share of the points; None if nothing could be judged; `message` then says why.
     explained : whether a known mistake explains all lost points; its flag then replaces the
         rubric's advice.
     models : for each acceptable model, the errors of the numbers; the best model counts. Empty if

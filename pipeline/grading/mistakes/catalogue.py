@@ -58,13 +58,7 @@ class Mistake:
     from_time_records: bool = False
 
     def help(self, typed: Decimal, reference: Reference) -> str:
-        """Return the advice about one number.
-
-        Parameters
-        ----------
-        typed : the reported number.
-        reference : the number from the recordings.
-        """
+        """Return the advice about one number."""
         counted, there = self.periods
         recomputed = f"{reference.value:.4g}"
         values = {"reported": as_typed(typed), "recomputed": recomputed}
@@ -218,7 +212,7 @@ def _miscounts(omegas: Numbers, zetas: Numbers, every_zeta: Numbers) -> Iterator
 def _with_slack(zeta: Reference) -> Reference:
     """Return a damping with bounds widened by the tolerance of dampings.
 
-    So a mistake can have a closer tolerance for its other numbers.
+    The other numbers of a mistake can then have a closer tolerance.
     """
     return zeta.widened(1 + limits.DAMPING)
 
@@ -226,7 +220,7 @@ def _with_slack(zeta: Reference) -> Reference:
 def _miscounted_damping(zeta: Reference, factor: float) -> Reference:
     """Return the bounds of a damping from miscounted periods.
 
-    They end halfway to the right damping, so that the right damping does not match.
+    The bounds end halfway to the right damping, so that the right damping does not match.
     """
     mistaken, middle = _with_slack(zeta.times(factor)), zeta.times(math.sqrt(factor))
     if factor < 1:

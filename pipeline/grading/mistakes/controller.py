@@ -65,7 +65,7 @@ class Controller:
         return [numbers for numbers in found if numbers is not None]
 
     def runaway(self, gains: Array) -> LoopNumbers | None:
-        """Return the loop on the carts from the recordings, if it is clearly unstable.
+        """Return the loop on the carts from the recordings; None unless it is clearly unstable.
 
         Growth by less than a factor e within the required settling time may be a model error.
         """
@@ -126,7 +126,7 @@ class Controller:
     def is_of_other_gains(self, numbers: LoopNumbers) -> bool:
         """Return whether the claimed settling time must be that of other gains.
 
-        This is so if it differs from the simulated one by more than a factor of 2.5.
+        That is so if it differs from the simulated one by more than a factor of 2.5.
         """
         if self.settling is None or self.settling <= 0 or numbers.settling_time is None:
             return False

@@ -21,13 +21,7 @@ from pipeline.results import Analysis, SinePoint
 
 @dataclass(frozen=True, kw_only=True)
 class _Rows:
-    """The rows of the table that have a matching dwell; each array has shape (n,).
-
-    Attributes
-    ----------
-    reported : amplitude ratios of the table.
-    measured : amplitude ratios of the dwells.
-    """
+    """Rows with a matching dwell: amplitude ratios as reported and as measured, of shape (n,)."""
 
     cart: Array
     reported: Array

@@ -47,10 +47,9 @@ class MatrixEntry:
 
     Attributes
     ----------
-    typed : the number as the student typed it.
     right : the acceptable values, one per model.
     error : difference in percent, beyond the uncertainty of the models.
-    bare : difference in percent, without allowance for this uncertainty.
+    bare : difference in percent, without allowance for the uncertainty.
     """
 
     name: str
@@ -229,7 +228,6 @@ def _spread(
     Parameters
     ----------
     make : function that computes [A B] from a table.
-    right : [A B] of the table as it is.
     """
     variance = np.zeros_like(right)
     for name, value in values.items():
@@ -420,13 +418,7 @@ def _slip(space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int)
 def _met(
     typed: Mapping[tuple[int, int], Decimal], slipped: Array, kinds: Sequence[Sequence[Kind]]
 ) -> bool:
-    """Return whether all typed entries match the [A B] that a mistake gives.
-
-    Parameters
-    ----------
-    typed : the typed entries, by row and column.
-    slipped : the [A B] that the mistake gives.
-    """
+    """Return whether all typed entries match the [A B] that a mistake gives."""
     return all(
         _entry_error(number, float(slipped[i, j]), kinds[i][j]) <= limits.EXPLAINED[kinds[i][j]]
         for (i, j), number in typed.items()

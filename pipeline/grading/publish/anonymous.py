@@ -18,7 +18,7 @@ KEY_FILE = "anonymous-key.csv"
 _PREFIX = "anon-"
 _SHORTEST = 6  # characters: rarely too few, even for a thousand submissions
 STRANGER = "another submission"
-# The name of an archive with which a reason begins.
+# The name of an archive at the beginning of a reason.
 _ARCHIVE = re.compile(r"^.*?\.zip\W?: ", re.IGNORECASE)
 
 

@@ -56,7 +56,6 @@ def feedback_page(
     Parameters
     ----------
     figures : pairs of file name and SVG text.
-    name : the name of the submission on the page.
     """
     numbers = count(1)
     sections = [Section("summary", "Summary", tuple(_summary(grade)))]

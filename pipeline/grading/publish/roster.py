@@ -145,7 +145,7 @@ class Roster:
             named = ", ".join(f"{s.called} ({s.grade.submission})" for s in passed_over)
             remarks.append(
                 Remark(
-                    text="has no points, because another account submitted it and received them: "
+                    text="given no points, because another account submitted and received them: "
                     f"{named}",
                     left_out=True,
                 )

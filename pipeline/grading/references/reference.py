@@ -13,7 +13,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.results import Analysis, Estimate, ParameterRow
 from pipeline.stages.compare import GAIN_AND_FREQUENCY_LIMIT
 
-OFF_SCALE = "the recordings are not in the units stated, see the data"
+OFF_SCALE = "the recordings are not in the stated units"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -45,11 +45,11 @@ def with_all_springs(
         )
     ):
         return analysis, ()
-    names = zip(spring_names(analysis.bench.n), springs, _there(other.fit), strict=True)
+    names = zip(spring_names(analysis.bench.n), springs, _certain(other.fit), strict=True)
     return other, tuple(name for name, asked, there in names if there and not asked)
 
 
-def _there(fit: ChainFit) -> list[bool]:
+def _certain(fit: ChainFit) -> list[bool]:
     """Return for each spring whether it certainly exists, even if the fit is not perfect."""
     wider = max(1.0, fit.chi_square_per_dof) ** 0.5
     std = dict(zip(fit.names, wider * np.sqrt(np.diag(fit.covariance)), strict=True))

@@ -74,7 +74,6 @@ class Typed:
     ----------
     excused : the largest error that is excused as rounding.
     hidden : half a unit of the last digit, as a share of the number.
-    digits : number of typed digits.
     """
 
     value: float

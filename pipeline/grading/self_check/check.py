@@ -132,7 +132,6 @@ def next_answer(
 
     Parameters
     ----------
-    before : the earlier answers.
     basis : hash of everything that must stay the same for hints to be given; see `find_basis`.
     where : the numbers to give hints for; None for all numbers that may have a hint.
     """

@@ -47,12 +47,7 @@ class Double:
 
 
 def find_doubles(authors: Mapping[str, Sequence[str]]) -> list[Double]:
-    """Return the people who are authors of several submissions.
-
-    Parameters
-    ----------
-    authors : authors of each submission.
-    """
+    """Return the people who are authors of several submissions."""
     typed: dict[str, str] = {}
     found: dict[str, dict[str, None]] = {}
     for submission, people in authors.items():

@@ -39,7 +39,6 @@ class Likeness:
 
     Attributes
     ----------
-    experiments : names of the two recordings.
     times : start and end of the compared or equal part, in s, in each recording.
     slope : slope of one noise on the other, after subtracting what the class explains.
     sigmas : agreement of the noise, in standard deviations above chance.

@@ -20,7 +20,7 @@ from pipeline.results import Record
 
 # The filter passes frequencies above 0.4 of the Nyquist frequency. On a bench logged at 113 Hz,
 # motion is below 12 Hz. A Kaiser window with β = 7 lets less than 1e-3 of the motion through.
-PASSED = 0.6  # share of the band
+PASSED = 0.6  # share of the frequency band that passes
 _TAPS, _WINDOW = 41, 7.0
 MARGIN = _TAPS // 2  # samples lost at each end of a recording
 

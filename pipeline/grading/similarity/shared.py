@@ -104,7 +104,7 @@ def find_shared(
     earlier: Iterable[Member] = (),
     examples: Iterable[bytes] = (),
 ) -> dict[str, tuple[SharedRecord, ...]]:
-    """Return the shared recordings of each submission of the batch, by submission.
+    """Return, for each submission of the batch, the recordings that it shares with others.
 
     Parameters
     ----------

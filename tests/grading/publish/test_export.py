@@ -363,7 +363,7 @@ def test_an_author_whose_points_another_account_got_is_named(tmp_path, own):
         )
     (remark,) = [remark for remark in done.remarks if remark.left_out]
     assert remark.text == (
-        "has no points, because another account submitted it and received them: s1 (b)"
+        "given no points, because another account submitted and received them: s1 (b)"
     )
 
 
