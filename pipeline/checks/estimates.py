@@ -124,9 +124,9 @@ def check_steps(
 ) -> list[Check]:
     """Check whether every step has one static gain, or only an interval because the cart sticks.
 
-    Friction can shift a step that seems to have one gain, if the cart stops equally short on the
-    way out and back. So the check passes only if several edges agree and nothing shows dry friction
-    on that cart.
+    If friction makes the cart stop equally short on the way out and back, all edges agree on a
+    wrong gain. So the check passes only if several edges agree and nothing shows dry friction on
+    that cart.
     """
     rubs: dict[int, list[str]] = {}
     for decay in decays:

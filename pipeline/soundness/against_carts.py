@@ -255,7 +255,7 @@ def _short_dwell(record: Record) -> Iterator[RecordingFault]:
 def _wrong_clock(record: Record, *, usual: float) -> Iterator[RecordingFault]:
     """Yield a fault if the time column of a record is in another unit than usual.
 
-    In that unit, the record's sampling would be the usual one.
+    That is so if its sample interval, in another unit of time, is the usual one.
     """
     for factor, words in TIME_FACTORS.items():
         # A factor of 100 or more is another unit of time; a factor of 2 may be another setting.
@@ -277,7 +277,7 @@ def _misread(record: Record, misread: Misread, everywhere: bool) -> RecordingFau
 def _strays(
     records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, Followed]
 ) -> Iterator[RecordingFault]:
-    """Yield the records that do not follow carts similar to those of most records.
+    """Yield the records that follow neither the carts of most records nor similar ones.
 
     It is enough if one cart follows, because another one may be near its null and hardly move. A
     cart that moves less than it should proves nothing, because friction may hold it.

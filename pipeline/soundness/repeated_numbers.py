@@ -166,14 +166,14 @@ def _contradictions(readings: Sequence[_Reading]) -> NDArray[np.bool_]:
 
 
 def _only_by_size(readings: Sequence[_Reading]) -> bool:
-    """Whether steps of the same size agree with each other, as with dry friction."""
+    """Whether readings contradict only between steps of different sizes, as with dry friction."""
     size = np.array([reading.size for reading in readings])
     alike = np.abs(size[:, None] - size) <= SAME_SIZE * np.maximum(size[:, None], size)
     return not np.any(_contradictions(readings) & alike)
 
 
 def _differ_in_size(readings: Sequence[_Reading]) -> bool:
-    """Whether the steps have several sizes, so that a limit or friction gives several gains."""
+    """Whether the steps have several sizes, so that friction or a limit can explain several gains."""
     size = np.array([reading.size for reading in readings])
     return bool(size.min() < (1 - SAME_SIZE) * size.max())
 
@@ -199,7 +199,7 @@ def _right_ones(readings: Sequence[_Reading], fitted: Estimate | None) -> list[_
 
 
 def _is_far(reading: _Reading, told: Estimate, *, name: str) -> bool:
-    """Whether a reading and its interval differ from a number that is known well."""
+    """Whether the whole interval of a reading is far from a number that is known well."""
     if told.std is None or told.value <= 0 or SIGMAS * told.std > _LIKE_THE_FIT * told.value:
         return False
     factor = _BY_THE_BENCH[read_name(name).symbol]
@@ -222,7 +222,7 @@ def _wrong_clock(values: Mapping[str, float], usual: Mapping[str, float]) -> str
 
 
 def _is_reversed(values: Mapping[str, float], usual: Mapping[str, float]) -> bool:
-    """Whether all gains have the opposite sign, which a log's sign of the input may explain."""
+    """Whether all gains have the opposite sign, perhaps because the logged input has."""
     known = [name for name in values if read_name(name).is_gain and usual.get(name)]
     return bool(known) and all(_near(values[name], -usual[name]) for name in known)
 

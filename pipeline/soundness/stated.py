@@ -21,7 +21,7 @@ _LARGEST = 100.0  # volts; no amplifier at a bench gives as much
 
 
 def swings(record: Record) -> tuple[float, dict[int, float]]:
-    """Return the largest swing of the free carts, and by cart the swings of the held ones.
+    """Return the largest swing of the free carts, and the swing of each held cart.
 
     If no free cart was measured, the held ones are left out.
     """
@@ -101,7 +101,7 @@ def find_other_scales(records: Sequence[Record], *, bench: Bench) -> list[Record
 def _reached(reaches: Iterable[tuple[Record, float]]) -> tuple[float, str]:
     """Return the second largest reach of all kinds of experiment, and its record.
 
-    Two kinds must reach this far, because one may be an accident.
+    The largest one may be an accident, so two kinds must reach this far.
     """
     by_kind: dict[str, tuple[float, str]] = {}
     for record, reach in reaches:

@@ -20,7 +20,7 @@ Reading = Callable[[Record, Array], float]
 def transient_fits(
     analysis: Analysis, table: Mapping[str, Decimal], known: Mapping[str, Reference]
 ) -> list[Mistake]:
-    """Return the variants of the mistake, one for each way of reading an amplitude too early."""
+    """Return the mistakes of reading amplitudes too early, one for each way to do so."""
     runs = {r.id: r for r in analysis.records if r.kind == "sine" and r.u is not None}
     if analysis.fit is None or not runs or len(runs) < len(analysis.sine_points) / analysis.bench.n:
         return []

@@ -74,7 +74,7 @@ def _held(cart: int, analysis: Analysis) -> float:
 
 
 def _shortest(edge: StepEdge, *, held: float) -> float:
-    """Return the smallest gain that fits an edge, if friction held the cart too far out.
+    """Return the smallest gain that fits a step's edge, if friction held the cart too far out.
 
     Parameters
     ----------
