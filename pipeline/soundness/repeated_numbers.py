@@ -173,7 +173,7 @@ def _only_by_size(readings: Sequence[_Reading]) -> bool:
 
 
 def _differ_in_size(readings: Sequence[_Reading]) -> bool:
-    """Whether the steps have several sizes, so that friction or a limit can explain several gains."""
+    """Whether the steps have several sizes, so that friction or a limit may explain the gains."""
     size = np.array([reading.size for reading in readings])
     return bool(size.min() < (1 - SAME_SIZE) * size.max())
 

@@ -137,7 +137,7 @@ def _unexplained_products(x: np.ndarray) -> np.ndarray:
 
 
 def equal_rows(a: Print, b: Print, *, shift: int) -> Likeness | None:
-    """Return the longest stretch in which two recordings are equal up to one factor per row.
+    """Return the longest stretch in which two recordings are equal, up to a factor per channel.
 
     Repeated readings, as from a cart at rest, count once. Returns None if too few remain to be
     significant.
