@@ -5,7 +5,7 @@ radians. Time is the last axis. Carts and springs count from 1. A standard error
 sigma; `None` means it could not be determined.
 
 The file starts with a recording and the results of single recordings. Fields marked `written` are
-in the type's file, in this order (`json_files.py`). Other packages have further types:
+in the JSON file of their type, in this order (`json_files.py`). Other packages have further types:
 
 - `Ingested` (`ingest/read.py`). The data read.
 - `Identified` and `Fitted` (`identify/`). Results of the stages up to the fit.
@@ -53,7 +53,8 @@ EXPLAINED = 2.0
 class HeadingUnit:
     """A unit that a heading states.
 
-    `converts` is true if it can be converted to the submission's unit; otherwise it was ignored.
+    `converts` is true if the unit can be converted to the submission's unit; otherwise it was
+    ignored.
     """
 
     role: Literal["position", "input"]
@@ -69,7 +70,7 @@ class Record:
     Attributes
     ----------
     id : the experiment's id, used in every message.
-    t : (n,) s, strictly increasing. As measured, never assumed uniform.
+    t : (n,) measured times in s; they increase strictly, but need not be evenly spaced.
     u : (n,) input, or None if the file has no input. A positive input pushes cart 1 towards
         positive x.
     y : (len(carts), n) positions. Row j belongs to cart `carts[j]`.
@@ -77,11 +78,11 @@ class Record:
     free : the carts free to move. The others are held.
     reference : (n,) set point of a closed-loop run, in position units, or None.
     omega : frequency of a sine dwell, rad/s, or None.
-    resolution : (len(carts),) the encoder step, in position units. It is 0 if no step is visible.
+    resolution : (len(carts),) encoder step in position units; 0 if no step is visible.
     hold : how the input behaves between samples.
-    source : path inside the submission.
+    source : path of the data file inside the submission.
     notes : corrections made while reading.
-    turned : whether the sign of the input was reversed. It then agrees with the other recordings.
+    turned : whether the sign of the input was reversed to agree with the other recordings.
     position_scale, input_scale : signed factors from the file's own numbers to y and u. A
         controller's gains may be in the file's units.
     heading_units : the units that the headings of the position and input columns state.
@@ -131,7 +132,7 @@ class Record:
 class Intervention:
     """A stretch of a record in which an unmeasured force moves or holds a cart.
 
-    Most likely it is a hand that moves the cart, or holds it away from its rest and lets it go.
+    Most likely a hand moves the cart, or holds it away from its rest position and releases it.
     """
 
     experiment: str = written()
@@ -158,7 +159,7 @@ class SinePoint:
     @property
     @computed()
     def gain_std(self) -> float:
-        """Standard error of the amplitude ratio, both amplitudes' errors combined."""
+        """Standard error of the amplitude ratio, combined from the errors of both amplitudes."""
         relative = (
             (self.amplitude_std / self.amplitude) ** 2
             + (self.input_amplitude_std / self.input_amplitude) ** 2
@@ -169,12 +170,12 @@ class SinePoint:
 
     phase: float = written("rad, of the position against the input's sine, in (-pi, pi]")
     phase_std: float = written()
-    amplitude: float = written("of the position")
+    amplitude: float = written("amplitude of the position")
     amplitude_std: float = written()
-    input_amplitude: float = written("of the measured input, fitted the same way")
+    input_amplitude: float = written("amplitude of the measured input, fitted in the same way")
     input_amplitude_std: float = written()
-    steady_from: float = written("s; the transient is over, the fit uses t >= steady_from")
-    settled: bool = written("false where the record ends before a steady state is seen")
+    steady_from: float = written("s; the fit uses t >= steady_from, after the transient")
+    settled: bool = written("false if the record ends before a steady state")
     note: str = written(
         "what a reader must know (few counts, not settled, off-sine residual), or empty", default=""
     )
@@ -186,11 +187,11 @@ class FrictionTest:
     """The F-test for dry friction in a decay: is viscous damping alone enough?"""
 
     present: bool = written("whether the statistic is above its threshold")
-    f_statistic: Number = written("of one further parameter")
+    f_statistic: Number = written("F-statistic of one further parameter, the friction")
     threshold: Number = written()
     drop: Number = written("d = F/k, half the width of the friction band, position units")
     drop_std: Number = written()
-    zeta: Number = written("with friction taken out")
+    zeta: Number = written("damping ratio without the effect of the friction")
     zeta_std: Number = written()
 
 
@@ -205,27 +206,29 @@ class LogDecrement:
     amplitude : (n_peaks - 2,) half the peak-to-peak swing, at peak_t[1:-1]. A moving rest point
         does not affect it.
     fit_t, fit_y : the fitted decay, for the figure.
-    envelope_upper, envelope_lower : the envelope. It is given at fit_t.
-    zeta_at_amplitude : (2, n) amplitudes and the local damping ratio at each.
+    envelope_upper, envelope_lower : the envelope at the times fit_t.
+    zeta_at_amplitude : (2, n) amplitudes, and the local damping ratio at each amplitude.
     """
 
     experiment: str = written()
     cart: int = written()
     number: int | None = written(
-        "which of the recording's decays, from 1; null: the only one", older=None, default=None
+        "number of this decay in the recording, from 1; null: the only one",
+        older=None,
+        default=None,
     )
     release: float = written(
-        "s, where the free decay begins; a hold or a hand may come before it", older=0.0
+        "s, start of the free decay; before it, the cart may be held or moved", older=0.0
     )
     delta: Number = written("logarithmic decrement per full cycle")
     delta_std: Number = written()
-    omega_n: Number = written("rad/s, of the exponential-sinusoid fit, the better estimate")
+    omega_n: Number = written("rad/s, from the fit of a decaying sinusoid; the better estimate")
     omega_n_std: Number = written()
-    zeta: Number = written("of that fit; with dry friction present it is biased")
+    zeta: Number = written("damping ratio from that fit; dry friction makes it wrong")
     zeta_std: Number = written()
-    omega_n_peaks: Number = written("rad/s, of the extrema")
+    omega_n_peaks: Number = written("rad/s, from the extrema")
     omega_n_peaks_std: float
-    zeta_peaks: Number = written("by the logarithmic decrement")
+    zeta_peaks: Number = written("damping ratio from the logarithmic decrement")
     zeta_peaks_std: Number = written()
     friction: FrictionTest | None = written()
     note: str = written("what a reader must know, or empty", default="")
@@ -269,10 +272,10 @@ class StepGain:
     experiment: str = written()
     cart: int = written()
     gain: Number = written("weighted mean over the edges")
-    gain_std: Number = written("the spread of the edges included")
-    interval: tuple[float, float] | None = written("of the gain, where the cart sticks")
+    gain_std: Number = written("including the spread of the edges")
+    interval: tuple[float, float] | None = written("range of the gain if the cart sticks")
     rest_shift: float | None = written(
-        "how far the rest point moved between first and last rest, by friction"
+        "shift of the rest position from the first to the last rest, by friction"
     )
     note: str = written(default="")
     edges: tuple[StepEdge, ...]
@@ -292,7 +295,7 @@ class FrequencyResponse:
     phase: Numbers | None = written("rad; null for a table of amplitude ratios")
     phase_std: Numbers | None = written()
     source: Literal["dwells", "table", "records"] = written(
-        "sine dwells, a table the students reduced, or transforms of step and sweep records"
+        "sine dwells, a table made by the students, or transforms of step and sweep records"
     )
     experiments: tuple[str, ...] = ()
 
@@ -324,22 +327,24 @@ class ChainFit:
     Attributes
     ----------
     chain : the fitted plant.
-    names : physical parameters that have a standard error. For example "m_1", "c_1", "k_2".
+    names : physical parameters that have a standard error, such as "m_1", "c_1", "k_2".
     covariance : (n_p, n_p) covariance of these parameters.
-    at_bound : physical parameters that the fitted data do not keep away from their bound, zero.
+    at_bound : physical parameters that the fitted data cannot distinguish from zero, their bound.
         They are held at zero or, where possible, taken from the decays.
-    parameters : the named parameters of the chain with standard errors, in table order. If one
-        ended at its bound, its `Estimate.at_bound` is true and no table shows it.
-    staged : the named parameters from the stage-by-stage fit (last cart first). For the report.
-    misfit : for a "bode_fit", the distance of the magnitude points from the fit beyond their
-        standard errors. It is a share of the magnitude.
-    standardised : residuals divided by their standard errors. One array (n_w,) per cart or (n,)
+    parameters : the named parameters of the chain with standard errors, in table order. A parameter
+        that ended at its bound has a true `Estimate.at_bound`, and no table shows it.
+    staged : the named parameters from the stage-by-stage fit (last cart first), for the report.
+    misfit : for a "bode_fit", how far the magnitude points are from the fit beyond their standard
+        errors, as a share of the magnitude.
+    standardised : residuals divided by their standard errors: one array (n_w,) per cart, or (n,)
         per record.
     experiments : the recordings that the chain was fitted to.
     """
 
-    method: Literal["bode_fit", "time_fit"] = written("to the frequency response or time records")
-    chi_square_per_dof: Number = written("near 1 where model and stated noise explain the data")
+    method: Literal["bode_fit", "time_fit"] = written(
+        "fit to the frequency response or to time records"
+    )
+    chi_square_per_dof: Number = written("near 1 if model and stated noise explain the data")
     dof: int = written()
     n_points: int = written(key="points")
     n_starts: int = written(key="starts")
@@ -414,11 +419,13 @@ class ParameterRow:
         """`bode_fit`, `time_fit` or `log_decrement`."""
         return self.final and self.final.source
 
-    change_percent: float | None = written("final against initial")
-    change_sigmas: float | None = written("in combined standard errors")
-    consistent: bool | None = written("null: nothing to compare, or errors too wide to tell")
+    change_percent: float | None = written("change from the initial to the final estimate")
+    change_sigmas: float | None = written("the change in combined standard errors")
+    consistent: bool | None = written(
+        "null: there is nothing to compare, or the errors are too wide"
+    )
     independent: bool | None = written(
-        "false: both rest on the same recordings; null: there are not two",
+        "false: both estimates use the same recordings; null: there is only one",
         older=None,
         default=None,
     )
@@ -458,9 +465,9 @@ class Check:
     Attributes
     ----------
     kind : the question, such as whether a step has one gain.
-    run, cart, parameter : what the question is about, as far as it has these.
-    part : tells several questions of one kind apart. It is "converged" for the fit, "in_ab" for the
-        order of a frequency, or the number of a recording's decay.
+    run, cart, parameter : what the question is about, if it is about one of these.
+    part : distinguishes several questions of one kind. For example, it is "converged" for the fit,
+        "in_ab" for the order of a frequency, or the number of a recording's decay.
     """
 
     @property
@@ -497,8 +504,8 @@ class FeedbackDesign:
 
     Attributes
     ----------
-    requested_poles : the poles requested from pole placement. None with LQR.
-    Q (2n, 2n), R : the weights of LQR's cost, the sum of x'Q x + R u². None with pole placement.
+    requested_poles : the poles requested from pole placement; None with LQR.
+    Q (2n, 2n), R : the weights of LQR's cost, the sum of x'Q x + R u²; None with pole placement.
     t, y (n_carts, n), u : the simulated step.
     """
 
@@ -507,17 +514,17 @@ class FeedbackDesign:
     reference: float = written("size of the step, in position units")
     gains: Array = written("(2n)")
     prefilter: Number = written("1 / DC gain of the loop for the chosen cart")
-    poles: ComplexArray = written(
-        "[re, im] of the closed loop, continuous equivalents (log z / sample_time), rad/s"
-    )
+    poles: ComplexArray = written("closed-loop poles as [re, im]: log z / sample_time, in rad/s")
     sample_time: float = written("s; the delay of one sample is part of the model")
-    overshoot_percent: Number = written("of the simulated step")
+    overshoot_percent: Number = written("overshoot of the simulated step")
     settling_time: float | None = written("s, to within 2 %")
     peak_input: Number = written()
     margins: Margins | None = written(
-        "of the loop with its observer and delay, cut at the motor", older=None, default=None
+        "margins of the loop with its observer and delay, opened at the motor",
+        older=None,
+        default=None,
     )
-    reachable: bool = written("false where the goal cannot be met")
+    reachable: bool = written("false if the goal cannot be met")
     message: str = written("what is reachable")
     requested_poles: ComplexArray | None
     Q: Array | None = None
@@ -548,20 +555,20 @@ class HardwareCheck:
     Attributes
     ----------
     input_scale : the factor on the logged input, sign included, that explains the motion best. It
-        is 1 if the log is right, and None where it was not estimated.
+        is 1 if the log is right, and None if it was not estimated.
     t, measured, model : (n,).
-    effort : (n,) input of the simulated loop. None in the comparison with the measured input.
-    set_point : (n,) desired position of this cart. None if the loop controls another cart.
-    contradicted : whether the log or the stated controller cannot be right. The note says why.
+    effort : (n,) input of the simulated loop; None in the comparison with the measured input.
+    set_point : (n,) desired position of this cart; None if the loop controls another cart.
+    contradicted : whether the log or the stated controller must be wrong; the note says why.
     """
 
     experiment: str = written()
     cart: int = written()
     loop: Literal["closed", "open"] = written(
-        "closed: the controller that ran, simulated; open: the measured input applied"
+        "closed: simulated with the controller that ran; open: with the measured input"
     )
     nrmse: Number = written(
-        "root-mean-square of measured minus simulated position over that of the measured one"
+        "rms of measured minus simulated position, divided by the rms of the measured one"
     )
     overshoot_model: float | None = written("percent of the change in level")
     overshoot_measured: float | None = written()
@@ -605,8 +612,8 @@ class Stage(StrEnum):
 class Skipped:
     """A stage that could not run, with its recording, cart or parameter, and the reason.
 
-    `missing` names the missing data in words. It is empty if there are such recordings but they
-    cannot be used; the reason then says why.
+    `missing` names the missing data in words. It is empty if the data exist but cannot be used;
+    `reason` then says why.
     """
 
     @property
@@ -631,10 +638,9 @@ class LeftOut:
     """A recording that was not used, and why."""
 
     experiment: str = written()
-    reason: str = written("in words that follow its name")
+    reason: str = written("in words that follow the recording's name")
     is_wrong: bool = written(
-        "it does not hold what happened, and the reason says how; else it only stands off its "
-        "repeats",
+        "true: the recording is wrong; false: it only differs from its repeats",
         older=False,
     )
 
@@ -643,25 +649,25 @@ class LeftOut:
 class Assumption:
     """A statement about the bench that every number depends on, and whether the data support it."""
 
-    key: str = written("of submission.toml: system.springs, …")
-    about: str = written("which one, where there are several: wall-1", default="")
+    key: str = written("key in submission.toml, such as system.springs")
+    about: str = written("which one, if there are several, such as wall-1", default="")
     value: bool | float | str | tuple[int, ...] = written("what was stated or taken")
     origin: Literal["stated", "data", "default"] = written()
-    support: Literal["supported", "contradicted", "open"] = written("open: the data do not tell")
-    found: float | None = written("what the data give for it, if it is a number", default=None)
+    support: Literal["supported", "contradicted", "open"] = written("open: the data do not decide")
+    found: float | None = written("value from the data, if it is a number", default=None)
     found_std: float | None = written(default=None)
     experiments: tuple[str, ...] = written(
-        "the recordings it is about, or that tell it", default=()
+        "the recordings that it is about, or that test it", default=()
     )
-    reason: str = written("how the data support or contradict it, or why they do not tell")
+    reason: str = written("how the data support or contradict it, or why they cannot")
 
 
 @dataclass(frozen=True, kw_only=True)
 class LateChannel:
     """A cart whose position is read later than another cart's, in the experiments of one kind.
 
-    `delay` is in s, negative if it is read earlier; `limit` is the largest allowed. `than` is the
-    other cart.
+    `delay` is in s, negative if this cart is read earlier; `limit` is the largest allowed delay.
+    `than` is the other cart.
     """
 
     cart: int
@@ -678,7 +684,7 @@ class Submitted:
 
     title: str = written()
     section: str = written()
-    authors: tuple[str, ...] = written("ids")
+    authors: tuple[str, ...] = written("ids of the authors")
     carts: int = written()
     springs: tuple[bool, ...] = written("wall-1, 1-2, …, n-wall")
     units: Units = written()
@@ -731,15 +737,15 @@ class Analysis:
     Attributes
     ----------
     authors : (id, name) of each author.
-    tables : the students' own reduced tables, even if dwells replace them. May be empty.
+    tables : frequency responses that the students computed, even if dwells replace them.
     rows : the table of parameters.
-    fit : None if no fit was possible. `skipped` says why.
+    fit : the fitted chain, or None; `skipped` then says why.
     files : the SHA-256 of each data file.
-    unreadable : by experiment, the reason why it could not be read. Empty if all were read.
-    unexplained : for each driven recording with motion, a share of its power. The fitted carts do
-        not explain this share.
+    unreadable : for each experiment that could not be read, the reason.
+    unexplained : for each driven recording with motion, the share of its power that the fitted
+        carts do not explain.
     discussion : `notes.md`, without its comments.
-    reported : the students' own numbers, initial and final. Digits are as typed.
+    reported : the students' own numbers, initial and final, with the digits as typed.
     """
 
     schema: Literal["cartlab-results/1"] = written(default="cartlab-results/1")

@@ -21,9 +21,9 @@ _WAVES: dict[RecordingKind, Literal["square", "chirp", "sine"]] = {
     "sine": "sine",
 }
 _SHORTEST = 1.0  # s
-# s. With three carts at 1 kHz, 120 s take 1 s and 0.5 GB to evaluate, 600 s take 20 s and 2 GB.
+# s; with three carts at 1 kHz, 120 s take 1 s and 0.5 GB to evaluate, 600 s take 20 s and 2 GB
 _LONGEST = 120.0
-_ROUNDING = 1e-9  # relative. 100 s at 0.07 Hz are 7 periods, however the product is rounded
+_ROUNDING = 1e-9  # relative rounding error that is ignored: 100 s at 0.07 Hz are exactly 7 periods
 # The numbers that define a recording of each kind, as keys of plan.toml, and the words for them.
 NEEDED: dict[RecordingKind, tuple[str, ...]] = {
     "step": ("amplitude",),
@@ -40,10 +40,10 @@ class WantedRecording:
 
     Attributes
     ----------
-    seconds : duration, 1 to 120. Rounded to whole periods of a dwell or sweep.
-    amplitude : input units.
-    frequency : of a dwell, or at the start of a sweep. Hz.
-    frequency_end : at the end of a sweep. Hz.
+    seconds : duration in s, 1 to 120; rounded to whole periods of a dwell or sweep.
+    amplitude : amplitude in input units.
+    frequency : frequency in Hz of a dwell, or at the start of a sweep.
+    frequency_end : frequency in Hz at the end of a sweep.
     cart : the released cart of a decay.
     """
 
@@ -58,7 +58,7 @@ class WantedRecording:
 def make_recording(wanted: WantedRecording, *, plan: Plan, submission: Submission) -> Recording:
     """Return the recording; all carts are free unless one is released by hand.
 
-    The rest before it is as long as before the plan's other driven recordings.
+    The rest before the recording is as long as before the plan's other driven recordings.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def make_recording(wanted: WantedRecording, *, plan: Plan, submission: Submissio
             frequency=wanted.frequency if kind != "step" else cycles / seconds,
             frequency_end=wanted.frequency_end if kind == "sweep" else None,
             cycles=cycles,
-            settle=driven[-1] if driven else 5.0,  # s. Used if the plan has no rest time
+            settle=driven[-1] if driven else 5.0,  # s, if the plan has no driven recording
         )
     for key, what in recording_problems(made, plan.limits, submission.system):
         raise ConfigError(f"{TYPED.get(key, key)}: {what}")
@@ -110,7 +110,7 @@ def _count_periods(seconds: float, frequency: float) -> int:
 
 
 def add_recording(folder: Path, recording: Recording) -> Recording:
-    """Append a recording to a submission's plan; return it with the id that it gets there.
+    """Append a recording to a submission's plan; return the recording with its id in the plan.
 
     Raises
     ------

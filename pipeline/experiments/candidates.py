@@ -13,8 +13,8 @@ from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.experiments.propose import FURTHEST, rounded, rounded_down
 from pipeline.plant.linear.dwells import SETTLED, SETTLED_DWELL, dwell_frequencies, settling_wait
 
-_PERIODS = 2  # periods of a multisine in its record
-_BAND = (0.4, 1.6)  # times the first and the last resonance
+_PERIODS = 2  # periods of a multisine in a record
+_BAND = (0.4, 1.6)  # lowest and highest frequency, as multiples of the first and the last resonance
 _DWELLS = 40  # number of frequencies for dwells
 
 
@@ -49,9 +49,9 @@ def propose_candidates(
 
 
 def _dwells(known: Knowledge) -> Iterator[Recording]:
-    """Yield dwells, each twice as long as the wait for its steady state.
+    """Yield dwells, each twice as long as the wait for the steady state.
 
-    Nothing is yielded if that takes too long, because a transient would be mistaken for a steady
+    No dwell is yielded if the wait is too long, because a transient would be mistaken for a steady
     state.
     """
     wait = settling_wait(known.chain, time_constants=SETTLED_DWELL)

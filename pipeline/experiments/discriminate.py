@@ -1,8 +1,8 @@
-"""Choose the experiment that distinguishes two explanations: where they differ even after a refit.
+"""Choose the experiment that distinguishes two explanations even after they are refitted.
 
 This is a T-optimal design: the difference of two predictions counts only as far as the other model
-cannot absorb it. That model may adjust its parameters, as far as all earlier records allow, its
-start and the encoder zeros. With several models, each pair counts by the product of their
+cannot absorb it. That model may adjust its start, the encoder zeros and, as far as all earlier
+records allow, its parameters. With several models, each pair is weighted by the product of its
 probabilities. This bounds the expected decrease of entropy.
 
 References: A. C. Atkinson, V. V. Fedorov, Biometrika 62 (1975), 57-70 and 289-303; G. E. P. Box, W.
@@ -42,23 +42,24 @@ from pipeline.submission import Submission
 Kind = Literal["step", "sweep"]
 Shape = Literal["square", "triangle", "chirp"]
 
-_PERIOD = 5e-3  # s between samples. Several samples fall in a period
-_PER_CYCLE, _BEYOND = 10, 2.0  # samples per period at this multiple of the highest resonance
-_TIME = 12.0  # s. Approximate duration of a record
-# A record may be so many times longer, if otherwise it would not settle its best pair.
+_PERIOD = 5e-3  # s between samples
+# samples per period, for periods at this multiple of the highest resonance
+_PER_CYCLE, _BEYOND = 10, 2.0
+_TIME = 12.0  # approximate duration of a record in s
+# A record may be this many times longer if it would otherwise not settle its best pair.
 _LONGEST = 4
-_STEP = 1e-3  # relative change of an effect's parameter for a difference
-_HOPELESS = np.exp(-0.5 * CLOSE_BIC)  # a model with a smaller share of the best weight is out
+_STEP = 1e-3  # relative change of an effect's parameter for a numerical derivative
+_HOPELESS = np.exp(-0.5 * CLOSE_BIC)  # a model with a smaller share of the best weight is left out
 _DECIDED = CLOSE_BIC * THINNING  # sum of squares that settles a pair
 # Least weight of a model. Correlated residuals make the criterion look too certain.
 _LEAST_WEIGHT = 0.1
-# Parameters with a smaller share of the largest effect on the motion are not visible.
+# A parameter is not visible if its effect on the motion is below this share of the largest effect.
 _SAME = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Weighed:
-    """A recording with its value, the pair of models that it separates best, and by how much."""
+    """A recording, its value, the pair of models that it separates best, and the separation."""
 
     worth: tuple[float, float]
     recording: Recording
@@ -179,9 +180,9 @@ def _pinned(gap: Gap) -> Array:
 
 
 def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, float]]:
-    """Yield steps to either side, triangles, chirps and releases of each cart, in several sizes.
+    """Yield steps to both sides, triangles, chirps, and releases of each cart, in several sizes.
 
-    Each comes with the height (position units) from which its cart is released, or 0.
+    Each recording comes with the position from which its cart is released (position units), or 0.
     """
     resonances = np.sort(np.abs(chain.poles)) / (2 * np.pi)
     settle = rounded(settling_wait(chain, time_constants=SETTLED))
@@ -201,8 +202,8 @@ def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, f
         ("triangle", "sweep", slow, None),
         ("triangle", "sweep", rounded(float(resonances[0])), None),
         ("chirp", "sweep", low, high),
-        # At high frequency with the motor's full input the carts move little. This shows delays and
-        # laws that matter only for small motions.
+        # At high frequencies the carts move little, even with the motor's full input. This shows
+        # delays, and laws that matter only for small motions.
         ("chirp", "sweep", high, fastest),
         ("chirp", "sweep", rounded(float(np.sqrt(high * fastest))), fastest),
     )
@@ -230,7 +231,7 @@ def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, f
     for cart in everyone:
         if chain.k[cart - 1] + chain.k[cart] <= 0:
             continue
-        for share in (0.6, 0.2):  # of the travel limit, for a release by hand
+        for share in (0.6, 0.2):  # shares of the travel limit, for a release by hand
             height = rounded(share * limits.travel)
             release = let_go(cart, name=f"apart-decay-{cart}", seconds=_TIME)
             note = f"let go at {share:.0%} of the travel limit, {height:g} from the zero"
@@ -256,8 +257,8 @@ def _separate(
 ) -> tuple[Array, Array, Array, Array] | None:
     """Return the separation (models, models) of each pair, with times, input and predictions.
 
-    A separation is the sum of squares over the noise that neither model can absorb. The result is
-    None if the motion of a model cannot be computed.
+    A separation is the sum of squared differences, relative to the noise, that neither model can
+    absorb. The result is None if the motion of a model cannot be computed.
     """
     t, u = sampled_input(recording, period=_PERIOD)
     u = recording.amplitude * u
@@ -293,8 +294,9 @@ def _need_input(one: AugmentedChain, other: AugmentedChain) -> bool:
 def _left(difference: Array, by: Array, pinned: Array) -> float:
     """Return the sum of squares of a difference (n,) that no change of parameters absorbs.
 
-    `by` holds its derivatives by the parameters, those of the chain first. All earlier records hold
-    these within `pinned` (n_p,): a change by this much costs one.
+    `by` has the derivatives of the difference by the parameters, those of the chain first. Earlier
+    records hold the chain's parameters within `pinned` (n_p,): a change by this much adds one to
+    the sum.
     """
     columns = by.reshape(len(by), -1).T
     held = np.zeros((pinned.size, len(by)))

@@ -33,7 +33,7 @@ from pipeline.submission import Design, Submission
 
 Table: TypeAlias = dict[str, Any]
 
-_PID_SHARES = (1.0, 0.5, 0.25, 0.1)  # a proposed kp adds such a share of the carts' own stiffness
+_PID_SHARES = (1.0, 0.5, 0.25, 0.1)  # shares of the carts' own stiffness that a proposed kp adds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,7 @@ def bench_scales(submission: Submission, *, bench: Description, analysis: Analys
 
     Raises
     ------
-    DataError : neither states a scale in the submission's unit.
+    DataError : neither the submission nor the bench states a scale in the submission's unit.
     """
     stated = submission.system
     for key, scale, unit in (
@@ -124,8 +124,8 @@ def propose_pid(
 ) -> PidLoop:
     """Return PID gains on cart 1 for a bench without state feedback.
 
-    They add stiffness and damping, and bring the cart to the reference. On a further cart a PID
-    soon becomes unstable, on the driven cart hardly ever.
+    The gains add stiffness and damping, and bring the cart to the reference. On a cart without the
+    motor, a PID soon becomes unstable; on the driven cart it hardly ever does.
 
     Raises
     ------
@@ -279,7 +279,10 @@ class _Trial:
         return f": set design.sample_time = {self.period:g} in submission.toml"
 
     def _step(self, law: Controller, *, delay: int) -> tuple[Array, Array]:
-        """Return t (n,) and positions (n_carts, n) of the step; refuse one beyond a limit."""
+        """Return t (n,) and positions (n_carts, n) of the step;
+
+        refuse a step that passes a limit.
+        """
         run = self.recording
         seconds = min(run.duration, 10.0)  # s of the step to simulate
         motion = simulate_loop(

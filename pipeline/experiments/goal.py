@@ -25,13 +25,13 @@ class Goal:
 
     Attributes
     ----------
-    name : as `--for` takes it.
+    name : the goal's name, as given to `--for`.
     words : the number in words, "the error of zeta_2".
-    rows : (k, n_p) derivatives of the wanted numbers by the relative parameters. For overshoot, as
-        a share of the step. One row is a c-optimal design.
-    mean : how several errors become one number. The "largest" is E-optimal in named parameters, the
-        "root mean square" A-optimal. The "volume" of the confidence region, as its mean radius, is
-        D-optimal.
+    rows : (k, n_p) derivatives of the wanted numbers by relative changes of the parameters. An
+        overshoot is a share of the step. With one row, the design is c-optimal.
+    mean : how several errors become one number. The "largest" gives an E-optimal design in the
+        named parameters, the "root mean square" an A-optimal design, and the "volume" of the
+        confidence region (as its mean radius) a D-optimal design.
     """
 
     name: str
@@ -107,7 +107,7 @@ def find_goal(name: str, known: Knowledge, *, feedback: FeedbackDesign | None) -
 
 
 def _by_overshoot(known: Knowledge, feedback: FeedbackDesign) -> Array:
-    """Return the derivative (1, n_p) of the loop's peak by the parameters, as share of the step.
+    """Return the derivative (1, n_p) of the loop's peak by the parameters, as a share of the step.
 
     The controller stays the same while the carts vary.
     """
@@ -133,21 +133,22 @@ def _by_overshoot(known: Knowledge, feedback: FeedbackDesign) -> Array:
 
 
 def choose(candidates: Array, information: Array, *, n: int, goal: Goal) -> tuple[int, ...]:
-    """Return the `n` candidates (m, 2, n_p, n_p) that give the smallest error, the best first.
+    """Return the indices of the `n` candidates that give the smallest error, the best first.
 
-    One candidate may be chosen several times. First, candidates are added one by one. Then each one
-    in turn is replaced by a better one, until no replacement helps (the exchange algorithm).
+    `candidates` is (m, 2, n_p, n_p); one candidate may be chosen several times. First, candidates
+    are added one by one. Then each one in turn is replaced by a better one, until no replacement
+    helps (the exchange algorithm).
 
     Parameters
     ----------
-    information : (2, n_p, n_p) the present information.
+    information : (2, n_p, n_p) the information in the present records.
 
     References
     ----------
     V. V. Fedorov, Theory of Optimal Experiments, 1972, chapter 3; A. C. Atkinson, A. N. Donev,
     R. D. Tobias, Optimum Experimental Designs, with SAS, 2007, chapter 12.
     """
-    enough = 1 - 1e-6  # a smaller relative improvement is rounding
+    enough = 1 - 1e-6  # a smaller relative improvement is a rounding error
     chosen: list[int] = []
     total = information
     for _ in range(n):

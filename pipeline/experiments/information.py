@@ -1,9 +1,10 @@
 """The Fisher information that a record will give on the carts, predicted before it is made.
 
-It follows from the fit that will use the record. H is the information: squares of the derivatives
-by the parameters over the noise, with start and encoder zeros eliminated. S is the covariance that
-the noise causes in these derivatives' sums. It equals H for white noise and is larger if rounding
-leaves lasting errors. Both add up over records, and the covariance of the parameters is H⁻¹ S H⁻¹.
+The prediction follows from the fit that will use the record. H is the information: the squared
+derivatives of the motion by the parameters, relative to the noise, with the start and the encoder
+zeros eliminated. S is the covariance that the noise causes in the gradient of the fit. It equals H
+for white noise and is larger if rounding leaves lasting errors. H and S add up over records, and
+the covariance of the parameters is H⁻¹ S H⁻¹.
 
 References: E. Walter, L. Pronzato, Identification of Parametric Models from Experimental Data,
 1997, chapter 6; G. C. Goodwin, R. L. Payne, Dynamic System Identification: Experiment Design and
@@ -47,15 +48,15 @@ class Knowledge:
     Attributes
     ----------
     chain : the identified chain.
-    information : (2, n_p, n_p) H and S for relative changes of the parameters. See
+    information : (2, n_p, n_p) H and S for relative changes of the parameters; see
         `parametrisation`.
-    size : (n_p,) the reference values of these changes, in physical units.
-    step, noise : (n,) encoder step and other noise of each cart. In position units.
-    sample_time : s, of the bench.
-    beyond : the ratio of the variances found to those that the encoders cause. Friction, for
-        example, makes it larger.
+    size : (n_p,) parameter values in physical units to which these changes are relative.
+    step, noise : (n,) encoder step and other noise of each cart, in position units.
+    sample_time : sample time of the bench in s.
+    beyond : ratio of the measured variances to those that encoder errors alone would cause.
+        Friction, for example, increases it.
     dwells : the dwells so far. If there are any, the carts are identified from dwells alone.
-    misfit : distance of a dwell from the carts beyond its standard error. As a share of its
+    misfit : how far a dwell is from the carts beyond its standard error, as a share of the dwell's
         magnitude.
     """
 
@@ -119,10 +120,10 @@ class Knowledge:
         return replace(known, noise=np.array(shaken))._compared(windows, covariance)
 
     def _compared(self, windows: Sequence[FitWindow], covariance: Array) -> Self:
-        """Return this knowledge with H of the windows, and the S that gives the found covariance.
+        """Return this knowledge with H of the windows, and with the S that gives the `covariance`.
 
-        `beyond` becomes the ratio of the found variances to those from the encoders' noise, at
-        least 1.
+        `beyond` becomes the ratio of the measured variances to those from encoder errors, at least
+        1.
         """
         H, S = np.sum([self._of_window(window) for window in windows], axis=0)
         J, inverse = self.by_parameters(), np.linalg.inv(H)
@@ -163,7 +164,7 @@ class Knowledge:
         return self._of_window(window) * np.array([1.0, self.beyond])[:, None, None]
 
     def _of_window(self, window: FitWindow) -> Array:
-        """Return H and S of a window, with its positions rounded as the encoders will do."""
+        """Return H and S of a window, with positions rounded as the encoders round them."""
         rows = [cart - 1 for cart in window.carts]
         theta = self.parametrisation.pack(self.chain)
         (misfit,) = look([window], self.parametrisation, theta).misfits
@@ -294,7 +295,7 @@ def _fitted_records(analysis: Analysis, fit: ChainFit) -> list[Record]:
 def _median_by_cart(
     runs: Sequence[Record] | Sequence[FitWindow], values: Sequence[Array], *, n: int
 ) -> Array:
-    """Return the median (n,) for each cart of a value that the runs have for their carts."""
+    """Return each cart's median (n,) of a value over the runs in which it was measured."""
     found = [
         [
             float(of_run[run.carts.index(cart)])

@@ -17,11 +17,11 @@ from pipeline.experiments.information import Knowledge
 Tones = tuple[tuple[int, float, float], ...]
 Lines = NDArray[np.int64]  # numbers of harmonics
 
-_QUANTA = 16  # equal parts of the motion's power. Each goes to the most informative line
+_QUANTA = 16  # The motion's power has so many equal parts; each goes to the most informative line.
 # The lines lie between these multiples of the first and the last resonance.
 _LOW, _HIGH = 0.3, 1.6
-_CLIP_AT = 0.8  # share of the peak
-_DIGITS = 4  # of shares and phases in the file
+_CLIP_AT = 0.8  # clipping level, as a share of the peak
+_DIGITS = 4  # digits of shares and phases in the file
 
 
 def optimal_tones(
@@ -31,7 +31,7 @@ def optimal_tones(
 
     Parameters
     ----------
-    base : the fundamental frequency, Hz.
+    base : fundamental frequency in Hz.
     seconds, travel : duration in s, and limit of the motion in position units.
     """
     resonances = np.sort(np.abs(known.chain.poles)) / (2 * np.pi)
@@ -62,7 +62,7 @@ def low_peak_phases(lines: Lines, size: Array, G: ComplexArray) -> Array:
     """Return phases (n,) for which the largest swing of the carts is small.
 
     The motion is clipped and the new phases are kept, again and again. `G` (carts, n) is the
-    response at the lines.
+    frequency response at the lines.
     """
     motion = size * G
     phase = schroeder_phases(np.max(np.abs(motion), axis=0))
@@ -73,7 +73,7 @@ def low_peak_phases(lines: Lines, size: Array, G: ComplexArray) -> Array:
         if top < lowest:
             best, lowest = phase, top
         spectrum = np.fft.rfft(np.clip(x, -_CLIP_AT * top, _CLIP_AT * top))[:, lines]
-        # Here a sine is -j times half its line. The carts are weighted by their motion.
+        # A sine is -j times half its line in the spectrum. The carts are weighted by their motion.
         phase = np.angle(np.sum(1j * spectrum * np.conj(motion), axis=0))
     return best
 

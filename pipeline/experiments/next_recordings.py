@@ -29,7 +29,7 @@ from pipeline.words.numbers import count, first_few
 from pipeline.words.progress import Progress
 from pipeline.workflow import analyse
 
-_ALONE = 4  # number of planned recordings whose own benefit is listed
+_ALONE = 4  # most planned recordings whose own benefit is listed
 STATISTICAL = (
     "these errors include only noise; no bench is calibrated to better than "
     f"{100 * CALIBRATION:g} %"
@@ -38,19 +38,18 @@ STATISTICAL = (
 
 @dataclass(frozen=True, kw_only=True)
 class NextPlan:
-    """The chosen experiments, and the expected error after each.
+    """The chosen experiments, and the expected error after each of them.
 
     Attributes
     ----------
-    words : description of the error.
-    now : the present error, relative.
-    errors : (n + 1,) the error after the open recordings of the plan. Then the error after each
-        chosen one.
-    planned : the error after each single open recording of the plan, by id.
-    separation : only for "gap". The separation of the best separated pair of explanations, in noise
-        standard deviations.
+    now : present relative error.
+    errors : (n + 1,) relative error after the open recordings of the plan, then after each chosen
+        experiment.
+    planned : relative error after each open recording of the plan alone, by the recording's id.
+    separation : only for "gap": separation of the best separated pair of explanations, in standard
+        deviations of the noise.
     wrote : the change of plan.toml, in words.
-    doubt : why the errors are not reliable, whatever is recorded. Empty if they are.
+    doubt : why the errors are not reliable, whatever is recorded; empty if they are reliable.
     """
 
     words: str
@@ -171,7 +170,7 @@ def choose_next(
 
     Parameters
     ----------
-    without : nothing similar to these is chosen.
+    without : recordings that the chosen experiments must not resemble.
 
     Raises
     ------

@@ -21,8 +21,8 @@ class PlanLimits(TomlTable):
 
     Attributes
     ----------
-    input : largest input, input units.
-    travel : largest distance of a cart from its zero, position units.
+    input : largest input, in input units.
+    travel : largest distance of a cart from its zero, in position units.
     """
 
     input: Positive
@@ -40,7 +40,7 @@ class PidLoop(TomlTable):
 
 
 class StateLoop(TomlTable):
-    """State feedback in the submission's units; () and None mean the gains of the design."""
+    """State feedback in the submission's units; () and None stand for the gains of the design."""
 
     type: Literal["state_feedback"] = "state_feedback"
     gains: tuple[Finite, ...] = ()
@@ -54,19 +54,20 @@ class Recording(TomlTable):
     Attributes
     ----------
     id : the id of the experiment in submission.toml. The data file has the same name.
-    carts : the carts free to move. The others are held.
-    wave : the waveform of the input. In closed loop, of the reference.
-    amplitude : input units. In closed loop, position units. Zero for a decay started by hand.
-    frequency : Hz, of the wave. A chirp starts there.
-    frequency_end : Hz, end of a chirp.
+    carts : the carts that are free to move; all others are held.
+    wave : waveform of the input or, in closed loop, of the reference.
+    amplitude : amplitude in input units or, in closed loop, in position units. Zero for a decay
+        started by hand.
+    frequency : frequency of the wave in Hz, at which a chirp starts.
+    frequency_end : frequency in Hz at which a chirp ends.
     tones : the sines of a multisine. Each has the harmonic of `frequency`, its share of the
         amplitude and its phase in rad.
     cycles : number of periods. The run takes cycles/frequency seconds.
-    release : the cart that is pulled out and released by hand. None without a release.
+    release : the cart that is pulled out and released by hand; None if no cart is released.
     controller : the controller that closes the loop.
-    settle : s of rest beforehand.
-    aim : the parameter for which cartlab chose it, such as "zeta_2". Empty if it is a standard
-        recording or a person chose it.
+    settle : time of rest before the run, in s.
+    aim : the parameter for which cartlab chose the recording, such as "zeta_2". Empty for a
+        standard recording and for one that a person chose.
     """
 
     id: str
@@ -86,7 +87,7 @@ class Recording(TomlTable):
 
     @property
     def duration(self) -> float:
-        """Duration of the run, s."""
+        """Duration of the run in s."""
         return self.cycles / self.frequency
 
     @property
@@ -95,7 +96,7 @@ class Recording(TomlTable):
         return tuple(Tone(harmonic=h, share=share, phase=p) for h, share, p in self.tones)
 
     def resembles(self, other: Self) -> bool:
-        """Return whether a person who refuses one of the two would refuse the other too."""
+        """Return whether a person who refuses one of two recordings would refuse the other too."""
         words = (self.kind, self.wave, self.carts, self.release, self.controller)
         if words != (other.kind, other.wave, other.carts, other.release, other.controller):
             return False

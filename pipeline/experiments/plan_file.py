@@ -26,7 +26,7 @@ from pipeline.submission.toml_file import parse_toml, read_text
 from pipeline.submission.toml_section import toml_section
 
 NAME = "plan.toml"
-LONGEST_RUN = 600.0  # s. Limits the time of a simulation and the size of a file
+LONGEST_RUN = 600.0  # s; limits the time of a simulation and the size of a file
 
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,60}")  # a data file has the same name
 _HEAD = """\
@@ -62,7 +62,8 @@ def load_plan(submission: Submission) -> Plan:
 
     Raises
     ------
-    ConfigError : the plan is wrong; one line gives the file, the key, what was expected and found.
+    ConfigError : the plan is wrong; the message has the file, the key, what was expected and what
+        was found.
     """
     path = plan_path(submission)
     where = f"{submission.folder.resolve().name}/{NAME}"
@@ -102,8 +103,8 @@ def save_plan(plan: Plan, submission: Submission) -> Path:
 def add_recordings(folder: Path, proposed: Sequence[Recording], *, otherwise: Plan) -> Plan:
     """Append recordings to the current plan of a submission; return the new plan.
 
-    Computing the proposal may have taken minutes, and others may have added recordings meanwhile.
-    An id that is already taken is changed.
+    Computing the proposal may have taken minutes, in which others may have added recordings. An id
+    that is already taken is changed.
 
     Parameters
     ----------
@@ -235,7 +236,7 @@ def _peak(recording: Recording) -> float:
 
 
 def _time_problems(recording: Recording) -> Iterator[tuple[str, str]]:
-    """Yield problems with times: a bench ignores such a command and sends no data."""
+    """Yield problems with times for which a bench would ignore the command and send no data."""
     low, high = FREQUENCIES
     for key in ("frequency", "frequency_end"):
         hertz = getattr(recording, key)

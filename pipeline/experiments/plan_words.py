@@ -13,7 +13,7 @@ def plan_table(plan: Plan, submission: Submission, *, new: Collection[str] = ())
 
     Parameters
     ----------
-    new : ids that were not in the plan before. Each is marked with +.
+    new : ids that were not in the plan before; each is marked with +.
     """
     n, done = submission.system.carts, recorded_ids(plan, submission)
     wide = max((len(recording.id) for recording in plan.recordings), default=0)

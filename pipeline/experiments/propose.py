@@ -47,10 +47,10 @@ _REPEATS = "ab"  # one decay for each letter
 EDGES = 4  # half periods of a step: off, on, off, on
 _SWEEP_TIME = 20.0  # s
 _FIRST_SETTLE = 5.0  # s
-FIRST_SWEEP_TIME = _SWEEP_TIME + _FIRST_SETTLE  # s, on every bench
+FIRST_SWEEP_TIME = _SWEEP_TIME + _FIRST_SETTLE  # s, the same on every bench
 
 _DWELLS = 24
-_STEP = 0.9  # the final level of a step, as a share of the aim; it overshoots up to twice as far
+_STEP = 0.9  # final level of a step, as a share of the aim; the step overshoots up to twice as far
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ class MadePlan:
     Attributes
     ----------
     said : the message, in one sentence.
-    trouble : why the data could not be used. Empty if they were used, or if there are no data.
+    trouble : why the data could not be used; empty if they were used, or if there are no data.
     """
 
     plan: Plan
@@ -104,7 +104,7 @@ def propose_plan(submission: Submission, *, bench: Description | None = None) ->
 
     Parameters
     ----------
-    bench : the bench's own description. None for a bench that knows every command.
+    bench : the bench's own description; None for a bench that knows every command.
     """
     system, recorded = submission.system, submission.experiments
     limits = _limits(system, submission.design, bench)
@@ -125,8 +125,8 @@ def propose_plan(submission: Submission, *, bench: Description | None = None) ->
 def extend_plan(plan: Plan, submission: Submission, *, bench: Description | None = None) -> Plan:
     """Add what the recorded data make possible: dwells after a sweep, the loop after dwells.
 
-    Existing entries stay unchanged and in place. Recordings that were added once are not added
-    again. A bench without state feedback gets a PID on cart 1.
+    Existing entries stay unchanged and in place. Dwells or a loop are added only if there are none
+    yet. A bench without state feedback gets a PID on cart 1.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def extend_plan(plan: Plan, submission: Submission, *, bench: Description | None
 
 
 def _wants_dwells(plan: Plan, submission: Submission) -> bool:
-    """Whether dwells should be added: no dwell exists, and a sweep is recorded.
+    """Return whether dwells should be added: no dwell exists, and a sweep is recorded.
 
     If no sweep is planned, a recorded step is enough.
     """
@@ -164,7 +164,10 @@ def _wants_dwells(plan: Plan, submission: Submission) -> bool:
 
 
 def _wants_loop(plan: Plan, submission: Submission) -> bool:
-    """Whether a loop should be added: no loop exists, and all planned dwells are recorded."""
+    """Return whether a loop should be added:
+
+    no loop exists, and all planned dwells are recorded.
+    """
     ids = {e.id for e in submission.experiments}
     kinds = {e.kind for e in submission.experiments}
     kinds_planned = {r.kind for r in plan.recordings}

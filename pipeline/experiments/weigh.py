@@ -22,8 +22,8 @@ class Weighed:
 
     Attributes
     ----------
-    words : the parameter, such as "zeta_2".
-    why : why the proposed recording does not help, or harms. Empty if it helps.
+    words : the parameter to improve, such as "zeta_2".
+    why : why the proposed recording does not help, or even does harm; empty if it helps.
     """
 
     words: str

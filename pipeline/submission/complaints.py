@@ -15,9 +15,9 @@ from pipeline.words.numbers import first_few
 
 Location = Sequence[int | str]
 
-_LONGEST_QUOTE = 60  # characters to show of a found value
-MOST_LISTED = 20  # faults to list for a file. Finding the nearest valid key takes a while
-_MOST_KNOWN = 40  # valid values to list
+_LONGEST_QUOTE = 60  # most characters shown of a found value
+MOST_LISTED = 20  # most faults listed for a file; finding the nearest valid key takes a while
+_MOST_KNOWN = 40  # most valid values listed
 
 # Descriptions of expected values, by pydantic's name for the error.
 _EXPECTED = {
@@ -59,7 +59,7 @@ def _summary(value: dict | tuple | list) -> str:
 
 
 def nearest(name: object, candidates: Sequence[str]) -> str:
-    """Return "; did you mean …?"; if nothing is near, all valid values if they are few."""
+    """Return "; did you mean …?", or all valid values if nothing is near and they are few."""
     close = get_close_matches(str(name)[:_LONGEST_QUOTE], candidates, n=1, cutoff=0.5)
     if close:
         return f"; did you mean {close[0]!r}?"
@@ -179,7 +179,7 @@ def refusal(error: ErrorDetails) -> str:
 
 
 def relevant_errors(errors: Sequence[ErrorDetails]) -> list[ErrorDetails]:
-    """Return errors, unknown keys first; drop missing keys that are only misspelt."""
+    """Return the errors, unknown keys first, without missing keys that are only misspelt."""
     unknown = [error for error in errors if error["type"] == "extra_forbidden"]
 
     def is_misspelt(error: ErrorDetails) -> bool:

@@ -1,4 +1,4 @@
-"""Change `submission.toml` in place; all other comments, the order and the digits are kept."""
+"""Change `submission.toml` in place; the comments, order and digits of the rest are kept."""
 
 import hashlib
 import re
@@ -54,13 +54,13 @@ def edit_submission(
     Parameters
     ----------
     change : function that changes the document.
-    seen : digest of the text for which the change was prepared. Empty for any text.
+    seen : digest of the text for which the change was prepared; empty to change any text.
 
     Raises
     ------
     SubmissionError : the result would be invalid (`InvalidSubmission`), or the file cannot be
         changed in this way.
-    Outdated : the file is not the one `seen`.
+    Outdated : the file's text is not the one for which the change was prepared.
     """
     with turn_in(folder):
         text = submission_text(folder)
@@ -80,10 +80,10 @@ def edit_submission(
         except (TOMLKitError, RecursionError) as error:
             raise SubmissionError(f"{where}: cannot be edited by cartlab ({error})") from None
         except ValueError:  # an integer of thousands of digits
-            parse_submission(text, folder=folder, where=where)  # raises if invalid before
+            parse_submission(text, folder=folder, where=where)  # raises if the file was invalid
             raise SubmissionError(f"{where}: a number has too many digits") from None
         except (TypeError, AttributeError, LookupError):
-            parse_submission(text, folder=folder, where=where)  # raises if a table is gone
+            parse_submission(text, folder=folder, where=where)  # raises if the file lacks a table
             raise
         if len(new.encode()) > MAX_TOML_BYTES:
             raise SubmissionError(f"{where}: would exceed {MAX_TOML_BYTES:,} bytes")

@@ -77,7 +77,7 @@ class InvalidSubmission(SubmissionError):
 
     Attributes
     ----------
-    problems : the first problems found, each with its place. The text has a line for each.
+    problems : the first problems found, each with its place. The error's text has a line for each.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submissio
     Raises
     ------
     SubmissionError : the text is not TOML.
-    InvalidSubmission : its content is invalid; lists every problem.
+    InvalidSubmission : the content is invalid; the message lists every problem.
     """
     # Decimals are kept, so that no typed digit is lost.
     document = parse_toml(text, where=where, error=SubmissionError, as_typed=True)
@@ -121,15 +121,15 @@ def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submissio
 
 
 def with_reported(submission: Submission, reported: Mapping[str, Any]) -> Submission:
-    """Return the submission with other numbers under `[reported]`, checked like those of a file.
+    """Return the submission with new numbers under `[reported]`, checked like those of a file.
 
     Parameters
     ----------
-    reported : the tables of `[reported]`. A text keeps the digits of its number, "0.10".
+    reported : the tables of `[reported]`. A number given as text, such as "0.10", keeps its digits.
 
     Raises
     ------
-    InvalidSubmission : lists every problem.
+    InvalidSubmission : the numbers are invalid; the message lists every problem.
     """
     system = {"carts": submission.system.carts}
     document = {"version": 1, "system": system, "reported": _as_typed(reported)}
@@ -201,7 +201,7 @@ def _plain(value: object, at: tuple[int | str, ...]) -> object:
 
 
 def _notes(folder: Path) -> str | None:
-    """Return `notes.md` without its comments, or None if nothing else is in it."""
+    """Return the text of `notes.md` without comments, or None if no text is left."""
     path, where = folder / "notes.md", f"{folder.resolve().name}/notes.md"
     if not path.exists() and not path.is_symlink():
         return None
@@ -209,7 +209,7 @@ def _notes(folder: Path) -> str | None:
         raise SubmissionError(f"{where}: {problem}")
     typed = read_text(path, where=where, limit=MAX_NOTES_BYTES, error=SubmissionError)
     text = COMMENT.sub("", typed)
-    most = 30_000  # characters, fifteen pages
+    most = 30_000  # characters; about fifteen pages
     if len(text) > most:
         shown = text[: text.rfind("\n", 0, most) + 1] or text[:most]
         length = f"{len(shown):,} of {len(text):,} characters"
@@ -396,7 +396,7 @@ def _may_be_link(path: Path) -> bool:
 def outside(folder: Path, name: str, *, taken: Collection[str] = ()) -> str | None:
     """Return why `name` is not a readable regular file inside `folder`, or None if it is one.
 
-    The files `taken` belong to other entries, so they are not suggested.
+    The files in `taken` belong to other entries, so messages do not suggest them.
     """
     if (problem := leaves(folder, name)) is not None:
         return problem

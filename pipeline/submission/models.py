@@ -37,7 +37,7 @@ class Author(TomlTable):
 
 
 class InputScale(TomlTable):
-    """The input's unit, sign and scale; with `sign` None the sign is found from the data."""
+    """The input's unit, sign and scale; if `sign` is None, the sign is found from the data."""
 
     unit: Unit = Field(default="V", title="Unit of the input", description="V")
     sign: Literal[1, -1] | None = Field(
@@ -76,9 +76,9 @@ class PositionScale(TomlTable):
 
 
 class System(TomlTable):
-    """The carts and springs on the bench; without a statement all springs exist.
+    """The carts and springs on the bench; if `springs` is not stated, all springs exist.
 
-    `columns` (role to heading or number) apply to every recording that has such columns.
+    `columns` maps roles to headings or numbers; it applies to every recording with such columns.
     """
 
     carts: int = Field(ge=1, le=MOST_CARTS, title="Carts")
@@ -252,7 +252,7 @@ class Students(TomlTable):
 
 
 class Submission(TomlTable):
-    """A validated submission; `folder` is where it is."""
+    """A validated submission; `folder` is the folder that contains it."""
 
     version: Literal[1]
     title: Line = Field(

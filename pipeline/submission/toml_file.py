@@ -17,8 +17,8 @@ from pipeline.submission.complaints import Location, dotted, quote, takes_number
 from pipeline.submission.models import Submission
 
 Value: TypeAlias = "str | bool | int | float | Sequence[Value] | Mapping[str, Value]"
-_LONGEST_LINE, _SHOWN = 300, 60  # characters of a line to check, and to show
-_LARGEST = 30  # exponent. Larger than any physical number in any unit, yet safe to multiply
+_LONGEST_LINE, _SHOWN = 300, 60  # characters of a line that are checked, and that are shown
+_LARGEST = 30  # exponent; above that of any physical number, but numbers can still be multiplied
 _AT = re.compile(r" \(at line (\d+), column (\d+)\)$")
 
 
@@ -44,7 +44,8 @@ def read_text(path: Path, *, where: str, limit: int, error: type[PipelineError])
 
     Raises
     ------
-    PipelineError : of class `error`; the file is too large or not UTF-8. One line.
+    PipelineError : the file is too large or not UTF-8. The error is of class `error`; its message
+        has one line.
     OSError : the computer cannot read the file now, whatever its content.
     """
     try:
@@ -80,8 +81,8 @@ class Toml:
     Attributes
     ----------
     document : the content of the readable lines.
-    text : the readable lines, each in its place. The others are empty.
-    slips : (line, what is wrong) for each other line. Line 0 means the whole text.
+    text : the readable lines, each in its place; all other lines are empty.
+    slips : (line, what is wrong) for each line that is not readable. Line 0 means the whole text.
     """
 
     document: dict[str, Any]
@@ -103,8 +104,8 @@ def parse_toml(
     ----------
     where : name of the file in messages. A line's number is added.
     error : class of error to raise for a mistake.
-    as_typed : whether to keep numbers with a point or an exponent as decimals. These have any size,
-        so see `check_number`. Otherwise they become floats.
+    as_typed : whether to keep numbers with a point or an exponent as decimals instead of floats.
+        Decimals can have any size; see `check_number`.
     root : the model of the format.
 
     Raises
@@ -135,8 +136,8 @@ def read_toml(
             line = text.count("\n", 0, key.start()) + 1
             return Toml(document={}, text="", slips=((line, "keys nest too deeply"),))
     typed, slips = text.split("\n"), list[tuple[int, str]]()
-    lines, emptied = list(typed), -1  # last line of the mistake before
-    for _ in range(30 if len(text) <= 50_000 else 1):  # a long text is not read again
+    lines, emptied = list(typed), -1  # last line of the previous mistake
+    for _ in range(30 if len(text) <= 50_000 else 1):  # a long text is read only once
         try:
             document = tomllib.loads("\n".join(lines), parse_float=_decimal)
             if not as_typed:
@@ -213,7 +214,10 @@ def _decimal(text: str) -> Decimal:
 
 
 def _with_floats(value: Any, at: tuple[int | str, ...], slips: list[tuple[int, str]]) -> Any:
-    """Return a document with floats for decimals; a number too large is a slip and becomes 1."""
+    """Return a document with floats for decimals;
+
+    a number that is too large is a slip and becomes 1.
+    """
     if isinstance(value, dict):
         return {key: _with_floats(item, (*at, key), slips) for key, item in value.items()}
     if isinstance(value, list):
@@ -240,7 +244,7 @@ def _find_spoilt(lines: Sequence[str], line: int, slip: _Slip) -> tuple[int, int
         for n in range(line - 1, 0, -1):
             if lines[n - 1].count("[") > lines[n - 1].count("]"):
                 return n, line - 1
-    if lines[line - 1].lstrip().startswith("["):  # else the table before would get its keys
+    if lines[line - 1].lstrip().startswith("["):  # otherwise the previous table would get its keys
         after = (n for n in range(line, len(lines)) if lines[n].lstrip().startswith("["))
         return line, next(after, len(lines))
     return line, line

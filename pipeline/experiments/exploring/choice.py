@@ -40,7 +40,7 @@ def choose_recording(
     Parameters
     ----------
     missing : the parameters that are not known well enough, with their relative errors.
-    refused : recordings refused before. Nothing similar is chosen.
+    refused : recordings refused before; no similar recording is chosen.
     commands : the extensions of the protocol that the bench knows.
     """
     named = gap is None or gap.verdict in SETTLED
@@ -64,7 +64,7 @@ def choose_recording(
             end = str(error)
         else:
             return found.recordings[0], found.said
-    # Record each only once: carts that were held back go no further the second time.
+    # Record each of these only once: carts that were held back would go no further the second time.
     recorded = {record.id for record in analysis.records}
     tried = [*refused, *(r for r in plan.recordings if r.id in recorded)]
     for recording, unseen in _reach_far_out(analysis, plan.limits):
@@ -79,9 +79,10 @@ def choose_recording(
 
 
 def _reach_far_out(analysis: Analysis, limits: PlanLimits) -> Iterator[tuple[Recording, str]]:
-    """Yield recordings that show effects at large motion, with the range they add; "" if none.
+    """Yield recordings that show effects at large motion, and the range that each adds, or "".
 
-    They are a step as far as the carts may rest, and a sweep that swings them to both sides.
+    These are a step that moves the carts as far as they may rest, and a sweep that swings them to
+    both sides.
     """
     chain = identified_chain(analysis)
     driven = [record for record in analysis.records if record.kind in ("step", "sweep")]

@@ -39,7 +39,7 @@ def read_error_goal(text: str) -> ErrorGoal:
 
     Raises
     ------
-    ConfigError : the text has another form.
+    ConfigError : the text does not have this form.
     """
     before, _, after = text.partition("%")
     *name, share = before.split() or [""]
@@ -57,7 +57,7 @@ def read_time(text: str) -> float:
 
     Raises
     ------
-    ConfigError : the text has another form.
+    ConfigError : the text does not have this form.
     """
     number = text.strip().rstrip("minsech ")
     unit = text.strip()[len(number) :].strip()

@@ -40,8 +40,9 @@ from pipeline.words.progress import Progress, silent
 from pipeline.workflow import analyse
 
 _FIRST = "sweep"  # the first recording that the plan proposes; nobody has to hold a cart for it
-_SEARCH = 300.0  # s for one search for the gap. Most take ten
-_OFTEN = 2  # recordings in a row that distinguish explanations, before another purpose has its turn
+_SEARCH = 300.0  # s, limit of one search for the gap; most take ten
+# most recordings in a row that distinguish explanations; then another purpose comes first
+_OFTEN = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,10 +51,10 @@ class Recorded:
 
     Attributes
     ----------
-    ids : the recordings made.
-    seconds : total time of all attempts.
-    vetoed : whether a person at the bench refused the missing recordings.
-    why : otherwise the reason why they are missing, if known.
+    ids : ids of the recordings that were made.
+    seconds : total time of all attempts, in s.
+    vetoed : whether recordings are missing because a person at the bench refused them.
+    why : the reason, if known, why other recordings are missing.
     """
 
     ids: tuple[str, ...]
@@ -72,22 +73,24 @@ class Exploration:
     Attributes
     ----------
     folder : the submission's folder.
-    record : makes recordings of the plan, given by their ids. The first call also makes submission
-        and plan if they are missing.
+    record : function that makes recordings of the plan, given by their ids. Its first call also
+        makes submission and plan if they are missing.
     goal : the errors to reach.
-    seconds : time at the bench, with rests. No recording begins that would exceed it. An
-        interrupted recording counts each time.
-    tell : called with a sentence in each turn.
-    progress : called often with a few words during computations. An exception that it raises ends
-        the exploration.
-    vetoes : returns whether a person refuses the chosen recording. If so, another one is chosen.
+    seconds : time allowed at the bench, including rests. No recording begins that would exceed it.
+        An interrupted recording counts each time.
+    tell : function that is called with a sentence in each turn.
+    progress : function that is called often with a few words during computations. An exception that
+        it raises ends the exploration.
+    vetoes : function that returns whether a person refuses the chosen recording; if so, another one
+        is chosen.
     turns : the knowledge after each turn.
-    made : recordings since the last turn.
-    spent : time at the bench, s.
-    ours : ids in the plan that cartlab added. A person added the other open ones.
+    made : ids of the recordings made since the last turn.
+    spent : time spent at the bench, in s.
+    ours : ids in the plan that cartlab added. All other recordings without data were added by a
+        person.
     refused : recordings that were vetoed or failed.
     asked : recordings made to decide between explanations.
-    lost : the reason why the last chosen recording is missing. Empty if it is there.
+    lost : the reason why the last chosen recording is missing; empty if it was made.
     failures : number of failures in a row.
     """
 
@@ -154,7 +157,10 @@ class Exploration:
                 self._record([step.id for step in steps])
 
     def _check_goal(self, system: System | None) -> None:
-        """Refuse a goal that these carts cannot meet; None if their number is not known yet."""
+        """Refuse a goal that these carts cannot meet;
+
+        `system` is None if they are not known yet.
+        """
         if system:
             names = parameter_names(system.carts, rigid=not system.bench.tied)
         else:
@@ -206,7 +212,8 @@ class Exploration:
         but = ""
         if recording and not self._has_time_for([recording]):
             but = WORDS.text("time_up", time=time_words(self.seconds), name=recording.id)
-        elif recording and self.failures >= 3:  # in a row; choosing better does not help
+        # after three failures in a row, another choice does not help
+        elif recording and self.failures >= 3:
             but = WORDS.text("none_came", count=self.failures)
         if but:
             recording = None
@@ -277,7 +284,7 @@ class Exploration:
         key = "vetoed" if came.vetoed else "lost_why" if came.why else "lost"
         values = {"name": recording.id} | ({"why": came.why} if key == "lost_why" else {})
         self.lost = WORDS.text(key, **values)
-        self._propose(self.analysis)  # which recording decides must be found again
+        self._propose(self.analysis)  # find again which recording decides
 
 
 def _identify_beside(analysis: Analysis, gap: Gap | None) -> Analysis:
