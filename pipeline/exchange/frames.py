@@ -25,10 +25,7 @@ if TYPE_CHECKING:
 
 
 def parameters(analysis: Analysis) -> "pd.DataFrame":
-    """Return initial and final estimates, one row per parameter;
-
-    the index is the parameter's name.
-    """
+    """Return initial and final estimates, one row per parameter, indexed by its name."""
     frame = _frame(_rows(analysis.rows), keys(ParameterRow), analysis=analysis)
     frame["consistent"] = frame["consistent"].astype("boolean")  # missing values stay missing
     return frame.set_axis(frame["name"].to_list(), axis="index")

@@ -279,9 +279,9 @@ class _Trial:
         return f": set design.sample_time = {self.period:g} in submission.toml"
 
     def _step(self, law: Controller, *, delay: int) -> tuple[Array, Array]:
-        """Return t (n,) and positions (n_carts, n) of the step;
+        """Return t (n,) and positions (n_carts, n) of the step.
 
-        refuse a step that passes a limit.
+        A step that passes a limit is refused.
         """
         run = self.recording
         seconds = min(run.duration, 10.0)  # s of the step to simulate

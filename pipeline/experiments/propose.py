@@ -164,10 +164,7 @@ def _wants_dwells(plan: Plan, submission: Submission) -> bool:
 
 
 def _wants_loop(plan: Plan, submission: Submission) -> bool:
-    """Return whether a loop should be added:
-
-    no loop exists, and all planned dwells are recorded.
-    """
+    """Return whether to add a loop: there is none, and all planned dwells are recorded."""
     ids = {e.id for e in submission.experiments}
     kinds = {e.kind for e in submission.experiments}
     kinds_planned = {r.kind for r in plan.recordings}

@@ -208,9 +208,9 @@ class _Rounded:
     even: bool
 
     def straight(self, period: float | None) -> tuple[Array, int]:
-        """Return the times and the number of lines;
+        """Return the times and the number of straight lines.
 
-        without `period`, each line has its own slope.
+        Without `period`, each line has its own slope.
         """
         if self.even and period is None:
             return self.stamps, 0

@@ -70,10 +70,7 @@ class Column:
 
 
 def holds_counts(table: FileTable, column: Column) -> bool:
-    """Return whether a column holds counts:
-
-    whole numbers that the format or the heading calls counts.
-    """
+    """Return whether a column holds whole numbers that the format or the heading calls counts."""
     return table.whole[column.index] and (table.form not in _IN_UNITS or column.is_counted)
 
 

@@ -93,9 +93,9 @@ def data_files(folder: Path) -> list[str]:
 
 
 def passed_over(folder: Path, *, named: Collection[str] = ()) -> list[Found]:
-    """Return the files of a submission that are not inspected;
+    """Return the files of a submission that are not inspected.
 
-    the files in `named` have a table.
+    The files in `named` are left out, because they have a table.
     """
     if problem := leaves(folder, "data"):  # `data` is a link that leads out of the submission
         return [Found(file="data", state="refused", remarks=(problem,))]

@@ -32,10 +32,7 @@ FEW_NAMES = 6  # names to list; further ones are only counted
 
 @dataclass(frozen=True, kw_only=True)
 class Signs:
-    """For each record, the stated sign and the sign found in the data;
-
-    0 if the data are unclear.
-    """
+    """The stated sign of each record, and the sign found in its data: 0 if unclear."""
 
     stated: Mapping[str, int]
     found: Mapping[str, int]

@@ -84,10 +84,7 @@ class Inspection:
 
     @property
     def ranges(self) -> str:
-        """The range of each column if the columns have no names, to help a person name them;
-
-        else "".
-        """
+        """The range of each column if the columns have no names; "" if they have names."""
         if "columns" not in self.needs:
             return ""
         said = [f"{one.name} ({one.low:.4g} to {one.high:.4g})" for one in self.columns]

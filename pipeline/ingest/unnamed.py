@@ -227,10 +227,7 @@ def _is_stepped(column: Array) -> bool:
 
 
 def _averages(values: Array, signals: Sequence[int]) -> tuple[Array, Array, Array] | None:
-    """Return mean, slope and curvature (signals, windows) per sample;
-
-    None if the record is short.
-    """
+    """Return mean, slope and curvature (signals, windows); None if the record is short."""
     n = values.shape[1]
     if not signals:
         return None

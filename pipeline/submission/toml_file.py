@@ -214,9 +214,9 @@ def _decimal(text: str) -> Decimal:
 
 
 def _with_floats(value: Any, at: tuple[int | str, ...], slips: list[tuple[int, str]]) -> Any:
-    """Return a document with floats for decimals;
+    """Return a document with floats in place of decimals.
 
-    a number that is too large is a slip and becomes 1.
+    A number that is too large is added to `slips` and becomes 1.
     """
     if isinstance(value, dict):
         return {key: _with_floats(item, (*at, key), slips) for key, item in value.items()}

@@ -157,9 +157,9 @@ class Exploration:
                 self._record([step.id for step in steps])
 
     def _check_goal(self, system: System | None) -> None:
-        """Refuse a goal that these carts cannot meet;
+        """Refuse a goal that the carts cannot meet.
 
-        `system` is None if they are not known yet.
+        If `system` is None, the number of carts is not known yet.
         """
         if system:
             names = parameter_names(system.carts, rigid=not system.bench.tied)

@@ -196,10 +196,7 @@ def _headings(segment: _Segment, names: Sequence[str], dialect: _Dialect) -> lis
 
 
 def _with_one_clock(rows: Rows, names: Sequence[str], *, place: str) -> Rows:
-    """Return the rows with only the first of their time columns;
-
-    the time columns must all be equal.
-    """
+    """Return the rows with only the first of their time columns, which must be equal."""
     clocks = [i for i in range(len(rows.names)) if names[i] == "X_Value"]
     if any((rows.values[:, i] != rows.values[:, clocks[0]]).any() for i in clocks[1:]):
         raise SubmissionError(

@@ -38,7 +38,7 @@ class DraftNumber:
 
 @dataclass(frozen=True, kw_only=True)
 class Change:
-    """A number in both drafts.
+    """A number of the earlier and of the current draft.
 
     Attributes
     ----------
@@ -155,10 +155,7 @@ def compare_drafts(before: Draft, analysis: Analysis) -> DraftChanges:
 
 
 def _numbers(draft: Draft) -> Iterator[tuple[str, str, DraftNumber]]:
-    """Yield all numbers of a draft;
-
-    the two texts are the part of the draft and the number's name.
-    """
+    """Yield every number of a draft, with the part of the draft and the number's name."""
     for which in ("final", "initial"):
         for row in draft["parameters"]:
             value, std = row.get(which), row.get(f"{which}_std")

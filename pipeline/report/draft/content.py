@@ -137,10 +137,7 @@ def _model(page: Page) -> list[Block]:
 
 
 def _about_gap(gap: "Gap | None") -> tuple[Blocks, Blocks, Blocks]:
-    """Return three functions that build blocks on the gap:
-
-    one paragraph, runs, and the whole section.
-    """
+    """Return functions that build blocks on the gap: a paragraph, runs, and the section."""
     if gap is None:
         return _nothing, _nothing, _nothing
     from pipeline.report.gap import section  # late: loads the catalogue of effects

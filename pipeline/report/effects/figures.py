@@ -75,10 +75,7 @@ def scales_readings(effect: Effect) -> bool:
 
 
 def _window(run: _Run, cart: int) -> slice:
-    """Return the samples to show:
-
-    all, or one second around the largest difference if that is brief.
-    """
+    """Return the samples to show: all, or one second around the largest difference."""
     if _difference(run, cart) > 0.1:
         return slice(None)
     largest = int(np.argmax(np.abs(run.with_it[cart - 1] - run.without[cart - 1])))
@@ -232,10 +229,7 @@ def _against_truth(ax: Axes, run: _Run, *, cart: int) -> None:
 
 
 def _cloud(ax: Axes, x: Array, y: Array) -> None:
-    """Plot points;
-
-    the axes leave out the spikes that numerical differentiation causes at a jump.
-    """
+    """Plot points; the axes leave out spikes from numerical differentiation at a jump."""
     shown = np.linspace(0, x.size - 1, min(x.size, 500)).astype(int)
     ax.plot(x[shown], y[shown], ".", color=MODEL, ms=2.6, mew=0)
     low, high = np.quantile(y, [0.002, 0.998])

@@ -212,7 +212,7 @@ def _polynomial(coefficients: Array) -> Term:
     degree = coefficients.size - 1
     terms: list[Term] = []
     for exponent, value in zip(range(degree, -1, -1), coefficients, strict=True):
-        # A coefficient below this limit is a rounding error of zero.
+        # A coefficient below this limit would be zero without rounding errors.
         if abs(value) <= 1e-12 * np.abs(coefficients).max() and degree > 0:
             continue
         s: list[Term] = (

@@ -101,10 +101,7 @@ def plot_magnitude(
 
 
 def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) -> None:
-    """Plot the phase in degrees;
-
-    each measured value is shifted by full turns to be nearest to the fit.
-    """
+    """Plot the phase in degrees, with measured values shifted by full turns towards the fit."""
     assert response.phase is not None
     phase = np.unwrap(response.phase)
     if chain:

@@ -242,10 +242,7 @@ def plot_points(
 def plot_line(
     ax: Axes, t: Array, y: Array, look: Look, *, name: str, in_legend: bool = True
 ) -> None:
-    """Draw a long line, thinned to what the eye can resolve;
-
-    a reader who zooms in sees every sample.
-    """
+    """Draw a line, thinned to what the eye can resolve; zooming in shows every sample."""
     (line,) = ax.plot(*thin(t, y), label=name if in_legend else None, **look)
     tell(line, t, y, name=name)
 

@@ -32,7 +32,7 @@ def tell(artist: Artist, x: Array, y: Array, *, name: str) -> None:
 
 
 def to_svg(figure: Figure, *, name: str, alt: str) -> str:
-    """Return the figure as an SVG element with its text alternative, always in equal bytes.
+    """Return the figure as an SVG element with a text alternative; the bytes are reproducible.
 
     Limits of panels and data of series are in `data-` attributes, which `plain_svg` removes. The
     canvas is called directly, because `savefig` would draw everything twice.

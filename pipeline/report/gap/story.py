@@ -144,10 +144,7 @@ def _where(page: Page, gap: Gap) -> list[Block]:
 
 
 def before_after_picture(page: Page, gap: Gap, trace: Trace, *, number: int) -> Block:
-    """Return a picture of one cart in one run:
-
-    the measurement and both models, and the residuals.
-    """
+    """Return a picture of one cart in one run: measurement, both models, and residuals."""
     row = _row(gap, trace)
     noise = 0.0
     if row is not None and row.final > 0:
@@ -223,10 +220,7 @@ def _step(gap: Gap, found: FoundEffect) -> Spans:
 def _evidence(
     page: Page, gap: Gap, found: FoundEffect, *, forces: Sequence[ResidualForce], number: int
 ) -> list[Block]:
-    """Return the figure that shows an effect:
-
-    its force over its cause, its timing, or a spectrum.
-    """
+    """Return the figure that shows an effect: force over its cause, timing, or spectrum."""
     axis, added = found.effect.axis, added_name(gap)
     if axis == "frequency":
         held_out = [trace for trace in gap.traces if trace.held_out]

@@ -90,8 +90,8 @@ def pack(values: Array) -> list[Any]:
 def _spectra(run: ComparedRun) -> tuple[Array, Any]:
     """Return frequencies (k,), and an iterator over the packed spectra in the page's order.
 
-    Spectra are logarithms to base ten. If the simulation of a model starts later than the run, all
-    spectra start with it.
+    Spectra are logarithms to base ten. If the simulation of a model begins later than the run, all
+    spectra begin there too.
     """
     signals = [signal for cart in run.carts for signal in _signals_of(cart)]
     first = max((int(np.argmax(np.isfinite(one))) for one in signals), default=0)

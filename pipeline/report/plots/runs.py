@@ -130,7 +130,7 @@ def _compare(record: Record, analysis: Analysis, gap: Gap | None) -> ComparedRun
 def _driven(
     record: Record, analysis: Analysis, chain: Chain, gap: Gap | None
 ) -> tuple[dict[int, list[Simulated]], str]:
-    """Return the simulations of each cart: on the measured input, and in the closed loop if any.
+    """Return the simulations of each cart: on the measured input, and in the loop if one ran.
 
     The text is a note for the reader of the plot.
     """

@@ -166,10 +166,7 @@ def _heads(table: Table) -> list[str]:
 
 
 def _board(board: Tiles) -> str:
-    """Return the style of a board:
-
-    characters of its longest value, and number of tiles in a row.
-    """
+    """Return the style of a board: length of its longest value, and tiles in a row."""
     return f"--least:{board.longest}ch;--across:{board.across}"
 
 

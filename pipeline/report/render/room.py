@@ -24,8 +24,8 @@ class Choices:
     whole : numbers of the tables that must not break across pages.
     """
 
-    shares: Mapping[int, float] = field(default_factory=dict)  # of the usual size
-    whole: tuple[int, ...] = ()  # tables that do not break
+    shares: Mapping[int, float] = field(default_factory=dict)
+    whole: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

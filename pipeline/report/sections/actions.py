@@ -158,7 +158,10 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
 
 
 def _may_lack_springs(analysis: Analysis) -> bool:
-    """Return whether a spring may be missing from the model."""
+    """Return whether a spring may be missing from the model.
+
+    It may be so if a gain from steps disagrees with the fit and no decay shows dry friction.
+    """
     fit, dry = analysis.fit, any(d.friction and d.friction.present for d in analysis.log_decrements)
     off = any(row.consistent is False and read_name(row.name).is_gain for row in analysis.rows)
     may_be_whole = fit is None or fit.explains_data or all(analysis.bench.springs)

@@ -303,7 +303,7 @@ def placed(
 def open_questions(
     asked: Sequence[Asked], answers: Mapping[str, tuple[Block, ...]], *, by_model: bool = False
 ) -> list[Paragraph]:
-    """Return a paragraph with a link to each question, which also says which are unanswered.
+    """Return a paragraph that links to each question and says which ones are unanswered.
 
     Parameters
     ----------

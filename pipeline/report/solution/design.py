@@ -26,7 +26,7 @@ _WEIGHED = row("R", "+", _GAMMA_T, "P", "Γ")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WorkedDesign:
-    """The numbers of the derivation of the gains.
+    """The numbers in the derivation of the gains.
 
     Attributes
     ----------

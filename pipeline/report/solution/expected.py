@@ -30,7 +30,7 @@ _WORDS = phrases("solution")
 
 @result()
 class Expected:
-    """A parameter, with the range in which a rubric gives full points; null if it is not judged."""
+    """A parameter and its range for full points; the range is null if no criterion judges it."""
 
     name: str = written()
     unit: str = written()
