@@ -77,12 +77,7 @@ def shipped_rubric(carts: int) -> Rubric | None:
 
 
 def rubric_source(path: Path) -> str:
-    """Return the text of a rubric.
-
-    Raises
-    ------
-    ConfigError : the file cannot be read.
-    """
+    """Return the text of a rubric."""
     return read_text(path, where=path.name, limit=_MAX_BYTES, error=ConfigError)
 
 

@@ -80,8 +80,6 @@ class RubricForm:
 
     Attributes
     ----------
-    late : fields of the late policy, by key.
-    costs : cost of each flag, by code.
     step : step to which points are rounded.
     """
 

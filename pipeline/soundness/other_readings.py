@@ -71,7 +71,6 @@ def without_lone_factors(
 
     Parameters
     ----------
-    records : all records that are compared with the chain.
     fits : how each record follows the chain without correction.
     """
     kept = {name: m for name, m in found.items() if m.scale is None and m.clock is None}

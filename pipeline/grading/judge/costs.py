@@ -49,12 +49,7 @@ def charge(
 
 
 def concerns(flag: Flag, criterion: asked.Criterion, *, names: list[str]) -> bool:
-    """Return whether a flag concerns what a criterion judges.
-
-    Parameters
-    ----------
-    names : all parameter names of the rubric's system.
-    """
+    """Return whether a flag concerns what a criterion judges."""
     if flag.code in _ABOUT:
         return _ABOUT[flag.code] == criterion.check
     tables = {flag.evidence.get("table"), flag.evidence.get("also_in")} - {None}

@@ -31,7 +31,6 @@ class Mistake:
 
     Attributes
     ----------
-    codes : codes of the flags.
     said : keys of the advice in `templates/words/grading.toml`.
     predicted : for each parameter, the bounds of the number that the mistake gives.
     tolerance : relative distance from these bounds within which a number still matches.
@@ -65,12 +64,7 @@ class Mistake:
         return "".join(WORDS.text(key, counted=counted, there=there, **values) for key in self.said)
 
     def together_with(self, code: Code, said: str, predicted: dict[str, Reference]) -> "Mistake":
-        """Return this mistake combined with a second one.
-
-        Parameters
-        ----------
-        predicted : for each parameter, the bounds of the number that both mistakes together give.
-        """
+        """Return this mistake combined with a second one."""
         codes, sentences = (*self.codes, code), (*self.said, said)
         return replace(self, codes=codes, said=sentences, predicted=predicted)
 

@@ -231,7 +231,6 @@ def _score(
 
     Parameters
     ----------
-    off : parameters whose numbers are wrong.
     free : codes of mistakes that cost no likelihood.
     """
     predicted: dict[str, Reference] = dict(known)

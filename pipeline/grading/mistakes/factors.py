@@ -37,7 +37,6 @@ class Factor:
     ----------
     said : key of the advice in `templates/words/grading.toml`.
     of : the group of numbers that the mistake can affect.
-    tolerance : relative tolerance around the predicted number.
     whole, least, tries, from_time_records : see `Mistake`.
     """
 

@@ -53,7 +53,6 @@ def export(
     ----------
     out : a folder, existing or new; or a .csv file, to write only the table.
     title : title of the assignment on the platform; default: the rubric's title.
-    roster : the table of students that the platform exports.
 
     Raises
     ------

@@ -65,7 +65,6 @@ class RubricPreview:
     teams : teams whose points are known under both rubrics, the largest change first.
     bars_before, bars_after : number of teams in each tenth of the total points.
     unknown : submissions without stored results of the checks.
-    failed : number of submissions that could not be graded.
     needs : changed keys of the rubric that take effect only if recordings are graded again.
     """
 

@@ -25,7 +25,6 @@ class Student:
         are exported; or "".
     uploader : whether this is the account that submitted, and it is unknown to which of several
         authors it belongs.
-    by_hand : the criteria whose points were given by hand.
     undecided : message that names the submissions, if the student is in several with different
         points.
     """

@@ -42,7 +42,6 @@ class Survey:
 
     Attributes
     ----------
-    students : number of students.
     opinions : Table 4: for each question, how many students gave each answer of `SCALE`.
     means : Table 5: for each concept, the mean scores (1 to 4) for each of `LEVELS`, rounded to two
         decimals, halves up; NaN if nobody answered.

@@ -54,8 +54,7 @@ def check_numbers(
 
     Parameters
     ----------
-    rubric : rubric that sets the tolerances; None for the shipped rubric for this number of carts,
-        with the submission's own system.
+    rubric : rubric with the tolerances; None for the shipped one for this number of carts.
     where : the numbers to give hints for; None for all numbers that may have a hint.
 
     Raises

@@ -42,7 +42,7 @@ def find_clusters(flags: Mapping[str, Flag]) -> list[Cluster]:
 
     Parameters
     ----------
-    flags : by submission, its flag for shared data.
+    flags : flag for shared data of each submission.
     """
     pairs = [
         ((name, mine["experiment"]), (mine["submission"], mine["other_experiment"]))
@@ -64,7 +64,6 @@ def renamed(clusters: Iterable[Cluster], names: Mapping[str, str], *, other: str
 
     Parameters
     ----------
-    names : the new name of each submission.
     other : the new name of submissions that are not in `names`.
     """
     return sorted(

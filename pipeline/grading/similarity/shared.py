@@ -69,7 +69,6 @@ class SharedRecord:
 
     Attributes
     ----------
-    experiment : name of the recording in this submission.
     submission, other_experiment : the other submission, and the recording's name there.
     sigmas : agreement of the noise, in standard deviations above chance.
     equal_rows : number of consecutive rows that are equal up to one factor per column; 0 if this is
@@ -108,7 +107,6 @@ def find_shared(
 
     Parameters
     ----------
-    batch : submissions of the current class.
     earlier : submissions of earlier batches; they are compared only with the batch, not with each
         other.
     examples : packed fingerprints of recordings that the lab gave out; everybody may have them.
