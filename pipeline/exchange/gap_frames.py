@@ -38,7 +38,7 @@ def parameters(gap: Gap) -> "pd.DataFrame":
 
 
 def simulated(gap: Gap, experiment: str) -> "pd.DataFrame":
-    """Return a recording by `time`: for each cart, the measurement and both simulations."""
+    """Return each cart's position by `time`, as measured and as simulated by two models."""
     import pandas as pd
 
     columns: dict[tuple[str, str], pd.Series] = {}

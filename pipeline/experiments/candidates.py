@@ -24,7 +24,7 @@ def propose_candidates(
     """Return the recordings that could come next, with all carts free.
 
     These are dwells if the carts are identified from dwells. Otherwise they are chirps, square
-    waves and multisines, as far as the bench knows their `commands`.
+    waves and multisines, if the bench knows the `commands` for them.
 
     Raises
     ------

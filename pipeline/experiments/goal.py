@@ -21,7 +21,7 @@ _STEP = 1e-4  # relative change of a parameter for a numerical derivative
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Goal:
-    """A standard error to reduce: one, the largest of several, or their mean.
+    """An error to reduce: the error of one number, or the largest or mean of several errors.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Goal:
 
 
 def check_goal(name: str, *, names: Sequence[str]) -> None:
-    """Refuse a goal that carts with these parameters do not have.
+    """Refuse a goal that does not exist for carts with these parameters.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def check_goal(name: str, *, names: Sequence[str]) -> None:
 
 
 def find_goal(name: str, known: Knowledge, *, feedback: FeedbackDesign | None) -> Goal:
-    """Return the goal of a name: a parameter, "design", "worst", "mean" or "volume".
+    """Return the goal with this name: a parameter, "design", "worst", "mean" or "volume".
 
     Raises
     ------

@@ -85,7 +85,7 @@ class Knowledge:
         everything = Parametrisation(bench=analysis.bench)
         gone = tuple(name for name in everything.names if name not in fit.names)
         P = everything.holding_at_zero(*gone)
-        # The fit held these at zero, but their logarithm needs a finite value here.
+        # The fit held some dampings at zero, but their logarithm needs a finite value here.
         undamped = 1e-6 * critical_damping(chain)
         chain = Chain(m=chain.m, c=np.where(chain.c > 0, chain.c, undamped), k=chain.k)
         value = P.physical(chain)
@@ -171,7 +171,7 @@ class Knowledge:
         J = misfit.jacobian * (self.size / self.parametrisation.dp_dtheta(theta))[:, None, None]
         exact = window.y + misfit.residual * window.sigma[:, None]
         resting = window.n_resting
-        exact[:, :resting] = exact[:, [resting]]  # the residual there is not weighted down
+        exact[:, :resting] = exact[:, [resting]]  # first residual with its full weight
         flat = J.reshape(theta.size, -1)
         S = np.mean(
             [score_covariance(weighed(off, window), J) for off in self._errors(exact, rows)], axis=0

@@ -45,9 +45,9 @@ def with_signs(
 
     A record with an unclear sign takes the sign of most other records of its kind. There are two
     kinds: records under feedback, because a controller's log may have another sign, and all others.
-    If there are no other records of its kind, it takes the sign of most others. If the sign stated
-    for a record differs from the system's sign, the record takes the sign found in its data, or the
-    stated sign if the data are unclear.
+    If there are no other records of its kind, it takes the sign of most records of the other kind.
+    If the sign stated for a record differs from the system's sign, the record takes the sign found
+    in its data, or the stated sign if the data are unclear.
     """
     stated: dict[str, int] = {}
     disputed: set[str] = set()
@@ -138,8 +138,8 @@ def find_signs(records: Sequence[Record], *, stated: Mapping[str, int]) -> dict[
     """Return by record the sign of its logged input; 0 or no entry if the data are unclear.
 
     A bench has one sign. A record gets the opposite sign only if its input is opposite to the force
-    that the equation of the others gives. A signal logged under feedback may not be the input, so
-    such a record is left out of the equation if there are other records.
+    that the equation of the other records gives. A signal logged under feedback may not be the
+    input, so such a record is left out of the equation if there are other records.
 
     Parameters
     ----------

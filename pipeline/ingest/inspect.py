@@ -46,7 +46,7 @@ class Inspection:
     Attributes
     ----------
     duration, interval, jitter : times in s. Jitter is the rms deviation of the sample interval.
-    rate : sample rate in Hz; None, like these times, if the file has no time column.
+    rate : sample rate in Hz. The rate and the times are None if the file has no time column.
     kind : kind of experiment that the file looks like.
     frequency : frequency in Hz if the file looks like a sine dwell.
     problems : points to check before using the file.
@@ -183,7 +183,7 @@ def _inspect_columns(
 
 
 def unread_entry(file: Path, state: str, problem: str, *, advice: str = "") -> dict[str, Any]:
-    """Return the JSON entry of a file that is not inspected, with the same keys as others.
+    """Return the JSON entry of a file that is not inspected, with the keys of an inspected file.
 
     `state` is "broken" or "not_read"; `advice` says what to do.
     """

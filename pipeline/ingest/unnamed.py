@@ -246,7 +246,7 @@ def _averages(values: Array, signals: Sequence[int]) -> tuple[Array, Array, Arra
 
 
 def _left_unexplained(values: Array, signals: Sequence[int]) -> dict[int | None, float]:
-    """Return for each trial input the share of accelerations that no linear law explains.
+    """Return, for each trial input, the share of accelerations that no linear law explains.
 
     The key None stands for no input. The law is linear in all other columns and their slopes. The
     share is the mean over these columns.

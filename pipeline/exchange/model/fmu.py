@@ -47,7 +47,7 @@ def fmu(description: Description) -> tuple[bytes, bool]:
     sources = c_sources(description)
     variables = _variables(description)
     settable = sum(v.causality in ("input", "parameter") for v in variables)
-    # The GUID in binary and description must be the same, as tools compare them.
+    # The GUID in binary and description must be the same, because tools compare them.
     known = "".join([*sources.values(), *map(repr, variables), __version__])
     guid = f"{{{hashlib.sha256(known.encode()).hexdigest()[:32]}}}"
     said = {"guid": guid, "variables": variables, "settable": settable, "version": __version__}

@@ -1,8 +1,8 @@
 """Read National Instruments' binary format (.tdms): find the group of channels with the recording.
 
-The file is read by npTDMS, which a hostile file could keep busy for hours. So the lengths in front
-of the segments are added up first: objects times segments, and bytes of metadata. Layout: "TDMS
-File Format Internal Structure", National Instruments.
+The file is read by npTDMS, which a hostile file could keep busy for hours. So the work is estimated
+first, from the lengths in front of the segments: objects times segments, and bytes of metadata.
+Layout: "TDMS File Format Internal Structure", National Instruments.
 """
 
 import logging
@@ -212,7 +212,7 @@ def _number(said: object) -> float:
 
 @contextmanager
 def _complaints() -> Iterator[list[str]]:
-    """Collect the messages that npTDMS only logs, such as that it reads less than expected."""
+    """Collect the messages that npTDMS only logs, for example that data are missing."""
     from nptdms.log import log_manager
 
     log_manager.console_handler.setLevel(logging.CRITICAL)

@@ -1,8 +1,8 @@
 """Read the cells of an Excel workbook (.xlsx), using only the standard library.
 
-A workbook of 2 kB may name two cells a million rows apart, or declare a billion texts. Readers that
-reserve memory for all this crash. Here no declaration is trusted: parts are decompressed and parsed
-piece by piece, and the results are counted. Layout: ECMA-376-1, chapter 18.
+A workbook of 2 kB may name two cells a million rows apart, or declare a billion texts. A reader
+that reserves memory for all of this crashes. Here no declaration is trusted: parts are decompressed
+and parsed piece by piece, and the results are counted. Layout: ECMA-376-1, chapter 18.
 """
 
 import posixpath
