@@ -1,11 +1,11 @@
 """Find crooked English, and keep each folder within its budget.
 
 `python .ci/prose.py` checks every text of the project that a person reads: Markdown, pages and
-words of templates, docstrings, comments and messages. A folder with more finds than
-`.ci/prose.toml` allows fails. `--lower` writes today's numbers, and only if no folder fails, so a
-budget can only fall. `python .ci/prose.py PATH...` lists the finds in these files.
+words of templates, docstrings, comments and messages. A folder with more odd sentences than
+`.ci/prose.toml` allows fails. If no folder fails, `--lower` writes the present numbers as the new
+budget, so it can only fall. `python .ci/prose.py PATH...` lists the odd sentences in these files.
 
-A find is a sentence to read aloud. Rewrite the whole thought, not only the word.
+Read a listed sentence aloud. Rewrite the whole thought, not only the word.
 """
 
 import ast
@@ -23,9 +23,9 @@ BUDGET = ROOT / ".ci" / "prose.toml"
 ROOTS = "README.md CONTRIBUTING.md CHANGELOG.md docs rubrics templates pipeline benchmarks tests"
 KINDS = {".py", ".md", ".j2", ".html", ".toml"}
 LONGEST = 38  # words in a sentence; above it a reader has to go back
-MESSAGE = 5  # from this number of words on, a string of a program counts as a text
+MESSAGE = 5  # a string in a program counts as text from this number of words on
 
-# Constructions that read as translated, and what native readers write.
+# Constructions that read like a translation, and what to write instead.
 RULES = {
     r"\b(?:What|Who|Whoever) (?!is\b|are\b|do\b|does\b|did\b|was\b|were\b|can\b|to\b)[a-z][^?.!]*"
     r" (?:is|are|has|have|was|were|may|must|comes?)\b[^?]*[.!]": "name the thing: 'the runs that'",
@@ -39,15 +39,14 @@ RULES = {
     r"\b(?:is|are|was|were) (?:not )?to be (?!able)\w+|\bthere to (?:see|read)\b": "'must be'",
 }
 FOUND = [(re.compile(pattern), advice) for pattern, advice in RULES.items()]
-# Places where a docstring goes on with a new paragraph or with the next entry of a numpydoc
-# section.
+# Starts of a new paragraph, or of the next entry in a numpydoc section.
 ENTRY = re.compile(r"\n\s*\n|\n\s*-{4,}\s*\n|\n(?=\s*[\w`][^:\n]{0,60} : )")
 INLINE = "a|abbr|b|code|em|i|kbd|label|mark|small|span|strong|sub|sup|time|var"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Find:
-    """A sentence to read aloud: where it is, and what is odd."""
+    """An odd sentence, its place, and what to do about it."""
 
     file: Path
     line: int
@@ -56,7 +55,7 @@ class Find:
 
 
 def texts(file: Path) -> Iterator[tuple[int, str]]:
-    """Yield line and text of whatever a person reads in a file."""
+    """Yield line number and text of everything in a file that a person reads."""
     raw = file.read_text(encoding="utf-8")
     if file.suffix == ".py":
         yield from _strings(raw)
@@ -91,7 +90,7 @@ def _strings(source: str) -> Iterator[tuple[int, str]]:
 
 
 def _comments(source: str) -> Iterator[tuple[int, str]]:
-    """Yield the comments; whole lines of comment that follow one another are one text."""
+    """Yield line number and text of each comment; successive comment lines are one text."""
     first, last, block = 0, -1, ""
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type != tokenize.COMMENT:
@@ -108,7 +107,10 @@ def _comments(source: str) -> Iterator[tuple[int, str]]:
 
 
 def _paragraphs(raw: str, *, marked_up: bool) -> Iterator[tuple[int, str]]:
-    """Yield the paragraphs of Markdown or of a page, in which any other tag ends a paragraph."""
+    """Yield the paragraphs of Markdown or of a page.
+
+    In a page, every tag that is not in INLINE ends a paragraph.
+    """
 
     def by(word: str) -> Callable[[re.Match[str]], str]:
         return lambda found: word + "\n" * found[0].count("\n")
@@ -153,7 +155,7 @@ def folder_of(file: Path) -> str:
 
 
 def counts() -> dict[str, int]:
-    """Return the number of finds of every folder that has some."""
+    """Return the number of odd sentences in each folder that has any."""
     every: dict[str, int] = {}
     for file in files_of([ROOT / name for name in ROOTS.split()]):
         n = len(list(finds(file)))
@@ -183,7 +185,7 @@ def check(*, lower: bool) -> int:
 
 
 def main(arguments: list[str]) -> int:
-    """List the finds of some paths, or check the project."""
+    """List the odd sentences of some paths, or check the project."""
     paths = [Path(name).resolve() for name in arguments if name != "--lower"]
     for find in (f for file in files_of(paths) for f in finds(file)):
         where = find.file.relative_to(ROOT)

@@ -1,4 +1,4 @@
-"""Write the catalogue of effects as a page of these documents, `effects.md`, with pictures."""
+"""Write the catalogue of effects, with pictures, as the page `effects.md`."""
 
 import textwrap
 from collections.abc import Iterator

@@ -21,7 +21,7 @@ TARGET = 441  # encoder counts, 1 cm
 KP, KD = 0.2, 0.02  # duty counts per encoder count, and per encoder count per second
 MOST = 4096  # duty counts
 PERIOD, SECONDS = 0.001, 2.0
-VOLT, CM = 0.0001220703125, 0.00227  # per duty count and encoder count, as the bench says
+VOLT, CM = 0.0001220703125, 0.00227  # V per duty count, cm per encoder count, as the bench says
 
 
 class Cart:

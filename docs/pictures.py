@@ -25,7 +25,7 @@ FIGURES = {
     "decay-cart-2": "decay.svg",
     "free-bodies": "free-bodies.svg",
 }
-# From the output of `cartlab demo`: figures as they are, and pages as a browser shows them.
+# Output of `cartlab demo`: figures to copy, and pages to show in a browser.
 DEMO_FIGURES = {
     "report/figures/overview.svg": "overview.svg",
     "report/figures/bode-cart-2.svg": "three-carts-bode.svg",
@@ -79,7 +79,7 @@ def gallery(made: Path) -> None:
 
 
 def exploration(team: Path) -> None:
-    """Take a picture of a virtual bench that explores itself, once it says why it goes on."""
+    """Take a picture of a virtual bench that explores itself, once the page gives its reasons."""
     command = [sys.executable, "-m", "pipeline", "emulate", "--preset", "throne-1dof"]
     options = ["--hide", "coulomb_friction", "--speed", "8"]
     with (
@@ -112,7 +112,7 @@ def desk(team: Path, grades: Path) -> None:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"))
         page = browser.new_page(viewport=WINDOW)
         page.goto(server.url)
-        page.locator(".kicker").evaluate("it => { it.textContent = 'lab/bench-4' }")  # not of here
+        page.locator(".kicker").evaluate("it => { it.textContent = 'lab/bench-4' }")  # a short path
         page.screenshot(path=IMAGES / "desk.png")
         own = "kind=sine&amplitude=0.01&frequency=3&seconds=20&goal=zeta_2"
         page.goto(f"{server.url.rsplit('/', 2)[0]}/bench/0/weigh?{own}")

@@ -1,9 +1,9 @@
-"""Make the numbers and pictures of `docs/real-labs.md` again, if the recordings are available.
+"""Update the numbers and pictures of `docs/real-labs.md`, if the recordings are available.
 
     python docs/real_labs.py [--keep FOLDER] [LAB …]
 
 The recordings may not be passed on, so they are not part of the project. FOLDER gets the
-submissions; a gap analysis that is already there is used as it is.
+submissions; a gap analysis that already exists there is used again.
 """
 
 import argparse
@@ -43,7 +43,7 @@ class Lab:
     Attributes
     ----------
     write : function that writes the submission into a new folder.
-    figures : figures of its report and gap pages for the gallery, with their names there.
+    figures : figures of the report and the gap analysis, with the names of their copies.
     """
 
     write: Callable[[Path], object]
@@ -51,7 +51,7 @@ class Lab:
 
 
 def write_lab(folder: Path, data: str, system: str, runs: Mapping[str, str]) -> None:
-    """Write a submission from the lines of its system and of each file's experiment."""
+    """Write a submission; `runs` maps each data file to the lines of its experiments."""
     (folder / "data").mkdir(parents=True)
     text = f"version = 1\n[system]\n{system}\n"
     for file, lines in runs.items():
@@ -63,20 +63,23 @@ def write_lab(folder: Path, data: str, system: str, runs: Mapping[str, str]) -> 
 
 
 def write_one(folder: Path) -> None:
-    """Write the submission of cart 1 alone: five equal steps."""
+    """Write a submission with five equal steps of cart 1 alone."""
     runs = {f"DOF1_en1_input1_test{i}.csv": 'kind = "step"' for i in range(1, 6)}
     write_lab(folder, "ecp210-ucsd", "carts = 1\nsprings = [true, false]", runs)
 
 
 def write_day(folder: Path) -> None:
-    """Write the submission of one day, with cart 2 moved by hand several times in a recording."""
+    """Write a submission with the recordings of one day.
+
+    Cart 2 is moved by hand several times in a recording.
+    """
     files = ("14-Feb-2025_09_22_43.txt", "14-Feb-2025_09_44_21.txt")
     runs = {file: 'kind = "decay"\ncarts = [2]' for file in files}
     write_lab(folder, "ecp210-2025", "carts = 2\nsprings = [true, true, false]", runs)
 
 
 def write_silverbox(folder: Path) -> None:
-    """Write three parts of the training record of the Silverbox."""
+    """Write a submission with three parts of the Silverbox's training record."""
     samples = 10_000
     starts = np.linspace(TRAIN[0], TRAIN[1] - samples, 3).astype(int)
     system = 'carts = 1\nsprings = [true, false]\nposition = { unit = "V" }\n'
@@ -87,21 +90,21 @@ def write_silverbox(folder: Path) -> None:
 
 
 def write_emps(folder: Path) -> None:
-    """Write the training record of the positioning axis."""
+    """Write a submission with the training record of the positioning axis."""
     system = 'carts = 1\nsprings = [false, false]\nposition = { unit = "m" }\n'
     system += 'columns = { time = "t", input = "vir", reference = "qg", x1 = "qm" }'
     write_lab(folder, "emps", system, {"DATA_EMPS.mat": 'kind = "closed_loop"'})
 
 
 def write_servo(folder: Path) -> None:
-    """Write the servo's sweep and its closed loop."""
+    """Write a submission with the servo's sweep and its closed loop."""
     loop = 'kind = "closed_loop"\ncontrolled_cart = 1'
     runs = {"raw_data_freq.txt": 'kind = "sweep"', "raw_data_cl_step1.m": loop}
     write_lab(folder, "ecp220-servo", "carts = 1\nsprings = [false, false]", runs)
 
 
 def write_torsion(folder: Path) -> None:
-    """Write the step of a disk whose input is only in the column of targets."""
+    """Write a submission with the step of a disk, whose input is only in the column of targets."""
     step = 'kind = "step"\ninput = { per_count = 0.001220703125 }\n'
     step += 'columns = { time = "t_received", input = "target_value", x1 = "cart1pos" }'
     system = "carts = 1\nsprings = [true, false]"
@@ -137,7 +140,7 @@ LABS = {
 
 
 def main() -> None:
-    """Make all labs, or those that are named."""
+    """Update all labs, or those named on the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("labs", nargs="*", metavar="LAB", help=", ".join(LABS))
     parser.add_argument("--keep", type=Path, metavar="FOLDER")
@@ -149,7 +152,7 @@ def main() -> None:
 
 
 def make(name: str, folder: Path) -> None:
-    """Write a lab, analyse it with cartlab, and keep its numbers and figures."""
+    """Write a lab's submission, analyse it, and put its numbers and figures into the docs."""
     lab = LABS[name]
     if not folder.exists():
         lab.write(folder)
@@ -203,7 +206,7 @@ def with_unit(value: float, std: float | None, unit: str) -> str:
 
 
 def span(decays: list[LogDecrement], of: Callable[[LogDecrement], float]) -> str:
-    """Return the smallest and the largest value."""
+    """Return the range of a value over some decays, as text."""
     values = [of(decay) for decay in decays]
     low, high = f"{min(values):.3f}", f"{max(values):.3f}"
     return low if low == high else f"{low} to {high}"
@@ -219,7 +222,7 @@ def _viscous(decay: LogDecrement) -> float:
 
 
 def draw_limit_cycle() -> None:
-    """Draw a run that the program leaves out, in which the swing grows while the motor drives."""
+    """Draw a run in which the motor makes the swing grow, and which the analysis does not use."""
     columns = np.loadtxt(REAL_DATA / "ecp210-2025" / LIMIT_CYCLE, skiprows=1, delimiter="\t")
     part = columns[3500::12]
     with drawing():

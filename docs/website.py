@@ -1,6 +1,6 @@
-"""The site of `mkdocs build`: the repository's pages at their own paths, loading nothing else.
+"""Hooks of `mkdocs build`, which makes a website that loads nothing from other hosts.
 
-In the site each page has its path in the repository, so that one relative link serves both.
+Each page has the same path in the site as in the repository, so relative links work in both.
 """
 
 import re
@@ -32,19 +32,19 @@ _SHOWN = (
     "rubrics/*.md",
 )
 _OUTSIDE = r"""["']?((?:https?:)?//[^"')\s>]+)"""
-# Parts that a browser fetches by itself to show a page; links wait for a click.
+# Parts of a page that a browser loads by itself, unlike links.
 _FETCHED = re.compile(
     rf"<(?:script|img|iframe|source|video|audio|embed|object|use|image)\b[^>]*?"
     rf"\s(?:xlink:)?(?:src|srcset|href|data)={_OUTSIDE}"
     rf"|<link\b[^>]*?\shref={_OUTSIDE}"
     rf"|(?:url\(|@import)\s*{_OUTSIDE}"
 )
-# "name : meaning" in one line, as in docstrings here; types are in the annotations.
+# Docstrings of this project describe an argument in one line, "name : meaning", without types.
 _ITEM = re.compile(r"^(\w[\w, ]*?) : (.+)$", re.MULTILINE)
 
 
 class OneLineItems(Extension):
-    """Bring one-line items of docstrings into the two lines that numpydoc expects."""
+    """Split one-line items of docstrings into the two lines that numpydoc expects."""
 
     def on_object(self, *, obj: Object, **_: Any) -> None:
         """Rewrite one docstring."""
@@ -53,7 +53,7 @@ class OneLineItems(Extension):
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Typeset formulas as the program does, and list the pages of the benchmarks."""
+    """Typeset formulas as the program does, and add the benchmarks to the navigation."""
     fence = {"name": "math", "class": "math", "format": _formula}
     config.mdx_configs["pymdownx.superfences"] = {"custom_fences": [fence]}
     benchmarks = sorted(ROOT.glob("benchmarks/*.md"))
@@ -70,7 +70,7 @@ def _formula(source: str, *_: Any, **__: Any) -> str:
 
 
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
-    """Put the repository's pages and pictures in place of the files of `docs/`."""
+    """Use pages and pictures of the whole repository instead of the files in `docs/`."""
     theme = [file for file in files if file.src_dir != config.docs_dir]
     shown = sorted({path for pattern in _SHOWN for path in ROOT.glob(pattern)})
     return Files(
@@ -88,14 +88,14 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
 
 
 def on_post_build(*, config: MkDocsConfig) -> None:
-    """Refuse a site that a browser could not show without the network."""
+    """Fail if the site would load anything from another host."""
     found = list(fetched_from_outside(Path(config.site_dir)))
     if found:
         raise PluginError("loaded from outside: " + "; ".join(found))
 
 
 def fetched_from_outside(site: Path) -> Iterator[str]:
-    """Yield file and address of everything that pages, styles and drawings load from elsewhere."""
+    """Yield file and address of everything that the site would load from another host."""
     for path in sorted(site.rglob("*")):
         if path.suffix in (".html", ".css", ".svg"):
             for match in _FETCHED.finditer(path.read_text(encoding="utf-8")):

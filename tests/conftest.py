@@ -21,8 +21,8 @@ from tests.helpers.compiled import await_compiler, start_compiler
 from tests.helpers.places import REAL_DATA
 from tests.helpers.waiting import PATIENCE
 
-# In containers Python may not be allowed to store compiled code. Then each of the hundred programs
-# that the tests start, and each worker, would compile the package again.
+# Let Python store compiled code, even in containers that forbid it. Otherwise every program that
+# the tests start would compile the package again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
@@ -30,24 +30,24 @@ sys.dont_write_bytecode = False
 os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="cartlab-tests-")
 atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # which shares the machine with others
+if "PYTEST_XDIST_WORKER" in os.environ:  # this worker shares the machine with others
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-# Hypothesis draws the same examples every time, and does not judge how fast a busy machine is.
+# Hypothesis draws the same examples every time and sets no time limit, as a machine may be busy.
 settings.register_profile(
     "cartlab", deadline=None, derandomize=True, max_examples=50,
     suppress_health_check=[HealthCheck.too_slow],
 )  # fmt: skip
 settings.load_profile("cartlab")
 
-# The first is Chromium without windows, which needs less than half of the processor time.
+# chromium-headless-shell needs less than half of the processor time of chromium.
 CHROMIUM = shutil.which("chromium-headless-shell") or shutil.which("chromium")
-_BENCHES = "benches"  # the group of the files that wait for them most of their time
+_BENCHES = "benches"  # group of the files that mostly wait for virtual benches
 _WITH_BENCHES = {
     "bench/host/test_acquire", "bench/host/test_mistakes", "bench/host/test_safety",
     "simulated/emulator/test_server", "system/test_live_page",
 }  # fmt: skip
-_LONGEST = {  # each over ten seconds: started late, they would end last
+_LONGEST = {  # each takes over ten seconds, so it must not start late
     "desk/test_bench", "desk/test_ending", "desk/test_grades", "desk/test_jobs",
     "desk/test_student", "experiments/exploring/test_exploration", "gap/test_explain",
     "grading/autograder/test_gradescope", "grading/batch/test_faults_of_the_computer",
@@ -56,7 +56,7 @@ _LONGEST = {  # each over ten seconds: started late, they would end last
     "system/test_desk", "system/test_desk_grades", "system/test_desk_rooms",
     "system/test_report_pages",
 }  # fmt: skip
-_FEW = 2  # up to so many files, starting other processes costs more than it saves
+_FEW = 2  # up to this many files, starting other processes takes more time than it saves
 
 # A shell starts background jobs with Ctrl-C ignored, and their children inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -83,9 +83,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
-    """Run a file or two in this process.
+    """Use no workers for one or two files.
 
-    With more files, use several workers, as tests often wait for a bench.
+    With more files, use one worker more than there are processors, as tests often wait for a bench.
     """
     few = len(config.args) <= _FEW and all(".py" in argument for argument in config.args)
     return 0 if few else (os.cpu_count() or 1) + 1
@@ -94,7 +94,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put tests that wait for benches first, then the longest files.
 
-    The short files come last, so that no worker ends alone with a long one.
+    The short files come last, so that no worker is busy with a long file at the end.
     """
     groups = [_group(item.nodeid) for item in items]
     size = Counter(groups)
@@ -105,7 +105,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Exclude the collected tests and modules, many thousands, from later garbage collections."""
+    """Exclude the collected tests and modules from later garbage collections."""
     gc.freeze()
     if "PYTEST_XDIST_WORKER" in os.environ:
         await_compiler()
@@ -115,7 +115,7 @@ def pytest_collection_finish() -> None:
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
     """Give each file to one worker; all files that wait for benches share a worker."""
     if config.getoption("dist") != "loadscope":
-        return None  # unless the user chose another way
+        return None  # the user chose another distribution of the tests
     from xdist.scheduler import LoadScopeScheduling
 
     class ByGroup(LoadScopeScheduling):
@@ -132,7 +132,7 @@ def _group(nodeid: str) -> str:
 
 @pytest.fixture(scope="session", autouse=True)
 def _patient_host() -> Iterator[None]:
-    """Allow virtual benches longer to answer, as a busy machine gives them no core of their own."""
+    """Give virtual benches more time to answer, since they may have to wait for a processor."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pipeline.bench.host.session.SILENCE", 3.0)
         for module in ("session", "serial_line"):
@@ -173,16 +173,16 @@ def fast() -> Iterator[Emulator]:
 
 @pytest.fixture(scope="session")
 def real_bench() -> Iterator[Emulator]:
-    """A virtual bench as fast as a real one."""
+    """Return a virtual bench as fast as a real one."""
     with emulator() as bench:
         yield bench
 
 
 @pytest.fixture
 def real(real_bench: Emulator) -> Emulator:
-    """Return the bench in real time, with its carts at rest and no faults left from earlier tests.
+    """Return `real_bench`, with its carts at rest and no faults left from earlier tests.
 
-    The bench reports a last fault only in a run of ten lines, which no test records.
+    A run of ten lines, which no test records, marks the end of the earlier tests' events.
     """
     from pipeline.bench.host.serial_line import open_line
     from pipeline.bench.protocol.messages import Hands, Start, Wave

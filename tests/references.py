@@ -22,8 +22,8 @@ from tests.helpers.ucsd import write_two_cart_submission
 EXAMPLES = ("one-cart", "two-cart", "three-cart")
 # Columns of a gradebook that differ from run to run, or from version to version.
 CLOCKS = frozenset({"at", "key"})
-LEFT_OUT = frozenset({".pdf", ".sqlite", ".zip"})  # compared as text, rows and files instead
-BOOKKEEPING = frozenset({".lock", ".turn", ".made.json"})  # the same only within one version
+LEFT_OUT = frozenset({".pdf", ".sqlite", ".zip"})  # their text, rows and files are compared instead
+BOOKKEEPING = frozenset({".lock", ".turn", ".made.json"})  # differ from version to version
 
 
 def main() -> int:
@@ -113,7 +113,7 @@ def _grades(out: Path) -> None:
             what = ("--preset", "throne-1dof", "--seed", str(seed), "--reported")
             _run(out / f"team-{seed}.txt", "simulate", *what, "--out", teams / f"team-{seed}")
         one, other = (next((teams / f"team-{seed}" / "data").glob("decay*")) for seed in (2, 3))
-        shutil.copyfile(one, other)  # a copied recording, and a frequency in Hz
+        shutil.copyfile(one, other)  # team 3 copies a recording; team 2 reports Hz for rad/s
         file = teams / "team-2" / "submission.toml"
         text = file.read_text(encoding="utf-8")
         file.write_text(re.sub(r"omega_n = .+", "omega_n = 0.987", text), encoding="utf-8")
@@ -168,7 +168,7 @@ def _run(said: Path, *command: str | Path) -> None:
         text=True,
         encoding="utf-8",
     )
-    told = re.sub(r"^.* … \d+ s\n", "", done.stderr, flags=re.MULTILINE)  # by the clock
+    told = re.sub(r"^.* … \d+ s\n", "", done.stderr, flags=re.MULTILINE)  # progress lines
     text = f"{done.stdout}\n--\n{told}\nexit {done.returncode}\n"
     for part in command:
         if isinstance(part, Path):

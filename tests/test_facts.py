@@ -1,4 +1,4 @@
-"""No code takes a fact out of a sentence, an id or a name that the program itself wrote."""
+"""No code extracts facts from sentences, ids or names that the program itself wrote."""
 
 import ast
 from collections.abc import Iterator
@@ -19,19 +19,19 @@ READERS = {
     "removeprefix",
     "removesuffix",
 }
-# Names of messages and ids: an attribute of any object, or a variable.
+# Attributes and variables that hold messages or ids.
 SAID = {"message", "reason", "stage", "id", "about", "note", "parameter", "warning",
         "partial"}  # fmt: skip
-# In these packages such a variable holds the name of a parameter, never the name of a file.
+# In these packages the variables in PARAMETERS hold names of parameters, never names of files.
 ROOMS = ("checks", "identify", "soundness", "report/equations", "grading/mistakes", "grading/judge",
          "grading/references")  # fmt: skip
 PARAMETERS = {"name", "omega", "zeta", "worst"}
-# The lines of a reason may be taken apart, since each line is a fault of its own.
+# A reason may be split into lines, since each line is a separate fault.
 ALLOWED = {'grade.reason.split("\\n")', 'reason.split("\\n")'}
 
 
 def read_back(source: str, *, of_parameters: bool = False) -> list[str]:
-    """Return the expressions of a module that read a fact out of a sentence, an id or a name."""
+    """Return the expressions in a module that extract a fact from a sentence, an id or a name."""
     names = SAID - {"id"} | (PARAMETERS if of_parameters else set())
     found = (ast.unparse(node) for node in _readings(ast.parse(source), names))
     return [text for text in found if text.replace("'", '"') not in ALLOWED]
@@ -59,10 +59,7 @@ def _is_said(node: ast.expr, names: set[str]) -> bool:
 
 
 def _is_part(index: ast.expr) -> bool:
-    """Return whether an expression takes letters out of a text.
-
-    That is a slice, or one letter by its number.
-    """
+    """Return whether an index is a slice or a number, and so takes letters out of a text."""
     return isinstance(index, ast.Slice) or (
         isinstance(index, ast.Constant) and isinstance(index.value, int)
     )
@@ -73,7 +70,7 @@ MODULES = [path for path in sorted(PIPELINE.rglob("*.py")) if path != PIPELINE /
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PIPELINE)))
 def test_no_fact_is_read_back_from_words(path: Path):
-    """Only `names.py` takes names apart; messages, ids and stages are never taken apart."""
+    """Only `names.py` splits names; no module splits messages, ids or stage names."""
     place = path.relative_to(PIPELINE).as_posix()
     of_parameters = place.startswith(tuple(f"{room}/" for room in ROOMS))
     assert read_back(path.read_text(encoding="utf-8"), of_parameters=of_parameters) == []
@@ -94,6 +91,6 @@ def test_no_fact_is_read_back_from_words(path: Path):
         'symbol = name.partition("_")[0]',
     ],
 )
-def test_what_stood_there_before_is_found(slip: str):
-    """The test recognises each of these lines, which once were in the program."""
+def test_earlier_slips_are_found(slip: str):
+    """`read_back` finds each of these lines, which once were in the program."""
     assert read_back(slip, of_parameters=True)

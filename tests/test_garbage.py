@@ -16,7 +16,7 @@ except SystemExit:
 """
 
 
-def test_a_command_looks_for_garbage_a_few_times_only():
+def test_a_command_rarely_collects_garbage():
     """A command collects garbage fewer than 40 times.
 
     With Python's defaults it would do so over 100 times.
@@ -38,7 +38,7 @@ Cycle()
 """
 
 
-def test_what_is_left_at_the_end_is_the_systems():
+def test_no_garbage_is_collected_at_exit():
     """At exit no garbage is collected, since the system frees the memory anyway.
 
     Python would otherwise search all loaded objects twice.
@@ -63,8 +63,8 @@ print(sum(looks))
 """
 
 
-def test_a_process_for_hours_does_not_wait_for_300_000_dead_objects():
-    """A process that runs for hours frees most of 100,000 dead cycles while they are being made."""
+def test_a_long_process_collects_garbage_while_it_runs():
+    """A process that runs for hours frees most of 100,000 unused objects while it creates more."""
     command = [sys.executable, "-c", SERVES]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert int(done.stdout) > 50_000

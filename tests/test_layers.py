@@ -1,4 +1,4 @@
-"""Imports go down only, no stage imports another stage, and each package has a home."""
+"""Imports go down only, no stage imports another stage, and outside packages stay in one place."""
 
 import ast
 from collections.abc import Sequence
@@ -11,8 +11,8 @@ from tests.helpers.places import ROOT
 
 PIPELINE = ROOT / "pipeline"
 
-# The rooms, from the lowest up, and the rooms within them. A module imports from its own room or
-# from lower ones.
+# The packages of `pipeline`, from the lowest level up. A module imports only from its own package
+# or from lower ones.
 LEVELS = (
     ("__init__", "arrays", "errors", "garbage", "threads", "resources", "plant.limits"),
     ("json_files",),
@@ -87,7 +87,7 @@ ROOMS = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
 
 
 def _room(parts: Sequence[str]) -> str:
-    """Return the innermost room of a module given by its path below `pipeline`."""
+    """Return the innermost package that contains a module, given the parts of the module's path."""
     paths = (".".join(parts[:depth]) for depth in range(len(parts), 0, -1))
     return next(path for path in paths if path in ROOMS)
 
@@ -101,14 +101,14 @@ def _imports(path: Path) -> list[str]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             names = [f"{node.module}.{alias.name}" for alias in node.names]
-            # A room that only groups modules is never imported itself.
+            # If only modules are imported from a package, the package itself does not count.
             modules = all((ROOT / f"{name.replace('.', '/')}.py").exists() for name in names)
             found += names if modules else [node.module or "", *names]
     return found
 
 
 def test_imports_go_down_only():
-    """A module imports only from its own room or lower ones, and every room has a level."""
+    """A module imports only from its own package or lower ones, and every package has a level."""
     upward = []
     for path in MODULES:
         room = _room(path.relative_to(PIPELINE).with_suffix("").parts)
@@ -132,8 +132,8 @@ def test_stages_never_import_each_other(stage):
     assert not [name for name in _imports(stage) if name.startswith("pipeline.stages")]
 
 
-def test_each_package_has_a_home():
-    """Each outside package is imported in one room only, for example matplotlib by the report."""
+def test_each_outside_package_has_one_place():
+    """Each outside package is imported by one part of the program: matplotlib by the report."""
     abroad = []
     for path in MODULES:
         place = ".".join(path.relative_to(PIPELINE).with_suffix("").parts) + "."
@@ -144,18 +144,18 @@ def test_each_package_has_a_home():
     assert abroad == []
 
 
-def test_a_file_is_read_in_one_sitting():
-    """No module that identifies or explains has over 400 lines, unless it only lists types."""
+def test_no_module_of_the_analysis_is_long():
+    """No module of the analysis has over 400 lines, except those that only list types."""
     rooms = ("plant", "estimation", "stages", "identify", "gap")
     files = [
         *PIPELINE.glob("*.py"),
         *(path for room in rooms for path in (PIPELINE / room).rglob("*.py")),
     ]
     long = [f.name for f in files if len(f.read_text(encoding="utf-8").splitlines()) > 400]
-    assert sorted(long) == ["results.py", "types.py"]  # those that list types
+    assert sorted(long) == ["results.py", "types.py"]  # these list types
 
 
-def test_tests_stand_in_folders_named_as_what_they_test():
+def test_test_folders_are_named_after_what_they_test():
     """Each test is in a folder named after what it tests.
 
     Exceptions are the tests of the whole program, statistics, benchmarks, and the helpers.
@@ -168,6 +168,6 @@ def test_tests_stand_in_folders_named_as_what_they_test():
 
 
 def test_every_folder_is_a_package():
-    """A folder with modules has an `__init__.py`; the API pages find it by that."""
+    """Each folder with modules has an `__init__.py`, by which the API pages find it."""
     folders = {path.parent for path in MODULES}
     assert [str(folder) for folder in folders if not (folder / "__init__.py").exists()] == []

@@ -59,14 +59,14 @@ def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == [".lock"]
 
 
-def test_a_lock_that_is_none_is_said(tmp_path):
-    """If a file has the lock's name but is no lock, the run stops with a message."""
+def test_a_foreign_file_with_the_locks_name_is_refused(tmp_path):
+    """If a file has the lock's name but is not a lock, the run stops with a message."""
     (tmp_path / ".lock").write_bytes(b"something else" * 100)
     with pytest.raises(ConfigError, match="not a lock of cartlab"), alone_in(tmp_path):
         pass
 
 
-def test_a_folder_nothing_came_of_goes_again(tmp_path):
+def test_a_new_folder_is_removed_if_the_run_fails(tmp_path):
     """If a run fails at once, a folder made for it is removed.
 
     A folder that existed before the run stays.

@@ -1,4 +1,4 @@
-"""Parameter names are read in one place, and real chains obey the inequalities between names."""
+"""Parameter names are read correctly, and real chains obey the inequalities between parameters."""
 
 import pytest
 
@@ -22,7 +22,7 @@ def test_every_name_is_read_back(n):
 
 
 def test_a_rigid_body_has_a_damping_but_no_ratio():
-    """A rigid body has the parameters mass and damping, each with its own unit."""
+    """A rigid body has a mass with its unit and a damping that is not a damping ratio."""
     mass, damping = map(read_name, parameter_names(1, rigid=True))
     assert mass.unit(PAPER_UNITS) == "V s^2/cm"
     assert damping.is_damping
@@ -37,7 +37,7 @@ def test_a_table_without_its_last_resonance_sets_no_upper_bound():
 
 
 @pytest.mark.parametrize("preset", ["throne-2dof", "throne-3dof"])
-def test_a_real_chain_obeys_them(preset):
+def test_real_chains_obey_the_inequalities(preset):
     """The carts of the paper satisfy every inequality between named parameters."""
     values = PRESETS[preset].parameters()
     for low, middle, high, _ in brackets(PRESETS[preset].n):
@@ -46,7 +46,7 @@ def test_a_real_chain_obeys_them(preset):
         assert values[lesser] <= values[greater]
 
 
-def test_names_are_said_in_words():
+def test_names_are_given_in_words():
     """`read_name` gives parameter names in words."""
     said = {name: read_name(name).words for name in ("zeta", "zeta_1", "omega_n", "omega_b",
             "omega_x", "K_2", "mass")}  # fmt: skip

@@ -33,7 +33,7 @@ def lab() -> Lab:
     return analyse(EXAMPLES / "two-cart")
 
 
-def test_analyse_is_the_packages_own(lab):
+def test_the_package_exports_analyse(lab):
     """`from pipeline import analyse` gives this function and the same results as a report."""
     assert pipeline.analyse is analyse
     assert json_text(lab.results) == json_text(analysed("two-cart"))
@@ -63,7 +63,7 @@ def test_the_system_is_the_identified_chain(lab):
         assert_array_equal(getattr(system, letter), own)
 
 
-def test_one_cart_held_is_a_system_of_its_own(lab):
+def test_holding_a_cart_leaves_a_smaller_system(lab):
     """With cart 1 held the system has only cart 2, and the input does not drive it."""
     alone = lab.chain.to_control(free=(2,))
     assert (alone.state_labels, alone.output_labels) == (["x2", "v2"], ["x2"])
@@ -126,7 +126,7 @@ def test_records_are_tables_by_time(lab):
     }  # fmt: skip
 
 
-def test_what_was_not_found_is_said(lab):
+def test_a_missing_system_or_loop_is_explained(lab):
     """Without a fit or a design there is no system or loop, and the error says what is missing."""
     bare = replace(lab, results=replace(lab.results, fit=None, feedback=None))
     with pytest.raises(DataError, match="the carts were not identified"):
@@ -158,14 +158,14 @@ def test_each_section_shows_itself(lab):
         lab.show("feedbak")
 
 
-def test_a_folder_that_is_none_is_one_clear_error(tmp_path):
-    """A folder that is no submission gives the same message as on the command line."""
+def test_a_missing_folder_is_one_clear_error(tmp_path):
+    """A missing folder gives the same message as on the command line."""
     with pytest.raises(SubmissionError, match="no such folder"):
         analyse(tmp_path / "nowhere")
 
 
 def test_the_style_sheet_stays_inside(lab):
-    """Every style rule is nested under the element's own class and leaves the notebook alone."""
+    """Every style rule is nested under the class `cartlab`, so the notebook keeps its own style."""
     html = lab._repr_html_()
     style = html[html.index("<style>") + 7 : html.index("</style>")].strip()
     assert style.startswith(".cartlab {")

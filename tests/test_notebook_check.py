@@ -27,12 +27,12 @@ def lab(tmp_path) -> Path:
     return folder
 
 
-def test_it_is_the_packages_own():
+def test_the_package_exports_check():
     """`from pipeline import check` is this function."""
     assert pipeline.check is check
 
 
-def test_numbers_of_the_notebook_are_checked_first_which_then_where(lab):
+def test_only_a_second_check_says_where_to_look(lab):
     """A first check says which numbers disagree, and a second where to look; both are logged."""
     first = check(lab, reported={"final": IN_HERTZ})
     assert first.disagree == ("final.omega_n",)
@@ -40,11 +40,11 @@ def test_numbers_of_the_notebook_are_checked_first_which_then_where(lab):
     assert "Hz" not in repr(first)
     second = check(lab, reported={"final": IN_HERTZ})
     assert "Hz where rad/s is asked" in repr(second)
-    assert not re.search(r"\b1[23]\.\d", repr(second))  # 13.2 rad/s is what they should find
+    assert not re.search(r"\b1[23]\.\d", repr(second))  # not even the right answer, 13.2 rad/s
     assert read_answers(lab) == (first.answer, second.answer)
 
 
-def test_without_numbers_those_of_the_file_are_checked(lab):
+def test_without_numbers_the_files_numbers_are_checked(lab):
     """Without numbers from the notebook, those in `submission.toml` are checked."""
     with (lab / "submission.toml").open("a", encoding="utf-8") as file:
         file.write("\n[reported.final]\nK = 28.9\nomega_n = 2.1\nzeta = 0.101\n")
@@ -55,7 +55,7 @@ def test_without_numbers_those_of_the_file_are_checked(lab):
     assert here.disagree == typed.disagree == tuple(json.loads(done.stdout)["disagree"])
 
 
-def test_numbers_that_numpy_computed_are_numbers(lab):
+def test_numpy_numbers_are_accepted(lab):
     """Numbers that numpy computed are accepted, in arrays too, such as a state model's matrices."""
     computed = {name: np.float64(value) for name, value in RIGHT.items()}
     A = np.array([[0.0, 1.0], [-(13.2**2), -2 * 0.101 * 13.2]])
@@ -65,15 +65,15 @@ def test_numbers_that_numpy_computed_are_numbers(lab):
     assert {"final.K", "state_space.A(2, 1)", "state_space.B(2)"} <= set(found.agree)
 
 
-def test_a_text_keeps_the_digits_that_were_typed(lab):
-    """A number given as text keeps its digits: "0.10" counts as finer than 0.1."""
+def test_a_number_given_as_text_keeps_its_digits(lab):
+    """A number given as text keeps its digits: "0.10" is more precise than 0.1."""
     as_typed = check(lab, reported={"final": {"zeta": "0.10"}})
     as_number = check(lab, reported={"final": {"zeta": 0.10}})
     assert as_typed.agree == as_number.agree == ("final.zeta",)
     assert as_typed.answer.basis != as_number.answer.basis
 
 
-def test_a_share_counts_missing_numbers_as_wrong(lab):
+def test_missing_numbers_count_as_wrong(lab):
     """A missing number counts as wrong, so that nobody earns more by reporting less."""
     found = check(lab, reported={"final": {"K": 28.9, "omega_n": 2.1}})
     assert found.share("final.K") == 1.0
@@ -108,7 +108,7 @@ def test_a_rubric_gives_its_tolerances(lab, tmp_path):
         ({"feedback": {"gains": [1.0]}}, r"feedback\.gains: expected 2 gains, found 1"),
     ],
 )
-def test_what_is_no_number_is_one_clear_error(lab, reported, said):
+def test_a_wrong_value_is_one_clear_error(lab, reported, said):
     """A text, NaN or unknown name in place of a number is one error, and no answer is counted."""
     with pytest.raises(SubmissionError, match=said):
         check(lab, reported=reported)

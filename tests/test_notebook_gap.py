@@ -18,7 +18,7 @@ FORCE, LAG = 0.004, 0.02  # V, s
 
 @pytest.fixture(scope="module")
 def gap(tmp_path_factory) -> ExplainedGap:
-    """The gap of one cart with dry friction and a drive that lags."""
+    """Return the gap of one cart with dry friction and a motor that lags."""
     folder = tmp_path_factory.mktemp("explained") / "lab"
     hide = [f"coulomb_friction:cart=1,force={FORCE}", f"actuator_lag:time_constant={LAG}"]
     bench = prepare_bench(preset="throne-1dof", hide=hide)
@@ -41,7 +41,7 @@ def test_effects_are_a_table(gap):
 
 
 def test_a_recording_is_simulated_by_both_models(gap):
-    """Of both simulations of a recording, only the one with the effects is near the measurement."""
+    """The model with effects simulates a recording much better than the linear model."""
     frame = gap.simulate(gap.records[-1])
 
     assert frame.index.name == "time"
@@ -53,7 +53,10 @@ def test_a_recording_is_simulated_by_both_models(gap):
 
 
 def test_the_systems_are_those_of_the_models(gap):
-    """The linear system is the chain; the other has a lag, and friction that stops a release."""
+    """The linear system is the chain;
+
+    the full one has a lag, and its friction stops a released cart.
+    """
     assert gap.linear.state_labels == ["x1", "v1"]
     assert_allclose(gap.linear.A, gap.results.linear.chain.state_space()[0])
     assert isinstance(gap.system, control.NonlinearIOSystem)
@@ -75,8 +78,11 @@ def test_the_systems_are_those_of_the_models(gap):
     assert abs(x[-1]) <= FORCE / gap.results.model.chain.k.sum()
 
 
-def test_the_force_left_is_a_table(gap):
-    """The table of forces has one row per window; if the model is right, it holds only noise."""
+def test_residual_forces_are_a_table(gap):
+    """The table of residual forces has columns with units;
+
+    with the right model the forces are small.
+    """
     assert list(gap.residual.columns) == [
         "experiment", "time", "cart", "position", "velocity", "input", "force",
     ]  # fmt: skip

@@ -34,8 +34,11 @@ def test_a_file_is_replaced_whole(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["results.json"]
 
 
-def test_a_file_that_many_write_at_once_is_one_of_theirs(tmp_path):
-    """If many write a file at once, it holds one writer's content; failed writes add no files."""
+def test_simultaneous_writes_leave_one_whole_file(tmp_path):
+    """If several threads write a file, it holds the text of one;
+
+    a failed write leaves no file behind.
+    """
     path, texts = tmp_path / "notes.md", [str(i) * 300_000 for i in range(8)]
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda text: write_file(path, text), 5 * texts))
@@ -46,10 +49,10 @@ def test_a_file_that_many_write_at_once_is_one_of_theirs(tmp_path):
     assert {p.name for p in tmp_path.iterdir()} == {"notes.md", "folder"}
 
 
-def test_what_a_killed_write_left_goes_with_the_next(tmp_path):
+def test_a_write_removes_old_temporary_files(tmp_path):
     """A write removes the old temporary files of writes that were killed, and no other files.
 
-    Newer ones may still be in use, and a student may have a file with a similar name.
+    Newer temporary files may still be in use, and a student may have a file with a similar name.
     """
     names = [f".{16 * '0'}.part", f".{16 * '1'}.part", ".mine.part", "left.part"]
     for name in names:
@@ -60,7 +63,7 @@ def test_what_a_killed_write_left_goes_with_the_next(tmp_path):
     assert {p.name for p in tmp_path.iterdir()} == {"notes.md", *names[1:]}
 
 
-def test_a_folder_is_looked_through_once(tmp_path):
+def test_old_files_are_searched_once_per_folder(tmp_path):
     """Old temporary files are searched once per folder, as a search takes longer than a write."""
     write_file(tmp_path / "notes.md", "whole")
     left = tmp_path / f".{16 * '0'}.part"
@@ -99,8 +102,8 @@ def test_a_file_in_the_way_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["report.pdf", "gs.csv", "Grades.HTML"])
-def test_a_file_s_name_is_no_new_folder(tmp_path, name):
-    """An output name with an ending is a file, unless a folder of that name exists."""
+def test_a_folder_named_like_a_file_is_refused(tmp_path, name):
+    """An output folder may not be named like a file, unless a folder of that name exists."""
     with pytest.raises(ConfigError, match="give a folder with --out"):
         named_folder(tmp_path / name)
     (tmp_path / name).mkdir()
@@ -108,7 +111,7 @@ def test_a_file_s_name_is_no_new_folder(tmp_path, name):
     assert named_folder(tmp_path / "lab 3.2") == tmp_path / "lab 3.2"
 
 
-def test_stale_files_go(tmp_path):
+def test_only_matching_files_are_removed(tmp_path):
     """Only files and links that match a pattern are removed, and no folders."""
     (tmp_path / "a.svg").write_text("")
     (tmp_path / "keep.txt").write_text("")
@@ -117,7 +120,7 @@ def test_stale_files_go(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["b.svg", "keep.txt"]
 
 
-def test_a_folder_with_something_in_it_is_not_new(tmp_path):
+def test_a_folder_with_files_is_refused(tmp_path):
     """A submission is never written into a folder that holds something.
 
     An empty folder is accepted.
@@ -151,7 +154,7 @@ _HIDING = [
 @pytest.mark.parametrize("hidden", _HIDING)
 @pytest.mark.parametrize("before", ["", "x;", 'x;"', "x; '"])
 def test_formulas_are_neutralised(before, hidden, sign):
-    """Formulas are found after invisible characters, at a cell's start and after a semicolon."""
+    """A formula at a cell's start or after a semicolon is quoted, even after invisible letters."""
     text = harmless(before + hidden + sign)
     assert text.isprintable()
     assert re.match(r"(x;)?'[ \"']*" + re.escape(sign), text)
@@ -162,8 +165,8 @@ _MEANT = st.text(st.sampled_from("=+-@;,\"'\r\n\t \u3000\u00ad\u200eab1")) | st.
 
 @given(st.lists(st.lists(_MEANT, min_size=2, max_size=2), max_size=4))
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
-def test_no_row_and_no_formula_comes_of_a_text(separator, rows):
-    """With any separator of a spreadsheet, a table has as many rows as written, and no formula."""
+def test_texts_add_no_rows_and_no_formulas(separator, rows):
+    """A spreadsheet sees as many rows as were written and no formula, whatever its separator is."""
     text = csv_text(("a", "b"), rows)
     assert not [c for c in text if unicodedata.category(c).startswith("C") and c != "\n"]
     assert text.count("\n") == len(rows) + 1

@@ -53,7 +53,7 @@ def test_parameters_follow_the_papers_table(results):
 
 
 def test_shapes_agree_with_the_number_of_carts(results):
-    """Matrices, gains and poles have the sizes that belong to two carts."""
+    """Matrices, gains and poles have the right sizes for two carts."""
     space = results["state_space"]
     assert [len(space["A"]), len(space["A"][0]), len(space["B"]), len(space["B"][0])] == [
         4,
@@ -66,8 +66,8 @@ def test_shapes_agree_with_the_number_of_carts(results):
     assert [len(results["chain"][key]) for key in "mck"] == [2, 2, 3]
 
 
-def test_hardware_has_one_entry_a_run_and_cart(results):
-    """The loop that ran, and the plant under the measured input, each have one entry per cart."""
+def test_hardware_has_one_entry_per_run_and_cart(results):
+    """There is one entry per closed-loop run and cart, with the error under the measured input."""
     keys = [(entry["experiment"], entry["cart"]) for entry in results["hardware"]]
     assert len(keys) == len(set(keys)) == 2
     assert all(entry["loop"] == "closed" for entry in results["hardware"])

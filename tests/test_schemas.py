@@ -45,7 +45,7 @@ def example(request):
 
 
 def test_real_results_obey_the_schema(example):
-    """Results and solution of every shipped example obey the schema, which has all their keys."""
+    """Results and solution of every shipped example obey their schemas, which have all the keys."""
     assert_fits("results", json_text(example))
     assert_fits("solution", solution_text(example))
 
@@ -67,14 +67,14 @@ def test_gaps_obey_the_schema(verdict):
 
 
 def test_grades_obey_the_schema(tmp_path):
-    """Grades obey the schema: graded, failed, flagged, shared, late, changed by hand."""
+    """Every kind of grade obeys the schema: failed, flagged, shared, late or changed by hand."""
     files = sorted((write_class(tmp_path) / "feedback").glob("*/grade.json"))
     assert len(files) == 16
     for file in files:
         assert_fits("grade", file.read_text(encoding="utf-8"))
 
 
-def test_a_broken_file_does_not_obey():
+def test_a_broken_file_is_refused():
     """The schema refuses an unknown outcome, a text for a number and a missing key."""
     schema = json.loads(schema_text("results"))
     validator = jsonschema.Draft202012Validator(schema)
@@ -88,7 +88,7 @@ def test_a_broken_file_does_not_obey():
     assert not validator.is_valid({key: value for key, value in good.items() if key != "checks"})
 
 
-def test_the_command_prints_it():
+def test_the_command_prints_the_schema():
     """`cartlab schema gap` prints the shipped schema; an unknown name gets the list of names."""
     command = [sys.executable, "-m", "pipeline", "schema"]
     done = subprocess.run([*command, "gap"], capture_output=True, encoding="utf-8", check=True)

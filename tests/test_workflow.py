@@ -51,8 +51,8 @@ def test_same_input_gives_same_bytes(analyses):
     assert json_text(again) == json_text(analyses["two-cart"])
 
 
-def test_how_the_records_follow_is_handed_on(analyses):
-    """`analyse` returns how well the carts explain each record, the same as a new computation."""
+def test_unexplained_shares_are_returned(analyses):
+    """`analyse` returns each record's unexplained share, equal to that of a new computation."""
     for analysis in analyses.values():
         fits = follow(analysis.records, analysis.chain)
         assert fits
@@ -82,15 +82,13 @@ def _without(tmp_path, *, kinds, example="two-cart"):
         ("closed_loop", "hardware check"),
     ],
 )
-def test_a_missing_experiment_is_skipped_with_its_reason_and_the_rest_goes_on(
-    tmp_path, kind, stage
-):
+def test_a_missing_experiment_skips_only_its_stage(tmp_path, kind, stage):
     """If one kind of experiment is missing, its stage is skipped; the carts are still found."""
     analysis = analyse(_without(tmp_path, kinds=[kind]))
     assert stage in {skip.name for skip in analysis.skipped}
     truth = PRESETS["throne-2dof"]
-    # Without dwells the fit uses steps and a sweep in encoder counts: right to percents, not to
-    # tenths of a percent.
+    # Without dwells, the fit to steps and a sweep is accurate to percents, not to tenths of a
+    # percent.
     assert analysis.chain is not None
     assert_allclose(analysis.chain.m, truth.m, rtol=0.01)
     assert_allclose(analysis.chain.k[1:], truth.k[1:], rtol=0.01)
@@ -106,7 +104,7 @@ def test_steps_alone_still_give_a_full_report(tmp_path):
     assert analysis.frequency_responses
 
 
-def test_decays_alone_end_in_reasons_not_in_a_crash(tmp_path):
+def test_decays_alone_give_reasons_not_a_crash(tmp_path):
     """From decays alone, each stage that needs the final estimate is skipped with a reason."""
     analysis = analyse(_without(tmp_path, kinds=["sine", "sweep", "step", "closed_loop"]))
     assert analysis.chain is None
@@ -118,7 +116,7 @@ def test_decays_alone_end_in_reasons_not_in_a_crash(tmp_path):
     assert math.isclose(initial["omega_2"], 32.926, rel_tol=1e-3)
 
 
-def test_no_controller_is_designed_for_a_goal_that_nobody_stated():
+def test_no_controller_is_designed_without_a_goal():
     """Without [design] there is no feedback, and the reason is given."""
     submission = load_submission(EXAMPLES / "one-cart").model_copy(update={"design": None})
     analysis = analyse(submission)
@@ -126,8 +124,11 @@ def test_no_controller_is_designed_for_a_goal_that_nobody_stated():
     assert [skip.stage for skip in analysis.skipped] == ["state feedback"]
 
 
-def test_the_design_can_be_left_out_and_had_later(analyses):
-    """An analysis without the design, as grading uses it, can compute the same design later."""
+def test_the_design_can_be_computed_later(analyses):
+    """An analysis may leave out the design, as in grading;
+
+    the same design can be computed later.
+    """
     submission, whole = load_submission(EXAMPLES / "one-cart"), analyses["one-cart"].feedback
     without = analyse(submission, design=False)
     assert without.feedback is None

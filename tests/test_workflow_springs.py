@@ -26,8 +26,8 @@ from pipeline.workflow import analyse
 
 COUNT = 0.00227  # cm, the encoder step
 RATE = 200.0  # Hz
-BODY = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.zeros(2))  # V, cm, s: slows in 0.3 s
-# Four standard errors: by chance one in 16 000 parameters is further off.
+BODY = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.zeros(2))  # in V, cm, s; slows in 0.3 s
+# Four standard errors: only one in 16 000 parameters is further off by chance.
 SIGMAS = 4.0
 
 
@@ -49,7 +49,7 @@ def record(folder: Path, chain: Chain, name: str, u: Array, *, rng: np.random.Ge
 
 
 def analysed(folder: Path, *, springs: str, carts: int, runs: dict[str, str]) -> Analysis:
-    """Analyse a submission of `runs`, each with the lines that follow its id and file."""
+    """Analyse a submission; `runs` gives the table of each experiment, without id and file."""
     text = f'version = 1\ntitle = "Few springs"\n[system]\ncarts = {carts}\n'
     text += f'springs = {springs}\nposition = {{ unit = "cm" }}\n'
     for name, lines in runs.items():
@@ -61,7 +61,10 @@ def analysed(folder: Path, *, springs: str, carts: int, runs: dict[str, str]) ->
 def dwells(
     folder: Path, frequencies: list[float], *, rng: np.random.Generator, chain: Chain = BODY
 ) -> dict[str, str]:
-    """Write sine dwells of about a centimetre at `frequencies` (Hz)."""
+    """Write sine dwells of about 1 cm at `frequencies` (Hz);
+
+    return their experiments for `analysed`.
+    """
     runs = {}
     for frequency in frequencies:
         omega = 2 * np.pi * frequency
@@ -74,7 +77,7 @@ def dwells(
 
 
 def assert_body_found(analysis: Analysis) -> None:
-    """Assert that mass and damping are right within a few percent and their errors."""
+    """Assert that mass and damping are known to 3 % and right within `SIGMAS` standard errors."""
     final = {row.name: row.final for row in analysis.rows}
     assert list(final) == ["mass", "damping"]
     for name, truth in {"mass": BODY.m[0], "damping": BODY.c[0]}.items():
@@ -107,7 +110,7 @@ def test_carts_on_some_springs_are_found(tmp_path, k):
 
 
 @pytest.mark.parametrize("frequencies", [[0.5, 2.0], [0.5, 1.0, 2.0], [0.4, 0.6, 1.0, 1.5, 2.5]])
-def test_dwells_give_a_body_on_no_spring_its_mass_and_damping(tmp_path, frequencies):
+def test_dwells_give_mass_and_damping_of_a_free_body(tmp_path, frequencies):
     """Two dwells suffice for a free body: two amplitudes and two phases give mass and damping."""
     runs = dwells(tmp_path, frequencies, rng=np.random.default_rng(len(frequencies)))
     analysis = analysed(tmp_path, springs="[false, false]", carts=1, runs=runs)
@@ -116,8 +119,8 @@ def test_dwells_give_a_body_on_no_spring_its_mass_and_damping(tmp_path, frequenc
     assert_body_found(analysis)
 
 
-def test_a_step_gives_a_body_on_no_spring_its_mass_and_damping(tmp_path):
-    """Without dwells a run under constant force gives a free body's mass and damping."""
+def test_a_step_gives_mass_and_damping_of_a_free_body(tmp_path):
+    """Without dwells, a run under constant force gives a free body's mass and damping."""
     t = np.arange(int(4 * RATE)) / RATE
     u = 5e-3 * (np.where(t > 0.2, 1.0, 0.0) - np.where(t > 2.0, 1.0, 0.0))
     record(tmp_path, BODY, "push", u, rng=np.random.default_rng(1))
@@ -129,8 +132,8 @@ def test_a_step_gives_a_body_on_no_spring_its_mass_and_damping(tmp_path):
     assert "step gain" in {skip.stage for skip in analysis.skipped}
 
 
-def test_two_carts_that_no_spring_ties_to_a_wall_are_found(tmp_path):
-    """Two carts without wall springs get masses, dampings and spring, but no static gains."""
+def test_two_carts_without_wall_springs_are_found(tmp_path):
+    """Two carts without wall springs have masses, dampings and one spring, but no static gains."""
     chain = Chain(m=np.array([3e-4, 2e-4]), c=np.array([1e-3, 6e-4]), k=np.array([0, 0.06, 0]))
     t = np.arange(int(8 * RATE)) / RATE
     u = 0.02 * np.sin(2 * np.pi * (0.5 + 0.3 * t) * t)
@@ -149,9 +152,12 @@ def test_two_carts_that_no_spring_ties_to_a_wall_are_found(tmp_path):
 @pytest.mark.parametrize(
     "springs", [(False, True, False), (True, False, False)], ids=["no wall", "not joined"]
 )
-def test_springs_that_the_bench_does_not_have_are_asked_about(tmp_path, springs):
-    """If no carts fit the stated springs, the summary asks about them; no heading is empty."""
-    shutil.copytree(EXAMPLES / "two-cart", tmp_path / "bench")  # between cart 2 and the wall is one
+def test_wrongly_stated_springs_are_questioned(tmp_path, springs):
+    """If no carts fit the stated springs, the summary asks about them;
+
+    no section has an empty heading.
+    """
+    shutil.copytree(EXAMPLES / "two-cart", tmp_path / "bench")  # its cart 2 has a spring to a wall
     toml = tmp_path / "bench" / "submission.toml"
     text = re.sub("springs = .*", f"springs = {json.dumps(springs)}", toml.read_text("utf-8"))
     toml.write_text(text, encoding="utf-8")

@@ -20,11 +20,11 @@ from pipeline.submission import Experiment, Submission, load_submission
 from pipeline.workflow import analyse
 
 KINDS = ("decay", "step", "sine", "sweep", "closed_loop")
-MOST_RUNS = 6  # at most so many runs of each kind: more would only cost time
+MOST_RUNS = 6  # at most this many runs of each kind; more would only cost time
 
 
 def stuck(y: Array) -> Array:
-    """Stop after a third of the record."""
+    """Keep the channel constant after a third of the record."""
     return np.where(np.arange(y.size) < y.size // 3, y, y[y.size // 3])
 
 
@@ -34,12 +34,12 @@ def jumping(y: Array) -> Array:
 
 
 def spiked(y: Array) -> Array:
-    """Keep the channel constant except for one sample."""
+    """Replace the channel by zeros with one spike."""
     return np.eye(1, y.size, y.size // 2)[0]
 
 
 def clipped(y: Array) -> Array:
-    """Clip the channel at nine tenths of its largest value."""
+    """Clip the channel at a tenth of its largest value."""
     return np.clip(y, -0.1 * np.abs(y).max(), 0.1 * np.abs(y).max())
 
 
@@ -70,7 +70,7 @@ LENGTHS = {"whole": slice(None), "first": slice(8), "short": slice(40), "half": 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A submission, its tables (header and values) by file, and a list of what was changed."""
+    """A submission, the header and values of each of its files, and a list of what was changed."""
 
     submission: Submission = field(repr=False)
     files: dict[str, tuple[str, Array]] = field(repr=False)
@@ -137,7 +137,7 @@ def spoil(draw: st.DrawFn, header: list[str], values: Array) -> tuple[Array, lis
 
 
 def mislabelled(draw: st.DrawFn, run: Experiment, n: int) -> Experiment:
-    """Declare another kind of experiment, or other free carts, than the recording really has."""
+    """Declare a wrong kind of experiment, or the wrong free carts."""
     if draw(st.booleans()):
         return run.model_copy(update={"kind": draw(st.sampled_from(KINDS))})
     carts = draw(st.sets(st.integers(1, n), min_size=1))
@@ -169,7 +169,7 @@ quick = settings(max_examples=5, deadline=None, suppress_health_check=[HealthChe
 
 @quick
 @given(broken(["one-cart", "two-cart"]))
-def test_broken_data_end_in_a_result_or_in_one_line(case):
+def test_broken_data_give_a_result_or_one_line(case):
     """Whatever is wrong with the channels, `analyse` returns a result or one line of error."""
     check(case)
 
@@ -177,6 +177,6 @@ def test_broken_data_end_in_a_result_or_in_one_line(case):
 @pytest.mark.slow
 @settings(quick, max_examples=400)
 @given(broken(["one-cart", "two-cart", "three-cart"]))
-def test_broken_data_of_up_to_three_carts_end_in_a_result_or_in_one_line(case):
-    """Broken data of up to three carts give a result or one line of error, in many more cases."""
+def test_broken_data_of_up_to_three_carts_give_a_result_or_one_line(case):
+    """In many more cases, broken data of up to three carts give a result or one line of error."""
     check(case)

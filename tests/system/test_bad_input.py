@@ -37,7 +37,7 @@ GOOD = HEAD + STEP
 
 
 def good_rows(n: int = 40) -> list[str]:
-    """A heading and a step response of two carts."""
+    """Return a heading and a step response of two carts."""
     t = 0.01 * np.arange(n)
     x = 1 - np.exp(-5 * t)
     rows = zip(t, np.where(t > 0.05, 1.0, 0.0), x, 0.5 * x, strict=True)
@@ -45,7 +45,7 @@ def good_rows(n: int = 40) -> list[str]:
 
 
 def write(folder: Path, toml: str | bytes = GOOD, **files: str | bytes) -> Path:
-    """Write a submission, with good data files for those that are not given."""
+    """Write a submission, with a good `step.csv` unless another one is given."""
     (folder / "data").mkdir(parents=True)
     raw = toml if isinstance(toml, bytes) else toml.encode()
     (folder / "submission.toml").write_bytes(raw)
@@ -57,7 +57,7 @@ def write(folder: Path, toml: str | bytes = GOOD, **files: str | bytes) -> Path:
 
 
 def one_line(folder: Path, pattern: str, *, most: int = 1) -> None:
-    """Load a submission; expect at most `most` matching lines, which the command prints too."""
+    """Expect that loading fails with at most `most` matching lines; the command prints them too."""
     with pytest.raises(SubmissionError, match=pattern) as caught:
         read_data(load_submission(folder))
     message = str(caught.value)
@@ -74,7 +74,7 @@ def one_line(folder: Path, pattern: str, *, most: int = 1) -> None:
     assert not (folder / "report").exists()  # no half-written report is left
 
 
-def test_the_good_one_is_read(tmp_path):
+def test_the_unbroken_submission_is_read(tmp_path):
     """The good submission, from which the broken ones are made, is read without a complaint."""
     assert read_data(load_submission(write(tmp_path / "team-01"))).records[0].carts == (1, 2)
 
@@ -248,7 +248,7 @@ BAD_TOML = {
 
 
 @pytest.mark.parametrize(("toml", "pattern"), BAD_TOML.values(), ids=BAD_TOML.keys())
-def test_a_broken_submission_file_is_a_line_each(toml, pattern, tmp_path):
+def test_each_mistake_in_the_submission_file_is_one_line(toml, pattern, tmp_path):
     """Each mistake in submission.toml gives one line, which names its key or line."""
     one_line(write(tmp_path / "team-01", toml), pattern, most=MOST_LISTED)
 
@@ -275,7 +275,7 @@ def _mat(**variables: object) -> bytes:
 
 
 def _bomb() -> bytes:
-    """A compressed element of 300 MB of zeros in a small file."""
+    """Return a small MATLAB file with a compressed element of 300 MB of zeros."""
     compressor = zlib.compressobj(1)
     packed = compressor.compress(struct.pack("<II", 14, 300_000_000))
     packed += b"".join(compressor.compress(bytes(10_000_000)) for _ in range(30))
@@ -413,8 +413,8 @@ def test_a_broken_bode_table_is_one_line(content, pattern, tmp_path):
     one_line(write(tmp_path / "team-01", toml, **{"step.csv": content}), pattern)
 
 
-def test_only_the_wrong_cart_in_the_file_is_one_line(tmp_path):
-    """If a file measures only carts that were held, one line names the free and measured carts."""
+def test_a_file_without_the_free_cart_is_one_line(tmp_path):
+    """If a file measures no free cart, one line names the free carts and the measured ones."""
     folder = write(tmp_path / "team-01", GOOD + "carts = [2]\n")
     (folder / "data" / "step.csv").write_text(
         "\n".join(",".join(row.split(",")[:3]) for row in good_rows())
@@ -481,7 +481,7 @@ SLIPS = {
     "K = −1.5": ("dash", "K = -1.5"),
     "kind\N{NO-BREAK SPACE}= 'step'": ("space", "kind = 'step'"),
     "K = 1.13 cm/V": ("unit", "K = 1.13"),
-    "zeta = 5%": ("unit", ""),  # that is, 0.05
+    "zeta = 5%": ("unit", ""),  # 5 % is 0.05, but cartlab does not guess
     "K = 1.2*10^-3": ("unit", "K = 1.2e-3"),
     "K = 1.2 * 3": ("unit", ""),
     "K = .5": ("point", "K = 0.5"),
@@ -499,8 +499,8 @@ SLIPS = {
 
 
 @pytest.mark.parametrize("typed", SLIPS)
-def test_a_slip_of_the_keyboard_is_told_by_what_to_type(typed, tmp_path):
-    """A typing slip that TOML refuses gives one line with the reason."""
+def test_a_typing_slip_gets_its_correction(typed, tmp_path):
+    """A typing slip that TOML refuses gives one line with its reason and perhaps a correction."""
     write(tmp_path / "team-01", "version = 1\n" + typed + "\n")
     words, mended = SLIPS[typed]
     with pytest.raises(SubmissionError, match=rf"toml line [234]: .*{words}") as caught:
@@ -511,7 +511,7 @@ def test_a_slip_of_the_keyboard_is_told_by_what_to_type(typed, tmp_path):
     assert len(said.splitlines()) == 1
 
 
-def test_no_file_is_proposed_that_is_another_experiments(tmp_path):
+def test_a_file_of_another_experiment_is_not_proposed(tmp_path):
     """If a file is missing, a similar file that another experiment already uses is not proposed."""
     second = STEP.replace("step-a", "step-b").replace("step.csv", "step2.csv")
     folder = write(tmp_path / "team-01", GOOD + second)
@@ -519,7 +519,7 @@ def test_no_file_is_proposed_that_is_another_experiments(tmp_path):
         "step-b": "there is no file 'data/step2.csv'"
     }
     (folder / "report" / "tables").mkdir(parents=True)
-    (folder / "report" / "tables" / "steps.csv").write_text("record,gain\n")  # is no recording
+    (folder / "report" / "tables" / "steps.csv").write_text("record,gain\n")  # not a recording
     (said,) = read_data(load_submission(folder)).unreadable.values()
     assert "did you mean" not in said
     (folder / "data" / "Step2.csv.csv").write_text("\n".join(good_rows()))
@@ -528,7 +528,7 @@ def test_no_file_is_proposed_that_is_another_experiments(tmp_path):
 
 
 @pytest.mark.parametrize("path", ["nowhere", "team-01/data", "team-01/data/step.csv"])
-def test_a_path_that_is_no_submission_is_one_line(path, tmp_path):
+def test_a_path_without_a_submission_is_one_line(path, tmp_path):
     """A path that is no submission gives one line of error that says why.
 
     The paths are a missing folder, a folder without submission.toml, and a file of another kind.

@@ -54,7 +54,7 @@ def test_a_command_loads_only_what_it_needs(module, unneeded):
     assert done.stdout.strip() == "set()"
 
 
-def test_report_writes_everything_and_ends_well(tmp_path):
+def test_report_writes_all_files(tmp_path):
     """For a consistent submission `report --json` writes all files and ends with status 0."""
     out = tmp_path / "out"
     done = cartlab("report", EXAMPLES / "one-cart", "--out", out, "--json")
@@ -113,7 +113,7 @@ def test_failed_checks_are_status_one(tmp_path):
     assert done.returncode == 1
 
 
-def test_a_file_that_cannot_be_read_is_its_own_run_s_problem(tmp_path):
+def test_an_unreadable_file_affects_only_its_run(tmp_path):
     """If one file is missing and one is broken, both are reported and everything else is computed.
 
     The exit status is 1. A solution from these files is doubtful, and gives each reason once. If no
@@ -160,7 +160,7 @@ def test_a_file_that_cannot_be_read_is_its_own_run_s_problem(tmp_path):
 
 
 def test_a_damping_at_its_bound_is_reported_as_unknown(tmp_path):
-    """Without a point near the peak the final ζ is missing, with its reason; figures are drawn.
+    """Without a point near the peak the final ζ is missing, with a reason; figures are still drawn.
 
     The fitted ζ is 0, and one point of the fitted curve lies on the pole.
     """
@@ -182,7 +182,7 @@ def test_a_damping_at_its_bound_is_reported_as_unknown(tmp_path):
     assert found["chain"]["c"] == [0.0]
 
 
-def test_new_then_report_tells_what_to_do_next(tmp_path):
+def test_report_on_a_new_folder_says_what_to_do_next(tmp_path):
     """For a folder fresh from `new`, `report` says that experiments are missing."""
     assert cartlab_here("new", tmp_path / "team", "--carts", "2").returncode == 0
     done = cartlab_here("report", tmp_path / "team")
@@ -190,7 +190,7 @@ def test_new_then_report_tells_what_to_do_next(tmp_path):
     assert "experiments" in done.stderr
 
 
-def test_simulate_makes_a_submission_that_report_takes(tmp_path):
+def test_report_accepts_a_simulated_submission(tmp_path):
     """`report` reads a simulated submission, with its reported values, without any complaint."""
     folder = tmp_path / "bench"
     done = cartlab_here(
@@ -205,7 +205,7 @@ def test_simulate_makes_a_submission_that_report_takes(tmp_path):
     assert (again.returncode, "is not empty" in again.stderr) == (2, True)
 
 
-def test_one_broken_file_does_not_make_a_folder_unreadable(tmp_path):
+def test_inspect_shows_the_files_beside_a_broken_one(tmp_path):
     """If `inspect` meets one broken file, it still shows the other files and ends with status 1.
 
     If no file can be read, the status is 2.

@@ -30,7 +30,7 @@ initial = {"K": 29.0, "omega_n": 2.12}
 final = {"K": 28.9, "omega_n": 2.1, "zeta": 0.101}
 """,
 }
-# One point for each number: one answer has a wrong frequency in both tables, and no damping.
+# One point per right number. The second answer has wrong frequencies and lacks one damping ratio.
 POINTS = {"right": 6.0, "in-hertz": 3.0}
 # The text that the tools put in place of a solution.
 _PLACE = re.compile(
@@ -39,14 +39,14 @@ _PLACE = re.compile(
 
 
 def need(tool: str) -> None:
-    """Skip where a tool is not installed."""
+    """Skip the test if a tool is not installed."""
     if find_spec(tool) is None:
         pytest.skip(f"{NEEDED[tool]} is not installed")
 
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory) -> Path:
-    """A student's recordings, for which the numbers in ANSWERS["right"] are correct."""
+    """Return a student's recordings, for which the numbers in ANSWERS["right"] are correct."""
     folder = tmp_path_factory.mktemp("bench") / "recordings"
     write_submission(folder, "throne-1dof", seed=7, compact=True)
     return folder
@@ -54,7 +54,7 @@ def recordings(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def run(tmp_path, monkeypatch) -> Callable[..., str]:
-    """A function that runs a program of this environment with a home folder of its own."""
+    """Return a function that runs a program of this environment with a home folder of its own."""
     jupyter = (f"JUPYTER_{what}_DIR" for what in ("CONFIG", "DATA", "RUNTIME"))
     for name in ("HOME", "IPYTHONDIR", *jupyter):
         monkeypatch.setenv(name, str(tmp_path / "home"))
@@ -86,7 +86,7 @@ def fill_in(released: Path, handed_in: Path, answers: str) -> None:
     handed_in.write_text(json.dumps(notebook), encoding="utf-8")
 
 
-def test_nbgrader_gives_a_point_for_each_number_that_agrees(recordings, run, tmp_path):
+def test_nbgrader_gives_a_point_per_right_number(recordings, run, tmp_path):
     """Nbgrader hides the solution and scores each number against the student's own recordings."""
     need("nbgrader")
     course = tmp_path / "course"
@@ -118,7 +118,7 @@ def test_nbgrader_gives_a_point_for_each_number_that_agrees(recordings, run, tmp
     ]
 
 
-def test_otter_gives_a_point_for_each_number_that_agrees(recordings, run, tmp_path):
+def test_otter_gives_a_point_per_right_number(recordings, run, tmp_path):
     """Otter hides the solution and scores each number of the zip that a notebook exports."""
     need("otter")
     shutil.copy(ROOT / "docs" / "course-otter.ipynb", tmp_path / "lab.ipynb")

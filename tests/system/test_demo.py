@@ -10,7 +10,7 @@ from pipeline.cli.demo import found_beside, search_beside
 from pipeline.errors import SubmissionError
 
 
-def test_what_the_other_process_could_not_do_is_said_by_this_one(tmp_path, capsys):
+def test_an_error_of_the_second_process_is_shown(tmp_path, capsys):
     """If the demo's second process fails, the demo shows its error and its exit status."""
     (tmp_path / "bench").mkdir()
     (tmp_path / "bench" / "submission.toml").write_text("version = 1\n", encoding="utf-8")

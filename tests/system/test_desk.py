@@ -44,13 +44,13 @@ def show(browser):
         own = (home[0], "blob:", "data:")
         window.on("request", lambda r: None if r.url.startswith(own) else errors.append(r.url))
         window.goto(url)
-        assert re.fullmatch(r"http://[^/]+/(\w+/0/)?", window.url)  # without the secret
+        assert re.fullmatch(r"http://[^/]+/(\w+/0/)?", window.url)  # the secret is no longer shown
         return window
 
     yield opened
     for context in contexts:
         context.close()
-    said = "the server responded with a status of (422|409)"  # on the page
+    said = "the server responded with a status of (422|409)"  # refusals that a page shows
     # A page may have a request open when its test ends the desk; browser and htmx then report
     # errors.
     ended = r"net::ERR_(CONNECTION_\w+|INCOMPLETE_CHUNKED_ENCODING|EMPTY_RESPONSE)"
@@ -59,7 +59,7 @@ def show(browser):
 
 
 def fits(window) -> bool:
-    """Return whether nothing is wider than the screen, and axe finds no fault by day or night.
+    """Return whether everything fits the screen, and axe finds no barrier by day or night.
 
     Axe checks the page at a phone's size, which needs the most scrolling and touching.
     """
@@ -85,7 +85,7 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
         window = show(server.url)
         window.get_by_text("Type a path").click()
         window.get_by_label("Folder on this computer").fill(str(folder))
-        with window.expect_navigation():  # to a page whose scripts can take the files
+        with window.expect_navigation():  # to a page whose scripts accept files
             window.get_by_role("button", name="Open").click()
         expect(window.get_by_role("heading", level=1)).to_have_text("team")
         stands = window.get_by_label("Current state")
@@ -97,7 +97,7 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
 
         window.get_by_label("Title of the report").fill("One <b>cart</b>")
         window.get_by_label("You", exact=True).fill("s1")
-        window.get_by_role("button", name="Use cm").click()  # saves what was typed with it
+        window.get_by_role("button", name="Use cm").click()  # also saves the typed text
         expect(window.locator("#details").get_by_text("Saved.")).to_be_visible()
         assert load_submission(folder).system.position.unit == "cm"
         expect(window.get_by_role("button", name="Use cm")).to_have_count(0)
@@ -122,7 +122,7 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
         window.get_by_text("What controller ran?").click()
         window.get_by_label("Controller", exact=True).select_option("state_feedback")
         expect(window.locator("#kind-closed_loop .chip")).to_have_text("understood")
-        expect(window.get_by_label("Prefilter").first).to_be_visible()  # is not folded
+        expect(window.get_by_label("Prefilter").first).to_be_visible()  # not folded away
         assert fits(window)
 
         window.get_by_role("button", name="Make the report").click()
@@ -131,7 +131,7 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
         window.get_by_role("link", name="Read the report").click()
         report = window.frame_locator("iframe")
         expect(report.get_by_role("heading", level=1)).to_have_text("One <b>cart</b>")
-        expect(report.locator("figure .tools").first).to_be_attached()  # its script works
+        expect(report.locator("figure .tools").first).to_be_attached()  # the report's script works
         own = "document.documentElement.scrollHeight - innerHeight"
         assert window.evaluate(own) <= 0  # only the report scrolls, not the page around it
         assert fits(window)
@@ -159,7 +159,7 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
 
 
 @pytest.mark.usefixtures("work_here")
-def test_the_way_is_gone_with_the_keyboard_alone_on_a_phone(show, tmp_path):
+def test_the_keyboard_alone_suffices_on_a_phone(show, tmp_path):
     """With keys alone, on a phone, a student answers a question about units and gets the zip."""
     folder = tmp_path / "team"
     (folder / "data").mkdir(parents=True)
@@ -191,7 +191,7 @@ def test_the_way_is_gone_with_the_keyboard_alone_on_a_phone(show, tmp_path):
         window.keyboard.press("Enter")
         until(lambda: load_submission(folder).reported is not None)
         button = window.get_by_role("button", name="Make the report")
-        expect(button).to_have_class("main")  # the focus is on the next step
+        expect(button).to_have_class("main")  # the page suggests this step next
         go_to(button)
         window.keyboard.press("Space")
         stands = window.get_by_label("Current state")
@@ -221,7 +221,7 @@ def test_the_way_is_gone_with_the_keyboard_alone_on_a_phone(show, tmp_path):
 
 
 @pytest.mark.usefixtures("work_here")
-def test_what_is_typed_stays_until_it_is_saved(show, tmp_path):
+def test_typed_text_stays_until_it_is_saved(show, tmp_path):
     """Typed text stays if another form is saved, a row is removed or a save is refused."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
@@ -232,7 +232,7 @@ def test_what_is_typed_stays_until_it_is_saved(show, tmp_path):
         details.get_by_role("checkbox").first.uncheck()
         window.locator("#row-1 summary").click()
         note = window.locator("#experiments-1-note")
-        note.evaluate("note => { note.value = 'bumped' }")  # typed, and the row not left
+        note.evaluate("note => { note.value = 'bumped' }")  # typed, but without leaving the row
         window.locator("#row-0 summary").click()
         window.locator("#row-0").get_by_role("button", name="Remove").click()
         expect(window.get_by_text("Saved.")).to_be_visible()
@@ -257,7 +257,7 @@ def test_what_is_typed_stays_until_it_is_saved(show, tmp_path):
 
 
 @pytest.mark.usefixtures("work_here")
-def test_one_key_answers_what_several_recordings_ask(show, tmp_path):
+def test_one_key_answers_for_several_recordings(show, tmp_path):
     """If several recordings ask the same question, one key answers it for all of them."""
     folder = tmp_path / "team"
     (folder / "data").mkdir(parents=True)
@@ -273,7 +273,7 @@ def test_one_key_answers_what_several_recordings_ask(show, tmp_path):
         row.get_by_role("button", name="It was free").press("Enter")
         for name in ("a.csv", "b.csv", "c.csv"):
             shown = window.locator("tr").filter(has_text=name)
-            expect(shown).to_be_visible(visible=name != "a.csv")  # that recording is understood
+            expect(shown).to_be_visible(visible=name != "a.csv")  # one answer is enough for a.csv
         window.get_by_role("button", name="It was held in all 2").press("Enter")
         expect(window.locator("#files details.kind[open]")).to_have_count(0)
         assert fits(window)
@@ -281,8 +281,8 @@ def test_one_key_answers_what_several_recordings_ask(show, tmp_path):
     assert [run.carts for run in runs] == [(1, 2), (1,), (1,)]
 
 
-def test_what_is_made_of_the_file_waits_for_what_is_not_saved(show, tmp_path):
-    """While typed text is not saved, zip and report are not made, and a message says why."""
+def test_zip_and_report_wait_for_unsaved_text(show, tmp_path):
+    """While typed text is not saved, no zip or report is made, and a message says why."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
         window = show(server.url)
@@ -302,7 +302,7 @@ def test_what_is_made_of_the_file_waits_for_what_is_not_saved(show, tmp_path):
             expect(within.get_by_role("alert")).to_have_count(shown + 1)
         assert not {"hand-in", "make-report", "make-gap"}.intersection(asked)
         assert violations(window) == []
-        window.get_by_role("button", name="hand in without them").click()  # all the same
+        window.get_by_role("button", name="hand in without them").click()  # despite the warning
         with window.expect_download() as download:
             window.get_by_role("link", name="Download the zip").click()
         with zipfile.ZipFile(download.value.path()) as archive:
@@ -332,14 +332,14 @@ def test_what_is_made_of_the_file_waits_for_what_is_not_saved(show, tmp_path):
 
 
 @pytest.mark.usefixtures("work_here")
-def test_everybody_can_use_it(show, tmp_path):
-    """The desk passes axe by day and night, fits every screen and can be used by keyboard."""
+def test_the_desk_is_accessible(show, tmp_path):
+    """The desk is accessible (axe) by day and night, fits every screen and works by keyboard."""
     folder = a_submission(tmp_path / "team", "two-cart")
     with DeskServer(folder=folder) as server:
         window = show(server.url, size=PHONE)
         unfold(window)
         table = window.locator(".wide").filter(has=window.locator("table.files")).first
-        assert table.evaluate("it => it.scrollWidth <= it.clientWidth")  # nor is it wide
+        assert table.evaluate("it => it.scrollWidth <= it.clientWidth")  # the table fits its frame
         window.get_by_label("Position of one encoder count").fill("0")
         window.get_by_label("Position of one encoder count").press("Enter")
         expect(window.locator("#system-position-per_count-wrong")).to_be_visible()
@@ -354,7 +354,7 @@ def test_everybody_can_use_it(show, tmp_path):
 
 
 @pytest.mark.usefixtures("work_here")
-def test_without_scripts_it_works_too(show, tmp_path):
+def test_the_desk_works_without_scripts(show, tmp_path):
     """Without scripts every change can be made with a plain form."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
@@ -369,14 +369,14 @@ def test_without_scripts_it_works_too(show, tmp_path):
     assert load_submission(folder).title == "Plain"
 
 
-def test_the_command_says_its_address_and_ends_with_a_signal(tmp_path):
+def test_the_command_prints_its_address_and_ends_on_a_signal(tmp_path):
     """`cartlab desk` prints its address in one line, and a signal ends it with status 0."""
     command = [sys.executable, "-m", "pipeline", "desk", str(tmp_path / "team"), "--no-browser"]
     with started(command, stderr=subprocess.PIPE, encoding="utf-8") as desk:
         assert desk.stderr is not None
         ready = re.fullmatch(r"ready: (http://127\.0\.0\.1:(\d+)/\S+/)\n", desk.stderr.readline())
         assert ready is not None
-        with pytest.raises(HTTPError, match="403"):  # led on without its cookie
+        with pytest.raises(HTTPError, match="403"):  # redirected, but without the cookie
             urllib.request.urlopen(ready[1], timeout=PATIENCE)
         taken = subprocess.run(
             [*command, "--port", ready[2]], stderr=subprocess.PIPE, encoding="utf-8", check=False
@@ -389,7 +389,7 @@ def test_the_command_says_its_address_and_ends_with_a_signal(tmp_path):
         assert desk.stderr.read() == f"cartlab: the desk ends: {number.name}\n"
 
 
-def test_a_row_is_typed_through_without_waiting(show, tmp_path):
+def test_typing_goes_on_while_a_field_is_saved(show, tmp_path):
     """While one field is saved, a user can type in the next without losing letters or messages."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
@@ -397,7 +397,7 @@ def test_a_row_is_typed_through_without_waiting(show, tmp_path):
         window.locator("#kind-decay > summary").press("Enter")
         window.locator("#more-0 > summary").press("Enter")
         window.locator("[name='experiments.0.window']").focus()
-        for text in ("0.1, 5", "my note", "", "100", ""):  # … and then leaves the row
+        for text in ("0.1, 5", "my note", "", "100", ""):  # the last Tab leaves the row
             window.keyboard.type(text, delay=15)
             window.keyboard.press("Tab")
 

@@ -32,8 +32,8 @@ def press(window, key: str) -> None:
         window.keyboard.press(key)
 
 
-def test_everybody_can_grade(show, tmp_path):
-    """Class page, team page and a refused change pass axe, and nothing exceeds the screen."""
+def test_the_grading_pages_are_accessible(show, tmp_path):
+    """Class page, team page and a refused change are accessible (axe) and fit the screen."""
     with DeskServer(folder=write_class(tmp_path / "grades")) as server:
         window = show(server.url)
         expect(window.locator("#teams tbody tr")).to_have_count(16)
@@ -57,7 +57,7 @@ def test_everybody_can_grade(show, tmp_path):
         assert fits(window)
 
 
-def test_a_class_is_gone_through_by_its_keys(show, tmp_path):
+def test_a_class_is_graded_by_keys(show, tmp_path):
     """Each key that changes points, for one team or for all with a flag, can be undone."""
     grades = write_class(tmp_path / "grades")
     with DeskServer(folder=grades) as server:
@@ -95,18 +95,18 @@ def test_a_class_is_gone_through_by_its_keys(show, tmp_path):
             expect(window.locator(needed)).to_be_in_viewport(ratio=1)
         press(window, "Enter")
         said = window.locator("#chosen").get_by_role("status")
-        expect(said).to_have_text("Saved.")  # at the place of the change
+        expect(said).to_have_text("Saved.")  # beside the changed points
         expect(said).to_be_in_viewport()
         expect(chosen).to_contain_text("0.5 / 1")
 
         press(window, "e")
         rows = window.locator("#list tbody tr")
-        expect(rows).to_have_count(5 - 1)  # one team has all points there
+        expect(rows).to_have_count(5 - 1)  # without the one team that has all points
         expect(window.get_by_label("Comment, which the teams read")).to_have_value(REASON)
         expect(rows.nth(1).locator("td").nth(1)).to_have_text("0.5")
         assert fits(window)
         window.keyboard.press("4")
-        expect(rows.nth(1).locator("td").nth(1)).to_have_text("0.75")  # not yet applied
+        expect(rows.nth(1).locator("td").nth(1)).to_have_text("0.75")  # shown but not yet applied
         rows.nth(0).get_by_role("checkbox").press("Space")
         window.get_by_label("Comment, which the teams read").focus()
         press(window, "Enter")
@@ -150,7 +150,7 @@ def test_a_class_is_gone_through_by_its_keys(show, tmp_path):
     assert (own.points, own.why, own.by) == (0.5, REASON, "Ada")
 
 
-def test_two_at_once_see_what_the_other_did(show):
+def test_two_tas_see_each_others_changes(show):
     """If two TAs change one class, each sees the other's change, and no change is lost."""
     if why := postgres.missing():
         pytest.skip(why)

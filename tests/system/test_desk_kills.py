@@ -1,6 +1,6 @@
-"""If the desk's server is killed at random, confirmed changes survive whole.
+"""If the desk's server is killed at random, confirmed changes stay complete.
 
-A change is confirmed by the answer to its form; grading again, by the page that says it is done.
+The answer to its form confirms a change; the page that says so confirms a new grading.
 """
 
 import http.client
@@ -62,7 +62,7 @@ class _Save:
 class _Upload(_Save):
     """Upload recordings of different lengths.
 
-    The desk answers an upload only after it has written the recording's table in the file too.
+    The desk answers an upload only after it has also written the recording's table in the file.
     """
 
     longest: float = 4.0
@@ -135,7 +135,7 @@ class _Regrade(_Save):
             book.finish(Batch(keys=(outcome.key,), shared={}), rubric=two_cart_rubric())
             book.override("team-04", "laws", 0.5, why="as told", by="Ada")
         self.team = a_submission(self.folder.with_name("team-x"), "two-cart")
-        self.rubric = self.folder.with_name("lab.toml")  # the class has the name of this file
+        self.rubric = self.folder.with_name("lab.toml")  # names the class
         shutil.copy(RUBRICS / "throne-2dof.toml", self.rubric)
 
     def act(self, who: Visitor) -> None:
@@ -163,7 +163,7 @@ def _whole(folder: Path) -> None:
 
 
 def kill_again_and_again(work: _Save, *, kills: int, seed: int) -> int:
-    """Kill the server many times and check its data after each.
+    """Kill the server many times, and check its data after each kill.
 
     Return how many changes were confirmed.
     """
@@ -180,7 +180,7 @@ def kill_again_and_again(work: _Save, *, kills: int, seed: int) -> int:
 def _act_until_killed(work: _Save, desk: subprocess.Popen, *, after: float) -> None:
     """Make one change after another until the desk is killed.
 
-    Its own processes must end with it.
+    The processes that the desk started must end too.
     """
     assert desk.stderr is not None
     who, started_by_it = Visitor.of(desk.stderr.readline().split()[1]), []

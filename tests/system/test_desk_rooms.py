@@ -20,7 +20,7 @@ show, fits = test_desk.show, test_desk.fits
 pytestmark = pytest.mark.usefixtures("work_here")
 
 
-def test_a_session_is_begun_watched_and_decided_on(show, tmp_path, real, monkeypatch):
+def test_a_session_is_watched_and_steered(show, tmp_path, real, monkeypatch):
     """During a session, buttons keep one run, end another, and the session goes on to its end."""
     monkeypatch.chdir(tmp_path)
     work = write_work(
@@ -98,7 +98,7 @@ def test_an_exploration_is_watched_and_steered(show, tmp_path):
         window.locator("#explore-port").select_option(bench.address)
         window.get_by_label("Parameter to find").select_option(label="the damping ratio ζ")
         window.get_by_label("to within ± %").fill("0,0001")
-        window.get_by_label("to within ± %").press("Enter")  # as its button does
+        window.get_by_label("to within ± %").press("Enter")  # Enter works like the button
 
         thought = window.locator("#thought")
         expect(thought).to_contain_text(re.compile(r"^ζ is known .* The next recording is \S+:"))
@@ -127,7 +127,7 @@ def test_an_exploration_is_watched_and_steered(show, tmp_path):
     assert chosen[1] not in {e.id for e in load_submission(work).experiments}
 
 
-def test_an_exercise_is_made_of_what_is_seen(show, tmp_path):
+def test_an_exercise_has_the_chosen_effect(show, tmp_path):
     """An instructor ticks an effect, moves its slider, and makes an exercise from it."""
     out = tmp_path / "exercise"
     with DeskServer() as server:
@@ -144,7 +144,7 @@ def test_an_exercise_is_made_of_what_is_seen(show, tmp_path):
         until(lambda: window.locator("#hidden img").get_attribute("src") != before)
         expect(window.locator("#hidden li")).to_contain_text("coulomb_friction on cart 1")
         expect(window.locator("#result")).to_have_text("1 effect is hidden in throne-2dof.")
-        expect(window.get_by_label("Masses")).to_be_hidden()  # of a chain of one's own
+        expect(window.get_by_label("Masses")).to_be_hidden()  # only a custom chain has this field
         assert fits(window)
         window.get_by_label("Folder").fill(str(out))
         window.get_by_role("button", name="Make it").click()
@@ -160,7 +160,7 @@ def test_an_exercise_is_made_of_what_is_seen(show, tmp_path):
     assert len(load_submission(out).experiments) > 10
 
 
-def test_a_rubric_is_begun_changed_previewed_and_saved_by_keyboard(show, tmp_path, monkeypatch):
+def test_a_rubric_is_edited_by_keyboard(show, tmp_path, monkeypatch):
     """A rubric is copied from a shipped one, changed, checked and saved by keyboard."""
     monkeypatch.chdir(tmp_path)
     write_class_of_two(tmp_path / "graded")

@@ -50,7 +50,7 @@ TUTORIALS = [page for page in PAGES if page.name.startswith(("tutorial", "comman
 @pytest.mark.slow
 @pytest.mark.sample
 @pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
-def test_what_a_page_says_to_type_works(page, monkeypatch, tmp_path, capsys):
+def test_the_commands_of_a_page_work(page, monkeypatch, tmp_path, capsys):
     """Each command of a page, typed in an empty folder, ends with the stated exit status.
 
     If the page quotes a line about open questions, its own commands print that line.
@@ -63,7 +63,7 @@ def test_what_a_page_says_to_type_works(page, monkeypatch, tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
-def test_the_slow_commands_of_a_page_work_too(page, monkeypatch, tmp_path):
+def test_the_slow_commands_of_a_page_work(page, monkeypatch, tmp_path):
     """The slow commands of a page also end with the exit status that the page states."""
     run_page(page, monkeypatch, tmp_path, slow=True)
 
@@ -106,7 +106,7 @@ def test_every_picture_is_shown_somewhere():
         assert picture.resolve() in shown, picture.name
 
 
-def test_the_files_that_contributors_are_sent_to_are_there():
+def test_the_files_named_to_contributors_exist():
     """Every path in CONTRIBUTING.md exists, unless the reader is asked to create it."""
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     paths = re.findall(r"`((?:pipeline|tests|docs|templates|rubrics)/[\w./-]+)`", text)

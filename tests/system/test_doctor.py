@@ -1,4 +1,4 @@
-"""`cartlab doctor` describes this installation truly."""
+"""`cartlab doctor` describes this installation correctly."""
 
 import json
 import os

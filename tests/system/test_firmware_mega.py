@@ -31,7 +31,7 @@ from tests.helpers.firmware_mega import Mega, build_sketch, memory, missing
 
 pytestmark = pytest.mark.skipif(bool(missing()), reason=f"{missing()} is not here")
 
-PERIOD = 0.004  # s of the Mega's time, at 115200 baud
+PERIOD = 0.004  # s between two lines at 115200 baud, in the Mega's time
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def program(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def board(program, tmp_path_factory):
-    """One simulated board for all tests; each test resets it."""
+    """Return one simulated board for all tests; each test resets it."""
     return Mega(program, tmp_path_factory.mktemp("board"))
 
 
@@ -96,7 +96,7 @@ def test_every_edge_at_the_pins_counts(mega):
     assert _readings(mega)[-1].counts == tuple(turns.sum(axis=0))
 
 
-def test_a_third_encoder_is_a_change_of_one_line(tmp_path):
+def test_a_third_encoder_needs_one_changed_line(tmp_path):
     """If it is built for three encoders, the sketch also counts at pins 20 and 21, and says so."""
     mega = Mega(build_sketch(tmp_path, encoders=3), tmp_path)
     mega.run(0.05)
@@ -109,7 +109,7 @@ def test_a_third_encoder_is_a_change_of_one_line(tmp_path):
     assert _readings(mega)[-1].counts == (30, -20, 10)
 
 
-def test_a_run_lasts_and_ticks_as_told(mega):
+def test_a_run_has_the_requested_length_and_period(mega):
     """A run of a tenth of a second sends 25 lines, 4 ms apart, and then the motor is off."""
     mega.send(encode(Start(wave=Wave.DELTA, frequency=10.0, amplitude=-4096)))
     mega.run(0.03)
@@ -120,8 +120,8 @@ def test_a_run_lasts_and_ticks_as_told(mega):
 
 
 @pytest.mark.parametrize("wave", [wave for wave in Wave if wave not in "dqm"])
-def test_waves_are_those_of_the_reference(mega, wave):
-    """Each wave of the board differs from that of the reference by at most one duty count.
+def test_waves_equal_those_of_the_reference(mega, wave):
+    """Each wave of the board differs from the reference's wave by at most one duty count.
 
     The board's floats have 32 bits, which hold 2000 counts to a thousandth of a count.
     """
@@ -148,8 +148,8 @@ def test_waves_are_those_of_the_reference(mega, wave):
 def test_it_closes_the_loop_over_its_pins(mega, gains):
     """Over the board's pins, a closed loop holds a simulated cart at the target.
 
-    The reference gets the board's own lines, so they differ only by rounding to 24 bits. A duty of
-    some thousand counts is exact to a thousandth, but may round up or down.
+    The reference computes from the board's own lines, so both differ only by rounding to 24 bits. A
+    duty of some thousand counts is exact to a thousandth, but its rounding may differ by a count.
     """
     start = Start(wave=Wave.SQUARE, encoder=1, frequency=0.5, amplitude=800)
     mega.send(encode(gains) + encode(start))
@@ -235,13 +235,13 @@ amplitude = 0.03
 frequency = 0.1
 settle = 0.1
 """
-STEP = 1e-3  # s between two exchanges of data between carts and board
+STEP = 1e-3  # s between exchanges of data between carts and board
 
 
 def _serve(mega: Mega, carts: VirtualCarts, link: Link, until: Callable[[], bool]) -> None:
     """Connect board and simulated carts, in real time or as fast as possible."""
     at, ahead = carts.counts(), mega.clock - time.monotonic()
-    volts = 5 / 4096 / carts.input_per_count  # the sketch's duty counts in those of the carts
+    volts = 5 / 4096 / carts.input_per_count  # per duty count of the sketch, in the carts' counts
     while not until():
         time.sleep(max(0.0, mega.clock - time.monotonic() - ahead))
         mega.send(link.receive())

@@ -94,7 +94,7 @@ def test_files_become_the_recordings_that_the_plan_asks_for(work, source):
     assert "# ours" in (work / "submission.toml").read_text(encoding="utf-8")
 
 
-def test_a_file_is_taken_once(work, source):
+def test_a_file_is_imported_once(work, source):
     """A file that was imported before is recognised by a second session, under any name."""
     put(source, "A.txt", STEP, at=100)
     assert len(take(work, source)[0]) == 1
@@ -120,7 +120,7 @@ def test_the_usb_logger_is_known(tmp_path, source):
     assert record.t[-1] == pytest.approx(4.998)
 
 
-def test_a_matrix_without_names_gets_its_columns_guessed(work, source):
+def test_the_columns_of_a_bare_table_are_guessed(work, source):
     """The columns of a table without headings are guessed, and a message asks to check them."""
     u = np.where((T > 1) & (T < 3), 0.5, 0.0)
     rows = "".join(
@@ -143,7 +143,7 @@ def test_a_matrix_without_names_gets_its_columns_guessed(work, source):
         ("sheet.csv", b"PK\x03\x04rest", "a zip archive"),
     ],
 )
-def test_what_is_no_record_is_refused_and_said(work, source, name, content, why):
+def test_an_unusable_file_is_refused_with_a_reason(work, source, name, content, why):
     """A file that cannot be used stays where it is and gets one line; nothing else changes."""
     before = (work / "submission.toml").read_bytes()
     put(source, name, content, at=1)
@@ -164,7 +164,7 @@ def test_an_export_for_matlab_is_a_record(work, source):
     assert record.y[0].max() == pytest.approx(200 * 0.00227)
 
 
-def test_everything_else_in_the_folder_is_said_once(work, source):
+def test_other_things_in_the_folder_are_named_once(work, source):
     """A script, a picture and a folder are each named once, with the reason for not importing them.
 
     Hidden files are ignored.
@@ -221,7 +221,7 @@ class Tidy(Notes):
             self._path.unlink(missing_ok=True)
 
 
-def test_a_file_that_vanishes_between_two_looks_ends_nothing(work, source):
+def test_a_file_that_disappears_is_skipped(work, source):
     """A file that disappears before it is read is skipped, and the others are imported."""
     put(source, "A.txt", "no table\n", at=1)
     put(source, "B.txt", STEP, at=2)
@@ -233,7 +233,7 @@ def test_a_file_that_vanishes_between_two_looks_ends_nothing(work, source):
 @pytest.mark.skipif(
     sys.platform == "win32" or os.geteuid() == 0, reason="root and Windows lock otherwise"
 )
-def test_a_locked_file_is_taken_once_it_can_be_read(work, source):
+def test_a_locked_file_is_imported_once_it_is_free(work, source):
     """A file that its program locks is reported once, and imported when the lock is gone."""
     put(source, "A.txt", STEP, at=1)
     (source / "A.txt").chmod(0)
@@ -251,7 +251,7 @@ def test_a_locked_file_is_taken_once_it_can_be_read(work, source):
     ]
 
 
-def test_the_command_takes_what_is_there(work, source):
+def test_the_command_imports_the_files_of_the_folder(work, source):
     """`cartlab acquire DIR --import FOLDER --once` lists what it imported."""
     put(source, "A.txt", STEP, at=100)
     result = CliRunner().invoke(
@@ -262,7 +262,7 @@ def test_the_command_takes_what_is_there(work, source):
     assert "1 files imported" in result.stderr
 
 
-def test_a_folder_that_is_none_is_said(work, source):
+def test_a_missing_folder_is_one_line(work, source):
     """If the folder to import from is missing, the command prints one line."""
     with pytest.raises(ConfigError, match="nowhere: not a folder"):
         Importer(work, source / "nowhere", observer=Notes())

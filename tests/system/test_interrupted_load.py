@@ -39,7 +39,7 @@ def test_ctrl_c_while_the_commands_load_is_quiet(at):
 
 
 @pytest.mark.parametrize("at", range(400, 1300, 200))
-def test_ctrl_c_while_a_command_loads_what_it_needs_is_one_line(tmp_path, at):
+def test_ctrl_c_while_a_command_loads_libraries_is_one_line(tmp_path, at):
     """Ctrl-C while a command loads its libraries for numbers, figures or pages gives one line."""
     out = tmp_path / "out"
     done = _pressed(at, "report", "submissions/one-cart", "--no-pdf", "--out", str(out))

@@ -24,10 +24,7 @@ PREFIX = "/user/ada/"
 
 @pytest.fixture
 def lab(tmp_path):
-    """A JupyterLab of the user Ada, as JupyterHub starts it, with its process, address and token.
-
-    With its process, address and token.
-    """
+    """Start a JupyterLab for the user Ada as JupyterHub does; return process, address and token."""
     pytest.importorskip("jupyterlab", reason="JupyterLab is not installed")
     pytest.importorskip("jupyter_server_proxy", reason="jupyter-server-proxy is not installed")
     if not entry_points(group="jupyter_serverproxy_servers", name="cartlab"):
@@ -67,7 +64,7 @@ def lab(tmp_path):
 
 
 def _status(url: str, **headers: str) -> int:
-    """Return the status of a form that is sent to an address."""
+    """Send a form to an address; return the HTTP status."""
     form = urllib.request.Request(url, data=b"folder=stolen", headers=headers)
     try:
         with urllib.request.urlopen(form, timeout=PATIENCE) as answer:

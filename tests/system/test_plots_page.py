@@ -25,17 +25,17 @@ def shown(window) -> str:
 
 
 @pytest.mark.usefixtures("work_here")
-def test_a_student_looks_through_runs_and_models(show, tmp_path):  # noqa: F811
-    """By keys a student compares two runs, then looks at one cart's residual and spectrum."""
+def test_runs_and_models_are_compared_by_keyboard(show, tmp_path):  # noqa: F811
+    """By keyboard a student compares two runs, then views one cart's residual and spectrum."""
     folder = a_submission(tmp_path / "team", "two-cart")
     with DeskServer(folder=folder) as server:
         window = show(server.url)
         window.get_by_role("button", name="Compare recordings and models").click()
         window.wait_for_url("**/report/compare.html")
         expect(window.locator(".result")).to_contain_text("The linear model fits worst in")
-        assert window.locator("canvas").evaluate_all(DRAWN) == [True, True]  # a plot a cart
+        assert window.locator("canvas").evaluate_all(DRAWN) == [True, True]  # one plot per cart
 
-        # By keys: a second run, one cart of two, the residual, its spectrum.
+        # Press keys to show a second run, one of the two carts, the residual and its spectrum.
         window.get_by_role("checkbox", name="step-2").focus()
         window.keyboard.press("Space")
         window.get_by_role("checkbox", name="x₂").focus()

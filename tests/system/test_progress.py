@@ -20,7 +20,7 @@ from tests.helpers.commandline import cartlab_here
 from tests.helpers.waiting import until
 
 
-def test_short_work_says_nothing_to_a_pipe(tmp_path):
+def test_short_work_prints_no_progress_to_a_pipe(tmp_path):
     """If stderr is no terminal, a short command prints only its summary, as plain text."""
     done = cartlab_here("report", EXAMPLES / "one-cart", "--out", tmp_path, "--no-pdf")
 
@@ -31,8 +31,8 @@ def test_short_work_says_nothing_to_a_pipe(tmp_path):
 
 
 @pytest.mark.parametrize("work", [progress_line, _batch_progress])
-def test_long_work_tells_a_pipe_what_it_is_about(work, monkeypatch, capsys):
-    """If stderr is no terminal, long work prints fewer and fewer lines, and none after its end."""
+def test_long_work_prints_progress_to_a_pipe(work, monkeypatch, capsys):
+    """If stderr is no terminal, long work prints lines ever more rarely, and none after its end."""
     monkeypatch.setattr("pipeline.cli.common.FIRST_WORD", 0.02)
     said, threads = [], threading.active_count()
 
@@ -44,13 +44,13 @@ def test_long_work_tells_a_pipe_what_it_is_about(work, monkeypatch, capsys):
         progress(*((3, 40, "fitting") if work is _batch_progress else ("fitting",)))
         began = time.monotonic()
         until(lambda: hear().count("fitting …") >= 3, "three lines")
-        # The three lines come after 0.02, 0.06 and 0.14 s at the soonest.
+        # The three lines come after 0.02, 0.06 and 0.14 s at the earliest.
         assert time.monotonic() - began > 0.1
     assert threading.active_count() == threads
     assert ("3 of 40: fitting" in hear()) == (work is _batch_progress)
 
 
-def test_what_was_known_before_is_no_speed():
+def test_earlier_grades_do_not_count_as_speed():
     """Submissions graded in an earlier run do not count in the estimate of the time left."""
     now = 0.0
     bar = Progress(get_time=lambda: now, disable=True)
@@ -64,8 +64,8 @@ def test_what_was_known_before_is_no_speed():
     assert bar.tasks[0].time_remaining == pytest.approx(8.0, abs=1.0)
 
 
-def test_a_time_says_what_it_is_of():
-    """The progress line says of each of its two times whether it has passed or is still to come."""
+def test_each_time_says_if_it_has_passed():
+    """The progress line says which of its two times has passed and which is still to come."""
     now = 0.0
     bar = Progress(*columns(), get_time=lambda: now, disable=True)
     show = counting(bar)
@@ -79,7 +79,7 @@ def test_a_time_says_what_it_is_of():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo terminals")
-def test_a_terminal_sees_what_is_done_and_for_how_long(tmp_path):
+def test_a_terminal_shows_stage_and_time(tmp_path):
     """On a terminal a line shows the current stage and the time; it is removed at the end."""
     import pty
 

@@ -23,7 +23,7 @@ def test_two_carts_have_the_masses_and_springs_found_before(two_carts):
     assert chain.k[2] == 0.0
 
 
-def test_the_repeat_that_stands_off_is_named(two_carts):
+def test_an_outlying_repeat_is_left_out(two_carts):
     """The first of five repeats, which moved differently, is left out by name."""
     assert [(one.experiment, one.is_wrong) for one in two_carts.left_out] == [("both-1", False)]
 
@@ -37,8 +37,8 @@ def test_single_carts_have_their_frequencies_and_friction(two_carts):
         assert alone[f"alone-2-{i}"].friction.present
 
 
-def test_the_closed_loop_is_compared_and_its_logged_effort_found_out(two_carts):
-    """Compared with the model, the log of the PID run has another sign or scale."""
+def test_a_wrongly_logged_input_is_found(two_carts):
+    """The logged input of the PID run has another sign or scale than that of the model."""
     closed = {h.cart: h for h in two_carts.hardware if h.loop == "closed"}
     assert set(closed) == {1, 2}
     # On the bench and in the model, the loop holds cart 1 at the set point.
@@ -56,7 +56,7 @@ def test_every_skipped_stage_says_why(two_carts):
     assert two_carts.feedback is not None
 
 
-def test_one_cart_from_steps_alone(real_data, tmp_path):
+def test_steps_alone_suffice_for_one_cart(real_data, tmp_path):
     """From steps of one cart alone, gain, frequency and damping get initial and final values."""
     folder = write_one_cart_submission(tmp_path / "one", real_data)
     analysis = analyse(load_submission(folder))

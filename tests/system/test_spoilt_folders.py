@@ -16,7 +16,7 @@ from tests.helpers.commandline import cartlab_here
 from tests.helpers.poison import poisoned
 from tests.system.test_any_submission import CHANNELS
 
-# Time of the processor, whatever else the machine does. `gap` also has a budget of its own.
+# Processor time, which does not depend on other programs. `gap` also has its own limit.
 MOST_TIME = 60.0  # s
 KINDS = ("decay", "step", "sine", "sweep", "closed_loop", "bode")
 FACTORS = (1e-9, 1e-3, 0.1, 0.5, 0.97, 2, 10, 1e3, 1e9)
@@ -149,7 +149,7 @@ def try_seed(command: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("command", ["report", "import"])
-def test_a_spoilt_submission_is_a_report_or_a_complaint(command):
+def test_a_spoilt_submission_gives_a_result_or_one_line(command):
     """For two spoilt submissions, `report` and `import` give a result or one line of error."""
     for seed in (0, 3):
         try_seed(command, seed)
@@ -159,7 +159,7 @@ def test_a_spoilt_submission_is_a_report_or_a_complaint(command):
 @pytest.mark.parametrize(
     ("command", "seeds"), [("report", 300), ("solution", 100), ("import", 300), ("gap", 30)]
 )
-def test_no_spoilt_submission_ends_in_a_traceback(command, seeds):
+def test_no_command_on_a_spoilt_submission_crashes(command, seeds):
     """For hundreds of spoilt submissions, every command gives a result or one line of error."""
     for seed in range(seeds):
         try_seed(command, seed)

@@ -8,7 +8,7 @@ from tests.helpers.places import ROOT
 
 
 def test_the_page_of_effects_is_the_catalogue():
-    """The page is what `docs/effects_page.py` writes, and each effect has its picture."""
+    """`docs/effects.md` is what `docs/effects_page.py` writes, and each effect has its picture."""
     page = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
     assert page == effects_page(), "run python -m docs.codegen"
     pictures = {path.stem for path in (ROOT / "docs" / IMAGES).iterdir()}
@@ -26,7 +26,7 @@ def test_the_page_of_effects_is_the_catalogue():
         ("a.svg", '<svg><image xlink:href="https://example.org/a.png"/></svg>'),
     ],
 )
-def test_what_a_browser_would_fetch_elsewhere_is_found(name, text, tmp_path):
+def test_loading_from_another_host_fails_the_build(name, text, tmp_path):
     """If a page would load a script, style, picture or font from another host, the build fails."""
     website = pytest.importorskip("docs.website", reason="the site needs cartlab[docs]")
     (tmp_path / name).write_text(text, encoding="utf-8")
@@ -35,7 +35,7 @@ def test_what_a_browser_would_fetch_elsewhere_is_found(name, text, tmp_path):
     assert "example.org" in found
 
 
-def test_links_and_local_files_are_no_loads(tmp_path):
+def test_links_and_local_files_are_allowed(tmp_path):
     """Links to other sites, namespaces and local files do not count as loading from outside."""
     website = pytest.importorskip("docs.website", reason="the site needs cartlab[docs]")
     (tmp_path / "a.html").write_text(
