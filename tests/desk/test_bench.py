@@ -55,14 +55,14 @@ def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
         assert visitor.post("/bench/0/press", wish="stop", number="0", plain="1").status == 303
         listener.join()
         states = re.findall(rb"event: state\ndata: (.*)\n", heard[0])
-        # The test cannot know how far the stop is when the first news is sent.
+        # When the first state is sent, the stop may or may not have been noticed.
         assert json.loads(states[0])["waits"] in ("Recording long.", "Stopping.")
         assert json.loads(states[-1])["waits"] == "The session is over."
         # A late viewer gets the earlier points.
         first, *_ = map(json.loads, re.findall(rb"event: points\ndata: (.*)\n", heard[0]))
         assert (first["run"], first["start"]) == (1, 0)
         assert first["points"][0][0] < 0.1 < 0.5 < first["points"][-1][0]
-        # The room gives notice when it shows the plan again: a page drawn just before then reloads.
+        # The last event says that the plan is shown again, so that open pages reload.
         assert heard[0].endswith(b"event: ended\ndata:\n\n")
         assert "Stopped. Start again" in visitor.get("/bench/0/").text
         assert visitor.get("/bench/0/events").body == b"event: ended\ndata:\n\n"
@@ -74,7 +74,7 @@ def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
     assert load_submission(work).experiments == ()
 
 
-def test_many_viewers_stop_nobody(tmp_path, real):
+def test_many_viewers_block_nobody(tmp_path, real):
     """If sixty viewers watch a session, eight are connected and the others refused at once.
 
     Other pages still open.
@@ -118,7 +118,7 @@ def test_the_bench_is_stopped_when_the_desk_is_gone(tmp_path, real, name, room, 
         (work / DIARY).write_text("of an older exploration", encoding="utf-8")
         visitor = Visitor.of(url[0])
         begun(visitor, work, name, room, port=real.address, **fields)
-        # The diary is shown once this exploration has written one.
+        # The diary of an older exploration stays hidden until this one has written its own.
         shown = re.findall(r'aria-labelledby="diary-title"(.*)>', visitor.get("/bench/0/").text)
         assert all(how.startswith(" hidden>") for how in shown)
         assert len(shown) == (room == "explore")
@@ -132,10 +132,10 @@ def test_the_bench_is_stopped_when_the_desk_is_gone(tmp_path, real, name, room, 
         kill(desk)
         assert desk.stderr is not None
         desk.stderr.close()
-    assert len(read_raw(work / "raw" / f"{name}-1.raw").content) > 10_000  # half of the bytes there
+    assert len(read_raw(work / "raw" / f"{name}-1.raw").content) > 10_000  # half a second of lines
 
 
-def test_a_plan_is_made_and_what_is_wrong_is_said(tmp_path):
+def test_a_plan_is_made_and_errors_are_named(tmp_path):
     """The desk makes the same plan as `cartlab plan`, and an error names a missing bench."""
     work = tmp_path / "team"
     work.mkdir()
@@ -154,7 +154,7 @@ def test_a_plan_is_made_and_what_is_wrong_is_said(tmp_path):
         assert visitor.post("/bench/0/press", wish="skip", number="0").status == 503
         assert visitor.post("/bench/0/press", wish="stop", number="0").status == 204
         until(lambda: "Waiting for the bench" not in visitor.get("/bench/0/").text)
-        assert not any('id="positions"' in page for page in shown)  # a session that never begins
+        assert not any('id="positions"' in page for page in shown)  # the session never began
         assert "no bench listens there" in shown[-1]
     assert load_plan(load_submission(work)).recordings
 
@@ -162,7 +162,7 @@ def test_a_plan_is_made_and_what_is_wrong_is_said(tmp_path):
 def test_exploring_has_a_form_of_its_own(tmp_path):
     """Exploring has its own form with its own port, and Enter in a field starts exploring.
 
-    Numbers may have a decimal comma as elsewhere, and an error names its field.
+    Numbers may have a decimal comma, and an error names its field.
     """
     work = a_recorded_cart(tmp_path / "team")
     with DeskServer(folder=work) as server:
@@ -174,7 +174,7 @@ def test_exploring_has_a_form_of_its_own(tmp_path):
             re.findall(r'action="/bench/0/(\w+)"', form)[0]: set(re.findall(r'name="(\w+)"', form))
             for form in forms
         }
-        ports = {"port", "other"} & fields["acquire"]  # for typing a port, if the list is empty
+        ports = {"port", "other"} & fields["acquire"]  # `other` takes a port that is not listed
         assert fields["explore"] == {*ports, "what", "error", "minutes"}
         assert fields["acquire"] == ports
         sound = {"port": "socket://127.0.0.1:1", "what": "all", "error": "1,5", "minutes": "0,5"}
@@ -210,7 +210,7 @@ def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
         said = f"The damping ratio ζ: ± {now:.2g} % now, ± {after:.2g} % after your experiment"
         assert said in answer.text
         assert answer.text.index(said) < answer.text.index("What would cartlab have chosen?")
-        assert 'value="0,01"' in answer.text  # as it was typed
+        assert 'value="0,01"' in answer.text  # as typed
         decay = visitor.get("/bench/0/weigh?kind=decay&seconds=20&cart=1")
         assert "but this is a decay" in decay.text
         for name, typed in (("amplitude", "20"), ("amplitude", "nan"), ("kind", "closed_loop"),
@@ -219,7 +219,7 @@ def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
             assert visitor.get(f"/bench/0/weigh?{urlencode(wrong)}").status == 422
         blank = visitor.get(f"/bench/0/weigh?{urlencode(mine | {'frequency': ''})}")
         assert blank.status == 422
-        assert 'name="frequency_end"' not in decay.text  # no fields of other kinds
+        assert 'name="frequency_end"' not in decay.text  # no fields of other kinds of experiment
         assert 'name="amplitude"' not in decay.text
         assert "found" not in re.findall('class="wrong" role="alert">(.*?)<', blank.text)[0]
         assert not (work / "plan.toml").exists()
@@ -240,7 +240,7 @@ def test_ports_are_listed_and_the_one_used_is_remembered(tmp_path, real):
     with DeskServer(folder=work) as server:
         visitor = Visitor.of(server.url)
         assert f'<option value="{real.address}">virtual bench' in visitor.get("/bench/0/").text
-        visitor.post("/bench/0/acquire", port=real.address, other=NOBODY)  # what is typed counts
+        visitor.post("/bench/0/acquire", port=real.address, other=NOBODY)  # the typed port is used
         until(lambda: "no bench listens there" in visitor.get("/bench/0/").text)
         page = visitor.get("/bench/0/").text
         assert f'<option value="{NOBODY}">{NOBODY} (used last, not found now)' in page

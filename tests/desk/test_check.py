@@ -84,7 +84,7 @@ def words_of(page: Answer) -> str:
     return " ".join(unescape(re.sub(r"<[^>]*>", " ", main[0])).split())
 
 
-def test_who_is_to_find_the_numbers_is_refused_the_report(lab):
+def test_students_who_must_find_the_numbers_get_no_report(lab):
     """Students who must find the numbers get no page, file or task that may show one.
 
     The answer is 403 with a link to the check.
@@ -105,8 +105,8 @@ def test_who_is_to_find_the_numbers_is_refused_the_report(lab):
     assert other.get(f"{HERE}report/results.json").status == 200
 
 
-def test_their_room_offers_the_check_in_place_of_the_report(lab):
-    """These students' page offers the check instead of the report."""
+def test_their_page_offers_the_check_instead_of_the_report(lab):
+    """The page of students who must find the numbers offers the check instead of the report."""
     page = lab("s1").get(HERE).text
     assert f'href="{HERE}check"' in page
     assert f"{HERE}report" not in page
@@ -115,10 +115,10 @@ def test_their_room_offers_the_check_in_place_of_the_report(lab):
     assert f'href="{HERE}check"' not in lab("s2").get(HERE).text
 
 
-def test_nobody_elses_work_tells_them_a_number(lab):
+def test_a_report_by_an_instructor_shows_them_no_number(lab):
     """If an instructor makes a report in a student's folder, the student sees no number of it.
 
-    The page only says that work goes on.
+    The page only says that some work is in progress.
     """
     student, instructor = lab("s1"), lab("i")
     assert instructor.post(f"{HERE}make-report").status == 303
@@ -126,10 +126,10 @@ def test_nobody_elses_work_tells_them_a_number(lab):
     told = set(re.findall(r"^data: (.+)$", student.get(f"{HERE}events").text, re.MULTILINE))
     assert told <= {"under way", "done"}
     assert "Work in this folder: done" not in instructor.get(HERE).text
-    assert "asks" not in words_of(student.get(f"{HERE}hand-in"))  # nor what the report asks about
+    assert "asks" not in words_of(student.get(f"{HERE}hand-in"))  # nor the report's questions
 
 
-def test_first_which_then_where_and_the_count_is_shown(lab, root):
+def test_the_check_says_which_number_is_wrong_then_where(lab, root):
     """First the check names the wrong number, then it says where to look.
 
     No page shows the value.
@@ -156,7 +156,7 @@ def test_first_which_then_where_and_the_count_is_shown(lab, root):
     assert "agree with your own recordings" in words_of(ask_check(student))
 
 
-def test_the_zip_has_the_asks_and_no_report(lab, root):
+def test_the_zip_has_the_answers_and_no_report(lab, root):
     """The zip has the file of answers, and the report only if the class sees reports."""
     student = lab("s1")
     ask_check(student)
@@ -170,7 +170,7 @@ def test_the_zip_has_the_asks_and_no_report(lab, root):
         assert archive.read(FILE) == (root / "team" / FILE).read_bytes()
 
 
-def test_what_is_computed_goes_into_no_zip_as_a_recording(lab, root):
+def test_a_result_file_is_not_zipped_as_a_recording(lab, root):
     """If a submission names a result file as a recording, the zip leaves this file out.
 
     The student is told that the file is computed.
@@ -182,7 +182,7 @@ def test_what_is_computed_goes_into_no_zip_as_a_recording(lab, root):
     assert "report/results.json" not in list_held(team, report=False)
 
 
-def test_no_upload_replaces_the_asks(lab, root):
+def test_no_upload_replaces_the_answers(lab, root):
     """The file of answers cannot be replaced by an upload, not even inside a zip."""
     student = lab("s1")
     ask_check(student)
@@ -195,7 +195,7 @@ def test_no_upload_replaces_the_asks(lab, root):
     assert (root / "team" / FILE).read_bytes() == before
 
 
-def test_on_ones_own_computer_the_submission_says_it(tmp_path):
+def test_on_a_students_computer_the_submission_hides_the_report(tmp_path):
     """On a student's own computer, a line in the submission hides the report.
 
     Anyone with the folder can remove the line.
@@ -217,13 +217,13 @@ def test_on_ones_own_computer_the_submission_says_it(tmp_path):
         ('role = "student"\nfolders = ["team"]\nrubric = "none.toml"', "there is no such rubric"),
     ],
 )
-def test_what_is_wrong_with_a_rubric_of_the_list_is_one_line(root, entry, said):
+def test_a_wrong_rubric_in_the_list_is_one_line(root, entry, said):
     """If the file of users names a wrong rubric, the error is one line and no desk starts."""
     with pytest.raises(ConfigError, match=said):
         read_users(write_users(root, f'[[users]]\nname = "x"\n{entry}\n'))
 
 
-def test_the_ta_reads_the_count_beside_the_grade(root):
+def test_the_ta_sees_how_often_the_check_was_run(root):
     """The team's page for the TA says how often the check was run."""
     for _ in range(2):
         cartlab_here("check", root / "other")

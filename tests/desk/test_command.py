@@ -24,7 +24,7 @@ USERS += f'secret_header = "X-Secret"\nsecret = "{"s" * 24}"\n'
         (["nowhere/team"], "does not exist"),
     ],
 )
-def test_what_it_cannot_do_is_one_line(options, why, tmp_path):
+def test_a_desk_that_cannot_start_is_one_line(options, why, tmp_path):
     """If the command cannot start, it ends with status 2, and nothing is served or written."""
     (tmp_path / "users.toml").write_text(USERS, encoding="utf-8")
     (tmp_path / "users.toml").chmod(0o600)
@@ -35,7 +35,7 @@ def test_what_it_cannot_do_is_one_line(options, why, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["users.toml"]
 
 
-def test_what_is_opened_is_known_by_what_lies_in_it(tmp_path):
+def test_the_kind_of_folder_is_recognised(tmp_path):
     """A folder or file with a gradebook opens as a class, any other folder as a submission."""
     grades = tmp_path / "grades"
     grades.mkdir()
@@ -63,7 +63,7 @@ ADDRESSES = (
 )  # fmt: skip
 
 
-def test_no_address_is_a_fault_of_the_desk(tmp_path, monkeypatch):
+def test_a_wrong_database_address_is_explained(tmp_path, monkeypatch):
     """If a database address is wrong, the error shows the right form, and no file is made."""
     monkeypatch.chdir(tmp_path)
     with DeskServer() as server:
@@ -76,10 +76,10 @@ def test_no_address_is_a_fault_of_the_desk(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_listed_address_that_makes_no_sense_shows_the_other_rooms(tmp_path):
+def test_one_bad_address_does_not_hide_the_other_gradebooks(tmp_path):
     """If one of a TA's gradebooks has a bad address, the others are still shown.
 
-    The page of the bad one says what is wrong.
+    The page of the bad gradebook says what is wrong.
     """
     (tmp_path / "grades").mkdir()
     books = '["postgresql://[::1", "grades"]'

@@ -111,10 +111,10 @@ def test_every_answer_has_its_policy(visitor, path):
 @pytest.mark.parametrize(
     "length", [f"Content-Length: {MOST_FORM + 1}", "Transfer-Encoding: chunked"]
 )
-def test_nobody_sends_more_than_is_read(visitor, length):
+def test_a_request_that_is_too_long_is_refused(visitor, length):
     """A request that is too long is refused, whether it states its length or not.
 
-    The desk goes on serving.
+    The desk still serves other requests.
     """
     host = f"127.0.0.1:{visitor.port}"
     head = (
@@ -131,7 +131,7 @@ def test_nobody_sends_more_than_is_read(visitor, length):
     assert visitor.get("/").status == 200
 
 
-def test_strangers_are_few_and_leave(visitor, monkeypatch):
+def test_idle_connections_are_few_and_short(visitor, monkeypatch):
     """Of 300 connections without a request the desk holds only some, for a short time.
 
     A visitor with the cookie is still served.
@@ -222,7 +222,7 @@ def test_a_name_may_come_in_utf_8_or_in_latin_1(name, tmp_path):
             assert through_proxy(port, other).get("/student/0/").status == 403
 
 
-def test_everybody_sees_their_own(lab):
+def test_students_see_only_their_own_folder(lab):
     """Students who open the same address each see their own folder and no other."""
     assert "one" in lab("s1").get("/student/0/").text
     assert "two" in lab("s2").get("/student/0/").text
@@ -236,7 +236,7 @@ def test_everybody_sees_their_own(lab):
     assert lab("s1").get("/").headers["location"] == "/student/0/"
 
 
-def test_a_form_outlasts_what_a_class_saves_meanwhile(lab, root):
+def test_a_form_can_be_saved_after_many_other_changes(lab, root):
     """A form can still be saved after others have saved many times.
 
     It saves only what was typed into it.
@@ -255,7 +255,7 @@ def test_a_form_outlasts_what_a_class_saves_meanwhile(lab, root):
     assert (answer.status, rows) == (409, [("Mine", shown["title"])])
 
 
-def test_students_and_tas_are_told_no_folder_of_the_server(lab, root):
+def test_students_and_tas_see_no_path_of_the_server(lab, root):
     """Students and TAs never see the path of a folder on the server.
 
     This holds for pages, refusals and progress messages. An instructor sees the paths.
@@ -288,14 +288,14 @@ def test_a_ta_sees_the_gradebooks_they_are_listed_for(lab):
     assert lab("t").get("/grades/1/").status == 404
 
 
-# For each room, by the first part of its address, the users of a lab server who may enter.
+# For each kind of page, the users of a lab server who may open it.
 ENTER = {"": "s t i w", "static": "s t i w", "student": "s i w", "grades": "t i w",
          "solution": "i w", "effects": "i w", "open": "", "exercises": "w", "rubric": "w",
          "bench": "w", "feedback": "s"}  # fmt: skip
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_each_role_has_its_rooms(lab, path):
+def test_each_role_has_its_pages(lab, path):
     """A user who asks for a page of another role is refused, whatever the request contains."""
     for role, name in {"s": "s1", "t": "t", "i": "i", "w": "w"}.items():
         let_in = role in ENTER[path.split("/")[1]].split()
@@ -317,7 +317,7 @@ def test_people_come_from_the_page_of_a_login(lab):
     assert lab("s1").send("/student/0/fill", b"", kind=kind, **page).status == 403
 
 
-def test_a_page_that_is_asked_for_writes_nothing(lab, root):
+def test_opening_a_page_writes_nothing(lab, root):
     """A GET request for any page changes no file."""
 
     def files() -> dict:
@@ -340,7 +340,7 @@ def test_nobody_names_a_folder_of_the_server(lab, tmp_path):
         assert lab(name).post("/open", folder=str(tmp_path)).status == 403
 
 
-def test_an_instructor_makes_in_the_workshop_and_nowhere_else(lab, root):
+def test_an_instructor_writes_only_in_the_workshop(lab, root):
     """An instructor writes exercises and rubrics only in the workshop.
 
     Ports come from the list of users.
@@ -432,7 +432,7 @@ def test_a_wrong_list_is_one_line(text, why, tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
-def test_a_secret_that_everybody_may_read_is_none(tmp_path):
+def test_a_file_of_users_that_others_can_read_is_refused(tmp_path):
     """The file of users is refused if others can read it."""
     path = write_users(tmp_path, '[[users]]\nname = "s1"\nrole = "student"\n')
     assert read_users(path)[0].site == "https://lab.example.edu"
@@ -442,7 +442,7 @@ def test_a_secret_that_everybody_may_read_is_none(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
-def test_a_list_that_everybody_may_change_is_none(tmp_path):
+def test_a_file_of_users_that_others_can_write_is_refused(tmp_path):
     """The file of users is refused if others can write it or its folder."""
     folder = tmp_path / "desk"
     folder.mkdir()
@@ -458,7 +458,7 @@ def test_a_list_that_everybody_may_change_is_none(tmp_path):
     assert read_users(path)[0].header == "X-Remote-User"
 
 
-def test_a_stranger_s_clock_runs(server):
+def test_a_connection_without_the_secret_times_out(server):
     """A connection that sends no secret is closed after a time limit."""
     began = time.monotonic()
     with socket.create_connection(("127.0.0.1", urlsplit(server.url).port or 0)) as line:

@@ -18,7 +18,7 @@ from tests.helpers.waiting import PATIENCE, started
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no such signals")
 
-# A desk whose threads can be interrupted by an exception at any moment.
+# A desk in which a line on stdin ends a thread or the whole process at any moment.
 DESK = """
 import ctypes, os, sys, threading
 from pipeline.cli import main
@@ -43,8 +43,8 @@ main()
 def a_desk(tmp_path: Path, *options: str) -> Iterator[tuple[subprocess.Popen, str, Callable]]:
     """Start a desk.
 
-    Yield the desk's process, its address, and a function that returns its further lines and its
-    log.
+    Yield the desk's process, its address, and a function that waits for its end and returns exit
+    status, output and log.
     """
     log = tmp_path / "state" / "cartlab" / "desk.log"
     environment = {**os.environ, "XDG_STATE_HOME": str(tmp_path / "state")}
@@ -56,7 +56,7 @@ def a_desk(tmp_path: Path, *options: str) -> Iterator[tuple[subprocess.Popen, st
 
         def ended() -> tuple[int, str, str]:
             assert desk.stderr is not None
-            said = desk.stderr.read()  # until the watching process has ended too
+            said = desk.stderr.read()  # ends when the watching process has ended too
             kept = log.read_text(encoding="utf-8") if log.exists() else ""
             return desk.wait(PATIENCE), said, kept
 
@@ -88,7 +88,7 @@ def test_a_signal_that_ends_the_desk_is_named(name, tmp_path):
         (signal.SIGSEGV, "Fatal Python error: Segmentation fault"),
     ],
 )
-def test_what_no_program_survives_is_told_all_the_same(number, told, tmp_path):
+def test_a_desk_killed_at_once_is_reported(number, told, tmp_path):
     """If a signal kills the desk at once, a second process, which watches the desk, reports it.
 
     After a crash in a library, it also reports the lines of code that were running.
@@ -112,7 +112,7 @@ def test_what_no_program_survives_is_told_all_the_same(number, told, tmp_path):
         ("exit now", 3, "was killed: by kill -9"),
     ],
 )
-def test_an_exception_or_an_exit_within_is_told(sent, status, told, tmp_path):
+def test_an_exception_or_exit_in_the_desk_is_reported(sent, status, told, tmp_path):
     """If an exception or an exit ends the desk, this is reported, with a traceback in the log."""
     with a_desk(tmp_path) as (desk, _, ended):
         assert desk.stdin is not None
@@ -152,7 +152,7 @@ def test_a_desk_outlives_its_terminal_and_an_exception_in_another_thread(tmp_pat
     assert 'raise ValueError("boom")' in kept or "ValueError: boom" in kept
 
 
-def test_what_a_killed_desk_left_goes_with_the_next_start(tmp_path, monkeypatch):
+def test_the_next_desk_removes_the_files_of_a_killed_one(tmp_path, monkeypatch):
     """The temporary folder of a killed desk is removed when the next desk starts.
 
     Folders of running desks, and folders that no desk made, stay.

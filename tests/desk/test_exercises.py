@@ -44,7 +44,7 @@ def wait_for(visitor: Visitor, address: str) -> str:
 # ------------------------------------------------------------------------------- exercises
 
 
-def test_every_effect_has_its_sizes_and_slides_about_them():
+def test_every_effect_has_valid_sizes_on_its_slider():
     """For every effect on each preset, the form's values are accepted by `simulate --hide`."""
     for preset, chain in PRESETS.items():
         for effect in CATALOGUE:
@@ -120,7 +120,7 @@ def test_a_class_is_what_simulate_writes(visitor, tmp_path):
     assert again.status == 422  # the folder is not empty
 
 
-def test_an_own_chain_and_what_is_wrong_with_it(visitor):
+def test_a_custom_chain_is_used_or_its_error_named(visitor):
     """A custom chain makes a bench; an error in it is named, and nothing is drawn."""
     chain = {"preset": "", "m": "2e-4 3e-4", "c": "5e-4, 5e-4", "k": "0 0.1 0.05"}
     page = shown(visitor, **chain, effect="input_delay")
@@ -158,7 +158,7 @@ def test_a_solution_is_what_the_command_writes(tmp_path):
 
 
 @pytest.mark.parametrize("folders", ["00000000000199999", "0" * 11 + "1" * 5000, "0", "-1", "²"])
-def test_a_number_of_folders_is_read_whole(visitor, tmp_path, folders):
+def test_the_number_of_folders_must_be_a_plain_number(visitor, tmp_path, folders):
     """The number of folders must be a plain number up to the limit; anything else is refused."""
     out = tmp_path / "class"
     sent = {"preset": "throne-1dof", "out": str(out), "seed": "0", "folders": folders}
@@ -167,8 +167,8 @@ def test_a_number_of_folders_is_read_whole(visitor, tmp_path, folders):
 
 
 @pytest.mark.parametrize("typed", ["~nosuch/x", "", "a\x00b", "a" * 300, "a/" * 5000])
-def test_a_place_that_is_none_is_said(visitor, typed):
-    """If a path cannot exist, every form refuses it; an example is `~` of an unknown user."""
+def test_an_impossible_path_is_refused(visitor, typed):
+    """Every form refuses a path that cannot exist, such as `~` of an unknown user."""
     sent = {"preset": "throne-1dof", "folders": "1", "seed": "0"}
     assert visitor.post("/open", folder=typed).status == 422
     assert visitor.post("/exercises/make", out=typed, **sent).status == 422

@@ -61,7 +61,10 @@ HOSTILE = (
 
 @pytest.fixture
 def lab(tmp_path, request):
-    """Start a desk with a graded class that is not yet released; return visitors by name."""
+    """Start a desk with a graded class that is not yet released;
+
+    yield a function that gives visitors.
+    """
     write_class(tmp_path / "grades", anonymous=getattr(request, "param", False))
     a_submission(tmp_path / "five")
     with DeskServer(users=write_users(tmp_path, USERS)) as server:
@@ -71,7 +74,7 @@ def lab(tmp_path, request):
 
 @pytest.fixture
 def released(lab):
-    """Return the same with the class released."""
+    """Return `lab` with the class released."""
     assert lab("prof").post(ROOM + "release", do="release").status == 303
     return lab
 
@@ -118,7 +121,7 @@ def test_students_see_nothing_before_the_release(lab):
     assert "Your feedback is not published yet." in student.get(HERE).text
 
 
-def test_of_another_s_feedback_there_is_no_address(released):
+def test_nobody_reads_the_feedback_of_another_student(released):
     """No number, path or role gives a student another's feedback, or lets them ask about it."""
     student = released("s4")
     assert student.get("/").headers["location"] == HERE
@@ -137,7 +140,7 @@ def test_of_another_s_feedback_there_is_no_address(released):
     assert released("s0").get(HERE).status == 404
 
 
-def test_the_grade_is_the_one_that_the_list_names(released):
+def test_a_student_sees_the_grade_that_the_list_names(released):
     """A student sees the grade of exactly that submission which the file of users names.
 
     No page shows anything about the server.
@@ -216,7 +219,7 @@ def test_a_request_goes_from_the_student_to_the_ta_and_back(released, book):
     assert ask(student, why="and page 4").status == 303
 
 
-def test_what_cannot_be_is_said_beside_the_field(released, book):
+def test_a_refused_request_is_explained_at_its_field(released, book):
     """If a request or answer is not allowed, a message is at its field and the typed text stays."""
     student, ta = released("s4"), released("Ada")
     long = "x" * (MOST_LETTERS + 1)
@@ -245,7 +248,7 @@ def test_what_cannot_be_is_said_beside_the_field(released, book):
     assert not book.entry("team-04").overrides
 
 
-def test_few_requests_wait_at_once(released):
+def test_a_team_may_have_only_a_few_open_requests(released):
     """A team with too many open requests cannot send another; a message at the field says so."""
     criteria = [criterion.id for criterion in two_cart_rubric().criteria]
     for criterion in criteria[:MOST_OPEN]:
@@ -270,7 +273,7 @@ def test_the_second_of_two_answers_sees_both(released, book):
     assert book.entry("team-04").overrides["laws"].by == "Ada"
 
 
-def test_hostile_words_are_words(released):
+def test_hostile_text_is_shown_as_plain_text(released):
     """Markup, templates and control characters in a request or answer appear as plain text."""
     student, ta = released("s4"), released("Ada")
     assert ask(student, why=HOSTILE).status == 303
@@ -315,7 +318,7 @@ def test_an_anonymous_class_has_anonymous_requests(released, book):
         assert other not in whole + student.get(HERE).text
 
 
-def test_a_gradebook_that_is_gone_says_nothing_of_the_server(released, tmp_path):
+def test_a_missing_gradebook_reveals_nothing_of_the_server(released, tmp_path):
     """If the gradebook cannot be read, the student's page shows neither its path nor the cause."""
     (tmp_path / "grades").rename(tmp_path / "elsewhere")
     for answer in (released("s4").get(HERE), ask(released("s4"))):
@@ -326,10 +329,10 @@ def test_a_gradebook_that_is_gone_says_nothing_of_the_server(released, tmp_path)
 
 
 @pytest.mark.parametrize("by_class", [False, True])
-def test_who_is_to_find_the_numbers_reads_none(tmp_path, by_class):
+def test_students_who_must_find_the_numbers_see_none(tmp_path, by_class):
     """Students who must find the numbers see points, outcomes and flags, but no numbers.
 
-    The rubric named for the student decides whether this holds, else the class's rubric.
+    The student's own rubric decides this, or without one the class's rubric.
     """
     write_class(tmp_path / "grades")
     a_submission(tmp_path / "five")

@@ -41,7 +41,7 @@ def changed(text: str, **values: str) -> str:
     return tomlkit.dumps(document)
 
 
-def test_a_form_that_nobody_touched_changes_nothing():
+def test_an_untouched_form_changes_nothing():
     """Values sent back as they were shown change nothing."""
     form = {path: field.value for path, field in fields(WHOLE).items()}
     flags = {"system.springs.shown": "1"}
@@ -53,7 +53,7 @@ NUMBER = st.from_regex(r"-?(0|[1-9][0-9]{0,5})(\.[0-9]{1,8})?", fullmatch=True)
 
 
 @given(NUMBER, NUMBER, st.text(st.characters(exclude_categories=["C", "Z"]), max_size=20))
-def test_what_was_typed_stands_in_the_file(initial, final, title):
+def test_numbers_are_written_as_typed(initial, final, title):
     """Numbers are written with the digits typed, and every other line stays as it was.
 
     If the table is missing, it is added first.
@@ -70,7 +70,7 @@ def test_what_was_typed_stands_in_the_file(initial, final, title):
     assert all(line.startswith(("title", "K_1")) for line in lost)
 
 
-def test_every_kind_of_field_goes_there_and_back():
+def test_every_kind_of_field_is_written_and_read_back():
     """A value typed into a field of any kind is written, read again and still valid."""
     given = {
         "authors": "s1, Ann\ns2", "system.position.per_count": "0.00227",
@@ -126,7 +126,7 @@ def test_a_row_has_the_fields_of_its_kind_only(table, keys):
     assert found - always == set(keys.split())
 
 
-def test_comments_outlive_every_change(tmp_path):
+def test_comments_survive_every_change(tmp_path):
     """All comments of the file that `cartlab new` writes survive every change."""
     new_submission(tmp_path / "team", carts=2)
     text = (tmp_path / "team" / "submission.toml").read_text(encoding="utf-8")
@@ -147,7 +147,7 @@ def test_comments_outlive_every_change(tmp_path):
         ("reported.state_space.A", "1 2\n3 4", "4 rows"), ("authors", "x" * 300, "200"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_said_at_its_field(path, value, wrong):
+def test_an_error_is_shown_at_its_field(path, value, wrong):
     """An error appears at its field, in the words of the file's own check, and nowhere else."""
     now = [Field(path=path, label="", kind=fields(WHOLE)[path].kind, value=value)]
     document = tomlkit.parse(WHOLE)

@@ -32,7 +32,7 @@ ROOM = "/grades/0/"
 
 @pytest.fixture
 def grades(tmp_path):
-    """Write the output of a grading."""
+    """Write the output of grading a class."""
     return write_class(tmp_path / "grades")
 
 
@@ -53,12 +53,12 @@ def names(answer: Answer) -> list[str]:
 
 
 def at(team: str, **more: str) -> str:
-    """Return the address of a team."""
+    """Return the address of a team's page."""
     return f"{ROOM}team?{urlencode({'of': team, **more})}"
 
 
 def version(answer: Answer, criterion: str) -> str:
-    """Return the version that this page shows of a criterion."""
+    """Return the version of a criterion that a page shows."""
     found = re.search(rf'value="{criterion}"><input type="hidden" name="seen" value="(.*?)"',
                       answer.text)  # fmt: skip
     assert found
@@ -103,7 +103,7 @@ def test_the_class_is_filtered_by_what_a_team_has(ta, grades):
         "state=hand": {"team-02"},
         "seen=yes": {"team-03"},
         "seen=no": set(entries) - {"team-03"},
-        "lost=laws": lost,  # of those who were graded
+        "lost=laws": lost,  # only graded teams
         "lost=laws&flag=shared_data&seen=no": {"team-02"} & lost,
         "q=S4": {"team-05"},
         "q=ünal": {"Ünal 学生 & co"},
@@ -149,7 +149,7 @@ def _batch(outcomes):
     return Batch(keys=tuple(outcome.key for outcome in outcomes), shared={})
 
 
-def test_what_is_drawn_is_of_the_class_as_it_is_now(ta, grades):
+def test_pages_show_the_current_gradebook(ta, grades):
     """Histogram, class page and feedback are drawn from the current gradebook, not from files."""
     before = ta.get(ROOM + "class.html").text
     picture = ta.get(ROOM + "distribution.svg")
@@ -168,7 +168,7 @@ def test_what_is_drawn_is_of_the_class_as_it_is_now(ta, grades):
 # ------------------------------------------------------------------------------- a team
 
 
-def test_a_team_has_its_numbers_beside_ours(ta):
+def test_reported_and_recomputed_numbers_are_shown(ta):
     """A team's page shows reported and recomputed numbers, the flag's evidence and the figure.
 
     Hostile text appears as plain text.
@@ -191,7 +191,7 @@ def test_a_team_has_its_numbers_beside_ours(ta):
     assert ta.get(f"{ROOM}figure?of=team-01&figure=../x").status == 404
 
 
-def test_a_record_stands_beside_its_criterion(tmp_path):
+def test_each_criterion_shows_its_recording(tmp_path):
     """Each criterion shows the recording of its number; other recordings are listed apart."""
     names = ("record-K_1", "record-omega_2-zeta_2", "response-1", "other")
     drawn = tuple((f"{n}.svg", f"<svg><title>{n}</title></svg>") for n in names)
@@ -223,7 +223,7 @@ def test_a_record_stands_beside_its_criterion(tmp_path):
     }
 
 
-def test_the_record_of_the_number_most_off_is_shown_first(tmp_path):
+def test_the_figure_of_the_largest_error_comes_first(tmp_path):
     """If a criterion has two figures, the first is that of the number with the largest error.
 
     The other figure is one click away, without scripts.
@@ -249,7 +249,7 @@ def test_the_record_of_the_number_most_off_is_shown_first(tmp_path):
         assert re.findall(shown, who.get(address).text) == ["response-1"]
 
 
-def test_what_lost_points_comes_first_and_is_shown(ta):
+def test_criteria_that_lost_points_come_first(ta):
     """Criteria that lost the most points come first; those with all points take one line each.
 
     Any criterion can be chosen.
@@ -297,7 +297,7 @@ def test_points_come_in_steps_of_the_rubric(out_of, step, steps):
     assert point_steps(out_of, step=step) == steps
 
 
-def test_points_are_changed_as_the_command_does(ta, grades):
+def test_points_are_changed_as_by_the_command(ta, grades):
     """Points can be changed with a reason and undone, and the history lists every change."""
     assert change(ta, "team-01", points="0,5", why="a clear plot").status == 303
     with Gradebook(grades) as book:
@@ -305,7 +305,7 @@ def test_points_are_changed_as_the_command_does(ta, grades):
         assert (given.points, given.why, given.by) == (0.5, "a clear plot", "Ada")
     page = ta.get(at("team-01"))
     assert "a clear plot" in page.text
-    for expected in ({}, {"laws": 0.5}):  # the undone change, and the undo
+    for expected in ({}, {"laws": 0.5}):  # undo the change, then undo that
         seen = version(ta.get(at("team-01", criterion="laws")), "laws")
         ta.post(at("team-01"), do="undo", criterion="laws", seen=seen)
         with Gradebook(grades) as book:
@@ -322,7 +322,7 @@ def test_points_are_changed_as_the_command_does(ta, grades):
     [{"points": "1", "why": " "}, {"points": "99", "why": "x"}, {"points": "-1", "why": "x"},
      {"points": "nan", "why": "x"}, {"points": "many", "why": "x"}],
 )  # fmt: skip
-def test_what_cannot_be_is_said_beside_the_field(ta, grades, fields):
+def test_an_error_is_shown_at_its_field(ta, grades, fields):
     """If points are not allowed, a message appears at their field, and nothing is written."""
     answer = change(ta, "team-01", **fields)
     assert answer.status == 422
@@ -343,7 +343,7 @@ def test_forged_forms_change_nothing(ta, grades):
         assert not book.entry("team-01").overrides
 
 
-def test_accept_goes_on_to_the_next_of_the_filter(ta):
+def test_accept_opens_the_next_team_of_the_filter(ta):
     """After a team is accepted, the next unreviewed team of the filter is shown.
 
     After the last one the class is shown. A mark can be removed.
@@ -363,7 +363,7 @@ def test_accept_goes_on_to_the_next_of_the_filter(ta):
     assert names(ta.get(address)) == expected[:1]
 
 
-def test_reasons_are_there_to_be_used_again(ta):
+def test_earlier_reasons_are_offered(ta):
     """The page offers reasons given before for the same criterion, the most common first."""
     for team, why in (("team-05", "b"), ("team-06", "a"), ("team-07", "b")):
         change(ta, team, points="1", why=why)
@@ -404,7 +404,7 @@ def two_desks(database, tmp_path):
         yield who("Ada", one), who("Bob", other), who("Eve", one)
 
 
-def test_two_change_the_same_and_one_is_told(two_desks, database):
+def test_the_second_of_two_changes_is_refused(two_desks, database):
     """If two TAs change the same points, the second sees both versions and changes nothing."""
     ada, bob, eve = two_desks
     seen = version(bob.get(at("team-04", criterion="laws")), "laws")
@@ -425,12 +425,12 @@ def test_two_change_the_same_and_one_is_told(two_desks, database):
     with Gradebook(database) as book:
         given = book.entry("team-04").overrides["laws"]
         assert (given.points, given.by) == (1.0, "Ada")  # the user whom the proxy named
-    assert eve.get(ROOM).status == 403  # a student has no class, whatever the list gives them
+    assert eve.get(ROOM).status == 403  # students see no class, whatever the list says
     assert eve.post(at("team-04"), do="accept").status == 403
     assert database not in ada.get(ROOM).text
 
 
-def test_of_changes_at_one_moment_one_counts(two_desks, database):
+def test_only_one_of_two_simultaneous_changes_counts(two_desks, database):
     """If two changes are sent from the same page at one moment, one counts and one is refused."""
     ada, bob, _ = two_desks
     for number in range(20):
@@ -452,7 +452,7 @@ def test_of_changes_at_one_moment_one_counts(two_desks, database):
 # ------------------------------------------------------------------------------ in and out
 
 
-def test_a_table_is_taken_over_whole_or_not_at_all(ta, grades):
+def test_a_table_is_imported_whole_or_not_at_all(ta, grades):
     """A table of points is imported only if every line is right; a wrong line is named.
 
     Importing the same table again adds nothing.
@@ -496,7 +496,7 @@ def test_the_export_is_that_of_the_command(ta, grades, tmp_path, platform):
             assert {name: archive.read(name) for name in archive.namelist()} == expected
 
 
-def test_a_roster_that_is_none_is_refused(ta):
+def test_a_table_that_is_not_a_roster_is_refused(ta):
     """Like the command, the desk refuses a table that is not the platform's roster."""
     assert upload(ta, ROOM + "export", "roster", "a,b\n1,2\n", lms="canvas").status == 422
     assert ta.post(ROOM + "export", lms="blackboard").status == 400
@@ -574,7 +574,7 @@ def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
         assert upload(who, ROOM + "import", "table", table).status == 303
 
 
-def test_the_lines_of_a_class_are_those_of_its_grades(grades):
+def test_each_line_of_a_class_equals_its_grade(grades):
     """Each line of the class page equals its grade, even if it comes from the cache."""
     from pipeline.grading.gradebook.class_lines import Line
 
@@ -594,7 +594,7 @@ def test_the_lines_of_a_class_are_those_of_its_grades(grades):
 def test_an_older_gradebook_gets_what_it_lacks(grades):
     """An older gradebook gets the tables that it lacks once, and keeps its content.
 
-    A gradebook opened before goes on working.
+    A gradebook that was already open still works.
     """
     with Gradebook(grades) as book:
         before = [(e.submission, e.grade) for e in book.entries()]
@@ -624,7 +624,7 @@ def listed(answer: Answer) -> dict[str, list[str]]:
 
 
 def together(**more: str) -> str:
-    """Return the address of the list of teams with frequencies in Hz that lost points for laws."""
+    """Return the address of the list of teams with a frequency in Hz that lost points for laws."""
     about = {"criterion": "laws", "flag": "hz_for_rad_s", "lost": "laws"}
     return f"{ROOM}together?{urlencode(about | more)}"
 
@@ -644,10 +644,10 @@ def apply(who: Visitor, address: str, form: str) -> Answer:
     return who.send(address, form.encode(), kind="application/x-www-form-urlencoded")
 
 
-def test_one_decision_for_several_is_looked_through_first(ta, grades):
+def test_one_decision_for_several_teams_is_previewed(ta, grades):
     """One decision for several teams shows points before and after, and changes only ticked teams.
 
-    It is signed and can be undone as a whole.
+    The decision carries the TA's name and can be undone as a whole.
     """
     with Gradebook(grades) as book:
         before = {entry.submission: entry.grade for entry in book.entries()}
@@ -696,7 +696,7 @@ def test_a_comment_changes_no_points(ta, grades):
     assert "Mind the unit." in ta.get(f"{ROOM}feedback/{quote(names[0])}/feedback.html").text
 
 
-def test_what_cannot_be_done_for_all_is_done_for_none(ta, grades):
+def test_a_decision_applies_to_all_teams_or_none(ta, grades):
     """If one decision for several teams is not possible for all of them, no team changes."""
     page = ta.get(together())
     names = list(listed(page))
@@ -713,15 +713,15 @@ def test_what_cannot_be_done_for_all_is_done_for_none(ta, grades):
     answer = apply(ta, together(), sent(page, *names, do="apply", points="0.5", why="one unit"))
     assert answer.status == 409
     assert answer.text.count("changed meanwhile") == 1
-    assert listed(answer)[names[1]][0] == "0"  # the version as it is now
+    assert listed(answer)[names[1]][0] == "0"  # the current version
     with Gradebook(grades) as book:
         given = {name: book.entry(name).overrides for name in names}
         assert {name: own["laws"].why for name, own in given.items() if own} == {names[1]: "mine"}
     again = apply(ta, together(), sent(answer, *names, do="apply", points="0.5", why="one unit"))
-    assert again.status == 303  # looked at once more
+    assert again.status == 303  # with the versions shown by the refusal
 
 
-def test_what_was_decided_keeps_its_place_in_the_list(ta):
+def test_criteria_keep_their_order_during_grading(ta):
     """Criteria keep their order while points are given, so that the next one is never skipped."""
 
     def titles() -> list[str]:
@@ -765,7 +765,7 @@ def test_only_a_decision_of_this_class_is_undone(ta, grades):
         assert book.entry("team-01").overrides["laws"].points == 0.5
 
 
-def test_to_undo_a_decision_leaves_what_came_after_it(ta, grades):
+def test_undoing_a_decision_keeps_later_changes(ta, grades):
     """If a decision is undone, teams that were changed after it keep their points and are named."""
     page = ta.get(together())
     names = list(listed(page))

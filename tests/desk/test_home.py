@@ -102,7 +102,7 @@ def test_what_can_be_opened_comes_first_and_nothing_hidden_is_listed(root):
 def test_no_folder_outside_of_the_root_is_listed(root, inside):
     """No folder outside the root, no hidden folder and no file can be listed.
 
-    The desk answers with one sentence.
+    The desk answers such a request with one sentence.
     """
     with pytest.raises(ConfigError):
         list_folders(root, inside)
@@ -131,13 +131,13 @@ def test_what_can_be_opened_is_never_cut_off(root):
     assert list_folders(root, "years").found[0].inside == "years/zoe"
 
 
-def test_the_whole_disk_is_no_root(monkeypatch):
+def test_the_home_folder_replaces_the_whole_disk(monkeypatch):
     """If the desk starts at the root of the disk, it lists the home folder instead."""
     monkeypatch.chdir(Path(Path.cwd().anchor))
     assert find_root() == Path.home()
 
 
-def test_a_folder_is_chosen_for_what_one_wants_to_do(root):
+def test_a_task_is_chosen_then_a_folder(root):
     """The user chooses a task on the first page, then a folder, and gets the page for the task."""
     with DeskServer() as server:
         visitor = Visitor.of(server.url)

@@ -1,4 +1,4 @@
-"""Long work runs in separate processes, so that nobody waits for another's work."""
+"""Long work runs in separate processes, so that nobody waits for another person's work."""
 
 import re
 import sys
@@ -26,7 +26,7 @@ def jobs():
     jobs.close()
 
 
-def test_a_slow_folder_is_waited_for_by_who_looks_at_it_only(tmp_path):
+def test_a_slow_folder_delays_no_other_folder(tmp_path):
     """A slow task of one folder does not delay another, however many requests wait for it."""
     slow, workers = a_submission(tmp_path / "slow"), WorkerPool()
 
@@ -53,7 +53,7 @@ def test_a_slow_folder_is_waited_for_by_who_looks_at_it_only(tmp_path):
 
 
 @pytest.mark.usefixtures("work_here")
-def test_a_stop_waits_for_no_thread(tmp_path):
+def test_a_stop_is_answered_while_all_threads_are_busy(tmp_path):
     """Even if all threads are busy, a request to stop the bench is answered at once."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
@@ -81,7 +81,7 @@ def test_a_process_that_does_not_start_ends_its_job(tmp_path, jobs, monkeypatch)
     assert (job.state, "its process could not be started" in job.said) == ("failed", True)
 
 
-def test_a_fault_of_our_own_is_told(tmp_path, jobs):
+def test_a_failed_task_shows_its_last_lines(tmp_path, jobs):
     """If a task itself fails, the message ends with the process's last lines."""
     job = jobs.start("nonsense", title="Nonsense", place=tmp_path)
     until(lambda: job.over)
@@ -89,10 +89,10 @@ def test_a_fault_of_our_own_is_told(tmp_path, jobs):
     assert "KeyError: 'nonsense'" in job.said
 
 
-def test_one_thing_at_a_time_in_a_folder(tmp_path, jobs):
+def test_a_folder_has_one_task_at_a_time(tmp_path, jobs):
     """In each folder only one task runs at a time, and any other task is refused.
 
-    To ask for the running task again gives the same job.
+    A second request for the running task gives the same job.
     """
     given = {"place": tmp_path, "folder": str(a_submission(tmp_path / "team"))}
     job = jobs.start("make_report", title="The report", **given)
@@ -104,7 +104,7 @@ def test_one_thing_at_a_time_in_a_folder(tmp_path, jobs):
     assert jobs.start("make_solution", title="The solution", **given) is not job
 
 
-def test_a_job_survives_a_reload_is_stopped_or_dies_and_tells_its_stages(tmp_path):
+def test_a_job_survives_a_reload_and_can_be_stopped(tmp_path):
     """Every later page shows a running job and its stage.
 
     A job that is stopped or killed leaves no half-written file and can be started again.
@@ -143,7 +143,7 @@ def test_a_job_survives_a_reload_is_stopped_or_dies_and_tells_its_stages(tmp_pat
         assert wrongs(page) == []
 
 
-def test_a_file_that_ends_the_process_costs_its_own_row(tmp_path):
+def test_a_file_that_ends_the_process_fails_only_its_row(tmp_path):
     """If a file ends the process that reads it, only the row of this file fails.
 
     The other files are shown, and the next task gets a new process.
@@ -174,7 +174,7 @@ def test_a_file_that_ends_the_process_costs_its_own_row(tmp_path):
         assert "the process ended" not in visitor.get(HERE).text
 
 
-def test_a_fault_costs_its_task_and_not_the_process(tmp_path):
+def test_a_failed_task_does_not_end_the_process(tmp_path):
     """If a task fails, the error's kind is named, and the same process does the next task."""
     workers = WorkerPool()
     with pytest.raises(Failed, match=r"cartlab itself failed \(TypeError: .*please report it"):
@@ -189,7 +189,7 @@ def test_a_fault_costs_its_task_and_not_the_process(tmp_path):
     workers.close()
 
 
-def test_a_process_that_was_used_up_is_replaced_before_the_next_task(tmp_path, monkeypatch):
+def test_a_used_up_process_is_replaced_in_time(tmp_path, monkeypatch):
     """After its last allowed task, a process is replaced before the next task arrives."""
     monkeypatch.setattr("pipeline.processes._TASKS_EACH", 1)
     workers = WorkerPool()
@@ -214,7 +214,7 @@ def test_a_lab_server_has_its_processes_before_students_ask(tmp_path):
         ("pipeline.desk.bench.process", b'{"folder": ".", "explore": [[], 7]}\n'),
     ],
 )
-def test_who_dies_of_an_exception_got_no_signal(module, line):
+def test_an_exception_that_ends_a_process_is_reported(module, line):
     """If an exception ends a process, the exception is reported, even while a thread waits."""
     process = LineProcess(module)
     try:
@@ -241,7 +241,7 @@ def test_a_job_whose_thread_fails_is_over(jobs, monkeypatch, tmp_path):
     assert (job.state, job.said) == ("failed", "the desk itself failed (MemoryError: no more)")
 
 
-def test_who_serves_is_gone_and_so_is_the_work(tmp_path):
+def test_workers_end_with_a_killed_desk(tmp_path):
     """If a desk is killed, its worker processes end by themselves."""
     workers = WorkerPool()
     workers.do("list_files", folder=str(tmp_path))

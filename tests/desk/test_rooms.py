@@ -1,4 +1,4 @@
-"""The line at the top of every page."""
+"""The line of links at the top of every page."""
 
 from pipeline.desk.books import Books
 from pipeline.desk.rooms import list_rooms

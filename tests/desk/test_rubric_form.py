@@ -30,7 +30,7 @@ def visitor() -> Iterator[Visitor]:
 
 @pytest.fixture
 def lab(tmp_path) -> Path:
-    """Write a rubric of an instructor."""
+    """Write an instructor's rubric."""
     path = tmp_path / "lab.toml"
     path.write_text(ONE_CART, encoding="utf-8")
     return path
@@ -80,7 +80,7 @@ def test_a_rubric_is_saved_only_when_valid(visitor, tmp_path):
     assert load_rubric(path) == load_rubric(Path("throne-2dof"))
 
 
-def test_a_rubric_that_was_changed_meanwhile_is_not_written_over(visitor, lab):
+def test_a_rubric_changed_meanwhile_is_not_overwritten(visitor, lab):
     """If a rubric was changed on disk meanwhile, both versions are shown and nothing is written."""
     seen = editor(visitor, lab).value("seen")
     lab.write_text(f"# by another\n{ONE_CART}", encoding="utf-8")
@@ -99,12 +99,12 @@ def test_a_rubric_that_was_changed_meanwhile_is_not_written_over(visitor, lab):
     ["", "rubric.txt", "/nowhere/at/all/rubric.toml", "a\x00.toml", "~nosuch/r.toml",
      "a" * 300 + ".toml"],
 )  # fmt: skip
-def test_a_rubric_lies_where_it_can(visitor, file):
+def test_a_bad_file_name_is_refused(visitor, file):
     """A bad file name for a rubric gets one clear sentence."""
     assert visitor.post("/rubric/save", file=file, text="x", seen="new").status == 422
 
 
-def test_a_rubric_is_found_again_whatever_its_folder_is_called(visitor, tmp_path):
+def test_a_rubric_is_found_in_a_folder_of_any_name(visitor, tmp_path):
     """A rubric is found even if its folder's name has characters that are special in addresses."""
     folder = tmp_path / "R+D & co #2 100%"
     folder.mkdir()
@@ -134,7 +134,7 @@ def test_every_shipped_rubric_is_one_click_away(visitor, lab, tmp_path, monkeypa
     assert begun.value("seen") == "new"
 
 
-def test_a_workshop_shows_its_own_files_alone(tmp_path):
+def test_a_workshop_shows_only_its_own_files(tmp_path):
     """An instructor sees the rubrics in the workshop, but none outside, even through a link."""
     shop = tmp_path / "shop"
     for path in (shop / "deep" / "a.toml", shop / ".hidden" / "b.toml", tmp_path / "c.toml"):
@@ -173,7 +173,7 @@ def test_the_form_and_the_text_may_both_be_changed(visitor, lab):
     assert written == text.replace("points = 1\n", "points = 1.5\n", 1)
 
 
-def test_a_number_that_cannot_be_is_told_at_its_field_and_line(visitor, lab):
+def test_a_wrong_number_is_shown_at_its_field_and_line(visitor, lab):
     """A wrong number is reported at its field and at its line of the text; nothing is saved.
 
     The typed text stays on the page.
@@ -190,7 +190,7 @@ def test_a_number_that_cannot_be_is_told_at_its_field_and_line(visitor, lab):
     assert lab.read_text(encoding="utf-8") == ONE_CART
 
 
-def test_a_number_outlives_a_mistake_in_the_text(visitor, lab):
+def test_a_number_survives_a_mistake_in_the_text(visitor, lab):
     """While the text is wrong, a number changed in the form waits and is inserted later."""
     page = editor(visitor, lab)
     wrong = ONE_CART.replace("version = 1", "version = one")
@@ -203,7 +203,7 @@ def test_a_number_outlives_a_mistake_in_the_text(visitor, lab):
 
 
 @pytest.mark.parametrize("shown", ["", "no JSON", "[]", '{"criteria.none.points": "1"}', "7"])
-def test_a_form_of_nobody_s_page_is_no_fault(visitor, lab, shown):
+def test_an_unknown_field_changes_nothing(visitor, lab, shown):
     """If a form has a field that its page never showed, nothing changes and no error occurs."""
     seen = editor(visitor, lab).value("seen")
     fields = {"file": str(lab), "text": ONE_CART, "seen": seen, "shown": shown}
@@ -249,7 +249,7 @@ def test_a_preview_shows_each_team_before_anything_is_written(tmp_path, lab):
         assert "Grade graded again with this rubric" in after
 
 
-def test_a_preview_tells_what_needs_the_recordings(tmp_path, lab):
+def test_a_preview_says_what_needs_the_recordings(tmp_path, lab):
     """If a change of the rubric needs the recordings, the preview says so and guesses no points."""
     write_class_of_two(tmp_path / "graded")
     with DeskServer() as server:
@@ -275,7 +275,7 @@ def test_a_preview_of_a_class_without_names_shows_none(tmp_path, lab):
     assert "team-1" not in shown
 
 
-def test_a_preview_is_of_a_class_that_is_open_and_a_rubric_that_is_valid(visitor, lab):
+def test_a_preview_needs_an_open_class_and_a_valid_rubric(visitor, lab):
     """A preview of a class that is not open is refused; a wrong rubric leads back to the editor."""
     page = editor(visitor, lab)
     for number in ("", "0", "-1", "²", "9" * 30):

@@ -154,7 +154,7 @@ def test_from_an_empty_folder_to_the_zip(room):
     assert found.problem == ""
 
 
-def test_what_is_wrong_stands_beside_its_field(filled):
+def test_an_error_is_shown_beside_its_field(filled):
     """An error in the form appears beside its field, in the words of the file's own check.
 
     The form keeps what was typed, and the file is unchanged.
@@ -195,7 +195,7 @@ def test_a_unit_in_doubt_is_asked_about_beside_its_field(room):
 def test_a_row_is_corrected_in_place(filled):
     """Kind, carts and window of a recording can be corrected in its row.
 
-    Its table can be removed while the file stays.
+    The recording's table in the file can be removed while the recording stays.
     """
     visitor, folder = filled
     page = visitor.get(HERE)
@@ -213,7 +213,7 @@ def test_a_row_is_corrected_in_place(filled):
     assert "not in submission.toml" in visitor.get(HERE).text
 
 
-def test_what_another_tab_saved_is_not_what_was_typed_here(filled):
+def test_a_change_in_another_tab_is_shown(filled):
     """If another tab saved first, both versions of the fields changed in this tab are shown."""
     visitor, _ = filled
     page = visitor.get(HERE)
@@ -249,7 +249,7 @@ def test_a_recording_is_moved_aside_and_comes_back(filled):
 
 
 @pytest.mark.parametrize("packed", [True, False])
-def test_a_name_that_does_not_show_is_stored_under_one_that_does(room, packed):
+def test_invisible_characters_in_a_file_name_are_replaced(room, packed):
     """Special spaces and invisible characters in a file's name are replaced, with a message."""
     visitor, folder = room
     raw, marks = some_files()[0][1], "\u00a0\u200b\u202f\ufeff"
@@ -271,7 +271,7 @@ def test_a_name_that_does_not_show_is_stored_under_one_that_does(room, packed):
 
 
 @pytest.mark.parametrize("named", [True, False])
-def test_moving_aside_waits_its_turn_before_it_looks(filled, named):
+def test_moving_aside_waits_for_other_changes(filled, named):
     """A recording is moved aside only after other changes of the folder have ended.
 
     If a table then names the file, or it is gone, nothing moves.
@@ -297,7 +297,7 @@ def test_moving_aside_waits_its_turn_before_it_looks(filled, named):
 
 
 def test_handing_in_warns_of_open_questions(filled):
-    """Before handing in, the page counts the open questions, but offers the zip all the same."""
+    """Before handing in, the page counts the open questions, but still offers the zip."""
     visitor, folder = filled
     ask_for(folder, "zeta", "level")
     for answered, open_ in ((None, "2 questions"), ("zeta", "1 question "), ("level", "")):
@@ -359,7 +359,7 @@ def test_what_is_handed_in_is_shown_before(filled):
     assert page.count(f'href="{HERE}questions#question-') == len(asked)
 
 
-def test_only_a_report_of_these_files_says_what_was_assumed(filled):
+def test_only_an_up_to_date_report_lists_assumptions(filled):
     """The page lists a report's assumptions with reasons only if the report is up to date."""
     visitor, folder = filled
     ask_for(folder)
@@ -375,7 +375,7 @@ def test_only_a_report_of_these_files_says_what_was_assumed(filled):
         ("system.springs", ", wall-1: there (no step tells)"),
         ("system.input.sign", ": -1 (all steps go down)"),
     ]
-    (folder / "notes.md").write_text("# Discussion\n", encoding="utf-8")  # no number depends on it
+    (folder / "notes.md").write_text("# Discussion\n", encoding="utf-8")  # notes change no number
     assert "system.springs" in visitor.get(HERE + "hand-in").text
     os.utime(folder / load_submission(folder).experiments[0].file, (1e9, 1e9))
     page = visitor.get(HERE + "hand-in").text
@@ -383,7 +383,7 @@ def test_only_a_report_of_these_files_says_what_was_assumed(filled):
     assert page.count("You will see them once the report of these files is made.") == 2
 
 
-def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
+def test_a_failed_report_does_not_prevent_handing_in(filled):
     """If the report cannot be made, the error is named, and the zip is offered without a report."""
     visitor, folder = filled
     (folder / "report").symlink_to(folder.parent)
@@ -392,11 +392,11 @@ def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
     assert "There is no report yet, so the zip will not contain one." in page
     assert (
         page.count("You will see them once the report of these files is made.") == 2
-    )  # not: none, nothing
+    )  # not that there are none
     assert "report/report.pdf" not in zipped(visitor).namelist()
 
 
-def test_a_recording_dropped_under_two_names_is_said_to_be_a_copy(room):
+def test_a_recording_uploaded_under_two_names_is_called_a_copy(room):
     """If a file is uploaded under two names, the message names the original.
 
     Only the first file gets a table.
@@ -410,7 +410,7 @@ def test_a_recording_dropped_under_two_names_is_said_to_be_a_copy(room):
     assert "is a copy of" not in visitor.get(HERE).text  # said once
 
 
-def test_of_a_file_that_cannot_be_read_no_columns_are_asked(filled):
+def test_columns_of_an_unreadable_file_are_not_asked_for(filled):
     """Columns are asked for only if a file can be read and its columns are unclear."""
     visitor, folder = filled
     (folder / "data" / "new.csv").write_bytes(b"")
@@ -420,8 +420,8 @@ def test_of_a_file_that_cannot_be_read_no_columns_are_asked(filled):
     assert "state its columns" in visitor.get(HERE).text
 
 
-def test_an_essay_and_an_empty_file_are_no_recordings(filled):
-    """A text file and an empty file are not counted as recordings; they need the student."""
+def test_an_essay_and_an_empty_file_do_not_count_as_recordings(filled):
+    """A text file and an empty file do not count as recordings; the student must act on them."""
     visitor, folder = filled
     before = re.search(r"(\d+) recordings, all understood", visitor.get(HERE).text)
     assert before
@@ -441,7 +441,7 @@ def test_a_recording_that_was_cut_short_is_not_green(filled):
     assert "the file is truncated: export it again" in page
 
 
-def test_edits_from_outside_show_and_are_not_written_over(filled):
+def test_edits_from_outside_are_shown_and_not_overwritten(filled):
     """If the file was changed outside the desk, the change is shown and not overwritten.
 
     A form or an answer made before the change is refused.
@@ -467,7 +467,7 @@ def test_edits_from_outside_show_and_are_not_written_over(filled):
     assert (folder / "notes.md").read_text(encoding="utf-8") == "Other words.\n"
 
 
-def test_what_a_page_showed_is_known_a_hundred_states_later():
+def test_a_page_can_be_saved_a_hundred_changes_later():
     """A page can be saved even if others have saved a hundred times since it was opened.
 
     The memory used for each person is limited.
@@ -483,7 +483,7 @@ def test_what_a_page_showed_is_known_a_hundred_states_later():
     assert desk.shown("1039", to="") is not None
 
 
-def test_of_two_at_once_one_is_told_of_the_other(filled):
+def test_only_one_of_many_simultaneous_saves_succeeds(filled):
     """If eight windows save the same state at once, one succeeds and the others are refused."""
     visitor, folder = filled
     seen = visitor.get(HERE).value("seen")
@@ -515,7 +515,7 @@ edit_submission(folder, change, seen=text_digest(submission_text(folder)))
 
 
 def test_another_process_waits_its_turn(filled):
-    """If a terminal command and the desk change the file at the same time, the later is refused."""
+    """If a terminal command and the desk change the file at once, the later change is refused."""
     visitor, folder = filled
     seen = visitor.get(HERE).value("seen")
     command = [sys.executable, "-c", _SAVES, str(folder), "terminal"]
@@ -534,7 +534,7 @@ def test_another_process_waits_its_turn(filled):
     assert load_submission(folder).title == "terminal"
 
 
-def test_of_two_answers_at_once_none_is_lost(filled):
+def test_no_simultaneous_answer_is_lost(filled):
     """If several answers are sent at once, each is in the notes or gets a conflict message."""
     visitor, folder = filled
     asked = ask_for(folder, *(f"zeta_{i}" for i in range(6)))
@@ -584,7 +584,7 @@ def test_lines_of_a_note_stay_lines(filled):
 
 
 @pytest.mark.parametrize("text", ["version = \n", "\xff", "version = 1\n[system]\ncarts = 9\n"])
-def test_a_broken_file_is_shown_as_such(filled, text):
+def test_a_broken_submission_file_is_shown_with_its_error(filled, text):
     """If the file is broken, the page opens, says what is wrong, and offers no report."""
     visitor, folder = filled
     (folder / NAME).write_bytes(text.encode("latin-1"))
@@ -595,7 +595,7 @@ def test_a_broken_file_is_shown_as_such(filled, text):
 
 
 @pytest.mark.parametrize("broken", [b"version = \n", b"\xff", b"#" * 1_000_001])
-def test_a_text_that_cannot_be_read_is_not_taken_and_gives_way(broken, filled):
+def test_an_unreadable_submission_file_is_refused_and_can_be_replaced(broken, filled):
     """A `submission.toml` that cannot be read is not accepted as an upload.
 
     A valid one replaces an unreadable one on disk.
@@ -605,7 +605,7 @@ def test_a_text_that_cannot_be_read_is_not_taken_and_gives_way(broken, filled):
     (folder / NAME).unlink()
     visitor.upload(HERE + "files", [(NAME, broken)])
     assert "not uploaded" in visitor.get(HERE).text
-    (folder / NAME).write_bytes(broken)  # by an editor
+    (folder / NAME).write_bytes(broken)  # as an editor would
     visitor.upload(HERE + "files", [(NAME, sound)])
     assert load_submission(folder).experiments
     visitor.upload(HERE + "files", [(NAME, b"version = 1\n")])
@@ -614,7 +614,7 @@ def test_a_text_that_cannot_be_read_is_not_taken_and_gives_way(broken, filled):
 
 
 @pytest.mark.parametrize("broken", [b"\xff", b"x" * 1_000_001])
-def test_notes_that_cannot_be_read_are_not_taken_and_give_way(broken, tmp_path, workers):
+def test_unreadable_notes_are_refused_and_can_be_replaced(broken, tmp_path, workers):
     """Notes that are too long or not UTF-8 are refused; readable ones replace such notes."""
     for name in ("notes.md", "there/notes.md"):
         (said,) = take_upload(name, io.BytesIO(broken), tmp_path, workers=workers)
@@ -636,7 +636,7 @@ NAMES = {
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_file_goes_nowhere_but_into_data(name, tmp_path, workers):
+def test_an_upload_is_always_stored_in_data(name, tmp_path, workers):
     """An uploaded recording is stored in `data`, whatever its name."""
     (tmp_path / "team").mkdir()
     take_upload(name, io.BytesIO(b"time,x1\n0,1\n"), tmp_path / "team", workers=workers)
@@ -647,7 +647,7 @@ def test_a_file_goes_nowhere_but_into_data(name, tmp_path, workers):
         assert [path.parent for path in found] == [Path("data")]
 
 
-def test_nothing_is_written_over(tmp_path, workers):
+def test_an_upload_never_replaces_a_file(tmp_path, workers):
     """An upload never replaces a file: an equal one is ignored, a different one gets a new name."""
     for raw in (b"one", b"one", b"two", b"two"):
         take_upload("a.csv", io.BytesIO(raw), tmp_path, workers=workers)
@@ -662,7 +662,7 @@ def test_nothing_is_written_over(tmp_path, workers):
     assert (tmp_path / "data" / "b-2.csv").read_bytes() == b"mine"
 
 
-def test_files_of_one_name_at_once_are_all_kept(tmp_path, workers):
+def test_simultaneous_uploads_of_one_name_are_all_kept(tmp_path, workers):
     """If several files of one name are uploaded at once, each is kept under its own name."""
     raws = [str(i).encode() * 200_000 for i in range(8)]
 
@@ -687,8 +687,11 @@ def test_a_linked_data_folder_is_refused(tmp_path, workers):
     assert list((tmp_path / "theirs").iterdir()) == []
 
 
-def test_an_archive_is_taken_by_the_limits_of_a_hand_in(tmp_path, workers):
-    """Recordings in an uploaded zip file are stored; bombs, links and paths outside are refused."""
+def test_an_uploaded_archive_must_obey_the_limits(tmp_path, workers):
+    """Recordings in an uploaded zip file are stored;
+
+    zip bombs, links and paths outside are refused.
+    """
 
     def zipped(*members: tuple[str, bytes]) -> io.BytesIO:
         buffer = io.BytesIO()
@@ -709,7 +712,7 @@ def test_an_archive_is_taken_by_the_limits_of_a_hand_in(tmp_path, workers):
     assert [path.name for path in tmp_path.rglob("*.csv")] == ["a.csv"]
 
 
-def test_a_folder_has_room_for_a_hand_in(tmp_path, workers, monkeypatch):
+def test_a_folder_accepts_files_up_to_the_limits(tmp_path, workers, monkeypatch):
     """A folder accepts files up to the limits on a submission's size and number of files."""
     monkeypatch.setattr(uploads, "MAX_DATA_BYTES", 10)
     (tmp_path / "whole").mkdir()
@@ -725,7 +728,7 @@ def test_a_folder_has_room_for_a_hand_in(tmp_path, workers, monkeypatch):
     assert said.text.startswith("'6.csv': not uploaded: a submission has at most 2 files")
 
 
-def test_what_is_no_part_of_a_hand_in_takes_no_room(tmp_path, workers, monkeypatch):
+def test_files_outside_the_zip_do_not_count_towards_the_limits(tmp_path, workers, monkeypatch):
     """Files that will not be in the zip do not count towards the limits on a folder."""
     for name in ("set-aside/old.csv", "report/report.html", "gap/gap.json", "raw/session-1/a.bin"):
         (tmp_path / name).parent.mkdir(parents=True)
@@ -778,7 +781,7 @@ def test_a_report_page_that_is_not_ours_runs_nothing(filled):
 # -------------------------------------------------------------------------------- jobs
 
 
-def test_the_gap_is_looked_for_as_a_job(filled):
+def test_the_gap_is_found_as_a_job(filled):
     """The desk finds the gap as a job and shows the same page as `cartlab gap`."""
     visitor, folder = filled
     assert visitor.get(HERE + "gap/gap.html").status == 404
@@ -789,7 +792,7 @@ def test_the_gap_is_looked_for_as_a_job(filled):
     assert json.loads((folder / "gap" / "gap.json").read_bytes())["schema"] == "cartlab-gap/1"
 
 
-def test_a_task_says_why_it_came_to_nothing(tmp_path, workers):
+def test_a_failed_task_says_why(tmp_path, workers):
     """If a task fails, the student reads the command's own message, and the process goes on."""
     with pytest.raises(Failed, match="contains no recordings"):
         workers.do("fill_tables", folder=str(tmp_path))
@@ -798,7 +801,7 @@ def test_a_task_says_why_it_came_to_nothing(tmp_path, workers):
     assert workers.do("list_files", folder=str(tmp_path)) == []
 
 
-def test_saving_what_is_not_valid_changes_nothing(tmp_path):
+def test_an_invalid_change_is_not_saved(tmp_path):
     """A change that makes the file invalid is not saved, in whichever way it is made."""
     folder = a_submission(tmp_path / "team")
     before = (folder / NAME).read_bytes()
@@ -808,7 +811,7 @@ def test_saving_what_is_not_valid_changes_nothing(tmp_path):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such names, and links need rights")
-def test_files_that_are_not_read_are_named_with_what_to_do(filled):
+def test_unread_files_are_listed_with_advice(filled):
     """Files that are not read are listed with advice, for example a spreadsheet or a link."""
     visitor, folder = filled
     assert "Not read" not in visitor.get(HERE).text
@@ -830,7 +833,7 @@ def answers(page: str) -> dict[str, str]:
     return {unescape(label): unescape(value) for value, label in found}
 
 
-def test_a_unit_is_set_by_one_click_with_what_was_typed_beside_it(room):
+def test_one_click_sets_a_unit_and_saves_the_form(room):
     """One click sets a unit and saves the rest of the form; the doubt is gone."""
     visitor, folder = room
     visitor.upload(HERE + "files", some_files())
@@ -844,7 +847,7 @@ def test_a_unit_is_set_by_one_click_with_what_was_typed_beside_it(room):
 
 
 @pytest.mark.parametrize(("label", "there"), [("No spring here", False), ("Spring present", True)])
-def test_a_spring_that_nothing_tells_is_answered_by_one_click(label, there, room):
+def test_one_click_answers_whether_a_spring_exists(label, there, room):
     """One click answers whether a spring exists.
 
     The doubt is then gone, even if the answer confirms the file.
@@ -859,7 +862,7 @@ def test_a_spring_that_nothing_tells_is_answered_by_one_click(label, there, room
     assert label not in answers(visitor.get(HERE).text)
 
 
-def test_what_a_report_contradicts_is_taken_back_by_one_click(filled):
+def test_one_click_reverses_a_contradicted_sign(filled):
     """If an up-to-date report contradicts the stated sign, one click reverses it."""
     visitor, folder = filled
     ask_for(folder)
@@ -876,7 +879,7 @@ def test_what_a_report_contradicts_is_taken_back_by_one_click(filled):
     assert "Reverse the sign" not in answers(visitor.get(HERE).text)  # the report is out of date
 
 
-def test_the_sign_of_turned_runs_is_stated_by_one_click(tmp_path):
+def test_one_click_states_the_sign_of_turned_runs(tmp_path):
     """If some runs have the opposite sign, one click states the sign in these runs only."""
     folder = a_submission(tmp_path / "team")
 
@@ -907,7 +910,7 @@ def test_the_sign_of_turned_runs_is_stated_by_one_click(tmp_path):
     assert {id_: sign for id_, sign in signs.items() if sign} == {turned.id: -1}
 
 
-def test_remarks_that_differ_in_a_number_are_said_once(room):
+def test_warnings_that_differ_in_a_number_appear_once(room):
     """Warnings that differ only in a number appear once, with the smallest and largest number."""
     visitor, _ = room
     for name, interval in (("a", 0.0103), ("b", 0.0104), ("c", 0.0105)):
@@ -920,7 +923,7 @@ def test_remarks_that_differ_in_a_number_are_said_once(room):
     assert "one sample every 10.3 to 10.5 ms" in page
 
 
-def test_a_closed_loop_folds_what_controller_ran_until_it_is_filled(filled):
+def test_the_controller_of_a_closed_loop_is_folded_until_filled_in(filled):
     """A closed loop's row asks for its controller in one folded line until the line is filled in.
 
     Only the row of a dwell asks for a frequency.
@@ -947,7 +950,7 @@ def test_a_closed_loop_folds_what_controller_ran_until_it_is_filled(filled):
     assert set(re.findall(r'name="experiments\.(\d+)\.frequency"', page)) == dwells
 
 
-def test_a_file_in_doubt_leaves_the_next_action_where_the_way_is(filled):
+def test_a_file_in_doubt_does_not_change_the_next_step(filled):
     """If the report is up to date, the next step is to hand in, even if a file is in doubt.
 
     The doubt stays visible.
@@ -962,7 +965,7 @@ def test_a_file_in_doubt_leaves_the_next_action_where_the_way_is(filled):
     assert "Look at 1 file</a>" in shown
 
 
-def test_a_cart_that_hardly_moves_is_said_to_be_held_or_free(room):
+def test_one_click_states_whether_a_cart_was_held(room):
     """If a cart hardly moves, one click states whether it was held or free."""
     visitor, folder = room
     rows = [f"{i / 100},0,{i % 200},{i % 6}" for i in range(400)]
@@ -978,7 +981,7 @@ def test_a_cart_that_hardly_moves_is_said_to_be_held_or_free(room):
     assert "hardly moves" not in (folder / NAME).read_text(encoding="utf-8")
 
 
-def test_one_click_answers_what_several_recordings_ask(room):
+def test_one_click_answers_for_several_recordings(room):
     """If several recordings raise the same question, one click answers it for all of them.
 
     A click that names recordings which do not exist is refused.
@@ -1008,7 +1011,7 @@ def test_one_click_answers_what_several_recordings_ask(room):
     assert visitor.send(HERE + "answer-together", body, kind=kind).status == 409  # outdated
 
 
-def test_what_needs_a_person_comes_first_and_the_rest_is_folded(filled):
+def test_recordings_that_need_the_student_come_first(filled):
     """In each group, recordings that need the student come first, and the others are folded."""
     visitor, folder = filled
     assert "rest-decay" not in visitor.get(HERE).text
@@ -1020,7 +1023,7 @@ def test_what_needs_a_person_comes_first_and_the_rest_is_folded(filled):
     assert re.match(r"\d+ understood</summary>", rest)
 
 
-def test_what_was_not_taken_does_not_look_like_what_was(room):
+def test_refused_files_look_different_from_accepted_ones(room):
     """Accepted, changed and refused files differ in look and in words."""
     visitor, _ = room
     raw = some_files(most=1)[0][1]
@@ -1034,7 +1037,7 @@ def test_what_was_not_taken_does_not_look_like_what_was(room):
     assert said["refused"]
 
 
-def test_rows_are_grouped_by_kind_and_folded_when_all_is_well(filled):
+def test_rows_are_grouped_by_kind_and_folded(filled):
     """Rows are grouped by kind; a group is folded unless one of its recordings has a problem."""
     visitor, folder = filled
     page = visitor.get(HERE).text
@@ -1046,7 +1049,7 @@ def test_rows_are_grouped_by_kind_and_folded_when_all_is_well(filled):
     assert "1 file needs you" in page
 
 
-def test_an_excel_file_is_dropped_like_any_other(room):
+def test_an_excel_file_is_uploaded_like_any_other(room):
     """An Excel file is uploaded like any other; if it is broken, a message says so."""
     visitor, folder = room
     (name, raw), *_ = [one for one in some_files() if one[0].startswith("step")]

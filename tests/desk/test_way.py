@@ -62,14 +62,14 @@ READY = Facts(recordings=33, sound=True, report="current", questions=3)
 def test_each_step_follows_from_the_facts(facts, states, following):
     """The next step is the first one that is not done.
 
-    A file in doubt does not hold up a report that exists.
+    If a report exists, a file in doubt does not change the next step.
     """
     steps = find_steps(facts)
     assert " ".join(step.state for step in steps) == states
     assert next_step(steps).key == following
 
 
-def test_a_zip_that_was_downloaded_as_it_is_now_ends_the_way():
+def test_downloading_the_current_zip_is_the_last_step():
     """Once the current zip has been downloaded, all steps are done and the last one is shown."""
     facts = Facts(recordings=1, sound=True, report="current", handed=True)
     assert {step.state for step in find_steps(facts)} == {"done"}

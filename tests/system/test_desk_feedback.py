@@ -1,4 +1,4 @@
-"""The way from a student's request to the TA's answer, in a real browser, by keyboard alone."""
+"""A student asks about a grade and the TA answers, in a real browser, by keyboard alone."""
 
 import socket
 from pathlib import Path
@@ -32,7 +32,7 @@ gradebooks = ["grades"]
 
 @pytest.fixture
 def lab(tmp_path):
-    """A lab server that browsers reach through a proxy."""
+    """Start a desk that browsers reach through a proxy, and yield its address."""
     write_class(tmp_path / "grades")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]

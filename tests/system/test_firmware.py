@@ -1,4 +1,4 @@
-"""The firmware's C core equals the reference controller in Python, byte for byte."""
+"""The firmware's C core sends the same bytes as the reference controller in Python."""
 
 import ctypes
 import shutil
@@ -83,7 +83,7 @@ COMMANDS = st.one_of(
 
 @st.composite
 def _damaged(draw):
-    """Commands with a byte lost, added or changed."""
+    """Draw commands with a byte lost, added or changed."""
     data = bytearray(b"".join(draw(st.lists(COMMANDS, min_size=1, max_size=3))))
     at = draw(st.integers(0, len(data) - 1))
     data[at : at + draw(st.integers(0, 1))] = draw(st.binary(max_size=1))
@@ -103,7 +103,7 @@ TICKS = st.tuples(
 )
 @example(encoders=2, session=[(b"?;?;?;d;s;o;o;1;5;1;", [([0, 0, 0], 1)])])
 @settings(max_examples=200)
-def test_any_session_is_that_of_the_reference(library, encoders, session):
+def test_any_session_equals_that_of_the_reference(library, encoders, session):
     """Whatever bytes arrive, firmware and reference give the same duties and lines.
 
     The host reads after each byte here, because the firmware drops lines for which its buffer has
@@ -126,7 +126,7 @@ def test_any_session_is_that_of_the_reference(library, encoders, session):
 
 
 @pytest.mark.parametrize("wave", [wave for wave in Wave if wave != Wave.MULTISINE])
-def test_whole_runs_are_those_of_the_reference(library, wave):
+def test_whole_runs_equal_those_of_the_reference(library, wave):
     """For ten seconds of each wave at an odd frequency, firmware and reference send equal lines."""
     firmware, reference = _both(library)
     start = Start(wave=wave, frequency=3.7, amplitude=4321, cycles=37)
@@ -143,8 +143,8 @@ def test_whole_runs_are_those_of_the_reference(library, wave):
 
 
 @pytest.mark.parametrize("end", [0.5, 2.0, 30.0])
-def test_chirps_end_where_they_are_told(library, end):
-    """A chirp ends at the requested frequency: below, above or equal to its start (a sine)."""
+def test_chirps_end_at_the_requested_frequency(library, end):
+    """A chirp ends at the requested frequency, whether below, above or equal to its start."""
     firmware, reference = _both(library)
     start = Start(wave=Wave.CHIRP, frequency=2.0, amplitude=1500, cycles=8)
     for core in (firmware, reference):
@@ -159,7 +159,7 @@ def test_chirps_end_where_they_are_told(library, end):
     "gains",
     [PidGains(kp=2.0, ki=3.0, kd=0.05), StateGains(gains=(3.0, 0.2, -1.0, 0.1), prefilter=2.0)],
 )
-def test_loops_are_those_of_the_reference(library, gains):
+def test_loops_equal_those_of_the_reference(library, gains):
     """With both control laws, firmware and reference agree on a bench that moves."""
     firmware, reference = _both(library)
     start = Start(wave=Wave.SQUARE, encoder=1, frequency=1.0, amplitude=700, cycles=3)
@@ -304,7 +304,7 @@ def test_a_reset_forgets_gains_and_chirp_end(library):
         assert firmware.take() == reference.take()
 
 
-def test_the_clock_may_go_round(library):
+def test_the_clock_may_overflow(library):
     """A run and the watchdog continue when the 32-bit counter of milliseconds overflows."""
     core, _ = _both(library)
     core.receive(b"k;" + encode(Start(wave=Wave.SQUARE, frequency=0.1, amplitude=50)))
@@ -318,7 +318,7 @@ def test_the_clock_may_go_round(library):
         assert reading.ms == ms
 
 
-def test_a_host_that_does_not_read_loses_whole_lines(library):
+def test_a_host_that_does_not_read_loses_only_whole_lines(library):
     """If the host does not read, the firmware drops whole lines and never part of one."""
     core, _ = _both(library)
     core.receive(encode(Start(wave=Wave.SINE, frequency=1.0, amplitude=4000, cycles=9)))
@@ -327,7 +327,7 @@ def test_a_host_that_does_not_read_loses_whole_lines(library):
     sent = core.take()
     readings = [parse_reading(line) for line in sent.splitlines()]
     assert sent.endswith(b"\n")
-    assert 200 < len(sent) < 256  # the room of the ring buffer, less one line
+    assert 200 < len(sent) < 256  # the ring buffer has 256 bytes, and one line may not fit
     assert [reading.ms for reading in readings if reading] == list(range(len(readings)))
 
 
@@ -353,8 +353,8 @@ def test_noise_breaks_nothing(tmp_path):
         assert done.returncode == 0, done.stderr
 
 
-# The functions of a 32-bit board, and of Teensy's additions to Arduino, that the sketch needs. They
-# have no bodies.
+# Declarations of the functions that the sketch needs from a 32-bit board and from Teensy's
+# additions to Arduino.
 ARDUINO = """
 #include <stdint.h>
 #include <stdlib.h>
@@ -416,7 +416,7 @@ def test_more_digits_than_fit_keep_their_place(library, text):
     "text",
     ["", "+", ".", "e5", "1e", "1e+", "--1", "1.2.3", "0x10", "inf", "nan", "1_0", "1 ", "1e999"],
 )
-def test_what_is_no_number_is_refused(library, text):
+def test_words_and_infinities_are_refused_as_numbers(library, text):
     """Words, incomplete numbers and infinities are refused as numbers."""
     assert not library.read_number(text.encode(), False, ctypes.byref(ctypes.c_double()))
 
@@ -451,15 +451,15 @@ def test_every_edge_of_an_encoder_counts(library, steps):
 
 
 @pytest.mark.parametrize("at", range(4))
-def test_a_transition_that_cannot_be_is_counted_as_missed(library, at):
-    """If both channels change at once, the count stays and counting goes on from the new state."""
+def test_an_impossible_transition_counts_as_missed(library, at):
+    """If both channels change at once, one missed transition is noted, and counting goes on."""
     encoder = _Quadrature(state=RING[at])
     for state in (RING[(at + 2) % 4], RING[(at + 3) % 4]):
         library.quadrature_update(ctypes.byref(encoder), state)
     assert (encoder.count, encoder.missed) == (1, 1)
 
 
-def test_full_scale_is_the_protocols(library):
+def test_a_target_is_clipped_to_full_scale(library):
     """A target beyond full scale is clipped to the full scale of the protocol."""
     core, _ = _both(library)
     core.receive(encode(Start(wave=Wave.SQUARE, frequency=1.0, amplitude=-5000)))

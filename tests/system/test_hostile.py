@@ -117,7 +117,7 @@ def _below(folder: Path) -> list[tuple[str, int]]:
     )
 
 
-def test_every_hand_in_has_its_row_and_its_reason(graded):
+def test_every_submission_has_a_row_with_a_reason(graded):
     """Each hostile submission gets a row with a one-line reason; the grader itself never fails."""
     base, names, done = graded
     assert done.returncode == 1, done.stderr
@@ -139,18 +139,18 @@ def test_every_hand_in_has_its_row_and_its_reason(graded):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="Linux says which file a descriptor belongs to")
-def test_nothing_is_written_elsewhere_and_nobody_is_called(graded):
+def test_grading_writes_only_into_its_folder_and_makes_no_connection(graded):
     """Grading writes only into its own folder, makes no connection and starts only Python."""
     base, _, _ = graded
     lines = (base / "audit.txt").read_text(encoding="utf-8").splitlines()
     events = [line.partition("\t")[::2] for line in lines]
-    assert {"open", "subprocess.Popen"} <= {event for event, _ in events}  # it may listen
+    assert {"open", "subprocess.Popen"} <= {event for event, _ in events}  # the audit log works
     own = (str(base / "out-"), str(base / "hook"), os.devnull)
     compiled = ("__pycache__", "numba", "matplotlib", "fontconfig")  # the caches of libraries
     for event, at in events:
         if event == "subprocess.Popen":
             program = at.strip("'")
-            libraries = ("fc-list", "lscpu", "uname")  # for fonts, threads and the processor
+            libraries = ("fc-list", "lscpu", "uname")  # look for fonts, threads and the processor
             assert program in (sys.executable, "") or Path(program).name in libraries, at
         elif event == "pickle.find_class":
             assert at.strip("'") not in ("os", "posix", "nt"), at
@@ -186,7 +186,7 @@ def test_no_page_runs_or_fetches_anything_of_theirs(graded):
         assert SECRET not in text
         (script,) = re.findall(r"<script[^>]*>(.*?)</script>", text, re.DOTALL)
         hashed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-        assert f"script-src 'sha256-{hashed}'" in text  # the browser would run no other script
+        assert f"script-src 'sha256-{hashed}'" in text  # no other script can run
         assert "alert(1)" not in script
         for tag, attributes in _elements(text):
             assert tag not in ("iframe", "object", "embed", "base", "form", "frame"), page
@@ -212,7 +212,7 @@ def test_no_cell_is_a_formula_and_all_json_is_valid(graded):
     out = base / "out-school"
     for lms in ("canvas", "moodle", "gradescope"):
         done = cartlab_here("export", out, "--lms", lms, "--out", base / "lms")
-        assert done.returncode == 1  # some with points have no name
+        assert done.returncode == 1  # some graded teams have no name
         assert "so not exported" in done.stderr
     tables = [out / "grades.csv", *(base / "lms").glob("*.csv")]
     assert len(tables) == 4
@@ -239,7 +239,7 @@ def test_no_cell_is_a_formula_and_all_json_is_valid(graded):
 @pytest.mark.skipif(
     not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root changes user"
 )
-def test_what_may_not_be_read_is_a_row(tmp_path_factory):
+def test_an_unreadable_folder_affects_only_its_row(tmp_path_factory):
     """If a folder or file may not be read, only the row of its submission says so."""
     base = tmp_path_factory.mktemp("rights")
     for name in ("folder", "inside", "toml", "listed", "good"):
@@ -269,7 +269,7 @@ def test_what_may_not_be_read_is_a_row(tmp_path_factory):
         os.seteuid(0)
 
 
-def test_what_goes_away_or_changes_meanwhile_is_a_row(tmp_path):
+def test_a_file_changed_meanwhile_affects_only_its_row(tmp_path):
     """If a file disappears or changes during grading, only the row of its submission says so."""
     for name in ("gone", "changed"):
         (tmp_path / "class" / name).mkdir(parents=True)

@@ -9,8 +9,8 @@ from tests.helpers.places import ROOT
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no such signal")
 
-# Presses Ctrl-C when the N-th module is imported, which is the same moment on any machine. The
-# first two modules are the package itself and the command line, before any of its code runs.
+# This program presses Ctrl-C at the N-th import, which is the same moment on any machine. The first
+# two imports are the package and its command line, before any of its code runs.
 _PRESS = """
 import os, signal, sys
 at, *words = sys.argv[1:]
@@ -46,7 +46,7 @@ def test_ctrl_c_while_a_command_loads_libraries_is_one_line(tmp_path, at):
     assert done.returncode == 130
     *progress, last = done.stderr.splitlines() or [""]
     assert last in ("", "stopped; repeat the command to start again")
-    assert all(" … " in line for line in progress)  # on a machine that is busy
+    assert all(" … " in line for line in progress)  # a busy machine shows progress
 
 
 def _pressed(at: int, *words: str) -> subprocess.CompletedProcess[str]:

@@ -86,10 +86,10 @@ def page(folder) -> Iterator[LivePage]:
         yield page
 
 
-# ------------------------------------------------------------------------ what it keeps
+# ------------------------------------------------------------------------ what the page keeps
 
 
-def test_points_are_few_in_units_and_of_this_run(folder):
+def test_points_are_thinned_in_units_and_of_this_run(folder):
     """The page gets every fifth line, in volts and centimetres; a new run clears the old points."""
     state = LiveState(folder)
     state.planned(PLAN, frozenset())
@@ -109,10 +109,10 @@ def test_points_are_few_in_units_and_of_this_run(folder):
     state.readings(lines(0, 1), Anomalies())
     fresh = state.points(run=1, start=202)
     assert fresh["run"] == 2
-    assert fresh["points"] == [(0.0, 0.0, 0.2, 0.0, 0.0)]  # a target of 100 counts
+    assert fresh["points"] == [(0.0, 0.0, 0.2, 0.0, 0.0)]  # 0.2 cm: the target of 100 counts
 
 
-def test_a_slow_reader_gets_less_and_not_later(folder):
+def test_a_slow_page_gets_only_the_latest_points(folder):
     """A page that did not ask for a minute then gets only the last twelve seconds."""
     state = LiveState(folder)
     state.planned(PLAN, frozenset())
@@ -124,7 +124,7 @@ def test_a_slow_reader_gets_less_and_not_later(folder):
     assert found["points"][0][0] == 48.0
 
 
-def test_the_plan_says_what_is_done_now_and_broken(folder):
+def test_the_plan_shows_the_state_of_each_recording(folder):
     """The plan shows the state of each recording, and for a partial one the reason."""
     state = LiveState(folder)
     state.planned(PLAN, frozenset({"decay-1"}))
@@ -140,7 +140,7 @@ def test_the_plan_says_what_is_done_now_and_broken(folder):
 
 
 def test_an_instruction_waits_for_its_own_answer(folder):
-    """An instruction ends by its own answer, not by that to an earlier one, or with the page."""
+    """Only its own answer, or the end of the page, ends an instruction."""
     state = LiveState(folder)
     assert not state.answer(1)
     waiting = threading.Thread(target=state.confirm, args=("hold cart 2",))
@@ -173,7 +173,7 @@ def ask(page: LivePage, path: str = "", method: str = "GET", body: str | None = 
 
 
 def news(page: LivePage, opened: ExitStack) -> http.client.HTTPResponse:
-    """Open the page's stream of events for as long as `opened` lasts."""
+    """Open the page's stream of events, which is closed with `opened`."""
     url = urlsplit(page.url)
     connection = http.client.HTTPConnection(url.hostname or "", url.port or 0, timeout=PATIENCE)
     opened.callback(connection.close)
@@ -198,7 +198,7 @@ def test_it_is_served_to_this_computer_only_with_strict_headers(page):
         assert ask(page, name)[0].status == 200
 
 
-def test_who_does_not_know_the_secret_sees_nothing(page):
+def test_nothing_is_shown_without_the_secret(page):
     """Every address with a missing, wrong or incomplete secret gets 403."""
     path = urlsplit(page.url).path
     for other in ("/", "/x/", path[:-2] + "/", path[:-1], "/events", "/live.js", f"/x{path}"):
@@ -243,7 +243,7 @@ def test_nonsense_confirms_nothing(page, body, status):
     assert ask(page)[0].status == 200
 
 
-def test_the_secret_is_new_each_time_and_written_nowhere(folder, caplog, capfd):
+def test_the_secret_is_new_each_time_and_never_written(folder, caplog, capfd):
     """Each live page has a new secret, which no log line and no printed line contains."""
     caplog.set_level(logging.DEBUG)
     secrets = set()
@@ -264,8 +264,8 @@ def test_a_port_that_is_taken_is_one_clear_line(page, folder):
         LivePage(folder, port=urlsplit(page.url).port or 0)
 
 
-def test_news_come_as_events_and_too_many_pages_are_turned_away(page):
-    """A page gets the whole state first, then new points; a ninth page gets 503."""
+def test_a_page_gets_events_and_a_ninth_page_is_refused(page):
+    """A page first gets the whole state, then new points; a ninth page gets 503."""
     with ExitStack() as opened:
         stream, *_ = [news(page, opened) for _ in range(8)]
         assert stream.headers["Content-Type"].startswith("text/event-stream")
@@ -291,7 +291,7 @@ def _held(page: LivePage) -> int:
     return sum(c.laddr[1:] == (port,) and c.status == psutil.CONN_ESTABLISHED for c in mine)
 
 
-def test_strangers_leave_the_run_its_descriptors(page):
+def test_idle_connections_do_not_use_up_the_descriptors(page):
     """Of 400 idle connections at most 140 are held, and the owner's page still loads."""
     url = urlsplit(page.url)
     with ExitStack() as opened:
@@ -308,8 +308,8 @@ def test_strangers_leave_the_run_its_descriptors(page):
         assert stream.readline() == b"event: state\n"
 
 
-def test_nobody_is_faster_than_who_has_the_secret(page, monkeypatch):
-    """A full queue of idle connections, accepted with the owner's, does not keep the owner out."""
+def test_a_full_queue_does_not_keep_the_owner_out(page, monkeypatch):
+    """An owner who waits in a queue full of idle connections is still served."""
     url, held, go_on = urlsplit(page.url), threading.Event(), threading.Event()
     snapshot = page.snapshot
 
@@ -333,7 +333,7 @@ def test_nobody_is_faster_than_who_has_the_secret(page, monkeypatch):
         assert rightful.recv(12) == b"HTTP/1.1 200"
 
 
-def test_a_stranger_is_turned_out_in_time_and_a_reader_is_not(folder, monkeypatch):
+def test_only_connections_without_the_secret_time_out(folder, monkeypatch):
     """A connection without the secret is closed after a time; one with the secret stays."""
     monkeypatch.setattr("pipeline.web.server._STRANGER_STAYS", 0.2)
     with LivePage(folder) as page, ExitStack() as opened:
@@ -350,7 +350,7 @@ def test_a_stranger_is_turned_out_in_time_and_a_reader_is_not(folder, monkeypatc
         assert line
 
 
-def test_a_run_is_not_held_up(folder):
+def test_the_page_does_not_delay_a_run(folder):
     """While two pages read and one does not, the live page takes 50 lines within a heartbeat."""
     took = []
     with ExitStack() as opened:
@@ -371,7 +371,7 @@ def test_a_run_is_not_held_up(folder):
     assert np.median(took) < HEARTBEAT_EVERY
 
 
-def test_pages_hear_the_end_and_the_server_is_gone(folder):
+def test_pages_get_the_end_of_the_session(folder):
     """When the session ends, each open page gets the last state, and the port is freed."""
     with ExitStack() as opened:
         with LivePage(folder) as page:
@@ -477,7 +477,7 @@ def test_an_instruction_is_confirmed_with_its_button(page, show, how):
     expect(window.locator("#ask")).to_be_hidden()
 
 
-def test_the_buttons_are_those_that_would_be_heeded(page, show):
+def test_only_buttons_that_have_an_effect_are_enabled(page, show):
     """Skip, Keep and Repeat work once in each run; Stop works always, also by Esc."""
     window = show()
     skip = window.get_by_role("button", name="Skip")
@@ -501,7 +501,7 @@ def test_the_buttons_are_those_that_would_be_heeded(page, show):
     expect(window.locator("#status")).to_have_text("Stopping.")
 
 
-def test_every_page_open_sees_the_same(page, show):
+def test_all_open_pages_show_the_same(page, show):
     """A page opened during a run shows the earlier points.
 
     An answer on one page counts for both.
@@ -517,8 +517,8 @@ def test_every_page_open_sees_the_same(page, show):
 
 
 @pytest.mark.parametrize("size", [WIDE, PHONE], ids=["wide", "phone"])
-def test_everybody_can_read_it(page, show, size):
-    """The live page passes axe by day and night, and nothing is wider than the screen."""
+def test_the_live_page_is_accessible(page, show, size):
+    """The live page is accessible (axe) by day and night, and nothing is wider than the screen."""
     window = show(size=size)
     record(page)
     threading.Thread(target=page.confirm, args=("let go of all carts",)).start()
@@ -539,7 +539,7 @@ def test_by_night_the_curves_change_colour(page, show):
     assert BLUE not in window.evaluate(INK, "positions")
 
 
-def test_the_end_is_told(folder, browser):
+def test_the_page_says_that_the_session_is_over(folder, browser):
     """After the session the page says that it is over, keeps its curves, and sends no requests."""
     context = browser.new_context()
     context.set_default_timeout(1e3 * PATIENCE)
@@ -558,7 +558,10 @@ def test_the_end_is_told(folder, browser):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_session_is_watched_and_confirmed_in_the_browser(tmp_path, browser):
-    """With `acquire --web`, a button on the page starts a recording; no file holds the secret."""
+    """With `acquire --web`, a button on the page starts a recording;
+
+    no file contains the secret.
+    """
     work = write_work(tmp_path / "work", [sine("dwell", seconds=1, settle=0.3)])
     toml = work / "submission.toml"
     scaled = toml.read_text(encoding="utf-8").replace('"cm"', '"cm", per_count = 0.00227')

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 CHECK = runpy.run_path(str(Path(__file__).parents[2] / ".ci" / "prose.py"))
-ODD = "The runs are" + " to be looked" + " at."  # in pieces, so that it is not found here
+ODD = "The runs are" + " to be looked" + " at."  # split, so that this file has no odd sentence
 
 
 @pytest.mark.parametrize(
@@ -26,12 +26,12 @@ def test_an_odd_sentence_is_found_once(tmp_path: Path, name: str, text: str) -> 
     assert ODD in find.sentence
 
 
-def test_code_is_no_sentence(tmp_path: Path) -> None:
+def test_code_is_not_checked(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text(f"Say `{ODD}` so.\n\n```\n{ODD}\n```\n", encoding="utf-8")
     assert list(CHECK["finds"](page)) == []
 
 
-def test_a_long_sentence_is_found() -> None:
+def test_a_text_is_split_into_sentences() -> None:
     words = CHECK["LONGEST"]
     assert len(CHECK["sentences"]("Word " * words + "end. Two.")) == 2

@@ -81,13 +81,13 @@ def _analysis(case: str, out: Path, request) -> Analysis:
 
 @pytest.fixture(params=CASES)
 def made(request, folder) -> Path:
-    """The report folders of all cases, one after another."""
+    """Return the folder of each case's report in turn."""
     return folder(request.param, request)
 
 
 @pytest.fixture
 def three(request, folder) -> Path:
-    """The folder of the shipped three-cart report."""
+    """Return the folder of the report on the shipped three-cart example."""
     return folder("three", request)
 
 
@@ -98,7 +98,7 @@ def page_of(made: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def window(browser):
-    """The browser window that shows most pages; a new window takes a second to open."""
+    """Return a browser window for most pages, since opening a new one takes a second."""
     return browser.new_context().new_page()
 
 
@@ -186,7 +186,7 @@ PRINTED = ("one", "two", "three", "gap", "solution")
 def test_no_page_of_the_print_is_a_third_empty(case, folder, request):
     """In print no page before the last is a third empty.
 
-    Figures shrink and tables break to fill it.
+    Figures shrink and tables are split to fill each page.
     """
     (pdf,) = folder(case, request).glob("*.pdf")
     pages = subprocess.run(
@@ -335,8 +335,8 @@ BROKEN = """() => Array.from(document.querySelectorAll('td:nth-child(2):not(:las
     .filter((e) => e.getClientRects().length > 1).map((e) => e.innerText)"""
 
 
-def test_everybody_can_read_it_on_every_screen(made, show):
-    """On every screen axe finds nothing serious in names, roles, headings and contrast at night.
+def test_pages_are_accessible_on_every_screen(made, show):
+    """On every screen the checker axe finds no serious barrier.
 
     Only parts that scroll are wider than the page, no text covers another, and figures contain
     their texts. A laptop shows every column of a table; a phone shows the name of a check on one
@@ -354,7 +354,7 @@ def test_everybody_can_read_it_on_every_screen(made, show):
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         boxes = [(Box(*box), scrolled) for *box, scrolled in page.evaluate(BOXES)]
         assert len(boxes) > 100
-        # Half a pixel: boxes of letters are rounded outwards.
+        # Half a pixel is allowed, since boxes of letters are rounded outwards.
         fixed = [box for box, scrolled in boxes if not scrolled]
         assert [box for box in fixed if box.left < -0.5 or box.right > width + 0.5] == []
         assert covered([box for box, _ in boxes]) == []
@@ -422,7 +422,7 @@ def test_figures_can_be_read_on_a_laptop(made, show):
         assert tools["y"] + tools["height"] <= bounds["y"] + bounds["height"] + 10
 
 
-def test_a_class_begins_with_how_the_points_are_spread(folder, request, show):
+def test_a_class_page_begins_with_the_distribution(folder, request, show):
     """The page of a class first shows the distribution of points, then flags, then criteria."""
     page = show(page_of(folder("class", request)), size=LAPTOP)
     first = page.locator("figure").first.bounding_box()
@@ -466,7 +466,7 @@ def numbers(text: str) -> list[float]:
     return [float(n.replace("−", "-")) for n in re.findall(r"−?\d+(?:\.\d+)?(?:e−?\d+)?", text)]
 
 
-def test_a_figure_says_the_values_under_the_pointer(three, show):
+def test_a_figure_shows_the_values_under_the_pointer(three, show):
     """Over a point of the Bode figure the pointer shows frequency, magnitude and phase."""
     analysis = analysed("three-cart")
     response = next(r for r in analysis.frequency_responses if r.cart == 3)
@@ -559,7 +559,7 @@ def test_numbers_can_be_copied(three, show):
     assert matrix.count(";") == 6
 
 
-def test_without_scripts_the_page_is_whole(three, show):
+def test_without_scripts_everything_can_be_read(three, show):
     """Without scripts all figures, numbers and folded parts can be read."""
     page = show(page_of(three), java_script_enabled=False)
 
@@ -570,7 +570,7 @@ def test_without_scripts_the_page_is_whole(three, show):
 
 
 @pytest.mark.skipif(shutil.which("pdftotext") is None, reason="no pdftotext: poppler-utils")
-def test_paper_shows_what_a_page_folds(three, show, tmp_path):
+def test_printing_opens_folded_tables(three, show, tmp_path):
     """Printing opens the folded tables, and omits buttons that work only on a screen."""
     page = show(page_of(three))
     paper = tmp_path / "paper.pdf"

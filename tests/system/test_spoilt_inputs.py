@@ -1,4 +1,4 @@
-"""Files of teachers and of earlier runs, spoilt at random: one line for each fault, or a result."""
+"""Randomly damaged files of teachers and earlier runs give a result or one line for each fault."""
 
 import json
 import tempfile
@@ -84,7 +84,7 @@ def spoilt(name: str, rng: Random) -> bytes:
     if name.endswith(".csv"):
         try:
             return poisoned_table(raw.decode(), rng).encode("utf-8", "replace")
-        except ValueError:  # the table has words in place of numbers
+        except ValueError:  # some tables contain words
             return damaged(raw, rng)
     return damaged(raw, rng)
 
@@ -128,9 +128,9 @@ def use(name: str, path: Path) -> None:
 
 
 def try_seed(name: str, seed: int) -> None:
-    """Damage a file at random and read it; expect at most a few lines of error.
+    """Damage a file at random and read it; expect a result or a short error.
 
-    Expect at most one line of error, in TOML one per mistake.
+    The error has one line, or in TOML one line per mistake.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
@@ -141,7 +141,7 @@ def try_seed(name: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_spoilt_file_is_a_complaint_or_a_result(name):
+def test_a_spoilt_file_gives_a_result_or_a_short_error(name):
     """For 30 random faults in each kind of file, there is a result or a short error."""
     for seed in range(30):
         try_seed(name, seed)
@@ -149,7 +149,7 @@ def test_a_spoilt_file_is_a_complaint_or_a_result(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_no_spoilt_file_ends_in_a_traceback(name):
+def test_no_spoilt_file_causes_a_traceback(name):
     """For thousands of random faults in each kind of file, there is a result or a short error."""
     for seed in range(30, 3_000):
         try_seed(name, seed)

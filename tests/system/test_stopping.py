@@ -10,7 +10,10 @@ from pipeline.cli.stopping import ctrl_c_says
 
 
 def _work(said: list[str], *, look: bool = False, error: Exception | None = None) -> None:
-    """Press Ctrl-C during work that swallows the interrupt; then look for it, or raise an error."""
+    """Press Ctrl-C during work that swallows the interrupt;
+
+    then check for it, or raise an error.
+    """
     with ctrl_c_says(lambda: said.append("stopped")) as looked:
         with contextlib.suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
@@ -25,7 +28,7 @@ def _work(said: list[str], *, look: bool = False, error: Exception | None = None
 def test_an_interrupt_that_a_library_drops_ends_the_work(how):
     """If a library swallows Ctrl-C, the command still ends, at its next check or at its end.
 
-    If the interrupted library raises an error, the command ends with 130 all the same.
+    The exit status is 130 even if the interrupted library raises an error.
     """
     said = []
     with pytest.raises(typer.Exit) as ended:
@@ -40,7 +43,7 @@ def test_an_error_without_ctrl_c_stays_an_error():
         raise ValueError("broken")
 
 
-def test_afterwards_ctrl_c_is_what_it_was():
+def test_the_earlier_ctrl_c_handler_is_restored():
     """After the command's work the earlier handler of Ctrl-C is restored."""
     before = signal.getsignal(signal.SIGINT)
     with ctrl_c_says(lambda: None):
