@@ -40,7 +40,7 @@ def test_a_bench_that_was_killed_is_not_listed(own_folder):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
-def test_a_folder_that_others_can_write_to_is_not_believed(own_folder):
+def test_a_folder_that_others_can_write_to_is_ignored(own_folder):
     """Benches announced in a folder that others can write to, or in a link, are not listed."""
     bench = RunningBench(name="b", address="socket://127.0.0.1:8")
     with announced(bench):

@@ -78,7 +78,7 @@ def test_subspaces_find_the_truth_in_a_record_without_noise():
     assert_allclose(found.omega, truth.omega, rtol=1e-3)
 
 
-def test_no_answer_is_infinitely_wrong():
+def test_a_missing_answer_counts_as_infinitely_wrong():
     """If a method gives no answer or too few resonances, its error counts as infinite."""
     chain = PRESETS["throne-1dof"]
     truth = modes_named(chain, list(chain.parameters().values()))
@@ -101,7 +101,7 @@ def test_a_free_run_is_judged_after_its_start_and_divergence_is_infinite():
     assert error(Model(run=lambda _: 1e9 * y, every=1, words=""), [part]) == np.inf
 
 
-def test_of_nearly_equal_models_the_sparser_is_taken():
+def test_the_sparser_of_nearly_equal_models_is_kept():
     """Of models with nearly equal errors, the one with fewest terms is kept.
 
     If all models diverge, no model is kept.
@@ -118,7 +118,7 @@ def test_of_nearly_equal_models_the_sparser_is_taken():
     assert best(iter([off_by(1e9, 1)]), [part]) is None
 
 
-def test_further_records_are_of_the_same_bench_and_none_that_anybody_had():
+def test_new_records_are_from_the_same_bench():
     """New records for judging come from the same bench, with inputs no larger than in training."""
     case = make_case(seed=7, n=1, rate=113.1)
     further = further_records(case, seed=8)
@@ -149,7 +149,7 @@ def test_further_records_are_of_the_same_bench_and_none_that_anybody_had():
         ("named", ("backlash",), False),
     ],
 )
-def test_only_what_is_said_as_named_counts_as_named(verdict, hidden, named):
+def test_effects_count_only_under_the_verdict_named(verdict, hidden, named):
     """The right effects count as named only under the verdict `named`."""
     found = ("cubic_spring",) if verdict not in ("none", "unexplained") else ()
     effects = tuple(SimpleNamespace(effect=SimpleNamespace(key=key)) for key in found)

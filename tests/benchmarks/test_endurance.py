@@ -24,7 +24,7 @@ def _points(token: str, points: float, *, confirmed: bool = True) -> Change:
 
 @pytest.fixture(scope="module")
 def book(tmp_path_factory):
-    """A class with points by hand, some given twice, and one request that was answered."""
+    """Return a class with points by hand, some given twice, and one request that was answered."""
     place = str(tmp_path_factory.mktemp("book"))
     fill_book(place)
     with RequestBook(place) as book:
@@ -57,7 +57,7 @@ def book(tmp_path_factory):
                 teams=("team-02", "team-03"), points=0.5), "spoilt"),
     ],
 )  # fmt: skip
-def test_a_change_of_points_is_there_once_and_whole(book, change, wrong):
+def test_a_change_of_points_is_stored_exactly_once(book, change, wrong):
     """A confirmed change must be stored exactly once; any other change at most once."""
     found = Found()
     with RequestBook(book) as opened:
@@ -101,7 +101,7 @@ def test_recordings_and_rows_are_compared_with_what_was_sent(tmp_path):
     assert found(("row", first.id, first.note), ("row", first.id, "newer")).lost
 
 
-def test_the_slope_of_memory_is_that_of_a_line():
+def test_the_slope_of_memory_is_found():
     """If memory grows steadily by 10 MB an hour, that slope is found, with no error."""
     memory = Memory()
     for second in range(0, 1800, 2):
@@ -126,7 +126,7 @@ def test_the_table_has_a_row_for_each_page():
 @pytest.mark.slow
 @pytest.mark.parametrize("part", ["class", "exploration"])
 def test_a_minute_loses_nothing(part):
-    """A minute of the class with kills, and a minute of an exploration, lose nothing."""
+    """In a minute of the class with kills, and in a minute of an exploration, nothing is lost."""
     if part == "class" and (why := postgres.missing()):
         pytest.skip(why)
     command = [sys.executable, "-m", "benchmarks.endurance", part, "--quick"]

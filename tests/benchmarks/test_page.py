@@ -1,4 +1,4 @@
-"""Making one section of the benchmarks' page keeps the others, and quick runs work."""
+"""Sections of the benchmarks' page can be made again one by one, and quick runs work."""
 
 import sys
 from importlib import import_module
@@ -22,7 +22,7 @@ def _section(name: str, cell: str) -> str:
     return section(name, _Module, [table], seconds=1.0, figures=None)  # type: ignore[arg-type]
 
 
-def test_one_section_made_anew_leaves_the_others_and_the_head(tmp_path):
+def test_making_one_section_again_keeps_the_others(tmp_path):
     """A section that is made again replaces only itself, and sections keep the list's order."""
     file, order = tmp_path / "README.md", ("first", "second")
     file.write_text("# Mine\n\nWritten by hand.\n", encoding="utf-8")
@@ -38,7 +38,7 @@ def test_one_section_made_anew_leaves_the_others_and_the_head(tmp_path):
     assert text.count("## Speed") == 2
 
 
-def test_a_section_says_what_it_was_made_with():
+def test_a_section_states_the_versions_of_its_tools():
     """A section states the versions of the compared tools, and names those not installed."""
     text = _section("first", "1.0")
 
@@ -91,7 +91,7 @@ def test_text_is_wrapped_to_the_width_of_the_page():
 
 
 @pytest.mark.parametrize("name", CHEAP)
-def test_quick_ones_run_and_leave_the_page_alone(name, monkeypatch, capsys):
+def test_quick_runs_do_not_change_the_page(name, monkeypatch, capsys):
     """`--quick` prints the tables and does not change the page."""
     page = command.page_of(name)
     before = page.read_bytes()

@@ -47,7 +47,7 @@ def test_a_limit_passed_is_told_apart_from_other_ends():
     assert _cells(explorations.table(rows), "all")[-2:] == ["1", "2"]
 
 
-def test_a_recording_beyond_the_travel_limit_is_a_limit_passed(tmp_path):
+def test_a_recording_beyond_the_travel_limit_is_counted(tmp_path):
     """A recording that passes the travel limit is counted as such in the study."""
     drawn = draw(71_001, effects=0)
     bench = VirtualBench(drawn.bench, seed=1)

@@ -70,7 +70,7 @@ def test_matlab_finds_the_names_of_the_report(analysis):
     assert found["units"] == {"position": "cm", "input": "V", "time": "s"}
 
 
-def test_a_file_of_matlab_does_not_tell_the_time(analysis):
+def test_a_mat_file_has_no_date(analysis):
     """The header of a MAT-file has no date, so the same results give the same bytes."""
     assert matlab_file(analysis)[:116] == b"MATLAB 5.0 MAT-file".ljust(116)
 
@@ -96,7 +96,7 @@ def test_a_table_of_ratios_has_no_phase(analysis):
     assert found["phase"][0, 0].size == 0
 
 
-def test_records_get_names_that_matlab_takes(analysis):
+def test_records_get_names_that_matlab_accepts(analysis):
     """Records whose ids MATLAB would refuse or confuse get other names, and keep their ids."""
     record = analysis.records[0]
     ids = ("step-1", "step 1", "1", "end", "é" * 80, "é" * 81, "x" * 70, "x" * 71)
@@ -107,7 +107,7 @@ def test_records_get_names_that_matlab_takes(analysis):
     assert all(name[0].isalpha() and name != "end" for name in names)
 
 
-def test_an_analysis_of_nothing_still_has_its_tables(analysis, tmp_path):
+def test_an_analysis_without_results_still_has_its_tables(analysis, tmp_path):
     """An analysis without results gives tables with headings only, and no A in the MAT-file."""
     nothing = replace(
         analysis, records=(), log_decrements=(), step_gains=(), sine_points=(), rows=(), checks=(),
@@ -121,7 +121,7 @@ def test_an_analysis_of_nothing_still_has_its_tables(analysis, tmp_path):
     assert "A" not in scipy.io.loadmat(tmp_path / "results.mat")
 
 
-def test_what_could_not_be_had_is_nan(analysis):
+def test_a_missing_initial_value_is_nan(analysis):
     """If a parameter has only a final value, its initial value is NaN in the table."""
     first = replace(analysis.rows[0], initial=None)
     found = matlab(replace(analysis, rows=(first, *analysis.rows[1:])))["parameters"]
@@ -139,4 +139,4 @@ def test_report_saves_tables_when_asked(tmp_path):
     assert {path.stem for path in (out / "tables").iterdir()} == TABLES
     assert Path(out / "results.mat").stat().st_size > 1000
     assert cartlab_here("report", folder, "--out", out, "--no-pdf").returncode == 0
-    assert not [*(out / "tables").iterdir(), *out.glob("*.mat")]  # nothing stale beside the new
+    assert not [*(out / "tables").iterdir(), *out.glob("*.mat")]  # the old ones are removed

@@ -11,7 +11,7 @@ from tests.helpers.acquisitions import sine, write_work
 
 @pytest.fixture
 def work(tmp_path):
-    """A folder of two carts with one planned dwell, limited to 0.5 V and 2.5 cm."""
+    """Return a folder of two carts with one planned dwell, limited to 0.5 V and 2.5 cm."""
     return write_work(tmp_path / "work", [sine("sine-1", seconds=5, settle=7.0)])
 
 
@@ -28,7 +28,7 @@ def work(tmp_path):
         ("decay", {"cart": 2}, {"carts": (2,), "release": 2, "duration": 20.0, "amplitude": 0.0}),
     ],
 )
-def test_what_is_wanted_stands_in_the_plan_after_what_is_there(work, kind, numbers, expected):
+def test_a_recording_is_added_at_the_end_of_the_plan(work, kind, numbers, expected):
     """A recording of any kind is added at the end of the plan, with a new id."""
     submission = load_submission(work)
     plan = load_plan(submission)
@@ -84,7 +84,7 @@ def test_whole_periods_last_as_long_as_typed(work, seconds, frequency, cycles):
     assert made.cycles == cycles
 
 
-def test_what_others_added_meanwhile_stays(work):
+def test_recordings_that_others_added_meanwhile_are_kept(work):
     """Recordings that others added to the plan meanwhile are kept."""
     old = load_plan(load_submission(work))
     theirs = add_recording(work, sine("theirs", seconds=5))

@@ -96,7 +96,7 @@ def proposed() -> Gap:
     return with_proposal(disputed(DRY, DRAG), limits=LIMITS)
 
 
-def test_what_is_proposed_keeps_the_limits_and_sets_them_apart(proposed):
+def test_the_proposal_separates_the_laws_within_the_limits(proposed):
     """The proposed recording separates the two laws of friction and stays within the limits.
 
     The laws differ by more than three times the noise, and no cart passes the travel limit.
@@ -112,7 +112,7 @@ def test_what_is_proposed_keeps_the_limits_and_sets_them_apart(proposed):
     assert np.ptp(found.prediction.positions[:2], axis=0).max() > 0
 
 
-def test_what_the_parameters_can_take_up_is_no_difference():
+def test_a_difference_that_parameters_can_remove_does_not_count():
     """A difference that other values of the parameters can remove does not count."""
     heavier = replace(DRY, chain=replace(CHAIN, m=CHAIN.m * 1.002, k=CHAIN.k * 0.999))
     gap = with_proposal(disputed(DRY, heavier), limits=LIMITS)
@@ -128,7 +128,7 @@ def test_what_the_parameters_can_take_up_is_no_difference():
     assert _left(difference, J, np.array([1e3, np.inf])) == pytest.approx((2 / 1e3) ** 2, rel=1e-3)
 
 
-def test_what_is_held_elsewhere_starts_there():
+def test_carts_start_where_a_constant_force_holds_them():
     """Under a constant force the carts start at rest where that force holds them."""
     pushed = model("force_offset", place=1, force=0.004)
     recording = Recording(
@@ -162,7 +162,7 @@ def test_a_hopeless_contender_decides_nothing():
     assert two.proposal.prediction is not None
     assert two.proposal.prediction.pair == (0, 1)
     assert two.proposal.separation == pytest.approx(alone.proposal.separation)
-    chosen = replace(gap.contenders[0], weight=1e-40)  # by held-out runs, contrary to the BIC
+    chosen = replace(gap.contenders[0], weight=1e-40)  # chosen by held-out runs against the BIC
     against = with_proposal(replace(gap, contenders=(chosen, gap.contenders[1])), limits=LIMITS)
     assert against.proposal is not None
     assert against.proposal.recording == alone.proposal.recording
@@ -174,8 +174,8 @@ def test_a_hopeless_contender_decides_nothing():
     assert other.separation == pytest.approx(alone.proposal.separation)
 
 
-def test_what_is_settled_has_little_say():
-    """If two pairs of explanations are nearly decided, the recording serves the open pair."""
+def test_nearly_decided_pairs_hardly_count():
+    """If two pairs of explanations are nearly decided, the recording serves the undecided pair."""
     late, lagged = (
         model("input_delay", place=0, delay=2e-3),
         model("actuator_lag", place=0, time_constant=2e-3),
@@ -189,7 +189,7 @@ def test_what_is_settled_has_little_say():
     assert three.recording == two.recording
 
 
-def test_of_those_that_settle_a_pair_the_best_is_proposed(proposed):
+def test_the_best_of_all_candidates_is_proposed(proposed):
     """Of all candidates, the proposed recording separates the two explanations most."""
     assert proposed.proposal is not None
     known = np.full(6, np.inf)
@@ -206,7 +206,7 @@ def test_of_those_that_settle_a_pair_the_best_is_proposed(proposed):
     assert mine == max(separations)
 
 
-def test_what_would_not_settle_it_is_recorded_for_longer(proposed):
+def test_a_longer_recording_is_proposed_if_a_short_one_is_not_enough(proposed):
     """If twelve seconds cannot separate two explanations, a longer recording is proposed."""
     late, lagged = (
         model("input_delay", place=0, delay=1e-4),
@@ -222,7 +222,7 @@ def test_what_would_not_settle_it_is_recorded_for_longer(proposed):
     assert long.resembles(long.model_copy(update={"cycles": long.cycles // 4}))
 
 
-def test_what_acts_on_the_input_alone_shows_in_no_decay():
+def test_a_decay_does_not_separate_effects_on_the_input():
     """Explanations that differ only in their response to the input are not separated by a decay."""
     late, lagged = (
         model("input_delay", place=0, delay=2e-3),
@@ -238,7 +238,7 @@ def test_what_acts_on_the_input_alone_shows_in_no_decay():
         assert (separations[0][0, 1] > 0) == apart
 
 
-def test_a_release_says_how_far_out_and_is_drawn_from_there():
+def test_each_height_of_a_release_is_a_candidate():
     """Each height of a release is a separate candidate, and its plan entry states the height."""
     heights = set()
     for recording, height in _candidates(CHAIN, LIMITS):
@@ -283,7 +283,7 @@ def swept(tmp_path) -> Callable[[list[str]], Callable[..., Gap]]:
 
 @pytest.mark.slow
 @pytest.mark.sample
-def test_an_effect_that_the_held_out_end_does_not_show_is_found_all_the_same(swept):
+def test_an_effect_absent_from_the_held_out_end_is_found(swept):
     """A slack spring is found even if the held-out end of the sweep does not show it."""
     slack = "slack_spring:spring=1,stiffness_change=0.0065,stretch=-0.55"
     gap = swept(["input_delay:delay=0.00167", slack])()
@@ -349,7 +349,7 @@ def test_a_proposal_of_other_data_or_limits_is_refused(proposed, tmp_path, other
     assert (tmp_path / "plan.toml").read_bytes() == before
 
 
-def test_nothing_is_added_that_would_break_the_plan(proposed, tmp_path):
+def test_a_recording_that_would_break_the_plan_is_not_added(proposed, tmp_path):
     """A recording that passes a limit, or frees a cart that is not there, is not written."""
     submission = shipped(tmp_path)
     plan = load_plan(submission)
@@ -363,7 +363,7 @@ def test_nothing_is_added_that_would_break_the_plan(proposed, tmp_path):
         assert load_plan(submission) == plan
 
 
-def test_a_spoilt_plan_costs_the_proposal_only(tmp_path):
+def test_a_spoilt_plan_prevents_only_the_proposal(tmp_path):
     """If the plan is broken, the gap is unchanged, and a note says why nothing is proposed."""
     submission = shipped(tmp_path)
     assert propose_for(disputed(DRY, DRAG), submission).proposal is not None

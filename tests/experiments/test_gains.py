@@ -1,4 +1,4 @@
-"""Gains in counts act on a bench as in the submission's units, or are refused."""
+"""Gains sent in counts act as in the submission's units; loops that would do harm are refused."""
 
 from dataclasses import replace
 
@@ -48,7 +48,7 @@ SECONDS = 2.0
 
 @pytest.fixture(scope="module", params=["one-cart", "two-cart"])
 def identified(request) -> tuple[Submission, Analysis]:
-    """A shipped example with the carts identified from decays, steps and sweep."""
+    """Return a shipped example with the carts identified from decays, steps and sweep."""
     submission = load_submission(EXAMPLES / request.param)
     kept = tuple(e for e in submission.experiments if e.kind in ("decay", "step", "sweep"))
     submission = submission.model_copy(update={"experiments": kept})
@@ -136,8 +136,9 @@ def test_the_designed_loop_runs_on_the_bench_as_simulated(identified):
 
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter)
     expected_x, expected_u = simulated(chain, law, delay=1)
-    # Whole duty counts are off by half a count each: 0.06 mV at up to 29 cm/V. An encoder may then
-    # change one tick earlier, which the velocity gain makes a pulse of one tick.
+    # Rounding to whole duty counts errs by up to half a count, 0.06 mV, at up to 29 cm/V. An
+    # encoder may then change one tick earlier, and the velocity gain turns this into a pulse of one
+    # tick.
     assert_allclose(x, expected_x, atol=2 * COUNT)
     velocity_gain = np.abs(gains.gains[1::2]).max()
     assert_allclose(u, expected_u, atol=DUTY * (2 + velocity_gain * 2 / BENCH.period))
@@ -175,7 +176,7 @@ def test_the_submission_records_what_ran(identified):
     }  # fmt: skip
 
 
-def test_an_input_that_pushes_the_other_way_turns_the_gains_round(identified):
+def test_a_reversed_input_reverses_the_gains(identified):
     """If positive duty pushes the carts backwards, gains are sent with the opposite sign."""
     submission, analysis = identified
     turned = tuple(replace(r, input_scale=-r.input_scale) for r in analysis.records)
@@ -189,7 +190,7 @@ def test_an_input_that_pushes_the_other_way_turns_the_gains_round(identified):
         gains_of((submission, reversed_), PidLoop(kp=0.5, ki=10.0))
 
 
-def test_what_the_submission_states_wins_over_what_the_bench_says(identified):
+def test_the_scale_of_the_submission_replaces_that_of_the_bench(identified):
     """If the submission states `per_count`, the gains are scaled by it, not by the bench's."""
     submission, analysis = identified
     stated = submission.system.input.model_copy(update={"per_count": 2 * DUTY})
@@ -218,7 +219,7 @@ def test_a_loop_that_would_do_harm_is_refused(loop, limits, amplitude, message):
     submission = submission.model_copy(update={"experiments": kept})
     with pytest.raises(DataError, match=message) as caught:
         gains_of((submission, analyse(submission)), loop, limits=limits, amplitude=amplitude)
-    assert "control: " not in str(caught.value)  # the name that the message gives
+    assert "control: " not in str(caught.value)  # the caller's message adds this name
 
 
 def test_a_slow_bench_that_misses_the_goal_is_refused(identified):
@@ -238,8 +239,8 @@ def test_a_slow_bench_that_misses_the_goal_is_refused(identified):
 @pytest.mark.parametrize(
     ("kd", "stable"), [(-0.02, False), (-0.005, True), (0.0, True), (20.0, False)]
 )
-def test_a_pid_is_refused_where_it_swings_up(identified, kd, stable):
-    """A PID that would swing up is refused; one that is sent settles within 40 s."""
+def test_a_pid_that_would_swing_up_is_refused(identified, kd, stable):
+    """A PID that makes the carts swing up is refused; a PID that is sent settles within 40 s."""
     _, analysis = identified
     assert analysis.chain is not None
     loop = PidLoop(kp=0.02, kd=kd)

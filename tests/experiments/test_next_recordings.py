@@ -50,7 +50,7 @@ COMMANDS = frozenset("cm")
 
 @pytest.fixture(scope="module")
 def analysis():
-    """The shipped two carts, identified from steps and a sweep."""
+    """Return the analysis of the shipped two carts from steps and a sweep."""
     submission = load_submission(EXAMPLES / "two-cart")
     kept = tuple(e for e in submission.experiments if e.kind in ("decay", "step", "sweep"))
     return analyse(submission.model_copy(update={"experiments": kept}))
@@ -78,12 +78,12 @@ def multisine(known: Knowledge, goal: Goal) -> Recording:
 # ------------------------------------------------------------ the information in a record
 
 
-def test_what_is_known_is_what_the_fit_says(known, analysis):
+def test_the_information_gives_the_standard_errors_of_the_fit(known, analysis):
     """The information matrices give the fit's own standard error of every parameter."""
     half = known.by_parameters() @ np.linalg.inv(known.information[0])
     std = np.sqrt(np.diag(half @ known.information[1] @ half.T))
     fitted = [e.std / e.value for e in analysis.fit.parameters.values()]
-    np.testing.assert_allclose(std, fitted, rtol=1e-3)  # differences of one step either way
+    np.testing.assert_allclose(std, fitted, rtol=1e-3)  # the derivatives are finite differences
 
 
 @pytest.mark.slow
@@ -99,7 +99,7 @@ def test_fit_reaches_the_predicted_errors(tmp_path):
     sweep = [r for r in plan.recordings if r.kind == "sweep"]
     bench.record(folder, sweep, limits=plan.limits)
     before = analyse(load_submission(folder))
-    alone = Plan(limits=plan.limits)  # the plan's own open steps are not recorded here
+    alone = Plan(limits=plan.limits)  # no recording is planned yet
     chosen = choose_next(before, alone, n=1, goal="worst", commands=EXTENSIONS)
     recordings = renamed(chosen.recordings, taken=["sweep", "sweep-1"])
     bench.record(folder, recordings, limits=plan.limits)
@@ -114,7 +114,7 @@ def test_fit_reaches_the_predicted_errors(tmp_path):
     assert max(off) < 4
 
 
-def test_steady_sines_tell_what_a_long_record_does(known):
+def test_twice_the_length_gives_twice_the_information(known):
     """A record of a steady sine that is twice as long has twice the information."""
     omega = known.chain.omega_carts
     once = known.of_lines(omega, amplitude=np.full(2, 0.05), seconds=10.0)
@@ -157,7 +157,7 @@ def test_the_exchange_finds_the_best_of_all_sets(mean):
     assert float(goal.of(told + candidates[list(chosen)].sum(axis=0))) <= 1.02 * best
 
 
-def test_the_goals_are_errors_of_what_they_name(known, analysis):
+def test_a_goal_is_a_relative_standard_error(known, analysis):
     """A goal is a parameter's relative standard error; `worst` is the largest of these."""
     fitted = {name: e.std / e.value for name, e in analysis.fit.parameters.items()}
     for name in ("zeta_2", "K_1"):
@@ -173,7 +173,7 @@ def test_the_goals_are_errors_of_what_they_name(known, analysis):
 
 
 def test_the_design_goal_is_the_spread_of_the_peak(known, analysis):
-    """The goal of the design is the spread of the overshoot over carts that the data allow."""
+    """The goal of the design is the spread of the overshoot over all carts that fit the data."""
     feedback = analysis.feedback
     goal = find_goal("design", known, feedback=feedback)
     covariance = (
@@ -181,7 +181,7 @@ def test_the_design_goal_is_the_spread_of_the_peak(known, analysis):
         @ known.information[1]
         @ np.linalg.inv(known.information[0])
     )
-    rng, peaks, widened = np.random.default_rng(1), [], 30.0  # errors so small hide in rounding
+    rng, peaks, widened = np.random.default_rng(1), [], 30.0  # the true errors are too small to see
     P, p = known.parametrisation, known.parametrisation.physical(known.chain)
     for change in rng.multivariate_normal(np.zeros(p.size), widened**2 * covariance, size=300):
         loop = simulate_loop(
@@ -197,7 +197,7 @@ def test_the_design_goal_is_the_spread_of_the_peak(known, analysis):
 
 
 def test_each_choice_serves_its_own_goal(analysis):
-    """An experiment chosen for one parameter serves it at least as well as others do."""
+    """An experiment chosen for one parameter reduces its error at least as much as others do."""
     plan = Plan(limits=LIMITS)
     left = {}
     for goal in ("K_1", "zeta_2"):
@@ -228,7 +228,7 @@ def test_no_choice_passes_a_limit(analysis):
         assert list(found.errors) == sorted(found.errors, reverse=True)
 
 
-def test_what_somebody_proposes_is_weighed_beside_what_is_chosen(analysis, known):
+def test_a_users_proposal_is_compared_with_the_choice(analysis, known):
     """The error after a user's proposal is compared with that after the program's choice."""
     mine = Recording(id="mine", kind="sweep", carts=(1, 2), wave="square", amplitude=0.02,
                      frequency=0.4, cycles=8)  # fmt: skip
@@ -269,7 +269,7 @@ def test_a_useless_proposal_gets_a_reason(known, change, words):
     assert words in why_useless(mine.model_copy(update=change), known, limits=LIMITS)
 
 
-def test_where_dwells_identify_dwells_are_chosen():
+def test_only_dwells_are_chosen_if_dwells_identified_the_carts():
     """If the carts were fitted to dwells alone, only further dwells are chosen."""
     analysis = analysed("two-cart")
     found = choose_next(analysis, Plan(limits=LIMITS), n=2, goal="zeta_2", commands=COMMANDS)
@@ -277,7 +277,7 @@ def test_where_dwells_identify_dwells_are_chosen():
     assert found.errors[2] < found.errors[1] < found.errors[0]
 
 
-def test_a_new_dwell_lies_as_far_off_as_those_before():
+def test_a_new_dwell_has_the_misfit_of_earlier_ones():
     """If friction moves all dwells off the fitted curve, a new dwell counts with that error too."""
     known = Knowledge.of(analysed("two-cart"))
     dwell = Recording(
@@ -364,7 +364,7 @@ def test_a_bench_adds_the_requested_tones():
 
 @pytest.fixture
 def work(tmp_path):
-    """The shipped one-cart submission without its dwells, in a new folder."""
+    """Return the shipped one-cart submission without its dwells, in a new folder."""
     source = load_submission(EXAMPLES / "one-cart")
     text = (EXAMPLES / "one-cart" / "submission.toml").read_text(encoding="utf-8")
     head, *tables = text.split("[[experiments]]")
@@ -380,7 +380,7 @@ def work(tmp_path):
     return tmp_path
 
 
-def test_the_command_adds_what_it_chose_to_the_plan(work):
+def test_the_command_adds_its_choice_to_the_plan(work):
     """The message, the plan and the JSON agree on the predicted errors of chosen recordings."""
     done = cartlab_here("plan", work, "--next", 2, "--for", "zeta", "--json")
     data = json.loads(done.stdout)
@@ -396,14 +396,14 @@ def test_the_command_adds_what_it_chose_to_the_plan(work):
     again = json.loads(cartlab_here("plan", work, "--next", 1, "--for", "zeta", "--json").stdout)
     planned = again["next"]["planned"]
     assert set(planned) >= {r.id for r in chosen}
-    # The predicted error of the first chosen recording alone.
+    # The error that is predicted after only the first chosen recording.
     assert planned[chosen[0].id] == pytest.approx(data["next"]["errors"][1], rel=1e-9)
-    # What is planned already is counted in the next prediction.
+    # The next prediction counts what is already planned.
     assert again["next"]["errors"][0] == pytest.approx(data["next"]["errors"][2], rel=1e-9)
     assert again["next"]["now"] == pytest.approx(data["next"]["now"], rel=1e-9)
 
 
-def test_what_is_written_is_counted(work):
+def test_added_recordings_are_counted(work):
     """The message counts the recordings that were added, those of a new plan included."""
     done = cartlab_here("plan", work, "--next", 2, "--for", "zeta")
     usual = len(propose_plan(load_submission(work)).recordings)
@@ -415,7 +415,7 @@ def test_what_is_written_is_counted(work):
     assert done.stdout.count("\n + ") == 1
 
 
-def test_beside_a_misfit_the_errors_are_doubted(analysis, tmp_path):
+def test_a_misfit_makes_the_predicted_errors_doubtful(analysis, tmp_path):
     """If the records show more than noise, a message doubts the predicted errors."""
     for chi_square, doubted in ((556.0, True), (1.0, False)):
         fit = replace(analysis.fit, chi_square_per_dof=chi_square)
@@ -423,7 +423,7 @@ def test_beside_a_misfit_the_errors_are_doubted(analysis, tmp_path):
 
 
 @pytest.mark.parametrize("words", [("--for", "zeta"), ("--next", 1, "--for", "omega_x")])
-def test_what_cannot_be_chosen_is_one_line(work, words, monkeypatch):
+def test_a_wrong_goal_is_one_line(work, words, monkeypatch):
     """A goal without a number, or an unknown goal, is refused before data are read."""
     monkeypatch.setattr("pipeline.experiments.next_recordings.analyse", None)
     done = cartlab_here("plan", work, *words)

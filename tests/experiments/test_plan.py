@@ -60,7 +60,7 @@ def of_kind(plan: Plan, kind: str) -> list[Recording]:
 # ------------------------------------------------------- before anything is known
 
 
-def test_the_first_runs_are_those_a_bench_of_unknown_carts_allows():
+def test_the_first_runs_suit_unknown_carts():
     """For unknown carts the plan has decays of each cart alone, small steps and one sweep."""
     plan = propose_plan(bare(carts=3))
 
@@ -72,7 +72,7 @@ def test_the_first_runs_are_those_a_bench_of_unknown_carts_allows():
     assert max(abs(r.amplitude) for r in plan.recordings) <= 0.05 * plan.limits.input
 
 
-def test_a_cart_without_springs_is_not_let_go_and_untied_carts_are_not_pushed_aside():
+def test_carts_without_springs_get_no_release_and_no_step():
     """A cart without springs is not released, and carts tied to no wall get no step."""
     plan = propose_plan(bare(carts=1, springs=(False, False)))
     assert [r.kind for r in plan.recordings] == ["sweep"]
@@ -80,7 +80,7 @@ def test_a_cart_without_springs_is_not_let_go_and_untied_carts_are_not_pushed_as
     assert [r.kind for r in plan.recordings] == ["decay"] * 4 + ["sweep"]
 
 
-def test_a_stock_bench_gets_no_command_it_does_not_know():
+def test_a_stock_bench_gets_only_its_own_commands():
     """A stock bench gets only its own commands: a square wave as sweep, and its PID on cart 1."""
     (sweep,) = of_kind(propose_plan(bare(), bench=STOCK), "sweep")
     assert (sweep.wave, sweep.frequency_end) == ("square", None)
@@ -95,7 +95,7 @@ def test_a_stock_bench_gets_no_command_it_does_not_know():
     assert loop.controller.cart == 1
 
 
-def test_what_is_recorded_is_not_proposed():
+def test_existing_recordings_are_not_proposed_again():
     """If decays, steps and sweep are recorded, the plan does not propose them again."""
     assert propose_plan(recorded("two-cart", *FIRST)).recordings == ()
 
@@ -114,7 +114,7 @@ def test_what_is_recorded_is_not_proposed():
         ),
     ],
 )
-def test_limits_come_from_what_is_stated(system, design, expected):
+def test_limits_come_from_the_submission(system, design, expected):
     """Limits come from the design, the input's scale and the unit, or are the usual ones."""
     limits = propose_plan(bare(**system, design=design)).limits
     assert (limits.input, limits.travel) == expected
@@ -162,7 +162,7 @@ def test_dwells_bracket_every_resonance_and_null(extended):
             assert -0.15 < away[away < 0].max() < 0
 
 
-def test_dwells_move_the_carts_as_far_as_asked_and_never_past_the_limit(extended):
+def test_dwells_move_the_carts_well_within_the_limit(extended):
     """Dwells move the carts by 0.3 to 1.3 of the distance aimed at, within the travel limit."""
     chain, plan, _ = extended
     aim = AIM * plan.limits.travel
@@ -234,7 +234,7 @@ def test_new_recordings_take_names_of_their_own():
     assert ids[:3] == ["step-5", "step-6", "sine-01"]
 
 
-def test_data_that_identify_nothing_say_so():
+def test_data_that_identify_nothing_give_a_reason():
     """If the data identify nothing, there are no dwells, and a reason is given."""
     submission = recorded("one-cart", "sweep")
     rigid = submission.system.model_copy(update={"springs": (False, False)})
@@ -301,7 +301,7 @@ def test_a_plan_reads_back_as_it_was_written(
     assert path.read_text(encoding="utf-8") == plan_text(plan, submission.system)
 
 
-def test_adding_keeps_every_byte_that_stood_there(tmp_path):
+def test_adding_keeps_every_byte_of_the_file(tmp_path):
     """Adding recordings changes nothing that is in the file; new ones come last."""
     example = recorded("two-cart", *FIRST)
     submission = example.model_copy(update={"folder": tmp_path})
@@ -322,7 +322,7 @@ def test_adding_keeps_every_byte_that_stood_there(tmp_path):
         save_plan(old, submission)
 
 
-def test_what_is_added_while_the_data_are_asked_stays(tmp_path):
+def test_a_recording_added_meanwhile_is_kept(tmp_path):
     """A recording that is added while `plan` analyses the data is kept."""
     work = a_recorded_cart(tmp_path / "work")
     submission = load_submission(work)
@@ -423,7 +423,7 @@ def with_run(**changes) -> str:
         (with_run() + RUN.format(**{**GOOD, "id": "RUN"}), r"recordings\[2\]\.id .*used before"),
     ],
 )
-def test_what_is_wrong_is_a_line_that_names_the_key(tmp_path, text, message):
+def test_a_mistake_is_one_line_that_names_the_key(tmp_path, text, message):
     """A mistake in the plan gives one line: file, key, what was expected, what was found."""
     submission = bare().model_copy(update={"folder": tmp_path})
     plan_path(submission).write_text(text, encoding="utf-8")
@@ -434,7 +434,7 @@ def test_what_is_wrong_is_a_line_that_names_the_key(tmp_path, text, message):
     )
 
 
-def test_a_link_in_its_place_is_not_followed(tmp_path):
+def test_a_plan_that_is_a_link_is_refused(tmp_path):
     """A plan that is a link is refused, for reading and for writing."""
     submission = bare().model_copy(update={"folder": tmp_path})
     (tmp_path / "other").write_text(with_run(), encoding="utf-8")

@@ -30,7 +30,7 @@ class Violation(NamedTuple):
 
 
 def violations(page: Any) -> list[Violation]:
-    """Return the faults found by axe in light mode, and those of colours in dark mode."""
+    """Return the faults found by axe in light mode, and the faults of contrast in dark mode."""
     page.evaluate(Axe().axe_script)
     page.evaluate(_THIN)
     found = []

@@ -1,6 +1,6 @@
 """Build complete analyses from known chains, without running any stage.
 
-The numbers are what the stages would plausibly find: the truth plus a small, seeded error.
+The numbers are what the stages would plausibly find: the true values plus a small, seeded error.
 """
 
 from functools import cache

@@ -1,4 +1,4 @@
-"""Simulate whole classes on one bench in memory; motion common to all teams only once."""
+"""Simulate whole classes on one bench in memory; motion that all teams share is computed once."""
 
 import math
 from collections.abc import Sequence

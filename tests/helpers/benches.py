@@ -23,7 +23,6 @@ class Emulator:
     ----------
     address : what pyserial's `serial_for_url` opens.
     said : the lines on stderr so far, without the events.
-    pid : the process id.
     runs : number of runs that have ended so far.
     """
 

@@ -9,11 +9,11 @@ import psutil
 from tests.helpers.places import ROOT
 from tests.helpers.waiting import until
 
-_COMPILER = "CARTLAB_TESTS_COMPILER"  # its process, for other processes that wait until it ends
+_COMPILER = "CARTLAB_TESTS_COMPILER"  # process id, for other processes that wait for the end
 
 
 def start_compiler() -> "subprocess.Popen[bytes]":
-    """Start to compile in another process, for which later child processes wait."""
+    """Start compiling in another process; later child processes can wait for its end."""
     script = "from tests.helpers.compiled import compile_all; compile_all()"
     compiler = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.DEVNULL, cwd=ROOT)
     os.environ[_COMPILER] = str(compiler.pid)
@@ -35,7 +35,7 @@ def await_compiler() -> None:
 
 
 def compile_all() -> None:
-    """Compile the workflow's simulator and the second one."""
+    """Compile the workflow's simulator and the tests' independent one."""
     import numpy as np
 
     from pipeline.plant.nonlinear.augmented import compile_simulator

@@ -40,7 +40,7 @@ class Answer:
 
     @property
     def text(self) -> str:
-        """The page."""
+        """The page as text."""
         return self.body.decode()
 
     def value(self, name: str) -> str:

@@ -36,7 +36,7 @@ class CompiledModel:
         self._run.restype = ctypes.c_int
 
     def simulate(self, t: Array, u: Array, *, x0: Array | None = None, step: float = 0.0) -> Array:
-        """Return the readings (carts, samples), starting at rest at `x0` or at equilibrium."""
+        """Return the readings (carts, samples) of a motion from rest, at `x0` or at equilibrium."""
         y = np.zeros((self._n, t.size))
         given = [np.ascontiguousarray(a, dtype=np.float64) for a in (t, u)]
         start = None if x0 is None else np.asarray(x0, dtype=np.float64)

@@ -62,7 +62,7 @@ class FirmwareCore:
 
     def __init__(self, library: ctypes.CDLL, description: Description) -> None:
         self._library, self._encoders = library, description.encoders
-        self._settings = _Settings(  # this memory is used by the bench
+        self._settings = _Settings(  # the C code keeps using this memory
             description.encoders, description.period, format_description(description)
         )
         self._bench = ctypes.create_string_buffer(library.bench_size())
@@ -85,7 +85,7 @@ class FirmwareCore:
 
 @contextmanager
 def kept_going(serve: Callable[[Callable[[], bool]], None]) -> Iterator[None]:
-    """Run `serve` beside the block; when the block ends, its event is set and it stops."""
+    """Run `serve` in a thread while the block runs; then set its event, so that it stops."""
     done = threading.Event()
     beside = threading.Thread(target=serve, args=(done.is_set,))
     beside.start()

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from tests.helpers.firmware_host import COMPILER, FIRMWARE, SOURCES, STRICT
 
-_ARDUINO = Path("/usr/share/arduino/hardware/arduino/avr")  # of Debian's arduino-core-avr
+_ARDUINO = Path("/usr/share/arduino/hardware/arduino/avr")  # Debian's arduino-core-avr
 _SIMAVR = Path("/usr/include/simavr/sim_avr.h")  # libsimavr-dev
-_LEFT_OUT = ("WString",)  # strings of the Arduino core: avr-gcc 5 lacks a constant that they need
+_LEFT_OUT = ("WString",)  # the core's strings need a constant that avr-gcc 5 lacks
 _COMMON = (
     "-Os", "-mmcu=atmega2560", "-ffunction-sections", "-fdata-sections",
     "-DF_CPU=16000000L", "-DARDUINO=10819", "-DARDUINO_ARCH_AVR", "-DARDUINO_AVR_MEGA2560",
@@ -71,7 +71,7 @@ def memory(program: Path) -> tuple[int, int]:
 
 
 class Mega:
-    """A simulated board with power, whose time passes only during calls such as `run`.
+    """A simulated board with power; its time passes only during calls such as `run`.
 
     Its pins are those of firmware/cartlab_bench/board.h.
     """

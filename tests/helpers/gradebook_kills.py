@@ -3,11 +3,11 @@
 python -m tests.helpers.gradebook_kills PLACE KILLS [answers]
 
 A child process stores outcomes and confirms each through a pipe once `put` has returned. Afterwards
-all confirmed outcomes must be there, whole, and at most one more, which it could not confirm in
-time.
+all confirmed outcomes must be stored completely. At most one more may be there, which the child
+could not confirm in time.
 
-With `answers` it answers requests instead, each with new points. Answer and points must both be
-there, or neither.
+With `answers`, the child answers requests instead, each with new points. An answer and its points
+must both be stored, or neither.
 """
 
 import os
@@ -22,8 +22,8 @@ from pipeline.grading.gradebook.request_book import RequestBook
 from pipeline.grading.gradings import Batch
 from tests.helpers.grades import hertz_flag, make_grade, make_outcome, two_cart_rubric
 
-_MOST_PUTS = 4  # number of outcomes that are waited for
-_LONGEST = 0.03  # s after that, since a put takes some milliseconds
+_MOST_PUTS = 4  # largest number of outcomes to wait for before the kill
+_LONGEST = 0.03  # longest further wait in s, as a put takes some milliseconds
 _FIGURE = ("step.svg", "<svg>" + "0.123 " * 4000 + "</svg>")
 
 
@@ -42,7 +42,7 @@ def put_until_killed(place: str, first: int, pipe: int) -> None:
 
 
 def answer_until_killed(place: str, first: int, pipe: int) -> None:
-    """Ask, answer with other points and reopen again and again; confirm each round by number."""
+    """Ask, answer with new points and reopen, again and again; confirm each round by its number."""
     book, number = RequestBook(place), first
     while True:
         asked = book.queue().waiting

@@ -106,7 +106,7 @@ def shared_flag(other: str) -> Flag:
 
 
 def make_outcome(grade: Grade, *, key: str = "", **changes: Any) -> Grading:
-    """Return the outcome that belongs to such a grade."""
+    """Return the outcome of a grading with this grade."""
     fields: dict[str, Any] = {
         "submission": grade.submission,
         "authors": grade.authors,
@@ -151,7 +151,7 @@ def write_class_of_two(folder: Path, *, anonymous: bool = False) -> None:
 
 @cache
 def _class_files(*, anonymous: bool) -> dict[str, bytes]:
-    """Return the files of such a folder by name; they are made once per process."""
+    """Return the files of a varied class by name; they are made once per process."""
     with TemporaryDirectory() as place:
         folder = Path(place)
         fill_book(folder, anonymous=anonymous)

@@ -1,7 +1,7 @@
 """A class of honest teams on benches of every kind, with numbers found by textbook methods.
 
-Each number is what a student reads by the textbook, if that is near the truth. If the method cannot
-get near the truth on this bench, a more careful student's number is used.
+Each number is what a student reads by the textbook, if that is near the true value. If the method
+cannot get near it on this bench, a more careful student's number is used.
 """
 
 import tempfile
@@ -43,10 +43,10 @@ ZETAS = (0.003, 0.15)
 DWELLS = (6, 22)
 COUNTS = (5.0, 500.0)  # encoder counts per centimetre
 DIGITS = (2, 4)
-FRICTION = 0.02  # largest share of the force of the small step
-LEAST_COUNTS = 25.0  # counts that the carts move, if the team can choose
+FRICTION = 0.02  # largest dry friction, as a share of the small step's force
+LEAST_COUNTS = 25.0  # least travel of the carts in encoder counts
 
-# The largest relative error of an honest number: gains and frequencies, dampings.
+# The largest relative errors of honest numbers: for gains and frequencies, then for dampings.
 HONEST_FIRST, HONEST_FIRST_DAMPING = 0.06, 0.4
 HONEST_BY_EYE = 0.2
 HONEST_FINAL, HONEST_FINAL_DAMPING = 0.03, 0.3
@@ -58,7 +58,7 @@ class Bench:
 
     Attributes
     ----------
-    count : encoder step in cm; travel : cm that the carts should move.
+    count, travel : encoder step, and travel wanted for the carts, both in cm.
     friction : dry friction of each cart, as a share of the force of the small step.
     digits : number of digits that the team types.
     """
@@ -88,7 +88,7 @@ class Bench:
 
 
 def make_bench(rng: np.random.Generator, *, carts: int) -> Bench:
-    """Draw a bench from the whole range; every second bench has dry friction."""
+    """Draw a bench at random; about half of the benches have dry friction."""
     preset = preset_bench(f"throne-{carts}dof").chain
     m = preset.m * rng.uniform(0.7, 1.4, carts)
     k = preset.k * rng.uniform(0.7, 1.4, carts + 1)
@@ -110,7 +110,7 @@ def make_bench(rng: np.random.Generator, *, carts: int) -> Bench:
 
 
 def rubric_of(bench: Bench) -> Rubric:
-    """Return the rubric of a class on such benches."""
+    """Return the rubric of a class that has such a bench."""
     rubric = load_rubric(Path(f"throne-{bench.chain.n}dof"))
     runs = tuple(
         run.model_copy(update={"at_least": min(run.at_least, DWELLS[0])})
@@ -133,12 +133,12 @@ class Team(Student):
 
 
 def make_team(seed: int, *, folder: Path | None = None, **bench: Any) -> Team:
-    """Return one honest team: bench, recordings, analysis, report.
+    """Return an honest team with bench, recordings, analysis and report.
 
     Parameters
     ----------
-    folder : where its files stay; by default they are removed.
-    bench : fields of `Bench` that are given instead of drawn.
+    folder : where the team's files stay; by default they are removed.
+    bench : fields of `Bench` with given values; the others are drawn at random.
     """
     rng = np.random.default_rng([2005, seed])
     drawn = replace(make_bench(rng, carts=1 + seed % 3), **bench)
@@ -149,7 +149,7 @@ def make_team(seed: int, *, folder: Path | None = None, **bench: Any) -> Team:
 
 
 def with_spoilt_data(seed: int) -> Team:
-    """Return the team of a seed; one of its files was spoilt before anything was read."""
+    """Return the team of a seed, with one file spoilt before the analysis."""
     rng = np.random.default_rng([2005, seed])
     bench = make_bench(rng, carts=1 + seed % 3)
     with tempfile.TemporaryDirectory() as folder:
@@ -157,9 +157,9 @@ def with_spoilt_data(seed: int) -> Team:
 
 
 def with_wrong_rubric(seed: int) -> Team | None:
-    """Return the team of a seed with a rubric that lacks its near spring.
+    """Return the team of a seed with a rubric that wrongly lacks the spring to the near wall.
 
-    If the team has no near spring, return None.
+    If the team has no such spring, return None.
     """
     rng = np.random.default_rng([2005, seed])
     bench = make_bench(rng, carts=1 + seed % 3)
@@ -214,7 +214,7 @@ def spoil_data(submission: Submission, rng: np.random.Generator) -> None:
     path = submission.folder / run.file
     lines = path.read_text(encoding="utf-8").splitlines()
     kind = int(rng.integers(3))
-    if kind == 0:  # while the cart moves
+    if kind == 0:  # the encoder sticks while the cart moves
         column = lines[0].split(",").index(f"x{run.carts[0] if run.carts else 1}")
         rows = [line.split(",") for line in lines[1:]]
         x = np.array([float(row[column]) for row in rows])
@@ -260,7 +260,7 @@ def report(team: Team) -> Team:
     table = {x: written(v, digits) for x, v in final.items()}
     space, feedback = team.reported.state_space, team.reported.feedback
     if final is not believed:
-        # Compute it from the results or from the typed numbers.
+        # Compute model and controller from the exact numbers or from the typed ones.
         values = final if rng.random() < 0.5 else {x: float(v) for x, v in table.items()}
         own = own_chain(values, n=n)
         if own is not None and is_real(own):

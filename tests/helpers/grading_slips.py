@@ -1,4 +1,4 @@
-"""Plant the mistake of each code in an honest team's own data.
+"""Make the mistake that each flag names, with an honest team's own data.
 
 The mistakes use the recordings and the true bench, but never the grader's own catalogue.
 """
@@ -116,7 +116,7 @@ def carts_swapped(team: Team) -> Team:
 
     groups = [g for g in groups if g == "zeta" or not alike(g)]
     groups = [g for g in groups if g != "zeta" or "omega" in groups]
-    if not groups:  # since nobody could see it
+    if not groups:  # nobody could see this swap
         return team
     exchanged = {
         t: {f"{g}_{a}": team.value(t, f"{g}_{b}") for g in groups for a, b in ((i, j), (j, i))}
@@ -139,7 +139,7 @@ def _one_off(team: Team, table: str) -> Team:
         factor = team.rng.uniform(*OFF) ** float(team.rng.choice([-1, 1]))
         moved = scaled(team, [name], factor, [table])
         gains = [moved.value(table, other) for other in own(team, "K")]
-        if gains == sorted(gains, reverse=True):  # otherwise the number is impossible
+        if gains == sorted(gains, reverse=True):  # in real carts the gains fall in this order
             return moved
 
 
@@ -270,7 +270,7 @@ def wrong_gains(team: Team) -> Team:
     else:
         gains = [2.5 * g for g in gains]
     team = _controlling(team, gains=tuple(written(g, 4) for g in gains))
-    if team.rng.random() < 0.5:  # … without stating the gains that ran
+    if team.rng.random() < 0.5:  # leave out the gains that ran
         return _with_runs(team, {"controller": None})
     return team
 
@@ -330,4 +330,4 @@ DOUBLE = (
     ("wrong_state_space", "wrong_prefilter"),
     ("hz_for_rad_s", "peak_to_peak"),
 )
-OF_SEVERAL_CARTS = {"carts_swapped", "no_fit_done"}  # with one cart no number shows it
+OF_SEVERAL_CARTS = {"carts_swapped", "no_fit_done"}  # the numbers of one cart cannot show these

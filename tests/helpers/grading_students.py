@@ -79,7 +79,7 @@ class Student:
 
 
 def typed(value: float | Decimal) -> Decimal:
-    """Return a number as typed to three digits; a text is returned as it is."""
+    """Return a number rounded to three digits, or a text as it is."""
     if isinstance(value, Decimal):
         return value
     return Decimal(f"{value:#.3g}".removesuffix("."))

@@ -1,7 +1,7 @@
 """Honest teams on benches with one effect of up to three times its usual size.
 
-They report what they read from their own recordings by textbook methods. Numbers that cannot be
-read that way are those of the pipeline.
+They report what they read from their own recordings by textbook methods. Other numbers are taken
+from the pipeline.
 """
 
 from collections.abc import Mapping
@@ -39,7 +39,10 @@ _SHRINKS = {"saturation": "limit", "end_stop": "position"}
 
 
 def draw_effect(chain: Chain, seed: int) -> EffectTerm:
-    """Return the effect for a seed; nineteen seeds in a row give every effect once."""
+    """Return the effect for a seed;
+
+    seeds 0 to 18 give each effect once, as do 19 to 37 and so on.
+    """
     rng = np.random.default_rng([16, seed, chain.n])
     turn, place = divmod(seed, len(CATALOGUE))
     effect = CATALOGUE[int(np.random.default_rng([16, turn]).permutation(len(CATALOGUE))[place])]
@@ -56,7 +59,7 @@ def draw_effect(chain: Chain, seed: int) -> EffectTerm:
 
 def _sized(effect: Effect, usual: Mapping[str, float], size: float) -> dict[str, float]:
     values = dict(usual)
-    if effect.key == "sensor_gain":  # one kind is not an effect
+    if effect.key == "sensor_gain":  # a gain of one is no effect
         values["gain"] = 1 + (values["gain"] - 1) * size
     elif effect.key in _SHRINKS:
         values[_SHRINKS[effect.key]] /= size

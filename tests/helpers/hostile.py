@@ -23,7 +23,7 @@ import scipy.io
 from tests.helpers.poison import poisoned, zipped
 from tests.helpers.recordings import package, sheet_xml, tdms_of
 
-SECRET = "root:x:0:0:the-secret-outside"  # of a file beside the class; must not appear
+SECRET = "root:x:0:0:the-secret-outside"  # content of a file outside the class; must not leak
 Files = Mapping[str, bytes]
 
 _SCRIPT = "<script>alert(1)</script>"
@@ -40,8 +40,8 @@ def write_hostile(
 ) -> list[str]:
     """Write the hostile submissions beside existing ones; return the names of the entries.
 
-    Good submissions with one thing spoilt take the longest to grade, so only one in `every` is
-    written. `drawn` more submissions are spoilt at random, a third of them as archives.
+    Good submissions with one spoilt part take the longest to grade, so only one in `every` is
+    written. `drawn` further submissions are spoilt at random, a third of them as archives.
     """
     rng = random.Random(seed)
     outside = school.parent / "outside"

@@ -65,7 +65,7 @@ def fork_benches() -> None:
 
 
 def load_bench() -> None:
-    """Import all that a bench needs, and compile its simulator unless that is done."""
+    """Import all that a bench needs, and compile its simulator unless that was done before."""
     from pipeline.simulated.emulator.server import EmulatorOptions, Server
     from pipeline.simulated.hidden import prepare_bench
 

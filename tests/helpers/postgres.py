@@ -34,7 +34,8 @@ def running() -> Iterator[str]:
     """Start a server and yield the URL of its database; remove the server afterwards."""
     binaries = _binaries()
     assert binaries is not None
-    # Pytest's folder does not do: only its owner can enter it, and the server never runs as root.
+    # Pytest's folder cannot be used, since only its owner can enter it, and the server never runs
+    # as root.
     folder = Path(tempfile.mkdtemp(prefix="pg-"))
     data = folder / "data"
     user = {}

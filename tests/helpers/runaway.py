@@ -1,8 +1,7 @@
 """A bench on a pseudo-terminal that misbehaves in one state of a session.
 
-The bench has its own clock, which advances by one millisecond at a time. It waits while the host
-still has a few lines to read; these are counted where the host reads them. So the host's reaction
-is measured in ms of the bench on any machine.
+The bench has its own clock, which advances by one millisecond at a time and waits for a host that
+is a few lines behind. So the host's reaction can be measured in ms of this clock on any machine.
 """
 
 import os
@@ -44,27 +43,27 @@ _PAUSE = 0.001  # s
 
 
 class RunawayBench(threading.Thread):
-    """A bench that keeps to the protocol except while `wrong` holds; a context manager.
+    """A bench that keeps to the protocol, except while `wrong` returns True.
 
-    Each cart is where the present duty holds it: 5 and 2 counts per duty count.
+    Use it as a context manager. Cart 1 stands at a fifth of the present duty, cart 2 at half of it.
 
     Parameters
     ----------
-    wrong : called each ms; returns whether the bench misbehaves now.
-    duty : the duty of a misbehaving motor; None: as commanded.
-    out : error of cart 1 in counts while the bench misbehaves.
-    mute : called each ms; returns whether its lines are lost.
+    wrong : function that is called each ms and returns whether the bench misbehaves at that time.
+    duty : motor's duty while the bench misbehaves; by default the commanded duty.
+    out : counts added to the reading of cart 1 while the bench misbehaves.
+    mute : function that is called each ms and returns whether the bench's lines are lost.
 
     Attributes
     ----------
-    run_on : the start of the present run; None: no run.
-    starts : all starts, except those that only stop a stock bench.
-    resets, lines : numbers of resets received and of lines sent.
+    run_on : start command of the present run, or None between runs.
+    starts : all start commands, except those that only stop a stock bench.
+    resets, lines : number of resets received, and number of lines sent.
     is_stopped : whether the last command was a stop.
-    is_pulled : whether a virtual hand is pulling a cart out.
-    offence : time in ms of the first line that shows the fault; None: no such line yet.
-    told : time in ms of the first stop after `offence`.
-    started_after : number of starts received after `offence`.
+    is_pulled : whether the virtual hand was ever told to pull a cart out.
+    offence : time in ms of the first line that shows the fault, or None if there was no such line.
+    told : time in ms of the first stop command after `offence`, or None if there was none.
+    started_after : start commands received after `offence`.
     """
 
     def __init__(
@@ -94,7 +93,7 @@ class RunawayBench(threading.Thread):
         self.started_after: list[Start] = []
 
     def __enter__(self) -> "RunawayBench":
-        import tty  # which does not exist on Windows
+        import tty  # absent on Windows
 
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
@@ -106,7 +105,7 @@ class RunawayBench(threading.Thread):
         return self
 
     def _metered(self, receive: Callable[[SerialLine], bytes]) -> Callable[[SerialLine], bytes]:
-        """Return a reader for the host that counts what has been read."""
+        """Wrap the host's `receive` so that the bytes it reads are counted."""
 
         def metered(line: SerialLine) -> bytes:
             data = receive(line)
@@ -144,7 +143,7 @@ class RunawayBench(threading.Thread):
         self.is_pulled |= isinstance(command, Hands) and command.released > 0
         if isinstance(command, Start):
             self.run_on = command
-            if command == STOCK_STOP[0]:  # the line was just opened, so what was unread is gone
+            if command == STOCK_STOP[0]:  # the line was just opened, so unread bytes are gone
                 self._unread = 0
             else:
                 self.starts.append(command)

@@ -10,8 +10,8 @@ import psutil
 
 PATIENCE = 120.0  # s after which an event is assumed never to come
 # Each check takes processor time from the awaited process, so checks become less frequent.
-_OFTEN, _SELDOM = 0.01, 0.1  # s between two checks, at first and at most, …
-_LATER = 0.1  # … and as a share of the time waited so far
+_OFTEN, _SELDOM = 0.01, 0.1  # first and longest time between two checks, in s, …
+_LATER = 0.1  # … and the time between checks as a share of the time waited so far
 
 
 def until(happened: Callable[[], object], what: str = "it") -> None:

@@ -37,7 +37,7 @@ def test_a_signal_without_steps_has_no_encoder_step():
     assert encoder_step(np.full(1000, 3.0)) == 0.0
 
 
-def test_a_mirrored_position_is_told_from_a_reference():
+def test_a_mirrored_position_is_distinguished_from_a_reference():
     """A copy of encoder 1, read between two samples, is recognised as a copy.
 
     A set point is not taken for a copy.
@@ -77,7 +77,7 @@ def test_a_coarse_encoder_that_stuck_comes_back_with_a_jump():
 
 
 @pytest.mark.parametrize("digits", [2, 3, 4, 9])
-def test_clipping_is_told_from_a_rounded_crest(digits):
+def test_clipping_is_distinguished_from_a_rounded_crest(digits):
     """A sine that rounding makes flat at its peak is not taken for a clipped one."""
     crest = np.round(0.8 * np.sin(7.3 * T), digits)
     assert saturation(crest) is None
@@ -85,7 +85,7 @@ def test_clipping_is_told_from_a_rounded_crest(digits):
     assert saturation(clipped) == 1.0
 
 
-def test_a_coarse_encoder_clips_no_crest_of_a_few_samples():
+def test_a_few_equal_samples_at_a_peak_are_not_clipping():
     """A coarse sine with three equal samples at its peak, as noise may leave, is not clipped."""
     t = 0.00884 * np.arange(159)
     sines = [np.round(34 * np.sin(31.2274 * t + phase)) for phase in np.linspace(0, 6, 400)]

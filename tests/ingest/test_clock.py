@@ -24,8 +24,8 @@ def test_a_rounded_even_clock_is_straightened(interval, start, n, rounded_down):
     clock = read_clock(stamps)
 
     assert clock.stopped is None
-    # Rounding errs most if it jumps once, by 1 ms in the middle of a record: the slope of least
-    # squares changes by 1.5 ms/n.
+    # Rounding errs most if it jumps once, by 1 ms in the middle of a record. The least-squares
+    # slope then changes by 1.5 ms/n.
     assert_allclose(clock.mean_interval, interval, atol=1.6e-3 / n)
     offset = np.median(clock.t - true)  # rounding down may shift all by a whole step
     assert abs(offset) <= 1e-3
@@ -50,7 +50,7 @@ def test_a_clock_that_missed_beats_is_straightened_in_pieces():
 
     assert clock.pieces > 1
     assert np.abs(clock.t - true).max() < 1e-3  # never farther off than the rounding of the stamps
-    assert np.sqrt(np.mean((clock.t - true) ** 2)) < 1e-4  # stamps alone: 0.29 ms
+    assert np.sqrt(np.mean((clock.t - true) ** 2)) < 1e-4  # the stamps alone differ by 0.29 ms
 
 
 @pytest.mark.parametrize("digits", [9, 6, 5])
@@ -81,7 +81,7 @@ def test_an_even_clock_needs_no_straightening():
     assert clock.jitter < 1e-12
 
 
-def test_several_samples_to_one_stamp_are_told_apart():
+def test_samples_with_equal_stamps_get_an_even_clock():
     """From a log at 2.3 kHz, whose stamps in whole ms repeat, the even clock is recovered."""
     true = np.arange(2000, dtype=np.float64) / 2300
     clock = read_clock(np.floor(true * 1e3) / 1e3)
@@ -91,7 +91,7 @@ def test_several_samples_to_one_stamp_are_told_apart():
 
 
 @pytest.mark.parametrize("at", [1, 37, 99])
-def test_where_time_stops_or_turns_back_is_found(at):
+def test_the_first_sample_that_does_not_advance_is_found(at):
     """The first sample whose time does not advance is found."""
     stamps = 0.01234567 * np.arange(100, dtype=np.float64)
     still, back = stamps.copy(), stamps.copy()
@@ -133,8 +133,8 @@ def a_session(interval: float, *, n: int = 15, jitter: float = 0.0) -> list[np.n
 @pytest.mark.parametrize(
     ("interval", "error"),
     # In 15 s the stamps jump against the clock several times, and each jump fixes the phase to 0.3
-    # µs. If there is less than one jump: the rounding over the length of all records, 1 ms in 120
-    # s, doubled since most of them show no jump.
+    # µs. Without a jump, the error is the rounding over the length of all records, 1 ms in 120 s.
+    # It is doubled, since most records show no jump.
     [(1.00031e-3, 3e-7 / 15), (0.99987e-3, 3e-7 / 15), (1.000047e-3, 2e-3 / 120)],
 )
 def test_the_records_of_a_session_share_one_period(interval, error):
@@ -150,11 +150,11 @@ def test_the_records_of_a_session_share_one_period(interval, error):
 
 
 @pytest.mark.parametrize("interval", [1.00031e-3, 0.99987e-3])
-def test_ticks_that_are_late_at_times_leave_one_period(interval):
+def test_small_jitter_does_not_split_a_session(interval):
     """Jitter far below the rounding of stamps does not split a session into several periods."""
     clocks = read_clocks(a_session(interval, jitter=2e-5))
     assert len({clock.period for clock in clocks}) == 1
-    # The jitter is 20 µs: three standard deviations at both ends of the longest record, 15 s.
+    # The jitter of 20 µs is taken three times, at both ends of the longest record of 15 s.
     assert_allclose(clocks[0].mean_interval, interval, rtol=6 * 2e-5 / 15)
 
 

@@ -44,7 +44,7 @@ def states(folder: Path) -> dict[str, tuple[str, str, str | None]]:
 
 
 def test_a_folder_of_files_becomes_a_submission(tmp_path):
-    """`fill` finds carts, units, kinds and free carts; all else in the file is a comment."""
+    """`fill` finds carts, units, kinds and free carts; everything else in the file is a comment."""
     still = 0 * T
     put(tmp_path, "run 10.csv", time=T, input=SINE, x1__cm=RING / 300, x2__cm=0.4 * RING / 300)
     put(tmp_path, "run 2.csv", time=T, input=STEP, x1__cm=RING / 300, x2__cm=0.4 * RING / 300)
@@ -70,7 +70,7 @@ def test_a_folder_of_files_becomes_a_submission(tmp_path):
 
 
 def test_a_second_run_prints_as_much_as_the_first(tmp_path):
-    """A second `fill` repeats free carts and doubts, until a person removes the doubt's mark."""
+    """A second `fill` repeats free carts and doubts, until a person removes the mark of a doubt."""
     still = 0 * T
     put(tmp_path, "pull.csv", time=T, input=still, x1=RING, x2=still)
     put(tmp_path, "loop.csv", time=T, input=RING / 999, reference=STEP, x1=RING, x2=RING)
@@ -91,7 +91,7 @@ def test_a_second_run_prints_as_much_as_the_first(tmp_path):
 
 
 @pytest.mark.parametrize("command", ["inspect", "fill"])
-def test_what_is_no_recording_by_its_name_is_said_to_be_left_out(tmp_path, command):
+def test_an_old_spreadsheet_is_named_as_not_read(tmp_path, command):
     """An old spreadsheet in `data/` is named as not read, with other files or alone."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     (tmp_path / "data" / "b.xls").write_bytes(b"PK")
@@ -104,7 +104,7 @@ def test_what_is_no_recording_by_its_name_is_said_to_be_left_out(tmp_path, comma
     assert re.findall(r"not read: (\S+) ", done.stderr) == ["data/b.xls"]
 
 
-def test_every_file_is_named_but_for_what_a_tool_hides(tmp_path):
+def test_every_file_is_named_except_hidden_ones(tmp_path):
     """Files that are no recordings are named, except files that a tool hides."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     data = tmp_path / "data"
@@ -135,14 +135,14 @@ def test_fill_says_whether_it_wrote(tmp_path):
     assert said == [True, True, False]
 
 
-def test_the_exporter_s_empty_columns_are_no_carts(tmp_path):
+def test_an_empty_column_does_not_count_as_a_cart(tmp_path):
     """An encoder that never moves in any file is not counted as a cart."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING, x2=0.5 * RING, x3=0 * T)
     fill_submission(tmp_path)
     assert load_submission(tmp_path).system.carts == 2
 
 
-def test_what_stands_there_is_kept_and_what_lacks_is_completed(tmp_path):
+def test_typed_entries_are_kept_and_missing_ones_added(tmp_path):
     """`fill` keeps kinds, ids and comments that a person typed, and adds what is missing."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     put(tmp_path, "b.csv", time=T, input=SINE, x1=RING)
@@ -166,7 +166,7 @@ def test_what_stands_there_is_kept_and_what_lacks_is_completed(tmp_path):
     assert (tmp_path / "submission.toml").read_bytes() == raw
 
 
-def test_what_is_no_recording_gets_no_table(tmp_path):
+def test_only_recordings_get_a_table(tmp_path):
     """Copies, texts and unknown files get no table; an unknown file gets one comment."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     put(tmp_path, "b.csv", time=T, input=STEP, x1=RING)
@@ -179,7 +179,7 @@ def test_what_is_no_recording_gets_no_table(tmp_path):
         assert [e.id for e in load_submission(tmp_path).experiments] == ["a"]
 
 
-def test_the_same_samples_in_another_form_get_one_table(tmp_path):
+def test_the_same_samples_in_two_formats_get_one_table(tmp_path):
     """The same recording saved as .csv and .mat gets one table.
 
     A recording that only has the same ranges gets its own table.
@@ -206,7 +206,7 @@ def test_a_bare_matrix_gets_its_columns(tmp_path):
     assert any("input = 3, x1 = 2" in one for one in found.remarks)
 
 
-def test_columns_that_the_signals_leave_open_are_asked_about(tmp_path):
+def test_unclear_columns_are_asked_about(tmp_path):
     """In a steady sine either column may be the input: `fill` proposes one and asks to check it."""
     (tmp_path / "data").mkdir()
     sines = np.round(300 * np.sin(20 * T)), np.round(200 * np.sin(20 * T - 1))
@@ -219,7 +219,7 @@ def test_columns_that_the_signals_leave_open_are_asked_about(tmp_path):
     assert f"# unsure: {doubt}" in (tmp_path / "submission.toml").read_text(encoding="utf-8")
 
 
-def test_a_bare_matrix_of_more_carts_than_there_are_spoils_nothing(tmp_path):
+def test_an_encoder_without_a_cart_gets_no_column(tmp_path):
     """An encoder without a cart gets no column, and all files still get their tables."""
     new_submission(tmp_path, carts=1)
     rows = [
@@ -234,7 +234,7 @@ def test_a_bare_matrix_of_more_carts_than_there_are_spoils_nothing(tmp_path):
 
 
 @pytest.mark.parametrize(("carts", "asked"), [(1, "x1 = …"), (2, "more carts")])
-def test_a_cart_that_the_system_has_not_is_asked_about(tmp_path, carts, asked):
+def test_a_moving_column_without_a_cart_is_asked_about(tmp_path, carts, asked):
     """If a column moves that belongs to none of the stated carts, `fill` asks about it.
 
     The file gets a table without `carts`.
@@ -249,7 +249,7 @@ def test_a_cart_that_the_system_has_not_is_asked_about(tmp_path, carts, asked):
     assert experiment.carts == tuple(range(1, carts + 1))
 
 
-def test_a_held_cart_that_is_stated_is_no_remark(tmp_path):
+def test_a_stated_held_cart_is_not_questioned(tmp_path):
     """A cart written as held is mentioned once; if its line is removed, `fill` asks about it."""
     put(tmp_path, "run.csv", time=T, input=STEP, x1=RING, x2=0.4 * RING)
     put(tmp_path, "pull.csv", time=T, input=0 * T, x1=RING, x2=0 * T)
@@ -263,7 +263,7 @@ def test_a_held_cart_that_is_stated_is_no_remark(tmp_path):
 
 
 def test_a_table_without_its_file_is_reported(tmp_path):
-    """A renamed file gets a new table, and a hint names it for the table of its old name."""
+    """A renamed file gets a new table, and the message on the old table names the renamed file."""
     put(tmp_path, "step-1.csv", time=T, input=STEP, x1=RING)
     fill_submission(tmp_path)
     (tmp_path / "data" / "step-1.csv").rename(tmp_path / "data" / "step1.csv")
@@ -288,7 +288,7 @@ def test_links_out_of_the_folder_are_not_followed(tmp_path):
     assert refused.advice == "replace the link with the file itself"
 
 
-def test_a_data_folder_that_is_a_link_tells_no_name_behind_it(tmp_path):
+def test_a_linked_data_folder_reveals_no_file_name(tmp_path):
     """If `data` is a link to outside the submission, no name of a file in it is shown."""
     put(tmp_path / "theirs", "a.csv", time=T, input=STEP, x1=RING)
     (tmp_path / "theirs" / "data" / "grades.xls").write_bytes(b"PK")
@@ -303,7 +303,7 @@ def test_a_data_folder_that_is_a_link_tells_no_name_behind_it(tmp_path):
 
 
 @pytest.mark.parametrize("mark", ["\u202f", "\u00a0", "\u200b", "\ufeff", "\u202e"])
-def test_a_name_that_does_not_show_is_named(mark, tmp_path):
+def test_an_invisible_file_name_is_reported(mark, tmp_path):
     """A file name with an invisible character is refused and reported.
 
     Other files are filled in.
@@ -344,13 +344,13 @@ def test_nothing_to_fill_in_is_one_line(tmp_path):
         ("version = 1", "version = 1\nexperiments = 3", "experiments"),
     ],
 )
-def test_what_is_no_table_is_one_line(old, new, where, tmp_path):
+def test_a_wrong_type_is_one_line(old, new, where, tmp_path):
     """A wrong type in `submission.toml` gives one line that names the key; nothing is written."""
     put(tmp_path, "pull.csv", time=T, input=0 * T, x1=RING, x2=0.4 * RING)
     typed = "version = 1\n[system]\ncarts = 1\n".replace(old, new).replace("[other]\ncarts = 1", "")
     (tmp_path / "submission.toml").write_text(typed, encoding="utf-8")
     done = CliRunner().invoke(app, ["fill", str(tmp_path)])
-    assert isinstance(done.exception, SubmissionError)  # with which the command ends with status 2
+    assert isinstance(done.exception, SubmissionError)  # the command turns this into exit status 2
     assert f"submission.toml: {where}: expected" in str(done.exception)
     assert (tmp_path / "submission.toml").read_text(encoding="utf-8") == typed
 
@@ -368,7 +368,7 @@ def test_the_command_says_what_it_did(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "carts"), [("one-cart", 1), ("two-cart", 2), ("three-cart", 3)])
-def test_the_files_of_an_example_are_told_apart(name, carts, tmp_path):
+def test_kinds_and_carts_of_an_example_are_found(name, carts, tmp_path):
     """Without an example's tables, `fill` finds kinds and free carts of all its files."""
     true = load_submission(EXAMPLES / name)
     shutil.copytree(true.folder / "data", tmp_path / "bare" / "data")
@@ -386,7 +386,7 @@ _TABLES = st.permutations(["system", "experiments", "reported.initial", "design"
 
 
 @given(_COMMENTS, _TABLES, st.integers(0, 3), st.booleans())
-def test_whatever_stands_there_stays(tmp_path_factory, comments, tables, n, blank):
+def test_existing_text_stays(tmp_path_factory, comments, tables, n, blank):
     """Whatever tables are added to the file, every comment, key and digit in it stays."""
     bodies = {
         "system": "[system] {}\ncarts = 1\ninput = {{ unit = 'V' }} {}\n",
@@ -427,7 +427,7 @@ def test_an_outdated_change_is_refused(tmp_path):
     assert "from outside" in toml.read_text(encoding="utf-8")
 
 
-def test_columns_that_are_stated_tell_what_a_file_is(tmp_path):
+def test_stated_columns_identify_a_file(tmp_path):
     """Stated `columns` identify a file: those of `[system]` any file, those of a table its own."""
     put(tmp_path, "a.csv", clock=T, volts=STEP, sled=2 * RING)
     put(tmp_path, "b.csv", time=T, input=SINE, x1=RING)
@@ -446,7 +446,7 @@ def test_columns_that_are_stated_tell_what_a_file_is(tmp_path):
     assert len(read_data(load_submission(tmp_path)).records) == 3
 
 
-def test_whatever_lies_there_is_named_with_what_to_do(tmp_path):
+def test_each_unread_file_is_named_with_advice(tmp_path):
     """Each file that is not read is named with a reason and advice."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     data = tmp_path / "data"
@@ -472,7 +472,7 @@ def test_whatever_lies_there_is_named_with_what_to_do(tmp_path):
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such names")
 @pytest.mark.parametrize("name", ["run\u200b1.csv", "run\u202f1.csv", os.fsdecode(b"run\xff.csv")])
-def test_a_name_that_no_table_may_have_is_told(tmp_path, name):
+def test_an_unprintable_name_is_refused(tmp_path, name):
     """A recording whose name cannot be printed is refused, and the name shown with escapes."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     shutil.copy(tmp_path / "data" / "a.csv", tmp_path / "data" / name)

@@ -164,7 +164,7 @@ def test_a_row_of_units_goes_into_the_headings():
     assert_array_equal(got.values[0], TIME)
 
 
-def test_the_bench_log_is_told_from_an_ecp_export():
+def test_a_bench_log_is_distinguished_from_an_ecp_export():
     """A bench log has the headings of an ECP export, but is recognised by tabs and no brackets."""
     lines = ["Sample\tTime\tEncoder 1 Pos\tEncoder 2 Pos\tControl Effort"]
     lines += [
@@ -229,7 +229,7 @@ def test_a_bare_matrix_has_numbered_columns():
     assert upright.whole == (True, False, True, False)
 
 
-def test_what_a_mat_file_holds_besides_is_mentioned():
+def test_other_content_of_a_mat_file_is_named():
     """Structs, texts and single numbers in a .mat file are not read, and are named."""
     got = table(mat(time=TIME, x1=X1, run={"P": 1.0}, name="bench 4", rate=113.0))
     assert got.names == ("time", "x1")
@@ -238,7 +238,7 @@ def test_what_a_mat_file_holds_besides_is_mentioned():
     assert [v.read for v in got.variables] == [True, True, False, False, False]
 
 
-def test_a_counter_that_ran_over_is_made_continuous():
+def test_a_counter_that_overflowed_is_made_continuous():
     """A 16-bit encoder count that overflows is made continuous, and the record says so."""
     true = 65_500 + 3 * np.arange(N)
     got = table(mat(time=TIME, enc1=(true % 65_536).astype("u2"), duty=np.zeros(N, "i2")))
@@ -259,7 +259,7 @@ def test_a_file_of_blanks_of_any_sort_is_empty():
         table(b"\x85")
 
 
-def test_the_recording_is_the_matrix_whatever_lies_beside_it():
+def test_the_matrix_of_a_mat_file_is_the_recording():
     """A .mat file's matrix is the recording, even beside twelve settings and a list of gains."""
     matrix = np.column_stack([TIME, X1, U])
     stream = BytesIO()
@@ -280,7 +280,7 @@ def test_a_matrix_beside_vectors_of_its_length_gives_its_columns_too():
     assert_array_equal(column(got, "y column 2"), U)
 
 
-def test_what_may_hold_another_recording_is_told_with_what_to_do():
+def test_a_possible_second_recording_gets_advice():
     """A note says how to read a second matrix, or a struct as large as the recording."""
     further = mat(time=TIME, x1=X1, log=np.ones((90, 70)), raw={"t": TIME, "x": X1, "u": U})
     notes = {v.name: v.advice for v in table(further).variables if not v.read}
@@ -292,7 +292,7 @@ def test_what_may_hold_another_recording_is_told_with_what_to_do():
         table(mat(log={"t": TIME, "x1": X1}))
 
 
-def test_a_matlab_table_is_told_by_its_name():
+def test_a_matlab_table_is_refused_with_advice():
     """A MATLAB `table` object cannot be read, and the error shows how to export it."""
     flags, name = np.array([6, 8, 17, 0], dtype="<u4").tobytes(), b"run7".ljust(8, b"\0")
     body = flags + np.array([1, 4], dtype="<u4").tobytes() + name
@@ -331,7 +331,7 @@ def test_a_matlab_7_3_log_is_read_like_any_other():
     assert_array_equal(table(mat73(data=matrix)).values, matrix.T)
 
 
-def test_what_a_matlab_7_3_file_holds_besides_is_mentioned():
+def test_other_content_of_a_matlab_7_3_file_is_named():
     """A struct, a text and an empty array in a version 7.3 file are not read, and are named."""
     stream = BytesIO(mat73(time=TIME, x1=X1))
     with h5py.File(stream, "r+") as file:
@@ -375,7 +375,7 @@ def scipy_element(values: np.ndarray, *, name: str) -> bytes:
     return raw.replace(named, np.array([1], dtype="<u4").tobytes() + b"\0")
 
 
-def test_a_mat_file_of_names_alone_is_refused():
+def test_a_mat_file_of_thousands_of_names_is_refused():
     """A .mat file with thousands of variables, or a name of a megabyte, gives one short error."""
     many = BytesIO()
     scipy.io.savemat(many, {f"v{i}": 1.0 for i in range(1001)})

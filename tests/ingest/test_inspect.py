@@ -50,7 +50,7 @@ KINDS = {
     "step": {"input": STEP},
     "sine": {"input": 0.3 * np.sin(2 * np.pi * 4.0 * T)},
     "sweep": {"input": np.sin((1 + 3 * T) * T)},
-    # An ECP in open loop logs its effort as the target too, in counts and between two samples.
+    # In open loop an ECP also logs its effort as the target, in counts and between two samples.
     "sweep, logged twice": {
         "input": np.sin((1 + 3 * T) * T),
         "reference": np.rint(50 * np.sin((1 + 3 * (T - 0.6 / RATE)) * (T - 0.6 / RATE))),
@@ -65,7 +65,7 @@ def test_the_kind_is_guessed(kind, signals, tmp_path):
     got = inspect(tmp_path, time=T, x1=X, **signals)
     assert got.kind == kind.split(",")[0]
     if kind == "sine":
-        assert got.frequency == pytest.approx(4.0, rel=0.01)  # a tenth of the 0.1 Hz lines
+        assert got.frequency == pytest.approx(4.0, rel=0.01)  # 10 s resolve 0.1 Hz
     else:
         assert got.frequency is None
 
@@ -114,7 +114,7 @@ def test_problems_are_named(columns, problem, tmp_path):
     assert any(problem in said for said in got.problems), got.problems
 
 
-def test_a_cut_file_is_inspected_all_the_same(tmp_path):
+def test_a_cut_file_is_still_inspected(tmp_path):
     """If the last line of a file is cut, `inspect` names the line and shows everything else."""
     inspect(tmp_path, time=T, x1=X)
     text = (tmp_path / "a.csv").read_text().rstrip("\n")
@@ -126,14 +126,14 @@ def test_a_cut_file_is_inspected_all_the_same(tmp_path):
     assert problem.startswith("line 2002: expected 2 columns, found 1; the file is truncated")
 
 
-def test_a_remark_does_not_keep_a_file_from_being_used(tmp_path):
+def test_a_file_with_a_remark_can_be_used(tmp_path):
     """A column without a role is reported, but the file can still be used."""
     got = inspect(tmp_path, time=T, input=np.sin(T), x1=X, temperature=X)
     assert got.problems
     assert got.unusable == ()
 
 
-def test_a_clock_that_goes_back_keeps_a_file_from_being_used(tmp_path):
+def test_a_file_whose_clock_goes_back_cannot_be_used(tmp_path):
     """A file whose time goes back, as in two records pasted together, cannot be used."""
     got = inspect(tmp_path, time=np.r_[T, T], x1=np.r_[X, X])
     assert any("goes back" in said for said in got.unusable)
@@ -150,7 +150,7 @@ def test_the_text_and_the_json_say_the_same(tmp_path):
     assert len(plain["problems"]) == 2
 
 
-def test_columns_without_names_get_a_line_to_use(tmp_path):
+def test_columns_without_names_get_a_suggestion(tmp_path):
     """For a matrix in the order of an ECP export, `inspect` prints a `columns` line to use."""
     counts = np.round(300 * np.sin(8 * T))
     copy = np.round(0.5 * counts + 0.5 * np.r_[0.0, counts[:-1]])
@@ -182,7 +182,7 @@ def test_a_link_may_be_inspected(tmp_path):
     assert inspect_file(tmp_path / "link").samples == 2000
 
 
-def test_what_is_no_data_file_is_one_line(tmp_path):
+def test_a_path_without_recordings_is_one_line(tmp_path):
     """A missing file, or a folder without recordings, gives one line of error."""
     typed = tmp_path / "none.csv"
     with pytest.raises(SubmissionError, match=r"there is no file 'none\.csv'") as caught:
@@ -196,7 +196,7 @@ def test_what_is_no_data_file_is_one_line(tmp_path):
         inspect_file(tmp_path)
 
 
-def test_a_folder_is_a_table_of_one_line_a_file(tmp_path):
+def test_a_folder_gives_one_line_per_file(tmp_path):
     """For a folder, `inspect` prints one line per file of `data/`, and then the problems."""
     (tmp_path / "data").mkdir()
     inspect(tmp_path / "data", time=T, input=STEP, x1=X)
@@ -209,7 +209,7 @@ def test_a_folder_is_a_table_of_one_line_a_file(tmp_path):
     assert all(problem.startswith("! ") for problem in problems)
 
 
-def test_what_is_wrong_with_many_files_is_said_once(tmp_path):
+def test_a_problem_of_many_files_is_printed_once(tmp_path):
     """A problem that six files share is printed once, under their table."""
     (tmp_path / "data").mkdir()
     for number in range(6):

@@ -104,7 +104,7 @@ def test_segments_that_continue_each_other_are_one_recording():
         assert got.lines[-1] == len(text.splitlines())
 
 
-def test_comments_beside_rows_are_said_not_read():
+def test_comments_beside_rows_are_not_read():
     """Comments beside the rows, in the last column, are not read, and a note says so."""
     got = table(GOOD.replace("\r\n0.010000", "\tknock\r\n0.010000"))
     assert got.notes == ("comments beside the rows are not read",)
@@ -145,7 +145,7 @@ def test_a_broken_lvm_names_its_line(content, said):
     assert "\n" not in str(caught.value)
 
 
-def test_an_lvm_cut_short_is_known_even_between_two_rows():
+def test_an_lvm_cut_between_two_rows_is_recognised():
     """A cut .lvm file is recognised from the number of samples in its header."""
     got = table(GOOD[: GOOD.index("0.300000")])
     assert got.cut is not None
@@ -198,7 +198,7 @@ def test_every_tdms_gives_the_same_numbers(raw):
     assert_allclose(got.values, [TIME, U, X1], rtol=0, atol=1e-9)
 
 
-def test_what_a_tdms_holds_besides_is_said():
+def test_other_content_of_a_tdms_is_named():
     """A note names short channels and text channels that are not read; units join the headings."""
     got = table(TDMS["settings"])
     assert got.notes == (
@@ -219,7 +219,7 @@ def lead_in(flags: int, length: int, data: int) -> bytes:
 
 
 def objects(*named: tuple[str, int]) -> bytes:
-    """Return metadata: paths, each with its number of doubles in a chunk, if above 0."""
+    """Return metadata: each path, with its number of doubles in a chunk if there are any."""
     body = struct.pack("<I", len(named))
     for path, count in named:
         body += struct.pack("<I", len(path)) + path.encode()

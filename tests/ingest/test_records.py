@@ -67,7 +67,7 @@ def test_counts_become_position_units_once(tmp_path):
     assert record.free == (1, 2)
 
 
-def test_positions_of_a_csv_are_in_the_unit_already(tmp_path):
+def test_positions_of_a_csv_are_not_scaled(tmp_path):
     """per_count never applies to the columns x1 … of a CSV file, even if all are whole numbers."""
     record = read(tmp_path, CM, STEP, csv(time=T, input=U, x2=X2, x1=X1)).records[0]
     assert_array_equal(record.position(1), X1)
@@ -86,7 +86,7 @@ def test_a_unit_in_the_heading_is_converted(unit, factor, tmp_path):
     """A displacement in mm is converted to cm, and the record says so."""
     content = csv(**{"Time__us": np.round(1e6 * T), f"Displacement__{unit}": X1})
     record = read(tmp_path, CM, 'kind = "decay"\ncarts = [2]', content).records[0]
-    assert record.carts == (2,)  # cart 1, the only free one
+    assert record.carts == (2,)  # the only free cart
     assert_allclose(record.position(2), factor * X1, rtol=1e-12)
     assert_allclose(record.t, T, atol=0.5e-6)
     assert any("converted" in note for note in record.notes) == (factor != 1.0)
@@ -116,7 +116,7 @@ def test_the_usual_headings_are_understood(headings, tmp_path):
     assert_allclose(record.position(2), X2 * (100.0 if milli else 1.0), rtol=1e-12)
 
 
-def test_a_copied_file_is_no_repeat(tmp_path):
+def test_a_copied_file_is_reported(tmp_path):
     """If two experiments have files with the same bytes, a warning says so."""
     toml = "version = 1\n[system]\ncarts = 2\n"
     for name in ("one", "two"):
@@ -258,7 +258,7 @@ def test_an_unneeded_scale_is_reported(content, tmp_path):
     assert said.startswith("system.input.per_count = 0.0001 is not used: no input holds counts")
 
 
-def test_an_effort_with_fractions_is_no_duty_count(tmp_path):
+def test_an_effort_with_fractions_is_in_volts(tmp_path):
     """An effort with fractions is taken as volts, not as duty counts."""
     record = read(tmp_path, "", STEP, bench_log(U)).records[0]
     assert record.u is not None
@@ -376,7 +376,7 @@ def test_a_commanded_position_is_the_reference_under_feedback_only(tmp_path):
     assert read(tmp_path, CM, STEP, content).records[0].reference is None
 
 
-def test_a_mirrored_commanded_position_is_no_reference(tmp_path):
+def test_a_mirrored_commanded_position_is_not_used(tmp_path):
     """A commanded position that only copies encoder 1 is not used as reference."""
     copy = np.round(0.5 * X1 + 0.5 * np.r_[0.0, X1[:-1]])
     record = read(tmp_path, CM, LOOP, ecp(reference=copy, x1=X1, effort=U)).records[0]
@@ -384,7 +384,7 @@ def test_a_mirrored_commanded_position_is_no_reference(tmp_path):
     assert any("only copies 'Encoder 1 Pos'" in note for note in record.notes)
 
 
-def test_a_stated_reference_goes_before_the_file(tmp_path):
+def test_a_stated_reference_replaces_that_of_the_file(tmp_path):
     """A stated `reference` is constant, in position units, and replaces that of the file."""
     content = csv(time=T, input=U, x1=X1, reference=0 * T)
     record = read(tmp_path, CM, LOOP + "\nreference = 1.5", content).records[0]
@@ -394,7 +394,7 @@ def test_a_stated_reference_goes_before_the_file(tmp_path):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_sign_not_stated_is_found_and_said(sign, tmp_path):
+def test_an_unstated_sign_is_found_and_reported(sign, tmp_path):
     """If no sign is stated, the data decide it, so that positive input pushes to positive x."""
     data = read(tmp_path, "", STEP, csv(time=T, input=sign * U, x1=X1))
     assert_array_equal(data.records[0].u, U)
@@ -402,7 +402,7 @@ def test_a_sign_not_stated_is_found_and_said(sign, tmp_path):
     assert f"sign of the input found from the data: {sign:+d}" in data.warnings
 
 
-def test_a_stated_sign_is_used_and_a_doubtful_one_mentioned(tmp_path):
+def test_a_stated_sign_is_used_and_a_doubtful_one_reported(tmp_path):
     """A stated sign is used even if the data contradict it, and a check reports that."""
     content = csv(time=T, input=U, x1=X1)
     data = read(tmp_path, 'input = { unit = "V", sign = -1 }', STEP, content)
@@ -473,7 +473,7 @@ def test_a_dwell_carries_its_frequency(tmp_path):
 # ------------------------------------------------------------------------- Bode tables
 
 
-def test_a_bode_table_becomes_a_response_a_cart(tmp_path):
+def test_a_bode_table_gives_one_response_per_cart(tmp_path):
     """A Bode table in Hz becomes one response per cart, sorted, with 1 % assumed as error."""
     f = np.array([4.0, 1.0, 2.0])
     data = read(tmp_path, "", 'kind = "bode"', csv(frequency=f, x1=f + 1, x2=f + 2))
@@ -493,7 +493,8 @@ def test_repeats_in_a_bode_table_give_its_standard_errors(tmp_path):
     x = (1 + f) * np.exp(0.03 * rng.standard_normal(f.size))
     (response,) = read(tmp_path, "", 'kind = "bode"', csv(frequency=f, x1=x)).tables
     assert response.omega.size == 100
-    # With 300 degrees of freedom a standard deviation is good to 1/sqrt(600) = 4 %; three of those.
+    # With 300 degrees of freedom a standard deviation is accurate to 1/sqrt(600) = 4 %. The limit
+    # is three times that.
     assert_allclose(response.magnitude_std / response.magnitude, 0.03 / 2, rtol=0.12)
 
 
@@ -505,7 +506,7 @@ def test_a_bode_table_may_be_in_rad_per_s_and_db(tmp_path):
     assert_allclose(response.magnitude, [10.0, 1.0], rtol=1e-12)
 
 
-def test_a_bode_table_with_held_carts_is_left_out_and_said(tmp_path):
+def test_a_bode_table_with_held_carts_is_left_out(tmp_path):
     """A Bode table with some carts held belongs to another plant, and is left out with a note."""
     content = csv(frequency=np.array([1.0, 2.0]), x1=np.array([1.0, 2.0]))
     data = read(tmp_path, "", 'kind = "bode"\ncarts = [1]', content)

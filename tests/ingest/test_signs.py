@@ -171,7 +171,7 @@ def test_a_record_that_counts_the_other_way_is_found(bench):
 
 
 def test_the_report_asks_why_a_record_was_inverted(tmp_path):
-    """The report asks about a step whose input was logged with the other sign, and reversed."""
+    """If a step was logged with the other sign, the report asks why cartlab inverted it."""
     folder = tmp_path / "bench"
     write_submission(folder, "throne-1dof", seed=5, compact=True)
     toml, step = folder / "submission.toml", folder / "data" / "step-1.csv"

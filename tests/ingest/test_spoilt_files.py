@@ -113,7 +113,7 @@ damage = st.one_of(
 
 
 def damaged(raw: bytes, hits: list[tuple[str, float, bytes]]) -> bytes:
-    """Apply each hit to the bytes."""
+    """Return the bytes after these changes, one after the other."""
     for what, where, junk in hits:
         at = int(where * len(raw))
         if what == "cut":
@@ -188,7 +188,7 @@ def test_the_undamaged_file_is_read(name, submission):
 )
 @given(hits=st.lists(damage, min_size=1, max_size=4))
 def test_a_damaged_file_is_an_error_or_a_record(name, hits, submission):
-    """Cuts, flipped bits, junk and repeats: one line of error, or finite data in time."""
+    """A file with cuts, flipped bits or junk gives one line of error, or finite data, in time."""
     try_everything(submission, damaged(FILES[name], hits))
 
 
@@ -204,14 +204,14 @@ def test_a_damaged_file_is_an_error_or_a_record(name, hits, submission):
     )
 )
 def test_junk_is_an_error_or_a_record(raw, submission):
-    """Bytes of no known form."""
+    """Random bytes give one line of error or finite data in time."""
     try_everything(submission, raw)
 
 
 @settings(max_examples=60)
 @given(hits=st.lists(damage, min_size=1, max_size=4))
 def test_a_damaged_submission_file_is_an_error_or_a_submission(hits, tmp_path_factory):
-    """`submission.toml` itself may be cut and garbled."""
+    """A cut or garbled `submission.toml` gives an error of few lines or a submission."""
     example = ROOT / "submissions" / "two-cart" / "submission.toml"
     folder = tmp_path_factory.mktemp("toml")
     (folder / "submission.toml").write_bytes(damaged(example.read_bytes()[:3000], hits))

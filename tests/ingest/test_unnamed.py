@@ -56,7 +56,7 @@ def told(columns: dict[str, Array], order: np.random.Generator) -> tuple[Roles, 
 def test_roles_assigned_without_doubt_are_right(example):
     """In the examples, roles found without doubt are right in any order.
 
-    Doubts concern dwells only.
+    Only dwells raise doubts.
     """
     asked = []
     order = np.random.default_rng(1)
@@ -78,7 +78,7 @@ def kinds_of(real: Path) -> dict[str, dict[str, int]]:
     return {name: roles for name, roles in files.items() if (real / name).exists()}
 
 
-def test_exports_of_a_real_bench_are_told_without_their_headings(real_data):
+def test_columns_of_real_exports_are_recognised(real_data):
     """In real step recordings all roles are found, although one column copies a position."""
     folder = real_data / "ecp210-ucsd"
     for name, roles in kinds_of(folder).items():
@@ -109,21 +109,21 @@ STEP = np.where(T > 1, 0.5, 0.0)
 ANSWER = np.where(T > 1, 1 - np.cos(9 * (T - 1)), 0.0)
 
 
-def test_a_velocity_is_no_cart():
+def test_a_velocity_gets_no_role():
     """A column that is the rate of another gets no role."""
     rate = np.where(T > 1, 9 * np.sin(9 * (T - 1)), 0.0)
     got = find_roles(bare(T, STEP, ANSWER, rate))
     assert got == Roles(columns={"time": 1, "input": 2, "x1": 3})
 
 
-def test_a_reference_is_told_from_the_input_that_jumps_with_it():
+def test_a_reference_is_distinguished_from_the_input():
     """Reference and controller output jump together, and each gets its own role."""
     effort = STEP - 0.2 * ANSWER
     got = find_roles(bare(T, STEP, ANSWER, effort))
     assert got == Roles(columns={"time": 1, "input": 4, "reference": 2, "x1": 3})
 
 
-def test_two_columns_that_are_one_signal_are_asked_about():
+def test_two_nearly_equal_columns_are_asked_about():
     """A smooth reference nearly equals the position that follows it, so cartlab asks."""
     path = 10 * np.sin(2 * T) * np.sin(0.3 * T)
     drive = np.gradient(np.gradient(path, T), T) + np.sin(5 * T)
@@ -131,7 +131,7 @@ def test_two_columns_that_are_one_signal_are_asked_about():
     assert any("nearly equal: is one of them the reference?" in doubt for doubt in got.doubts)
 
 
-def test_a_time_in_small_units_is_said():
+def test_a_time_in_milliseconds_is_reported():
     """A time in milliseconds is recognised, and the message proposes the sample rate."""
     got = find_roles(bare(np.round(1e3 * T), STEP, ANSWER))
     assert got.columns == {}

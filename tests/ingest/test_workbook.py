@@ -188,7 +188,7 @@ def test_percent_is_read_and_reported():
     "code",
     ["General", "0.000", '0.0" s"', "[Red]0.0", r"0.0\ \d", "#,##0.00 [$€-407]", "0.00E+00", "@"],
 )
-def test_a_format_that_is_no_date_changes_nothing(code):
+def test_a_number_format_is_not_taken_for_a_date(code):
     """A number format with quoted letters, colours or a currency is not taken for a date."""
 
     def fill(ws) -> None:
@@ -236,7 +236,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(("raw", "said"), BAD.values(), ids=BAD.keys())
-def test_a_cell_that_is_no_measurement_is_named(raw, said):
+def test_a_cell_that_is_not_a_number_is_named(raw, said):
     """A cell that is not a number gives one line of error with sheet, cell and column."""
     with pytest.raises(SubmissionError, match=said) as caught:
         table(raw)
@@ -347,7 +347,7 @@ def test_a_workbook_cut_short_is_refused(share):
         table(raw[: max(int(share * len(raw)), 10)])
 
 
-def test_what_inflates_without_end_is_refused(monkeypatch):
+def test_a_workbook_that_inflates_too_far_is_refused(monkeypatch):
     """A workbook that inflates to more bytes than allowed is refused, whatever size it declares."""
     monkeypatch.setattr(workbook_cells, "_MOST_BYTES", 1_000_000)
     with pytest.raises(SubmissionError, match="cut short or larger"):

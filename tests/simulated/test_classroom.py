@@ -7,7 +7,7 @@ from pipeline.grading.gradebook.book import Gradebook
 from pipeline.simulated.classroom import PRESET, write_class
 
 
-def test_the_slip_and_the_copy_are_found_and_the_honest_team_is_not_touched(tmp_path):
+def test_only_the_slip_and_the_copy_are_flagged(tmp_path):
     """Team 1 has all points, team 2 is flagged for Hz, and teams 2 and 3 for a shared recording."""
     write_class(tmp_path / "class")
     assert [p.name for p in tmp_path.iterdir()] == ["class"]

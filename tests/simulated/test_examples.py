@@ -129,7 +129,7 @@ def test_the_carts_move_well_and_not_too_far(sessions, preset):
 
         assert 0.4 <= np.abs(x).max() <= 2.0, entry["id"]
         assert np.abs(data["input"]).max() <= 5.0
-        # Four decimals are written: half of the last one.
+        # Four decimals are written, so rounding errs by half of the last one.
         assert_allclose(x / COUNT, np.round(x / COUNT), atol=0.51e-4 / COUNT)
         assert_allclose(np.diff(data["time"]), SAMPLE_TIME, atol=1.01e-5)
 
@@ -144,7 +144,7 @@ def test_the_log_is_the_motion_of_the_plant(sessions, preset, kind):
         model = simulate_linear(PRESETS[preset], data["time"], data["input"])
 
         residual = positions(data) - model
-        residual -= np.median(residual, axis=1, keepdims=True)  # the encoder's zero
+        residual -= np.median(residual, axis=1, keepdims=True)  # offset of the encoder
         # A cart at rest may be anywhere between two counts, so rounding errs by up to half a count.
         assert np.sqrt(np.mean(residual**2)) < np.hypot(NOISE, COUNT / 2), entry["id"]
 
@@ -159,7 +159,7 @@ def test_dwells_settle_before_they_end(sessions, preset):
         late = t > t[-1] - 2 * period
         for cart in x:
             earlier = np.interp(t[late] - 4 * period, t, cart)
-            # Two readings, each with noise and rounding, and straight lines between samples.
+            # Two readings have noise and rounding, and interpolation between samples adds an error.
             noise = np.sqrt(2 * (NOISE**2 + COUNT**2 / 12))
             bend = np.abs(cart).max() * (2 * np.pi * SAMPLE_TIME / period) ** 2 / 8
             assert np.sqrt(np.mean((cart[late] - earlier) ** 2)) < 1.2 * noise + bend, entry["id"]
@@ -210,8 +210,8 @@ def test_a_hand_holds_then_lets_go_softly():
     assert_array_equal(x[0], 0.0)
     first = np.argmax(~held)
     step = np.diff(x[1])
-    # After a sudden release the cart moves omega² x T²/2 = 0.06 cm in a sample; after a fading one,
-    # less.
+    # Within a sample the cart moves omega² x T²/2 = 0.06 cm after a sudden release, and less after
+    # a release that fades.
     assert abs(step[first]) < 0.04
     assert x[1].max() > 1.2  # then it swings to the other side
 
@@ -250,7 +250,7 @@ def test_honest_claims_are_near_the_truth(sessions, preset):
 
     assert list(reported["initial"]) == list(reported["final"]) == list(truth)
     for name, value in truth.items():
-        # Two standard errors, combined over two or three springs and masses.
+        # Two standard errors, each combined from two or three springs and masses.
         limit = 0.2 if name.startswith("zeta") else 0.02
         assert reported["final"][name] == pytest.approx(value, rel=limit), name
         if re.fullmatch("zeta_[a-cxy]", name):

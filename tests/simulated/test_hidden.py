@@ -104,7 +104,7 @@ def _cases():
 
 @pytest.fixture(scope="module")
 def linear(tmp_path_factory):
-    """A session without effects for each preset."""
+    """Return a session without effects for each preset."""
     root = tmp_path_factory.mktemp("linear")
     for preset in PRESETS:
         write_submission(root / preset, preset, seed=3, compact=True)
@@ -155,10 +155,10 @@ def test_the_linear_path_compiles_nothing():
 
 @pytest.mark.parametrize("key", KEYS)
 @pytest.mark.parametrize("make_run", [step, decay, control], ids=lambda f: f.__name__)
-def test_next_to_nothing_is_the_linear_bench(key, make_run):
+def test_a_tiny_effect_gives_the_linear_bench(key, make_run):
     """At a hundred-thousandth of its usual size, no effect changes a run by a count."""
     term = usual(key)
-    # These effects have further sizes, which have no neutral value.
+    # These parameters grow with the effect too, but have no neutral value.
     further = {
         "stiction": ("static_force",),
         "end_stop": ("damping",),
@@ -178,8 +178,8 @@ def test_next_to_nothing_is_the_linear_bench(key, make_run):
 
     moved, plain = bench(small).move(make_run()), bench().move(make_run())
 
-    # An effect that grows in proportion with its size stays below a count. The other differences
-    # are single roundings of an encoder in the loop.
+    # An effect that grows in proportion with its size stays below a count. Other differences are
+    # single roundings of an encoder in the loop.
     assert_allclose(moved.x, plain.x, atol=COUNT)
 
 
@@ -199,8 +199,8 @@ def test_steps_agree_with_the_independent_bench(key):
         m=TWO.m, c=TWO.c, k=TWO.k, hidden=[hidden], t=run.t, u=run.u, free=(1, 2),
         x0=rest_positions(model),
     )  # fmt: skip
-    # The 50-µs simulator reads along straight lines and errs by omega h / 2 in phase: 0.07 count in
-    # linear motion.
+    # The 50-µs simulator interpolates the input, so its phase errs by omega h / 2. That is 0.07
+    # count in linear motion.
     assert_allclose(moved.x, truth, atol=0.2 * COUNT)
     assert np.abs(moved.x - bench().move(run).x).max() > 2 * COUNT
 
@@ -220,8 +220,7 @@ def test_closed_loops_agree_with_the_independent_bench(key):
     truth = simulate_truth(
         m=TWO.m, c=TWO.c, k=TWO.k, hidden=[hidden], t=run.t, u=moved.u, free=(1, 2)
     )
-    # As for the steps; since the input changes every sample, that simulator has an edge in each
-    # sample.
+    # The phase errs as for the steps, at each sample, since the input changes at each sample.
     assert_allclose(moved.x, truth, atol=0.5 * COUNT)
     # The effect changes the loop: the controller asks for other inputs than on the linear bench.
     assert np.abs(moved.u - bench().move(run).u).max() > 1e-4
@@ -249,12 +248,13 @@ def test_releases_agree_with_the_independent_bench(key):
         m=TWO.m, c=TWO.c, k=TWO.k, t=fine, u=push, free=(1,), x0=np.array([held, 0.0]),
         hidden=[Hidden(effect=key, place=term.place, parameters=named(term))],
     )  # fmt: skip
-    # The phase of the 50-µs simulator errs by omega h / 2: 1e-3 of 1.5 cm at the spring's stiffest.
+    # The phase of the 50-µs simulator errs by omega h / 2. At the spring's stiffest that is 1e-3 of
+    # 1.5 cm.
     assert_allclose(x[0, start:], np.interp(samples, fine, truth[0]), atol=0.6 * COUNT)
 
 
 @pytest.mark.parametrize("key", KEYS)
-def test_sample_by_sample_is_the_whole_run(key):
+def test_sample_by_sample_equals_the_whole_run(key):
     """A bench simulated sample by sample gives the same run as one simulated all at once."""
     term = usual(key)
     model, run = AugmentedChain(chain=TWO, terms=(term,)), step()
@@ -274,7 +274,8 @@ def test_sample_by_sample_is_the_whole_run(key):
 def test_a_constant_force_shows_where_the_carts_rest():
     """Under a constant force the carts rest where the springs balance it.
 
-    They rest elsewhere if other carts are held. Before a closed loop the encoders are zeroed there.
+    They rest elsewhere if other carts are held. Before a closed loop the encoders are zeroed at
+    rest.
     """
     term = usual("force_offset")
     (force,) = term.values
@@ -366,7 +367,7 @@ def test_a_stored_model_gives_the_same_records(tmp_path):
         assert path.read_bytes() == (tmp_path / "b" / "data" / path.name).read_bytes()
 
 
-def test_a_model_of_chain_and_effects_alone_will_do(tmp_path):
+def test_chain_and_effects_suffice_as_a_model(tmp_path):
     """The chain and effects of `gap.json` suffice for a simulation, without other entries."""
     document = {
         "chain": {"m": [2e-4], "c": [5e-4], "k": [0.035, 0.0]},
@@ -488,7 +489,7 @@ def test_a_wrong_effect_is_one_line(hide, message):
         prepare_bench(preset="throne-2dof", hide=[hide])
 
 
-def test_one_place_has_one_dry_friction():
+def test_one_place_can_have_only_one_dry_friction():
     """Two laws of dry friction cannot be hidden at one place, but at two places they can."""
     with pytest.raises(ConfigError, match="cart 1 already has coulomb_friction"):
         prepare_bench(preset="throne-2dof", hide=["coulomb_friction", "stiction"])
@@ -515,7 +516,7 @@ def test_a_bench_needs_one_source(tmp_path):
         prepare_bench(preset="throne-1dof", model=tmp_path)
 
 
-def test_an_effect_the_linear_chain_can_replace_is_reported():
+def test_an_effect_that_equals_the_linear_chain_is_reported():
     """A note says if no data of this bench can distinguish a hidden effect from the chain."""
     prepared = prepare_bench(preset="throne-1dof", hide=["coupling_damper"])
 

@@ -115,7 +115,7 @@ def test_any_number_of_a_rubric(number, at):
 
 @pytest.fixture(scope="module")
 def planned(tmp_path_factory) -> Path:
-    """A submission with a plan."""
+    """Return a submission with a plan."""
     folder = tmp_path_factory.mktemp("planned")
     (folder / NAME).write_text(
         'version = 1\n[system]\ncarts = 2\nposition = { unit = "cm", per_count = 0.002 }\n',
@@ -161,7 +161,7 @@ def test_any_number_of_a_benchs_description(number, key):
 
 
 @pytest.mark.parametrize("number", ["1e1000000", "-1e-1000000", "9" * 5000, "0x" + "f" * 5000])
-def test_what_changes_a_file_refuses_such_a_number_too(tmp_path, number):
+def test_fill_and_desk_refuse_an_impossible_number(tmp_path, number):
     """`fill` and the desk refuse an impossible number with its key or line before they write."""
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "a.csv").write_text("time,input,x1\n0,0,0\n0.1,0,0\n", encoding="utf-8")
@@ -184,7 +184,7 @@ def test_a_column_typed_with_thousands_of_digits_is_refused(tmp_path):
         edit_submission(tmp_path, lambda document: write_fields(document, [columns]))
 
 
-def test_numbers_that_are_sound_come_out_as_python_reads_them():
+def test_valid_numbers_are_read_as_python_reads_them():
     """Numbers are read as tomllib reads them, or with their exact digits if asked."""
     text = "a = 0.1\nb = -1.5e-7\nc = [1, 2.50]\nd = { e = 1_000.0 }\n"
     assert parse_toml(text, where="f", error=PipelineError) == tomllib.loads(text)

@@ -74,7 +74,7 @@ settling_time = 0.90
 
 @pytest.fixture
 def folder(tmp_path):
-    """A submission with every table of the format."""
+    """Return a submission with every table of the format."""
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "a.csv").write_text("time,x1\n0,0\n")
     (tmp_path / "submission.toml").write_text(FULL, encoding="utf-8")
@@ -137,7 +137,7 @@ def test_any_typed_number_comes_back_as_typed(number):
 
 
 @pytest.mark.parametrize("carts", [1, 2, 3, 4])
-def test_springs_left_out_are_all_there(carts, tmp_path):
+def test_springs_that_are_not_stated_exist(carts, tmp_path):
     """If `springs` is missing, n carts have n + 1 springs between the walls."""
     (tmp_path / "submission.toml").write_text(f"version = 1\n[system]\ncarts = {carts}\n")
     assert load_submission(tmp_path).system.springs == (True,) * (carts + 1)
@@ -198,7 +198,7 @@ def test_every_problem_is_listed(folder):
         assert line.startswith(where + start)
 
 
-def test_an_unknown_table_hides_no_other_mistake(folder):
+def test_an_unknown_table_does_not_hide_other_mistakes(folder):
     """A misspelt table does not hide a misspelt key in another or a wrong value."""
     text = FULL.replace("[design]", "[desing]").replace("version = 1", "version = 1\ncolour = 3")
     text = text.replace("carts = 2\n", 'carts = "two"\n')
@@ -210,7 +210,7 @@ def test_an_unknown_table_hides_no_other_mistake(folder):
         assert words in said
 
 
-def test_a_slip_in_one_line_hides_no_slip_in_another(folder):
+def test_each_wrong_line_is_reported(folder):
     """Each line that is not TOML is reported once, with its number."""
     text = "version = 1\ntitle = “a”\n[system\ncarts = 2\n[design]\ncart = 1,5\nx = [1, two,\n 3]\n"
     (folder / "submission.toml").write_text(text, encoding="utf-8")
@@ -220,7 +220,7 @@ def test_a_slip_in_one_line_hides_no_slip_in_another(folder):
     assert lines == ["2", "3", "6", "7"]
 
 
-def test_a_list_that_is_not_closed_is_one_slip(folder):
+def test_a_list_that_is_not_closed_is_one_mistake(folder):
     """A list that is not closed is one mistake; the keys after it are read as they are."""
     text = "version = 1\ntitle = [1,\n 2\n[system]\ncarts = 1\n[design]\ncart = 1,5\n"
     (folder / "submission.toml").write_text(text, encoding="utf-8")
@@ -232,7 +232,7 @@ def test_a_list_that_is_not_closed_is_one_slip(folder):
 
 
 @pytest.mark.parametrize("carts", [1, 2, 3, 4])
-def test_a_new_submission_loads_and_says_what_is_next(carts, tmp_path):
+def test_a_new_submission_asks_for_experiments(carts, tmp_path):
     """A new submission is valid, but reading its data gives an error that asks for experiments."""
     new_submission(tmp_path / "team", carts=carts)
 
@@ -278,7 +278,7 @@ def test_a_new_submission_overwrites_nothing(tmp_path):
     assert not (tmp_path / "new").exists()
 
 
-def test_a_wrong_number_of_carts_is_said_before_what_follows_from_it(tmp_path):
+def test_a_wrong_number_of_carts_is_the_only_mistake(tmp_path):
     """If `carts` contradicts two lengths that agree, only `carts` is called wrong."""
     text = """
 version = 1
@@ -297,7 +297,7 @@ gains = [1, 0, 1, 0]
         load_submission(tmp_path)
 
 
-def test_of_many_thousand_mistakes_the_first_are_worded(tmp_path):
+def test_only_the_first_of_many_mistakes_are_written_out(tmp_path):
     """Of thousands of mistakes the first are written out, and the others only counted."""
     keys = "".join(f"k{i} = 1\n" for i in range(60_000))
     text = f"version = 1\n[system]\ncarts = 1\n{keys}"

@@ -351,7 +351,7 @@ def test_only_connections_without_the_secret_time_out(folder, monkeypatch):
 
 
 def test_the_page_does_not_delay_a_run(folder):
-    """While two pages read and one does not, the live page takes 50 lines within a heartbeat."""
+    """While two pages read and one does not, the page processes 50 lines within a heartbeat."""
     took = []
     with ExitStack() as opened:
         with LivePage(folder) as page:

@@ -52,7 +52,7 @@ def test_rounds_value_and_error_together(value, std, expected):
     st.floats(-1e9, 1e9, allow_nan=False).filter(lambda v: v == 0 or abs(v) > 1e-9),
     st.floats(1e-7, 1e7),
 )
-def test_rounding_changes_nothing_that_the_error_could_tell(value, ratio):
+def test_rounding_is_small_beside_the_error(value, ratio):
     """Rounding changes a value by at most a twentieth of its error."""
     std = ratio * abs(value) or ratio
 
@@ -99,7 +99,7 @@ def test_listing_reads_as_english():
     ]
 
 
-def test_margins_say_lag_lead_and_no_limit():
+def test_margins_distinguish_lag_lead_and_no_limit():
     """A negative phase margin is called a lead; without a critical gain there is no limit."""
     lag = Margins(gain=4.0, phase_deg=60.0, modulus=0.7, omega_gain=0.0, omega_phase=20.0)
     assert margin_rows(lag) == [

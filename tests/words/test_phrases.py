@@ -38,7 +38,7 @@ def modules() -> list[tuple[str, set[str]]]:
 
 
 @pytest.mark.parametrize("subject", SUBJECTS)
-def test_every_sentence_is_said_somewhere(subject, modules):
+def test_every_sentence_is_used(subject, modules):
     """Every sentence of a catalogue is used by some module."""
     asking = (f'"{subject}"', "WORDS", "words: Phrases", "said=(")
     strings: set[str] = set()
@@ -50,10 +50,10 @@ def test_every_sentence_is_said_somewhere(subject, modules):
     built_ends = tuple(s for s in parts if s.startswith("_"))
     for key in phrases(subject).by_key:
         said = key in strings or key.startswith(built) or key.endswith(built_ends)
-        assert said or key in ("bode_fit", "time_fit"), key  # the fit's own name
+        assert said or key in ("bode_fit", "time_fit"), key  # names of fit methods
 
 
-def test_marks_are_set_and_values_are_never_markup(tmp_path):
+def test_values_in_a_sentence_are_never_markup(tmp_path):
     """Bold text, code and links come from a sentence, and never from a value put into it."""
     words = written(tmp_path, 'a = "**Yes: **{name}, see `f` under [here](#x)."')
     assert words.spans("a", name="**no** [b](#y)") == (

@@ -63,7 +63,7 @@ def decay(name: str, cart: int = 1) -> Recording:
 
 
 def last_run(bench) -> dict:
-    """Return the bench's account of the run that was last stopped or cut."""
+    """Return what the bench reports of the last run that was stopped or cut."""
     while (sent := bench.event("run"))["ended"] not in ("stopped", "watchdog"):
         pass
     return sent
@@ -104,7 +104,7 @@ def test_a_plan_becomes_a_submission(tmp_path, fast):
     )
     whole = [outcome.recording.id for outcome in outcomes if not outcome.partial]
     assert whole == ["decay-1", "step", "dwell", "control"]
-    assert all(asked.endswith("again") for asked in notes.confirmed)  # after a busy host
+    assert all(asked.endswith("again") for asked in notes.confirmed)  # if the host was busy
     submission = load_submission(work)
     assert "# ours" in (work / "submission.toml").read_text(encoding="utf-8")
     assert submission.system.position.per_count == 0.00227
@@ -247,7 +247,7 @@ def test_a_run_that_breaks_off_is_saved_as_partial_and_recorded_again(tmp_path, 
         outcomes = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
     assert [bool(o.partial) for o in outcomes] == [True, False]
     assert why in outcomes[0].partial
-    # The reason is given together with the request.
+    # The request to record again contains the reason.
     assert notes.confirmed == [f"dwell ended early: {outcomes[0].partial}. Record dwell again"]
     assert (work / "data" / "dwell.partial.txt").exists()
     assert [e.file for e in load_submission(work).experiments] == ["data/dwell.txt"]
@@ -306,7 +306,7 @@ def test_an_amplitude_past_the_limits_is_never_sent(tmp_path, real):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no SIGTERM to catch")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["ctrl-c", "sigterm"])
-def test_a_host_told_to_end_stops_the_motor_and_saves(tmp_path, number, real):
+def test_an_interrupted_host_stops_the_motor_and_saves(tmp_path, number, real):
     """Ctrl-C or SIGTERM ends a run by a stop command, and the partial record is saved."""
     work = write_work(tmp_path, [sine("dwell", seconds=30)])
     with host(work, real.address, "--only", "dwell") as process:
@@ -340,7 +340,7 @@ def test_a_killed_host_leaves_a_readable_file_and_a_motor_that_is_off(tmp_path, 
     assert "data/dwell.partial.txt holds the data of an interrupted session" in notes.remarks
 
 
-def test_a_stuck_encoder_is_said(tmp_path):
+def test_a_stuck_encoder_is_reported(tmp_path):
     """An encoder that does not move while the motor drives is counted and mentioned in a note."""
     work = write_work(tmp_path, [sine("dwell", seconds=6)])
     with emulator("--fault", "stuck=2@0.2", "--speed", "10", "--period", "5.003") as bench:
@@ -352,20 +352,20 @@ def test_a_stuck_encoder_is_said(tmp_path):
 # ----------------------------------------------------------------- ports and scales
 
 
-def test_nobody_at_the_port_is_said_at_once():
+def test_a_port_without_a_bench_is_reported():
     """If nothing listens at a port, one line says what to do."""
     with pytest.raises(HardwareError, match="no bench listens there; start one"):
         open_line("socket://127.0.0.1:9", baud=115_200)
 
 
-def test_a_port_that_is_not_there_names_those_that_are():
+def test_a_missing_device_gets_the_list_of_ports():
     """If a device does not exist, one line names the ports of this machine."""
     with pytest.raises(HardwareError, match=r"no such port; is the bench plugged in\?; .*port"):
         open_line("/dev/ttyNONE7", baud=115_200)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
-def test_a_port_that_another_program_has_is_said():
+def test_a_port_in_use_is_reported():
     """If another program has the port open, the message says so."""
     controller, device = os.openpty()
     import fcntl
@@ -380,7 +380,7 @@ def test_a_port_that_another_program_has_is_said():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
-def test_what_is_no_bench_is_said():
+def test_a_device_that_is_not_a_bench_is_reported():
     """If a device gives other answers than a bench, the message says so."""
     controller, device = os.openpty()
     echo = subprocess.Popen(
@@ -430,7 +430,7 @@ cart = 1
 
 
 @pytest.mark.parametrize("stock", [True, False])
-def test_a_scale_that_nobody_knows_is_asked_for(tmp_path, stock):
+def test_an_unknown_scale_is_asked_for(tmp_path, stock):
     """If the bench does not state its units, one line says what to add to the submission."""
     text = 'version = 1\n[system]\ncarts = 2\nposition = { unit = "mm" }\n'
     (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
@@ -448,14 +448,14 @@ def test_more_carts_than_encoders_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("options", [[], ["--port", "x", "--import", "y"]])
-def test_either_a_port_or_a_folder(tmp_path, options):
+def test_a_port_and_a_folder_exclude_each_other(tmp_path, options):
     """`acquire` with both a port and a folder to import, or with neither, is refused."""
     result = CliRunner().invoke(app, ["acquire", str(tmp_path), *options])
     assert isinstance(result.exception, ConfigError)
     assert "either --port or --import" in str(result.exception)
 
 
-def test_an_id_that_the_plan_does_not_have_is_said(tmp_path, real):
+def test_an_unknown_id_gets_the_list_of_the_plan(tmp_path, real):
     """`--only` with an unknown name gives the list of the plan's recordings."""
     work = write_work(tmp_path, [sine("a", seconds=1)])
     with pytest.raises(ConfigError, match=r"--only nine: no such recording; plan.toml has a$"):
@@ -471,7 +471,7 @@ def shown(*, terminal: bool, **options) -> tuple[Terminal, StringIO]:
     return Terminal(console=Console(file=out, force_terminal=terminal, width=100), **options), out
 
 
-def test_the_view_tells_plan_rate_faults_and_positions():
+def test_the_terminal_shows_progress_faults_and_positions():
     """During a run the terminal shows progress, lost lines and where the carts are."""
     view, out = shown(terminal=True)
     plan = Plan(limits=LIMITS, recordings=(sine("a", seconds=30), sine("b", seconds=45)))
@@ -490,7 +490,7 @@ def test_the_view_tells_plan_rate_faults_and_positions():
     assert sparkline(range(0, 2000, 50)) in text
 
 
-def test_without_a_terminal_only_trouble_is_told():
+def test_without_a_terminal_only_bad_runs_are_reported():
     """In a log file a good run leaves no line, and a bad run leaves its reason."""
     view, out = shown(terminal=False)
     well = RunOutcome(recording=sine("a", seconds=1), lines=998)
@@ -504,7 +504,7 @@ def test_without_a_terminal_only_trouble_is_told():
     assert out.getvalue() == "a: stopped: cart 1 [b] was too far\n"
 
 
-def test_nobody_at_the_keyboard_confirms_nothing(monkeypatch):
+def test_without_a_keyboard_nothing_is_confirmed(monkeypatch):
     """Without a keyboard an instruction ends the session, unless `--yes` is given."""
     monkeypatch.setattr("sys.stdin", StringIO())
     view, _ = shown(terminal=False)

@@ -48,8 +48,8 @@ class OddBench(threading.Thread):
 
     Parameters
     ----------
-    lines : function from the lines that a run should have to those that are sent.
-    late : further lines, which are under way at the first stop and arrive after it.
+    lines : function that turns the lines that a run should have into the lines that are sent.
+    late : further lines that arrive just after the first stop.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ def leapt(lines: list[Reading]) -> Iterator[Reading]:
         (leapt, "the bench's time stamps jump from 0.499 to 8640000.500 s", 500),
     ],
 )
-def test_a_clock_that_cannot_be_believed_ends_the_run(tmp_path, lines, said, kept):
+def test_a_clock_that_stops_or_leaps_ends_the_run(tmp_path, lines, said, kept):
     """A run whose clock stands still or leaps is partial; its lines up to then are saved."""
     work = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)])
     tracemalloc.start()
@@ -126,7 +126,7 @@ def test_a_clock_that_cannot_be_believed_ends_the_run(tmp_path, lines, said, kep
     assert most < 50e6  # bytes
 
 
-def test_lines_of_the_run_before_that_come_late_are_not_of_this_one(tmp_path):
+def test_late_lines_of_the_previous_run_do_not_count(tmp_path):
     """Lines of an earlier run that arrive late are not counted in the next run."""
     first = iter([True])
 
@@ -142,7 +142,7 @@ def test_lines_of_the_run_before_that_come_late_are_not_of_this_one(tmp_path):
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.6])
-def test_lost_lines_are_told_however_many(tmp_path, share):
+def test_any_number_of_lost_lines_is_counted(tmp_path, share):
     """As a bench's stated period is trusted, missing lines are counted as lost and noted."""
     lost = np.random.default_rng(5).random(RUN) < share
 

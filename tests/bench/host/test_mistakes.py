@@ -23,7 +23,7 @@ from tests.helpers.acquisitions import Notes, host, sine, until_bytes, write_wor
 from tests.helpers.benches import emulator
 
 
-def test_another_bench_than_the_submission_is_of_is_refused(tmp_path):
+def test_a_bench_with_too_few_carts_is_refused(tmp_path):
     """A bench with one cart is refused for a submission of two carts."""
     work = write_work(tmp_path, [sine("dwell", seconds=1)])
     with emulator("--speed", "20", preset="throne-1dof") as bench:
@@ -34,7 +34,7 @@ def test_another_bench_than_the_submission_is_of_is_refused(tmp_path):
     assert not (work / "raw").exists()
 
 
-def test_a_bench_of_more_carts_is_said(tmp_path):
+def test_a_bench_with_more_carts_is_reported(tmp_path):
     """If the bench has more carts than the submission, a message says so and the run goes on."""
     submission = load_submission(write_work(tmp_path, []))
     bench = Description(name="three", encoders=3, carts=3, commands=EXTENSIONS)
@@ -77,7 +77,7 @@ class Late(Notes):
         super().readings(batch, anomalies)
 
 
-def test_a_busy_computer_is_named_where_the_watchdog_bites(tmp_path):
+def test_a_busy_computer_is_named_if_the_watchdog_acts(tmp_path):
     """If the computer is too busy to send a heartbeat, the message says so."""
     work = write_work(tmp_path, [sine("dwell", seconds=5)])
     notes = Late()
@@ -110,7 +110,7 @@ def test_an_interrupt_after_the_last_line_keeps_the_run(tmp_path):
     assert not (work / "data" / "first.partial.txt").exists()
 
 
-def test_a_network_port_typed_as_a_device_is_told_how_to_write_it():
+def test_a_network_port_typed_as_a_device_is_corrected():
     """If a network port is typed as a device, the message shows the right notation."""
     for port in ("41001", "127.0.0.1:41001"):
         with pytest.raises(HardwareError, match=r"is written socket://HOST:PORT"):
@@ -124,7 +124,7 @@ def test_a_port_that_is_taken_says_what_to_choose():
             open_link(f"socket://127.0.0.1:{taken.getsockname()[1]}")
 
 
-def test_one_is_not_many():
+def test_nouns_agree_with_their_numbers():
     """In messages the noun agrees with its number: one line, one encoder, two resets."""
     assert str(Anomalies(lost=1, stuck=1, resets=2)) == "1 line lost, 2 resets, 1 encoder stuck"
     assert str(Anomalies(lost=2, stuck=2, resets=1)) == "2 lines lost, 1 reset, 2 encoders stuck"
@@ -144,7 +144,7 @@ def test_a_new_submission_says_what_the_bench_does_not_know(tmp_path):
     assert submission.design is not None
 
 
-def test_where_nothing_was_recorded_no_report_is_offered(tmp_path, fast):
+def test_no_report_is_offered_if_nothing_was_recorded(tmp_path, fast):
     """If no recording was possible, the message names the limit and offers no report."""
     near = PlanLimits(input=0.5, travel=0.05)
     work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=near)

@@ -68,7 +68,7 @@ def test_a_file_cut_at_any_byte_is_read_up_to_there(raw, which):
             assert len(readings) == len(LINES)
 
 
-def test_a_raw_file_is_never_written_over(raw):
+def test_a_raw_file_is_never_overwritten(raw):
     """A second run of the same name is refused, and the first raw file stays."""
     with pytest.raises(FileExistsError), RawWriter(raw, HEADER):
         pass
@@ -86,7 +86,7 @@ def test_a_raw_file_is_never_written_over(raw):
         (b"[1]\n", "not a raw file of a bench"),
     ],
 )
-def test_what_is_no_raw_file_is_refused(tmp_path, content, why):
+def test_a_file_without_a_header_is_refused(tmp_path, content, why):
     """A file without a whole header gives one error that names the file."""
     path = tmp_path / "strange.raw"
     path.write_bytes(content)

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no 
 AT_ONCE = 20  # ms on the bench's clock, as docs/bench.md promises
 FULL = 4096
 FAR = round(11.0 / PER_COUNT)  # counts, for a limit of 2.5 cm
-BY_HANDS = EXTENSIONS - {"h"}  # a person moves the carts
+BY_HANDS = EXTENSIONS - {"h"}  # a person moves the carts, since `h` is unknown
 Wrong = Callable[[RunawayBench], bool]
 
 
@@ -35,7 +35,7 @@ def plan() -> list[Recording]:
 
 
 def decay(name: str) -> Recording:
-    """Return a decay that a hand starts."""
+    """Return a decay that begins with a release by hand."""
     return Recording(
         id=name,
         kind="decay",
@@ -111,7 +111,7 @@ def session(
 
 @pytest.mark.parametrize("wrong", [before_start, between, at_the_end])
 @pytest.mark.parametrize("commands", [EXTENSIONS, BY_HANDS], ids=["hands", "people"])
-def test_a_motor_that_is_on_while_no_run_is_ends_the_session(tmp_path, wrong, commands):
+def test_a_motor_that_is_on_without_a_run_ends_the_session(tmp_path, wrong, commands):
     """If the motor is on before, between or after runs, the session ends."""
     work = write_work(tmp_path, plan())
     with RunawayBench(wrong, duty=FULL, commands=commands) as bench:
@@ -125,7 +125,7 @@ def test_a_motor_that_is_on_while_no_run_is_ends_the_session(tmp_path, wrong, co
 
 @pytest.mark.parametrize("duty", [FULL, 3])
 @pytest.mark.parametrize("wrong", [resting, resting_again, running])
-def test_a_motor_that_is_not_driven_as_told_ends_the_session(tmp_path, wrong, duty):
+def test_a_motor_with_another_duty_than_ordered_ends_the_session(tmp_path, wrong, duty):
     """If the motor has another duty than ordered, full or slight, the session ends."""
     work = write_work(tmp_path, plan())
     with RunawayBench(wrong, duty=duty) as bench:
@@ -156,9 +156,7 @@ def test_before_the_carts_are_zeroed_they_may_be_anywhere(tmp_path):
 
 def test_carts_that_a_run_took_too_far_may_swing_back(tmp_path):
     """After a run stopped at the travel limit, the next run waits for rest and is recorded."""
-    near = PlanLimits(
-        input=0.5, travel=70 * PER_COUNT
-    )  # one count per two duty counts: at most 82 counts
+    near = PlanLimits(input=0.5, travel=70 * PER_COUNT)  # the carts move by at most 82 counts
 
     def swinging(bench: RunawayBench) -> bool:
         return resting_again(bench) and bench.ms - bench_began.setdefault("at", bench.ms) < 50
@@ -184,7 +182,7 @@ def test_a_cart_that_stays_too_far_out_is_not_driven_again(tmp_path):
     assert bench.started_after == []
 
 
-def test_a_stop_that_is_not_heeded_is_sent_again(tmp_path):
+def test_an_ignored_stop_is_sent_again(tmp_path):
     """If a bench goes on after a stop command, the stop is sent again and no run is started."""
     near = PlanLimits(input=0.5, travel=70 * PER_COUNT)
     first, second = plan()
@@ -201,8 +199,8 @@ def test_a_stop_that_is_not_heeded_is_sent_again(tmp_path):
 
 
 @pytest.mark.parametrize("period", [1, 2, 5, 10])
-def test_a_bench_of_few_lines_is_stopped_as_soon(period):
-    """A bench that sends few lines is stopped as soon as others, after two of them."""
+def test_a_bench_of_few_lines_is_stopped_after_two(period):
+    """A bench that sends few lines is also stopped after two faulty lines."""
     order = make_order(
         plan()[0],
         limits=PlanLimits(input=0.5, travel=2.5),
@@ -237,17 +235,17 @@ class Pulling(Notes):
         return any(instruction.startswith("Pull") for instruction in self.confirmed)
 
 
-def test_a_motor_that_comes_on_while_a_person_is_awaited_is_stopped(tmp_path):
+def test_a_motor_that_starts_while_a_person_holds_a_cart_is_stopped(tmp_path):
     """If the motor starts while a person holds a cart, the bench is stopped at once."""
     work, notes = write_work(tmp_path, [decay("decay")]), Pulling()
     with RunawayBench(notes.is_pulling, duty=FULL, commands=BY_HANDS) as notes.bench:
         (partial,), _ = session(work, notes.bench, notes=notes, only=["decay"])
     assert_over(notes.bench)
     assert partial.startswith("stopped: the bench drives its motor")
-    assert partial in notes.remarks  # at once, not only after the Enter key
+    assert partial in notes.remarks  # before the Enter key was pressed
 
 
-def test_a_motor_that_comes_on_while_a_virtual_hand_pulls_is_stopped(tmp_path):
+def test_a_motor_that_starts_while_a_virtual_hand_pulls_is_stopped(tmp_path):
     """If the motor starts while the virtual bench pulls a cart, the bench is stopped."""
     work = write_work(tmp_path, [decay("decay")])
     with RunawayBench(lambda bench: bench.is_pulled, duty=FULL) as bench:
@@ -256,7 +254,7 @@ def test_a_motor_that_comes_on_while_a_virtual_hand_pulls_is_stopped(tmp_path):
     assert partial.startswith("stopped: the bench drives its motor")
 
 
-def test_a_motor_that_comes_on_in_a_decay_by_hand_is_stopped(tmp_path):
+def test_a_motor_that_starts_in_a_decay_by_hand_is_stopped(tmp_path):
     """If the motor starts in a decay by hand, in which it has no duty, the bench is stopped."""
 
     def in_the_decay(bench: RunawayBench) -> bool:
@@ -273,7 +271,7 @@ def test_a_bench_that_misbehaves_after_its_line_was_lost_is_stopped(tmp_path):
     """After a lost line is opened again, the bench is watched from its first answer on."""
 
     def mute(bench: RunawayBench) -> bool:
-        return bench.resets == 3 and bench.lines > 800  # in the first run
+        return bench.resets == 3 and bench.lines > 800  # during the first run
 
     def reconnected(bench: RunawayBench) -> bool:
         return bench.resets > 4 and resting(bench)
@@ -287,7 +285,7 @@ def test_a_bench_that_misbehaves_after_its_line_was_lost_is_stopped(tmp_path):
 
 
 @pytest.mark.parametrize("wrong", [resting, running])
-def test_an_exploration_ends_where_the_bench_misbehaves(tmp_path, wrong):
+def test_an_exploration_ends_if_the_bench_misbehaves(tmp_path, wrong):
     """If the bench misbehaves, an exploration ends and chooses no other experiment."""
     with RunawayBench(wrong, duty=FULL) as bench:
         with pytest.raises(HardwareError, match=r"stopped: .*; the exploration ends here"):

@@ -87,7 +87,7 @@ def test_a_plan_for_a_stronger_bench_moves_nothing(tmp_path, real):
     assert not (work / "raw").exists()
 
 
-def test_the_numbers_are_said_before_anything_moves(tmp_path, fast):
+def test_the_limits_are_printed_before_anything_moves(tmp_path, fast):
     """Before anything moves, the limits are printed in units and counts, with full scale.
 
     2.5 cm in counts of 0.00227 cm are 1101.
@@ -99,7 +99,7 @@ def test_the_numbers_are_said_before_anything_moves(tmp_path, fast):
     assert any(remark.startswith(said) for remark in notes.remarks)
 
 
-def test_what_a_bench_cannot_do_is_left_out_and_the_rest_recorded(tmp_path):
+def test_an_impossible_recording_is_skipped_with_a_reason(tmp_path):
     """A chirp on a stock bench, or an amplitude below one count, is skipped with a reason.
 
     All other recordings are made, and the exit status is 1.
@@ -192,7 +192,7 @@ class Slow(Notes):
             time.sleep(2.0)
 
 
-def test_the_stop_goes_out_before_anybody_is_told(tmp_path, real):
+def test_the_stop_is_sent_before_observers_are_called(tmp_path, real):
     """The motor is stopped even if an observer hangs at the line that passes the limit."""
     with _session(real, observer=Slow()) as (session, _, ask):
         near = PlanLimits(input=0.5, travel=22 * 0.00227)
@@ -236,12 +236,12 @@ def test_a_new_line_is_zeroed_once_the_carts_rest(tmp_path, real):
             return bool(whole) and int(whole[-1].split(b":")[0]) > 100
 
         until(away, "a swing")  # at the latest after one second
-        line.send(Signal.RESET)  # as at the start of every session
+        line.send(Signal.RESET)  # every session starts with this
         line.drain()
         order = make_order(recording, **ask)
         assert session.prepare(order) == ""
         session.record(order, tmp_path / "dwell-1.raw")
-    assert max(map(abs, notes.readings_seen[0].counts)) <= 4  # which a cart at rest may flicker
+    assert max(map(abs, notes.readings_seen[0].counts)) <= 4  # as a cart at rest may flicker
 
 
 class Answers(threading.Thread):
@@ -262,7 +262,7 @@ class Answers(threading.Thread):
                     peer.sendall(next(self._answers))
 
 
-def test_a_description_is_believed_when_it_came_twice():
+def test_a_description_must_arrive_twice():
     """The bench's description is asked for until two answers agree, as one may be damaged."""
     true = DESCRIPTION.encode() + b"\n"
     wrong = [true.replace(b"0.002cm", b"0.00%dcm" % digit) for digit in (1, 3, 6)]
@@ -276,15 +276,15 @@ def test_a_description_is_believed_when_it_came_twice():
         open_line(port.address, baud=115_200)
 
 
-def test_a_late_answer_leaves_none_under_way():
+def test_a_run_starts_only_after_both_answers():
     """A run starts only after both answers to two queries have arrived.
 
-    If an answer is lost, here through a byte before it, the start is not delayed.
+    If an answer is lost, here through a stray byte before it, the start is not delayed.
     """
     described = DESCRIPTION.encode() + b"\n"
 
     def answers() -> Iterator[bytes]:
-        yield from (described, described)  # bytes of the handshake
+        yield from (described, described)  # answers in the handshake
         time.sleep(0.8)
         yield described
         time.sleep(0.1)
@@ -303,7 +303,7 @@ def test_a_late_answer_leaves_none_under_way():
 
 def test_a_stock_bench_may_take_half_a_second_to_begin(monkeypatch):
     """Lines of a stock bench's trial run are accepted if they come half a second late."""
-    monkeypatch.setattr("pipeline.bench.host.serial_line._ANSWER", 0.05)  # to what it cannot answer
+    monkeypatch.setattr("pipeline.bench.host.serial_line._ANSWER", 0.05)  # no answer comes
     door = socket.create_server(("127.0.0.1", 0))
 
     def late() -> None:
@@ -378,7 +378,7 @@ DESCRIPTION = (
         ("carts=2", "carts=0"),
     ],
 )
-def test_a_description_that_no_limit_can_be_reckoned_with_is_refused(stated, wrong):
+def test_a_description_with_a_useless_scale_is_refused(stated, wrong):
     """A description whose counts are worth zero or infinity is refused: no limit would hold."""
     assert parse_description(DESCRIPTION.encode()).carts == 2
     with pytest.raises(DataError, match=f"describes itself as .*{wrong}.* is wrong"):
@@ -396,7 +396,7 @@ def test_more_than_the_bench_can_give_is_refused():
         make_order(least.model_copy(update={"amplitude": 0.41}), **ask)
 
 
-def test_a_lost_byte_leaves_no_gains_of_an_earlier_run():
+def test_no_earlier_gains_act_after_a_lost_byte():
     """A gain command that lost a letter or a semicolon does nothing.
 
     Gains sent earlier do not act either.

@@ -64,7 +64,7 @@ def test_noise_is_never_an_error(raw, lump):
 
 
 @pytest.mark.parametrize("period", [1.0, 1.0024, 1.0007, 2.08])
-def test_a_clock_without_losses_is_told_exactly(period):
+def test_an_uneven_clock_without_losses_counts_none(period):
     """However uneven the clock, a whole run counts no line as lost, and its period is found."""
     fit = fit_stamps(clock(5000, period=period), period=1.0)
     assert fit.missing == 0
@@ -74,7 +74,7 @@ def test_a_clock_without_losses_is_told_exactly(period):
 
 @pytest.mark.parametrize("share", [0.002, 0.01, 0.04])
 @pytest.mark.parametrize("period", [1.0, 1.0024, 2.08])
-def test_lost_lines_are_told_from_the_skips_of_an_odd_clock(period, share):
+def test_lost_lines_are_distinguished_from_skips_of_the_clock(period, share):
     """If lines are lost at random, their number is found although the clock skips too."""
     rng = np.random.default_rng(7)
     stamps = clock(20_000, period=period)
@@ -100,7 +100,7 @@ def test_every_fault_is_counted_and_every_valid_line_kept():
     sent = lines(20_000)
     kind = rng.choice(["whole", "drop", "garble", "merge"], size=20_000, p=[0.97] + 3 * [0.01])
     kind[[0, 1, -2, -1]] = "whole"
-    kind[1:][kind[:-1] == "merge"] = "whole"  # the line after a merged one is damaged enough
+    kind[1:][kind[:-1] == "merge"] = "whole"  # a merged line damages the next one already
     raw, whole = bytearray(), []
     for reading, what, before in zip(sent, kind, ["", *kind[:-1]], strict=True):
         line = format_reading(reading)
@@ -113,7 +113,7 @@ def test_every_fault_is_counted_and_every_valid_line_kept():
     got, stream = read(bytes(raw), lump=300)
     assert got == whole
     anomalies = stream.anomalies(stream.fit())
-    so_far = stream.anomalies().lost  # reported during the run, accurate to a few a second
+    so_far = stream.anomalies().lost  # the count during the run errs by a few per second
     assert abs(so_far - anomalies.lost) <= 3 * 20
     assert anomalies.garbled == np.count_nonzero((kind == "garble") | (kind == "merge"))
     assert abs(anomalies.lost - np.count_nonzero(kind == "drop")) <= 2
@@ -121,7 +121,7 @@ def test_every_fault_is_counted_and_every_valid_line_kept():
 
 
 @pytest.mark.parametrize("period", [1.0, 1.0004, 1.0024, 1.017, 5.003])
-def test_no_line_is_said_to_be_lost_of_a_stream_that_is_whole(period):
+def test_no_line_of_a_whole_stream_counts_as_lost(period):
     """During a run the skips of an uneven clock are not counted as lost lines."""
     stream = Stream(encoders=2, period=round(period))
     for i in range(10_000):
@@ -135,7 +135,7 @@ def test_no_line_is_said_to_be_lost_of_a_stream_that_is_whole(period):
     [("ms", b"9"), ("ms", b""), ("counts", b"77")],
     ids=["stamp ahead", "stamp behind", "count"],
 )
-def test_a_line_that_can_be_read_but_cannot_be_is_garbled(field, wrong):
+def test_a_line_with_an_impossible_number_is_garbled(field, wrong):
     """A line with a digit too many or too few can be parsed, but counts as garbled."""
     sent = lines(200)
     texts = [format_reading(reading) for reading in sent]
@@ -159,7 +159,7 @@ def test_a_hard_hit_on_a_stop_is_no_fault():
     assert stream.anomalies().garbled == 0
 
 
-def test_a_bench_that_begins_again_ends_the_run():
+def test_a_bench_that_restarts_ends_the_run():
     """If stamps start again at zero, a reset is counted, and no later line belongs to the run."""
     sent = lines(500)
     got, stream = read(join(sent) + join(lines(300)))
@@ -170,7 +170,7 @@ def test_a_bench_that_begins_again_ends_the_run():
     assert stream.anomalies().resets == 1
 
 
-def test_what_an_earlier_run_left_in_the_line_is_not_of_this_one():
+def test_the_last_line_of_an_earlier_run_does_not_count():
     """A last line of the run before, or half of it, is not taken for this run's first line."""
     sent = lines(100)
     got, _ = read(b"5:0:0\n" + format_reading(lines(9000)[-1]) + join(sent))
@@ -178,7 +178,7 @@ def test_what_an_earlier_run_left_in_the_line_is_not_of_this_one():
 
 
 @pytest.mark.parametrize("closed", [True, False])
-def test_a_kick_of_the_duty_is_a_line_in_a_closed_loop_only(closed):
+def test_a_duty_in_only_one_line_is_accepted_in_closed_loop(closed):
     """A duty in only one line is accepted in a closed loop, where an encoder may flicker.
 
     In open loop such a line is not accepted.
@@ -204,17 +204,17 @@ def test_late_lines_are_counted_and_kept():
     assert stream.anomalies().late in (
         40,
         41,
-    )  # stamps 500 … 539; the next is 20 ms late, except for rounding
+    )  # stamps 500 to 539; rounding decides on 540
 
 
 def test_a_host_that_was_busy_makes_no_line_late():
     """Lines that waited because the host was busy do not count as late.
 
-    The host counts from its previous look, which found the port empty.
+    The host counts from the last time when it read and found the port empty.
     """
     sent = lines(1000, period=1.0)
     stream = Stream(encoders=2)
-    for start in range(0, 1000, 100):  # a look every 100 ms
+    for start in range(0, 1000, 100):  # the host reads every 100 ms
         stream.feed(join(sent[start : start + 100]), since=1e-3 * start, now=1e-3 * (start + 100))
     assert stream.anomalies().late == 0
 

@@ -90,7 +90,7 @@ def test_skip_goes_on_with_the_next(tmp_path, fast):
     assert not any(asked.endswith("Record long again") for asked in finger.confirmed)
 
 
-def test_keep_takes_what_came_and_says_so(tmp_path, fast):
+def test_keep_saves_the_lines_so_far(tmp_path, fast):
     """Keep saves every line of the run so far, and its table says how the run ended."""
     work = write_work(tmp_path, [sine("long", seconds=300), sine("next", seconds=1)])
     outcomes = record(work, fast.address, Finger("keep"), "long", "next")
@@ -117,7 +117,7 @@ def test_repeat_begins_the_run_again(tmp_path, fast):
     assert [e.id for e in load_submission(work).experiments] == ["dwell"]
 
 
-def test_what_passed_a_limit_is_neither_repeated_nor_kept(tmp_path, real):
+def test_a_run_past_a_limit_is_neither_repeated_nor_kept(tmp_path, real):
     """A run that passed a limit is neither kept nor repeated, whatever is pressed."""
     for wish in ("repeat", "keep"):
         work = write_work(tmp_path / wish, [sine("dwell", seconds=4)], limits=NEAR)
@@ -130,7 +130,7 @@ def test_what_passed_a_limit_is_neither_repeated_nor_kept(tmp_path, real):
 # ---------------------------------------------------------------- while a person is awaited
 
 
-def test_what_broke_off_is_kept_when_asked_about(tmp_path):
+def test_a_run_that_broke_off_can_be_kept(tmp_path):
     """After a fault the page offers Repeat, Keep and Skip; Keep saves the lines before it."""
     work = write_work(tmp_path, [sine("dwell", seconds=2)])
     state, done = LiveState(work), []
@@ -152,7 +152,7 @@ def test_what_broke_off_is_kept_when_asked_about(tmp_path):
         until(lambda: state.snapshot()["instruction"])
         shown = state.snapshot()
         assert shown["offered"] == ["repeat", "keep", "skip"]
-        assert not state.press("keep", turn=shown["turn"] - 1)  # meant for another run
+        assert not state.press("keep", turn=shown["turn"] - 1)  # the press is for another run
         assert state.press("keep", turn=shown["turn"])
         thread.join()
     assert [bool(o.partial) for o in done] == [True, False]
@@ -161,7 +161,7 @@ def test_what_broke_off_is_kept_when_asked_about(tmp_path):
 
 
 @pytest.mark.parametrize("wish", ["stop", "skip"])
-def test_a_run_that_waits_for_hands_need_not_begin(tmp_path, wish):
+def test_a_run_that_waits_for_a_person_can_be_ended(tmp_path, wish):
     """If a person is asked to free the carts, Stop or Skip ends the run before the motor moves."""
     scale = 'input = { unit = "V", per_count = 0.001220703125 }\n'
     work = write_work(tmp_path, [sine("dwell", seconds=2, settle=0.3)], scales=scale)

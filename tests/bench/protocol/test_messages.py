@@ -106,7 +106,7 @@ def test_nothing_swallows_a_stop_or_a_reset(data):
 
 
 @given(garbled())
-def test_a_bench_without_extensions_is_reset_all_the_same(data):
+def test_a_bench_without_extensions_always_obeys_a_stop(data):
     """A stock bench obeys a stop, whatever came before."""
     stock = read(data + b"".join(map(encode, STOCK_STOP)), extensions=())
     assert stock[-1] is Signal.RESET
@@ -132,7 +132,7 @@ def test_a_bench_without_extensions_is_reset_all_the_same(data):
         b"d;q;o;o;0.00000000000000000000000000000001;100;1;",  # too long
     ],
 )
-def test_what_is_no_command_does_nothing(data):
+def test_a_malformed_command_does_nothing(data):
     """Fields that are missing, out of range or of the wrong kind start nothing."""
     assert read(data) == []
 

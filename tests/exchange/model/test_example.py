@@ -57,7 +57,7 @@ def test_friction_is_compensated_on_the_virtual_bench(tmp_path):
 @no_compiler
 @pytest.mark.slow
 @pytest.mark.sample
-def test_the_commands_of_the_page_lead_to_the_same(tmp_path, monkeypatch):
+def test_the_commands_of_the_page_compensate_the_bench(tmp_path, monkeypatch):
     """The commands of docs/model.md lead from simulated recordings to the compensated bench."""
     monkeypatch.chdir(tmp_path)
     commands = re.findall(r"^cartlab ((?:simulate|gap) .*bench-4.*)$", PAGE, re.MULTILINE)

@@ -1,8 +1,8 @@
 """The model in C, in Octave, as an FMU and in python-control moves as our simulator does.
 
 The exported programs take second-order steps of h s. They make an oscillation of ω rad/s too fast
-by the factor 1 + (ω h)² / 24. The fastest motion here has ω = 35. With h = 0.125 ms, its
-phase is off by ω t (ω h)² / 24 = 4e-5 rad after 1.5 s. A knock in the play is faster, with ω = 370.
+by the factor 1 + (ω h)² / 24. The fastest motion here has ω = 35. With h = 0.125 ms, its phase is
+off by ω t (ω h)² / 24 = 4e-5 rad after 1.5 s. A contact in the backlash is faster, with ω = 370.
 """
 
 import io
@@ -38,7 +38,7 @@ from tests.helpers.exported import OCTAVE, CompiledModel, no_compiler, no_octave
 CHAIN = PRESETS["throne-2dof"]
 T = np.arange(0.0, 1.5, 0.002)
 STEP = np.where((T >= 0.1) & (T < 0.9), 0.05, 0.0)
-SWEEP = 0.05 * np.sin(2 * np.pi * (0.5 * T + 2.0 * T**2))  # 0.5 to 6.5 Hz
+SWEEP = 0.05 * np.sin(2 * np.pi * (0.5 * T + 2.0 * T**2))  # from 0.5 to 6.5 Hz
 RUNS: dict[str, tuple[Array, Array]] = {
     "step": (STEP, np.zeros(2)),
     "sweep": (SWEEP, np.zeros(2)),
@@ -102,7 +102,7 @@ def test_c_moves_as_the_simulator_does_with_friction_play_and_delay(run, tmp_pat
 
 @no_compiler
 @pytest.mark.parametrize("free", [1, 2])
-def test_a_cart_that_was_always_held_is_a_wall(free, tmp_path):
+def test_a_cart_that_was_always_held_does_not_move(free, tmp_path):
     """A cart that is held in all runs does not move and adds no parameters to the model."""
     model = model_of("coulomb_friction", "cubic_spring", last=free == 2)
     names = {p.name for p in describe(model, units=PAPER_UNITS, free=(free,)).parameters}
@@ -118,7 +118,7 @@ def test_a_cart_that_was_always_held_is_a_wall(free, tmp_path):
 
 
 @no_compiler
-def test_a_cart_that_friction_holds_does_not_move(tmp_path):
+def test_a_force_below_the_friction_moves_no_cart(tmp_path):
     """A force below the friction does not move a cart at all, and a moving cart finally stops."""
     model = model_of("coulomb_friction", last=False)
     in_c = compiled(model, tmp_path)
@@ -132,11 +132,11 @@ def test_a_cart_that_friction_holds_does_not_move(tmp_path):
 
 @no_compiler
 @pytest.mark.parametrize("interval", [1e-5, 1e-3, 7e-3])
-def test_a_delay_is_true_at_any_length_of_step(interval, tmp_path):
+def test_a_delay_is_right_at_any_step_length(interval, tmp_path):
     """A delay shifts the whole motion by the same time, whatever the length of steps.
 
     The model remembers 254 jumps of the input within a delay. If there are more, as here with one
-    every 10 us, it delays their mean.
+    every 10 µs, it delays their mean.
     """
     delay = SIZES["input_delay"]["delay"]
     t = np.arange(0.0, 0.2, interval)
@@ -149,7 +149,7 @@ def test_a_delay_is_true_at_any_length_of_step(interval, tmp_path):
     prompt = compiled(model_of(), tmp_path / "prompt").simulate(t, u, x0=np.zeros(2))
     assert_array_equal(late[:, t <= delay - interval], 0.0)
     shifted = np.array([np.interp(t - delay, t, y, left=0.0) for y in prompt])
-    # Linear interpolation is off by up to a interval² / 8, with a = 160 cm/s².
+    # Linear interpolation is off by up to a interval² / 8, with the acceleration a = 160 cm/s².
     assert_allclose(late, shifted, atol=160 * interval**2 / 8 + 2e-5)
 
 
@@ -313,7 +313,7 @@ def test_fmpy_moves_as_the_simulator_does(name, hard_fmu):
 
 
 @no_compiler
-def test_an_fmu_forgets_at_a_reset_and_returns_to_a_state(hard_fmu):
+def test_an_fmu_can_be_reset_and_returned_to_a_state(hard_fmu):
     """After a reset an FMU repeats its run, and from a saved state it continues as before."""
     instance, refer = instantiate(hard_fmu)
     values = {"x1_start": 1.5, "x2_start": 0.5, "m1": 2 * CHAIN.m[0]}
@@ -333,7 +333,7 @@ def test_an_fmu_forgets_at_a_reset_and_returns_to_a_state(hard_fmu):
 
 
 @no_compiler
-def test_an_fmu_refuses_what_it_cannot(hard_fmu):
+def test_an_fmu_refuses_unsupported_calls(hard_fmu):
     """A step before the start, setting a state, and a cart that runs away are errors."""
     instance, refer = instantiate(hard_fmu)
     with pytest.raises(FMICallException, match="DoStep"):
@@ -354,7 +354,7 @@ def test_the_same_model_gives_the_same_bytes(hard_fmu):
     assert len(guids) == 2
 
 
-def test_without_a_compiler_the_fmu_has_its_sources(monkeypatch):
+def test_without_a_compiler_the_fmu_has_only_sources(monkeypatch):
     """Without a compiler the FMU contains only its sources, and `fmu` returns False with it."""
     monkeypatch.setattr(fmu_module.shutil, "which", lambda name: None)
     whole, compiled_too = fmu(describe(HARD, units=PAPER_UNITS))

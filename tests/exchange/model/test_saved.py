@@ -43,7 +43,7 @@ def test_the_files_are_saved_and_cleared(analysis, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["model.slx"]
 
 
-def test_a_drive_that_leads_its_log_is_refused_in_a_sentence(analysis, tmp_path):
+def test_a_drive_that_leads_its_log_is_refused(analysis, tmp_path):
     """A drive that leads its log would need future inputs: no model is saved."""
     said = save_model(with_effect("input_delay", delay=-0.01), analysis, tmp_path, free=(1,))
     assert said.startswith("no model was written: the drive leads its log")
@@ -70,7 +70,7 @@ def read(folder: Path) -> list:
 
 @no_compiler
 @pytest.mark.parametrize("unit", ["µm", "*/ #error", "°", '"<&>', "\\", "??/", "m%n", ""])
-def test_a_unit_stays_a_word(unit, analysis, tmp_path):
+def test_no_unit_can_break_a_file(unit, analysis, tmp_path):
     """Whatever unit a submission states, it cannot break the files of the model."""
     units = Units(position=unit, input=unit)
     bench = replace(analysis.bench, units=units)

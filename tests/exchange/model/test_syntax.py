@@ -92,7 +92,7 @@ def test_expressions_keep_their_value_in_octave(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["a if b else c", "a < b", "[a]", "f(a)", "a @ b", "'a'"])
-def test_what_no_law_may_have_is_refused(text):
+def test_an_operation_that_laws_may_not_use_is_refused(text):
     """An operation that laws may not use is refused, for C and for MATLAB."""
     with pytest.raises(ValueError, match="no part of a law"):
         in_c(text)

@@ -51,7 +51,7 @@ def test_durations_are_read_in_seconds_minutes_or_hours():
 @pytest.mark.parametrize(
     "text", ["zeta", "zeta 1", "zeta omega 1%", "1.5", "0%", "200%", "%", "zeta 1% K 2%"]
 )
-def test_what_is_no_wish_is_refused(text):
+def test_a_text_that_is_not_a_goal_is_refused(text):
     """A text that is no goal is refused with an example."""
     with pytest.raises(ConfigError, match="expected a name and a percentage"):
         read_error_goal(text)
@@ -60,7 +60,7 @@ def test_what_is_no_wish_is_refused(text):
 @pytest.mark.parametrize(
     "text", ["20", "min", "-3s", "20 parsec", "inf s", "1e999s", "1e308h", "nan s"]
 )
-def test_what_is_no_duration_is_refused(text):
+def test_a_text_that_is_not_a_duration_is_refused(text):
     """A text that is no duration is refused with an example."""
     with pytest.raises(ConfigError, match="expected a duration"):
         read_time(text)
@@ -68,7 +68,7 @@ def test_what_is_no_duration_is_refused(text):
 
 @pytest.fixture(scope="module")
 def explored(tmp_path_factory):
-    """A bench with an end stop on one side that no step reaches, explored to the end."""
+    """Return the exploration of a bench with an end stop on one side that no step reaches."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=["end_stop:position=-1.7"])
     folder = tmp_path_factory.mktemp("explored") / "work"
     said: list[str] = []
@@ -83,13 +83,13 @@ def explored(tmp_path_factory):
     return folder, turns, said, bench
 
 
-def test_an_exploration_names_what_acts_and_knows_the_carts(explored):
+def test_an_exploration_names_the_effect_and_finds_the_carts(explored):
     """The exploration names the end stop on its cart, and finds every parameter correctly."""
     folder, turns, said, bench = explored
     last = turns[-1]
     assert last.verdict == "named"
     assert last.reached
-    assert last.recorded == ("sweep-2",)  # a run that swings the cart out shows the effect there
+    assert last.recorded == ("sweep-2",)  # the second sweep reaches the end stop
     assert "the worst to ±" in last.said
     (explanation,) = last.explanations
     assert "cart 1" in explanation.name
@@ -101,8 +101,8 @@ def test_an_exploration_names_what_acts_and_knows_the_carts(explored):
     assert said == [turn.said for turn in turns]
 
 
-def test_an_exploration_leaves_an_ordinary_submission_and_its_diary(explored):
-    """Every record is in submission.toml and plan.toml, and every turn is in the diary."""
+def test_an_exploration_writes_a_submission_and_a_diary(explored):
+    """Every record is in submission.toml and plan.toml, and the diary shows each decision."""
     folder, turns, _, _ = explored
     recorded = [name for turn in turns for name in turn.recorded]
     submission = load_submission(folder)
@@ -113,8 +113,11 @@ def test_an_exploration_leaves_an_ordinary_submission_and_its_diary(explored):
         assert f"{turn.seconds:.0f} s" in diary
 
 
-def test_an_exploration_keeps_no_trace_that_its_diary_does_not_show(explored):
-    """Each earlier turn keeps only the run that its picture shows; the last keeps all runs."""
+def test_an_exploration_keeps_only_runs_that_its_diary_shows(explored):
+    """Each earlier decision keeps only the run that its picture shows;
+
+    the last one keeps all runs.
+    """
     folder, turns, _, _ = explored
     *earlier, last = [turn.gap for turn in turns]
     assert earlier
@@ -133,10 +136,10 @@ def no_gap(monkeypatch):
 
 
 @pytest.mark.usefixtures("no_gap")
-def test_time_that_is_up_ends_it_before_the_next_recording(tmp_path):
+def test_an_exploration_ends_before_it_exceeds_its_time(tmp_path):
     """A recording that would exceed the time is not begun, and the diary names it.
 
-    If the gap cannot be searched, the carts are identified and no effect is named.
+    If the gap analysis fails, the carts are still identified, and no effect is named.
     """
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
@@ -169,7 +172,7 @@ def test_less_time_than_the_sweep_takes_moves_no_cart(tmp_path):
     assert virtual.seconds == 0.0
 
 
-def test_a_wish_that_meets_no_parameter_is_refused_before_a_cart_moves(explored, tmp_path):
+def test_a_goal_for_an_unknown_parameter_is_refused(explored, tmp_path):
     """A goal for a parameter that does not exist is refused with the nearest name."""
     asked: list[str] = []
 
@@ -178,7 +181,7 @@ def test_a_wish_that_meets_no_parameter_is_refused_before_a_cart_moves(explored,
         return Recorded(ids=(), seconds=0.0)
 
     wish = read_error_goal("Zeta 1%")
-    for folder in (explored[0], tmp_path):  # whose carts are known, and not yet
+    for folder in (explored[0], tmp_path):  # with known carts, and with unknown ones
         with pytest.raises(ConfigError, match="did you mean 'zeta'"):
             Exploration(folder=folder, record=record, goal=wish, seconds=900.0, tell=silent).run()
     assert not asked
@@ -186,7 +189,7 @@ def test_a_wish_that_meets_no_parameter_is_refused_before_a_cart_moves(explored,
         ErrorGoal(prefix="zeta_7").missing({"zeta_1": 0.1, "zeta_2": None})
 
 
-def test_a_wish_for_what_a_rigid_cart_has_is_heard(tmp_path):
+def test_a_goal_for_a_rigid_cart_is_accepted(tmp_path):
     """A goal for a rigid cart is accepted, as cartlab cannot know yet whether there are springs."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
@@ -201,7 +204,7 @@ def test_a_wish_for_what_a_rigid_cart_has_is_heard(tmp_path):
 
 
 @pytest.mark.usefixtures("no_gap")
-def test_a_bench_on_which_nothing_comes_off_is_left_after_three_tries(tmp_path):
+def test_an_exploration_ends_after_three_failures(tmp_path):
     """If three recordings fail, an exploration ends, and the diary says what failed and why."""
     asked = []
 
@@ -226,7 +229,7 @@ def test_a_bench_on_which_nothing_comes_off_is_left_after_three_tries(tmp_path):
 def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
     """A recording that a person vetoes is replaced, and one that is added comes next.
 
-    gap.json is written again, with the recording that decides if the vetoed one is left out.
+    gap.json is written again, and then proposes another deciding run than the vetoed one.
     """
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     folder, offered, said = tmp_path / "work", [], []
@@ -239,7 +242,7 @@ def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
     def vetoes(recording):
         offered.append(recording)
         gap = json.loads((folder / "gap" / "gap.json").read_text(encoding="utf-8"))
-        assert (gap["next_experiment"] == "another") == (len(offered) >= 2)  # searched again, too
+        assert (gap["next_experiment"] == "another") == (len(offered) >= 2)  # after a new search
         if len(offered) == 1:
             step = next(one for one in load_plan(load_submission(folder)).recordings
                         if one.kind == "step")  # fmt: skip
@@ -269,7 +272,7 @@ def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
     assert f"{first.id} was vetoed" in (folder / NAME).read_text(encoding="utf-8")
 
 
-def test_what_is_added_counts_whatever_it_is_called(tmp_path):
+def test_an_added_recording_comes_next_whatever_its_id(tmp_path):
     """A recording that a person adds comes next, even with the id of the program's own step."""
     bench = VirtualBench(prepare_bench(preset="throne-1dof", model=None, hide=[]), seed=1)
     folder = new_folder(tmp_path / "work", bench, springs=[True, True])
@@ -302,7 +305,7 @@ def test_what_is_added_counts_whatever_it_is_called(tmp_path):
     assert offered == [step]
 
 
-def test_the_large_step_remains_after_all_better_proposals_were_refused(tmp_path):
+def test_a_large_step_is_proposed_after_all_else_was_refused(tmp_path):
     """After all better proposals were refused, a large step is proposed."""
     submission = load_submission(a_recorded_cart(tmp_path / "work"))
     analysis = analyse(submission)
@@ -341,7 +344,7 @@ def test_thinking_can_be_ended(tmp_path):
 def test_the_command_explores_a_bench_over_its_line(tmp_path):
     """`cartlab explore` makes a submission with its diary from an empty folder, over a socket.
 
-    The time limit holds for the first recordings too: the sweep fits and the steps do not.
+    The time limit also holds for the first recordings: the sweep fits, but the steps do not.
     """
     folder = tmp_path / "work"
     with emulator("--speed", "8", "--port", "socket://127.0.0.1:0", preset="throne-1dof") as bench:
@@ -355,7 +358,7 @@ def test_the_command_explores_a_bench_over_its_line(tmp_path):
 
 
 @pytest.mark.slow
-def test_one_large_step_shows_what_acts_far_out(tmp_path):
+def test_the_large_step_is_made_only_once(tmp_path):
     """If drag keeps carts from the wanted distance, the large step is still made only once."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=["quadratic_drag"])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=13))

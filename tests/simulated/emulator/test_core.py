@@ -55,10 +55,10 @@ def test_a_run_streams_its_wave_and_ends(wave):
     assert [line.ms for line in lines] == list(range(375))
     assert [line.target for line in lines] == [target_at(start, 1e-3 * ms) for ms in range(375)]
     assert all(line.duty == np.clip(line.target, -FULL_SCALE, FULL_SCALE) for line in lines)
-    assert all(line.counts == (0, 0) for line in lines)  # zeroed where it had its power
+    assert all(line.counts == (0, 0) for line in lines)  # zeroed at power-on
 
 
-def test_the_waves_are_what_they_are_called():
+def test_each_wave_has_its_shape():
     """Each wave has the right value at eighths of its period, and a chirp the right frequency."""
 
     def eighths(wave: Wave) -> list[int]:
@@ -178,7 +178,7 @@ def test_silence_after_a_heartbeat_cuts_the_motor():
     assert len(run(core, b"z;d;q;o;o;1;50;9;", still, ticks=500, first=1400)) == 500
 
 
-def test_a_query_is_answered_and_hands_are_not_the_controllers():
+def test_a_query_is_answered_during_a_run():
     """A query during a run is answered between two lines of the run.
 
     The command `h` changes nothing, and a stock bench answers no query.

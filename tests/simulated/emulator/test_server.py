@@ -33,8 +33,8 @@ from pipeline.stages.log_decrement import fit_log_decrement
 from tests.helpers.benches import Emulator, emulator
 from tests.helpers.waiting import started
 
-QUIET = 0.3  # s that a read waits
-MOTOR_OFF = 1000  # ms after the last heartbeat: the watchdog's 100 and a machine as busy as can be
+QUIET = 0.3  # longest time in s that a read waits
+MOTOR_OFF = 1000  # ms after the last heartbeat: the watchdog's 100, and some for a busy machine
 pty_only = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 
 
@@ -55,7 +55,7 @@ def play(
     """Return all bytes until a run has ended, and add them to `heard` as they come."""
     heard, runs = bytearray() if heard is None else heard, bench.runs
     line.write(b"".join(commands))
-    # If the cable is pulled, pyserial forgets the part of a piece that it has read: small pieces.
+    # Small pieces, since pyserial loses a piece that it has partly read if the cable is pulled.
     while (got := line.read(64)) or bench.runs == runs:
         heard += got
     return bytes(heard)
@@ -99,7 +99,7 @@ def test_hosts_talk_to_a_pseudo_terminal_one_after_the_other():
             assert len(readings) == pytest.approx(2.0 / TRUE_PERIOD, abs=1)
             steps = np.diff([reading.ms for reading in readings])
             assert set(steps) == {1, 2}
-            assert np.sum(steps == 2) in (4, 5)  # of 1.0024 ms every 417th stamp is left out
+            assert np.sum(steps == 2) in (4, 5)  # at 1.0024 ms, one stamp in 417 is skipped
             assert readings[-1].counts[0] > readings[-1].counts[1] > 100
             assert took > 1.9
             assert [bench.event("client")["connected"] for _ in "io"] == [True, False]
@@ -107,7 +107,7 @@ def test_hosts_talk_to_a_pseudo_terminal_one_after_the_other():
     assert bench.event("exit")["status"] == 0
 
 
-def test_the_static_gain_comes_out(fast_bench):
+def test_a_step_gives_the_static_gain(fast_bench):
     """A step's motion, scaled by the description, gives the preset's static gain."""
     with host(fast_bench) as line:
         line.write(encode(Signal.QUERY))
@@ -119,12 +119,12 @@ def test_the_static_gain_comes_out(fast_bench):
     level = x[:, -3000:].mean(axis=1) - x[:, : x.shape[1] // 3].mean(axis=1)
     gain = level * scales.position_per_count / (duty[-1] * scales.input_per_count)
     expected = PRESETS["throne-2dof"].static_gains()
-    # The mean of rounded counts is off by 0.15 count, twice, in at least 1400. After 7 s of the
-    # slower mode (0.9/s) 2e-3 are left, averaged over half of its swings and so far less.
+    # The mean of rounded counts is off by 0.15 count, twice, in at least 1400. After 7 s, 2e-3 of
+    # the slower mode (0.9/s) is left. Averaging over its swings reduces that much further.
     np.testing.assert_allclose(gain, expected, rtol=1e-3)
 
 
-def test_a_cart_that_hands_let_go_rings_at_its_own_frequency(fast_bench):
+def test_a_released_cart_swings_at_its_own_frequency(fast_bench):
     """With cart 1 held, cart 2 swings at ω_2 and ζ_2 of the chain after its release."""
     chain = PRESETS["throne-2dof"]
     with host(fast_bench) as line:
@@ -147,12 +147,13 @@ def test_a_cart_that_hands_let_go_rings_at_its_own_frequency(fast_bench):
     fit = fit_log_decrement(record, cart=2)
     assert 0.3 <= fit.release <= 0.65
     omega_n = np.sqrt((chain.k[1] + chain.k[2]) / chain.m[1])
-    # The fit's own standard errors are some 1e-5 and 1e-4; its start in the fade adds its share.
+    # The fit's own standard errors are some 1e-5 and 1e-4. Its start while the hand's force fades
+    # adds some error.
     assert fit.omega_n == pytest.approx(omega_n, rel=5e-4)
     assert fit.zeta == pytest.approx(chain.c[1] / (2 * chain.m[1] * omega_n), rel=5e-3)
 
 
-def test_a_hand_lets_go_even_where_the_run_starts_before_it_is_ready():
+def test_a_hand_releases_the_cart_even_if_the_run_starts_early():
     """If a run starts while a virtual hand still pulls, the hand releases the cart all the same."""
     carts = VirtualCarts(prepare_bench(preset="throne-1dof"), seed=1)
     carts.take_in_hand(Hands(released=1))
@@ -165,9 +166,10 @@ def test_a_hand_lets_go_even_where_the_run_starts_before_it_is_ready():
     assert 0 < out[0] < 1.5 / TRUE_PERIOD
     gain = PRESETS["throne-1dof"].static_gains()[0]
     rest = -2000 * carts.input_per_count * gain / 0.00227
-    # After the start e^(-1.32 · 4) of the swing is left, 5e-3 of at most 1.8 cm and the rest.
+    # After 4 s the swing has decayed to e^(-1.32 · 4) = 5e-3 of at most 1.8 cm and the rest
+    # position.
     assert np.mean(x[-400:]) == pytest.approx(rest, abs=5e-3 * (800 + abs(rest)))
-    held = np.array(x[1600:1780])  # until 0.3 s after the pull only a tremor
+    held = np.array(x[1600:1780])  # until 0.3 s after the pull there is only tremor
     assert np.ptp(held) < 0.03 * np.abs(held).max()
 
 
@@ -177,7 +179,7 @@ def damaged(readings: bytes) -> tuple[list[Reading], int]:
     return [reading for reading in parsed if reading is not None], parsed.count(None)
 
 
-def test_what_is_injected_is_what_a_host_finds():
+def test_a_host_finds_the_injected_faults():
     """A host finds as many lost, garbled and merged lines as the emulator injected."""
     faults = [f"--fault={kind}=0.01" for kind in ("drop", "garble", "merge", "delay", "reset")]
     with emulator("--speed", "10", *faults) as bench, host(bench) as line:
@@ -210,14 +212,14 @@ def test_faults_come_at_the_requested_time():
         assert 1990 <= len(counts) <= 1999
         assert np.ptp(counts[1000:], axis=0)[1] == 0 < np.ptp(counts[:1000], axis=0)[1]
         assert np.ptp(counts[1000:], axis=0)[0] > 50
-        assert bench.event("run")["ended"] == "done"  # it does not miss its host
+        assert bench.event("run")["ended"] == "done"  # the bench does not need its host
         with host(bench) as line:
             start = Start(wave=Wave.SINE, frequency=1.0, amplitude=200, cycles=1)
             again = stream(bench, line, start)
         assert len({reading.counts[1] for reading in again}) == 1
 
 
-def test_what_is_held_up_still_comes():
+def test_delayed_bytes_still_arrive():
     """A lost line end is sent after the run, and delayed bytes arrive in order."""
     faults = Faults([read_fault("merge@0.003"), read_fault("delay@0.004")], seed=0, period=1e-3)
     sent = [faults.strike(b"1:2:3:4:%d\n" % ms, clock=1e-3 * ms)[0] for ms in range(3)]
@@ -231,7 +233,7 @@ def test_what_is_held_up_still_comes():
 
 
 @pytest.mark.parametrize("way", ["falls silent", "goes away", "is killed"])
-def test_the_motor_is_cut_when_the_host(fast_bench, way):
+def test_the_motor_is_cut_if_the_host(fast_bench, way):
     """100 ms after the last heartbeat the run is over, however fast the bench's clock runs."""
     start = encode(Signal.HEARTBEAT) + encode(
         Start(wave=Wave.SINE, frequency=0.01, amplitude=300, cycles=1)
@@ -266,7 +268,7 @@ def test_a_host_that_leaves_an_unguarded_bench_stops_nothing(fast_bench):
     with host(fast_bench) as line:
         line.write(encode(Start(wave=Wave.SINE, frequency=0.01, amplitude=30, cycles=1)))
         line.read(100)
-        # A start command that noise cut short comes before it.
+        # A start command that noise cut short precedes the stop.
         play(fast_bench, line, b"d;q;o;\xff", encode(Signal.STOP))
     ended = fast_bench.event("run")
     assert ended["ended"] == "stopped"
