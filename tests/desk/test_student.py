@@ -392,7 +392,7 @@ def test_a_failed_report_does_not_prevent_handing_in(filled):
     assert "There is no report yet, so the zip will not contain one." in page
     assert (
         page.count("You will see them once the report of these files is made.") == 2
-    )  # not that there are none
+    )  # the page does not say that no questions are open
     assert "report/report.pdf" not in zipped(visitor).namelist()
 
 

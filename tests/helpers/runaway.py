@@ -45,7 +45,8 @@ _PAUSE = 0.001  # s
 class RunawayBench(threading.Thread):
     """A bench that keeps to the protocol, except while `wrong` returns True.
 
-    Use it as a context manager. Cart 1 stands at a fifth of the present duty, cart 2 at half of it.
+    Use it as a context manager. The position of cart 1 is a fifth of the present duty, that of cart
+    2 half of it.
 
     Parameters
     ----------
@@ -61,8 +62,8 @@ class RunawayBench(threading.Thread):
     resets, lines : number of resets received, and number of lines sent.
     is_stopped : whether the last command was a stop.
     is_pulled : whether the virtual hand was ever told to pull a cart out.
-    offence : time in ms of the first line that shows the fault, or None if there was no such line.
-    told : time in ms of the first stop command after `offence`, or None if there was none.
+    offence : time in ms of the first line that shows the fault, or None so far.
+    told : time in ms of the first stop command after `offence`, or None so far.
     started_after : start commands received after `offence`.
     """
 
