@@ -1,4 +1,4 @@
-"""Teams and classes that were once judged wrongly are now judged right."""
+"""Teams and classes that were once judged wrongly are now judged correctly."""
 
 import tempfile
 from dataclasses import replace
@@ -21,7 +21,7 @@ from pipeline.submission import load_submission
 from tests.helpers.grading_class import Team, make_team
 from tests.helpers.grading_slips import SLIPS, scaled
 
-# By default one of each kind of case that once went wrong runs, the others with the sample.
+# By default, one case of each kind that once went wrong runs; `LONG` marks the other cases.
 LONG = [pytest.mark.slow, pytest.mark.sample]
 TIED = Chain(
     m=np.array([3.1e-4, 1.7e-4]), c=np.array([6.7e-4, 4.4e-4]), k=np.array([0.05, 0.127, 0.061])
@@ -35,17 +35,17 @@ def flags(team: Team) -> list[str]:
 @pytest.mark.parametrize(
     "seed", [30, *(pytest.param(seed, marks=LONG) for seed in (5, 90, 60023, 60066))]
 )
-def test_little_damping_accuses_nobody(seed):
+def test_little_damping_flags_nobody(seed):
     """If damping is too small for the dwells to show, nobody gets a flag."""
     team = make_team(seed)
     assert team.bench.chain.zeta_carts.max() < 0.02
     assert flags(team) == []
 
 
-def test_a_damping_that_the_fit_puts_at_zero_is_told_by_the_decay():
+def test_a_damping_fitted_as_zero_is_judged_by_the_decays():
     """If the fit puts a damping at zero, a reported damping is judged by the decays.
 
-    A fit at its bound has measured nothing.
+    A fit that ends at its bound does not measure the damping.
     """
     team = make_team(30)
     assert team.analysis.chain is not None
@@ -65,8 +65,8 @@ def test_coarse_encoders_cost_no_points(seed):
 
 @pytest.mark.slow
 @pytest.mark.sample
-def test_a_table_of_three_carts_without_a_gain_is_none_of_two():
-    """If a table of three carts lacks a gain, no carts are computed from it."""
+def test_a_table_of_three_carts_without_a_gain_gives_no_carts():
+    """If a table of three carts lacks a gain, no carts are computed from the table."""
     team = make_team(2)
     table = {x: float(v) for x, v in team.reported.final.items()}
     assert own_chain(table, n=3) is not None
@@ -77,10 +77,10 @@ def test_a_table_of_three_carts_without_a_gain_is_none_of_two():
 
 
 @pytest.mark.parametrize(("seed", "digits"), [pytest.param(11, 2, marks=LONG), (17, 3)])
-def test_a_model_made_of_a_vague_table_is_no_wrong_one(seed, digits):
+def test_a_model_from_coarse_numbers_is_not_flagged(seed, digits):
     """A state model computed from coarsely typed numbers is not flagged.
 
-    Rounding alone changes its couplings by a third.
+    In the test, rounding alone changes the couplings by a third.
     """
     team = make_team(seed, digits=digits)
     assert [f for f in flags(team) if f.startswith("wrong_state_space")] == []
@@ -92,17 +92,17 @@ def test_a_model_made_of_a_vague_table_is_no_wrong_one(seed, digits):
         pytest.param(
             72014, 6, ("peak_count", "log10_for_ln"), {"peak_count", "log10_for_ln"}, marks=LONG
         ),
-        (73025, 0, ("hz_for_rad_s",), {"hz_for_rad_s"}),  # one resonance seen anywhere by eye
-        # the seventh period of one decay
+        (73025, 0, ("hz_for_rad_s",), {"hz_for_rad_s"}),  # one resonance read anywhere by eye
+        # one decay read at its seventh period
         pytest.param(73026, 0, ("peak_count",), {"peak_count"}, marks=LONG),
-        # typed too coarsely to differ from 6/5
+        # too coarse to differ from a factor of 6/5
         pytest.param(72007, 3, ("initial_off",), {"initial_off"}, marks=LONG),
         pytest.param(
             72021, 0, ("hz_for_rad_s", "log10_for_ln"), {"hz_for_rad_s", "log10_for_ln"}, marks=LONG
         ),
     ],
 )
-def test_what_makes_the_whole_table_likeliest_is_named(seed, turn, slips, codes):
+def test_the_flags_are_those_that_explain_a_table_best(seed, turn, slips, codes):
     """If several mistakes overlap, the flags are those that explain the whole table best."""
     team = replace(make_team(seed), rng=np.random.default_rng([9, seed, turn]))
     for slip in slips:
@@ -110,10 +110,10 @@ def test_what_makes_the_whole_table_likeliest_is_named(seed, turn, slips, codes)
     assert {flag.code for flag in team.grade().flags} == codes
 
 
-def test_a_gain_that_two_mistakes_make_is_told_with_both():
+def test_a_gain_that_two_mistakes_explain_names_both():
     """If two mistakes explain a gain equally well, the flag names both.
 
-    With little damping, the peak of a step is twice its level, so a doubled gain may be either.
+    With little damping, the peak of a step is twice its level, so a doubled gain fits both.
     """
     team = scaled(make_team(72003), ["K"], 2.0, ["initial"])
     (flag,) = team.grade().flags
@@ -133,7 +133,7 @@ def tied(seed: int) -> tuple[Team, Grade]:
         return team, grade_submission(submission, rubric=rubric, name="team-07").grade
 
 
-def test_springs_that_the_rubric_does_not_have_accuse_nobody():
+def test_a_spring_that_the_rubric_lacks_flags_nobody():
     """If the recordings need a spring that the rubric lacks, it is used and nobody is flagged."""
     team, grade = tied(1)
     assert grade.springs == ("wall-1",)
@@ -145,10 +145,10 @@ def test_springs_that_the_rubric_does_not_have_accuse_nobody():
     assert wrong_springs([(), ()]) == ""
 
 
-def test_a_decay_with_friction_is_no_wrong_logarithm(tmp_path):
+def test_a_decay_with_friction_is_not_flagged_as_a_wrong_logarithm(tmp_path):
     """If friction makes the decays' damping uncertain, no wrong logarithm is flagged.
 
-    The team's own final value contradicts such a mistake.
+    The team's own final value contradicts a wrong logarithm.
     """
     bench = prepare_bench(preset="throne-1dof", hide=("coulomb_friction:cart=1,force=0.003",))
     write_submission(tmp_path / "team", bench, seed=3, reported=True)

@@ -52,7 +52,7 @@ def school(tmp_path_factory) -> Path:
 
 @pytest.fixture(autouse=True)
 def _here(monkeypatch):
-    """Grade in this process; a separate worker would make no difference here."""
+    """Grade in this process; a separate worker would give the same result."""
     monkeypatch.setattr(
         "pipeline.grading.batch.grade_class.run_here", lambda *, jobs: in_this_process
     )
@@ -82,10 +82,10 @@ def pages(out: Path) -> dict[str, bytes]:
     return {name: (out / name).read_bytes() for name in ("grades.csv", "class.html")}
 
 
-def test_a_late_hand_in_by_itself_keeps_the_class(school, tmp_path):
+def test_a_late_submission_graded_alone_keeps_the_class(school, tmp_path):
     """A late submission graded alone gives the same class as grading all submissions together.
 
-    Its id, all rows, feedback and flags of sharing are the same.
+    The ids, rows, feedback and flags for shared data are the same.
     """
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     grade(school, out=whole)
@@ -107,7 +107,7 @@ def test_a_late_hand_in_by_itself_keeps_the_class(school, tmp_path):
 
 
 def test_a_renamed_folder_is_the_same_submission(school, tmp_path):
-    """A submission in a renamed folder keeps its row, its points by hand and its requests.
+    """A submission whose folder was renamed keeps its row, its points by hand and its requests.
 
     A message gives the new name.
     """
@@ -131,11 +131,11 @@ def test_a_renamed_folder_is_the_same_submission(school, tmp_path):
 
 
 @pytest.mark.parametrize("author", ["s0", "s1"])
-def test_a_folder_in_a_strangers_zip_takes_nothing_from_a_team(school, tmp_path, author):
-    """If a stranger's zip file has a folder named like a team, the team keeps its row.
+def test_a_strangers_folder_does_not_replace_a_team(school, tmp_path, author):
+    """If a stranger's zip file contains a folder with a team's name, the team keeps its row.
 
-    Points given by hand stay, and the stranger's submission gets a longer id. The team also keeps
-    its row if the stranger's submission has the team's id or cannot be read.
+    Points given by hand stay, and the stranger's submission gets a longer id. This holds even if
+    the stranger's submission has the team's id or cannot be read.
     """
     out, folder = tmp_path / "out", tmp_path / "class"
     shutil.copytree(school / "B" / "team-1", folder / "team-1")
@@ -162,10 +162,10 @@ def test_a_folder_in_a_strangers_zip_takes_nothing_from_a_team(school, tmp_path,
     assert {now[name]["by_hand"] for name in ("stranger-team-1", "other-team-2")} == {""}
 
 
-def test_a_rubric_of_another_name_replaces_no_class(school, tmp_path):
-    """A run is refused if its rubric's file name differs from that of the existing class.
+def test_a_rubric_of_another_name_is_refused(school, tmp_path):
+    """A run is refused if its rubric has another file name than that of the existing class.
 
-    Files and points given by hand would be lost otherwise.
+    Otherwise, files and points given by hand would be lost.
     """
     out, rubric = tmp_path / "out", tmp_path / "lab.toml"
     shutil.copy(RUBRICS / "throne-1dof.toml", rubric)
@@ -180,10 +180,10 @@ def test_a_rubric_of_another_name_replaces_no_class(school, tmp_path):
     assert rows(out)["team-1"]["by_hand"] == "pieces"
 
 
-def test_a_mended_id_and_another_folder_accuse_nobody(school, tmp_path):
+def test_a_corrected_id_in_another_folder_flags_nobody(school, tmp_path):
     """The platform's number identifies a submission even if its id and folder have changed.
 
-    So nobody is flagged for sharing data with themselves, in later runs either.
+    So nobody is flagged for sharing data with their own earlier submission.
     """
     out, folder = tmp_path / "out", tmp_path / "class"
     for inside, id_ in (("lab", "s 1"), ("lab-final", "s1")):
@@ -198,15 +198,15 @@ def test_a_mended_id_and_another_folder_accuse_nobody(school, tmp_path):
         assert [one.sharing for one in done] == [0, 0]
         if inside == "lab":
             give(out, "lab", 0.25)
-        else:  # a folder under another id is another team's, with a message
+        else:  # a folder under another id belongs to another team, and a message says so
             assert [r for r in done[0].remarks if "'s1' in place of 's 1'" in r]
     assert {name: row["authors"] for name, row in rows(out).items()} == {
         "lab-final": "s1", "other": "s0",
     }  # fmt: skip
 
 
-def test_who_exchanges_folders_keeps_what_was_given(tmp_path):
-    """If two teams exchange folders and record again, each keeps its own points by hand."""
+def test_teams_that_exchange_folders_keep_their_points(tmp_path):
+    """If two teams exchange folders and record again, each team keeps its points by hand."""
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         for run, names in enumerate(((("a", "ann"), ("b", "bo")), (("a", "bo"), ("b", "ann")))):
             outcomes = [
@@ -228,7 +228,7 @@ def test_who_exchanges_folders_keeps_what_was_given(tmp_path):
         }
 
 
-def test_what_makes_two_the_same_submission(tmp_path):
+def test_submissions_are_recognised_by_number_files_or_authors(tmp_path):
     """Two submissions count as one if the platform's number, else files, else authors agree."""
     old = make_outcome(make_grade("old", authors=("ann",)), key="k-files", owner="A (canvas 7)")
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
@@ -253,7 +253,7 @@ def test_what_makes_two_the_same_submission(tmp_path):
         assert goes_on_as(another=((), "3-y", "")) == ""
 
 
-def test_two_that_hand_in_nothing_are_not_the_same(tmp_path):
+def test_two_empty_submissions_are_not_the_same(tmp_path):
     """Two empty submissions without authors are the same only if they are in the same folder."""
     old = make_outcome(failed_grade("team-3", "empty"), key="k-none", fingerprints=b"")
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
@@ -265,7 +265,7 @@ def test_two_that_hand_in_nothing_are_not_the_same(tmp_path):
         assert class_so_far({"team-9": new[0]}, book).moved == {}
 
 
-def test_a_mended_id_of_an_author_accuses_nobody(school, tmp_path):
+def test_a_corrected_id_of_an_author_flags_nobody(school, tmp_path):
     """If an author's id is corrected and the recordings are the same, nobody is flagged."""
     own, out = shutil.copytree(school / "B" / "team-1", tmp_path / "team-1"), tmp_path / "out"
     file = own / "submission.toml"
@@ -280,7 +280,7 @@ def test_a_mended_id_of_an_author_accuses_nobody(school, tmp_path):
     )
 
 
-def test_the_rubric_of_those_kept_is_told(tmp_path):
+def test_kept_submissions_keep_their_rubric(tmp_path):
     """Submissions kept from an earlier run keep their rubric, and a message says so."""
     a, b = make_outcome(make_grade("a")), make_outcome(make_grade("b"))
     other = RUBRIC.model_copy(update={"criteria": RUBRIC.criteria[:-1]})
@@ -295,8 +295,8 @@ def test_the_rubric_of_those_kept_is_told(tmp_path):
         assert book.by_other_rubrics() == ["a", "b"]
 
 
-def test_who_is_removed_is_off_every_list_but_history(tmp_path):
-    """A removed submission is only in the history; it is listed again when it is graded again."""
+def test_a_removed_submission_is_only_in_the_history(tmp_path):
+    """A removed submission is only in the history until it is graded again."""
     outcomes = [make_outcome(make_grade(name)) for name in ("a", "b", "c")]
     everybody = Batch(keys=tuple(o.key for o in outcomes), shared={})
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
@@ -342,7 +342,7 @@ def test_a_failed_second_try_hides_no_recordings(tmp_path):
 def test_an_override_stays_with_the_same_person(tmp_path):
     """An override stays if the author's id changes only in capitals and blanks.
 
-    Another id means another person, who does not get it.
+    If the id changes otherwise, it is another person, who does not get the override.
     """
     grades = [make_grade("team", authors=(who,)) for who in ("ada 1", " Ada  1", "bob")]
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
@@ -356,10 +356,9 @@ def test_an_override_stays_with_the_same_person(tmp_path):
         assert kept == [True, True, False]
 
 
-def test_the_id_of_a_class_so_far_is_kept(school, tmp_path):
-    """A submission graded alone keeps the longer id that it has in the class list.
+def test_a_submission_graded_alone_keeps_its_id(school, tmp_path):
+    """A submission graded alone keeps the id of the class list, whether this id is plain or longer.
 
-    If the list has the plain id, the submission gets that one.
     """
     path = [school / "A" / "team-1"]
     for known, id_ in (
@@ -371,8 +370,8 @@ def test_the_id_of_a_class_so_far_is_kept(school, tmp_path):
         assert [hand_in.id for hand_in in found] == [id_]
 
 
-def test_only_the_feedback_that_changes_is_written_again(school, tmp_path):
-    """Feedback of a kept submission is written again only if a new one shares its recordings."""
+def test_only_changed_feedback_is_written_again(school, tmp_path):
+    """Feedback of an earlier submission is rewritten only if a new one shares its recordings."""
     out = tmp_path / "out"
     grade(school / "B", out=out)
     before = {p: p.stat().st_mtime_ns for p in (out / "feedback").glob("team-1/*")}

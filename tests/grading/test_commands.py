@@ -1,4 +1,4 @@
-"""The commands for use after grading are run as typed."""
+"""The commands that are used after grading are run as typed."""
 
 import csv
 import io
@@ -36,7 +36,7 @@ def run(monkeypatch, capsys):
 
 @pytest.fixture(scope="module")
 def grades(tmp_path_factory) -> Path:
-    """Return a graded class that no test changes."""
+    """Return a graded class, which no test may change."""
     return write_class(tmp_path_factory.mktemp("grades"))
 
 
@@ -72,7 +72,7 @@ def test_an_override_reaches_the_pages_at_once(run, tmp_path):
     ]  # fmt: skip
 
 
-def test_a_team_is_corrected_by_the_name_that_stands_in_for_it(run, tmp_path):
+def test_an_anonymous_team_is_corrected_by_its_pseudonym(run, tmp_path):
     """An anonymous team can be corrected under its pseudonym, and no output shows its name."""
     grades = write_class(tmp_path, anonymous=True)
     with (grades / "anonymous-key.csv").open(newline="", encoding="utf-8") as file:
@@ -90,7 +90,7 @@ def test_a_team_is_corrected_by_the_name_that_stands_in_for_it(run, tmp_path):
     assert run("history", grades, "anon-nobody")[0] == 2
 
 
-def test_what_was_given_by_hand_is_not_taken_off_without_a_word(run, tmp_path):
+def test_removing_points_by_hand_gives_a_message(run, tmp_path):
     """If a removed submission had points given by hand, a message lists it."""
     grades = write_class(tmp_path)
     status, _, err = run("remove", grades, "team-02", "s2")
@@ -102,7 +102,7 @@ def test_what_was_given_by_hand_is_not_taken_off_without_a_word(run, tmp_path):
     assert run("remove", grades, "team-02")[0] == 2
 
 
-def test_a_name_writes_nothing_over_what_is_said(run, tmp_path):
+def test_control_characters_in_a_name_are_blanks(run, tmp_path):
     """Control characters in an author's id are printed as blanks."""
     outcomes = [make_outcome(make_grade(name, share=1 / n, authors=("eve\r\x1b[2Kbob",)))
                 for n, name in ((1, "a"), (2, "b"))]  # fmt: skip
@@ -112,13 +112,13 @@ def test_a_name_writes_nothing_over_what_is_said(run, tmp_path):
         book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=two_cart_rubric())
     status, _, err = run("export", tmp_path, "--lms", "canvas")
     assert err.startswith("eve  [2Kbob is in a (20) and b (10): left out")
-    assert status == 1  # an author with points has an empty cell in the table
+    assert status == 1  # the cell of an author with points is empty in the table
 
 
 @pytest.mark.parametrize("lms", ["canvas", "moodle", "gradescope"])
 @pytest.mark.parametrize("listed", [False, True])
-def test_who_is_in_two_submissions_makes_every_export_end_so(run, tmp_path, lms, listed):
-    """If a person is in two submissions, every export leaves them out and ends with status 1."""
+def test_a_person_in_two_submissions_makes_every_export_fail(run, tmp_path, lms, listed):
+    """If a person is in two submissions, each export omits the person and ends with status 1."""
     outcomes = [make_outcome(make_grade(name, share=1 / n, authors=("s1",)))
                 for n, name in ((1, "a"), (2, "b"))]  # fmt: skip
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
@@ -139,7 +139,7 @@ def test_who_is_in_two_submissions_makes_every_export_end_so(run, tmp_path, lms,
     assert status == 1
 
 
-def test_a_console_of_few_letters_is_no_error(grades, monkeypatch):
+def test_letters_that_a_console_lacks_are_written_as_numbers(grades, monkeypatch):
     """A letter that the console cannot show is written as its number, and the JSON stays valid."""
     raw = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding="cp1252"))
@@ -154,8 +154,8 @@ def test_a_console_of_few_letters_is_no_error(grades, monkeypatch):
 
 
 @pytest.mark.parametrize("lms", ["canvas", "moodle", "gradescope"])
-def test_an_export_lies_beside_the_grades(run, grades, tmp_path, lms):
-    """An export is written beside the grades or into the folder given."""
+def test_an_export_is_written_beside_the_grades(run, grades, tmp_path, lms):
+    """An export is written beside the grades, or into the given folder."""
     status, out, err = run("export", grades, "--lms", lms)
     assert (status, out) == (0, "")
     assert f"wrote {grades / lms}.csv" in err
@@ -179,7 +179,7 @@ def test_an_export_into_a_file_writes_that_file(run, grades, tmp_path, lms):
     assert "gs.xlsx: this writes several files; give a folder" in err
 
 
-def test_an_export_that_leaves_points_out_ends_so(run, grades, tmp_path):
+def test_an_export_that_omits_points_ends_with_status_1(run, grades, tmp_path):
     """If the platform's roster lacks a team with points, the export ends with status 1."""
     roster = tmp_path / "roster.csv"
     roster.write_text("Student,ID,SIS User ID,Section\nDoe,7,nobody-here,A\n", encoding="utf-8")
@@ -188,10 +188,10 @@ def test_an_export_that_leaves_points_out_ends_so(run, grades, tmp_path):
     assert status == 1
 
 
-def test_a_class_that_nobody_could_be_graded_of(run, tmp_path):
+def test_a_class_without_grades_asks_about_the_rubric(run, tmp_path):
     """If no submission could be graded, the message asks whether the rubric is another lab's.
 
-    Lateness is recorded all the same.
+    Lateness is recorded nevertheless.
     """
     for name in ("team-1", "team-2"):
         (tmp_path / "c" / name).mkdir(parents=True)
@@ -222,9 +222,9 @@ def test_a_class_that_nobody_could_be_graded_of(run, tmp_path):
 
 
 def test_an_anonymous_grading_names_nobody_on_stderr(run, tmp_path, monkeypatch):
-    """An anonymous grading prints no name on stderr, neither in progress nor in warnings."""
+    """An anonymous grading prints no name on stderr, neither in progress lines nor in warnings."""
     monkeypatch.setattr("pipeline.cli.common.FIRST_WORD", 0.001)
-    # A pseudonym has no 1, since base 32 has only the digits 2 to 7.
+    # A pseudonym contains no 1, since base 32 has only the digits 2 to 7.
     names = ["doe1-jane1", "roe1-richard1", "poe1-anna1", "moe1-max1"]
     toml = 'version = 1\n[[authors]]\nid = "{name}"\n[system]\ncarts = {carts}\n'
     for name, carts in zip(names, ("1", "1", '"two"', "1"), strict=True):
@@ -256,10 +256,10 @@ def test_an_anonymous_grading_names_nobody_on_stderr(run, tmp_path, monkeypatch)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
-def test_names_and_grades_are_for_their_owner_alone(run, tmp_path):
-    """Only their owner can read the grades' folder, gradebook and key, whatever the umask.
+def test_only_the_owner_can_read_names_and_grades(run, tmp_path):
+    """The folder of grades, gradebook and key can be read only by their owner, whatever the umask.
 
-    Files of earlier runs are restricted too.
+    The permissions of files from earlier runs are restricted too.
     """
     (tmp_path / "c" / "team-1").mkdir(parents=True)
     (tmp_path / "c" / "team-1" / "submission.toml").write_text("version = 1\n", encoding="utf-8")
@@ -292,8 +292,8 @@ def test_names_and_grades_are_for_their_owner_alone(run, tmp_path):
         os.umask(before)
 
 
-def test_a_survey_is_told_on_stdout(run, tmp_path):
-    """A survey is printed as Markdown or JSON; columns left out are named on stderr."""
+def test_a_survey_is_printed_on_stdout(run, tmp_path):
+    """A survey is printed as Markdown or JSON; columns left out are listed on stderr."""
     file = write_paper(tmp_path / "answers.csv")
     status, out, err = run("survey", file)
     assert status == 0
@@ -317,10 +317,10 @@ def test_a_survey_is_told_on_stdout(run, tmp_path):
         (("export", "mysql://u:secret@h/d", "--lms", "canvas"), "no driver"),
     ],
 )
-def test_what_cannot_be_done_is_one_line(run, grades, tmp_path, monkeypatch, words, message):
-    """A command that cannot be done ends with status 2 and a message of one line.
+def test_a_command_that_fails_prints_one_line(run, grades, tmp_path, monkeypatch, words, message):
+    """A command that cannot be carried out ends with status 2 and a message of one line.
 
-    It shows neither a traceback nor a password.
+    The message contains neither a traceback nor a password.
     """
     monkeypatch.chdir(tmp_path)
     status, out, err = run(*(word.replace("{grades}", str(grades)) for word in words))

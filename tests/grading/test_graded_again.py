@@ -1,4 +1,4 @@
-"""A submission is graded again if anything that its outcome depends on has changed."""
+"""A submission is graded again if anything on which its outcome depends has changed."""
 
 import shutil
 import sys
@@ -48,8 +48,8 @@ def task(school):
 
 
 def test_an_error_of_the_grader_is_tried_again(task, tmp_path):
-    """If the grader itself fails, the next run tries again, and the traceback is kept."""
-    broken = RUBRIC.model_copy(update={"system": None})  # as in no valid rubric
+    """If the grader itself fails, the traceback is kept, and the next run tries again."""
+    broken = RUBRIC.model_copy(update={"system": None})  # stands for an invalid rubric
     outcome = grade_task(task, rubric=broken, scratch=tmp_path)
     assert (outcome.status, outcome.settled) == ("failed", False)
     assert outcome.reason.startswith("the grader failed: AttributeError")
@@ -61,8 +61,8 @@ def test_an_error_of_the_grader_is_tried_again(task, tmp_path):
     [("carts = 1", "carts = ?"), ("carts = 1", "cart = 1"), ("data/step-1.csv", "data/none.csv"),
      ("version = 1", "version = 1,0"), ('id = "s0"', "id = s0  # me"), ('"s0"', "“s0”")],
 )  # fmt: skip
-def test_what_cannot_be_read_is_still_somebodys(school, tmp_path, slip, typed):
-    """A submission that cannot be read still names its authors, so points by hand reach them."""
+def test_an_unreadable_submission_keeps_its_authors(school, tmp_path, slip, typed):
+    """The authors of an unreadable submission are still known, so points by hand reach them."""
     own = shutil.copytree(school / "team-0", tmp_path / "team-0")
     file = own / "submission.toml"
     text = file.read_text(encoding="utf-8")
@@ -73,7 +73,7 @@ def test_what_cannot_be_read_is_still_somebodys(school, tmp_path, slip, typed):
     assert outcome.authors == ("s0",)
 
 
-def test_what_changed_meanwhile_is_not_graded_under_the_old_key(task, tmp_path, school):
+def test_files_that_change_during_the_grading_are_not_graded(task, tmp_path, school):
     """If a file changes between the hash and the copy, the submission is not graded but retried."""
     own = shutil.copytree(school / "team-0", tmp_path / "team-0")
     if sys.platform == "linux":  # only Linux allows this file name
@@ -90,7 +90,7 @@ def test_what_changed_meanwhile_is_not_graded_under_the_old_key(task, tmp_path, 
 
 
 def test_the_version_covers_what_it_computes_with(monkeypatch):
-    """With another version of numpy or scipy, everything is graded again."""
+    """If numpy or scipy has another version, everything is graded again."""
     before = code_version()
     assert code_version() == before
     for name in ("numpy", "scipy"):
@@ -102,7 +102,7 @@ def test_the_version_covers_what_it_computes_with(monkeypatch):
             assert code_version() != before
 
 
-def test_what_was_handed_out_is_no_copy(school, tmp_path):
+def test_a_handed_out_recording_is_not_flagged(school, tmp_path):
     """A recording that was handed out to everybody is not flagged in two submissions."""
     given = fingerprint(read_data(load_submission(school / "team-0")).records)
     shared = []

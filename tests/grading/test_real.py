@@ -24,7 +24,7 @@ from tests.helpers.ucsd import write_two_cart_submission
 
 @dataclass(frozen=True)
 class Bench:
-    """The five repeats of one lab section, analysed."""
+    """Five repeats recorded by one lab section, with their analysis."""
 
     submission: Submission
     analysis: Analysis
@@ -32,7 +32,7 @@ class Bench:
     def flags(
         self, *, initial: dict, final: dict, space: ReportedStateSpace | None = None
     ) -> list[str]:
-        """Grade a report; return the flags except for missing parts."""
+        """Grade a report; return all flags except those for missing parts."""
         reported = Reported(initial=initial, final=final, state_space=space)
         submission = self.submission.model_copy(update={"reported": reported})
         rubric = load_rubric(Path("ucsd-mae171a"))
@@ -78,7 +78,7 @@ def test_textbook_numbers_get_no_flag(bench, sign, digits):
     assert bench.flags(initial=initial, final=final, space=space) == []
 
 
-def test_a_student_of_every_single_repeat_is_honest(bench):
+def test_damping_from_any_single_repeat_gets_no_flag(bench):
     """Whichever single run a student uses for the damping of a cart, there is no flag."""
     first = first_estimates(bench)
     for record in bench.analysis.records:

@@ -59,7 +59,7 @@ def test_shipped_rubrics_are_valid_and_worth_twenty_points(path):
 
 
 def test_four_rubrics_are_shipped():
-    """The shipped rubrics are one for each of the paper's systems and one for a bench in counts."""
+    """There is one shipped rubric for each of the paper's systems, and one in counts."""
     names = {path.stem for path in SHIPPED}
     assert names == {"throne-1dof", "throne-2dof", "throne-3dof", "ucsd-mae171a"}
 
@@ -168,26 +168,26 @@ def test_a_table_without_its_bracket_is_one_mistake(tmp_path):
     assert [int(line.split()[2].rstrip(":")) for line in said] == [8, 14]
 
 
-def test_a_criterion_may_only_build_on_an_earlier_one(tmp_path):
-    """A criterion that requires a later one is refused, so there are no cycles."""
+def test_a_criterion_may_only_require_an_earlier_one(tmp_path):
+    """A criterion that requires a later one is refused, which rules out cycles."""
     text = GOOD.replace('parameters = ["K_*"]', 'requires = ["model"]')
     with pytest.raises(ConfigError, match="'model' comes later"):
         load_rubric(write(tmp_path, text))
 
 
-def test_a_rubric_that_is_not_there_names_the_shipped_ones():
+def test_a_misspelt_rubric_gives_the_nearest_shipped_one():
     """If a rubric's name is misspelt, the error suggests the nearest shipped rubric."""
     with pytest.raises(ConfigError, match="did you mean 'throne-2dof'"):
         load_rubric(Path("throne-2dofs"))
 
 
-def test_every_remark_has_its_cost():
-    """Each flag may have a cost, except the flag for shared data, which a person decides."""
+def test_every_flag_may_have_a_cost():
+    """Each flag may have a cost, except that for shared data, on which a person decides."""
     assert {*FlagCosts.model_fields} == {*CODES} - {"shared_data"}
     assert all(load_rubric(path).flags.of("wrong_state_space") == 0.5 for path in SHIPPED)
 
 
-def test_toml_that_is_none_says_where(tmp_path):
+def test_invalid_toml_is_named_with_its_line(tmp_path):
     """If a rubric is not valid TOML, the error gives the parser's line."""
     with pytest.raises(ConfigError, match=r"line 2: the value after = is missing; found title ="):
         load_rubric(write(tmp_path, "version = 1\ntitle = \n"))

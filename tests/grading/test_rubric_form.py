@@ -70,14 +70,14 @@ def test_a_form_keeps_comments_and_order(data):
     assert document == before
     assert _comments(new) == _comments(text)
     left = iter(_without_numbers(new))
-    assert all(line in left for line in _without_numbers(text))  # all of them, in their order
+    assert all(line in left for line in _without_numbers(text))  # the lines keep their order
 
 
 def _without_numbers(text: str) -> list[str]:
     return [re.sub(r"(?<== )[0-9.]+", "a number", line) for line in text.splitlines()]
 
 
-def test_nothing_changed_is_the_same_text():
+def test_an_unchanged_form_changes_no_byte():
     """If a form is sent back unchanged, or with extra zeros, no byte of the file changes."""
     for text in SHIPPED.values():
         form = rubric_form(parse_rubric(text, where=""))
@@ -91,7 +91,7 @@ def test_nothing_changed_is_the_same_text():
         assert with_values(text, changed_fields(form, zeros)) == text
 
 
-def test_late_work_at_half_and_a_point_for_hertz():
+def test_one_changed_number_changes_one_line():
     """One changed number changes one line; a new key adds one line to its table."""
     text = SHIPPED["throne-1dof"]
     late = typed_into(text, late__percent_per_day="50")
@@ -103,7 +103,7 @@ def test_late_work_at_half_and_a_point_for_hertz():
     assert parse_rubric(hertz, where="").flags.of("hz_for_rad_s") == 0.5
 
 
-def test_a_table_that_is_not_there_is_made_before_the_criteria():
+def test_a_missing_table_is_added_before_the_criteria():
     """A missing table is added before the criteria and before any comment above them."""
     text = SHIPPED["throne-1dof"]
     start, end = text.index("[late]"), text.index("[[criteria]]")
@@ -114,7 +114,7 @@ def test_a_table_that_is_not_there_is_made_before_the_criteria():
     assert parse_rubric(new, where="").late.percent_per_day == 12.5
 
 
-def test_what_stands_in_no_line_of_its_own_is_left_to_a_person():
+def test_an_inline_table_is_not_changed():
     """An inline table is not changed by the form; the error says so."""
     text = SHIPPED["throne-1dof"]
     start, end = text.index("[late]"), text.index("[[criteria]]")
@@ -123,7 +123,7 @@ def test_what_stands_in_no_line_of_its_own_is_left_to_a_person():
         typed_into(inline, late__percent_per_day="50")
 
 
-def test_a_value_within_a_longer_text_is_not_taken_for_the_key():
+def test_a_line_of_a_longer_text_is_not_changed():
     """A line of a longer text is not changed, even if it looks like a key with its value."""
     text = SHIPPED["throne-1dof"].replace(
         'title = "everything the lab asks for"\npoints = 1',
@@ -133,7 +133,7 @@ def test_a_value_within_a_longer_text_is_not_taken_for_the_key():
     assert new == text.replace('"""\npoints = 1', '"""\npoints = 2')
 
 
-def test_what_students_see_is_chosen_in_a_table_of_its_own_or_in_its_line():
+def test_the_choice_of_what_students_see_is_saved():
     """The choice of what students see is saved in its own table; a comment after it stays."""
     text = SHIPPED["throne-1dof"]
     new = typed_into(text, students__see="check")

@@ -1,4 +1,4 @@
-"""The autograder's zip runs in Gradescope's folders, and its results are what students read."""
+"""The autograder's zip file runs in Gradescope's folders and writes the results for students."""
 
 import json
 import os
@@ -36,7 +36,7 @@ RUBRIC = RUBRICS / "throne-1dof.toml"
 TOP = {"score", "output", "output_format", "test_output_format", "test_name_format",
        "stdout_visibility", "tests", "extra_data"}  # fmt: skip
 TEST = {"score", "max_score", "status", "name", "number", "output", "tags", "visibility"}
-# A computed number as it would be written: three digits or more, a decimal point among them.
+# Matches a computed number: at least one digit on each side of a decimal point.
 NUMBER = re.compile(r"\d+\.\d+")
 
 
@@ -65,7 +65,7 @@ def root(tmp_path_factory) -> Path:
     source = root / "source"
     with zipfile.ZipFile(root / "autograder.zip") as archive:
         archive.extractall(source)
-    # pip, which is there too, finds every pinned version and downloads nothing.
+    # `setup.sh` also calls pip, which finds every pinned version installed and downloads nothing.
     venv.create(source / "venv", symlinks=True)
     (own,) = (source / "venv").glob("lib/python*/site-packages")
     (own / "here.pth").write_text("\n".join(site.getsitepackages()), encoding="utf-8")
@@ -92,12 +92,12 @@ def start(*command: str | Path, **environment: str) -> subprocess.CompletedProce
 
 @pytest.fixture(scope="module")
 def shown(root, team) -> dict[str, Any]:
-    """Return the autograder's result for the submission."""
+    """Return the autograder's result for the team's submission."""
     return upload(root, team)
 
 
 def upload(root: Path, submission: Path) -> dict[str, Any]:
-    """Put a student's files in place, run the autograder as a program, return its result."""
+    """Upload a student's files, run the autograder as a program, and return its result."""
     put(root, submission)
     done = start(root / "run_autograder")
     assert done.returncode == 0, done.stderr
@@ -106,7 +106,7 @@ def upload(root: Path, submission: Path) -> dict[str, Any]:
 
 
 def upload_here(root: Path, submission: Path, *, rubric: str = "") -> dict[str, Any]:
-    """Grade the upload in this process, since a new one takes a second to start."""
+    """Grade the upload in this process, because starting a new process takes a second."""
     put(root, submission, rubric=rubric)
     (root / "results").mkdir()
     assert run.grade_upload(root) == ""
@@ -114,7 +114,7 @@ def upload_here(root: Path, submission: Path, *, rubric: str = "") -> dict[str, 
 
 
 def put(root: Path, submission: Path, *, rubric: str = "") -> None:
-    """Put a student's files in place, and a rubric if it is not the usual one."""
+    """Put a student's files, and a rubric if one is given, into Gradescope's folders."""
     shutil.rmtree(root / "submission", ignore_errors=True)
     shutil.rmtree(root / "results", ignore_errors=True)
     if submission.is_dir() and not submission.is_symlink():
@@ -186,7 +186,7 @@ def test_all_ways_to_upload_have_the_same_result(root, team, shown, tmp_path, fo
     assert upload_here(root, given) == shown
 
 
-def test_students_who_find_the_numbers_read_none(root, team, shown):
+def test_results_hide_computed_numbers_if_the_rubric_says_so(root, team, shown):
     """If the rubric says `see = "check"`, the results show no computed number.
 
     Points stay hidden until the due date.
@@ -205,13 +205,13 @@ def test_students_who_find_the_numbers_read_none(root, team, shown):
     assert wrong["output"] == "not passed: a final value that disagrees with the recordings"
 
 
-HOSTILE = (  # one of a kind; `tests/system/test_hostile.py` grades all of them as a class
+HOSTILE = (  # one archive of each kind; `tests/system/test_hostile.py` grades all of them
     "zip-00-a link.zip", "zip-05-escape 0.zip", "zip-14-ratio.zip", "zip-32-two.zip",
     "place-04-linked folder", "linked.zip",
 )  # fmt: skip
 
 
-def test_hostile_uploads_get_a_sentence_and_no_more(root, team, tmp_path):
+def test_a_hostile_upload_gets_a_reason_and_reaches_no_other_file(root, team, tmp_path):
     """A hostile upload, such as a zip bomb or a link, gets a result that names the reason.
 
     No file outside the upload is read or written.
@@ -243,7 +243,7 @@ def test_hostile_uploads_get_a_sentence_and_no_more(root, team, tmp_path):
         ),
     ],
 )
-def test_an_upload_that_is_no_submission_is_told_why(root, tmp_path, files, said):
+def test_an_upload_without_a_submission_gets_the_reason(root, tmp_path, files, said):
     """An upload without `submission.toml`, or with two of them, gets 0 points and the reason."""
     for name in files:
         (tmp_path / "given" / name).parent.mkdir(parents=True, exist_ok=True)
@@ -285,9 +285,9 @@ def test_a_grader_that_is_killed_leaves_a_result(root, team):
 
 
 def test_a_grading_that_takes_too_long_is_stopped(root, team, monkeypatch):
-    """If grading exceeds cartlab's time limit, the result says so.
+    """If grading takes longer than cartlab's time limit, the result says so.
 
-    Gradescope's own limit is longer; beyond it there would be no result.
+    Gradescope's own limit is longer; a grader that exceeds it leaves no result.
     """
     put(root, team)
     (root / "results").mkdir()
@@ -300,7 +300,7 @@ def test_a_grading_that_takes_too_long_is_stopped(root, team, monkeypatch):
 # -------------------------------------------------------------------------------- the zip
 
 
-def test_the_zip_is_made_for_gradescope_and_always_the_same(tmp_path):
+def test_the_zip_is_reproducible_and_its_scripts_are_executable(tmp_path):
     """Two zip files for one rubric are equal byte by byte, and both scripts in them are executable.
 
     A rubric that ships with cartlab may be given by its name.
@@ -326,7 +326,7 @@ def test_the_zip_is_made_for_gradescope_and_always_the_same(tmp_path):
     assert python == f"{sys.version_info.major}.{sys.version_info.minor}"
 
 
-def test_all_that_grading_needs_is_pinned_to_what_is_installed():
+def test_every_needed_package_is_pinned_to_its_installed_version():
     """Every package that grading needs, directly or indirectly, is pinned to its installed version.
 
     Packages that only the tests need are left out.
@@ -348,8 +348,11 @@ def test_all_that_grading_needs_is_pinned_to_what_is_installed():
         (("--autograder", "throne-1dof", "--out", "folder"), "an autograder is one zip file"),
     ],
 )
-def test_export_says_what_it_needs(tmp_path, arguments, said):
-    """`export` takes either grades and a platform, or a rubric for a zip file, and nothing else."""
+def test_export_refuses_arguments_that_do_not_go_together(tmp_path, arguments, said):
+    """`export` accepts grades and a platform, or a rubric and a zip file;
+
+    other mixtures are errors.
+    """
     done = cartlab_here("export", *arguments, cwd=tmp_path)
     assert done.returncode == 2
     assert said in done.stderr

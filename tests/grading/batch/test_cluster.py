@@ -71,7 +71,7 @@ def grade(folder, out, execute, progress=lambda *_: None):
 
 @pytest.mark.slow
 @pytest.mark.sample
-def test_a_cluster_grades_as_this_machine_does_though_a_worker_dies(cluster, tmp_path):
+def test_a_cluster_gives_the_same_rows_even_if_a_worker_dies(cluster, tmp_path):
     """A cluster gives the same rows as this machine, even if one of two workers is killed."""
     address, workers = cluster
     for number in range(5):
@@ -99,8 +99,11 @@ def test_a_cluster_grades_as_this_machine_does_though_a_worker_dies(cluster, tmp
     assert batch == here
 
 
-def test_an_address_that_is_no_schedulers_is_refused():
-    """The address must be a scheduler's, and for another machine it must be encrypted."""
+def test_an_address_that_is_not_a_schedulers_is_refused():
+    """An address is refused unless it belongs to a scheduler;
+
+    to another machine it must be encrypted.
+    """
     with pytest.raises(ConfigError, match="expected a scheduler's address"):
         run_on("http://localhost:8786")
     with pytest.raises(ConfigError, match=r"tls://"):
@@ -109,7 +112,7 @@ def test_an_address_that_is_no_schedulers_is_refused():
         run_on("tls://192.0.2.1:8786")
 
 
-def test_nobody_there_is_said(monkeypatch):
+def test_an_address_without_a_scheduler_is_an_error(monkeypatch):
     """If no scheduler listens at the address, the batch stops with an error that says so."""
     monkeypatch.setattr("pipeline.grading.batch.cluster._CONNECT_LIMIT", 1)
     setup = Setup(rubric=RUBRIC, scratch=Path())

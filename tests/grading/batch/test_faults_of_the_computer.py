@@ -1,4 +1,4 @@
-"""A fault of the computer costs nobody a grade: the next run tries again."""
+"""A fault of the computer costs nobody a grade, because the next run tries again."""
 
 import io
 import json
@@ -22,7 +22,7 @@ from tests.helpers.places import ROOT
 
 RUBRIC = load_rubric(Path("throne-1dof"))
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limits")
-_MEMBER = 3_000_000  # length in bytes of a file that compresses to a tenth
+_MEMBER = 3_000_000  # bytes in a file that compresses to a tenth of its size
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def teams(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def zips(teams, tmp_path_factory) -> Path:
-    """The two teams, packed."""
+    """Return the folder in which each of the two teams is a zip file."""
     folder = tmp_path_factory.mktemp("zips")
     for team in teams.iterdir():
         shutil.make_archive(str(folder / team.name), "zip", teams, team.name)
@@ -68,7 +68,7 @@ def small_disk(at: Path, *, size: str) -> Iterator[None]:
 
 
 def grade(zips: Path, out: Path) -> subprocess.CompletedProcess[str]:
-    """Grade the class in a process of its own."""
+    """Grade the class in a new process."""
     command = [sys.executable, "-m", "pipeline", "grade", zips, "--rubric", "throne-1dof",
                "--no-figures", "--jobs", "1", "--out", out]  # fmt: skip
     return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
@@ -95,10 +95,10 @@ def test_a_full_disk_costs_nobody_a_grade(zips, tmp_path):
     assert all("shared_data" in [flag.code for flag in grade.flags] for grade in grades)
 
 
-def test_a_name_that_cannot_be_is_still_the_archives_own(tmp_path):
-    """If the file system cannot store a file of an archive, this file is refused for good.
+def test_a_file_with_an_impossible_name_is_refused_for_good(tmp_path):
+    """If the file system cannot store a member of an archive, the member is refused for good.
 
-    Its name is too long, or it needs a folder where another file is. A retry cannot help.
+    One name is too long; another needs a folder where a file is. Trying again cannot help.
     """
     archive = tmp_path / "odd.zip"
     with zipfile.ZipFile(archive, "w") as packed:
@@ -138,7 +138,7 @@ print(json.dumps(told))
 def starved(source: Path, scratch: Path, limit: str, soft: range) -> list[list]:
     """Grade once without a limit, then once with each limit.
 
-    Return for each: whether the outcome is final, whether space was short, the reason, the grade.
+    Return for each grading: whether it is final, whether space was short, the reason, the grade.
     """
     scratch.mkdir()
     words = [sys.executable, "-c", _STARVED, source, scratch, limit, *soft]
@@ -149,10 +149,10 @@ def starved(source: Path, scratch: Path, limit: str, soft: range) -> list[list]:
 
 
 @POSIX
-def test_a_file_that_may_not_grow_costs_nobody_a_grade(zips, teams, tmp_path):
-    """If the system limits the size of files, the submission is graded in the next run.
+def test_a_limit_on_file_size_costs_nobody_a_grade(zips, teams, tmp_path):
+    """If the system limits file sizes, the submission is not graded; the next run tries again.
 
-    The limit is reached while a zip file is unpacked or a folder is copied.
+    The limit is reached while a zip file is unpacked, or while a folder is copied.
     """
     for number, source in enumerate((zips / "team-0.zip", teams / "team-0")):
         size = range(_MEMBER // 2, _MEMBER // 2 + 1)
@@ -165,25 +165,25 @@ def test_a_file_that_may_not_grow_costs_nobody_a_grade(zips, teams, tmp_path):
 
 @POSIX
 @pytest.mark.parametrize("packed", [True, False])
-def test_too_few_files_at_a_time_cost_nobody_a_point(zips, teams, tmp_path, packed):
-    """If the system allows few open files, a submission gets its usual grade or none yet."""
+def test_a_limit_on_open_files_costs_nobody_a_point(zips, teams, tmp_path, packed):
+    """If few files may be open at a time, a submission gets its usual grade or is tried again."""
     source = zips / "team-0.zip" if packed else teams / "team-0"
-    few = range(3, 12)  # three files are open at the start, and a few more belong to libraries
+    few = range(3, 12)  # three files are open at the start; libraries open a few more
     (_, _, _, whole), *others = starved(source, tmp_path / "s", "RLIMIT_NOFILE", few)
     assert any(not settled for settled, *_ in others)
     assert {grade for settled, _, _, grade in others if settled} <= {whole}
 
 
-def test_the_faults_of_a_decoder_are_the_archives(tmp_path):
+def test_undecodable_content_is_refused_for_good(tmp_path):
     """If an archive's content cannot be decoded, the submission is refused for good.
 
-    The operating system reports no error then, so the archive itself is at fault.
+    The operating system reports no error, so the archive itself must be at fault.
     """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_BZIP2) as packed:
         packed.writestr("submission.toml", "version = 1\n" * 1000)
     content = bytearray(buffer.getvalue())
-    content[60:70] = b"\xff" * 10  # within the compressed bytes
+    content[60:70] = b"\xff" * 10  # these are compressed bytes
     archive = tmp_path / "broken.zip"
     archive.write_bytes(content)
     outcome = grade_task(

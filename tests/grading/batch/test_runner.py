@@ -1,4 +1,4 @@
-"""A batch gives every submission one row, in any order of work, and grades none twice."""
+"""A batch gives each submission one row, whatever the order of work, and grades none twice."""
 
 import json
 import random
@@ -51,7 +51,10 @@ def school(tmp_path_factory):
 
 
 def run(paths, out, *, jobs=1, time_limit=PATIENCE, execute=None, progress=lambda *_: None):
-    """Grade into a new gradebook; return the batch, and outcomes and grades by id."""
+    """Grade into a new gradebook;
+
+    return the batch, and the outcome and grade of each submission.
+    """
     scratch = out / "scratch"
     scratch.mkdir(parents=True, exist_ok=True)
     with Gradebook(out, create=True) as book:
@@ -93,7 +96,7 @@ def test_a_class_is_graded_and_sharing_is_flagged(graded):
     assert seen == [0, 1, 2, 3, 4, 4]
 
 
-def test_the_number_of_processes_does_not_show(school, graded, tmp_path):
+def test_the_number_of_processes_changes_no_row(school, graded, tmp_path):
     """A class graded with one process gets the same rows as with two."""
     _, _, rows, _ = graded
     _, alone = run([school], tmp_path, execute=in_this_process)
@@ -162,10 +165,10 @@ def test_a_worker_killed_while_it_starts_is_started_again(task, setup, kill_next
         assert worker.run(task).status == "graded"
 
 
-def test_a_grade_stands_where_its_figures_fail(school, tmp_path, monkeypatch):
+def test_a_grade_is_kept_if_its_figures_fail(school, tmp_path, monkeypatch):
     """If figures cannot be drawn, the row has its points without figures.
 
-    The next run tries again.
+    The next run grades the submission again.
     """
 
     def undrawable(*_):
@@ -182,7 +185,7 @@ def test_a_grade_stands_where_its_figures_fail(school, tmp_path, monkeypatch):
     assert "Singular matrix" in outcome.detail
 
 
-def test_what_this_machine_fails_at_is_tried_again(task, tmp_path):
+def test_a_fault_of_this_machine_is_tried_again(task, tmp_path):
     """If the scratch folder cannot be written, the row says so and the next run tries again."""
     (tmp_path / "scratch").touch()  # no folder can be made in a file
     outcome = grade_task(task, rubric=RUBRIC, scratch=tmp_path / "scratch")
@@ -218,7 +221,7 @@ def test_a_hang_is_stopped_and_tried_again(school, tmp_path):
 def killed_within(rng, book, command):
     """Run a command and kill it, with its children, at a random point of its work.
 
-    The point is a share of the work done, since machines differ in speed.
+    The point is chosen by the number of submissions graded, since machines differ in speed.
     """
     enough = n_graded(book) + rng.randrange(3)
     with started(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
@@ -228,7 +231,7 @@ def killed_within(rng, book, command):
 
 @pytest.mark.slow
 @pytest.mark.sample
-def test_killed_at_any_moment_it_goes_on(school, graded, tmp_path):
+def test_a_run_that_is_killed_can_be_continued(school, graded, tmp_path):
     """A run that is killed at random times and started again ends like an undisturbed one."""
     killed = tmp_path / "killed"
     command = [sys.executable, "-m", "pipeline", "grade", school, "--rubric", "throne-1dof",
@@ -237,7 +240,7 @@ def test_killed_at_any_moment_it_goes_on(school, graded, tmp_path):
     for _ in range(30):
         killed_within(rng, killed, [*command, "--jobs", "2"])
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 1, done.stderr  # since team-3 could not be graded
+    assert done.returncode == 1, done.stderr  # because team-3 cannot be graded
     assert "team-3: team-3/submission.toml line 1" in done.stderr
     out, batch, rows, _ = graded
     with Gradebook(killed) as book:
@@ -269,10 +272,10 @@ HOSTILE = {
 }
 
 
-def test_hostile_submissions_are_rows(tmp_path):
+def test_hostile_submissions_get_rows(tmp_path):
     """Every hostile submission gets a row with a printable reason.
 
-    It writes no file outside the scratch folder.
+    No file is written outside the scratch folder.
     """
     for name, text in HOSTILE.items():
         folder = tmp_path / "class" / name.replace("/", "_")

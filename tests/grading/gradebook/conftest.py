@@ -28,7 +28,7 @@ def place(request, tmp_path):
 
 @pytest.fixture
 def place_in_postgresql(server):
-    """Return an empty database; remove afterwards what a test put there."""
+    """Yield the address of an empty database, and empty the database after the test."""
     url = server
     yield url
     engine = create_engine(url.replace("postgresql:", "postgresql+psycopg:"))

@@ -20,9 +20,9 @@ RUBRIC = two_cart_rubric()
 
 
 def test_a_rubric_is_compared_by_its_criteria():
-    """A new, removed or reordered criterion is named, and so is each changed number.
+    """Changed numbers, removed criteria and a new order of the criteria are listed.
 
-    Other changes of the rubric are named by their keys.
+    Other changes of the rubric are listed by their keys.
     """
     first, second, *rest = RUBRIC.criteria
     dearer = first.model_copy(update={"points": first.points + 1})
@@ -44,7 +44,7 @@ def test_a_rubric_is_compared_by_its_criteria():
     ]
 
 
-def test_a_rubric_of_another_version_is_said_to_be_one():
+def test_a_rubric_of_another_version_is_not_compared():
     """If the earlier rubric was written by another version, the summary says only that."""
     assert rubric_changes('{"version": 0}', RUBRIC.model_dump_json()) == [
         "the earlier rubric was written by another version of cartlab"
@@ -58,10 +58,10 @@ def test_points_are_compared_by_name():
     ]  # fmt: skip
 
 
-def test_the_gradebook_tells_and_history_keeps_it(tmp_path):
+def test_changes_are_printed_and_kept_in_the_history(tmp_path):
     """After a regrade the changes are printed and kept in the history.
 
-    The first class list is no change, nor is a second run with the same result.
+    A first class list is not a change, nor is a second run with the same result.
     """
     outcome = make_outcome(make_grade("a", share=0.5))
     batch = Batch(keys=(outcome.key,), shared={})
@@ -79,7 +79,7 @@ def test_the_gradebook_tells_and_history_keeps_it(tmp_path):
     assert events[-1].text == "rubric: anonymous False → True"
 
 
-# Number of submissions left when the first one is graded, in case Ctrl-C comes late.
+# Submissions still ungraded when the first one is done, so that Ctrl-C comes early enough.
 _LEFT = 4
 
 
@@ -87,7 +87,7 @@ _LEFT = 4
 def test_ctrl_c_says_how_to_go_on(tmp_path):
     """After Ctrl-C one line says how to continue, and the same command then continues.
 
-    No worker is left, and the exit status is that of an interrupt.
+    Not every submission is graded yet, and the exit status is 130, that of an interrupt.
     """
     for number in range(_LEFT + 1):
         write_submission(tmp_path / "c" / f"t{number}", "throne-1dof", seed=number,
@@ -101,7 +101,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path):
         os.killpg(process.pid, signal.SIGINT)
         _, said = process.communicate()
     assert process.returncode == 130, said
-    *progress, last = said.splitlines()  # a progress line, if grading took over two seconds
+    *progress, last = said.splitlines()  # a progress line appears if grading took over two seconds
     assert all(f" of {_LEFT + 1}" in line for line in progress)
     assert last == (
         f"stopped; finished grades are kept in {tmp_path / 'out'}; repeat the command to continue"

@@ -45,7 +45,7 @@ def comment_all(book, why="Mind the unit."):
 
 
 def pieces(book):
-    """Return the criterion as it counts now."""
+    """Return the criterion `pieces` of team-1 as it counts now."""
     return next(c for c in book.entry("team-1").grade.criteria if c.id == "pieces")
 
 
@@ -73,8 +73,8 @@ def test_points_by_hand_stay_by_hand_with_a_comment(book, say):
     assert pieces(book).points == 0.0
 
 
-def test_a_comment_is_undone_and_given_back(book):
-    """Undo removes a comment; if it replaced an earlier comment, that one is back."""
+def test_undo_brings_back_the_earlier_comment(book):
+    """Undo removes a comment; if it had replaced an earlier comment, the earlier one returns."""
 
     def undo():
         book.undo("team-1", "pieces", by="Ada", seen=book.team("team-1").versions["pieces"])
@@ -93,7 +93,7 @@ def test_a_comment_is_undone_and_given_back(book):
     assert pieces(book).message == "omega_1 is off. Mind the unit."
 
 
-def test_what_a_comment_would_change_is_shown_first(book):
+def test_a_preview_shows_what_a_comment_changes(book):
     """Before a comment is saved, its preview shows the new message and unchanged points."""
     wish = WantedPoints(submission="team-1", criterion="pieces", points=None, why="x", comment=True)
     (tried,) = book.try_all([wish])
@@ -102,7 +102,7 @@ def test_what_a_comment_would_change_is_shown_first(book):
 
 
 def test_an_answer_with_the_same_points_leaves_them_automatic(book, place):
-    """If an answer confirms the automatic points, a later regrade may still change them."""
+    """If an answer confirms the automatic points, a later regrade may still change these points."""
     with RequestBook(place) as shared:
         shared.release(True, by="prof")
         shared.ask("team-1", "pieces", why="please", by="s1")
@@ -113,7 +113,7 @@ def test_an_answer_with_the_same_points_leaves_them_automatic(book, place):
 
 
 def test_a_gradebook_without_comments_gets_them(book, place):
-    """A gradebook of a version without comments opens, keeps its overrides and accepts comments."""
+    """A gradebook written before comments existed opens, keeps overrides and accepts comments."""
     book.override("team-1", "laws", 0.0, why="no", by="Ada")
     book.close()
     if "://" in place:

@@ -53,10 +53,10 @@ def _found(content: bytes) -> list[str]:
     return [trace for trace in TRACES if trace.encode() in content]
 
 
-def test_in_a_folder_no_file_keeps_a_trace(tmp_path):
-    """After erasing, no file of the folder contains the student.
+def test_no_file_of_a_folder_keeps_a_trace(tmp_path):
+    """After a student is erased, no file of the folder contains the student's data.
 
-    The free pages of the database are searched too.
+    The search includes the database's free pages.
     """
     folder = tmp_path / "grades"
     folder.mkdir()
@@ -83,8 +83,8 @@ def test_in_a_folder_no_file_keeps_a_trace(tmp_path):
         assert connection.execute("PRAGMA freelist_count").fetchone() == (0,)
 
 
-def test_in_postgresql_no_row_keeps_a_trace(server, place_in_postgresql):
-    """After erasing, the student is neither in a dump of the database nor in its table files."""
+def test_no_row_in_postgresql_keeps_a_trace(server, place_in_postgresql):
+    """After an erasure, neither a dump of the database nor its table files contain the student."""
     url = place_in_postgresql
     _fill(url)
     assert set(_found(_dump(url))) == {"zebra", "s-zebra", "31.41592", "quagga"}
@@ -103,12 +103,12 @@ def test_in_postgresql_no_row_keeps_a_trace(server, place_in_postgresql):
 
 
 def test_a_backup_of_a_file_is_the_same_gradebook(tmp_path):
-    """A copy that SQLite makes of an open gradebook has the same entries and history."""
+    """A backup that SQLite makes of an open gradebook has the same entries and history."""
     _fill(str(tmp_path))
     copy = tmp_path / "copy.sqlite"
     with Gradebook(tmp_path) as book:
         with closing(sqlite3.connect(tmp_path / FILE)) as own, closing(sqlite3.connect(copy)) as to:
-            own.backup(to)  # as `sqlite3 gradebook.sqlite ".backup copy.sqlite"` does
+            own.backup(to)  # does the same as `sqlite3 gradebook.sqlite ".backup copy.sqlite"`
         with Gradebook(copy) as restored:
             assert list(restored.entries()) == list(book.entries())
             assert restored.history(GONE) == book.history(GONE)

@@ -67,8 +67,8 @@ def finish(book, *outcomes, shared=None):
     book.finish(batch, rubric=RUBRIC)
 
 
-def test_what_is_put_in_comes_back(open_book):
-    """An outcome, Unicode included, is the same after the gradebook was closed and reopened."""
+def test_an_outcome_is_read_back_unchanged(open_book):
+    """An outcome, Unicode included, is unchanged after the gradebook is closed and reopened."""
     grade = make_grade("tëam 学 '\"; DROP TABLE gradings; --", share=0.5, flags=(hertz_flag(),))
     outcome = make_outcome(
         grade,
@@ -97,8 +97,8 @@ def test_runs_that_begin_at_once_make_one_gradebook(place):
         book.close()
 
 
-def test_a_folder_may_be_called_like_a_database(tmp_path):
-    """Whether a place is a folder or a file is found by looking at it, not from its name."""
+def test_a_folder_may_have_the_name_of_a_database(tmp_path):
+    """Whether a place is a folder or a file is decided by what exists there, not by its name."""
     (tmp_path / "lab.db").mkdir()
     Gradebook(tmp_path / "lab.db", create=True).close()
     assert (tmp_path / "lab.db" / FILE).is_file()
@@ -118,7 +118,7 @@ def test_the_newest_of_a_key_counts(open_book):
 
 
 def test_fingerprints_are_those_of_the_newest_outcomes(open_book):
-    """Each submission has one fingerprint, that of its newest outcome.
+    """Each submission has one fingerprint, which is that of its newest outcome.
 
     Fingerprints of other assignments are included.
     """
@@ -137,7 +137,7 @@ def test_reading_fingerprints_does_not_keep_a_writer_waiting(open_book, monkeypa
     """Outcomes can be stored while another program reads the fingerprints."""
     monkeypatch.setattr(rows, "_PAGE", 10)
     book = open_book()
-    for n in range(15):  # more than one page
+    for n in range(15):  # the fingerprints fill more than one page
         book.put(make_outcome(make_grade(f"team-{n}")))
     prints = book.prints()
     next(prints)
@@ -150,7 +150,7 @@ def test_reading_fingerprints_does_not_keep_a_writer_waiting(open_book, monkeypa
 def test_the_class_list_is_the_last_batch_that_ended(open_book):
     """The class list is that of the last batch that ended.
 
-    Outcomes of a killed run count only when a later batch ends with them.
+    Outcomes of a killed run count only if a later batch that ends includes them.
     """
     book = open_book()
     with pytest.raises(ConfigError, match="no grading of 'lab' is complete"):
@@ -165,7 +165,7 @@ def test_the_class_list_is_the_last_batch_that_ended(open_book):
 
 
 def test_shared_data_is_flagged_in_the_class_list(open_book):
-    """The class list has the flag for shared data until a later batch no longer finds it."""
+    """The class list has the flag for shared data until a later batch finds no shared data."""
     book = open_book()
     outcomes = [make_outcome(make_grade(name, flags=(hertz_flag(),))) for name in "ab"]
     finish(book, *outcomes, shared={"a": shared_flag("b"), "b": shared_flag("a")})
@@ -217,9 +217,9 @@ def test_a_broken_submission_can_be_graded_by_hand(open_book):
 
 
 def test_an_override_goes_with_the_people(open_book):
-    """An override belongs to the people: a team that grows keeps it.
+    """An override belongs to the authors: a team that grows keeps it.
 
-    Another year's team of the same name does not get it.
+    A team of the same name in another year does not get it.
     """
     book = open_book()
     finish(book, make_outcome(make_grade("team-1", share=0.0, authors=("ann",)), key="1"))
@@ -247,10 +247,10 @@ def test_assignments_in_one_database_stay_apart(open_book):
     assert open_book(None, create=False).entry("team-1").grade.points == 0
 
 
-def test_one_hand_in_under_one_rubric_is_graded_in_each_assignment(open_book):
-    """If two assignments grade the same submission, each has its own grade and overrides.
+def test_the_same_submission_has_a_grade_in_each_assignment(open_book):
+    """If a submission is graded in two assignments, each has its own grade and overrides.
 
-    This holds even if both use the same rubric, so that the submission's key is the same.
+    This holds even if both assignments use the same rubric, so that the grades have the same key.
     """
     one, two = open_book("lab 1"), open_book("lab 2")
     for book in (one, two):
@@ -263,8 +263,8 @@ def test_one_hand_in_under_one_rubric_is_graded_in_each_assignment(open_book):
     assert [event.what for event in one.history("team-1")[1]] == ["graded", "listed"]
 
 
-def test_no_override_is_above_what_the_rubric_has_now(open_book):
-    """If a changed rubric gives fewer points for a criterion, an override cannot exceed them."""
+def test_an_override_never_exceeds_the_points_of_the_rubric(open_book):
+    """If a changed rubric gives fewer points for a criterion, an override is lowered to them."""
     book = open_book()
     outcome = make_outcome(make_grade("team-1", share=0.0))
     finish(book, outcome)
@@ -317,7 +317,7 @@ def test_a_team_is_found_by_its_members(open_book):
 
 
 def test_the_history_says_who_did_what_when_and_why(open_book):
-    """The history lists every grading, change of the class list and override in order of time."""
+    """The history lists every grading, override and change of the class list in order of time."""
     book = open_book()
     late = make_outcome(make_grade("team-1", share=0.5, flags=(hertz_flag(),)), key="1")
     finish(book, late)
@@ -346,8 +346,8 @@ def test_the_history_says_who_did_what_when_and_why(open_book):
     assert json.loads(json.dumps(history_dict(name, events)))["events"][2]["by"] == "Ada"
 
 
-def test_the_history_tells_under_which_name_a_team_goes_on(open_book):
-    """If a team's folder has a new name in the next run, the history says so under both names."""
+def test_the_history_gives_the_new_name_of_a_team(open_book):
+    """If a team's folder has a new name in the next run, the history of both names says so."""
     book = open_book()
     finish(
         book, make_outcome(make_grade("team-1", authors=("ann",))), make_outcome(make_grade("b"))
@@ -397,7 +397,7 @@ def test_rows_are_only_added(open_book, place):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
-def test_a_kill_at_any_moment_loses_nothing_that_was_put_in(tmp_path):
+def test_a_kill_leaves_every_outcome_whole_or_absent(tmp_path):
     """If a process is killed while it writes, each outcome is stored either whole or not at all."""
     assert_nothing_lost(str(tmp_path), kills=8)
 
@@ -424,7 +424,7 @@ def assert_nothing_lost(place: str, *, kills: int) -> None:
     done, within, told, there = map(int, re.findall(r"\d+", said.stdout))
     assert done == kills
     assert there == told
-    assert within > kills // 4  # most children lived long enough to write
+    assert within > kills // 4  # most processes lived long enough to write
 
 
 # --------------------------------------------------------- places without a gradebook
@@ -446,7 +446,7 @@ def test_a_place_without_a_gradebook_is_an_error(tmp_path):
         ("://", "not a database URL"),
     ],
 )
-def test_an_address_that_leads_nowhere_is_one_line_without_the_password(url, message):
+def test_a_useless_address_is_an_error_without_the_password(url, message):
     """An address that cannot be used gives an error of one line without the password.
 
     For example, a driver is missing, no server answers, or the text is not a URL.
@@ -457,7 +457,7 @@ def test_an_address_that_leads_nowhere_is_one_line_without_the_password(url, mes
     assert "\n" not in str(error.value)
 
 
-def test_a_file_that_is_no_gradebook_is_an_error(tmp_path):
+def test_a_file_that_is_not_a_gradebook_is_an_error(tmp_path):
     """A file that is not a gradebook of this version is an error and stays as it is.
 
     The file is a text, another program's database, or a gradebook of a later version.

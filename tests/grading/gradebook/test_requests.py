@@ -1,4 +1,4 @@
-"""Students can ask for another look at their points, in SQLite and in PostgreSQL."""
+"""Students can ask for a review of their points, in SQLite and in PostgreSQL."""
 
 import os
 import re
@@ -36,7 +36,7 @@ def book(place):
 
 
 def finish(book, *grades, moved=None, rubric=RUBRIC, key=""):
-    """Grade a class."""
+    """Store a batch with this grade."""
     outcomes = [make_outcome(grade, key=f"{key}{grade.submission}") for grade in grades]
     for outcome in outcomes:
         if book.known(outcome.key) is None:
@@ -88,7 +88,7 @@ def test_an_answer_and_its_points_count_at_once(book):
     assert book.n_waiting() == 0
 
 
-def test_points_stay_where_the_answer_gives_none(book):
+def test_points_stay_if_the_answer_gives_none(book):
     """If an answer gives no points, the points stay as they are."""
     book.ask("team-1", "laws", why="see page 3", by="s1")
     answer(book, None, text="page 3 is about cart 2")
@@ -137,10 +137,10 @@ def test_a_request_that_makes_no_sense_is_refused(book, criterion, why, message)
     assert book.n_waiting() == 0
 
 
-def test_whole_points_are_not_asked_about(book):
+def test_a_criterion_with_all_points_cannot_be_asked_about(book):
     """A criterion with all its points cannot be asked about.
 
-    One that was never judged can, since its points are lost too.
+    A criterion that was never judged can be asked about, since its points are lost too.
     """
     finish(book, make_grade("team-1"), failed_grade("team-2", "no submission.toml"), key="new ")
     with pytest.raises(RequestRefused, match="points were lost"):
@@ -161,7 +161,7 @@ def test_few_requests_wait_at_once(book):
     book.ask("team-1", CRITERIA[MOST_OPEN], why="x", by="s1")
 
 
-def test_students_read_and_ask_nothing_before_the_release(place):
+def test_students_can_read_and_ask_only_while_released(place):
     """Students can read and ask only while their class is released."""
     with RequestBook(place, assignment="lab", create=True) as book:
         assert book.own_feedback("team-1") is None
@@ -177,7 +177,7 @@ def test_students_read_and_ask_nothing_before_the_release(place):
         assert book.own_feedback("team-1", assignment="lab") is not None
         assert book.own_feedback("team-1", assignment="lab-2") is None
         with pytest.raises(ConfigError, match="not the name of a submission"):
-            book.own_feedback("s-team-1")  # one of the authors
+            book.own_feedback("s-team-1")  # s1 is an author
         with pytest.raises(ConfigError, match="no such submission"):
             book.own_feedback("team-9")
     with RequestBook(place, assignment="lab-2", create=True) as other:
@@ -185,10 +185,10 @@ def test_students_read_and_ask_nothing_before_the_release(place):
         assert other.own_feedback("team-1") is None
 
 
-def test_an_answer_that_rests_on_what_is_no_longer_so_is_refused(book):
+def test_an_answer_to_a_changed_request_is_refused(book):
     """An answer is refused if the request has changed since the TA saw it.
 
-    Another TA's answer, a change by hand or a regrade may have come first.
+    Another TA may have answered, points may have been given by hand, or a regrade may have run.
     """
     for criterion in ("laws", "pieces"):
         book.ask("team-1", criterion, why="x", by="s1")
@@ -221,7 +221,7 @@ def test_an_answer_that_rests_on_what_is_no_longer_so_is_refused(book):
     assert [e.what for e in events].count("override") == 2
 
 
-def test_of_two_answers_at_one_moment_one_counts(book, place):
+def test_only_one_of_two_simultaneous_answers_counts(book, place):
     """If two TAs answer a request at the same moment, only one answer counts.
 
     The other answer is refused as a conflict.
@@ -232,7 +232,7 @@ def test_of_two_answers_at_one_moment_one_counts(book, place):
             seen = book.queue().waiting[0].version
             ready = Barrier(2)
 
-            points = 0.25 + 0.5 * (number % 2)  # points that differ from those of the round before
+            points = 0.25 + 0.5 * (number % 2)  # points different from those of the round before
 
             def give(who, by, *, seen=seen, ready=ready, points=points):
                 ready.wait()
@@ -250,7 +250,7 @@ def test_of_two_answers_at_one_moment_one_counts(book, place):
     assert (what.count("answered"), what.count("override")) == (10, 10)
 
 
-def test_of_two_who_ask_at_one_moment_one_asks(book, place):
+def test_only_one_of_two_simultaneous_requests_is_stored(book, place):
     """If two members of a team ask at the same moment, one request is stored, the other refused."""
     with RequestBook(place) as other:
         ready = Barrier(2)
@@ -269,9 +269,9 @@ def test_of_two_who_ask_at_one_moment_one_asks(book, place):
 
 
 def test_a_request_goes_with_the_people(book):
-    """A request stays with its people under a new team name.
+    """A request stays with its authors when their team gets another name.
 
-    Another team with the old name does not get it.
+    Another team that now has the old name does not get it.
     """
     book.ask("team-1", "laws", why="see page 3", by="s1")
     moved = {"team-1": "group-1"}
@@ -284,7 +284,7 @@ def test_a_request_goes_with_the_people(book):
 
 
 def test_a_criterion_that_is_gone_can_still_be_answered(book):
-    """If a criterion was removed, a request about it can be answered in words, without points."""
+    """If a criterion was removed, a request about it can be answered, but not with points."""
     book.ask("team-1", "laws", why="x", by="s1")
     less = tuple(c for c in RUBRIC.criteria if c.id != "laws")
     finish(
@@ -296,8 +296,8 @@ def test_a_criterion_that_is_gone_can_still_be_answered(book):
     assert book.n_waiting() == 0
 
 
-def test_an_anonymous_history_does_not_say_who_asked(book):
-    """In an anonymous class the history hides who asked, even if the student's text has a name."""
+def test_an_anonymous_history_hides_who_asked(book):
+    """An anonymous history hides who asked, even if the student's text contains a name."""
     anonymous = RUBRIC.model_copy(update={"anonymous": True})
     finish(book, make_grade("team-1", share=0.5), rubric=anonymous)
     book.ask("team-1", "laws", why="I, u42 of team-1 (S-team-1), see page 3", by="u42")
@@ -308,11 +308,8 @@ def test_an_anonymous_history_does_not_say_who_asked(book):
     assert "u42" in history_text(*history_of(book, "team-1"))
 
 
-def test_a_gradebook_made_before_opens(tmp_path):
-    """If a gradebook was made before requests existed, it gets the missing tables.
-
-    Its content stays.
-    """
+def test_a_gradebook_without_requests_gets_them(tmp_path):
+    """A gradebook written before requests existed gets the missing tables and keeps its rows."""
     with OpenBook(tmp_path, assignment="lab", create=True) as book:
         finish(book, make_grade("team-1", share=0.5))
     with closing(sqlite3.connect(tmp_path / FILE)) as old:

@@ -46,7 +46,7 @@ def hand_ins(tmp_path, *paths):
 
 
 def opened(tmp_path, hand_in):
-    """Return the files of the submission found, as paths within its folder."""
+    """Return the paths of a submission's files, relative to its folder."""
     folder = open_submission(hand_in.sources, tmp_path / "opened" / hand_in.id)
     return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
 
@@ -54,7 +54,7 @@ def opened(tmp_path, hand_in):
 def test_a_tree_gives_a_row_for_every_team(tmp_path):
     """Each team of a class gets a row, whether in a section's folder or in a zip file.
 
-    A team without a submission gets a row too.
+    A team whose folder has no submission gets a row too.
     """
     tree(
         tmp_path / "class",
@@ -76,7 +76,7 @@ def test_a_tree_gives_a_row_for_every_team(tmp_path):
     assert opened(tmp_path, found[5]) == ["submission.toml"]
 
 
-def test_two_of_one_name_have_the_parents_before_it(tmp_path):
+def test_duplicate_ids_get_the_parent_folders_name(tmp_path):
     """An id is the folder's name; duplicates get the parent folder's name as a prefix."""
     tree(tmp_path, {f"c/{s}/lab/submission.toml": TOML for s in ("ann", "bob")})
     tree(tmp_path, {"c/carl/submission.toml": TOML})
@@ -103,7 +103,7 @@ def test_a_canvas_download(tmp_path):
             "loose_1027_77004_submission.toml": TOML,
             "loose_1027_77005_step.csv": "1,2",
             "empty_1028_text.html": "<p>sorry</p>",
-            "LATE_anon_x7Yb2_77006_lab3.zip": inner,  # graded without names
+            "LATE_anon_x7Yb2_77006_lab3.zip": inner,  # from an anonymous assignment
         },
     )
     found = {h.id: h for h in hand_ins(tmp_path, download)}
@@ -114,7 +114,7 @@ def test_a_canvas_download(tmp_path):
         1.0,
         "anon_x7Yb2",
     )
-    assert opened(tmp_path, found["team-07"]) == ["submission.toml"]  # of the later resubmission
+    assert opened(tmp_path, found["team-07"]) == ["submission.toml"]  # only from the resubmission
     loose = opened(tmp_path, found["loose"])
     assert loose == ["data/step.csv", "step.csv", "submission.toml"]
     assert found["roeric-lab3"].days_late == 1.0
@@ -125,7 +125,7 @@ def test_a_canvas_download(tmp_path):
 
 
 def test_a_moodle_download(tmp_path):
-    """A Moodle download has one folder for each student, with a zip file or the files in it."""
+    """A Moodle download has one folder for each student, which holds a zip file or the files."""
     inner = zip_bytes(tmp_path, {"submission.toml": TOML})
     download = archive(
         tmp_path / "Lab 3.zip",
@@ -168,7 +168,7 @@ def test_a_gradescope_download(tmp_path):
     assert (known.handed_in, unknown.handed_in) == ("2026-11-20T10:00:00-08:00", "")
 
 
-def test_metadata_that_explode_are_only_text(tmp_path):
+def test_yaml_aliases_in_metadata_are_not_expanded(tmp_path):
     """Metadata with nested YAML aliases are not expanded, so they cannot fill the memory."""
     laughs = "".join(f"  - &l{i} [{', '.join([f'*l{i - 1}'] * 9)}]\n" for i in range(1, 30))
     metadata = f"x:\n  - &l0 [ha]\n{laughs}submission_77:\n  :submitters:\n  - :name: *l29\n"
@@ -178,7 +178,7 @@ def test_metadata_that_explode_are_only_text(tmp_path):
     assert (found.id, found.handed_in) == ("submission_77", "")
 
 
-def test_unpacked_canvas_archives_are_not_taken_for_one_student(tmp_path):
+def test_folders_named_like_canvas_files_are_separate_submissions(tmp_path):
     """Folders whose names look like one Canvas student's files are separate submissions."""
     tree(tmp_path / "c", {f"team_1_{n}_lab/submission.toml": TOML for n in range(3)})
     assert len(hand_ins(tmp_path, tmp_path / "c")) == 3
@@ -193,10 +193,10 @@ def test_a_folder_keeps_its_name_whatever_platform_it_looks_like(tmp_path):
 
 
 @pytest.mark.parametrize("wrapped", ["", "class/", "term/class/"])
-def test_what_is_refused_costs_the_hand_in_it_is_in(tmp_path, wrapped):
-    """If a file in a class archive is refused, only its own submission is marked.
+def test_a_refused_file_affects_only_its_own_submission(tmp_path, wrapped):
+    """If a file in a class archive is refused, only the submission with this file gets the reason.
 
-    There is no extra row, unless the submission has no other files.
+    The file gets no row of its own, unless its submission has no other files.
     """
     members = {f"{wrapped}team-{n}/submission.toml": TOML for n in range(3)}
     class_ = archive(tmp_path / "all.zip", members)
@@ -211,8 +211,8 @@ def test_what_is_refused_costs_the_hand_in_it_is_in(tmp_path, wrapped):
     assert all(why.endswith("is a link") for why in found.values() if why)
 
 
-def test_metadata_of_a_students_own_are_not_read(tmp_path):
-    """Metadata are read only at the top of a download, where no student can write."""
+def test_metadata_written_by_a_student_are_not_read(tmp_path):
+    """Metadata are read only at the top of a download, where students cannot write."""
     own = "submission_1:\n  :submitters:\n  - :name: Nobody\n"
     tree(tmp_path / "c", {"a/submission_1/submission.toml": TOML,
                           "a/submission_metadata.yml": own,
@@ -222,8 +222,8 @@ def test_metadata_of_a_students_own_are_not_read(tmp_path):
     ]  # fmt: skip
 
 
-def test_a_zip_of_two_submissions_is_called_as_it_is(tmp_path):
-    """A zip file with two submissions keeps its own name, since its team is unknown."""
+def test_a_zip_of_two_submissions_keeps_its_own_name(tmp_path):
+    """A zip file with two submissions is listed under its own name, since its team is unknown."""
     twice = {f"{team}/submission.toml": TOML for team in ("team-01", "team-02")}
     (tmp_path / "class").mkdir()
     archive(tmp_path / "class" / "two.zip", twice)
@@ -235,7 +235,7 @@ def test_a_zip_of_two_submissions_is_called_as_it_is(tmp_path):
 
 
 def test_one_students_zip_is_one_hand_in(tmp_path):
-    """One student's zip file is one submission, and a broken zip file gets a row."""
+    """A student's zip file is one submission, and a broken zip file gets a row."""
     good = archive(tmp_path / "team-07.zip", {"submission.toml": TOML})
     bad = tmp_path / "team-08.zip"
     bad.write_bytes(b"PK\x03\x04 no more")
@@ -249,10 +249,10 @@ def test_one_students_zip_is_one_hand_in(tmp_path):
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_a_class_that_was_cut_short_is_refused_by_its_name(tmp_path, packed):
+def test_an_incomplete_class_archive_is_refused(tmp_path, packed):
     """If a class archive is incomplete, nobody is graded.
 
-    A single incomplete submission gets a row.
+    A single incomplete submission still gets a row.
     """
     teams = {f"team-{n}": {"submission.toml": TOML, "data/a.csv": "1,2\n" * 99} for n in range(4)}
     files = {f"{team}/{name}": text for team, own in teams.items() for name, text in own.items()}
@@ -270,10 +270,10 @@ def test_a_class_that_was_cut_short_is_refused_by_its_name(tmp_path, packed):
 
 
 @pytest.mark.parametrize("how", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
-def test_a_class_cut_within_its_first_packed_hand_in_is_refused(tmp_path, how):
+def test_a_class_archive_cut_in_its_first_submission_is_refused(tmp_path, how):
     """If a class archive ends within its first submission, it is refused.
 
-    It is not read as a single submission.
+    It is not taken for a single student's submission.
     """
     own = zip_bytes(tmp_path, {"submission.toml": TOML, "data/a.csv": "1,2\n" * 99})
     download = tmp_path / "class.zip"
@@ -285,23 +285,23 @@ def test_a_class_cut_within_its_first_packed_hand_in_is_refused(tmp_path, how):
         hand_ins(tmp_path, download)
 
 
-def test_a_zip_out_of_which_a_file_was_taken_is_whole(tmp_path):
+def test_a_zip_with_a_deleted_member_is_accepted(tmp_path):
     """A zip file from which a member was deleted is still accepted.
 
-    Its table of contents is valid, although the member's bytes are still in the file.
+    Its table of contents is valid, although the deleted member's bytes are still in the file.
     """
     taken = archive(tmp_path / "team-1.zip", {"draft.txt": "x", "submission.toml": TOML})
     with zipfile.ZipFile(taken, "a") as opened_again:
         del opened_again.filelist[0]
-        opened_again.comment = b"tidied"  # the table of contents is written again
+        opened_again.comment = b"tidied"  # makes zipfile write the table of contents again
     (found,) = hand_ins(tmp_path, taken)
     assert opened(tmp_path, found) == ["submission.toml"]
 
 
-def test_one_bad_hand_in_of_a_download_costs_its_own_row(tmp_path):
+def test_a_hostile_submission_in_a_download_fails_alone(tmp_path):
     """A hostile submission in a class download fails alone; all others are graded.
 
-    The faults are paths that lead out, folders that are too deep, a password and broken bytes.
+    The faults are paths out of the folder, very deep folders, a password and broken bytes.
     """
     download = archive(
         tmp_path / "class.zip",
@@ -318,8 +318,8 @@ def test_one_bad_hand_in_of_a_download_costs_its_own_row(tmp_path):
     for signature, name_at, flags_at in ((b"PK\x03\x04", 30, 6), (b"PK\x01\x02", 46, 8)):
         at = raw.find(b"evil-3/", raw.find(signature)) if signature == b"PK\x03\x04" else 0
         at = at or raw.find(b"evil-3/", raw.find(b"PK\x01\x02"))
-        raw[at - name_at + flags_at] |= 1  # now encrypted, so its checksum is wrong
-    raw[raw.find(b"0" * 500) + 7] ^= 1  # now its checksum is wrong
+        raw[at - name_at + flags_at] |= 1  # marks the member as encrypted
+    raw[raw.find(b"0" * 500) + 7] ^= 1  # makes the checksum wrong
     download.write_bytes(raw)
     found = {h.id: h.problem for h in hand_ins(tmp_path, download)}
     assert {name: why for name, why in found.items() if not why} == {
@@ -331,7 +331,7 @@ def test_one_bad_hand_in_of_a_download_costs_its_own_row(tmp_path):
     }  # fmt: skip
 
 
-def test_what_is_hidden_counts_only_with_a_submission(tmp_path):
+def test_a_hidden_folder_counts_only_with_a_submission(tmp_path):
     """A hidden folder counts only if it holds a submission; `.git` is ignored."""
     tree(
         tmp_path / "c",
@@ -341,10 +341,10 @@ def test_what_is_hidden_counts_only_with_a_submission(tmp_path):
     assert [h.id for h in hand_ins(tmp_path, tmp_path / "c")] == ["_", "a", "lab", "~$x"]
 
 
-def test_results_of_a_grading_are_no_hand_ins(tmp_path):
-    """Folders of earlier results are not graded as submissions, and a message names them.
+def test_folders_of_results_are_not_graded(tmp_path):
+    """Folders with earlier results are not graded as submissions, and a message names them.
 
-    A team's folder may still have the name of such a folder.
+    A team's folder may still be called `results`, for example.
     """
     made = ("class.html", "feedback/.made.json", "feedback/a/feedback.html", "gradescope/a/x")
     tree(tmp_path / "c", dict.fromkeys(("a/submission.toml", *made), TOML))
@@ -358,10 +358,10 @@ def test_results_of_a_grading_are_no_hand_ins(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["t.tar.gz", "t.tgz", "t.7z", "t.rar", "t.tar"])
-def test_an_archive_that_is_not_opened_is_a_row(tmp_path, name):
-    """An archive of a format other than zip gets a row that says so.
+def test_an_archive_of_another_format_gets_a_row(tmp_path, name):
+    """An archive in a format other than zip gets a row that says so.
 
-    Inside a team's own folder it is taken for the team's backup and ignored.
+    Inside a team's own folder such an archive is taken for a backup and ignored.
     """
     tree(tmp_path / "c", {"a/submission.toml": TOML, "b/lab/submission.toml": TOML, name: "packed"})
     tree(tmp_path / "c" / "b", {name: "packed"})
@@ -373,7 +373,7 @@ def test_an_archive_that_is_not_opened_is_a_row(tmp_path, name):
 
 @pytest.mark.parametrize("beside", [(), ("figures/bode.png",), ("notes.md",)])
 def test_a_team_without_its_file_keeps_its_name(tmp_path, beside):
-    """A team without `submission.toml` gets a row with its own name, not its data folder's."""
+    """A team without `submission.toml` gets a row with the team's name, not its data folder's."""
     for where in ("c/team-7", "alone", "section/only/team-7"):
         tree(tmp_path / where, dict.fromkeys(("data/step.csv", *beside), "1,2"))
     tree(tmp_path / "c", {"a/submission.toml": TOML})
@@ -383,10 +383,7 @@ def test_a_team_without_its_file_keeps_its_name(tmp_path, beside):
 
 
 def test_a_name_of_many_numbers_is_read_at_once():
-    """A very long name with many numbers is read in a short time.
-
-    A name in an archive has at most 65,535 letters.
-    """
+    """Names of a million characters with many numbers are parsed without delay."""
     for part in ("_1", "_LATE_1", "_assignsubmission_", "anon_", "-1.a"):
         parse_name(part * (1_000_000 // len(part)) + "\n")
 
@@ -412,10 +409,10 @@ def test_many_nested_archives_share_one_limit(tmp_path):
         open_submission([whole], tmp_path / "opened")
 
 
-def test_two_submissions_in_one_hand_in_are_a_question(tmp_path):
+def test_two_submissions_at_one_depth_are_refused(tmp_path):
     """If a folder has two submissions at the same depth, it is refused.
 
-    One at a higher level is graded.
+    A submission at a higher level is graded.
     """
     files = {"a/submission.toml": TOML, "b/submission.toml": TOML}
     folder = tree(tmp_path / "t", files)
@@ -441,14 +438,14 @@ def test_links_and_pipes_are_not_followed(tmp_path):
 
 
 def test_a_recording_that_is_too_large_is_refused_and_not_missed(tmp_path):
-    """If a recording is too large, the reason says so, and not that the file is missing."""
+    """If a recording is too large, the reason says so; it does not say that the file is missing."""
     team = tree(tmp_path / "team-01", {"submission.toml": TOML, "data/long.csv": ""})
     os.truncate(team / "data" / "long.csv", MAX_DATA_BYTES + 1)
     folder = open_submission([team], tmp_path / "opened")
     assert "100,000,001 bytes, the limit is 100,000,000" in str(outside(folder, "data/long.csv"))
 
 
-def test_too_many_files_are_said_to_be_too_many(tmp_path):
+def test_too_many_files_are_refused_with_one_reason(tmp_path):
     """A submission with too many files is refused with the same reason on every machine."""
     team = tree(
         tmp_path / "team", {NAME: TOML, **{f"junk/{i}": "" for i in range(HAND_IN.members)}}
@@ -472,7 +469,7 @@ def test_a_hand_in_travels_whole(tmp_path):
     assert digest([folder]) != before
 
 
-def test_nothing_to_grade_is_said(tmp_path):
+def test_an_empty_or_missing_folder_is_an_error(tmp_path):
     """An empty or missing folder is an error."""
     (tmp_path / "empty").mkdir()
     with pytest.raises(ConfigError, match="nothing to grade"):
@@ -483,7 +480,7 @@ def test_nothing_to_grade_is_said(tmp_path):
 
 @given(st.lists(st.text(min_size=1, max_size=30), min_size=1, max_size=6))
 def test_any_name_becomes_a_folders(tmp_path_factory, names):
-    """Ids are unique, printable, not too long, and stay inside their folder."""
+    """For any name, the id is unique, printable, not too long, and stays inside its folder."""
     from pipeline.grading.intake.hand_ins import HandIn, _with_ids
 
     found = [HandIn(id=name, parent="p") for name in names]
@@ -496,7 +493,7 @@ def test_any_name_becomes_a_folders(tmp_path_factory, names):
 
 
 @given(st.text(max_size=60))
-def test_any_name_is_a_platforms_or_not(name):
-    """Reading a name never fails."""
+def test_any_name_can_be_read(name):
+    """Any name can be parsed as a learning platform's file name without an error."""
     found = parse_name(name)
     assert found is None or found.owner

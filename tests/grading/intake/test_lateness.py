@@ -1,4 +1,4 @@
-"""Lateness follows from the deadline or from a table."""
+"""Days late are computed from the deadline or read from a table."""
 
 from datetime import datetime
 
@@ -18,7 +18,7 @@ def hand_in(name: str, **fields) -> HandIn:
 
 
 def settle(tmp_path, *hand_ins: HandIn, text: str | None = None, due: datetime | None = None):
-    """Return the days by id, and the warnings."""
+    """Return the days late by id, and the warnings."""
     table = {}
     if text is not None:
         path = tmp_path / "late.csv"
@@ -28,10 +28,10 @@ def settle(tmp_path, *hand_ins: HandIn, text: str | None = None, due: datetime |
     return {one.id: one.days_late for one in settled}, remarks
 
 
-def test_the_deadline_counts_where_it_is_said_when_something_was_handed_in(tmp_path):
+def test_a_known_time_of_submission_is_compared_with_the_deadline(tmp_path):
     """If the time of submission is known, lateness is computed from the deadline.
 
-    Any time zone is understood. Otherwise the platform's late mark counts.
+    Any time zone is accepted. If the time is unknown, the platform's late mark counts.
     """
     days, _ = settle(
         tmp_path,
@@ -43,10 +43,10 @@ def test_the_deadline_counts_where_it_is_said_when_something_was_handed_in(tmp_p
     assert days == {"late": 0.5, "early": 0.0, "marked": 1.0}
 
 
-def test_a_table_of_ones_own_goes_first(tmp_path):
+def test_a_table_of_days_late_overrides_the_deadline(tmp_path):
     """The instructor's table of days late overrides the deadline.
 
-    Zero days are an extension, and an unknown name gives a warning.
+    Zero days in the table mean an extension, and an unknown name gives a warning.
     """
     days, remarks = settle(
         tmp_path,
@@ -70,7 +70,7 @@ def test_a_table_of_ones_own_goes_first(tmp_path):
         ("submission,days_late\nx,nan\n", "late.csv line 2"),
     ],
 )
-def test_what_cannot_be_understood_is_said(tmp_path, text, message):
+def test_an_unreadable_table_of_days_late_is_an_error(tmp_path, text, message):
     """If the table of days late cannot be read, the error names the line."""
     with pytest.raises(ConfigError) as error:
         settle(tmp_path, hand_in("x"), text=text)

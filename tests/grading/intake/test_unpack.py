@@ -1,4 +1,4 @@
-"""A hostile archive writes nothing outside its folder and is refused with one reason."""
+"""A hostile archive writes nothing outside its folder and is refused with a reason."""
 
 import struct
 import zipfile
@@ -31,7 +31,7 @@ def files_below(folder):
     return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
 
 
-def test_what_was_packed_comes_out_without_debris(tmp_path):
+def test_files_are_unpacked_without_debris(tmp_path):
     """Files come out as packed, without the extra files of macOS and Windows."""
     members = {
         "team/submission.toml": "x",
@@ -48,7 +48,7 @@ def test_what_was_packed_comes_out_without_debris(tmp_path):
     "name", ["../x", "a/../../x", "/etc/x", "C:/x", "..\\x", "a\\..\\..\\x", "\\\\host\\share\\x"]
 )
 def test_a_path_that_leaves_the_archive_is_refused(tmp_path, name):
-    """A member with a path outside the archive is not written; the other members are."""
+    """A member whose path leads outside the archive is not written; the other members are."""
     archive = zipped(tmp_path / "a.zip", {name: "evil", "good.txt": "good"})
     refused = unpack(archive, tmp_path / "in" / "out", limits=SMALL)
     assert "points outside the archive" in "".join(refused.values())
@@ -56,7 +56,7 @@ def test_a_path_that_leaves_the_archive_is_refused(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["data/run:1.csv", "x.csv.", "a /x", "nul.csv", "COM1", "a?b"])
-def test_what_is_no_name_on_windows_is_refused_there(tmp_path, monkeypatch, name):
+def test_a_name_that_is_invalid_on_windows_is_refused_there(tmp_path, monkeypatch, name):
     """A name that is not valid on Windows is refused there and accepted elsewhere."""
     packed = zipped(tmp_path / "a.zip", {name: "x", "good.txt": "good"})
     assert not unpack(packed, tmp_path / "here", limits=SMALL)
@@ -70,7 +70,7 @@ def test_what_is_no_name_on_windows_is_refused_there(tmp_path, monkeypatch, name
     ("mode", "reason"), [(0o120777, "is a link"), (0o010644, "regular"), (0o020644, "regular")]
 )
 def test_links_pipes_and_devices_are_refused(tmp_path, mode, reason):
-    """A link, pipe or device in an archive is refused; only regular files are written."""
+    """A link, pipe or device in an archive is refused, since only regular files may be written."""
     archive = zipped(tmp_path / "a.zip", {"t/x": "/etc/passwd"}, mode=mode)
     (refused,) = unpack(archive, tmp_path / "out", limits=SMALL).values()
     assert reason in refused
@@ -93,8 +93,8 @@ def test_bombs_do_not_go_off(tmp_path, members, reason):
     assert sum(p.stat().st_size for p in tmp_path.rglob("*") if p.suffix != ".zip") <= 100_000
 
 
-def test_the_contents_that_count_are_those_that_are_read(tmp_path):
-    """The length of the table of contents is taken from the 64-bit record if there is one."""
+def test_the_64_bit_length_of_the_contents_is_limited_too(tmp_path):
+    """A table of contents is refused as too long even if its length is in the 64-bit record."""
     archive = zipped(tmp_path / "a.zip", {"y" * 4_000 + str(i): "" for i in range(19)})
     with pytest.raises(SubmissionError, match="table of contents"):
         unpack(archive, tmp_path / "plain", limits=BRIEF)
@@ -112,7 +112,7 @@ def test_the_contents_that_count_are_those_that_are_read(tmp_path):
     assert member_names(archive, limits=BRIEF) == []
 
 
-def test_the_ratio_counts_where_the_size_would_still_do(tmp_path):
+def test_a_high_ratio_is_refused_even_below_the_size_limit(tmp_path):
     """A file that unpacks to over 200 times its size is refused, even below the size limit."""
     archive = zipped(tmp_path / "bomb.zip", {"zeros": "0" * 20_000_000})
     with pytest.raises(SubmissionError, match="200 times its size"):
@@ -120,7 +120,7 @@ def test_the_ratio_counts_where_the_size_would_still_do(tmp_path):
 
 
 def test_a_header_that_lies_about_the_size_does_not_help(tmp_path):
-    """A bomb whose headers claim ten bytes is refused as a broken archive."""
+    """A zip bomb whose headers claim ten bytes is refused as a broken archive."""
     archive = zipped(tmp_path / "a.zip", {"x": "0" * 3_000_000})
     raw = archive.read_bytes().replace(struct.pack("<L", 3_000_000), struct.pack("<L", 10))
     archive.write_bytes(raw)
@@ -132,17 +132,17 @@ def test_an_encrypted_archive_says_so(tmp_path):
     """If an archive is encrypted, the reason says so."""
     archive = zipped(tmp_path / "a.zip", {"x": "secret"})
     raw = bytearray(archive.read_bytes())
-    raw[6] |= 1  # the flags of the local header and of the table of contents
+    raw[6] |= 1  # the flags in the local header; below, those in the table of contents
     raw[raw.find(b"PK\x01\x02") + 8] |= 1
     archive.write_bytes(raw)
     with pytest.raises(SubmissionError, match="encrypted"):
         unpack(archive, tmp_path / "out", limits=SMALL)
 
 
-def test_names_are_read_as_they_were_meant(tmp_path):
+def test_unmarked_utf_8_names_are_recognised(tmp_path):
     """Names in UTF-8 are recognised even if the archive does not mark them as UTF-8.
 
-    A letter and its accent become one character.
+    A letter and a combining accent become one character.
     """
     path = tmp_path / "a.zip"
     with zipfile.ZipFile(path, "w") as archive:
@@ -170,7 +170,7 @@ def test_any_bytes_are_unpacked_or_refused(tmp_path_factory, junk, at, patch):
             unpack(path, folder / str(number), limits=SMALL)
 
 
-def test_debris_is_told_from_work():
+def test_debris_is_distinguished_from_work():
     """Hidden files that macOS adds are ignored; a student's file with an odd name is kept."""
     assert is_debris(PurePosixPath("a/._step.csv"))
     assert is_debris(PurePosixPath("__MACOSX/a"))

@@ -1,4 +1,4 @@
-"""Points follow consequences: a harmful model, a flag's least cost, the rubric's step."""
+"""What costs points: a harmful model, the least cost of a flag, and rounding to a step."""
 
 from dataclasses import replace
 from decimal import Decimal
@@ -29,13 +29,13 @@ def with_model(one: Student, A: np.ndarray, B: np.ndarray) -> Student:
 
 
 def space_of(A: np.ndarray, B: np.ndarray) -> ReportedStateSpace:
-    """Return a model as typed to three digits."""
+    """Return a reported state model with entries typed to three digits."""
     rows = tuple(tuple(typed(float(a)) if a else Decimal(0) for a in row) for row in A)
     return ReportedStateSpace(A=rows, B=tuple(typed(float(b)) if b else Decimal(0) for b in B))
 
 
 def under(one: Student, **changed: object) -> Student:
-    """Return the student under a rubric with other values."""
+    """Return the student graded by a rubric with changed values."""
     plain = one.rubric.model_dump(mode="json") | changed
     return replace(one, rubric=Rubric.model_validate(plain))
 
@@ -77,7 +77,7 @@ def _flip_couplings(A: np.ndarray, B: np.ndarray) -> None:
     ],
 )
 def test_a_harmful_model_keeps_a_quarter_at_most(slip, said):
-    """A sign that makes the model unstable or reversed leaves at most a quarter of the points."""
+    """A sign error that makes the model unstable or reversed costs at least three quarters."""
     one = student(2)
     A, B = model(one)
     slip(A, B)
@@ -88,8 +88,8 @@ def test_a_harmful_model_keeps_a_quarter_at_most(slip, said):
 
 @pytest.mark.parametrize("carts", [2, 3])
 @pytest.mark.parametrize("first", ["positions", "last cart"])
-def test_another_order_of_the_states_is_no_harm(carts, first):
-    """A model with its states in another order loses points, but is not judged as harmful."""
+def test_another_order_of_the_states_is_not_harmful(carts, first):
+    """A model with reordered states loses points, but is not judged as harmful."""
     one = student(carts)
     A, B = model(one)
     both = [[*range(0, 2 * carts, 2), *range(1, 2 * carts, 2)]]
@@ -101,7 +101,7 @@ def test_another_order_of_the_states_is_no_harm(carts, first):
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
-def test_an_honest_model_does_no_harm(preset):
+def test_a_slightly_wrong_model_is_not_harmful(preset):
     """A state model with entries up to 10 % off is not judged as harmful, even if unstable."""
     chain, rng = PRESETS[preset], np.random.default_rng(5)
     A, B, _, _ = chain.state_space()
@@ -120,7 +120,7 @@ def test_an_honest_model_does_no_harm(preset):
 
 
 def test_gains_that_only_work_on_paper_keep_a_quarter_at_most():
-    """Gains that are stable only for a wrong model keep at most a quarter of the points."""
+    """Gains that stabilise only a wrong model keep at most a quarter of the points."""
     one = student(2)
     feedback, times = one.reported.feedback, 30
     assert feedback is not None
@@ -135,10 +135,10 @@ def test_gains_that_only_work_on_paper_keep_a_quarter_at_most():
 # -------------------------------------------------------------- the least cost of a flag
 
 
-def test_an_error_in_the_model_costs_half_where_the_rubric_says_nothing():
+def test_a_wrong_model_costs_half_if_the_rubric_states_no_cost():
     """If the rubric states no cost, a wrong state model costs at least half of its criterion.
 
-    Here one coupling is too weak.
+    In the test, one coupling is too weak.
     """
     one = student(2)
     A, B = model(one)
@@ -151,8 +151,8 @@ def test_an_error_in_the_model_costs_half_where_the_rubric_says_nothing():
     assert 0.5 * free.out_of < free.points < free.out_of
 
 
-def test_a_remark_on_a_table_costs_the_criteria_of_its_numbers():
-    """A flag costs points only in the criteria that judge the numbers it names."""
+def test_a_flag_costs_only_the_criteria_of_its_numbers():
+    """A flag costs points only in the criteria that judge the flagged numbers."""
     one = student(2)
     hertz = {
         name: one.value("final", name) / (2 * np.pi)
@@ -167,7 +167,7 @@ def test_a_remark_on_a_table_costs_the_criteria_of_its_numbers():
         assert found.points == kept * found.out_of, id_
 
 
-def test_of_two_remarks_on_one_criterion_the_dearer_counts():
+def test_the_larger_cost_of_two_flags_counts():
     """If two flags concern one criterion, the larger cost counts, not the sum."""
     one = student(2)
     off = {"omega_1": one.value("final", "omega_1") / (2 * np.pi)}
@@ -179,7 +179,7 @@ def test_of_two_remarks_on_one_criterion_the_dearer_counts():
     assert criterion(grade, "final-frequencies").points == (1 - worst) * 2
 
 
-# ------------------------------------------------------------------------------ the step
+# ------------------------------------------------------------- rounding to a step
 
 
 @pytest.mark.parametrize("step", [0.01, 0.1, 0.25, 0.5, 1.0])
@@ -199,7 +199,7 @@ def test_points_are_multiples_of_the_step(step):
     }
 
 
-def test_halves_are_rounded_for_the_student():
+def test_half_a_step_is_rounded_in_the_students_favour():
     """Half a step is rounded in the student's favour, in points and in the late deduction."""
     assert to_step(Fraction("1.75"), 0.5) == 2
     late = Late(percent_per_day=10.0)

@@ -1,4 +1,4 @@
-"""Each named mistake gets its own flag and no other; an honest student gets none."""
+"""Each known mistake gets its own flag and no other; an honest student gets no flag."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -44,7 +44,7 @@ def scaled(one: Student, table: str, names: list[str], factor: float) -> Student
 def test_an_honest_student_gets_no_flag(carts, hide):
     """An honest student gets no flag.
 
-    Rounding, small errors, guessed dampings and a sticking cart are honest.
+    Students who round, make small errors, guess dampings or have a sticking cart are honest.
     """
     one = student(carts, hide=hide)
     assert one.grade().flags == ()
@@ -63,11 +63,8 @@ def test_numbers_typed_with_two_digits_are_honest_too(carts):
 
 
 @pytest.mark.parametrize(("carts", "hide"), [(1, ()), (2, ()), (3, ()), (2, FRICTION)])
-def test_a_student_with_a_textbook_is_honest(carts, hide):
-    """Numbers that a student reads by textbook methods get no flag.
-
-    The student starts with the last cart.
-    """
+def test_textbook_methods_get_no_flag(carts, hide):
+    """A student who uses textbook methods and starts with the last cart gets no flag."""
     one = student(carts, hide=hide)
     records = one.analysis.records
     initial = by_eye(records, carts) if carts > 1 else {}
@@ -81,7 +78,7 @@ def test_a_student_with_a_textbook_is_honest(carts, hide):
 
 
 @pytest.mark.parametrize("digits", [2, 3])
-def test_a_right_first_estimate_may_be_found_again(digits):
+def test_equal_initial_and_final_estimates_may_be_honest(digits):
     """For one cart on a quiet bench, equal initial and final estimates get no flag."""
     one = student(1)
     right = {row.name: row.final.value for row in one.analysis.rows if row.final}
@@ -107,7 +104,7 @@ def test_the_order_in_which_numbers_are_listed_does_not_matter(carts):
     assert only_flag(swapped).code == "physically_impossible"
 
 
-def test_a_student_who_reports_first_estimates_only_misses_the_rest():
+def test_unreported_final_numbers_are_flagged_as_missing():
     """If only initial estimates are reported, all other numbers are flagged as missing."""
     one = student(2)
     reported = Reported(initial=one.reported.initial)
@@ -117,7 +114,7 @@ def test_a_student_who_reports_first_estimates_only_misses_the_rest():
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 @pytest.mark.parametrize("table", ["initial", "final"])
-def test_frequencies_in_hz(carts, table):
+def test_frequencies_in_hz_are_flagged(carts, table):
     """If all frequencies of a table are divided by 2π, the flag says Hz and gives the ratio."""
     one = student(carts)
     names = [n for n in getattr(one.reported, table) if n.startswith("omega")]
@@ -129,7 +126,7 @@ def test_frequencies_in_hz(carts, table):
     assert "also_in" not in flag.evidence
 
 
-def test_a_named_mistake_is_told_once_and_nothing_else_is_advised():
+def test_one_mistake_in_two_tables_gets_one_flag():
     """If the frequencies of both tables are in Hz, one flag names them all.
 
     Other messages give no further advice.
@@ -147,7 +144,7 @@ def test_a_named_mistake_is_told_once_and_nothing_else_is_advised():
 
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
-def test_numbers_beside_a_slip_are_as_far_off_as_honest_ones(carts):
+def test_gains_in_counts_get_one_flag_even_if_inexact(carts):
     """If all gains are in counts, there is one flag, even if one gain is also 7 % off."""
     one, names = student(carts), own("K", carts)
     counted = {n: one.value("initial", n) / 0.00227 for n in names}
@@ -157,10 +154,10 @@ def test_numbers_beside_a_slip_are_as_far_off_as_honest_ones(carts):
 
 
 @pytest.mark.parametrize("carts", [2, 3])
-def test_a_mistake_that_is_made_everywhere_shows_everywhere(carts):
+def test_a_single_wrong_damping_is_not_a_wrong_logarithm(carts):
     """A single damping that is 2.3 times too small is not flagged as log10 instead of ln.
 
-    That mistake would show in all dampings.
+    With that mistake, all dampings would be too small.
     """
     one = student(carts)
     flag = only_flag(scaled(one, "initial", ["zeta_1"], np.log10(np.e)))
@@ -169,10 +166,10 @@ def test_a_mistake_that_is_made_everywhere_shows_everywhere(carts):
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 @pytest.mark.parametrize("k", [1, 2, 3])
-def test_one_period_counted_too_many(carts, k):
+def test_one_period_too_many_is_flagged(carts, k):
     """If one period too many was counted, a flag says so.
 
-    Then ω is (k + 1)/k of its true value, and ζ is smaller by the same factor.
+    Then ω is (k + 1)/k times its true value, and ζ is smaller by the same factor.
     """
     one = student(carts)
     omegas, zetas = own("omega", carts), own("zeta", carts)
@@ -183,7 +180,7 @@ def test_one_period_counted_too_many(carts, k):
 
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
-def test_a_decrement_with_log10(carts):
+def test_a_decrement_with_log10_is_flagged(carts):
     """If every ζ of the decays is 2.303 times too small, the flag says log10 instead of ln."""
     one = student(carts)
     flag = only_flag(scaled(one, "initial", own("zeta", carts), np.log10(np.e)))
@@ -193,7 +190,7 @@ def test_a_decrement_with_log10(carts):
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 @pytest.mark.parametrize("table", ["initial", "final"])
-def test_gains_from_peak_to_peak_and_in_counts(carts, table):
+def test_gains_from_peak_to_peak_and_in_counts_are_flagged(carts, table):
     """Gains that are twice too large are flagged as read from peak to peak.
 
     Gains divided by the encoder step are flagged as counts; a gain can have both flags.
@@ -207,7 +204,7 @@ def test_gains_from_peak_to_peak_and_in_counts(carts, table):
 
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
-def test_the_peak_of_the_step(carts):
+def test_a_gain_from_the_peak_of_the_step_is_flagged(carts):
     """A gain read at the peak of the step instead of its settled level is flagged as such."""
     one = student(carts)
     record = next(r for r in one.analysis.records if r.kind == "step")
@@ -222,7 +219,7 @@ def test_the_peak_of_the_step(carts):
 
 @pytest.mark.parametrize("vague", ["0e2", "0.0"])
 @pytest.mark.parametrize("carts", [1, 2, 3])
-def test_digits_that_say_nothing_earn_nothing(carts, vague):
+def test_zeros_earn_nothing(carts, vague):
     """Zeros are flagged as physically impossible, however they are typed, and earn no points."""
     one = student(carts)
     zeros = dict.fromkeys(one.rubric.names, Decimal(vague))
@@ -232,7 +229,7 @@ def test_digits_that_say_nothing_earn_nothing(carts, vague):
     )
     grade = one.reporting(initial=zeros, final=zeros, state_space=space).grade()
     told = [flag.message for flag in grade.flags if flag.code == "physically_impossible"]
-    assert len(told) == len(set(told)) == 2  # one message per table
+    assert len(told) == len(set(told)) == 2  # one message for each table
     assert all(vague in message for message in told)
     tables = [c for c in grade.criteria if c.id.split("-")[0] in FROM_TABLES]
     assert tables
@@ -245,8 +242,8 @@ def test_digits_that_say_nothing_earn_nothing(carts, vague):
 
 
 @pytest.mark.parametrize("hide", [(), FRICTION])
-def test_the_peak_of_one_edge_of_both_carts(hide):
-    """Gains read at the peaks of one edge of the step are recognised even under friction."""
+def test_gains_from_the_peak_of_one_edge_are_flagged(hide):
+    """Gains read at the peaks after one edge of the step are recognised, even with friction."""
     one = student(2, hide=hide)
     record = next(r for r in one.analysis.records if r.kind == "step")
     assert record.u is not None
@@ -258,7 +255,7 @@ def test_the_peak_of_one_edge_of_both_carts(hide):
 
 @pytest.mark.parametrize("carts", [2, 3])
 @pytest.mark.parametrize("table", ["initial", "final"])
-def test_carts_swapped(carts, table):
+def test_swapped_carts_are_flagged(carts, table):
     """If the numbers of the first and the last cart are swapped, a flag says so."""
     one = student(carts)
     swapped = {}
@@ -270,7 +267,7 @@ def test_carts_swapped(carts, table):
     assert {"K_1", f"K_{carts}"} <= set(flag.parameters)
 
 
-def test_two_mistakes_in_one_number():
+def test_two_mistakes_in_one_number_get_both_flags():
     """Swapped frequencies in Hz get both flags, since neither mistake alone explains them."""
     one = student(2)
     wrong = {
@@ -283,7 +280,7 @@ def test_two_mistakes_in_one_number():
 
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
-def test_a_final_table_copied_from_the_first(carts):
+def test_a_final_table_copied_from_the_first_is_flagged(carts):
     """If the final table equals the initial one in every digit, the only flag is "no fit done"."""
     one = student(carts)
     flag = only_flag(one.reporting(final=one.reported.initial))
@@ -292,7 +289,7 @@ def test_a_final_table_copied_from_the_first(carts):
 
 
 @pytest.mark.parametrize("carts", [2, 3])
-def test_tables_of_single_digits_agree_anyway(carts):
+def test_equal_tables_of_single_digits_get_no_flag(carts):
     """Equal tables of one-digit numbers get no flag, since a fit could give the same digits."""
     one = student(carts)
     coarse = {n: Decimal(f"{float(v):.0e}") for n, v in one.reported.final.items()}
@@ -310,17 +307,17 @@ def test_a_number_that_no_mistake_explains_is_only_off(carts):
     assert (flag.code, flag.parameters) == ("initial_off", (gain,))
 
 
-def test_a_frequency_out_of_order_is_told_by_the_recordings():
+def test_a_frequency_out_of_order_gets_one_flag():
     """A wrong frequency of a null gets one flag, even if it also breaks the order of the nulls.
 
-    The message gives the value from the recordings.
+    The flag's message gives the frequency computed from the recordings.
     """
     one = student(3)
     flag = only_flag(scaled(one, "final", ["omega_2"], 1.4))
     assert (flag.code, flag.parameters) == ("final_off", ("omega_2",))
 
 
-def test_what_no_carts_can_do():
+def test_impossible_numbers_are_flagged():
     """A negative damping is impossible, and so is a far cart that moves more than a near one."""
     one = student(2)
     flag = only_flag(scaled(one, "final", ["zeta_a"], -1.0))
@@ -360,7 +357,7 @@ def exchanged(A: list, n: int) -> list:
         (exchanged, "exchanged"),
     ],
 )
-def test_a_wrong_state_model_says_which_slip_made_it(carts, slip: Callable, said):
+def test_a_single_slip_in_a_state_model_is_named(carts, slip: Callable, said):
     """If a single known mistake explains a wrong state model, the message names it."""
     one = student(carts)
     space = one.reported.state_space
@@ -373,7 +370,7 @@ def test_a_wrong_state_model_says_which_slip_made_it(carts, slip: Callable, said
 
 
 def test_a_state_model_that_follows_from_a_wrong_table_is_right():
-    """A state model built correctly from frequencies in Hz gets no flag besides that for Hz."""
+    """A state model built correctly from frequencies in Hz gets only the flag for Hz."""
     one = student(1)
     hertz = one.value("final", "omega_n") / TURN
     space = one.reported.state_space
@@ -404,10 +401,10 @@ def test_wrong_gains_and_wrong_prefilters_are_told_apart(carts):
     assert "take its reciprocal" in flag.message
 
 
-def test_claims_of_other_gains_are_not_these_gains():
+def test_gains_that_contradict_the_reported_settling_time_are_flagged():
     """If the gains cannot give the settling time that the student reported, they are flagged.
 
-    Here they are 2.5 times too large.
+    In the test, the gains are 2.5 times too large.
     """
     one = student(1)
     feedback = one.reported.feedback
@@ -421,7 +418,7 @@ def test_claims_of_other_gains_are_not_these_gains():
     assert flag.code == "wrong_gains"
 
 
-def test_what_is_missing_is_named():
+def test_a_number_not_reported_is_flagged_as_missing():
     """A number that was not reported is flagged as missing."""
     one = student(2).without("final", "zeta_b")
     flag = only_flag(one)

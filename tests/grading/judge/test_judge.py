@@ -1,4 +1,4 @@
-"""A submission is graded from its folder alone, and results planted in it are ignored."""
+"""A submission is graded from its own files, and result files planted in it are ignored."""
 
 import json
 import shutil
@@ -64,7 +64,7 @@ def test_the_same_submission_gives_the_same_bytes(folder, honest):
 def test_grading_loads_neither_pandas_nor_control(folder):
     """Grading loads neither pandas nor python-control.
 
-    They would take each worker half a second.
+    Importing them would cost each worker half a second.
     """
     code = f"""
 import sys
@@ -87,8 +87,8 @@ print({{"pandas", "control", "scipy.signal"}} & set(sys.modules))
     assert done.stdout.strip() == "set()"
 
 
-def test_results_that_a_submission_brings_along_are_not_believed(folder, honest, tmp_path):
-    """Result files that a submission brings along do not change its grade."""
+def test_result_files_in_a_submission_are_ignored(folder, honest, tmp_path):
+    """Result files in a submission do not change its grade."""
     planted = tmp_path / "team-07"
     shutil.copytree(folder, planted)
     for name in ("results.json", "gap.json", "grade.json", "report/results.json", "gap/gap.json"):
@@ -97,10 +97,10 @@ def test_results_that_a_submission_brings_along_are_not_believed(folder, honest,
     assert grade_text(grade(planted)) == grade_text(honest)
 
 
-def test_a_record_s_own_scale_does_not_win_over_the_rubric_s(folder):
-    """A recording's own input scale counts only under feedback.
+def test_a_recordings_own_scale_counts_only_under_feedback(folder):
+    """An input scale stated for a recording counts only for closed-loop recordings.
 
-    Benches log other signals there; elsewhere the rubric's scale counts.
+    A bench may log another signal under feedback. Otherwise the rubric's scale counts.
     """
     submission, rubric = load_submission(folder), load_rubric(Path("throne-1dof"))
     system = rubric.system.model_copy(update={"input": InputScale(sign=1, per_count=1e-4)})
@@ -122,7 +122,7 @@ def test_a_record_s_own_scale_does_not_win_over_the_rubric_s(folder):
 
 
 @pytest.mark.parametrize("turned", [True, False])
-def test_between_a_record_s_own_sign_and_the_rubric_s_the_data_decide(
+def test_the_data_decide_between_two_stated_signs(
     folder, honest, tmp_path, turned
 ):
     """If a step states another sign than the rubric, the sign that fits the data is used."""
@@ -148,8 +148,8 @@ def test_between_a_record_s_own_sign_and_the_rubric_s_the_data_decide(
     assert graded.grade.points == honest.points
 
 
-def test_rounding_is_no_error():
-    """The rounding errors that MATLAB leaves in zeros and ones of A are no errors."""
+def test_rounding_errors_in_a_model_are_not_errors():
+    """The tiny errors that MATLAB leaves in zeros and ones of A are not counted as errors."""
     model = np.array([[0.0, 1.0, 0.0], [-174.0, -2.6, 5000.0]])
     exactly = StateMatrices(right=model, slack=np.zeros_like(model))
     noisy = [["1.2e-17", "1.0000000001"], ["-174", "-2.6"]]
@@ -159,7 +159,7 @@ def test_rounding_is_no_error():
     assert not any(entry.error for entry in compare_entries(space, models=[exactly], n=1))
 
 
-def test_the_rubric_s_system_wins(folder, honest, tmp_path):
+def test_springs_and_sign_come_from_the_rubric(folder, honest, tmp_path):
     """Springs and sign come from the rubric, even if the submission states others."""
     other = tmp_path / "team-07"
     shutil.copytree(folder, other)
@@ -172,15 +172,15 @@ def test_the_rubric_s_system_wins(folder, honest, tmp_path):
     found = grade(other)
     assert found.points == honest.points
     assert found.flags == ()
-    assert found.notes == ()  # with one cart only the sum of the two springs matters
+    assert found.notes == ()  # with one cart, only the sum of the two springs matters
 
 
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_delay_is_not_read_as_a_spring(tmp_path):
-    """A spring that the fit puts at zero is not added, even if the fit then seems better.
+    """A spring for which the fit finds zero stiffness is not added, even if the fit seems better.
 
-    Here a hidden delay makes the fit seem better.
+    In the test, a hidden delay makes the fit seem better.
     """
     bench = prepare_bench(preset="throne-2dof", model=None, hide=["input_delay"])
     write_submission(tmp_path, bench, seed=304)
@@ -190,7 +190,7 @@ def test_a_delay_is_not_read_as_a_spring(tmp_path):
     assert springs == ()
 
 
-def test_two_first_and_final_numbers_of_one_sign_agree(folder):
+def test_two_gains_of_reversed_sign_agree(folder):
     """Two gains that both have the reversed sign agree; gains of different signs do not."""
     assert between(Decimal("-24.4"), Decimal("-24.3")) == between(Decimal("24.4"), Decimal("24.3"))
     assert between(Decimal("-24.4"), Decimal("24.3")) == between(Decimal("0"), Decimal("24.3"))
@@ -205,7 +205,7 @@ def test_a_submission_for_another_bench_fails_with_its_reason(folder):
 
 
 def test_a_cut_file_costs_its_own_run_only(folder, tmp_path):
-    """If a file is cut off, its run is flagged with the line and the rest is graded."""
+    """If a file is cut off, its run is flagged with the line number; the other runs are graded."""
     cut = tmp_path / "team-07"
     shutil.copytree(folder, cut)
     path = cut / "data" / "sine-05.csv"
@@ -219,8 +219,8 @@ def test_a_cut_file_costs_its_own_run_only(folder, tmp_path):
     assert found.points > 19
 
 
-def test_a_missing_file_costs_what_was_to_be_in_it(folder, honest, tmp_path):
-    """If a file is missing, its run is flagged; a criterion that needs this file is missing too."""
+def test_a_missing_file_costs_its_run_and_its_criteria(folder, honest, tmp_path):
+    """If a file is missing, its run is flagged; a criterion that needs the file is missing too."""
     less = tmp_path / "team-07"
     shutil.copytree(folder, less)
     (less / "data" / "decay-1a.csv").unlink()
@@ -236,8 +236,8 @@ def test_a_missing_file_costs_what_was_to_be_in_it(folder, honest, tmp_path):
     assert honest.points > one.points > two.points > 15
 
 
-def test_a_copied_file_and_another_experiment_s_are_seen(folder, tmp_path):
-    """A decay copied in place of a step gets one flag for the copy and the missing step."""
+def test_a_decay_copied_as_a_step_gets_one_flag(folder, tmp_path):
+    """If a decay is copied in place of a step, one flag covers the copy and the missing step."""
     other = tmp_path / "team-07"
     shutil.copytree(folder, other)
     shutil.copyfile(other / "data" / "decay-1a.csv", other / "data" / "step-1.csv")
@@ -246,7 +246,7 @@ def test_a_copied_file_and_another_experiment_s_are_seen(folder, tmp_path):
     assert "step-1" in flag.parameters
 
 
-def test_what_builds_on_a_failed_criterion_is_skipped_and_says_so():
+def test_criteria_that_depend_on_a_failed_one_are_skipped():
     """If the gains fail, criteria that depend on them are skipped, and the message says so."""
     one = student(2)
     feedback = one.reported.feedback
@@ -263,7 +263,7 @@ def test_what_builds_on_a_failed_criterion_is_skipped_and_says_so():
 @pytest.mark.parametrize("table", ["initial", "final"])
 @pytest.mark.parametrize("side", [1, -1])
 def test_points_never_rise_with_the_error(table, side):
-    """The larger the error of a gain, the fewer points it earns, down to none."""
+    """The larger the error of a gain, the fewer points it earns, down to zero."""
     one = student(1)
     right = one.value(table, "K")
     errors = (0.0, 0.02, 0.06, 0.08, 0.1, 0.15, 0.2, 0.3, 0.5)
@@ -280,8 +280,8 @@ def test_points_never_rise_with_the_error(table, side):
     )
 
 
-def test_a_broken_law_is_told_in_words():
-    """If a law fails, the message says in words what fails and why it should hold."""
+def test_a_broken_law_is_explained_in_words():
+    """If a law is broken, the message says in words what is wrong and why the law holds."""
     honest = student(2)
     final = honest.reported.final
     swapped = honest.reporting(final={"K_1": final["K_2"], "K_2": final["K_1"]})
@@ -293,21 +293,21 @@ def test_a_broken_law_is_told_in_words():
     assert "order.K_2.K_1" in laws.found["broken"]
 
 
-def test_lateness_takes_its_share_for_every_day_begun():
+def test_each_day_late_costs_its_share():
     """Each day begun after the due date costs 10 %, at most half of the points.
 
-    The first hour is free.
+    The first hour of each day is free.
     """
     one = student(1)
     full = one.grade().points
     for days, share in ((0.0, 0), (0.04, 0), (0.5, 0.1), (1.04, 0.1), (2.0, 0.2), (30.0, 0.5)):
         graded = one.grade(days_late=days)
-        assert graded.deducted == pytest.approx(share * full, abs=0.005)  # rounded to a hundredth
+        assert graded.deducted == pytest.approx(share * full, abs=0.005)  # rounded to 0.01 points
         assert graded.points == pytest.approx(full - graded.deducted)
 
 
-def test_a_submission_that_reports_nothing_is_graded_for_its_recordings():
-    """Without [reported], all reported numbers are missing; the recordings still earn points."""
+def test_recordings_earn_points_without_reported_numbers():
+    """Without `[reported]`, all reported numbers are missing; the recordings still earn points."""
     one = student(2)
     silent = replace(one, submission=one.submission.model_copy(update={"reported": None}))
     graded = silent.grade()
@@ -317,7 +317,7 @@ def test_a_submission_that_reports_nothing_is_graded_for_its_recordings():
 
 
 def test_further_flags_keep_the_order_of_the_codes():
-    """A flag that the batch adds is put in the order of the codes."""
+    """Flags that a batch adds are sorted in the order of the codes."""
     graded = student(2).without("final", "zeta_b").grade()
     flag = Flag(code="shared_data", parameters=("step-1",), message="…", evidence={})
     data = Flag(code="data_problem", parameters=("step-1",), message="…", evidence={})
@@ -326,8 +326,8 @@ def test_further_flags_keep_the_order_of_the_codes():
 
 
 @pytest.mark.parametrize(("hide", "loosely"), [((), False), (("dead_zone",), True)])
-def test_numbers_that_are_judged_loosely_are_said_to_be(hide, loosely):
-    """If no linear carts fit the recordings, the message asks a person to check the numbers."""
+def test_a_message_says_if_numbers_are_judged_loosely(hide, loosely):
+    """If linear carts do not fit the recordings, the message asks a person to check the numbers."""
     criteria = {c.id: c for c in student(1, hide=hide).grade().criteria}
     for name in ("final-gains", "final-frequencies", "final-dampings"):
         message = criteria[name].message

@@ -1,4 +1,4 @@
-"""The laws of a final table are judged for the paper's own tables and for real chains."""
+"""The laws of a final table are tested with the paper's own tables and with real chains."""
 
 from decimal import Decimal
 from fractions import Fraction
@@ -31,8 +31,8 @@ def broken(table: dict[str, str], *, n: int) -> set[str]:
     return {law.name for law in laws if law.widening > 0}
 
 
-def test_table_2_of_the_paper_passes_but_for_its_first_cart():
-    """Table 2 of the paper fails in ω_1, and in R1 unless ζ_b is 0.034 instead of 0.03.
+def test_table_2_of_the_paper_fails_in_its_first_cart():
+    """Table 2 of the paper breaks the law for ω_1, and also R1 unless ζ_b is 0.034 instead of 0.03.
 
     ω_1 = 19.8 is below the recomputed range of 20.07 to 20.49.
     """
@@ -40,13 +40,13 @@ def test_table_2_of_the_paper_passes_but_for_its_first_cart():
     assert broken(TABLE_2, n=2) == {"recomputed.omega_1", "redundancy.R1"}
 
 
-def test_table_3_of_the_paper_fails_where_it_is_known_to():
-    """Table 3 of the paper fails R4, R5, the sign of a wall spring and ω_2."""
+def test_table_3_of_the_paper_breaks_known_laws():
+    """Table 3 of the paper breaks R4, R5, the sign of a wall spring, the law for ω_2 and others."""
     failed = {"redundancy.R4", "redundancy.R5", "sign.k_1", "recomputed.omega_2"}
     assert failed < broken(TABLE_3, n=3)
 
 
-def test_one_digit_excuses_no_more_than_two():
+def test_one_digit_does_not_excuse_every_broken_law():
     """If a table is typed with one digit, rounding does not excuse every broken law."""
     vague = {name: f"{float(value):.0e}" for name, value in TABLE_2.items()}
     assert broken(vague, n=2) == {"recomputed.omega_1", "recomputed.zeta_1"}
@@ -54,10 +54,10 @@ def test_one_digit_excuses_no_more_than_two():
 
 
 @pytest.mark.parametrize("n", [2, 3])
-@settings(max_examples=20)  # the rounding box of three carts has 2^15 corners
+@settings(max_examples=20)  # for three carts, the rounding intervals have 2^15 corners
 @given(data=st.data())
 def test_a_rounded_table_of_a_real_chain_obeys_every_law(n, data):
-    """A rounded table of a real chain obeys every law, however few digits it has."""
+    """A real chain's table, rounded to two to five digits, obeys every law."""
     sizes = st.floats(0.5, 2.0)
     digits = data.draw(st.integers(2, 5))
     chain = Chain(
@@ -70,7 +70,7 @@ def test_a_rounded_table_of_a_real_chain_obeys_every_law(n, data):
 
 
 def test_an_incomplete_table_is_not_judged():
-    """A table with a missing parameter is not judged."""
+    """A table that lacks a parameter is not judged."""
     typed = {name: Decimal(value) for name, value in TABLE_2.items() if name != "K_1"}
     assert judge_laws(typed, n=2, frequency_percent=3.0, damping_percent=30.0) is None
 
@@ -78,8 +78,8 @@ def test_an_incomplete_table_is_not_judged():
 @pytest.mark.parametrize(
     ("n", "name"), [*((2, x) for x in ("K_1", "omega_a", "omega_2", "zeta_2")), (3, "omega_2")]
 )
-def test_the_worse_a_number_the_less_its_table_earns(n, name):
-    """The larger the error of one number, the more the laws' tolerances must be widened."""
+def test_a_larger_error_needs_wider_tolerances(n, name):
+    """The larger the error of one number, the more the tolerances of the laws must be widened."""
     table = PRESETS[f"throne-{n}dof"].parameters()
 
     def needed(factor: float) -> Fraction:

@@ -1,4 +1,4 @@
-"""From stored findings, another rubric gives the same points as grading again."""
+"""Stored findings under another rubric give the same points as a new grading."""
 
 from dataclasses import replace
 from decimal import Decimal
@@ -21,7 +21,7 @@ from tests.helpers.grading_students import Student, student
 
 @cache
 def _erring(carts: int) -> Student:
-    """Return a team with some numbers right, some slightly off and the others wrong."""
+    """Return a team with some right numbers, some slightly wrong and some badly wrong."""
     honest = student(carts)
     names = honest.rubric.names
     off = {name: honest.value("final", name) * (1 + 0.03 * i) for i, name in enumerate(names)}
@@ -71,8 +71,8 @@ def _changes(draw, rubric: Rubric) -> Rubric:
 @pytest.mark.parametrize("carts", [1, 2])
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
-def test_points_are_those_of_grading_again(carts, data):
-    """Under any changed rubric, stored findings give the same points as grading again."""
+def test_reweighed_points_are_those_of_grading_again(carts, data):
+    """Under any changed rubric, stored findings give the same points as a new grading."""
     team, before = _erring(carts), _graded(carts)
     now = data.draw(_changes(team.rubric))
     kept = read_findings(findings_text(before.verdicts))
@@ -92,15 +92,15 @@ def test_points_are_those_of_grading_again(carts, data):
 
 
 def test_the_same_rubric_gives_the_same_points():
-    """Points computed from stored findings equal those of the grading that stored them."""
+    """Points computed from stored findings equal those of the grading that stored the findings."""
     team, before = _erring(2), _graded(2)
     weighed = reweigh(before.grade, before.verdicts, rubric=team.rubric)
     assert weighed.points == before.grade.points
     assert {c.outcome for c in weighed.criteria} == {"pass", "partial", "fail"}
 
 
-def test_what_needs_the_recordings_is_named():
-    """If a changed key of the rubric needs the recordings, the key is named."""
+def test_a_changed_key_that_needs_recordings_is_named():
+    """If a changed key of the rubric needs the recordings, the result names the key."""
     rubric = student(2).rubric
     plain = rubric.model_dump(mode="json")
     plain["required"]["final"] = ["K_*"]

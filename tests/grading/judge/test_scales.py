@@ -1,4 +1,4 @@
-"""Recordings may have a wrong unit: counts stated as cm, or mV stated as V."""
+"""Recordings may be in a wrong unit: counts stated as cm, or an input that is far too large."""
 
 import csv
 from pathlib import Path
@@ -16,7 +16,7 @@ COUNT = 0.00227  # cm
 
 
 def scaled(folder: Path, column: str, factor: float, *, whole: bool = False) -> Path:
-    """Write a submission and multiply a column of each recording."""
+    """Write a submission and multiply one column of each recording."""
     write_submission(folder, "throne-1dof", seed=3, compact=True, reported=True)
     for path in (folder / "data").glob("*.csv"):
         with path.open(encoding="utf-8", newline="") as file:
@@ -44,17 +44,17 @@ def in_counts(tmp_path_factory):
     return scaled(tmp_path_factory.mktemp("counts"), "x1", 1 / COUNT, whole=True)
 
 
-def test_counts_said_to_be_centimetres_fail_a_check(in_counts):
+def test_counts_stated_as_centimetres_fail_a_check(in_counts):
     """Recordings in counts that are stated as centimetres fail a check.
 
-    Every gain is then hundreds of times too large, and everything else agrees.
+    Every gain is then hundreds of times too large; all other checks pass.
     """
     failed = [c.id.split(".")[0] for c in analyse(load_submission(in_counts)).checks
               if c.outcome == "fail"]  # fmt: skip
-    assert failed == ["position_scale", "hardware"]  # gains in counts agree with no stated gain
+    assert failed == ["position_scale", "hardware"]  # no stated gain agrees with gains in counts
 
 
-def test_the_right_gain_is_not_accused_where_the_recordings_are_in_counts(in_counts):
+def test_no_gain_is_judged_if_recordings_are_in_counts(in_counts):
     """If the recordings are in counts, they are flagged, and no reported gain is judged."""
     graded = grade(in_counts)
     assert [flag.code for flag in graded.flags] == ["data_problem"]
@@ -65,15 +65,15 @@ def test_the_right_gain_is_not_accused_where_the_recordings_are_in_counts(in_cou
 
 
 def test_a_stated_length_of_a_count_makes_the_gain_known(in_counts):
-    """If the rubric states the length of a count, gains are judged by recordings in that length."""
+    """If the rubric states the length of a count, gains are judged in units of length."""
     outcomes = {c.id: c.outcome for c in grade(in_counts, per_count=COUNT).criteria}
     assert outcomes["initial-gains"] == outcomes["final-gains"] == "pass"
     off = {c.id: c.outcome for c in grade(in_counts, per_count=2 * COUNT).criteria}
     assert off["initial-gains"] == off["final-gains"] == "fail"
 
 
-def test_millivolts_said_to_be_volts_fail_a_check(tmp_path):
-    """If the input is in millivolts stated as volts, it is flagged, and no gain is judged."""
+def test_millivolts_stated_as_volts_fail_a_check(tmp_path):
+    """If the input is 10,000 times too large, it is flagged, and no gain is judged."""
     graded = grade(scaled(tmp_path / "team", "input", 1e4))
     assert [flag.code for flag in graded.flags] == ["data_problem"]
     assert {c.id: c.outcome for c in graded.criteria}["final-gains"] == "skip"

@@ -32,7 +32,7 @@ Spoil = Callable[[Columns], Columns]
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory) -> Path:
-    """Write a whole session: two decays per cart, four steps, dwells, a sweep, a closed loop."""
+    """Write a whole session: two decays per cart, four steps, dwells, a sweep and a closed loop."""
     folder = tmp_path_factory.mktemp("bench")
     write_submission(folder, PRESET, seed=3, compact=True, reported=True)
     return folder
@@ -87,7 +87,7 @@ def frozen(name: str) -> Spoil:
     return freeze
 
 
-# name of the case: kind, which of its files, the change, a word of the reason
+# name of the case: kind of recording, which of its files, the change, a word of the reason
 SPOILT = {
     "a decay in milliseconds": ("decay-1", slice(1), in_milliseconds, "milliseconds"),
     "a decay in thousands of seconds": ("decay-1", slice(1), times(1e-3, "time"), "thousands"),
@@ -114,7 +114,7 @@ SPOILT = {
 }
 
 
-# The slowest cases, and cases whose reason equals that of a faster one.
+# the slowest cases, and cases that give the same reason as a faster one
 SEARCHED = (
     "cart 1 turned in every step",
     "all dwells exchanged",
@@ -127,9 +127,8 @@ LONG = [pytest.mark.slow, pytest.mark.sample]
 
 
 def _cases() -> Iterator[Any]:
-    """Return every case without a stated sign.
+    """Yield each case without a stated sign, and those that look like a wrong sign also with one.
 
-    Return with a stated sign only the cases that look like a wrong sign.
     """
     for case in SPOILT:
         yield pytest.param(case, "", marks=LONG if case in SEARCHED else ())
@@ -139,10 +138,10 @@ def _cases() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize(("case", "sign"), [*_cases()])
-def test_what_is_wrong_is_named_left_out_and_flagged(case, sign, bench, tmp_path):
-    """Spoilt recordings, and no others, are named, left out of all estimates and flagged.
+def test_spoilt_recordings_are_named_left_out_and_flagged(case, sign, bench, tmp_path):
+    """Only the spoilt recordings are named, left out of all estimates and flagged.
 
-    Report and grade give the reason.
+    The report and the grade give the reason.
     """
     kind, which, how, word = SPOILT[case]
     folder = shutil.copytree(bench, tmp_path / "spoilt")
@@ -184,7 +183,7 @@ def _numbers_are_right(analysis: Analysis) -> None:
             assert row.initial.value == pytest.approx(TRUE[row.name], rel=0.02)
 
 
-def test_dwells_that_were_cut_are_flagged(bench, tmp_path):
+def test_dwells_that_are_too_short_are_flagged(bench, tmp_path):
     """A dwell with less than 1.5 cycles is flagged as too short for a steady state."""
     folder = shutil.copytree(bench, tmp_path / "cut")
     for path in files(folder, "sine"):
@@ -203,10 +202,10 @@ def test_dwells_that_were_cut_are_flagged(bench, tmp_path):
     ("kind", "stated", "word"),
     [("step", "decay", "free decay"), ("sine", "step", "not a step"), ("step", "cut", "truncated")],
 )
-def test_a_recording_of_another_kind_or_a_cut_one_fails_report_and_grade(
+def test_a_cut_recording_or_one_of_another_kind_is_flagged(
     kind, stated, word, bench, tmp_path
 ):
-    """A recording of another kind, or a cut one, is flagged in grading and fails a report's check.
+    """A recording that is cut off or of another kind is flagged, and a check of the report fails.
 
     No estimate uses the recording.
     """
@@ -230,11 +229,8 @@ def test_a_recording_of_another_kind_or_a_cut_one_fails_report_and_grade(
 
 
 @pytest.mark.parametrize("which", [slice(1), slice(None)])
-def test_decays_in_millimetres_are_told_and_used(which, bench, tmp_path):
-    """If one or all decays are in millimetres, a warning names them.
-
-    They are still used correctly.
-    """
+def test_decays_in_millimetres_give_a_warning_and_are_used(which, bench, tmp_path):
+    """If one or all decays are in millimetres, a warning names them, and no check fails."""
     folder = shutil.copytree(bench, tmp_path / "spoilt")
     paths = files(folder, "decay")[which]
     for path in paths:
@@ -246,7 +242,7 @@ def test_decays_in_millimetres_are_told_and_used(which, bench, tmp_path):
     assert paths[0].stem in told[0]
 
 
-def test_grading_says_what_the_stated_frequencies_are_in(bench, tmp_path):
+def test_frequencies_in_rad_per_s_stated_as_hz_are_named(bench, tmp_path):
     """If frequencies in rad/s were stated as Hz, the message says so and blames no file."""
     folder = shutil.copytree(bench, tmp_path / "spoilt")
     path = folder / "submission.toml"
@@ -263,10 +259,10 @@ def test_grading_says_what_the_stated_frequencies_are_in(bench, tmp_path):
     assert all("rad/s" in why for why in problems.values())
 
 
-def test_a_held_cart_that_nobody_called_free_is_told_with_its_cure(bench, tmp_path):
+def test_a_missing_list_of_free_carts_is_named_with_its_fix(bench, tmp_path):
     """If the key `carts` is missing although a cart was held, the message gives the line to add.
 
-    Without the key, all carts count as free.
+    Without this key, all carts count as free.
     """
     folder = shutil.copytree(bench, tmp_path / "spoilt")
     path = folder / "submission.toml"
@@ -276,11 +272,8 @@ def test_a_held_cart_that_nobody_called_free_is_told_with_its_cure(bench, tmp_pa
     assert "write carts = [1]" in one.reason
 
 
-def test_a_loop_that_is_left_out_is_held_against_nothing(bench, tmp_path):
-    """A closed loop with a clock in milliseconds is not compared with the model.
-
-    The reason is given.
-    """
+def test_a_loop_that_is_left_out_is_not_compared(bench, tmp_path):
+    """A closed loop with a clock in milliseconds is not compared with the model."""
     folder = shutil.copytree(bench, tmp_path / "loop")
     for path in files(folder, "control"):
         spoil(path, in_milliseconds)
@@ -291,7 +284,7 @@ def test_a_loop_that_is_left_out_is_held_against_nothing(bench, tmp_path):
     assert "milliseconds" in skip.reason
 
 
-def test_the_sound_repeats_stay_where_most_are_exchanged(bench, tmp_path):
+def test_a_sound_repeat_is_kept_if_most_have_swapped_columns(bench, tmp_path):
     """If three of four steps have swapped columns, only these three are left out.
 
     The report does not advise another sign.
@@ -306,7 +299,7 @@ def test_the_sound_repeats_stay_where_most_are_exchanged(bench, tmp_path):
     assert not any("sign = " in warning for warning in analysis.warnings)
 
 
-def test_one_clock_in_milliseconds_throughout_fails_the_dwells(bench, tmp_path):
+def test_times_in_milliseconds_throughout_fail_a_check(bench, tmp_path):
     """If all times are in milliseconds, a check finds the dwells' frequencies off by 1000."""
     folder = shutil.copytree(bench, tmp_path / "slow")
     for path in files(folder, ""):
@@ -336,10 +329,10 @@ def test_one_recording_in_two_experiments_counts_once(bench, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.sample
-def test_columns_exchanged_in_every_recording_are_named(bench, tmp_path):
+def test_columns_swapped_in_every_recording_are_named(bench, tmp_path):
     """If the columns of all driven recordings are swapped, the reason says so.
 
-    Then nothing is identified.
+    Then no parameters are identified.
     """
     folder = shutil.copytree(bench, tmp_path / "exchanged")
     driven = [*files(folder, "step"), *files(folder, "sine"), *files(folder, "sweep")]
@@ -352,10 +345,10 @@ def test_columns_exchanged_in_every_recording_are_named(bench, tmp_path):
     assert "fit.identified" in _failed(analysis)
 
 
-def test_dwells_and_steps_that_contradict_one_another_identify_nothing(bench, tmp_path):
+def test_contradicting_dwells_and_steps_identify_nothing(bench, tmp_path):
     """If the inputs of all dwells are ten times off those of all steps, nothing is identified.
 
-    The report gives both explanations: wrong dwells or wrong steps.
+    The report gives two possible explanations: wrong dwells or wrong steps.
     """
     folder = shutil.copytree(bench, tmp_path / "undecided")
     for path in files(folder, "sine"):
@@ -375,10 +368,10 @@ def test_dwells_and_steps_that_contradict_one_another_identify_nothing(bench, tm
     assert initial == {"omega_1", "omega_2", "zeta_1", "zeta_2"}
 
 
-def test_a_record_that_follows_no_carts_is_left_out_without_an_accusation(bench, tmp_path):
-    """A recording that no carts could make is left out, but not called wrong.
+def test_a_recording_of_no_linear_carts_is_left_out_but_not_called_wrong(bench, tmp_path):
+    """A recording that no linear carts could make is left out, but not called wrong.
 
-    Something besides the input moves the cart there.
+    In the test, something besides the input moves the cart.
     """
     folder = shutil.copytree(bench, tmp_path / "stray")
     path = files(folder, "sine")[4]
@@ -393,7 +386,7 @@ def test_a_record_that_follows_no_carts_is_left_out_without_an_accusation(bench,
     _numbers_are_right(analysis)
 
 
-def test_records_of_two_carts_identify_no_third(bench, tmp_path):
+def test_without_recordings_of_the_last_cart_nothing_is_identified(bench, tmp_path):
     """If the last cart has no recording, nothing is identified and the report fails."""
     folder = shutil.copytree(bench, tmp_path / "three")
     path = folder / "submission.toml"
@@ -412,7 +405,7 @@ def test_records_of_two_carts_identify_no_third(bench, tmp_path):
 def test_a_coarse_encoder_that_freezes_for_half_a_second_is_found(kind, tmp_path):
     """A freeze of half a second is found even with a coarse encoder.
 
-    The cart has moved far when the encoder counts again.
+    In the test, the cart has moved far before the encoder counts again.
     """
     write_submission(tmp_path, replace(preset_bench(PRESET), count=0.03), seed=5, compact=True)
     (path,) = files(tmp_path, kind)
@@ -429,7 +422,7 @@ def test_a_coarse_encoder_that_freezes_for_half_a_second_is_found(kind, tmp_path
     assert "froze" in analysis.left_out[0].reason
 
 
-def test_fewer_decimals_in_some_files_are_no_other_unit(bench, tmp_path):
+def test_files_with_fewer_decimals_are_not_in_another_unit(bench, tmp_path):
     folder = shutil.copytree(bench, tmp_path / "rounded")
     for kind, decimals in {"decay": 1, "step": 1, "sine": 2}.items():
         for path in files(folder, kind):
@@ -437,23 +430,23 @@ def test_fewer_decimals_in_some_files_are_no_other_unit(bench, tmp_path):
     assert analyse(load_submission(folder), design=False).left_out == ()
 
 
-def test_carts_that_stick_and_creep_are_in_no_other_unit_of_time(bench):
+def test_sticking_carts_are_not_in_another_unit_of_time(bench):
     """If carts stick and creep, the recording is not said to be in another unit of time."""
     chain = PRESETS[PRESET]
     dwell = next(
         r for r in analyse(load_submission(bench), design=False).records if r.kind == "sine"
     )
-    creep = 0.02 * dwell.t / dwell.t[-1]  # cm, nine encoder steps in total
+    creep = 0.02 * dwell.t / dwell.t[-1]  # in cm; nine encoder steps in total
     stuck = replace(dwell, y=np.array([creep, 0.7 * creep]))
     assert find_misread(stuck, chain, follow([stuck], chain)[stuck.id]) is None
 
 
 @pytest.mark.slow
 @pytest.mark.sample
-def test_a_cart_that_moves_farther_than_the_one_that_pulls_it_accuses_no_gain(bench, tmp_path):
+def test_a_cart_moving_too_far_blames_no_gain(bench, tmp_path):
     """If cart 2 seems to move farther than the cart that pulls it, no gain is called wrong.
 
-    In every file one column is in another unit, so nothing is identified.
+    In every file the column of cart 2 is in another unit, so nothing is identified.
     """
     folder = shutil.copytree(bench, tmp_path / "millimetres")
     for path in files(folder, ""):

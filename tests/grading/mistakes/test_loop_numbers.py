@@ -14,7 +14,7 @@ GAINS = np.array(
 
 
 @pytest.mark.parametrize("sample_time", [1e-2, 1e-3, 5e-4, 1e-4])
-def test_a_fast_controller_is_seen_to_settle(sample_time):
+def test_a_loops_step_figures_are_those_of_the_textbook(sample_time):
     """Overshoot and settling time equal the textbook's to within one sample and the delay."""
     numbers = loop_numbers(CHAIN, GAINS, cart=1, settling=1.0, sample_time=sample_time)
     assert numbers is not None
@@ -27,8 +27,8 @@ def test_a_fast_controller_is_seen_to_settle(sample_time):
     assert numbers.prefilter == pytest.approx(OMEGA**2, rel=1e-6)
 
 
-def test_a_loop_without_a_static_gain_has_no_numbers():
-    """If carts are so stiff that the loop has no static gain, no numbers are given."""
+def test_a_loop_without_a_static_gain_has_no_step_figures():
+    """If carts are so stiff that the loop has no static gain, no step figures are computed."""
     K, omega, zeta = 28.9, 1e20, 2.0
     stiff = Chain(
         m=np.array([1 / (K * omega**2)]),

@@ -13,7 +13,7 @@ TURN = 2 * np.pi
 
 
 def reduced(analysis: Analysis) -> tuple[FrequencyResponse, ...]:
-    """Return an honest table, read as half the swing of the last three cycles with 1 % error."""
+    """Return an honest table: half the swing of the last three cycles, with 1 % reading error."""
     runs = {record.id: record for record in analysis.records}
     rng = np.random.default_rng(5)
     tables = []
@@ -49,7 +49,7 @@ def changed(analysis: Analysis, *, ratio=lambda x: x, stretch: float = 1.0) -> A
 
 @pytest.mark.parametrize(("carts", "hide"), [(1, ()), (2, ()), (3, ()), (2, ("coulomb_friction",))])
 def test_an_honest_table_gets_no_flag(carts, hide):
-    """An honest table gets no flag, although half the swing differs from a sine fit."""
+    """An honest table gets no flag, although half the swing differs slightly from a sine fit."""
     analysis = student(carts, hide=hide).analysis
     assert diagnose_reduced(changed(analysis)) == []
 
@@ -75,10 +75,10 @@ def test_a_slip_in_the_table_is_named(carts, code, change):
 
 
 @pytest.mark.parametrize(("code", "factor"), [("peak_to_peak", 2.0), ("hz_for_rad_s", TURN)])
-def test_without_dwells_steps_and_decays_tell(code, factor):
-    """Without dwells, the table's fit is compared with steps and decays.
+def test_without_dwells_a_table_is_judged_by_steps_and_decays(code, factor):
+    """Without dwells, the fit to the table is compared with steps and decays.
 
-    If they differ by one factor for all carts, a flag names the mistake.
+    If the two differ by one factor for all carts, a flag names the mistake.
     """
     analysis = student(2).analysis
     symbol = "K" if code == "peak_to_peak" else "omega"

@@ -27,7 +27,7 @@ RUBRIC = two_cart_rubric()
 
 
 def write(tmp_path: Path, *outcomes, platform, roster: str = "", overrides=(), **options):
-    """Export a class; return the rows of its table and the messages."""
+    """Export a class; return the rows of the exported table and the messages."""
     with Gradebook(tmp_path / "g.sqlite", assignment="lab", create=True) as book:
         for outcome in outcomes:
             book.put(outcome)
@@ -44,7 +44,7 @@ def write(tmp_path: Path, *outcomes, platform, roster: str = "", overrides=(), *
 
 
 def test_a_grade_is_better_than_none(tmp_path):
-    """If an author has an ungraded submission and one with 0 points, the 0 points count."""
+    """If an author has an ungraded submission and one with 0 points, the 0 points are exported."""
     unread = failed_grade("a", "too slow")
     unread = unread.model_copy(update={"authors": ("bob",)})
     nothing = make_grade("b", share=0.0, authors=("bob",))
@@ -59,9 +59,9 @@ def test_a_grade_is_better_than_none(tmp_path):
 
 
 def canvas_import(rows: list[list[str]]) -> dict[str, dict[str, str]]:
-    """Read grades by the rules of `gradebook_importer.rb`.
+    """Read grades by the rules of Canvas's `gradebook_importer.rb`.
 
-    Return them by assignment and student.
+    Return the points by assignment and student.
     """
     head = rows[0]
     assert len(head) > 3
@@ -72,7 +72,7 @@ def canvas_import(rows: list[list[str]]) -> dict[str, dict[str, str]]:
     assert re.search(r"SIS\s+Login\s+ID", head[3])
     columns += 2 + ("Integration ID" in head[4])
     columns += "Root Account" in head[columns - 1]
-    assert "Section" in head[columns - 1]  # the last column about the student
+    assert "Section" in head[columns - 1]  # the last column that describes the student
     grades: dict[str, dict[str, str]] = {title: {} for title in head[columns:]}
     for row in rows[1:]:
         if "Points Possible" in row[0]:
@@ -85,7 +85,7 @@ def canvas_import(rows: list[list[str]]) -> dict[str, dict[str, str]]:
 
 
 def moodle_import(rows: list[list[str]]) -> dict[str, tuple[str, str]]:
-    """Read a worksheet by the rules of `importgradeslib.php`.
+    """Read a worksheet by the rules of Moodle's `importgradeslib.php`.
 
     Return grade and feedback by participant.
     """
@@ -106,7 +106,7 @@ FULL = make_outcome(make_grade("team-2", authors=("=ann", "bo")), owner="poeann 
 BROKEN = make_outcome(failed_grade("team-3", "<b>broken</b>"), owner="roeric (1026)")
 
 
-def test_canvas_takes_the_grades(tmp_path):
+def test_the_table_for_canvas_can_be_imported(tmp_path):
     """The table for Canvas has a row for each author; an ungraded author's cell is blank.
 
     A message names the ungraded submissions.
@@ -129,7 +129,7 @@ def test_a_broken_submission_graded_by_hand_is_exported(tmp_path):
     assert remarks == ()
 
 
-def test_a_submission_that_names_nobody_is_said(tmp_path):
+def test_a_submission_without_authors_is_named_in_a_message(tmp_path):
     """If a submission names no author, a message says that it is not exported."""
     nobody = make_outcome(failed_grade("team-8", "broken"))
     rows, remarks = write(tmp_path, FULL, nobody, platform="canvas")
@@ -138,8 +138,8 @@ def test_a_submission_that_names_nobody_is_said(tmp_path):
 
 
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
-def test_a_number_of_another_platform_is_nobodys(tmp_path, platform):
-    """A student's number on another platform is not used, since it means somebody else here."""
+def test_a_number_of_another_platform_is_ignored(tmp_path, platform):
+    """A student's number on another platform is ignored, since here it may be somebody else's."""
     others = {"canvas", "moodle", "gradescope"} - {platform}
     entries = [
         make_outcome(make_grade(f"team-{of}"), owner=f"Jane Doe ({of} 1024)") for of in others
@@ -154,7 +154,7 @@ def test_a_number_of_another_platform_is_nobodys(tmp_path, platform):
     assert any("1024" in cell for row in rows for cell in row)
 
 
-def test_canvas_own_export_is_filled_in(tmp_path):
+def test_a_canvas_roster_is_filled_in(tmp_path):
     """A Canvas roster is filled in by id, login or name; rows of other students stay unchanged.
 
     The column is found by the assignment's title.
@@ -174,7 +174,7 @@ def test_canvas_own_export_is_filled_in(tmp_path):
     assert remarks[-1] == "not in roster.csv, so not exported: roeric"
 
 
-def test_who_stands_twice_in_a_roster_is_said_to(tmp_path):
+def test_an_author_twice_in_a_roster_is_named_in_a_message(tmp_path):
     """If two rows of a roster match an author, neither changes, and a message says why."""
     roster = (
         "Student,ID,SIS User ID,SIS Login ID,Section,Lab 3\n"
@@ -188,7 +188,7 @@ def test_who_stands_twice_in_a_roster_is_said_to(tmp_path):
     assert not any("not in roster.csv, so not exported: bo" in remark for remark in remarks)
 
 
-def test_moodle_takes_a_worksheet_where_participants_are_known(tmp_path):
+def test_moodle_gets_a_worksheet_if_participants_are_known(tmp_path):
     """If participant numbers are known, Moodle gets a worksheet with feedback as safe HTML."""
     rows, _ = write(tmp_path, HALF, BROKEN, platform="moodle")
 
@@ -199,7 +199,7 @@ def test_moodle_takes_a_worksheet_where_participants_are_known(tmp_path):
     assert all(row[rows[0].index("Maximum Grade")] == "20" for row in rows[1:])
 
 
-def test_moodle_own_worksheet_is_filled_in(tmp_path):
+def test_a_moodle_worksheet_is_filled_in(tmp_path):
     """A Moodle worksheet is filled in by participant, id number or email.
 
     Every other cell stays unchanged.
@@ -227,7 +227,7 @@ def test_a_worksheet_with_another_maximum_is_refused(tmp_path):
         write(tmp_path, HALF, platform="moodle", roster=roster.format("18.00"))
 
 
-def test_a_gradebook_with_other_points_possible_is_refused(tmp_path):
+def test_a_canvas_gradebook_with_another_maximum_is_refused(tmp_path):
     """A Canvas gradebook with another maximum is refused, since Canvas would keep its own."""
     roster = (
         "Student,ID,Section,Lab 3 (77),Lab 4 (78)\n"
@@ -248,7 +248,7 @@ def test_moodle_is_told_why_points_were_given_by_hand(tmp_path):
     assert "by hand from 0 to" in rows[1][2]
 
 
-def test_moodle_takes_a_table_of_grades_otherwise(tmp_path):
+def test_moodle_gets_a_table_if_participants_are_unknown(tmp_path):
     """Without participant numbers, Moodle gets a table of grades by id number."""
     rows, _ = write(tmp_path, FULL, platform="moodle", title="Lab 3")
     assert rows == [
@@ -289,10 +289,10 @@ def test_gradescope_gets_a_result_for_each_submission(tmp_path):
 
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 @pytest.mark.parametrize("author", ["s-team-1", " S-Team-1"])
-def test_who_is_in_two_submissions_has_no_points_until_somebody_decides(tmp_path, platform, author):
-    """If an author's two submissions have different points, the author's cell stays empty.
+def test_different_points_in_two_submissions_are_not_exported(tmp_path, platform, author):
+    """If an author's two submissions have different points, no points are exported for the author.
 
-    A message names both submissions; the instructor removes the wrong one.
+    A message names both submissions, so that the instructor can remove the wrong one.
     """
     other = make_outcome(make_grade("team-9", share=0.25, authors=(author,)))
     rows, remarks = write(tmp_path, HALF, other, platform=platform)
@@ -303,14 +303,14 @@ def test_who_is_in_two_submissions_has_no_points_until_somebody_decides(tmp_path
     )
 
 
-def test_two_submissions_with_the_same_points_leave_nothing_to_decide(tmp_path):
+def test_equal_points_in_two_submissions_are_exported(tmp_path):
     """If an author's two submissions have the same points, the author gets these points."""
     other = make_outcome(make_grade("team-9", share=0.5, authors=("s-team-1",)))
     rows, remarks = write(tmp_path, HALF, other, platform="canvas")
     assert (canvas_import(rows), remarks) == ({RUBRIC.title: {"1024": "10"}}, ())
 
 
-def test_a_row_that_two_submissions_lead_to_stays_as_it_was(tmp_path):
+def test_a_row_that_two_submissions_match_is_unchanged(tmp_path):
     """If one submission matches a row by author and another by uploader, the row is unchanged."""
     roster = 'Student,ID,SIS User ID,SIS Login ID,Section,Lab 3\n"Doe, Jane",1001,S1,jane,A,3\n'
     by_id = make_outcome(make_grade("team-1", share=0.5, authors=("s1",)))
@@ -325,10 +325,10 @@ def test_a_row_that_two_submissions_lead_to_stays_as_it_was(tmp_path):
         assert [r for r in remarks if "team-1 (10)" in r and "o (20)" in r and "left out" in r]
 
 
-def test_the_number_of_who_handed_in_decides_nothing(tmp_path):
-    """If an author of two submissions uploaded one of them, the points still stay open.
+def test_an_upload_does_not_decide_between_two_submissions(tmp_path):
+    """If an author is in two submissions and uploaded one, neither one's points are exported.
 
-    The message about this appears once.
+    One message names both submissions.
     """
     roster = 'Student,ID,SIS User ID,SIS Login ID,Section,Lab 3\n"Doe, Jane",1001,s1,jane,A,3\n'
     one = make_outcome(make_grade("a", share=0.5, authors=("s1", "x")), owner="doejane (1001)")
@@ -341,11 +341,11 @@ def test_the_number_of_who_handed_in_decides_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("own", [False, True])
-def test_an_author_whose_points_another_account_got_is_named(tmp_path, own):
-    """If an author's points go to the uploader's row, a message names the author.
+def test_an_author_is_named_if_the_uploader_got_the_points(tmp_path, own):
+    """If an author's points go to another student who uploaded, a message names the author.
 
-    The uploader's number counts before the authors' ids. If `own` is true, the author also has an
-    ungraded submission and so is in two submissions.
+    The uploader's number takes precedence over the authors' ids. If `own` is true, the author also
+    has an ungraded submission.
     """
     roster = 'Student,ID,SIS User ID,Section,Lab 3\n"Doe, Jane",1001,s1,A,\n"Roe, Jo",1002,s2,A,\n'
     broken = failed_grade("a", "no TOML").model_copy(update={"authors": ("s1",)})
@@ -371,7 +371,7 @@ def test_an_author_whose_points_another_account_got_is_named(tmp_path, own):
 def test_points_by_hand_of_a_submission_without_names_are_exported(tmp_path, platform):
     """If a submission names nobody, points given by hand are exported under its folder's name.
 
-    If an earlier version named its authors, they get the points.
+    If an earlier version of the submission named authors, the authors get the points.
     """
     broken = make_outcome(failed_grade("team-8", "no TOML"))
     rows, remarks = write(
@@ -392,7 +392,7 @@ def test_points_by_hand_of_a_submission_without_names_are_exported(tmp_path, pla
     assert (student.id, student.points, remarks) == ("s-team-8", "0.75", [])
 
 
-def test_of_several_authors_the_one_who_handed_it_in_is_found(tmp_path):
+def test_the_author_who_uploaded_is_found_by_number(tmp_path):
     """If Canvas knows no author's id, the number in the file's name decides who gets the points.
 
     The other authors are named in a message.
@@ -418,7 +418,7 @@ def test_of_several_authors_the_one_who_handed_it_in_is_found(tmp_path):
         ("canvas", "First Name,Last Name,SID,Email", "ID and Student"),
     ],
 )
-def test_a_table_that_is_no_roster_is_refused(tmp_path, platform, head, wanted):
+def test_a_table_that_is_not_a_roster_is_refused(tmp_path, platform, head, wanted):
     """A table that is not a roster of the platform is refused; the message names the columns."""
     with pytest.raises(
         ConfigError, match=rf"roster\.csv: is not {platform.capitalize()}.*{wanted}"
@@ -427,10 +427,7 @@ def test_a_table_that_is_no_roster_is_refused(tmp_path, platform, head, wanted):
 
 
 def test_a_roster_with_two_columns_of_one_name_is_refused(tmp_path):
-    """A roster with two columns of the same name is refused.
-
-    Columns without a name do not matter.
-    """
+    """A roster with two columns of the same name is refused, unless the columns have no name."""
     with pytest.raises(ConfigError, match=r"roster\.csv: has two columns 'Lab'"):
         write(tmp_path, HALF, platform="canvas", roster="Student,ID,Lab,Lab\na,1,,\n")
     rows, _ = write(tmp_path, HALF, platform="gradescope", roster="SID,,Name,\ns-team-1,x,y,z\n")
@@ -438,7 +435,7 @@ def test_a_roster_with_two_columns_of_one_name_is_refused(tmp_path):
                     ["s-team-1", "x", "y", "z", "10", "20"]]  # fmt: skip
 
 
-def test_gradescope_must_have_a_score(tmp_path):
+def test_gradescope_gets_0_for_an_ungraded_submission(tmp_path):
     """Gradescope gets 0 for an ungraded submission, and a message says so."""
     _, remarks = write(tmp_path, BROKEN, platform="gradescope")
     (path,) = (tmp_path / "out" / "gradescope").glob("*/results.json")

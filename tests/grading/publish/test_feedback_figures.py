@@ -1,4 +1,4 @@
-"""The feedback's figures draw the curve of the reported numbers beside the measurement."""
+"""The figures in the feedback draw the curve of the reported numbers beside the measurement."""
 
 import numpy as np
 import pytest
@@ -13,20 +13,20 @@ from tests.helpers.grading_students import student
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
-def test_the_curve_is_that_of_the_table(preset):
-    """The curve drawn from a chain's table is the chain's own frequency response."""
+def test_the_curve_of_a_table_is_the_chains_response(preset):
+    """The curve drawn from a chain's parameters is the chain's own frequency response."""
     chain = PRESETS[preset]
     omega = np.geomspace(1.0, 100.0, 50)
     reported = transfer_functions(chain.parameters())
     for cart in range(1, chain.n + 1):
         expected = 20 * np.log10(np.abs(chain.frequency_response(omega)[cart - 1]))
-        # Roots and products of at most sixth order, in double precision: far below 1e-6 dB.
+        # Roots and products up to order six in double precision: the error is far below 1e-6 dB.
         got = reported_magnitude(omega, cart=cart, reported=reported)
         assert_allclose(got, expected, atol=1e-6)
 
 
 def test_each_cart_has_a_figure_with_the_reported_curve():
-    """Each cart has a figure with the reported curve, and its bytes are the same each time."""
+    """Each cart has a figure with the reported curve, and drawing it again gives the same bytes."""
     two = student(2)
     figures = draw_figures(two.analysis, two.reported)
 
@@ -36,7 +36,7 @@ def test_each_cart_has_a_figure_with_the_reported_curve():
 
 
 @pytest.mark.parametrize("left", ["K_1", "omega_a", "zeta_2"])
-def test_a_table_that_is_not_complete_has_no_curve(left):
+def test_an_incomplete_table_has_no_curve(left):
     """If the table is incomplete, the figure shows measurement and fit without a reported curve."""
     two = student(2).without("final", left)
     figures = draw_figures(two.analysis, two.reported)
@@ -52,7 +52,7 @@ def test_a_table_without_damping_has_a_curve():
 
 
 @pytest.mark.parametrize("value", [0.0, 1e300, 1e-300])
-def test_numbers_that_stand_for_no_response_have_no_curve(value):
+def test_a_zero_or_infinite_frequency_has_no_curve(value):
     """If a reported frequency is zero or infinite, no curve is drawn."""
     two = student(2).reporting(final={"omega_a": value})
     assert not any("your numbers" in svg for _, svg in draw_figures(two.analysis, two.reported))
@@ -82,8 +82,8 @@ def test_a_number_that_lost_points_is_shown_on_its_record():
 
 
 @pytest.mark.parametrize(("omega", "zeta"), [(-3.0, 0.1), (1e9, 0.1), (20.0, 1.5), (20.0, -1.0)])
-def test_numbers_of_no_swing_are_told_and_not_drawn(omega, zeta):
-    """If the reported numbers are no damped swing, they are only written beside the recording."""
+def test_numbers_of_no_oscillation_are_written_but_not_drawn(omega, zeta):
+    """Reported numbers that give no damped oscillation are written in the figure but not drawn."""
     two = student(2)
     criterion = Criterion(
         id="decays", title="", outcome="fail", points=0.0, out_of=1.0, message="",

@@ -1,4 +1,4 @@
-"""A grading's files depend only on the gradebook; they are safe and complete."""
+"""The files of a grading depend only on the gradebook; they are safe and complete."""
 
 import csv
 import io
@@ -42,7 +42,7 @@ from tests.helpers.grades import (
 RUBRIC = two_cart_rubric()
 
 
-def test_a_remark_s_evidence_keeps_its_words():
+def test_the_evidence_of_a_flag_keeps_its_words():
     """A flag's evidence shows which table is meant and which mistake explains it.
 
     True and false appear as yes and no.
@@ -73,7 +73,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 
 def tree(folder: Path) -> dict[str, bytes]:
-    """Return all files except the gradebook itself."""
+    """Return the content of all files except the gradebook itself."""
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in sorted(folder.rglob("*"))
@@ -85,7 +85,7 @@ def tree(folder: Path) -> dict[str, bytes]:
 
 
 def test_every_submission_has_its_row(graded):
-    """Every submission has a row in `grades.csv`, even a broken one with its reason.
+    """Every submission has a row in `grades.csv`; that of a broken submission gives the reason.
 
     The row has points by criterion, lateness and points given by hand.
     """
@@ -110,8 +110,8 @@ def test_no_cell_is_a_formula(graded):
     assert not [cell for cell in cells if cell.startswith(tuple("=@\t\r"))]
 
 
-def test_a_criterion_may_be_called_like_a_column():
-    """A criterion with the id of a fixed column gets another heading."""
+def test_a_criterion_with_the_name_of_a_column_gets_another_heading():
+    """A criterion whose id equals a fixed column's heading gets another heading."""
     criteria = (RUBRIC.criteria[0].model_copy(update={"id": "points"}),)
     rubric = RUBRIC.model_copy(update={"criteria": criteria})
     (head,) = csv.reader([grades_csv([], rubric=rubric).strip()])
@@ -128,7 +128,7 @@ def test_the_same_class_gives_the_same_bytes(graded, tmp_path):
     assert tree(again) == tree(graded)
 
 
-def test_nothing_of_a_student_is_markup(graded):
+def test_markup_of_students_is_shown_as_text(graded):
     """Names, reasons and messages with markup appear as plain text on every page."""
     for path in (graded / "class.html", graded / "feedback" / "team-02" / "feedback.html"):
         html = path.read_text(encoding="utf-8")
@@ -184,7 +184,7 @@ def test_only_what_changed_is_written_again(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["../out", "a/b", "..", ""])
-def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
+def test_a_name_that_leads_outside_the_folder_is_refused(tmp_path, name):
     """If a submission's name would lead outside the folder, nothing is written."""
     with Gradebook(tmp_path / "g.sqlite", assignment="lab", create=True) as book:
         book.put(make_outcome(make_grade(name), key="k"))
@@ -198,7 +198,7 @@ def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
 # --------------------------------------------------------------------- without names
 
 
-def test_without_names_nothing_tells_who_it_was(tmp_path):
+def test_an_anonymous_grading_reveals_no_name(tmp_path):
     """In anonymous grading, pages, table and order of rows reveal no name.
 
     Only the key file does.
@@ -229,18 +229,18 @@ def test_without_names_nothing_tells_who_it_was(tmp_path):
     assert names == sorted(key)
     for name, content in tree(out).items():
         if name != KEY_FILE:
-            told = re.sub(rb'url\("data:[^"]*"\)', b"", content)  # a font may draw any text
+            told = re.sub(rb'url\("data:[^"]*"\)', b"", content)  # a font is no text
             assert not re.search(rb"zoe|\bann\b|bob", told), name
             assert not re.search(r"zoe|ann-|bob", name)
     (ann,) = [n for n, row in key.items() if row["authors"] == "ann"]
     (zoe,) = [n for n, row in key.items() if row["authors"] == "zoe"]
     flag = json.loads(before[f"feedback/{zoe}/grade.json"])["flags"][0]
-    assert flag["evidence"]["submissions"] == [ann]  # a new submission keeps its pseudonym
+    assert flag["evidence"]["submissions"] == [ann]  # the pseudonym is as before
     assert ann in flag["message"]
 
 
-def test_a_name_that_is_a_number_or_a_word_garbles_nothing():
-    """Hiding teams named 3 or step leaves numbers and experiments in their feedback as they are."""
+def test_hiding_a_name_does_not_change_other_words():
+    """Hiding teams named `3` or `step` does not change their feedback's numbers and experiments."""
     grade = make_grade("3", share=0.5, flags=(hertz_flag(), shared_flag("step")))
     hidden = anonymise(grade, {"3": "anon-a", "step": "anon-b"})
     assert [c.message for c in hidden.criteria] == [c.message for c in grade.criteria]
@@ -257,12 +257,12 @@ def test_a_name_that_is_a_number_or_a_word_garbles_nothing():
     ],
 )
 def test_a_reason_names_nobody(reason, shown):
-    """In anonymous grading, a reason shows no folder or archive that bears a student's name."""
+    """In an anonymous grading, a reason shows no folder or archive with a student's name."""
     assert anonymise(failed_grade("3", reason), {"3": "anon-a"}).reason == shown
 
 
-def test_names_that_stand_in_are_all_different():
-    """Ten thousand pseudonyms, made from the submissions alone, are all different."""
+def test_pseudonyms_are_all_different():
+    """Ten thousand pseudonyms, computed from the submissions alone, are all different."""
     names = pseudonyms({f"team-{n}": f"key {n}" for n in range(10_000)})
     assert len(set(names.values())) == 10_000
     assert names["team-7"].startswith(pseudonyms({"renamed": "key 7"})["renamed"])
@@ -279,10 +279,10 @@ def test_every_flag_has_a_name_and_a_place_to_look():
         ]
 
 
-def test_the_feedback_puts_their_numbers_beside_ours():
+def test_the_feedback_compares_reported_and_recomputed_numbers():
     """The feedback shows reported number, recomputed number and difference, with message and help.
 
-    It also shows what lateness costs.
+    It also shows the deduction for lateness.
     """
     grade = make_grade("team-1", share=0.5, days_late=1.5, deducted=2.0, flags=(hertz_flag(),))
     html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
@@ -304,7 +304,7 @@ def test_feedback_on_shared_data_names_nobody_and_does_not_praise():
     assert not re.search("b-team|Well done", html)
 
 
-def test_a_submission_that_could_not_be_graded_hears_why():
+def test_feedback_says_why_a_submission_was_not_graded():
     """If a submission could not be graded, its feedback says why and what to do."""
     grade = failed_grade("team-1", "no submission.toml in it")
     html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
@@ -312,10 +312,10 @@ def test_a_submission_that_could_not_be_graded_hears_why():
     assert "Fix it and hand it in again" in html
 
 
-def test_a_broken_submission_hears_every_reason(tmp_path):
+def test_feedback_lists_every_mistake_of_a_broken_submission(tmp_path):
     """If a submission's file has three mistakes, the feedback lists them in three lines.
 
-    In the table they are in one cell.
+    In the table they share one cell.
     """
     folder = tmp_path / "class" / "team-1"
     (folder / "data").mkdir(parents=True)
@@ -386,9 +386,9 @@ _VALUES = (
 @settings(max_examples=40)
 @given(st.dictionaries(st.text(max_size=8), _VALUES, max_size=4))
 def test_any_numbers_can_be_shown(values):
-    """Any numbers of a criterion give a page without control characters.
+    """Whatever the numbers of a criterion are, the page has no control characters.
 
-    They may be infinite, missing, texts or nested.
+    The numbers may be infinite, missing, nested or text.
     """
     grade = make_grade("team-1", share=0.5)
     found = dict(reversed(values.items()))
@@ -399,10 +399,10 @@ def test_any_numbers_can_be_shown(values):
 
 
 @pytest.mark.parametrize(("points", "percent"), [(19.95, "99"), (4.6, "23")])
-def test_only_all_points_are_100_percent(points, percent):
+def test_only_full_points_are_100_percent(points, percent):
     """Percentages are computed from the decimals as typed and rounded down.
 
-    So only all points give 100 %.
+    So only full points are shown as 100 %.
     """
     page = class_page([Line.of(make_grade("a", points=points))], rubric=RUBRIC)
     cells = re.sub(r"<[^>]+>", " ", page.split("All submissions.")[-1]).split()
@@ -428,7 +428,7 @@ def test_the_class_page_counts_what_there_is():
 def shares(*found: tuple[str, str, str]) -> Flag:
     """Return a flag for shared data.
 
-    Each argument is an own recording, another submission and its recording.
+    Each argument has a recording of this submission, another submission, and its recording.
     """
     keys = ("experiment", "submission", "other_experiment")
     recordings = [{**dict(zip(keys, one, strict=True)), "sigmas": 9.5} for one in found]
@@ -436,7 +436,7 @@ def shares(*found: tuple[str, str, str]) -> Flag:
     return shared_flag("x").model_copy(update={"evidence": evidence})
 
 
-def test_the_class_page_groups_who_shares_with_whom(tmp_path):
+def test_the_class_page_lists_groups_that_share_recordings(tmp_path):
     """The class page lists groups that share recordings.
 
     A submission of an earlier batch is named without a link.
@@ -472,7 +472,7 @@ def test_the_class_page_groups_who_shares_with_whom(tmp_path):
     assert [text for text in texts[True] if re.search(r"anon-\w+ , another submission", text)]
 
 
-def test_the_class_is_a_frame(tmp_path):
+def test_the_data_frame_has_a_row_for_each_criterion(tmp_path):
     """The data frame of a class has one row for each submission and criterion.
 
     A criterion that was never judged has no points.
@@ -509,7 +509,7 @@ def missing_flag() -> Flag:
     return Flag(code="missing", parameters=("K_1",), message="K_1 is missing.", evidence={})
 
 
-def test_points_by_hand_are_not_asked_for_again():
+def test_points_by_hand_need_no_new_submission():
     """If points were given by hand, neither the page nor Gradescope asks for a new submission."""
     grade = failed_grade("team-7", "no submission.toml in it")
     given = HandPoints(criterion=RUBRIC.criteria[0].id, points=1.0, why="x", by="y", at="")
@@ -538,7 +538,7 @@ def test_points_are_read_as_typed(text, points):
     assert read_points(text) == points
 
 
-def test_points_that_are_none_are_refused():
+def test_a_text_that_is_not_points_is_refused():
     """A text that is not a number of points is refused, and the message says what is allowed."""
     with pytest.raises(ConfigError, match="two: expected a number of points, or auto"):
         read_points("two")

@@ -1,4 +1,4 @@
-"""The preview of a class under another rubric gives the same points as grading again."""
+"""The preview of a class under another rubric gives the same points as a new grading."""
 
 import re
 from dataclasses import replace
@@ -55,10 +55,10 @@ def _grade(school: Path, out: Path, rubric: Rubric) -> Gradebook:
     return book
 
 
-def test_the_preview_is_what_grading_again_gives(school, tmp_path):
-    """The preview of a changed rubric gives the same points as grading again.
+def test_the_preview_gives_the_points_of_a_new_grading(school, tmp_path):
+    """The preview of a changed rubric gives the same points as a new grading.
 
-    Points given by hand stay.
+    Points given by hand stay in both.
     """
     plain = RUBRIC.model_dump(mode="json")
     plain["late"]["percent_per_day"] = 40.0
@@ -97,7 +97,7 @@ def test_the_preview_is_what_grading_again_gives(school, tmp_path):
     assert sum(shown.bars_before) == sum(shown.bars_after) == 3
 
 
-def test_who_was_graded_before_findings_were_kept_is_named(tmp_path):
+def test_a_team_without_stored_findings_is_named(tmp_path):
     """If a grade has no stored findings, the preview names the team and shows no points."""
     fill_book(tmp_path)
     with Gradebook(tmp_path) as book:
@@ -106,7 +106,7 @@ def test_who_was_graded_before_findings_were_kept_is_named(tmp_path):
     assert sorted(shown.unknown) == sorted(graded)
 
 
-def test_who_was_graded_by_another_rubric_is_named(school, tmp_path):
+def test_a_team_graded_by_another_rubric_is_named(school, tmp_path):
     """If a team was graded by another rubric, the preview names the team and shows no points."""
     plain = RUBRIC.model_dump(mode="json")
     plain["required"]["final"] = []

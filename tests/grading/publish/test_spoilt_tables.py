@@ -1,4 +1,4 @@
-"""A damaged or hostile table gives a result or one clear error."""
+"""A damaged or hostile table gives either a result or one clear error."""
 
 import csv
 import io
@@ -51,7 +51,7 @@ def filled(platform) -> Callable[[Path], object]:
 
 
 def tabulate(path: Path) -> None:
-    """Read a questionnaire and write its tables."""
+    """Read a questionnaire and write the tables of its answers."""
     survey = read_survey(path)
     survey_text(survey)
     survey_dict(survey)

@@ -1,4 +1,4 @@
-"""Answers that were made to fit the paper's Tables 4 and 5 give these tables."""
+"""Answers made to fit Tables 4 and 5 of the paper reproduce these tables."""
 
 import json
 import re
@@ -8,7 +8,7 @@ import pytest
 from pipeline.errors import ConfigError
 from pipeline.grading.publish.survey import LEVELS, SCALE, read_survey, survey_dict, survey_text
 
-# Table 4 of Throne (2005) has whole percents of the twelve who answered each question.
+# Table 4 of Throne (2005) gives whole percentages of the twelve students who answered.
 TABLE_4 = {
     "uses of models": (75, 25, 0, 0, 0),
     "limitations of models": (58, 33, 8, 0, 0),
@@ -19,7 +19,7 @@ COUNTS = {
     "limitations of models": (7, 4, 1, 0, 0),
     "frequency response": (5, 7, 0, 0, 0),
 }
-# Table 5 has averages with two decimals; all are twelfths.
+# The averages in Table 5 have two decimals; each is a multiple of 1/12.
 TABLE_5 = {
     "approaches to modeling": ("2.83", "2.75", "3.67", "3.67"),
     "model and real system": ("3.00", "2.92", "3.67", "3.58"),
@@ -52,7 +52,7 @@ def write_paper(path, *, heading="{level}: {concept}"):
 @pytest.mark.parametrize(
     "heading", ["{level}: {concept}", "{level} [{concept}]", "{level} - {concept}"]
 )
-def test_the_tables_of_the_paper_come_out(tmp_path, heading):
+def test_the_tables_of_the_paper_are_reproduced(tmp_path, heading):
     """The paper's tables are reproduced to the digit; a column of dates is left out."""
     survey = read_survey(write_paper(tmp_path / "answers.csv", heading=heading))
 
@@ -66,7 +66,7 @@ def test_the_tables_of_the_paper_come_out(tmp_path, heading):
     assert plain["concepts"][0]["answers"]["Pre Course Knowledge"] == 12
 
 
-def test_the_tables_read_as_markdown(tmp_path):
+def test_the_tables_are_printed_as_markdown(tmp_path):
     """The tables printed as Markdown have the paper's headings and aligned columns."""
     text = survey_text(read_survey(write_paper(tmp_path / "answers.csv")))
     rows = [re.split(r"\s*\|\s*", line.strip("| ")) for line in text.splitlines() if "|" in line]

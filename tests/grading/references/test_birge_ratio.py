@@ -1,4 +1,4 @@
-"""A fit that contradicts other readings of the same carts counts with larger standard errors."""
+"""A fit that contradicts other estimates of the same carts gets larger standard errors."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from tests.helpers.grading_students import student
 
 
 def with_gain_off(analysis: Analysis, *, sigmas: float) -> Analysis:
-    """Return the analysis with the fitted K_1 so many standard errors from that of the steps."""
+    """Return the analysis with the fitted K_1 this many standard errors from that of the steps."""
     rows = []
     for row in analysis.rows:
         if row.name == "K_1":
@@ -26,7 +26,10 @@ def with_gain_off(analysis: Analysis, *, sigmas: float) -> Analysis:
 
 @pytest.mark.parametrize("sigmas", [0.0, 30.0])
 def test_the_errors_grow_with_the_contradiction(sigmas):
-    """The errors of all fitted gains grow by the gains' Birge ratio; those of frequencies stay."""
+    """All fitted gains' standard errors grow by the gains' Birge ratio;
+
+    those of frequencies do not.
+    """
     analysis = with_gain_off(student(2).analysis, sigmas=sigmas)
     apart = [
         (row.initial.value - row.final.value) / np.hypot(row.initial.std or 0, row.final.std or 0)

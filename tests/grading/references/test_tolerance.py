@@ -1,4 +1,4 @@
-"""Rounding is subtracted before an error is judged, and limits of a tolerance are exact."""
+"""Rounding is subtracted before an error is judged, and the limits of a tolerance are exact."""
 
 from decimal import Decimal
 from fractions import Fraction
@@ -27,16 +27,16 @@ def at(value: float, *, std: float = 0.0) -> Reference:
     ("typed", "half"),
     [("0.10", "0.005"), ("29", "0.5"), ("2.90e1", "0.05"), ("-3.5", "0.05"), ("0", "0.5")],
 )
-def test_half_a_digit_is_that_of_the_typed_number(typed, half):
-    """The rounding of a typed number is half of its last digit: 0.005 for 0.10, 0.5 for 29."""
+def test_rounding_is_half_of_the_last_digit(typed, half):
+    """The rounding error of a typed number is half its last digit: 0.005 for 0.10, 0.5 for 29."""
     assert half_digit(Decimal(typed)) == Fraction(half)
 
 
 @given(full=percents, width=percents)
-def test_the_edges_belong_to_the_tolerance(full, width):
+def test_the_limits_of_a_tolerance_are_exact(full, width):
     """An error of exactly `full` earns all points, and one of exactly `none` earns no points.
 
-    If both limits are equal, that error earns all points.
+    If both limits are equal, an error at the limit earns all points.
     """
     none = float(Decimal(str(full)) + Decimal(str(width)))
     assert credit(Fraction(str(full)), full=full, none=none) == 1
@@ -69,7 +69,7 @@ def test_the_error_grows_with_the_distance(value, steps, sign):
     assert errors[0] <= errors[1]
 
 
-def test_rounding_and_standard_errors_come_off_first():
+def test_rounding_and_standard_errors_are_subtracted_first():
     """Rounding and then the standard errors are subtracted from the difference.
 
     A typed 105 is 4.5 off 100; with a standard error of 1 and 3 sigmas, 1.5/103 remains.
@@ -79,11 +79,11 @@ def test_rounding_and_standard_errors_come_off_first():
     assert error == 100 * (Fraction(209, 2) / 103 - 1)
 
 
-def test_five_percent_is_the_same_factor_either_way():
+def test_too_small_and_too_large_by_one_factor_are_the_same_error():
     """A number too small by some factor has the same error as one too large by that factor."""
     high = percent_off(Decimal("120.0000"), at(100.0), sigmas=0.0)
     low = percent_off(Decimal("83.33333"), at(100.0), sigmas=0.0)
-    # The digits typed differ: half of a unit in 1e-4 and 1e-5 is 1e-4 percent.
+    # The typed digits differ: half a unit of the last digit is 1e-4 percent of 1e-4 or 1e-5.
     assert abs(high - low) < Fraction(2, 10**4)
 
 
@@ -94,16 +94,16 @@ def test_a_wrong_sign_earns_nothing():
 
 
 @pytest.mark.parametrize("vague", ["0e2", "0", "0.0", "-0.0"])
-def test_a_zero_is_no_number_that_fits_everything(vague):
+def test_a_typed_zero_earns_nothing(vague):
     """A typed zero earns nothing, since rounding may excuse only a share of the number."""
     assert rounding(Decimal(vague)) == 0
     assert credit(percent_off(Decimal(vague), at(0.1), sigmas=0.0), full=50.0, none=200.0) == 0
 
 
-def test_one_digit_is_excused_as_little_as_two():
-    """A number typed with one digit is excused no more rounding than one with two digits.
+def test_one_digit_is_excused_no_more_than_two():
+    """A number typed with one digit gets the rounding allowance of one with two digits.
 
-    3e1 may mean 28.5 to 31.5, not 25 to 35.
+    So 3e1 stands for 28.5 to 31.5, not for 25 to 35.
     """
     assert rounding(Decimal("3e1")) == Fraction(3, 2)
     assert percent_off(Decimal("3e1"), at(35.0), sigmas=0.0) == 100 * (Fraction(70, 63) - 1)

@@ -1,4 +1,4 @@
-"""The check names the numbers that disagree and where to look, but no answer reveals a value."""
+"""The check names the numbers that disagree and where to look, but reveals no value."""
 
 import json
 import re
@@ -12,8 +12,8 @@ from pipeline.grading.self_check.words import answer_lines
 from tests.helpers.grading_class import Team, make_team
 from tests.helpers.grading_slips import OF_SEVERAL_CARTS, SLIPS, reporting, scaled
 
-SEEDS = range(3)  # one bench each of one, two and three carts
-NOT_PLACED = {  # no number disagrees with the recordings
+SEEDS = range(3)  # one bench each with one, two and three carts
+NOT_PLACED = {  # seeds for which no number disagrees with the recordings
     "initial_final_disagree",
     "missing",
     "no_fit_done",
@@ -22,7 +22,7 @@ team = cache(make_team)
 
 
 def slipped(slip: str, seed: int) -> Team:
-    """Return the team of a seed with a mistake, or unchanged if its carts do not allow it."""
+    """Return the seed's team with a mistake, or unchanged if its carts do not allow the mistake."""
     one = team(seed)
     alone = one.bench.chain.n == 1 and slip in OF_SEVERAL_CARTS
     return one if alone else SLIPS[slip](one)
@@ -38,7 +38,7 @@ def asked_twice(found: JudgedNumbers) -> tuple[CheckAnswer, CheckAnswer]:
 
 
 def stripped(text: str, one: Team) -> str:
-    """Return a text without the names of numbers, recordings and carts, and without counts."""
+    """Return a text without counts and without the names of numbers, recordings and carts."""
     for run in sorted((e.id for e in one.submission.experiments), key=len, reverse=True):
         text = text.replace(run, "")
     text = re.sub(r"(initial|final)\.\w+|state_space\.[AB]\([\d, ]+\)", "", text)
@@ -49,8 +49,8 @@ def stripped(text: str, one: Team) -> str:
 
 @pytest.mark.parametrize("slip", sorted(SLIPS))
 @pytest.mark.parametrize("seed", SEEDS)
-def test_no_answer_holds_anything_numeric_of_a_value(seed, slip):
-    """In words and in JSON, answers contain no digits besides those in names and counts."""
+def test_no_answer_contains_digits_of_a_value(seed, slip):
+    """In words and in JSON, the only digits of an answer are in names and counts."""
     one = slipped(slip, seed)
     for answer in asked_twice(judge(one)):
         said = stripped("\n".join(answer_lines(answer)), one)
@@ -61,7 +61,7 @@ def test_no_answer_holds_anything_numeric_of_a_value(seed, slip):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_answer_tells_neither_side_nor_size(seed):
+def test_the_answer_reveals_neither_sign_nor_size_of_an_error(seed):
     """The answer does not reveal whether a gain is too large or too small, nor by how much."""
     one = team(seed)
     name = next(iter(one.reported.final))
@@ -86,8 +86,8 @@ def test_honest_numbers_agree(seed):
 
 
 @pytest.mark.parametrize("slip", sorted(SLIPS.keys() - NOT_PLACED))
-def test_each_common_mistake_is_placed(slip):
-    """In the second stage, the check names the right mistake for most of the wrong numbers."""
+def test_most_common_mistakes_are_recognised(slip):
+    """At the second run, the check names the right mistake for most of the wrong numbers."""
     placed = []
     for seed in SEEDS:
         one = slipped(slip, seed)
@@ -101,10 +101,10 @@ def test_each_common_mistake_is_placed(slip):
     assert sum(placed) >= 0.6 * len(placed)
 
 
-def test_where_is_told_only_of_what_disagreed_and_was_not_changed():
-    """The first answer says which numbers disagree; asked again, it says where to look.
+def test_only_an_unchanged_number_gets_a_hint_where_to_look():
+    """The first answer says which numbers disagree; the next one says where to look.
 
-    After any change it says only which numbers disagree.
+    After any change, the answer again says only which numbers disagree.
     """
     one = SLIPS["peak_to_peak"](team(1))
     found = judge(one)

@@ -1,4 +1,4 @@
-"""`cartlab check` is run as typed, and its exit status and its file of answers are tested."""
+"""`cartlab check` is run as typed; its exit status and its file of answers are tested."""
 
 import json
 import re
@@ -45,18 +45,18 @@ def in_hertz(honest):
     return honest
 
 
-def test_right_numbers_are_status_0(honest):
-    """If all numbers agree, the exit status is 0, and the folder records this one check."""
+def test_correct_numbers_end_with_status_0(honest):
+    """If all numbers agree, the exit status is 0, and the folder records one check."""
     done = check(honest, "--rubric", RUBRIC)
     assert done.returncode == 0
     assert re.match(r"All \d+ numbers that were checked agree", done.stdout)
     assert len(read_answers(honest)) == 1
 
 
-def test_first_which_then_where(in_hertz):
+def test_the_second_answer_says_where_to_look(in_hertz):
     """The first answer names the wrong number, the second says where to look.
 
-    Neither gives the right value, and the exit status is 1 both times.
+    Neither answer gives the right value, and the exit status is 1 both times.
     """
     first, second = check(in_hertz), check(in_hertz)
     assert (first.returncode, second.returncode) == (1, 1)
@@ -69,10 +69,10 @@ def test_first_which_then_where(in_hertz):
         assert not re.search(r"13[.\d]|6\.28", said)
 
 
-def test_a_change_begins_again_with_which(in_hertz):
-    """After any change, the next answer again says only which numbers disagree.
+def test_after_a_change_the_answer_only_names_the_number(in_hertz):
+    """After any change, the next answer says only which numbers disagree.
 
-    Every question is counted.
+    Each run is counted.
     """
     check(in_hertz)
     change(in_hertz, "omega_n = 2.085", "omega_n = 9.0")
@@ -81,7 +81,7 @@ def test_a_change_begins_again_with_which(in_hertz):
     assert [one.stage for one in read_answers(in_hertz)] == ["which", "which"]
 
 
-def test_json_is_the_line_that_is_added(in_hertz):
+def test_json_prints_the_line_that_is_added(in_hertz):
     """`--json` prints the same line that is added to the file of answers.
 
     The line follows the schema and contains no time.
@@ -94,8 +94,8 @@ def test_json_is_the_line_that_is_added(in_hertz):
         assert json.loads(line)["ask"] == number
 
 
-def test_a_rubric_of_other_carts_cannot_be_used(honest):
-    """If the rubric is for other carts, one line says so and nothing is counted."""
+def test_a_rubric_for_other_carts_is_refused(honest):
+    """If the rubric is for another number of carts, one line says so and nothing is counted."""
     done = check(honest, "--rubric", "throne-2dof")
     assert done.returncode == 2
     assert "the submission is for 1 cart, the rubric for 2" in done.stderr
@@ -103,7 +103,7 @@ def test_a_rubric_of_other_carts_cannot_be_used(honest):
 
 
 def test_nothing_reported_cannot_be_checked(honest):
-    """If no number is reported, the message says what to write where."""
+    """If no number is reported, the message says what to write and where."""
     path = honest / "submission.toml"
     text = path.read_text(encoding="utf-8").partition("[reported")[0]
     path.write_text(text, encoding="utf-8")
@@ -115,7 +115,7 @@ def test_nothing_reported_cannot_be_checked(honest):
 @pytest.mark.parametrize(
     "text", ["", "\n", "{}\n", "no json\n", '{"ask": 1}\n', "[" * 100_000, "\x00", "\u2028\n"]
 )
-def test_a_file_of_asks_that_is_not_as_it_was_is_refused(honest, text):
+def test_an_edited_file_of_answers_is_refused(honest, text):
     """If the file of answers was edited, the check is refused and the file stays.
 
     An empty file is accepted.
@@ -130,10 +130,10 @@ def test_a_file_of_asks_that_is_not_as_it_was_is_refused(honest, text):
         assert done.returncode == 0
 
 
-def test_a_line_taken_out_is_refused(in_hertz):
+def test_a_missing_line_is_refused(in_hertz):
     """If a line of the file is missing, `cartlab check` refuses to answer.
 
-    The questions are numbered, so a missing one shows.
+    The lines are numbered, so a missing line is noticed.
     """
     for _ in range(3):
         check(in_hertz)
@@ -154,7 +154,7 @@ def test_a_link_is_not_followed(honest, tmp_path):
     assert other.read_text(encoding="utf-8") == "mine"
 
 
-def test_the_grade_tells_how_often_it_was_asked(in_hertz, tmp_path):
+def test_the_grade_says_how_often_the_check_was_run(in_hertz, tmp_path):
     """A note in the grade says how often the check was run, or that its file was changed.
 
     It costs no points.
@@ -173,7 +173,7 @@ def test_the_grade_tells_how_often_it_was_asked(in_hertz, tmp_path):
     assert "was changed and cannot be read" in notes()[-1]
 
 
-def test_what_students_see_is_report_or_check(honest, tmp_path):
+def test_a_wrong_value_of_see_is_refused(honest, tmp_path):
     """If the key `see` of a rubric or submission is wrong, one line gives the allowed values."""
     rubric = tmp_path / "lab.toml"
     text = RUBRIC.read_text(encoding="utf-8")

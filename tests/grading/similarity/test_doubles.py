@@ -44,10 +44,10 @@ def told(folder: Path, recordings, *, anonymous: bool = False) -> list[Double]:
         return write_outputs(book, folder)
 
 
-def test_a_copy_with_the_victims_id_is_told(recordings, tmp_path):
+def test_a_copy_that_names_its_victim_is_reported(recordings, tmp_path):
     """If a copied submission names its victim as an author, the class page says so.
 
-    It gives the person, both submissions and their number of common recordings.
+    The page names the person and both submissions, and counts their common recordings.
     """
     (double,) = told(tmp_path, recordings)
     assert (double.authors, double.submissions) == (("bob",), ("team-1", "team-9"))
@@ -60,14 +60,14 @@ def test_a_copy_with_the_victims_id_is_told(recordings, tmp_path):
 
 
 def test_without_names_nobody_is_named(recordings, tmp_path):
-    """In anonymous grading, the message has the submissions' pseudonyms and names no person."""
+    """In an anonymous grading, the message has the submissions' pseudonyms and names no person."""
     (double,) = told(tmp_path, recordings, anonymous=True)
     assert re.fullmatch(
         r"One person is in anon-\w+ and anon-\w+, and these share \d+ recordings", str(double)
     )
 
 
-def test_recordings_are_counted_not_pairs_of_submissions(recordings):
+def test_each_common_recording_is_counted_once(recordings):
     """If four submissions have the same recordings, each recording is counted once."""
     prints = [
         Member(submission=f"t{i}", authors=("s1",), fingerprints=recordings[0]) for i in range(4)
@@ -79,8 +79,8 @@ def test_recordings_are_counted_not_pairs_of_submissions(recordings):
     assert counted[0] == counted[1] >= 3
 
 
-def test_what_could_not_be_read_was_not_compared(recordings):
-    """If a submission has no fingerprints, the number of common recordings is left open."""
+def test_a_submission_without_fingerprints_was_not_compared(recordings):
+    """If a submission has no fingerprints, the message says that it could not be compared."""
     for left, compared in ((b"", False), (recordings[1], True)):
         prints = [
             Member(submission=name, authors=("s1",), fingerprints=kept)
@@ -91,10 +91,10 @@ def test_what_could_not_be_read_was_not_compared(recordings):
         assert ("could not be compared" in str(double)) is not compared
 
 
-def test_partners_in_the_same_two_submissions_are_told_of_once():
+def test_partners_in_two_submissions_are_reported_once():
     """Two partners who are both in the same two submissions are reported once.
 
-    An author of two other submissions is reported apart.
+    An author of two other submissions gets a separate message.
     """
     teams = {"a": ("x", "y"), "b": ("Y", "x"), "c": ("z",), "d": ("z", "x2")}
     both, alone = find_doubles(teams)
@@ -104,10 +104,10 @@ def test_partners_in_the_same_two_submissions_are_told_of_once():
     assert str(replace(both, authors=("", ""))).startswith("2 people are in a and b")
 
 
-def test_one_submission_each_is_nothing_to_tell():
+def test_nobody_is_reported_for_one_submission():
     """If each person is in only one submission, nothing is reported.
 
-    An id that one submission gives twice counts once.
+    An id that one submission lists twice counts once.
     """
     assert find_doubles({"a": ("x", "y"), "b": ("z", "Z ")}) == []
     (double,) = find_doubles({f"t{i}": ("S\n1",) for i in range(10)})

@@ -1,4 +1,4 @@
-"""A shared recording is found however disguised, and teams on one bench are not flagged."""
+"""A shared recording is found however it is disguised, and teams on one bench are not flagged."""
 
 import json
 import zlib
@@ -31,7 +31,7 @@ def teams(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def others(teams):
-    """Return four teams of the class that share nothing with anybody."""
+    """Return four more teams of the class that share nothing with anybody."""
     return [prints(f"other-{number}", records) for number, records in enumerate(teams[2:])]
 
 
@@ -59,7 +59,7 @@ def disguised(record, rng, *, noise=0.0, scale=1.0, keep=1.0, later=0.0):
 
 @pytest.fixture(scope="module")
 def quiet_teams(tmp_path_factory):
-    """Return three teams' readings on one bench, with encoders too fine to show noise."""
+    """Return three teams' recordings on one bench, with encoders too fine to show rounding."""
     folder = tmp_path_factory.mktemp("quiet")
     for seed in range(3):
         write_submission(
@@ -72,9 +72,9 @@ def quiet_teams(tmp_path_factory):
 
 
 def rounded(records, *, count, seed):
-    """Return recordings as read by an encoder with this step, with any zero, without noise.
+    """Return recordings rounded to the given encoder step, each cart with a random zero.
 
-    Only open-loop runs are returned, since a controller would also have read this encoder.
+    Closed-loop runs are omitted, because the controller would have read this encoder too.
     """
     rng = np.random.default_rng(seed)
     zeros = [rng.uniform(-2, 2, size=(record.y.shape[0], 1)) for record in records]
@@ -94,23 +94,22 @@ def of_kind(records, kind):
 
 
 def test_honest_teams_on_one_bench_share_nothing(teams):
-    """Teams that drive the same bench with the same inputs are not flagged.
+    """Teams that drive the same bench with the same inputs are not flagged, as their noise differs.
 
-    Their noise differs.
     """
     assert find_shared([prints(str(i), records) for i, records in enumerate(teams)]) == {}
 
 
 @pytest.mark.parametrize("per_cm", [5, 20, 37, 100, 500])
-def test_rounding_of_one_motion_is_nobodys(quiet_teams, per_cm):
-    """If two recordings without noise are equal only by rounding, nobody is flagged."""
+def test_agreement_by_rounding_is_not_flagged(quiet_teams, per_cm):
+    """If two noise-free recordings agree only because of rounding, nobody is flagged."""
     honest = [
         rounded(records, count=1 / per_cm, seed=seed) for seed, records in enumerate(quiet_teams)
     ]
     batch = [prints(str(seed), records) for seed, records in enumerate(honest)]
     assert find_shared(batch) == {}
     rng = np.random.default_rng(4)
-    if per_cm >= 100:  # a whole submission has too many possible zeros in common
+    if per_cm >= 100:  # with fewer steps per cm, a whole submission has too many zeros in common
         copied = [disguised(r, rng, keep=0.8, later=2.0) for r in honest[0]]
         assert set(find_shared([*batch, prints("copy", copied)])) == {"0", "copy"}
 
@@ -119,7 +118,7 @@ def test_rounding_of_one_motion_is_nobodys(quiet_teams, per_cm):
 def test_honest_teams_with_coarse_encoders_share_nothing(tmp_path, per_cm):
     """Honest teams with coarse encoders are not flagged, even if a cart moves by one or two counts.
 
-    Under feedback the input then has few levels too.
+    Under feedback, the input then has few levels too.
     """
     for seed in (1, 2, 7):
         write_submission(
@@ -147,8 +146,8 @@ def test_honest_teams_with_coarse_encoders_share_nothing(tmp_path, per_cm):
     ],
     ids=str,
 )
-def test_one_copied_recording_is_found_however_disguised(teams, others, kind, disguise):
-    """One copied recording among honest ones is found and named on both sides."""
+def test_a_disguised_copy_of_one_recording_is_found(teams, others, kind, disguise):
+    """One copied recording among honest ones is found, and both submissions name it."""
     rng = np.random.default_rng(7)
     copied = disguised(of_kind(teams[0], kind), rng, **disguise)
     found = find_shared([prints("a", teams[0]), prints("b", [*teams[1], copied]), *others])
@@ -158,11 +157,11 @@ def test_one_copied_recording_is_found_however_disguised(teams, others, kind, di
     assert mine.experiment == copied.id
 
 
-def test_under_feedback_the_input_gives_a_copy_away(teams, others):
+def test_under_feedback_a_copy_is_found_by_its_input(teams, others):
     """Under feedback, a copy is recognised by its input, even if noise was added.
 
-    The controller turned the carts' own noise into input. The copy here also lacks the start, where
-    the reference steps.
+    The input contains the carts' own noise. The copy in this test lacks the start of the recording,
+    where the reference steps.
     """
     rng = np.random.default_rng(9)
     record = of_kind(teams[0], "closed_loop")
@@ -182,7 +181,7 @@ def test_under_feedback_the_input_gives_a_copy_away(teams, others):
 def test_a_whole_copy_is_found_under_much_noise(teams, others):
     """If a whole submission is copied, even strong added noise cannot hide every recording.
 
-    The noise is six times the encoder's own.
+    The added noise is six times that of the encoder.
     """
     rng = np.random.default_rng(8)
     copied = [disguised(r, rng, noise=1.5, scale=0.9, keep=0.8) for r in teams[0]]
@@ -191,15 +190,15 @@ def test_a_whole_copy_is_found_under_much_noise(teams, others):
     assert {record.submission for record in found["a"]} == {"b"}
 
 
-def test_teammates_and_repeats_do_not_count(teams):
-    """Submissions with a common author, and a recording submitted twice, are not flagged."""
+def test_teammates_and_repeats_are_not_flagged(teams):
+    """Submissions with a common author are not flagged, nor is a recording submitted twice."""
     twice = [*teams[0], replace(of_kind(teams[0], "step"), id="again")]
     a = prints("a", twice, authors=("ann", "bob"))
     b = prints("b", teams[0], authors=("bob", "carl"))
     assert find_shared([a, b]) == {}
 
 
-def test_what_was_handed_out_may_be_used_by_all(teams):
+def test_recordings_that_were_handed_out_are_not_flagged(teams):
     """Recordings that the instructor handed out are not flagged; a copy of any other one is."""
     given, own = teams[0][:-1], teams[0][-1]
     example = fingerprint(given)
@@ -213,7 +212,7 @@ def test_what_was_handed_out_may_be_used_by_all(teams):
     }
 
 
-def test_what_was_handed_out_may_be_used_by_a_whole_class(teams):
+def test_a_whole_class_may_use_a_handed_out_recording(teams):
     """However many teams submit a handed-out recording, none of the teams is flagged."""
     rng = np.random.default_rng(11)
     copies = [[disguised(r, rng, scale=2.0, later=1.0) for r in teams[0][:2]] for _ in range(40)]
@@ -222,7 +221,7 @@ def test_what_was_handed_out_may_be_used_by_a_whole_class(teams):
     assert find_shared(batch, examples=[fingerprint(teams[0][:2])]) == {}
 
 
-def test_earlier_batches_count(teams):
+def test_a_copy_from_an_earlier_batch_is_found(teams):
     """A recording from an earlier batch is found and named as such.
 
     Copies within the earlier batch are not reported again.
@@ -238,7 +237,7 @@ def test_earlier_batches_count(teams):
 
 @pytest.fixture
 def compared(monkeypatch):
-    """Return all pairs of recordings compared sample by sample, and each time shift."""
+    """Record each compared pair of recordings and the number of its time shifts."""
     pairs, compare = [], shared.compare
 
     def counted(a, b, **how):
@@ -263,7 +262,7 @@ def test_a_recording_under_many_names_is_compared_once(teams, compared):
 
 @pytest.mark.parametrize("alike", ["cuts of one run", "one hum in all"])
 def test_the_cost_grows_with_the_recordings_not_their_square(teams, alike, compared):
-    """Submissions made to look the same everywhere take time in proportion to their size."""
+    """If submissions look the same everywhere, the time grows only in proportion to their size."""
     rng = np.random.default_rng(5)
     record = of_kind(teams[0], "decay")
     if alike == "cuts of one run":
@@ -277,7 +276,7 @@ def test_the_cost_grows_with_the_recordings_not_their_square(teams, alike, compa
 
 
 @pytest.mark.parametrize("kind", ["step", "decay"])
-def test_real_repeats_on_one_bench_are_not_shared(real_data, tmp_path, kind):
+def test_repeats_on_a_real_bench_are_not_flagged(real_data, tmp_path, kind):
     """Repeats of one experiment on a real bench are not flagged as copies of each other."""
     folder = write_two_cart_submission(tmp_path / "s", real_data, steps=(1, 2, 3, 4, 5))
     records = [r for r in read_data(load_submission(folder)).records if r.kind == kind]
@@ -295,7 +294,7 @@ def knocking():
     return read_class(moved, seed=3)
 
 
-def test_the_knocks_of_a_bench_are_nobodys(knocking):
+def test_the_impacts_of_a_bench_are_not_flagged(knocking):
     """Teams that share only a bench's impacts are not flagged; a noisy copy is still found."""
     honest = [prints(str(number), records) for number, records in enumerate(knocking)]
     assert find_shared(honest) == {}
@@ -307,10 +306,10 @@ def test_the_knocks_of_a_bench_are_nobodys(knocking):
 
 
 @pytest.mark.parametrize("members", [2, 3])
-def test_a_small_class_is_told_of_equal_rows_only(teams, members):
+def test_in_a_small_class_only_equal_rows_are_flagged(teams, members):
     """In a class of two or three teams, a copy is flagged only if its rows are equal.
 
-    Equal noise could come from the bench, and so few teams cannot rule that out.
+    So few teams cannot rule out that equal noise comes from the bench.
     """
     rng = np.random.default_rng(2)
     record = of_kind(teams[0], "step")
@@ -321,7 +320,7 @@ def test_a_small_class_is_told_of_equal_rows_only(teams, members):
         assert set(find_shared([prints("a", teams[0]), b, *others])) == told
 
 
-def test_three_of_six_may_have_the_same_copy(teams):
+def test_three_equal_copies_among_six_teams_are_flagged(teams):
     """If three of six teams have the same copy, all three are flagged.
 
     The copies do not count as evidence that the noise comes from the bench.
@@ -341,7 +340,7 @@ def test_three_of_six_may_have_the_same_copy(teams):
     }
 
 
-def test_a_flag_names_what_can_be_checked(teams):
+def test_a_flag_says_which_rows_are_equal(teams):
     """The flag's evidence and message say which rows at which times are equal."""
     copied = disguised(of_kind(teams[0], "step"), np.random.default_rng(6), scale=10.0, later=3.0)
     (record,) = find_shared([prints("a", teams[0]), prints("b", [copied])])["b"]
@@ -356,7 +355,7 @@ def test_a_flag_names_what_can_be_checked(teams):
 
 
 def test_fingerprints_of_an_older_version_are_not_compared(teams):
-    """Fingerprints of an older version are ignored, since they lack what is compared now."""
+    """Fingerprints of an older version are ignored, because they lack what is compared now."""
     head = {"experiment": "step-1", "group": "step 1,2 ", "shape": [2, 3], "step": [1, 1]}
     old = zlib.compress(json.dumps([head | {"anchors": [], "swing": []}]).encode() + bytes(7))
     assert unpack(old) == ()
