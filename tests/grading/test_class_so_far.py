@@ -357,9 +357,7 @@ def test_an_override_stays_with_the_same_person(tmp_path):
 
 
 def test_a_submission_graded_alone_keeps_its_id(school, tmp_path):
-    """A submission graded alone keeps the id of the class list, whether this id is plain or longer.
-
-    """
+    """A submission graded alone keeps its id of the class list, even if this id is longer."""
     path = [school / "A" / "team-1"]
     for known, id_ in (
         ((), "team-1"),

@@ -74,7 +74,7 @@ def test_an_unreadable_submission_keeps_its_authors(school, tmp_path, slip, type
 
 
 def test_files_that_change_during_the_grading_are_not_graded(task, tmp_path, school):
-    """If a file changes between the hash and the copy, the submission is not graded but retried."""
+    """If a file changes between the hash and the copy, the submission is left for the next run."""
     own = shutil.copytree(school / "team-0", tmp_path / "team-0")
     if sys.platform == "linux":  # only Linux allows this file name
         (own / "n\udcff").write_text("no name in any encoding", encoding="utf-8")

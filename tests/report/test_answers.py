@@ -1,4 +1,4 @@
-"""An answer is found in `notes.md` under its question's id, and writing it changes nothing else."""
+"""An answer in `notes.md` is found under its question's id; writing it changes nothing else."""
 
 import pytest
 from hypothesis import given
@@ -33,14 +33,14 @@ More.
 """
 
 
-def test_an_answer_is_what_stands_under_its_heading():
+def test_an_answer_is_the_text_under_its_heading():
     """An answer includes code and smaller headings under its heading, but no comment."""
     assert written_answer(NOTES, "friction-2").startswith("Because.\n\n### In detail")
     assert written_answer(NOTES, "friction-2").endswith("# no heading\n```")
     assert written_answer(NOTES, "zeta_b") == ""
 
 
-def test_an_answer_is_replaced_added_and_taken_away():
+def test_an_answer_can_be_replaced_added_and_removed():
     """An answer can be replaced, added and removed; all other lines stay as they are."""
     new = with_answer(NOTES, "friction-2", "Dry bearings.\r\n")
     assert written_answer(new, "friction-2") == "Dry bearings."
@@ -52,7 +52,7 @@ def test_an_answer_is_replaced_added_and_taken_away():
 
 
 def test_a_heading_that_would_end_the_answer_is_refused():
-    """An answer that contains a heading as large as its own is refused."""
+    """An answer is refused if it contains a heading of the same or a higher level than its own."""
     with pytest.raises(SubmissionError, match="must start with ###"):
         with_answer(NOTES, "level", "So.\n\n# Aha\n\nMore.")
     assert "### Aha" in with_answer(NOTES, "level", "So.\n\n### Aha\n\nMore.")
@@ -62,18 +62,18 @@ OPEN = ["```\ncode", "~~~", "So <!-- why", "```\n<!-- x\n```", "So.\n\n### outlo
 
 
 @pytest.mark.parametrize("text", OPEN)
-def test_an_answer_that_would_swallow_another_is_refused(text):
+def test_an_answer_that_would_hide_another_is_refused(text):
     """An answer with an unclosed comment or code block is refused.
 
-    It would hide the next answer.
+    Otherwise it would hide the next answer.
     """
     with pytest.raises(SubmissionError, match="close every"):
         with_answer(NOTES, "friction-2", text)
     for closed in ("```\n# code\n```", "So <!-- why --> it is.", "### In detail\n\nMore."):
         assert written_answer(with_answer(NOTES, "friction-2", closed), "friction-2") == closed
-    with pytest.raises(SubmissionError, match="close every"):  # it would be in the open code
+    with pytest.raises(SubmissionError, match="close every"):  # a code block is open
         with_answer("## zeta_b\n\n```\ncode", "level", "So.")
-    with pytest.raises(SubmissionError, match="close every"):  # the next answer would be inside it
+    with pytest.raises(SubmissionError, match="close every"):  # it would contain the next answer
         with_answer(NOTES, "level", "So.\n```")
 
 
@@ -81,8 +81,8 @@ WORDS = st.text(st.characters(codec="utf-8", exclude_categories=["C"]), max_size
 
 
 @given(st.lists(WORDS, max_size=6), WORDS.filter(str.strip), st.integers(0, 6))
-def test_what_is_written_is_what_the_report_shows(lines, answer, at):
-    """Whatever surrounds it, an answer without headings is read back unchanged."""
+def test_an_answer_is_read_back_unchanged(lines, answer, at):
+    """Whatever text surrounds it, an answer without headings is read back unchanged."""
     notes = "\n\n".join([*lines[:at], "## zeta_b", *lines[at:]])
     try:
         new = with_answer(notes, "level", answer)

@@ -22,7 +22,7 @@ def test_pages_have_the_colours_of_the_figures():
     assert len({dash for _, dash in dashes}) == len(CARTS)
 
 
-def test_other_pages_take_the_colours_from_there():
+def test_other_pages_use_the_colours_of_the_style_sheet():
     """Other pages use the style sheet's colours for carts and define none."""
     desk = re.findall(r"\.thumb [^{]*\{[^}]*stroke: var\((--[\w-]+)\)", sheet("desk/desk.css"))
     assert desk == [f"--cart-{n}" for n in range(1, len(CARTS) + 1)]

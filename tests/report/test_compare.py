@@ -1,4 +1,4 @@
-"""Two drafts are compared by the numbers that changed and the checks that fail now."""
+"""Two drafts are compared by the numbers that changed and by the checks that newly fail."""
 
 import json
 from dataclasses import replace
@@ -39,7 +39,7 @@ def with_final(analysis: Analysis, name: str, factor: float) -> Analysis:
     return replace(analysis, rows=rows)
 
 
-def test_a_draft_does_not_differ_from_itself():
+def test_a_draft_compared_with_itself_has_no_changes():
     """An analysis compared with its own `results.json` shows no changes."""
     analysis = make_analysis(3)
     changes = compare_drafts(draft_of(analysis), analysis)
@@ -48,7 +48,7 @@ def test_a_draft_does_not_differ_from_itself():
     assert changes_line(changes) == "since the earlier draft: nothing changed"
 
 
-def test_a_number_that_moved_is_told_in_combined_standard_errors():
+def test_a_change_is_given_in_combined_standard_errors():
     """A change is given in combined standard errors of both drafts.
 
     A change of 2 %, with a standard error of 1 % in each draft, is 1.4 σ.
@@ -78,7 +78,7 @@ def test_a_number_that_moved_is_told_in_combined_standard_errors():
 
 
 def test_checks_that_fail_now_are_named():
-    """Of the checks, only those are listed that fail now and did not fail before."""
+    """The only checks listed are those that fail now and did not fail before."""
     analysis = make_analysis(2)
     passing = tuple(replace(check, outcome="pass") for check in analysis.checks)
     first, *others = passing
@@ -112,8 +112,8 @@ def test_the_report_has_a_section_on_the_changes():
         ("{}", "schema: Field required"),
     ],
 )
-def test_what_is_no_results_json_is_refused_in_one_line(tmp_path, text, expected):
-    """A file that is not a `results.json` is refused by one line that names its fault."""
+def test_a_file_that_is_not_results_json_is_refused(tmp_path, text, expected):
+    """A file that is not a `results.json` is refused by one line that gives the reason."""
     path = tmp_path / "results.json"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=r"results\.json: ") as error:
@@ -138,8 +138,8 @@ def test_other_benches_are_not_compared():
     ("key", "other"),
     [("carts", 3), ("units", {"position": "mm", "input": "V"})],
 )
-def test_what_cannot_be_compared_is_refused_before_the_analysis(tmp_path, monkeypatch, key, other):
-    """If drafts have different units or carts, they are refused before the analysis starts."""
+def test_other_units_or_carts_are_refused_before_the_analysis(tmp_path, monkeypatch, key, other):
+    """If the units or carts of the drafts differ, the command stops before the analysis."""
 
     def analysed_after_all(*_, **__):
         pytest.fail("the analysis ran")
@@ -156,7 +156,7 @@ def test_what_cannot_be_compared_is_refused_before_the_analysis(tmp_path, monkey
     assert not out.exists()
 
 
-def test_the_command_tells_the_change_in_one_line_of_stderr(tmp_path):
+def test_compare_prints_a_change_in_one_line_on_stderr(tmp_path):
     """With `--compare` a changed gain is reported on the page and in one line on stderr."""
     earlier = json.loads(json_text(analysed("one-cart")))
     earlier["parameters"][0]["final"] *= 0.9

@@ -35,7 +35,7 @@ def test_json_is_for_programs():
     assert [e["effect"] for e in catalogue_data(CATALOGUE)] == [e.key for e in CATALOGUE]
 
 
-def test_a_wrong_name_is_one_line_with_the_nearest():
+def test_a_misspelt_effect_gives_the_nearest_name():
     """If an effect's name is misspelt, the error gives the nearest name and the status is 2."""
     done = cartlab_here("effects", "back_lash")
 
@@ -43,7 +43,7 @@ def test_a_wrong_name_is_one_line_with_the_nearest():
     assert done.stderr == "cartlab: no effect 'back_lash'; did you mean 'backlash'?\n"
 
 
-def test_wrong_options_of_simulate_are_one_line(tmp_path):
+def test_a_wrong_option_of_simulate_prints_one_line(tmp_path):
     """A wrong option of `simulate` ends with status 2 and one line, and nothing is written."""
     for arguments, expected in (
         (("--preset", "throne-1dof", "--hide", "friction:force=1"), "no effect 'friction'"),
@@ -58,7 +58,7 @@ def test_wrong_options_of_simulate_are_one_line(tmp_path):
         assert not (tmp_path / "out").exists()
 
 
-# One effect for each kind of picture, and the one that scales the readings.
+# one effect for each kind of picture, and the effect that scales the readings
 FIRST = {effect.axis: effect for effect in reversed(CATALOGUE)}
 PICTURED = [*FIRST.values(), find_effect("sensor_gain")]
 
@@ -75,12 +75,12 @@ def page(tmp_path_factory):
 @pytest.mark.sample
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
 def test_every_effect_has_a_picture(effect, tmp_path):
-    """Every effect of the catalogue has a picture at its usual size."""
+    """Every effect of the catalogue has a picture for parameters of usual size."""
     render_effects([effect], tmp_path)
     assert (tmp_path / "figures" / f"{effect.key}.svg").is_file()
 
 
-def test_the_page_stands_alone(page):
+def test_the_page_loads_nothing(page):
     """The page is one file that loads nothing and has a picture of each effect."""
     html = (page / "effects.html").read_text(encoding="utf-8")
 

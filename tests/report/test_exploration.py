@@ -18,7 +18,7 @@ from tests.report.test_gap import make_gap, two_cart_analysis
 
 
 def make_turn(*weights: float) -> Turn:
-    """Return a turn with explanations of these weights, the first of which the model uses."""
+    """Return a turn with one explanation for each weight; the model uses the first explanation."""
     return Turn(
         seconds=30.0,
         recorded=("step-1",),
@@ -35,8 +35,8 @@ def make_turn(*weights: float) -> Turn:
     )
 
 
-def test_the_explanation_in_the_model_is_told_from_what_the_criterion_prefers(tmp_path):
-    """The diary marks the explanation that the model uses, and gives each one's weight.
+def test_the_diary_marks_the_explanation_in_the_model(tmp_path):
+    """The diary marks the explanation that the model uses, and gives each explanation's weight.
 
     A weight far below the best is written as under 1 %; a single explanation has no weight.
     """
@@ -47,8 +47,8 @@ def test_the_explanation_in_the_model_is_told_from_what_the_criterion_prefers(tm
     assert told == ["Effect 0 (in the model, under 1 %); effect 1 (100 %)", "Effect 0"]
 
 
-def test_effects_are_called_what_they_are_called_elsewhere():
-    """Effects have their usual names in the diary, and each cart is named once."""
+def test_effects_have_their_usual_names_in_the_diary():
+    """Effects have their usual names in the diary, and each effect's cart is named once."""
     chain = PRESETS["throne-1dof"]
     mass, friction = (
         EffectTerm(effect=effect, place=1, values=tuple(1.0 for _ in effect.names))
@@ -58,7 +58,7 @@ def test_effects_are_called_what_they_are_called_elsewhere():
     assert told == "a hidden mass on a cart (cart 1) and dry (Coulomb) friction on cart 1"
 
 
-def test_the_answer_comes_first_and_each_turn_has_the_run_that_decided(tmp_path):
+def test_the_diary_gives_the_answer_first(tmp_path):
     """The diary gives parameters and effects first, then each turn with its deciding run."""
     gap = make_gap()
     runs = {trace.experiment for trace in gap.traces}

@@ -62,7 +62,7 @@ def bode_svg(carts: int = 2) -> str:
         return to_svg(figure, name="bode", alt="Bode <plot>")
 
 
-def test_a_figure_is_well_formed_and_says_what_it_shows():
+def test_a_figure_is_valid_svg_with_a_text_alternative():
     """The SVG of a figure is valid, has a text alternative, and its labels are text."""
     root = ElementTree.fromstring(bode_svg())
     assert root.attrib["role"] == "img"
@@ -85,10 +85,10 @@ def test_every_dwell_is_drawn_as_a_diamond():
     assert len(marks) == 3 * 24 + 1
 
 
-def test_measured_phase_lies_on_the_branch_of_the_fit():
+def test_a_measured_phase_is_drawn_near_the_models():
     """A measured phase is shifted by full turns so that it is drawn near the model's phase."""
     analysis = make_analysis(3)
-    response = analysis.frequency_responses[2]  # cart 3 goes down to -540°
+    response = analysis.frequency_responses[2]  # the phase of cart 3 goes down to -540°
     with drawing():
         figure = bode_figure(response, chain=analysis.chain, units=PAPER_UNITS)
     _, phase, _ = figure.axes
@@ -96,13 +96,13 @@ def test_measured_phase_lies_on_the_branch_of_the_fit():
     assert response.phase is not None
     assert np.min(response.phase) > -np.pi
     assert line.min() < -500
-    # Noise of 0.01 rad and a grid of 300 points on the line: well within 15°.
+    # With noise of 0.01 rad and 300 points on the line, the difference is well below 15°.
     at = np.interp(response.omega, np.asarray(phase.lines[0].get_xdata(), dtype=float), line)
     assert np.max(np.abs(points - at)) < 15
 
 
-def test_a_peak_without_end_does_not_hide_the_measurement():
-    """If undamped carts have infinite peaks, the curve is cut above the measured points."""
+def test_an_infinite_peak_does_not_hide_the_measurement():
+    """If undamped carts have infinite peaks, the axis ends at most 50 dB above the measurement."""
     chain = Chain(m=np.array([1.0]), c=np.zeros(1), k=np.array([4.0, 0.0]))
     omega = np.array([0.5, 1.0, 3.0, 4.0])
     magnitude = np.abs(chain.frequency_response(omega)[0])
@@ -121,7 +121,7 @@ def test_a_peak_without_end_does_not_hide_the_measurement():
     assert figure.axes[0].get_ylim()[1] < 20 * np.log10(magnitude.max()) + 50
 
 
-def test_what_was_measured_is_seen_where_nothing_else_is_drawn():
+def test_the_axis_of_an_input_covers_all_samples():
     """The axis of an input covers all samples, even if no model is drawn."""
     with drawing():
         _, (ax,) = panels(1.0)
@@ -131,7 +131,7 @@ def test_what_was_measured_is_seen_where_nothing_else_is_drawn():
     assert high >= 3
 
 
-def test_a_student_s_dollar_signs_are_no_formula():
+def test_dollar_signs_are_drawn_as_they_are():
     """Dollar signs in an id are drawn as they are, not as a formula."""
     with drawing():
         figure, (ax,) = panels(1.0)
@@ -157,7 +157,7 @@ def test_an_unstable_model_does_not_hide_the_measurement():
 
 
 def test_a_zero_in_a_table_of_ratios_is_left_out():
-    """A zero in a table of ratios is left out of the logarithmic plot; other points are drawn."""
+    """A zero in a table of ratios is omitted from the logarithmic plot; other points are drawn."""
     (response,) = make_analysis(1).frequency_responses
     magnitude = response.magnitude.copy()
     magnitude[3] = 0.0
@@ -168,7 +168,7 @@ def test_a_zero_in_a_table_of_ratios_is_left_out():
             units=PAPER_UNITS,
         )
         root = ElementTree.fromstring(to_svg(figure, name="x", alt=""))
-    assert len(list(root.iter(f"{SVG}use"))) == 23 + 1  # and one in the legend
+    assert len(list(root.iter(f"{SVG}use"))) == 23 + 1  # and one diamond in the legend
 
 
 def test_a_dwell_shades_the_transient():
@@ -187,7 +187,7 @@ def test_a_dwell_shades_the_transient():
 
 @given(st.integers(10, 3000), st.integers(0, 2**32 - 1))
 def test_thinning_keeps_the_envelope(n, seed):
-    """The largest and smallest value stay, times ascend, and few points remain."""
+    """Thinning keeps the largest and smallest values and ascending times, and few points remain."""
     rng = np.random.default_rng(seed)
     t, y = np.sort(rng.uniform(0, 1, n)), rng.normal(size=n)
     thin_t, thin_y = thin(t, y)
@@ -211,7 +211,7 @@ def test_ticks_are_round_numbers_inside_the_axis(low, span, most):
     assert ticks[0] >= low - 1e-8 * step
     assert ticks[-1] <= high + 1e-8 * step
     mantissa = step / 10.0 ** np.floor(np.log10(step * (1 + 1e-6)))
-    # Cancellation: the step is a difference of numbers up to 1e9 times larger.
+    # Rounding: the step is a difference of numbers up to 1e9 times larger.
     assert min(abs(mantissa - m) for m in (1, 2, 5)) < 1e-5 * (1 + abs(low) / step * 1e-9)
 
 
@@ -225,7 +225,7 @@ def test_tick_labels_share_their_decimals():
     assert tick_labels(np.array([0.0, 5e-6])) == ["0", "5e−06"]
 
 
-def test_the_user_s_own_settings_do_not_matter(monkeypatch):
+def test_the_users_matplotlib_settings_do_not_matter(monkeypatch):
     """The user's own matplotlib settings change no figure."""
     import matplotlib
 
@@ -254,11 +254,11 @@ def test_panels_leave_room_for_their_labels():
     assert all(lower.y1 < upper.y0 for upper, lower in pairwise(boxes))
 
 
-_TOUCH = 2.0  # points of the canvas: a text's box includes room above and below its letters
+_TOUCH = 2.0  # points by which two boxes may overlap, since letters do not fill their boxes
 
 
 def figures_of(carts: int) -> dict[str, Figure]:
-    """Return a figure of each kind in a report, with long and odd names of records."""
+    """Return a figure of each kind in a report; the names of the recordings are long."""
     analysis = make_analysis(carts)
     records = {r.id: replace(r, id=f"{r.id} the second try of Tuesday") for r in analysis.records}
     long = {id_: record.id for id_, record in records.items()}
@@ -302,7 +302,7 @@ def test_no_text_of_a_figure_is_cut_or_covered(carts):
     """All text in a figure lies on the canvas, and no two texts overlap."""
     with drawing():
         for name, figure in figures_of(carts).items():
-            to_svg(figure, name=name, alt="")  # this draws the ticks
+            to_svg(figure, name=name, alt="")  # draws the ticks
             canvas = FigureCanvasAgg(figure)
             renderer = canvas.get_renderer()
             canvas.draw()
@@ -320,8 +320,8 @@ def test_no_text_of_a_figure_is_cut_or_covered(carts):
                 assert apart.any(), (name, text, other)
 
 
-def test_every_series_carries_all_its_data():
-    """On the page, a figure has all measured points; in files and print, only those drawn."""
+def test_a_figure_on_the_page_has_all_its_data():
+    """On the page, a figure stores every measured point; a plain SVG has only the points drawn."""
     rng = np.random.default_rng(3)
     t = np.linspace(0.0, 9.0, 5001)
     y = rng.normal(size=t.size)
@@ -336,7 +336,7 @@ def test_every_series_carries_all_its_data():
     model, measured = sorted(series, key=lambda attributes: attributes["data-name"])
     assert measured["data-name"] == "measured"
     assert measured["data-x"] == "0 9"
-    # Numbers are stored as float32.
+    # The numbers are stored as float32.
     np.testing.assert_allclose(unpacked(measured["data-y"]), y, rtol=1e-6)
     assert model["data-name"] == "\"quoted\" <b> 'model'"
     np.testing.assert_allclose(unpacked(model["data-x"]), uneven, rtol=1e-6)
@@ -348,8 +348,8 @@ def unpacked(text: str) -> np.ndarray:
     return np.frombuffer(b64decode(text), dtype="<f4")
 
 
-def test_repeats_stand_on_one_time_axis():
-    """Panels of repeated runs share one time axis; each has one title."""
+def test_repeats_share_one_time_axis():
+    """Panels of repeated runs share one time axis; each panel has a title."""
     with drawing():
         figure, axes = small_multiples(list("abcde"), height=1.0, share_y=True)
         axes[0].set_xlim(0, 3)
@@ -360,7 +360,7 @@ def test_repeats_stand_on_one_time_axis():
     assert len(figure.axes) == 5
 
 
-def test_phases_are_read_against_right_angles():
+def test_a_phase_has_ticks_at_multiples_of_90_degrees():
     """A phase that turns by more than 90° has ticks at multiples of 90°."""
     response = make_analysis(2).frequency_responses[1]
     figure, (ax,) = panels(1.0)
@@ -372,7 +372,7 @@ def test_phases_are_read_against_right_angles():
     assert len(texts) >= 3
 
 
-def test_labels_of_a_phase_that_turns_far_do_not_touch():
+def test_a_phase_over_540_degrees_has_fewer_labels():
     """If a phase turns by 540° or more, only every second multiple of 90° is labelled."""
     for least, step in ((-360.0, 90.0), (-540.0, 180.0)):
         response = make_analysis(2).frequency_responses[1]
@@ -386,8 +386,8 @@ def test_labels_of_a_phase_that_turns_far_do_not_touch():
         assert np.diff(ticks).tolist() == [step] * int(-least / step)
 
 
-def test_carts_of_a_step_are_told_apart_without_colour():
-    """In the figure of a step each cart has its own mark, also in legend and caption."""
+def test_carts_of_a_step_have_different_markers():
+    """In the figure of a step, each cart has its own marker, also in the legend and caption."""
     analysis = make_analysis(3)
     run = analysis.step_gains[0].experiment
     gains = [gain for gain in analysis.step_gains if gain.experiment == run]
@@ -402,7 +402,7 @@ def test_carts_of_a_step_are_told_apart_without_colour():
 
 
 @pytest.mark.parametrize("points", [[10.0], [1.0, 9.0, 9.5, 4.0], [3.0] * 40])
-def test_submissions_are_counted_in_whole_numbers(points):
+def test_the_count_axis_has_only_whole_numbers(points):
     """The count axis of a histogram has only whole numbers."""
     with drawing():
         figure = distribution_figure(points, out_of=10.0)
@@ -413,8 +413,8 @@ def test_submissions_are_counted_in_whole_numbers(points):
     assert all(text.isdigit() for text in texts)
 
 
-def test_long_titles_lose_what_they_share():
-    """Long names of runs with a common beginning are shortened to the part that differs."""
+def test_long_titles_are_shortened_to_their_differences():
+    """If long names of runs begin with the same words, only the part that differs is shown."""
     names = [f"DOF1_en1_input1_trial_of_monday_{i}" for i in range(6)]
     with drawing():
         _, axes = small_multiples(names, height=1.0, share_y=True)

@@ -1,4 +1,4 @@
-"""The gap report, its file, and the report's quote of it are right for all verdicts and effects."""
+"""The gap report, its file, and its quote in the main report are right for all verdicts."""
 
 import json
 import re
@@ -70,7 +70,7 @@ T = np.arange(0.0, 4.0, 0.00884)
 U = np.where((T > 0.1) & (T < 2.0), 0.05, 0.0)
 
 
-# -------------------------------------------------------------- gaps made by hand
+# -------------------------------------------------------------- constructed gaps
 
 
 def usual_values(effect, place):
@@ -99,7 +99,7 @@ RESIDUAL = Residual(
 
 
 def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
-    """Return a possible gap of the two-cart bench, with traces of the first cart's runs."""
+    """Return a plausible gap of the two-cart bench, with traces of the first cart's runs."""
     terms: list[EffectTerm] = []
     for key in keys:
         effect = find_effect(key)
@@ -197,7 +197,7 @@ def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
 
 
 def two_cart_analysis():
-    """Return an analysis whose records belong to the gaps made here."""
+    """Return an analysis whose recordings belong to the constructed gaps."""
     analysis = make_analysis(2)
     step = next(record for record in analysis.records if record.id == "step-a")
     return replace(analysis, records=(step, replace(step, id="step-b")))
@@ -208,8 +208,8 @@ def page_of(gap: Gap) -> Page:
     return Page(render_html(build_gap_document(gap, two_cart_analysis())))
 
 
-def test_a_name_stands_on_top_with_its_numbers():
-    """The first paragraph names the effect with its place, its size, the errors and the noise."""
+def test_the_first_paragraph_names_the_effect_with_its_numbers():
+    """The first paragraph names the effect, its place, its size, the errors and the noise."""
     text = page_of(make_gap()).text
 
     assert "Dry (Coulomb) friction on cart 2 explains what the linear model leaves out" in text
@@ -217,7 +217,7 @@ def test_a_name_stands_on_top_with_its_numbers():
     assert text.index("explains what") < text.rindex("Where the linear model fails")
 
 
-def test_each_size_has_its_cart_and_each_sentence_is_said_once():
+def test_each_force_is_given_with_its_cart():
     """If both carts have dry friction, each force is given with its cart.
 
     The sentence on dry friction appears only once.
@@ -228,11 +228,11 @@ def test_each_size_has_its_cart_and_each_sentence_is_said_once():
 
     assert re.search(r"force [^;]+ V on cart 1; force [^;]+ V on cart 2\. ", said)
     assert said.count(one.effect.sentence) == 1
-    assert " V on cart" not in terminal_verdict(gap)  # the name of a single effect says where
+    assert " V on cart" not in terminal_verdict(gap)  # the effect's name includes the cart
 
 
-def test_a_stretch_without_a_phase_is_told_in_words():
-    """If the error is spread evenly over a stretch, sentence and table say so."""
+def test_an_evenly_spread_error_is_described():
+    """If the error is spread evenly over a part of the run, the sentence and the table say so."""
     gap = replace(make_gap("partial"), noise_floor=0.01)
     (window,) = gap.left
     text = page_of(replace(gap, left=(replace(window, what="throughout"),))).text
@@ -241,16 +241,16 @@ def test_a_stretch_without_a_phase_is_told_in_words():
     assert "throughout" not in text
 
 
-def test_repeats_are_the_measure_where_they_differ_by_more_than_noise():
-    """If repeats differ by more than the noise, the page compares the model's error with them."""
+def test_scattering_repeats_are_compared_with_the_models_error():
+    """If repeats differ by more than the noise, the model's error is compared with the repeats."""
     gap = replace(make_gap(), repeatability=0.035)
     text = page_of(gap).text
 
     assert "to 4.1 %; repeats of one run differ by 3.5 %" in text
 
 
-def test_suspects_are_listed_as_such():
-    """If the verdict is unexplained, suspects are listed with the error that each would leave."""
+def test_suspects_are_listed_with_their_errors():
+    """If the verdict is unexplained, each suspect is listed with the error that would remain."""
     suspect = Rival(effect=find_effect("backlash"), where={}, nrmse_after=0.12, confidence=0.9)
     gap = replace(make_gap("unexplained", ()), final=0.153, suspects=(suspect,))
     text = page_of(gap).text
@@ -259,7 +259,7 @@ def test_suspects_are_listed_as_such():
     assert read_gap(json_text(gap)).suspects == gap.suspects
 
 
-def test_nothing_to_name_is_said():
+def test_the_verdict_none_is_stated():
     """If the verdict is "none", a sentence says that no effect is needed."""
     gap = replace(make_gap("none", ()), final=0.031, baseline=0.031)
     text = page_of(gap).text
@@ -269,8 +269,8 @@ def test_nothing_to_name_is_said():
     assert "The model with its effects" not in text
 
 
-def test_the_page_of_none_speaks_of_no_effects():
-    """If the verdict is "none", the page mentions no effects and draws one model."""
+def test_the_page_of_the_verdict_none_mentions_no_effects():
+    """If the verdict is "none", the page mentions no effects and draws only one model."""
     gap = replace(make_gap("none", ()), final=0.031, baseline=0.031, where=())
     page = page_of(gap)
 
@@ -282,18 +282,18 @@ def test_the_page_of_none_speaks_of_no_effects():
         "was then tried at every place",
     ):
         assert wrong not in page.text
-    assert "with the effects" not in html_of(gap)  # nor in the legends of the figures
+    assert "with the effects" not in html_of(gap)  # nor do the legends of the figures
     assert tones(gap) == ["good", ""]
     assert "Error and noise of every run" in page.text
     assert "cart 1 up to" in page.text
     assert "the input up to 0.0500 V" in page.text
-    # Beyond noise of 3 %: the square root of 1.15 - 1, where a search begins.
+    # A search begins at a chi-square of 1.15 per point. With noise of 3 %: 3 % √(1.15 - 1) = 1.2 %.
     assert "by more than about 1.2 % of their motion" in page.text
     assert page.text.index("What to do next") < page.text.rindex("Error and noise of every run")
     assert "What to do next." in terminal_verdict(gap)
 
 
-def test_what_no_effect_explains_is_drawn_without_effects():
+def test_an_unexplained_gap_is_drawn_without_effects():
     """If the verdict is unexplained, no figure shows a model with effects.
 
     If there are suspects, figures show the model with the suspects, marked as such.
@@ -308,7 +308,7 @@ def test_what_no_effect_explains_is_drawn_without_effects():
     assert "with the suspects" in html_of(suspected)
 
 
-def test_two_explanations_are_neither_right_nor_wrong():
+def test_an_ambiguous_error_is_neither_good_nor_bad():
     """If the verdict is ambiguous, the remaining error is marked neither good nor bad."""
     assert tones(make_gap("ambiguous")) == ["", "", ""]
     assert (
@@ -319,16 +319,16 @@ def test_two_explanations_are_neither_right_nor_wrong():
 
 
 def html_of(gap: Gap) -> str:
-    """Return the page of a gap report, with the texts of its figures."""
+    """Return the page of a gap report, including the text in its figures."""
     return render_html(build_gap_document(gap, two_cart_analysis()))
 
 
 def tones(gap: Gap) -> list[str]:
-    """Return the marks of the tiles at the top, such as good or bad."""
+    """Return the marks of the tiles at the top, such as "good" or "bad"."""
     return re.findall(r'<div class="tile (\w*)"', html_of(gap))
 
 
-def test_two_explanations_are_both_told():
+def test_both_explanations_are_described():
     """If the verdict is ambiguous, both explanations and the deciding experiment are described."""
     text = page_of(make_gap("ambiguous")).text
 
@@ -340,7 +340,7 @@ def test_two_explanations_are_both_told():
 
 
 @pytest.mark.parametrize("keys", [(), ("coulomb_friction",)])
-def test_what_stays_unexplained_has_suspects_only(keys):
+def test_an_unexplained_gap_names_only_suspects(keys):
     """If the verdict is unexplained, suspects are named, but not as an explanation."""
     text = page_of(make_gap("unexplained", keys)).text
 
@@ -349,8 +349,8 @@ def test_what_stays_unexplained_has_suspects_only(keys):
     assert "explains what" not in text
 
 
-def test_a_part_of_the_gap_says_what_is_left_and_where():
-    """If the verdict is partial, the page says how much error is left, and where."""
+def test_a_partial_verdict_says_how_much_error_is_left():
+    """If the verdict is partial, the page says how much error remains, and where."""
     gap = replace(make_gap("partial"), noise_floor=0.01)
     text = page_of(gap).text
 
@@ -362,8 +362,8 @@ def test_a_part_of_the_gap_says_what_is_left_and_where():
 
 
 @pytest.mark.parametrize("verdict", ["partial", "unexplained"])
-def test_the_force_left_has_a_picture_and_its_formula(verdict):
-    """The unexplained force is drawn for each cart, with a formula outside the catalogue."""
+def test_the_unexplained_force_has_a_figure_and_a_formula(verdict):
+    """The unexplained force is drawn for each cart, with a formula that is not in the catalogue."""
     page = page_of(make_gap(verdict))
 
     assert "The unexplained force" in page.text
@@ -377,7 +377,7 @@ def test_the_force_left_has_a_picture_and_its_formula(verdict):
     assert "The unexplained force" not in page_of(make_gap()).text
 
 
-def test_an_answer_so_far_is_said_to_be_one():
+def test_an_answer_at_the_time_limit_is_called_the_best_so_far():
     """If the time budget ended the search, the page calls its result the best answer so far."""
     text = page_of(replace(make_gap("unexplained", ()), complete=False)).text
 
@@ -387,9 +387,10 @@ def test_an_answer_so_far_is_said_to_be_one():
 
 
 def test_effects_that_help_only_together_are_one_step():
-    """If an effect raises the error until the next one acts, the page takes both as one step.
+    """If an effect helps only together with the next one, the page treats both as one step.
 
-    The table has one row for both, and each effect's section gives the error before and after both.
+    The table has one row for both. Each effect's section gives the error before and after both
+    effects.
     """
     gap = make_gap("partial", ("coulomb_friction", "saturation", "dead_zone"))
     errors = (0.135, 0.0925, 0.0968, 0.0723)
@@ -416,9 +417,9 @@ def test_effects_that_help_only_together_are_one_step():
 
 @pytest.mark.parametrize("seen", [True, False])
 def test_the_band_of_the_noise_is_mentioned_if_it_can_be_seen(seen):
-    """A caption mentions the band only if the residuals are not much larger than the noise.
+    """A caption mentions the noise band only if the residuals are not much larger than the noise.
 
-    With both models right, the residuals are the noise. The linear model here is far off.
+    If `seen` is true, both models leave only noise; otherwise the linear model's error is large.
     """
     gap = make_gap()
     if seen:
@@ -434,7 +435,7 @@ PREDICTION = Prediction(
 
 
 def predicted(first, second) -> Gap:
-    """Return a gap whose proposed recording tells two models with these effects apart."""
+    """Return a gap that proposes a recording to decide between two models with these effects."""
     contenders = tuple(
         Contender(chain=CHAIN, terms=make_gap("named", keys).model.terms, weight=0.5)
         for keys in (first, second)
@@ -474,8 +475,8 @@ MANY = ("cogging", "drive_damping", "input_delay", "slack_spring", "coulomb_fric
         ),
     ],
 )
-def test_two_models_are_named_by_what_differs(first, second, names, legend):
-    """The text names the effects that only one model has; the legend is inside the figure."""
+def test_two_models_are_named_by_their_differences(first, second, names, legend):
+    """The text names the effects that only one model has, and the legend shows short names."""
     gap = predicted(first, second)
     page = page_of(gap)
 
@@ -489,7 +490,7 @@ def test_two_models_are_named_by_what_differs(first, second, names, legend):
 
 
 def test_the_longest_names_in_a_legend_fit_in_the_figure():
-    """Two names of as many characters as a legend may have end inside the figure."""
+    """Two names with the greatest length allowed in a legend still end inside the figure."""
     names = ("with a sensor with a scale", "without a dead zone.")
     assert len("".join(names)) == LEGEND
     figure = predicted_figure(PREDICTION, names=names, position_unit="cm")
@@ -502,7 +503,7 @@ def test_the_longest_names_in_a_legend_fit_in_the_figure():
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
 def test_every_effect_has_its_page(effect):
-    """The page of every effect has its figure, its law as a formula, and its entry's texts."""
+    """The page of every effect has its figure, its fingerprint and its reference."""
     page = page_of(make_gap("named", (effect.key,)))
 
     assert effect.fingerprint in page.text
@@ -515,10 +516,10 @@ def test_every_effect_has_its_page(effect):
     assert alts
 
 
-def test_two_effects_share_the_equations():
+def test_two_effects_have_two_letters_in_the_equations():
     """If two effects act, each force has its own letter in the equations.
 
-    Here the drive's change is the first and friction on cart 2 the second.
+    In the test, saturation of the drive is the first effect, and friction on cart 2 the second.
     """
     terms = make_gap("named", ("saturation", "coulomb_friction")).model.terms
 
@@ -532,10 +533,10 @@ def test_two_effects_share_the_equations():
 @pytest.mark.parametrize(
     "keys", list(permutations(("saturation", "actuator_lag", "dead_zone", "input_delay")))[::5]
 )
-def test_changes_of_the_input_follow_each_other_as_in_the_simulator(keys):
-    """In any order of the effects, each change of the input starts from the one before it.
+def test_changes_of_the_input_are_applied_as_in_the_simulator(keys):
+    """In whatever order effects are listed, each change of the input starts from the last one.
 
-    The last one, and no other, pushes cart 1, and the friction that grows with the drive uses it.
+    Only the last change pushes cart 1, and the load-dependent friction uses this last change.
     """
     terms = make_gap("named", (*keys, "load_friction")).model.terms
     laws = [to_text(law(terms, index).math) for index in in_order(terms)]
@@ -563,14 +564,14 @@ def test_the_dead_zone_comes_before_the_saturation_in_the_simulator():
     drive = AugmentedChain(chain=CHAIN, terms=terms).tables().drive
     u = np.linspace(-0.8, 0.8, 33)
 
-    # In the other order nothing would arrive, because the limit is below the width.
+    # In the other order no input would remain, because the limit is below the width.
     expected = np.clip(np.sign(u) * np.maximum(np.abs(u) - width, 0.0), -limit, limit)
     assert_allclose([arriving(drive, one) for one in u], expected, atol=1e-15)
     assert [term.effect.key for term in input_steps(terms)] == ["dead_zone", "saturation"]
 
 
-def test_with_a_play_the_input_pushes_the_motor():
-    """With backlash, cart 1 feels the contact, and the motor feels input, contact and cogging.
+def test_with_backlash_the_input_pushes_the_motor():
+    """With backlash, cart 1 feels the contact; the motor feels input, contact and cogging.
 
     The motor's mass is part of m_1, so it is subtracted on the right-hand side.
     """
@@ -596,7 +597,7 @@ def test_a_model_of_many_effects_has_its_equations():
 
 
 def test_every_command_on_the_page_can_be_copied(tmp_path):
-    """A command on the page has all arguments that it needs; else parsing it raises an error."""
+    """Each command on the page is complete: parsing it raises no error."""
     commands = re.findall("`cartlab ([^`]+)`", WORDS.path.read_text(encoding="utf-8"))
     assert len(commands) == 3
     (tmp_path / "gap").mkdir()
@@ -607,7 +608,7 @@ def test_every_command_on_the_page_can_be_copied(tmp_path):
         group.commands[name].make_context(name, args)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_a_spring_pulls_both_its_carts():
+def test_a_spring_pulls_both_of_its_carts():
     """The extra force of spring 2 acts on cart 2 and, reversed, on cart 1."""
     terms = (
         make_term(find_effect("cubic_spring"), place=2, values={"coefficient": 1.0}, chain=CHAIN),
@@ -637,7 +638,7 @@ def test_pdf_and_files_are_the_same_each_time(tmp_path):
 
 
 def test_residual_force_of_a_constant_force_is_that_force():
-    """If a constant force pushes cart 2, the residual force found is this force."""
+    """If a constant force pushes cart 2, the computed residual force equals this force."""
     pushed = make_term(find_effect("force_offset"), place=2, values={"force": 0.004}, chain=CHAIN)
     model = AugmentedChain(chain=CHAIN, terms=(pushed,))
     x = simulate_augmented(model, T, U)
@@ -650,8 +651,8 @@ def test_residual_force_of_a_constant_force_is_that_force():
         replace(make_gap(), model=model, traces=traces), free={"a": (1, 2)}
     )
 
-    # Windows of 9 samples: the weight is exact for parabolas. The fourth-order rest is m x''''
-    # T²/50, and (18 rad/s · 0.07 s)²/50 is 3 % of the forces, here 0.05 V at the edges.
+    # With 9 samples in a window, the estimate is exact for parabolas. The error is m x'''' T²/50;
+    # since (18 rad/s · 0.07 s)²/50 is 3 %, it is at most 3 % of the forces of 0.05 V at the edges.
     assert_allclose(second.measured, 0.004, atol=0.03 * 0.05)
     assert_allclose(np.median(second.measured), 0.004, rtol=1e-3)
     assert_allclose(np.median(first.measured), 0.0, atol=1e-5)
@@ -659,7 +660,7 @@ def test_residual_force_of_a_constant_force_is_that_force():
 
 
 def test_a_cart_beside_one_that_was_not_measured_has_no_residual_force():
-    """If a cart's neighbour was not measured, its residual force is not estimated."""
+    """If a cart's neighbour was not measured, the cart's residual force is not estimated."""
     gap = make_gap()
     alone = replace(gap, traces=tuple(t for t in gap.traces if t.cart == 1))
 
@@ -697,13 +698,13 @@ def test_the_file_is_read_back_as_it_was(verdict):
         '{"gap":' * 200_000,
     ],
 )
-def test_what_is_no_gap_file_is_refused_in_one_line(text):
+def test_a_file_that_is_not_gap_json_is_refused(text):
     """A file that is not a `gap.json` is refused by one error without a traceback."""
     with pytest.raises(ConfigError, match=r"cartlab gap|cartlab-gap/1"):
         read_gap(text)
 
 
-# ------------------------------------------------------- one real run, end to end
+# ------------------------------------------------------- one whole run
 
 
 @pytest.fixture(scope="module")
@@ -719,7 +720,7 @@ def bench(tmp_path_factory):
     for record in case.records:
         if record.id == "sweep":
             continue
-        # The last step is taken as the run under feedback, since its input was measured.
+        # The last step is stated to be a closed loop, since its input was measured.
         kind = "closed_loop" if record.id == "step-d" else record.kind
         reference = np.zeros(record.t.size)
         columns = [record.t, record.u, reference, record.y[0]]
@@ -746,7 +747,7 @@ def test_command_writes_everything_and_names_the_friction(bench):
     assert document["verdict"] == "named"
     (effect,) = document["effects"]
     assert (effect["effect"], effect["where"]) == ("coulomb_friction", {"cart": 1})
-    # The two simulators differ by some 1e-3 of the force; noise adds as much.
+    # The two simulators differ by about 1e-3 of the force; noise adds about as much.
     assert_allclose(effect["parameters"]["force"]["value"], bench.force, rtol=5e-3)
     assert effect["nrmse_after"] == document["gap"]["final"]
     assert set(document["chain"]) == {"m", "c", "k", "units"}
@@ -776,7 +777,7 @@ def test_report_shows_the_verdict_and_the_better_simulation(bench):
     linear, augmented = map(
         float, re.findall(r"step-d1(\d+(?:\.\d+)?) %(\d+(?:\.\d+)?) %", page.text)[-1]
     )
-    # The run was never fitted, so only the encoder's rounding is left.
+    # The fit did not use this run, so the error is only the encoder's rounding.
     assert augmented < 0.2 * linear
     assert {href[1:] for href in page.values("href") if href.startswith("#")} <= set(
         page.values("id")
@@ -784,7 +785,7 @@ def test_report_shows_the_verdict_and_the_better_simulation(bench):
 
 
 def test_gap_analysis_of_other_data_is_only_a_warning(bench, tmp_path):
-    """If data have changed since the gap analysis, the report warns and does not quote it."""
+    """If the data have changed since the gap analysis, the report warns and does not quote it."""
     analysis = analyse(load_submission(bench.folder))
     changed = replace(analysis, files=analysis.files | {"data/step-a.csv": "0" * 64})
 
@@ -798,7 +799,7 @@ def test_gap_analysis_of_other_data_is_only_a_warning(bench, tmp_path):
         assert "gap.json cannot be used" in with_gap(analysis, tmp_path)[0].warnings[-1]
 
 
-def test_hostile_words_in_a_gap_file_stay_words(bench):
+def test_hostile_text_in_a_gap_file_stays_text(bench):
     """Hostile text in a `gap.json` appears as plain text."""
     analysis = analyse(load_submission(bench.folder))
     text = (bench.folder / "gap" / "gap.json").read_text(encoding="utf-8")
@@ -812,7 +813,7 @@ def test_hostile_words_in_a_gap_file_stay_words(bench):
     assert "<script>alert(1)</script>" in page.text
 
 
-def test_without_usable_runs_the_command_says_so_in_one_line(tmp_path):
+def test_a_folder_without_a_submission_gives_one_line(tmp_path):
     """If a folder is not a submission, `cartlab gap` ends with one line and status 2."""
     done = cartlab_here("gap", tmp_path / "nowhere")
 
@@ -820,7 +821,7 @@ def test_without_usable_runs_the_command_says_so_in_one_line(tmp_path):
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_every_law_in_a_report_has_a_reading():
+def test_every_formula_has_a_text_alternative():
     """Every formula has a text alternative for readers who cannot see it."""
     document = build_gap_document(make_gap("named", ("extra_mode",)), two_cart_analysis())
     formulas = [b for s in document.sections for b in s.blocks if isinstance(b, Formula)]

@@ -61,7 +61,7 @@ def kinds(term: Term, kind: str) -> list[Math]:
 
 
 def physical_values(chain: Chain) -> dict[str, complex]:
-    """Return m_1, c_1, k_1 … as named in the formulas, without an index for a single cart."""
+    """Return m_1, c_1, k_1, … as named in the formulas; a single cart's names have no index."""
     if chain.n == 1:
         return {"m": chain.m[0], "c": chain.c[0], "k": chain.k.sum()}
     named = {"m": chain.m, "c": chain.c, "k": chain.k}
@@ -77,7 +77,7 @@ CHAINS = [*PRESETS.values(), FOUR]
 
 @pytest.mark.parametrize("chain", CHAINS, ids=lambda chain: f"{chain.n}-carts")
 def test_symbolic_matrices_are_those_of_the_chain(chain):
-    """The printed A and B have the values of the chain's state space."""
+    """The printed A and B have the values of the chain's state-space model."""
     formula = symbolic_state_space(springs_of(chain)).math
     _, A, _, B = kinds(formula, "matrix")
     values = physical_values(chain)
@@ -86,7 +86,7 @@ def test_symbolic_matrices_are_those_of_the_chain(chain):
     got_B = np.array([evaluate(t, values).real for t in B.parts]).reshape(-1, B.columns)
 
     expected_A, expected_B, _, _ = chain.state_space()
-    assert_allclose(got_A, expected_A, rtol=1e-12)  # the same operations in another order
+    assert_allclose(got_A, expected_A, rtol=1e-12)  # only the order of operations differs
     assert_allclose(got_B, expected_B, rtol=1e-12)
 
 
@@ -101,7 +101,7 @@ def test_symbolic_transfer_functions_are_those_of_the_chain(chain):
         base, _, index = name.partition("_")
         values[names[base] + (f"_{index}" if index else "")] = value
 
-    # The zeros of a chain of exact numbers: only rounding is left.
+    # The numbers are exact, so only rounding errors remain.
     assert_responses(formula.math, values, chain=chain, rtol=1e-9)
 
 
@@ -110,12 +110,12 @@ def test_numeric_transfer_functions_are_those_of_the_chain(chain):
     """The printed numbers, with four digits each, give each cart's response."""
     formula = numeric_transfer_functions(chain)
 
-    # Four digits: 5e-4 at most in each number, up to 17 of them, at a frequency off resonance.
+    # Each of up to 17 numbers is rounded by at most 5e-4; the frequency is off resonance.
     assert_responses(formula.math, {}, chain=chain, rtol=1e-2)
 
 
 def assert_responses(math: Math, values, *, chain: Chain, rtol: float) -> None:
-    """Compare each printed line, gain over D(s) times the zeros, with the chain's response."""
+    """Compare each printed transfer function with the chain's response at one frequency."""
     omega = 11.0  # rad/s, between the resonances
     values = {**values, "s": 1j * omega}
     *lines, (_, _, *denominator) = [line.parts for line in math.parts if isinstance(line, Math)]
@@ -133,7 +133,7 @@ def assert_responses(math: Math, values, *, chain: Chain, rtol: float) -> None:
 
 
 def test_a_missing_spring_is_not_in_the_equations():
-    """A wall spring that is missing does not appear in the equations.
+    """A missing wall spring does not appear in the equations.
 
     The two springs of a single cart appear as one sum.
     """
@@ -146,7 +146,7 @@ def test_a_missing_spring_is_not_in_the_equations():
 def test_a_chain_without_walls_is_shown_as_polynomials():
     """If a chain has no walls, its transfer function is printed as a ratio of polynomials.
 
-    Without a static gain the paper's factors do not exist.
+    Without a static gain, the factors of the paper's form do not exist.
     """
     rigid = Chain(m=np.array([2e-4]), c=np.array([5e-4]), k=np.zeros(2))
     text = to_text(numeric_transfer_functions(rigid).math)
@@ -172,8 +172,8 @@ def test_every_formula_is_well_formed_mathml(chain):
         assert formula.alt
 
 
-def test_leaves_are_escaped():
-    """A name with markup brings no tag into the page."""
+def test_a_name_with_markup_is_escaped():
+    """A name with markup adds no tag to the page."""
     assert "<script>" not in to_mathml(row("<script>", symbol("<b>_<i>")))
 
 

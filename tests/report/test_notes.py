@@ -1,4 +1,4 @@
-"""Students' notes in Markdown become blocks in which nothing can run."""
+"""Students' notes in Markdown become blocks that cannot run any code."""
 
 import re
 
@@ -24,7 +24,7 @@ from pipeline.words.spans import Span, plain
 
 
 def document_of(blocks: tuple[Block, ...]) -> Document:
-    """Return a report that holds only these blocks."""
+    """Return a report that contains only these blocks."""
     return Document(
         title="t",
         subtitle="",
@@ -35,7 +35,7 @@ def document_of(blocks: tuple[Block, ...]) -> Document:
 
 
 def page(blocks: tuple[Block, ...]) -> str:
-    """Return the HTML of a report that holds only these blocks."""
+    """Return the HTML of a report that contains only these blocks."""
     return render_html(document_of(blocks))
 
 
@@ -48,7 +48,7 @@ def test_markdown_becomes_blocks():
 
     heading, text, items, quote, code, table = blocks
     assert isinstance(heading, Heading)
-    assert heading.level == 3  # the report's own headings have the levels above
+    assert heading.level == 3  # the report's own headings use the levels above
     assert isinstance(text, Paragraph)
     assert text.text[1:] == (
         Span("very", "strong"),
@@ -107,7 +107,7 @@ def test_web_and_mail_links_stay():
 
 
 def test_control_characters_are_replaced():
-    """Characters that no page may contain are replaced."""
+    """Characters that are not allowed in a page are replaced."""
     (block,) = note_blocks("a\x07b\ud800c\ufffe")
     assert isinstance(block, Paragraph)
     assert plain(block.text) == "a�b�c�"
@@ -125,7 +125,7 @@ def test_any_text_gives_a_page_without_foreign_tags(markdown):
 @settings(max_examples=20)
 @given(st.text(alphabet=st.sampled_from("ab#->*1._`|\n "), max_size=60))
 def test_any_notes_give_an_accessible_pdf(markdown):
-    """Whatever headings, lists and tables there are, the outline has no gap, as PDF/UA demands."""
+    """Whatever the notes contain, the PDF's outline skips no level, as PDF/UA demands."""
     blocks = even_headings(note_blocks(markdown))
 
     assert render_pdf(document_of(blocks)).startswith(b"%PDF")
@@ -140,7 +140,7 @@ def test_headings_go_down_one_level_at_a_time():
 
 
 @pytest.mark.parametrize("nest", ["> " * 20, "> " * 90, "- " * 40, "1. " * 30])
-def test_deep_nesting_is_set_flat(nest):
+def test_deeply_nested_notes_give_a_page(nest):
     """Notes with deeply nested quotes or lists still give a page and a PDF."""
     blocks = note_blocks(f"{nest}deep")
     assert "deep" in str(blocks)
@@ -148,6 +148,6 @@ def test_deep_nesting_is_set_flat(nest):
 
 
 @pytest.mark.parametrize("nest", ["> " * 3000, "*" * 5000 + "x" + "*" * 5000, "[" * 3000])
-def test_nesting_beyond_sense_is_survived(nest):
+def test_absurdly_deep_nesting_causes_no_crash(nest):
     """Notes with absurdly deep nesting cause no crash."""
     assert isinstance(note_blocks(nest), tuple)

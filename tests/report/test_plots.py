@@ -1,4 +1,4 @@
-"""The page of plots has all that was measured and simulated, in few bytes."""
+"""The page of plots contains all that was measured and simulated, in few bytes."""
 
 import json
 import re
@@ -22,11 +22,11 @@ from pipeline.words.progress import silent
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.examples import analysed
 
-MOST_BYTES = 1_500_000  # limit for three carts and their 36 recordings
+MOST_BYTES = 1_500_000  # limit for three carts with 36 recordings
 
 
 def unpacked(packed: list[Any]) -> Array:
-    """Return numbers as the page's script reads them."""
+    """Return numbers as the page's script decodes them."""
     middle, step, text = packed
     levels = np.frombuffer(b64decode(text), dtype="<i2").astype(float)
     return np.where(levels == -32768, np.nan, middle + step * levels)
@@ -60,13 +60,14 @@ def test_every_recording_is_there_with_its_model(runs):
         assert [[one.model for one in cart.models] for cart in run.carts] == [names] * len(
             run.carts
         )
-        # The shipped submissions hide nothing; the smallest dwell is noise for a twentieth.
+        # The shipped submissions have no hidden effects; in the smallest dwell, a twentieth is
+        # noise.
         assert all(one.nrmse < 0.1 for cart in run.carts for one in cart.models)
     assert {run.kind for run in runs} == {"decay", "step", "sine", "sweep", "closed_loop"}
 
 
-def test_the_loop_is_as_the_report_has_it(runs):
-    """The closed loop's errors and lines equal those of `results.json` and the figures."""
+def test_the_closed_loop_is_that_of_the_report(runs):
+    """The closed loop's errors and curves equal those of `results.json` and the figures."""
     checks = {(c.cart, c.loop): c for c in analysed("two-cart").hardware}
     (control,) = [run for run in runs if run.kind == "closed_loop"]
 
@@ -78,13 +79,13 @@ def test_the_loop_is_as_the_report_has_it(runs):
     assert not checks
 
 
-def test_a_page_holds_what_was_measured_and_simulated(runs):
-    """The page stores each number with 16 bits, right to half a step."""
+def test_a_page_stores_all_numbers_to_half_a_step(runs):
+    """The page stores each number with 16 bits, with an error of at most half a step."""
     for run in runs:
         packed = pack_run(run)
         for cart, held in zip(run.carts, packed["carts"], strict=True):
             y = unpacked(held["y"])
-            # Half a step, and the rounding of the float from which the step is computed.
+            # Half a step, plus the rounding of the float from which the step is computed.
             assert_allclose(y, cart.measured, atol=0.51 * held["y"][1], rtol=1e-12)
             for one, model in zip(cart.models, held["models"], strict=True):
                 residual = unpacked(model["residual"])
@@ -97,7 +98,7 @@ def test_a_page_holds_what_was_measured_and_simulated(runs):
 
 
 def test_a_decay_is_simulated_from_its_release(runs):
-    """A decay is simulated from its release on, and the error of the simulation is only noise."""
+    """A decay is simulated from its release on, and the simulation's error is only noise."""
     for run in runs:
         if run.kind == "decay":
             (cart,) = run.carts
@@ -109,7 +110,8 @@ def test_a_decay_is_simulated_from_its_release(runs):
             measured, y = cart.measured[first:], linear.y[first:]
             motion = np.sum((measured - measured[-50:].mean()) ** 2)
             error = np.sqrt(np.sum((measured - y) ** 2) / motion)
-            # Taken about the mean of the end instead of the fitted rest position: equal to 1 %.
+            # The motion is taken about the mean of the end, not about the fitted rest: equal to 1
+            # %.
             assert error == pytest.approx(linear.nrmse, rel=0.01)
 
 
@@ -129,7 +131,7 @@ def test_thinning_keeps_every_peak():
     assert unpacked(packed["carts"][0]["y"]).max() == pytest.approx(5.0, abs=1e-3)
 
 
-def test_numbers_that_are_none_or_all_the_same_survive():
+def test_packing_keeps_nan_constants_and_empty_arrays():
     """Packing keeps NaN, constants and empty arrays."""
     values = np.array([np.nan, 1.0, 2.0, np.nan])
     assert_allclose(unpacked(pack(values)), values, atol=1e-4)
@@ -148,7 +150,7 @@ def test_a_sine_has_its_amplitude_in_the_spectrum():
     omega, amplitude = amplitude_spectrum(t, y)
     kept, (shown,) = thin_lines([amplitude])
 
-    # Between samples a straight line is low by (ω Δt)² / 8 = 7e-3 at most.
+    # Interpolation between samples reduces the amplitude by at most (ω Δt)² / 8 = 7e-3.
     assert amplitude[299] == pytest.approx(0.7, rel=8e-3)
     assert omega[299] == pytest.approx(300 * step, rel=1e-3)
     assert kept.size <= MOST_LINES < omega.size
@@ -157,7 +159,7 @@ def test_a_sine_has_its_amplitude_in_the_spectrum():
 
 
 def test_the_page_is_small_valid_and_the_same_every_time(tmp_path):
-    """The page for three carts has under 1.5 MB, is valid, and is the same each time."""
+    """The page for three carts is smaller than 1.5 MB, valid, and the same each time."""
     analysis = analysed("three-cart")
     for _ in range(2):
         write_plots(analysis, tmp_path, gap=None, progress=silent)
@@ -174,7 +176,7 @@ def test_the_page_is_small_valid_and_the_same_every_time(tmp_path):
     assert "36 runs. The linear model fits worst in" in page
 
 
-def test_what_a_stranger_wrote_is_text():
+def test_markup_in_a_submission_is_shown_as_text():
     """Titles, ids and units with markup close no element and run no script."""
     analysis = make_analysis(2)
     hostile = '</script><script>alert(1)</script><!--"&\x00\u2028'
@@ -190,7 +192,7 @@ def test_what_a_stranger_wrote_is_text():
     assert shown == [f"{r.id}{hostile}".replace("\x00", "�") for r in analysis.records]
 
 
-def test_without_carts_the_measured_motion_is_there():
+def test_without_carts_only_the_measured_motion_is_shown():
     """If no carts were identified, the page shows only the measured motion and gives the reason."""
     page = page_of(replace(make_analysis(1), fit=None, hardware=()))
 

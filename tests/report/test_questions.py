@@ -29,7 +29,7 @@ SECTIONS = (
 
 
 def well(carts: int = 2) -> Analysis:
-    """Return an analysis in which all parts agree."""
+    """Return an analysis in which all results agree."""
     analysis = make_analysis(carts)
     rows = tuple(replace(row, consistent=True, change_percent=1.0) for row in analysis.rows)
     decays = tuple(replace(decay, friction=None) for decay in analysis.log_decrements)
@@ -63,7 +63,7 @@ def off(name: str, percent: float, **initial) -> Analysis:
     return replace(analysis, rows=tuple(rows))
 
 
-def test_nothing_is_asked_where_all_is_well():
+def test_nothing_is_asked_if_all_results_agree():
     """If all results agree, the report asks no question."""
     analysis = well()
     assert ask(analysis) == ()
@@ -85,17 +85,17 @@ def test_a_damping_that_changed_asks_for_the_amplitudes():
     ("name", "expected"),
     [("K_1", "short of its spring equilibrium"), ("omega_1", "Which masses and which springs")],
 )
-def test_other_parameters_ask_for_what_may_have_moved_them(name, expected):
+def test_a_changed_parameter_asks_about_its_likely_cause(name, expected):
     """A changed gain raises a question about sticking, a changed frequency one about free carts."""
     (question,) = ask(off(name, 40.0))
     assert question.id == name
     assert expected in question.text
 
 
-def test_a_guess_that_was_far_off_asks_where_the_data_show_it():
+def test_a_wrong_assumed_damping_raises_a_question():
     """If an assumed damping was far off, a question asks where the data show this.
 
-    The question says that the peak is sharper, or flatter, than assumed.
+    The question says whether the peak is sharper or flatter than assumed.
     """
     (question,) = ask(off("zeta_b", -67.0, source="assumed"))
     assert question.section == "frequency-response"
@@ -106,7 +106,7 @@ def test_a_guess_that_was_far_off_asks_where_the_data_show_it():
     assert ask(off("zeta_a", 20.0, source="assumed")) == ()
 
 
-def test_points_are_not_asked_for_where_the_fit_had_none():
+def test_a_fit_to_time_records_asks_for_no_bode_points():
     """If the fit used time records, no question asks for points of a Bode plot."""
     analysis = off("zeta_a", 148.0, source="assumed")
     rows = tuple(
@@ -116,10 +116,10 @@ def test_points_are_not_asked_for_where_the_fit_had_none():
     assert ask(replace(analysis, rows=rows)) == ()
 
 
-def test_bench_against_model_asks_level_overshoot_and_shape_apart():
+def test_level_overshoot_and_shape_raise_separate_questions():
     """If level, overshoot and shape differ from the model, each raises its own question.
 
-    Each question has both numbers.
+    Each question gives the measured and the simulated number.
     """
     analysis = well()
     first, *others = analysis.hardware
@@ -149,8 +149,8 @@ def test_a_cart_that_sticks_is_asked_about_with_its_interval():
     assert "between 23.1 and 26.4" in question.text
 
 
-def test_a_fit_that_leaves_more_than_noise_asks_at_its_worst_point():
-    """If a fit's error exceeds the noise, a question names the cart and frequency fitted worst."""
+def test_a_poor_fit_asks_about_its_worst_point():
+    """If a fit's error exceeds the noise, a question names the worst-fitting cart and frequency."""
     analysis = well()
     assert analysis.fit is not None
     response = analysis.frequency_responses[1]
@@ -199,7 +199,7 @@ Oil it.
 """
 
 
-def test_an_answer_stands_beside_its_question():
+def test_an_answer_is_shown_beside_its_question():
     """An answer is shown beside its question; other notes stay in the discussion."""
     analysis = replace(off("zeta_b", 65.0), discussion=NOTES.format(heading="zeta_b"))
     ((section, question),) = questions_of(analysis)
@@ -207,13 +207,13 @@ def test_an_answer_stands_beside_its_question():
     first = question.answer[0]
     assert isinstance(first, Paragraph)
     assert plain(first.text) == "The decay saw more."
-    assert len(question.answer) == 4  # the smaller heading and its text belong to it
+    assert len(question.answer) == 4  # includes the smaller heading and its text
 
 
 @pytest.mark.parametrize(
     "heading", ["zeta_b", "Question zeta_b", "Q: zeta_b: amplitudes", "`zeta_b`", "ζ_b", "ZETA_B."]
 )
-def test_any_spelling_of_an_id_will_do(heading):
+def test_an_answer_is_found_under_any_spelling_of_its_id(heading):
     """An answer is found under any spelling of its question's id."""
     analysis = replace(off("zeta_b", 65.0), discussion=NOTES.format(heading=heading))
     answers, rest = split_notes(discussion_blocks(analysis.discussion or ""), ask(analysis))
@@ -223,7 +223,7 @@ def test_any_spelling_of_an_id_will_do(heading):
     assert open_line(analysis) == ""
 
 
-def test_an_answer_to_nothing_that_is_asked_stays_in_the_discussion():
+def test_an_answer_without_a_question_stays_in_the_discussion():
     """An answer to a question that the data no longer raise stays in the discussion."""
     analysis = replace(well(), discussion=NOTES.format(heading="zeta_b"))
     _, rest = split_notes(discussion_blocks(analysis.discussion or ""), ask(analysis))
@@ -264,8 +264,8 @@ def test_page_and_print_mark_the_place_and_show_the_answer():
 
 
 @pytest.mark.parametrize("answered", [False, True])
-def test_a_question_is_printed_with_what_answers_it(answered):
-    """In print a question stays on one page with its answer, wherever pages break."""
+def test_a_question_is_printed_with_its_answer(answered):
+    """In print, a question is on the same page as its answer, wherever pages break."""
     answer = (paragraph("Our answer. " + "It sticks. " * 40),) if answered else ()
     question = Question(id="q", text=spans("Why so? " * 30), answer=answer)
     line = paragraph("A line.")
@@ -280,7 +280,7 @@ def test_a_question_is_printed_with_what_answers_it(answered):
 
 
 def test_a_new_submission_says_how_to_answer_without_answering(tmp_path):
-    """A new submission explains how to answer in a comment, which is in no report."""
+    """A new submission explains in a comment how to answer; the comment is in no report."""
     new_submission(tmp_path / "team", carts=2)
     notes = tmp_path / "team" / "notes.md"
     assert "## zeta_b" in notes.read_text(encoding="utf-8")
@@ -293,7 +293,7 @@ def test_a_new_submission_says_how_to_answer_without_answering(tmp_path):
     assert discussion.strip() == "Our words."
 
 
-def test_the_three_cart_example_answers_what_it_is_asked():
+def test_the_three_cart_example_answers_its_question():
     """The one question raised by the shipped three-cart example is answered in its notes."""
     analysis = analysed("three-cart")
     ((section, question),) = questions_of(analysis)

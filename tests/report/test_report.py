@@ -44,17 +44,17 @@ class Page(HTMLParser):
         assert self._open == []
 
     def handle_starttag(self, tag, attrs):
-        """Note an opening tag."""
+        """Record an opening tag."""
         self.tags.append((tag, dict(attrs)))
         if tag not in VOID:
             self._open.append(tag)
 
     def handle_startendtag(self, tag, attrs):
-        """Note a tag that closes itself."""
+        """Record a tag that closes itself."""
         self.tags.append((tag, dict(attrs)))
 
     def handle_endtag(self, tag):
-        """Check that the tag closed is the one opened last."""
+        """Check that the closed tag is the one opened last."""
         assert self._open.pop() == tag
 
     def handle_data(self, data):
@@ -84,7 +84,7 @@ def folders(tmp_path_factory) -> dict[int, Path]:
 
 
 def read(folder: Path) -> tuple[Page, str]:
-    """Return the parsed page and the PDF's text, which is "" without a PDF."""
+    """Return the parsed page and the PDF's text, which is empty if there is no PDF."""
     page = Page((folder / "report.html").read_text(encoding="utf-8"))
     if not (folder / "report.pdf").exists():
         return page, ""
@@ -112,12 +112,12 @@ def test_every_part_is_there(carts, folders):
     expected += ["damping", "feedback", "hardware-1", "overview", "sine", "steps"]
     assert names == sorted(expected)
     bode = re.findall(r"Bode plot of cart (\d)", " ".join(page.values("aria-label")))
-    assert bode == [str(i) for i in range(carts, 0, -1)]  # last cart first, as in the paper
+    assert bode == [str(i) for i in range(carts, 0, -1)]  # as in the paper, from the last cart
     assert "Émilie du Châtelet (s1025)" in page.text
     assert "Émilie du Châtelet (s1025)" in pdf
 
 
-def test_print_keeps_figures_and_questions_where_the_page_has_them(folders):
+def test_figures_are_in_the_same_sections_in_print(folders):
     """In print, every figure and question is in the same section as on the page."""
     html = (folders[3] / "report.html").read_text(encoding="utf-8")
     _, pdf = read(folders[3])
@@ -131,9 +131,9 @@ def test_print_keeps_figures_and_questions_where_the_page_has_them(folders):
     assert len([place for place in places if place.startswith("Figure")]) > 8
 
 
-def test_no_page_ends_the_print_with_one_row_of_hashes(folders):
+def test_no_printed_page_has_a_single_row_of_files(folders):
     """A long list of files is split so that no page ends with a single row."""
-    # One more than a page has room for:
+    # one file more than fits on a page
     files = {f"data/run-{i:03d}.csv": f"{i:064x}" for i in range(97)}
     analysis = replace(make_analysis(1), files=files)
     table = file_table(Shown(analysis))
@@ -148,7 +148,7 @@ def test_no_page_ends_the_print_with_one_row_of_hashes(folders):
 
 @pytest.mark.parametrize(("number", "tall", "pages"), [(6, 1.02, 4), (7, 0.66, 3), (2, 0.66, 1)])
 def test_figures_in_a_row_fill_pages(number, tall, pages):
-    """Figures are drawn slightly smaller if one more then fits on a page."""
+    """Figures are drawn slightly smaller if one more figure then fits on a page."""
     svg = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 100 {100 * tall}"/>'
     row = tuple(
         Picture(number=n, name=f"p{n}", caption=spans("Two words"), alt="nothing", draw=lambda: svg)
@@ -164,7 +164,7 @@ def test_pages_are_laid_out_before_the_figures_are_drawn():
 
     layout = lay_out(document)
 
-    assert not any("svg" in vars(picture) for picture in pictures)  # no figure is drawn yet
+    assert not any("svg" in vars(picture) for picture in pictures)  # no figure has been drawn yet
     for picture in pictures:
         blank, drawn = map(ElementTree.fromstring, (picture.blank, picture.svg))
         for size in ("width", "height", "viewBox"):
@@ -179,7 +179,7 @@ def numbers(text: str) -> list[float]:
 
 
 def without_blanks(document: Document) -> Document:
-    """Return the document with figures that must be drawn before pages can be laid out."""
+    """Return the document without blank figures, so that figures are drawn before the layout."""
 
     def drawn(block: Block) -> Block:
         return replace(block, blank="") if isinstance(block, Picture) else block
@@ -191,7 +191,7 @@ def without_blanks(document: Document) -> Document:
 
 
 def printed(*sections: Section) -> list[str]:
-    """Return the text of each page on which sections are printed."""
+    """Return the text of each page on which the sections are printed."""
     document = Document("A", "", (), sections, "the footer")
     return [page.extract_text() for page in pypdf.PdfReader(io.BytesIO(render_pdf(document))).pages]
 
@@ -211,7 +211,7 @@ def test_a_table_longer_than_a_page_breaks_and_stays_with_its_heading(rows):
     assert sum(len(re.findall(r"row-\d\d", page)) for page in pages) == rows
 
 
-def test_the_list_of_files_does_not_stand_alone_on_a_page():
+def test_the_list_of_files_is_never_alone_on_a_page():
     """The list of files is never on a page without its heading and sentence."""
     files = {f"data/run-{i:03d}.csv": f"{i:064x}" for i in range(40)}
     shown = Shown(replace(make_analysis(1), files=files))
@@ -224,7 +224,7 @@ def test_the_list_of_files_does_not_stand_alone_on_a_page():
         assert page.count("Made by") == page.count("run-000")
 
 
-def test_the_page_stands_alone(folders):
+def test_the_page_loads_nothing(folders):
     """The page loads nothing, and its policy lets only its own script run."""
     page, _ = read(folders[2])
 
@@ -245,8 +245,8 @@ def test_the_page_stands_alone(folders):
     assert not re.search(r"\son\w+=", html)
 
 
-def test_the_page_can_be_found_and_heard(folders):
-    """Every section is linked, every figure described, and every formula is MathML."""
+def test_the_page_is_accessible(folders):
+    """Every section is linked, every figure has a description, and every formula is MathML."""
     page, _ = read(folders[3])
 
     ids = set(page.values("id"))
@@ -260,12 +260,12 @@ def test_the_page_can_be_found_and_heard(folders):
     assert len(figures) == len(drawings) > 5
     assert all(attrs.get("role") == "img" for attrs in drawings)
     assert all(attrs.get("aria-label") for attrs in drawings)
-    assert sum(tag == "title" for tag, _ in page.tags) == 1  # a drawing's title would pop up
+    assert sum(tag == "title" for tag, _ in page.tags) == 1  # it would be a tooltip
     assert sum(attrs.get("display") == "block" for tag, attrs in page.tags if tag == "math") >= 6
     assert ("html", {"lang": "en"}) in page.tags
 
 
-def test_a_report_without_a_title_says_what_it_is_once():
+def test_a_report_without_a_title_uses_its_subject_once():
     """If a report has no title, its subject becomes the title and is not repeated."""
     analysis = make_analysis(2)
     named = build_document(analysis)
@@ -359,7 +359,7 @@ def test_hostile_text_stays_text(tmp_path):
     assert '#read("report.typ")' in flat
 
 
-def test_names_that_the_fonts_lack_are_warned_of(tmp_path):
+def test_characters_that_the_fonts_lack_give_a_warning(tmp_path):
     """If the PDF's fonts lack characters of a name, the PDF shows boxes, and a warning says so."""
     said = []
     analysis = replace(make_analysis(1), authors=(("s1", "李雷 😀"), ("s2", "Žofie Ελένη Иван")))
@@ -417,8 +417,8 @@ def bare(analysis: Analysis, **parts) -> Analysis:
     return replace(empty, **parts)
 
 
-def test_without_anything_the_reasons_are_told(tmp_path):
-    """If there are no results at all, the report gives the reason for each missing one."""
+def test_without_results_the_reasons_are_given(tmp_path):
+    """If there are no results at all, the report gives the reason for each missing result."""
     page, pdf = render(bare(make_analysis(2)), tmp_path)
     for text in (page.text, pdf):
         assert "No model of the chain of 2 carts could be identified" in text
@@ -427,7 +427,7 @@ def test_without_anything_the_reasons_are_told(tmp_path):
     assert list((tmp_path / "figures").iterdir()) == []
 
 
-def test_without_anything_and_without_reasons_there_is_still_a_report(tmp_path):
+def test_without_results_and_reasons_there_is_still_a_report(tmp_path):
     """If there are neither results nor reasons, a report is still made, without dead links."""
     page, pdf = render(bare(make_analysis(1), skipped=()), tmp_path)
     assert "No model of the single cart could be identified" in pdf
@@ -453,8 +453,8 @@ def test_any_part_may_be_missing(part, tmp_path):
     "part",
     ["log_decrements", "step_gains", "sine_points", "frequency_responses", "feedback", "hardware"],
 )
-def test_any_part_may_stand_alone(part, tmp_path):
-    """Results of a single stage with their records give a page and a PDF."""
+def test_results_of_a_single_stage_give_a_report(part, tmp_path):
+    """The results of a single stage, with their recordings, give a page and a PDF."""
     analysis = make_analysis(1)
     kept = bare(analysis, records=analysis.records, **{part: getattr(analysis, part)})
     page, pdf = render(kept, tmp_path)
@@ -517,7 +517,7 @@ def test_unusual_chains_are_shown(name, tmp_path):
     assert "The identified chain" in pdf
 
 
-def test_a_poor_result_is_called_so(tmp_path):
+def test_the_summary_reports_a_poor_result(tmp_path):
     """If results disagree or the fit failed, the summary says so and what to do."""
     analysis = make_analysis(2)
     assert analysis.fit is not None
@@ -533,7 +533,7 @@ def test_a_poor_result_is_called_so(tmp_path):
     assert "The failed fit ended at K_1" in text
     assert "It has" not in text
     assert "the residual is larger than the stated noise" in text
-    assert "±" in terminal_summary(analysis)  # this needs a fit that leaves only noise
+    assert "±" in terminal_summary(analysis)  # requires a fit whose error is only noise
     assert "±" not in text
     assert "K_1 (+23.4 %)" in text
     assert "1 of 2 checks failed" in text
@@ -541,7 +541,7 @@ def test_a_poor_result_is_called_so(tmp_path):
     assert "Find out what the linear model misses" in text
 
 
-def test_a_cart_that_a_step_set_swinging_was_not_let_go():
+def test_the_ring_down_of_a_step_is_not_called_a_release():
     """If there is no decay, the figure shows the ring-down of a step and says so."""
     analysis = make_analysis(1)
     ringing = {decay.experiment for decay in analysis.log_decrements}
@@ -556,8 +556,8 @@ def test_a_cart_that_a_step_set_swinging_was_not_let_go():
     assert "released" not in stepped
 
 
-def test_what_was_not_used_is_not_said_to_be():
-    """The model's sources do not list a record that was left out.
+def test_a_recording_that_was_left_out_is_not_listed_as_a_source():
+    """A recording that was left out is not listed among the model's sources.
 
     If a file is missing, the summary asks for it.
     """
@@ -584,7 +584,7 @@ def test_what_was_not_used_is_not_said_to_be():
     assert f"{dwells[0]} is left out: froze" in text
 
 
-def test_a_file_that_cannot_be_read_asks_for_no_experiment():
+def test_an_unreadable_file_asks_for_no_new_experiment():
     """If a file cannot be read, the summary asks for this file and not for a new experiment."""
     unread = Skipped(stage=Stage.READING, run="step-1", reason="empty")
     reason = "no closed-loop run was recorded"
@@ -597,7 +597,7 @@ def test_a_file_that_cannot_be_read_asks_for_no_experiment():
     assert asked == [False, True]
 
 
-def test_skipped_stages_are_told_apart():
+def test_skipped_stages_are_separated_by_semicolons():
     """Skipped stages are separated by semicolons, since their names contain commas."""
     skipped = tuple(
         Skipped(stage=Stage.LOG_DECREMENT, run=f"decay-{i}", cart=1, reason="too short")
@@ -609,7 +609,7 @@ def test_skipped_stages_are_told_apart():
     assert "; 2 more; " in line
 
 
-def test_an_id_keeps_its_underscores_where_it_was_skipped(tmp_path):
+def test_an_id_of_a_skipped_run_keeps_its_underscores(tmp_path):
     """An id with underscores is shown unchanged in the lists of skipped stages."""
     decay = Skipped(stage=Stage.LOG_DECREMENT, run="my_decay_1", cart=1, reason="too short")
     skipped = (decay,)
@@ -619,7 +619,7 @@ def test_an_id_keeps_its_underscores_where_it_was_skipped(tmp_path):
     assert page.text.count("my_decay_1, cart 1") >= 2
 
 
-def test_a_good_result_is_called_so():
+def test_the_summary_of_a_good_result_is_short():
     """If there is no problem, the summary says so in a few lines."""
     analysis = make_analysis(1, repeats=1)
     rows = tuple(replace(row, consistent=True) for row in analysis.rows)
@@ -636,7 +636,7 @@ def test_a_good_result_is_called_so():
         assert "Nothing stands out" not in terminal_summary(worse)
 
 
-def test_one_swing_shows_no_rise_of_the_damping():
+def test_damping_at_one_amplitude_is_not_drawn():
     """Damping is drawn against amplitude only if a decay has at least two amplitudes."""
     analysis = make_analysis(1)
     one = tuple(
@@ -648,7 +648,7 @@ def test_one_swing_shows_no_rise_of_the_damping():
     assert drawn[0].count("picture") == drawn[1].count("picture") + 1
 
 
-def test_what_may_be_either_of_two_values_is_said_with_both():
+def test_estimates_too_uncertain_to_compare_are_both_given():
     """If the estimates are too uncertain to compare, the summary gives both values."""
     analysis = make_analysis(1)
     (first, *others) = analysis.rows
@@ -661,7 +661,7 @@ def test_what_may_be_either_of_two_values_is_said_with_both():
     assert "Too uncertain" not in terminal_summary(analysis)
 
 
-def test_gains_that_the_fit_cannot_give_ask_for_the_springs():
+def test_steps_that_contradict_the_fit_ask_about_the_springs():
     """If steps contradict a fit with few springs, the summary says to check the springs.
 
     Dry friction is mentioned separately.
@@ -683,7 +683,7 @@ def test_gains_that_the_fit_cannot_give_ask_for_the_springs():
         assert "Check springs" not in terminal_summary(replace(asked, **other))
 
 
-def test_a_wrong_sign_is_said_first():
+def test_a_wrong_sign_is_named_first():
     """A sign that the data contradict is named first, since it may cause other failures."""
     analysis = make_analysis(1, repeats=1)
     wrong = Check(

@@ -8,7 +8,7 @@ TOP, BOTTOM = 50.0, 750.0
 
 
 def figures(*heights: float) -> Callable[[Choices], Pages]:
-    """Return the layout of figures with these heights, one below the other."""
+    """Return a function that lays out figures with these heights, one below the other."""
 
     def lay_out(choices: Choices) -> Pages:
         ends, page, y = [], 1, TOP
@@ -24,8 +24,8 @@ def figures(*heights: float) -> Callable[[Choices], Pages]:
     return lay_out
 
 
-def test_a_figure_that_nearly_fits_comes_up():
-    """A figure that nearly fits, and the one above it, are drawn smaller by the same factor."""
+def test_a_figure_that_nearly_fits_is_drawn_smaller():
+    """If a figure nearly fits, it and the figure above it are drawn smaller by the same factor."""
     shares = fill_pages(figures(400.0, 350.0, 100.0)).shares
     assert shares == {1: shares[1], 2: shares[1]}
     assert (BOTTOM - TOP) * 0.9 < shares[1] * 750.0 <= BOTTOM - TOP
@@ -48,8 +48,8 @@ def test_full_pages_are_left_as_they_are():
     assert told == [Choices()]
 
 
-def test_a_table_stays_whole_where_less_is_white_then():
-    """A table is kept on one page if the pages then have less white space."""
+def test_a_table_stays_whole_if_this_saves_white_space():
+    """A table is kept on one page if this leaves less white space."""
 
     def lay_out(choices: Choices) -> Pages:
         begun = 2 if choices.whole == (7,) else 1

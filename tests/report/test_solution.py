@@ -1,4 +1,4 @@
-"""In the worked reference every printed formula is true, and its numbers are the model's."""
+"""In the worked reference, every printed formula is true, and the numbers are the model's."""
 
 import json
 from collections.abc import Mapping
@@ -50,12 +50,12 @@ SPRINGS += [(False, True, True, True), (True,) * 4]
 
 
 def parsed(text: str, names: Mapping[str, Any] | None = None) -> Any:
-    """Return an expression of the derivation for the computer algebra system."""
+    """Return an expression of the derivation as a SymPy expression."""
     return parse_expr(text, local_dict=dict(names or {}))
 
 
 class Truth:
-    """A chain in symbols, solved by the impedance matrix alone."""
+    """A chain in symbols, solved directly from its impedance matrix."""
 
     def __init__(self, springs) -> None:
         n = self.n = len(springs) - 1
@@ -114,7 +114,7 @@ class Truth:
 
 
 def is_zero(text: str, names: dict[str, Any]) -> bool:
-    """Return whether an expression vanishes identically once all its names are inserted."""
+    """Return whether an expression vanishes identically after all its names are substituted."""
     return sympy.fraction(sympy.together(parsed(text, names)))[0].expand() == 0
 
 
@@ -127,7 +127,7 @@ def truth(request):
     return request.param, Truth(request.param)
 
 
-def test_motion_and_elimination_are_true_of_the_impedance_matrix(truth):
+def test_the_way_to_the_transfer_functions_is_true(truth):
     """Each printed step from Newton's laws to the transfer functions is an identity."""
     springs, chain = truth
     n = len(springs) - 1
@@ -142,7 +142,7 @@ def test_motion_and_elimination_are_true_of_the_impedance_matrix(truth):
         assert is_zero(f"({equation.left})-({equation.right})", names), equation
 
 
-def test_the_way_back_is_true_of_the_impedance_matrix(truth):
+def test_the_way_back_to_masses_and_springs_is_true(truth):
     """Each printed step from coefficients back to masses and springs is an identity."""
     springs, chain = truth
     n = len(springs) - 1
@@ -185,20 +185,20 @@ def test_the_redundancies_are_as_many_as_the_checks():
 
 
 @given(chains())
-def test_numbers_put_in_step_by_step_end_in_the_state_model(chain):
+def test_numbers_worked_step_by_step_give_the_state_model(chain):
     """A and B computed step by step from the named parameters equal the chain's matrices."""
     values = work_state_model(chain)
     n = chain.n
     A, B, _, _ = chain.state_space()
     entries, column = derivation.state_entries(n)
     got = np.array([[evaluate(text, values) for text in line] for line in entries])
-    # kappa is the small difference of products of omega²: rounding grows by their ratio.
+    # kappa is a small difference of products of omega², so rounding grows by their ratio.
     scale = np.abs(A).max() * (chain.poles.__abs__().max() / np.abs(chain.poles).min()) ** 2
     assert_allclose(got, A, rtol=1e-9, atol=1e-13 * scale)
     assert_allclose([evaluate(text, values) for text in column], B[:, 0], rtol=1e-9)
 
 
-# -------------------------------------------- displayed formulas equal the tested ones
+# ------------------------------------- the displayed formulas are those tested above
 
 WRITTEN = {
     "ω": "omega", "ζ": "zeta", "κ": "kappa", "Δ": "Delta", "·": "*",
@@ -232,8 +232,8 @@ def side_by_side(parts):
 
 
 @pytest.mark.parametrize("springs", SPRINGS, ids=numbered)
-def test_a_formula_reads_as_the_text_it_is_made_from(springs):
-    """Every displayed formula, read back with its brackets, equals the tested expression."""
+def test_a_displayed_formula_equals_the_tested_one(springs):
+    """Every displayed formula, read with its brackets, equals the tested expression."""
     n = len(springs) - 1
     equations = [*derivation.newton(springs), *derivation.laplace(springs)]
     equations += [*derivation.couplings(n), *derivation.physical(springs)]
@@ -259,8 +259,8 @@ def test_a_formula_reads_as_the_text_it_is_made_from(springs):
         assert sympy.expand(seen - parsed(text, spelt)) == 0, text
 
 
-def test_numbers_put_in_are_worked_out_as_written():
-    """A line with numbers in place of names gives the right result when read as displayed.
+def test_a_line_with_numbers_gives_the_right_result():
+    """A line with numbers in place of names gives the right result when evaluated as displayed.
 
     The numbers have signs and powers of ten.
     """
@@ -283,7 +283,7 @@ def test_the_worked_gains_are_the_designed_ones(preset, method):
         Design(cart=chain.n, reference=1.0, overshoot_percent=10, settling_time=1.0, method=method),
     )
     worked = work_design(chain, design)
-    # Six poles near 1: the controllability matrix of six states loses some nine digits.
+    # With six poles near 1, the controllability matrix loses about nine digits.
     assert_allclose(worked.gains, design.gains, rtol=1e-5, atol=1e-6 * np.abs(design.gains).max())
     assert_allclose(worked.prefilter, design.prefilter, rtol=1e-6)
     if worked.P is not None and design.Q is not None and design.R is not None:
@@ -311,10 +311,10 @@ def test_ackermann_is_exact_in_symbols():
 # ------------------------------------------------------------------- expected values
 
 
-def test_the_reference_passes_its_own_tolerances_and_a_slip_does_not():
+def test_expected_values_pass_and_mistakes_fail():
     """Every expected value is within its own tolerance.
 
-    A frequency in Hz or a doubled gain is far outside.
+    A frequency in Hz or a doubled gain is far outside the tolerance.
     """
     analysis = make_analysis(3)
     for p in expected_parameters(analysis, default_rubric(analysis)):
@@ -331,7 +331,7 @@ def test_the_reference_passes_its_own_tolerances_and_a_slip_does_not():
 @pytest.mark.parametrize(
     ("carts", "hide"), [(1, ()), (3, ()), pytest.param(1, ("dead_zone",), id="not linear")]
 )
-def test_the_solution_accepts_what_the_rubric_gives_full_points_for(carts, hide):
+def test_bounds_in_the_solution_earn_all_points(carts, hide):
     """A student's number at a bound in the solution earns all points, and beyond it fewer."""
     one = student(carts, hide=hide)
     expected = expected_parameters(one.analysis, one.rubric)
@@ -340,7 +340,7 @@ def test_the_solution_accepts_what_the_rubric_gives_full_points_for(carts, hide)
         assert p.low is not None
         assert p.high is not None
         for bound, out in ((p.low, 0.995), (p.high, 1.005)):
-            if bound == 0:  # within the errors there is no lower bound
+            if bound == 0:  # a bound of 0 means that there is no lower bound
                 continue
             shares = []
             for value in (bound * (2 - out), bound * out**4):
@@ -352,7 +352,7 @@ def test_the_solution_accepts_what_the_rubric_gives_full_points_for(carts, hide)
 
 
 def test_another_rubric_has_other_bounds(tmp_path):
-    """With `--rubric`, page and file have the bounds of this rubric and name it."""
+    """With `--rubric`, page and file have the bounds of this rubric and its title."""
     analysis = make_analysis(2)
     text = (RUBRICS / "throne-2dof.toml").read_text(encoding="utf-8")
     text = text.replace(
@@ -373,8 +373,8 @@ def test_another_rubric_has_other_bounds(tmp_path):
 
 @given(chains(min_carts=2, max_carts=3), st.integers(0, 2**32 - 1))
 @settings(max_examples=20)
-def test_entry_tolerances_cover_tables_that_are_off_as_accepted(chain, seed):
-    """If a table is off by a third of its tolerances, most entries of A and B are within theirs."""
+def test_tolerances_of_entries_cover_tolerated_tables(chain, seed):
+    """Errors of a third of a table's tolerances keep most entries of A and B within tolerance."""
     rng = np.random.default_rng(seed)
     table = derivation.given(chain)
     tolerances = {name: 1e-3 * value for name, value in table.items()}
@@ -388,7 +388,7 @@ def test_entry_tolerances_cover_tables_that_are_off_as_accepted(chain, seed):
         worked = work_out(derivation.state_steps(chain.n), moved)
         A = np.array([[evaluate(text, worked) for text in line] for line in rows])
         inside.append(np.abs(A - model.A) <= model.A_tolerance + 1e-6 * np.abs(model.A))
-    # A third of the tolerance is one standard error, so the tolerance holds 99.7 %.
+    # A third of the tolerance is one standard deviation, so the tolerance holds 99.7 %.
     assert np.mean(inside) > 0.97
 
 
@@ -415,8 +415,8 @@ def test_the_document_works_everything_out(carts):
 
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
-def test_nothing_that_students_wrote_stands_in_the_solution(carts):
-    """The solution has no students' notes, and a model answer for each question of the report."""
+def test_the_solution_has_no_text_by_students(carts):
+    """The solution has no students' notes, but a model answer for each question of the report."""
     analysis = make_analysis(carts)
     asked = ask(analysis)
     notes = "# Discussion\n\nOurs alone.\n" + "".join(
@@ -438,8 +438,8 @@ def test_every_kind_of_question_has_a_model_answer(kind):
     assert "?" not in plain(answer.text)
 
 
-def test_what_has_no_table_is_left_out():
-    """Without a fit the solution has only the derivation; a rigid cart has a short one."""
+def test_without_a_fit_the_solution_is_only_the_derivation():
+    """Without a fit, the solution has only the derivation; that of a rigid cart is short."""
     bare = replace(make_analysis(2), fit=None, rows=(), feedback=None)
     ids = [section.id for section in build_solution(bare).sections]
     assert ids[1:3] == ["motion", "transfer-functions"]
@@ -471,8 +471,8 @@ def test_solution_json_is_the_reference_for_programs():
     assert len(found["feedback"]["gains"]) == 4
 
 
-def test_a_reference_that_failed_a_check_says_so_where_its_numbers_stand():
-    """If the reference failed a check, a warning is under the title and above the values."""
+def test_a_reference_that_failed_a_check_has_a_warning():
+    """If the reference failed a check, a warning is shown under the title and above the values."""
     doubtful = make_analysis(2)
     (failed,) = doubtful.failed_checks
     sound = replace(doubtful, checks=tuple(c for c in doubtful.checks if c != failed))

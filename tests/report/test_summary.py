@@ -28,7 +28,7 @@ needs_real = pytest.mark.skipif(
 
 
 def next_part(analysis: Analysis) -> list[str]:
-    """Return the lines of the part on what to do next."""
+    """Return the lines that say what to do next."""
     _, _, advice = terminal_summary(analysis).partition("What to do next.")
     return [line.removeprefix("- ") for line in advice.splitlines() if line]
 
@@ -40,7 +40,7 @@ def every_failed_check_is_named(analysis: Analysis) -> bool:
 
 
 @needs_real
-def test_only_steps_are_no_two_ways_and_no_decays(tmp_path):
+def test_only_steps_are_called_the_same_recordings(tmp_path):
     """If there are only steps, the summary says that both estimates use the same recordings.
 
     It does not mention decays.
@@ -69,7 +69,7 @@ def test_only_steps_are_no_two_ways_and_no_decays(tmp_path):
 def test_the_steps_counted_are_those_of_the_fit(tmp_path):
     """The summary gives the number of steps that the fit used.
 
-    Of ten steps one was left out, and five were of one cart alone.
+    In the test, one of ten steps is left out, and five are steps of one cart alone.
     """
     folder = write_two_cart_submission(tmp_path / "s", REAL_DATA, steps=(1, 2, 3, 4, 5))
     analysis = analyse(load_submission(folder))
@@ -81,14 +81,14 @@ def test_the_steps_counted_are_those_of_the_fit(tmp_path):
     assert "For K_1, K_2, ω_a and ω_b both estimates use the same recordings." in text
     assert every_failed_check_is_named(analysis)
     advice = next_part(analysis)
-    assert advice[0].startswith("Fix the recordings that were left out")  # the worst one first
+    assert advice[0].startswith("Fix the recordings that were left out")  # the worst one is first
     assert "Failed: record.both-1" in advice[0]
 
 
-def test_an_independent_check_is_not_called_the_same():
+def test_independent_initial_estimates_are_named():
     """The summary says which initial estimates are independent of the fit to the dwells.
 
-    Those from decays and steps are; peaks read off the dwells are not.
+    Initial estimates from decays and steps are independent; peaks read off the dwells are not.
     """
     analysis = analysed("two-cart")
     said = {row.name: row.independent for row in analysis.rows if row.independent is not None}
@@ -98,7 +98,7 @@ def test_an_independent_check_is_not_called_the_same():
     }  # fmt: skip
     text = terminal_summary(analysis)
     assert "identified from 23 sine dwells, by" in text
-    assert "sweep" not in text.splitlines()[0]  # no number depends on it
+    assert "sweep" not in text.splitlines()[0]  # because no number depends on the sweep
     notes = plain_of(parameter_blocks(Page(analysis)))
     assert "ω_a, ω_b: initial and final estimates use the same recordings" in notes
 
@@ -114,7 +114,7 @@ def plain_of(blocks) -> str:
     return "\n".join(found)
 
 
-def test_the_sources_of_the_table_are_those_there_are():
+def test_the_table_mentions_only_existing_sources():
     """The text on the table of parameters mentions decays only if there are some."""
     analysis = make_analysis(1)
     without = tuple(
@@ -127,8 +127,8 @@ def test_the_sources_of_the_table_are_those_there_are():
     )
 
 
-def test_a_check_that_nobody_foresaw_is_named_too():
-    """A failed check of unknown kind is named by id and message, before the fit's error."""
+def test_a_failed_check_of_unknown_kind_is_named():
+    """A failed check of an unknown kind is named by id and message, before the fit's error."""
     odd = Check(
         kind="order", run="run-1", outcome="fail", value=1.0, limit=0.5, message="run-1: odd."
     )
@@ -147,10 +147,10 @@ def test_a_check_that_nobody_foresaw_is_named_too():
 
 
 @pytest.mark.parametrize("drop", ["step", "step sine sweep"])
-def test_without_runs_of_all_carts_the_advice_is_what_to_record(drop, tmp_path):
-    """If no run has all carts, the summary advises what to record.
+def test_without_runs_of_all_carts_the_summary_says_what_to_record(drop, tmp_path):
+    """If no run has all carts, the summary says what to record.
 
-    It neither repeats the reason nor asks for an impossible table.
+    The advice neither repeats the reason nor asks for an impossible table.
     """
     shutil.copytree(EXAMPLES / "two-cart", tmp_path / "s")
     toml = tmp_path / "s" / "submission.toml"
@@ -172,7 +172,7 @@ def test_without_runs_of_all_carts_the_advice_is_what_to_record(drop, tmp_path):
     assert every_failed_check_is_named(analysis)
 
 
-def test_nothing_failed_is_named_in_no_list():
+def test_no_failure_is_listed_if_no_check_failed():
     """If no check failed, neither the summary nor the section on checks lists a failure."""
     analysis = analysed("one-cart")
     assert not any("Failed:" in line for line in next_part(analysis))
@@ -181,8 +181,8 @@ def test_nothing_failed_is_named_in_no_list():
     assert not any(isinstance(block, Table) for block in blocks)
 
 
-def test_a_question_about_one_recording_does_not_ask_of_two():
-    """If both estimates use the same recordings, the question does not ask about two amplitudes."""
+def test_a_question_about_one_recording_does_not_mention_two():
+    """If both estimates use the same recordings, the question does not mention two amplitudes."""
     analysis = make_analysis(1)
     rows = tuple(
         replace(row, consistent=False, change_percent=80.0, independent=False)

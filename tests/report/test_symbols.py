@@ -20,12 +20,12 @@ _AS_IN_FILES = re.compile(r"\b(?:omega|zeta)(?:_\w)?\b|overshoot_percent|settlin
 
 
 def raw(html: str) -> list[str]:
-    """Return the names on a page that are spelt as in files."""
+    """Return the parameter names on a page that are spelt as in files."""
     return _AS_IN_FILES.findall(unescape(_HIDDEN.sub(" ", html)))
 
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
-def test_reports_write_symbols(carts):
+def test_reports_show_symbols(carts):
     """Report, solution and terminal show parameters as symbols, not by their names in files."""
     analysis = make_analysis(carts)
     assert raw(render_html(build_document(analysis))) == []
@@ -33,7 +33,7 @@ def test_reports_write_symbols(carts):
     assert raw(terminal_summary(analysis)) == []
 
 
-def test_grades_write_symbols():
+def test_grades_show_symbols():
     """The feedback to a student shows parameters as symbols, also in its text for a platform."""
     one = student(2)
     off = {name: one.value("final", name) * 2 for name in ("zeta_b", "omega_1", "K_1")}

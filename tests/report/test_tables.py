@@ -12,12 +12,12 @@ from tests.helpers.analysis_factory import make_analysis
 
 
 def page(rows, reported=None) -> Page:
-    """Return a page of one cart with changed rows and reported numbers."""
+    """Return a page of one cart with these rows and reported numbers."""
     return Page(replace(make_analysis(1), rows=tuple(rows), reported=reported or {}))
 
 
-def test_a_number_of_ones_own_that_is_off_says_what_to_look_at():
-    """If a reported number is off by a factor of 2π, a hint names the likely slip.
+def test_a_wrong_reported_number_gets_a_hint():
+    """If a reported number is off by a factor of 2π, a hint names the likely mistake.
 
     A number that is merely rounded gets no hint.
     """
@@ -35,7 +35,7 @@ def test_a_number_of_ones_own_that_is_off_says_what_to_look_at():
     assert "Hz" in frequency[-1]
 
 
-def test_what_was_assumed_says_nothing_of_a_number():
+def test_a_number_is_not_compared_with_an_assumed_value():
     """A student's number is not compared with a value that the program assumed."""
     row = make_analysis(1).rows[0]
     assert row.initial
@@ -44,7 +44,7 @@ def test_what_was_assumed_says_nothing_of_a_number():
     assert [plain(cell.text) for cell in table.rows[0]][-2:] == ["–", ""]
 
 
-def test_nothing_found_and_no_known_slip_say_nothing():
+def test_a_number_without_an_estimate_has_a_dash():
     """A reported number without an estimate has a dash beside it.
 
     A wrong mass gets no hint, since no known mistake explains it.
@@ -59,7 +59,7 @@ def test_nothing_found_and_no_known_slip_say_nothing():
     assert plain(table.rows[0][-1].text) == ""
 
 
-def test_agree_stands_beside_its_limit():
+def test_a_verdict_is_shown_beside_its_limit():
     """Beside each verdict, the table gives its limit: 15 % for frequencies, 50 % for dampings."""
     rows = [row for row in make_analysis(1).rows if row.consistent is not None]
     table = parameter_table(page(rows))
@@ -68,7 +68,7 @@ def test_agree_stands_beside_its_limit():
     assert limits["ζ"] == "50 %"
 
 
-def test_a_dwell_that_did_not_settle_is_said():
+def test_a_dwell_that_did_not_settle_is_marked():
     """The table lists every dwell and cart, and marks a dwell that did not settle."""
     analysis = make_analysis(2)
     settled = [replace(point, settled=True) for point in analysis.sine_points]

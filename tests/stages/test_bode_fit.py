@@ -27,7 +27,7 @@ FOUR_CARTS = Chain(
 
 
 def exact(chain: Chain, omega: Array = BENCH_BAND) -> tuple[FrequencyResponse, ...]:
-    """Return magnitudes without error that claim an error of 1 %."""
+    """Return exact magnitudes with a stated error of 1 %."""
     size = np.abs(chain.frequency_response(omega))
     return tuple(
         FrequencyResponse(
@@ -57,18 +57,18 @@ def thinned(responses: tuple[FrequencyResponse, ...], points: slice) -> list[Fre
     ]  # fmt: skip
 
 
-# ----------------------------------------------------------------------- truth
+# ---------------------------------------------------------------------- exact data
 
 
 @pytest.mark.parametrize("chain", [*PRESETS.values(), FOUR_CARTS], ids=lambda c: f"{c.n}-carts")
-def test_exact_magnitudes_give_the_chain_back_without_a_start(chain):
+def test_exact_magnitudes_give_the_chain_without_a_start(chain):
     """From exact magnitudes and without a start value, the fit finds every named parameter."""
     got = fit_bode(exact(chain), bench=Bench(springs=(True,) * (chain.n + 1)))
 
     assert got.converged
     for name, value in chain.parameters().items():
-        # The fit stops where its cost or step changes by 1e-8; the cost is quadratic, so a
-        # parameter is then good to about 1e-5 of its standard error's scale, 1 %.
+        # The fit stops when its cost or step changes by less than 1e-8. The cost is quadratic, so a
+        # parameter is then within about 1e-5 of its standard error.
         assert_allclose(got.parameters[name].value, value, rtol=1e-5)
 
 
@@ -94,7 +94,7 @@ def test_any_bench_is_found(chain):
 
     got = fit_bode(exact(chain, omega), bench=Bench(springs=(True,) * (chain.n + 1)))
 
-    # As above; a wrong minimum would be off by per cents.
+    # Near the tolerance above; a wrong minimum would be off by several percent.
     assert_allclose(got.chain.m, chain.m, rtol=1e-4)
     assert_allclose(got.chain.k, chain.k, rtol=1e-4)
 
@@ -124,7 +124,7 @@ def test_a_rigid_body_has_mass_and_damping():
 
 
 def test_the_staged_fit_is_reported_as_well():
-    """From exact data the stage-by-stage fit finds all parameters, recomputed ones included."""
+    """From exact data, the stage-by-stage fit finds all parameters, also the recomputed ones."""
     chain = PRESETS["throne-3dof"]
 
     got = fit_bode(exact(chain), bench=Bench(springs=(True,) * 4), initial=PAPER_STARTS[3])
@@ -132,7 +132,8 @@ def test_the_staged_fit_is_reported_as_well():
     truth = chain.parameters()
     assert set(got.staged) == set(truth)
     for name, value in truth.items():
-        # Each stage stops as the joint fit does; recomputing omega_1 multiplies by some ten.
+        # Each stage stops like the joint fit; recomputing omega_1 multiplies the error by about
+        # ten.
         assert_allclose(got.staged[name], value, rtol=1e-3)
 
 
@@ -142,23 +143,23 @@ def test_the_staged_fit_is_reported_as_well():
 @pytest.mark.parametrize("phases", [False, True], ids=["magnitudes", "phases"])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_intervals_cover_the_truth(preset, phases):
-    """Over 16 noisy data sets, each 95 % interval contains the truth as often as it should."""
+    """Over 16 noisy data sets, 95 % intervals contain the true value as often as they should."""
     got = quality(PRESETS[preset], seeds=16, phases=phases)
 
-    # A right interval falls below this limit once in 10,000 tries.
+    # For correct intervals, the coverage is below this limit once in 10,000 tries.
     assert np.all(got.coverage >= binom.ppf(1e-4, 16, 0.95) / 16)
-    # The mean of 16 values of chi²/dof, each with 17 dof or more, has a standard error of at most
-    # 0.086; 4 of those are allowed.
+    # The mean of 16 values of chi²/dof, each with at least 17 dof, has a standard error of at most
+    # 0.086. The tolerance is four of these.
     assert_allclose(np.mean(got.chi_square), 1.0, atol=0.35)
 
 
 # ------------------------------------------------------------------ hard cases
 
 
-def test_a_spring_that_is_not_there_is_held_at_zero():
+def test_a_missing_spring_is_held_at_zero():
     """If the true k_1 is zero, about half of the noisy fits hold it at zero, with a note.
 
-    The other half find a small positive value.
+    The other fits find a small positive value.
     """
     fits = [
         fit_bode(noisy("throne-2dof", seed=seed), bench=Bench(springs=(True,) * 3))
@@ -166,13 +167,13 @@ def test_a_spring_that_is_not_there_is_held_at_zero():
     ]
 
     held = [fit for fit in fits if "k_1" not in fit.names]
-    # Binomial with one half: fewer than 3 or more than 17 once in 2000.
+    # For a binomial of 20 with probability 1/2, this fails once in 2000 tries.
     assert 3 <= len(held) <= 17
     assert all(fit.chain.k[0] >= 0 for fit in fits)
     assert all(fit.chain.k[0] == 0 and "k_1 is at its bound" in fit.message for fit in held)
 
 
-def test_a_far_spring_and_a_damper_that_are_not_there_are_held_at_zero():
+def test_a_missing_far_spring_and_damper_are_found_to_be_zero():
     """If the far spring and the damper of cart 2 are missing, the fit finds both to be zero."""
     chain = PRESETS["throne-2dof"]
     loose = Chain(m=chain.m, c=np.array([6e-4, 0.0]), k=np.array([0.05, 0.127, 0.0]))
@@ -184,13 +185,13 @@ def test_a_far_spring_and_a_damper_that_are_not_there_are_held_at_zero():
     assert_allclose(got.parameters["K_1"].value, got.parameters["K_2"].value, rtol=1e-4)
 
 
-# Beside a peak so sharp that the six points do not show its damping.
+# All points are beside the sharp peak, so they do not show its damping.
 SHARP = Chain(m=np.array([2e-3]), c=np.array([0.0]), k=np.array([0.6, 0.0]))
 BESIDE = np.sqrt(300.0) * np.array([0.4, 0.6, 0.8, 1.25, 1.5, 2.0])
 
 
-def test_a_damping_at_its_bound_is_no_measurement():
-    """If the fit holds a damping at zero, a note says so and it has no standard error.
+def test_a_damping_at_its_bound_has_no_standard_error():
+    """If the fit holds a damping at zero, a note says so, and the damping has no standard error.
 
     Gain and frequency still have their standard errors.
     """
@@ -203,10 +204,10 @@ def test_a_damping_at_its_bound_is_no_measurement():
     assert_allclose(got.parameters["omega_n"].value, np.sqrt(300.0), rtol=1e-4)
 
 
-def test_what_rests_on_a_damping_at_its_bound_is_known_no_better_than_it():
+def test_a_damping_at_its_bound_widens_the_modes_errors():
     """If one of two dampings is held at zero, the modes' dampings get larger standard errors.
 
-    The true value of the held damping need not be zero.
+    This is because the true value of the held damping need not be zero.
     """
     chain = replace(PRESETS["throne-2dof"], c=np.array([6e-4, 0.0]))
     got = fit_bode(exact(chain), bench=Bench(springs=(False, True, True)))
@@ -215,13 +216,13 @@ def test_what_rests_on_a_damping_at_its_bound_is_known_no_better_than_it():
     assert got.parameters["zeta_2"].at_bound
     row = got.names.index("c_2")
     damping_std = float(np.sqrt(got.covariance[row, row]))
-    # Of the second mode's damping rate, c_2 has the share of its kinetic energy: over a third.
+    # c_2 causes over a third of the second mode's damping rate, by its share of kinetic energy.
     std = got.parameters["zeta_b"].std
     assert std is not None
     assert std > 0.3 * damping_std / (2 * chain.m[1] * got.parameters["omega_b"].value)
 
 
-def test_the_decay_tells_a_damping_that_the_response_leaves_open():
+def test_a_damping_that_the_response_leaves_open_is_the_decays():
     """If points beside a sharp peak leave the damping open, the damping of the decay is used."""
     decay = Estimate(value=0.017, std=0.0005, source="log_decrement")
     got = fit_bode(exact(SHARP, BESIDE), bench=Bench(springs=(True, True)), decays={1: decay})
@@ -233,7 +234,7 @@ def test_the_decay_tells_a_damping_that_the_response_leaves_open():
     assert_allclose(got.chain.zeta_carts, 0.017, rtol=0.02)
 
 
-def test_where_one_damping_is_open_all_decays_are_fitted_along():
+def test_if_one_damping_is_open_all_decays_are_used():
     """If the response leaves one of two dampings open, the fit also uses both carts' decays."""
     chain = PRESETS["throne-2dof"]
     decays = {
@@ -247,7 +248,7 @@ def test_where_one_damping_is_open_all_decays_are_fitted_along():
 
     got = fit_bode(vague, bench=Bench(springs=(False, True, True)), decays=decays)
     assert got.at_bound == ("c_1", "c_2")
-    # Two standard errors of the decays; a response with 30 % error adds nothing.
+    # Two standard errors of the decays. A response with 30 % error adds no information.
     assert_allclose(got.chain.zeta_carts, chain.zeta_carts, rtol=0.04)
     assert {got.parameters[f"zeta_{cart}"].source for cart in (1, 2)} == {"log_decrement"}
 
@@ -262,10 +263,10 @@ def test_a_decay_that_the_response_rules_out_is_not_used():
     assert got.chain.c[0] == 0
 
 
-def test_a_decay_is_not_used_where_the_response_tells():
+def test_a_decay_is_not_used_if_the_response_gives_the_damping():
     """If the response determines the damping, the decay is not used.
 
-    Initial and final estimate then come from different data.
+    The initial and the final estimate then come from different data.
     """
     responses = noisy("throne-1dof")
     decay = Estimate(value=0.3, std=1e-4, source="log_decrement")
@@ -289,7 +290,7 @@ def test_a_spring_known_to_be_missing_is_not_fitted():
         free_std, std = free.parameters[name].std, estimate.std
         assert std is not None
         assert free_std is not None
-        assert std <= free_std * 1.02  # the two fits' errors differ by their values, per cents
+        assert std <= free_std * 1.02  # the fits differ by a few percent
 
 
 @pytest.mark.parametrize("change", ["delay", "sign"])
@@ -328,7 +329,7 @@ def test_good_phases_sharpen_the_dampings():
 
 
 def test_a_misfit_widens_the_errors():
-    """If points scatter by 5 % but claim 0.01 %, the standard errors are those of 5 %."""
+    """If points scatter by 5 % but claim 0.01 %, the standard errors correspond to 5 %."""
     chain = PRESETS["throne-2dof"]
     rng = np.random.default_rng(4)
     scattered = [
@@ -351,9 +352,9 @@ def test_a_misfit_widens_the_errors():
     for name, value in chain.parameters().items():
         estimate = got.parameters[name]
         assert estimate.std is not None
-        # All ten parameters of one draw are within 4 standard errors.
+        # All ten parameters of one noisy data set are within 4 standard errors.
         assert abs(estimate.value - value) < 4 * estimate.std
-        # 500 times the error that 0.01 % would give, so 100 times is safe.
+        # The error is 500 times that of 0.01 %; a limit of 100 times is safe.
         claimed = honest.parameters[name].std
         assert claimed is not None
         assert estimate.std > 100 * claimed
@@ -371,12 +372,13 @@ def test_a_table_is_judged_by_its_own_scatter():
 
     gain = got.parameters["K_1"]
     assert gain.std is not None
-    # Rounding to 3 digits is uniform within 0.05 to 0.5 %: 0.1 % rms, over 90 points for 10 values.
+    # Rounding to 3 digits errs by at most 0.05 to 0.5 %, about 0.1 % rms; 90 points determine 10
+    # values.
     assert 5e-5 < gain.std / gain.value < 1e-3
     assert abs(gain.value - chain.parameters()["K_1"]) < 4 * gain.std
 
 
-def test_one_measured_cart_may_do():
+def test_one_measured_cart_may_be_enough():
     """If the near spring is missing, the response of cart 1 alone determines both carts."""
     got = fit_bode(
         noisy("throne-2dof")[:1], bench=Bench(springs=(False, True, True)), initial=PAPER_STARTS[2]
@@ -385,7 +387,7 @@ def test_one_measured_cart_may_do():
     for name, value in PRESETS["throne-2dof"].parameters().items():
         estimate = got.parameters[name]
         assert estimate.std is not None
-        assert abs(estimate.value - value) < 4 * estimate.std  # for ten parameters of one draw
+        assert abs(estimate.value - value) < 4 * estimate.std  # ten parameters of one data set
     assert set(got.standardised) == {"1"}
 
 
@@ -414,7 +416,7 @@ def test_few_points_are_refused():
     ],
 )
 def test_impossible_responses_are_refused(change, message):
-    """Infinite values, negative frequencies and numbers of carts that do not exist are errors.
+    """Infinite values, negative frequencies and impossible cart numbers are refused.
 
     The error names the cause.
     """
@@ -441,7 +443,7 @@ def test_residuals_belong_to_their_points():
     assert {name: z.shape for name, z in got.standardised.items()} == {
         str(r.cart): r.omega.shape for r in responses
     }
-    # The point draws the fit towards itself, but 90 points share 10 parameters.
+    # The point pulls the fit towards itself, but only a little, as 90 points share 10 parameters.
     assert 5 < got.standardised["2"][7] < 13
 
 

@@ -65,7 +65,7 @@ def test_limits_are_tight_for_frequencies_and_loose_for_damping(name, limit):
 
 
 @pytest.mark.parametrize(("std", "outcome"), [(0.05, "fail"), (0.1, "skip")])
-def test_a_wide_error_makes_no_agreement(std, outcome):
+def test_a_large_error_does_not_make_two_numbers_agree(std, outcome):
     """Two numbers 30 % apart never agree; if their errors are large, there is no verdict."""
     row = _row(1.0, 1.3, std=std)
     assert row.consistent is (False if outcome == "fail" else None)
@@ -73,7 +73,7 @@ def test_a_wide_error_makes_no_agreement(std, outcome):
     assert check.outcome == outcome
 
 
-def test_a_final_value_at_its_bound_is_none():
+def test_a_final_value_at_its_bound_is_not_used():
     """If the fit holds a damping at zero, the table has no final value and no verdict."""
     final = Estimate(value=0.0, std=None, source="bode_fit", at_bound=True)
     (row,) = compare(
@@ -89,7 +89,7 @@ def test_a_final_value_at_its_bound_is_none():
 @pytest.mark.parametrize(
     ("name", "std", "there"), [("K", 0.19, True), ("K", 0.21, False), ("zeta", 0.6, True)]
 )
-def test_a_final_value_known_no_better_than_the_limit_is_none(name, std, there):
+def test_a_very_uncertain_final_value_is_not_determined(name, std, there):
     """If a final value's error is as large as its limit, the value is called not determined.
 
     The limit is 15 % for a gain and 50 % for a damping.
@@ -101,7 +101,7 @@ def test_a_final_value_known_no_better_than_the_limit_is_none(name, std, there):
 
 
 def test_an_estimate_is_not_compared_with_itself():
-    """If the final damping comes from the decay too, it is not compared with the decay's."""
+    """If the final damping comes from the decay, it is not compared with the initial one."""
     (row,) = compare(
         {"zeta": _estimate(0.017, 1e-4, "log_decrement")},
         final={"zeta": _estimate(0.017, 1e-4, "log_decrement")},
@@ -123,8 +123,8 @@ def test_an_assumed_value_is_never_judged():
     assert not check_rows([row])
 
 
-def test_a_disagreement_advises_what_to_look_at():
-    """If two estimates disagree, the message gives the change and says what to look at."""
+def test_a_disagreement_says_what_to_check():
+    """If two estimates disagree, the message gives the change and says what to check."""
     (check,) = check_rows([_row(0.1, 0.3, name="zeta_2")])
     assert check.outcome == "fail"
     assert "+200.0 %" in check.message
@@ -152,8 +152,8 @@ def test_a_negative_spring_is_named():
     assert "k_1" in checks["physical.signs"].message
 
 
-def test_the_papers_third_table_breaks_the_laws_it_is_known_to_break():
-    """The paper's Table 3 violates the redundancies R4 and R5, but every order holds."""
+def test_the_papers_third_table_breaks_two_redundancies():
+    """The paper's Table 3 violates the redundancies R4 and R5, but breaks no law of order."""
     gains = {"K_1": 39.4, "K_2": 30.6, "K_3": 16.0}
     modes = {"omega_a": 6.9, "omega_b": 24.1, "omega_c": 34.1}
     dampings = {"zeta_a": 0.25, "zeta_b": 0.03, "zeta_c": 0.03}

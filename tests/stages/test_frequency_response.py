@@ -84,7 +84,7 @@ def errors(chain: Chain, response: FrequencyResponse) -> Array:
 # ---------------------------------------------------------------------- dwells
 
 
-def test_dwells_come_out_in_ascending_order():
+def test_dwells_are_sorted_by_frequency():
     """Each dwell becomes one point with its gain and error, in ascending order of frequency."""
     (got,) = collect_dwells([dwell(omega=20.0, gain=3.0), dwell(omega=5.0, gain=2.0)])
 
@@ -95,15 +95,15 @@ def test_dwells_come_out_in_ascending_order():
 
 
 def test_repeats_that_agree_halve_the_variance():
-    """Two equal dwells of one frequency become one point with a standard error smaller by √2."""
+    """Two equal dwells at one frequency become one point with a standard error smaller by √2."""
     (got,) = collect_dwells([dwell(omega=5.0, gain=2.0), dwell(omega=5.002, gain=2.0)])
 
     assert got.omega.size == 1
     assert_allclose(got.magnitude_std, 0.001 / np.sqrt(2), rtol=1e-9)
 
 
-def test_repeats_that_scatter_say_so():
-    """If two dwells of one frequency differ by 0.1, their mean has an error of 0.05."""
+def test_repeats_that_scatter_have_a_larger_error():
+    """If the gains of two dwells at one frequency differ by 0.1, the mean has an error of 0.05."""
     (got,) = collect_dwells([dwell(omega=5.0, gain=1.95), dwell(omega=5.0, gain=2.05)])
 
     assert_allclose(got.magnitude, 2.0, rtol=1e-12)
@@ -111,7 +111,7 @@ def test_repeats_that_scatter_say_so():
 
 
 def test_repeats_around_half_a_turn_do_not_cancel():
-    """Phases of 179° and −179° combine to 180°, not to zero."""
+    """The mean of the phases 179° and −179° is 180°, not zero."""
     phase = np.deg2rad(179.0)
     (got,) = collect_dwells(
         [dwell(omega=5.0, gain=2.0, phase=phase), dwell(omega=5.0, gain=2.0, phase=-phase)]
@@ -121,10 +121,10 @@ def test_repeats_around_half_a_turn_do_not_cancel():
     assert_allclose(np.abs(got.phase), np.pi, rtol=1e-9)
 
 
-def test_a_dwell_that_did_not_settle_counts_little():
+def test_an_unsettled_dwell_counts_little():
     """A dwell that did not settle gets an error of 5 %.
 
-    Beside a settled dwell of the same frequency it hardly counts.
+    If there is also a settled dwell at the frequency, the unsettled one hardly counts.
     """
     (alone,) = collect_dwells([dwell(omega=5.0, gain=2.0, settled=False)])
     (both,) = collect_dwells(
@@ -168,8 +168,8 @@ def test_a_step_record_gives_the_response_exactly(preset):
         G = chain.frequency_response(response.omega)[response.cart - 1]
         assert response.phase is not None
         off = np.abs(response.magnitude * np.exp(1j * response.phase) - G)
-        # Straight lines between samples at h: after the sinc² correction what is left are aliases
-        # of y' ~ 1/s², some (omega h / 2 pi)³; at 60 rad/s and 9 ms that is 6e-4.
+        # The input is a straight line between samples. After the sinc² correction, aliases of y' ~
+        # 1/s² remain, about (omega h / 2 pi)³: 6e-4 at 60 rad/s and h = 9 ms.
         low = response.omega < 60
         assert low.sum() > 50
         assert np.max(off[low] / np.abs(G[low])) < 1e-3
@@ -192,8 +192,8 @@ DRIVES = {
 
 @pytest.mark.parametrize("drive", DRIVES)
 @pytest.mark.parametrize("preset", PRESETS)
-def test_errors_of_a_record_are_honest(preset, drive):
-    """With noise of half a count, errors of a response are about as large as stated."""
+def test_stated_errors_of_a_response_are_right(preset, drive):
+    """With noise of half a count, the errors of a response hardly exceed the stated errors."""
     chain = PRESETS[preset]
     t, u, kind = DRIVES[drive]
 
@@ -202,14 +202,14 @@ def test_errors_of_a_record_are_honest(preset, drive):
     assert [r.cart for r in responses] == list(range(1, chain.n + 1))
     for response in responses:
         z = errors(chain, response)
-        # 100 and more values of unit size: their rms is within 1 ± 0.2; up to 1.4 is allowed for
-        # the error of the local polynomials at a resonance. Larger standard errors are accepted,
-        # because half a count is allowed at rest; a tenth would mean no error estimate at all.
+        # The rms of 100 or more standardised errors is within 1 ± 0.2. The limit 1.4 allows for
+        # errors of the local polynomials at a resonance. Stated errors may be too large, because
+        # they include half a count at rest; below 0.1 they would be useless.
         assert 0.1 < np.sqrt(np.mean(z**2)) < 1.4
         assert response.omega.size > 50
 
 
-def test_records_combine():
+def test_four_records_halve_the_error():
     """If noise is the only error, four records together have half the error of one."""
     chain = PRESETS["throne-2dof"]
     t = np.arange(0, 20, 1 / 113)
@@ -222,13 +222,13 @@ def test_records_combine():
     gain = np.interp(shared, four.omega, four.magnitude_std) / np.interp(
         shared, one.omega, one.magnitude_std
     )
-    # Scatter beyond the errors is included, and that of four varies by 40 %: the median over the
-    # lines is between exactly half and half times 1.4.
+    # The stated error includes the scatter of the four records, which varies by 40 %, so the median
+    # ratio is between 0.5 and 0.5 times 1.4.
     assert 0.45 < np.median(gain) < 0.7
 
 
-def test_a_band_limited_input_is_taken_as_smooth():
-    """A smooth sweep gives no false phase lag if its input is declared band-limited."""
+def test_a_band_limited_input_causes_no_false_phase():
+    """A smooth sweep shows no false phase lag if its input is declared band-limited."""
     chain = PRESETS["throne-2dof"]
     t = np.arange(0, 20, 1 / 113)
     u = chirp(t) * np.clip((15 - t) / 2, 0, 1)
@@ -238,7 +238,7 @@ def test_a_band_limited_input_is_taken_as_smooth():
     G = chain.frequency_response(response.omega)[0]
     assert response.phase is not None
     lag = np.angle(np.exp(1j * (np.angle(G) - response.phase)))
-    # Half a sample taken wrongly would be 4.4 ms: 0.16 rad at 37 rad/s.
+    # Half a sample is 4.4 ms; ignoring it would cause 0.16 rad at 37 rad/s.
     inside = (response.omega > 3) & (response.omega < 38)
     assert np.max(np.abs(lag[inside])) < 0.01
 
@@ -251,7 +251,7 @@ def test_records_without_an_input_are_refused():
         response_from_records([silent])
 
 
-def test_a_record_of_nothing_but_noise_is_refused():
+def test_a_record_of_only_noise_is_refused():
     """A record in which no frequency is above the noise is refused."""
     t = np.arange(0, 5, 0.01)
     still = record(PRESETS["throne-1dof"], t, 1e-7 * pulse(t + 0.4), noise=COUNT_NOISE)
@@ -297,7 +297,7 @@ def test_peaks_and_nulls_are_found(preset):
     }
     assert expected <= set(got)
     for name in expected:
-        # The grid's ratio is 1.08, and a peak is sqrt(1 - 2 zeta²) low: 6 % at zeta 0.25.
+        # The grid's ratio is 1.08, and a peak is low by sqrt(1 - 2 zeta²), or 6 % at zeta 0.25.
         assert_allclose(got[name].value, truth[name], rtol=0.08)
     assert all(e.value == 0.1 for e in got.values() if e.source == "assumed")
 
@@ -306,17 +306,17 @@ def test_a_mode_too_damped_to_peak_is_found_from_the_roll_off():
     """If the first mode is too damped to have a peak, it is found from the roll-off."""
     chain = PRESETS["throne-2dof"]
     damped = Chain(m=chain.m, c=np.array([1, 1.7]) * 3e-3, k=chain.k * [1, 20, 1])
-    assert damped.parameters()["zeta_a"] > 0.72  # no peak above 1/sqrt 2
+    assert damped.parameters()["zeta_a"] > 0.72  # above 1/sqrt 2 there is no peak
     omega = np.geomspace(1.0, 300.0, 60)
 
     got = find_resonances(table(damped, omega), n=2)
 
-    # This is only a start for a fit: the formula ignores the damping.
+    # The value is only a start for a fit, since the formula ignores the damping.
     assert_allclose(got["omega_a"].value, damped.parameters()["omega_a"], rtol=0.3)
     assert_allclose(got["omega_b"].value, damped.parameters()["omega_b"], rtol=0.05)
 
 
-def test_noise_makes_no_resonance():
+def test_noise_gives_no_resonance():
     """A flat response with 5 % noise gives no resonance."""
     omega = np.geomspace(1.0, 50.0, 40)
     rng = np.random.default_rng(1)

@@ -47,7 +47,7 @@ def encoder(x: Array, seed: int = 1) -> Array:
 
 
 def noise_floor(y: Array) -> float:
-    """Return the NRMSE of a perfect model, which leaves only noise and rounding."""
+    """Return the NRMSE of a perfect model, whose error is only noise and rounding."""
     return float(np.sqrt((NOISE**2 + COUNT**2 / 12) / np.mean(y**2)))
 
 
@@ -100,7 +100,7 @@ def known(value: float | None) -> float:
 def bench(
     chain: Chain, law: Controller, *, sample_time: float | None = None, limit: float | None = None
 ) -> tuple[Array, Array]:
-    """Return readings and logged input of a closed-loop run."""
+    """Return the readings and the logged input of a closed-loop run."""
     run = simulate_loop(
         chain,
         law,
@@ -113,9 +113,9 @@ def bench(
 
 @pytest.mark.parametrize(("name", "cart"), LAST_CART)
 def test_a_true_model_leaves_the_noise(name, cart):
-    """If the model is true, the simulations with open and closed loop leave only noise.
+    """With a true model, the errors of the open-loop and closed-loop simulations are only noise.
 
-    Both give the same overshoot, settling time and level.
+    Both simulations have the measured overshoot, settling time and level.
     """
     chain = PLANTS[name]
     design = designed(chain, cart)
@@ -130,25 +130,25 @@ def test_a_true_model_leaves_the_noise(name, cart):
         (loop, j) for loop in ("closed", "open") for j in range(1, chain.n + 1)
     ]
     for check in checks:
-        # The controller reacts to the rounding of its readings: up to a third more.
+        # The controller reacts to the rounding of its readings, which adds up to a third.
         assert check.nrmse < 1.35 * noise_floor(y[check.cart - 1])
         assert check.note == ""
-        # The scale's error is the noise's over the root of the 340 samples that move.
+        # The scale's error is the noise divided by the square root of the 340 moving samples.
         assert_allclose(known(check.input_scale), 1.0, atol=1e-3)
-        # A level at rest is rounded by half a count, and the controller follows it.
+        # A level at rest is rounded by half a count, and the controller follows the rounding.
         assert_allclose(
             known(check.steady_state_measured), known(check.steady_state_model), atol=COUNT
         )
     steered = of(checks, "closed")[cart]
     assert_allclose(known(steered.steady_state_measured), 1.0, atol=COUNT)
-    # Noise adds to a maximum some three of its deviations, 0.4 % of a 1 cm step.
+    # Noise raises the maximum by about three standard deviations, 0.4 % of a 1 cm step.
     assert_allclose(known(steered.overshoot_measured), known(steered.overshoot_model), atol=0.8)
     assert_allclose(known(steered.settling_measured), known(steered.settling_model), atol=0.05)
 
 
 @pytest.mark.parametrize(("name", "cart"), LAST_CART)
 @pytest.mark.parametrize("factor", [-0.5, -1.0, 3.0])
-def test_a_log_of_another_sign_and_scale_is_found_out(name, cart, factor):
+def test_a_logged_input_of_another_sign_or_scale_is_corrected(name, cart, factor):
     """If the logged input has another sign or scale, its factor is found, reported and used."""
     chain = PLANTS[name]
     design = designed(chain, cart)
@@ -168,8 +168,8 @@ def test_a_log_of_another_sign_and_scale_is_found_out(name, cart, factor):
     )
 
 
-def test_an_input_a_little_off_is_the_models_error():
-    """If the bench's gain is 20 % off that of the model, this is reported but not corrected."""
+def test_a_gain_of_the_bench_20_percent_off_is_not_corrected():
+    """If the bench's gain is 20 % above that of the model, this is reported but not corrected."""
     y = encoder(1.2 * simulate_linear(TWO, CLOCK, 0.06 * STEPS))
 
     checks = check_hardware(record(y, u=0.06 * STEPS, kind="step"), TWO)
@@ -177,15 +177,15 @@ def test_an_input_a_little_off_is_the_models_error():
     for check in checks:
         assert check.note == ""
         assert_allclose(known(check.input_scale), 1.2, atol=1e-3)
-        # A fifth of the level is missing: 0.2 of 1.2.
+        # The model's level is low by 0.2 of 1.2.
         assert_allclose(check.nrmse, 0.2 / 1.2, rtol=0.02)
         assert_allclose(
             known(check.steady_state_measured), 1.2 * known(check.steady_state_model), rtol=0.01
         )
 
 
-def test_a_stated_sign_that_the_log_contradicts_is_said():
-    """If the logged input has the opposite sign of the stated law, the log is followed.
+def test_a_stated_sign_that_the_log_contradicts_is_noted():
+    """If the logged input has the opposite sign of the stated law, the log is used.
 
     A note says so.
     """
@@ -200,7 +200,7 @@ def test_a_stated_sign_that_the_log_contradicts_is_said():
     assert checks[0].nrmse < 1.35 * noise_floor(y[0])
 
 
-def test_a_stated_scale_that_the_log_contradicts_is_said():
+def test_a_stated_scale_that_the_log_contradicts_is_noted():
     """If the scale of the PID was left out, the factor found in the log is used."""
     law = Pid(kp=2.0, kd=0.1, scale=0.009765625)
     run = simulate_loop(TWO, law, t=CLOCK, reference=STEPS)
@@ -213,13 +213,13 @@ def test_a_stated_scale_that_the_log_contradicts_is_said():
         controlled_cart=1,
     )
 
-    # The median of many ratios of an input to one of rounded readings.
+    # The scale is the median ratio of the input to a law that uses rounded readings.
     assert re.match(r"the logged input is 0\.0097\d times what the stated", checks[0].note)
     assert checks[0].nrmse < 1.35 * noise_floor(y[0])
 
 
 @pytest.mark.parametrize("wrong", ["input", "reference", "gains", "controlled_cart", "counts"])
-def test_what_contradicts_the_run_fails_a_check(wrong):
+def test_a_wrong_statement_about_a_run_fails_a_check(wrong):
     """If a column's unit, the gains or the controlled cart are wrong, a check fails."""
     design = designed(TWO, 2)
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
@@ -248,8 +248,8 @@ def test_what_contradicts_the_run_fails_a_check(wrong):
     assert check_loops(true) == []
 
 
-def test_noise_at_a_fast_sample_is_no_scale_of_the_log():
-    """If velocities are mostly noise, as at 1 kHz, the true controller's scale is not doubted."""
+def test_noisy_velocities_do_not_change_the_scale():
+    """If velocities are mostly noise, as at 1 kHz, the controller's scale is still accepted."""
     t = 0.001 * np.arange(4000, dtype=np.float64)
     steps = np.where((t > 0.2) & (t < 2.5), 1.0, 0.0)
     design = design_feedback(
@@ -266,7 +266,7 @@ def test_noise_at_a_fast_sample_is_no_scale_of_the_log():
 
     for check in checks:
         assert check.note == ""
-        # The noise over the motion; of 4000 samples, good to 1/sqrt(8000), 1 %.
+        # This is the noise over the motion; 4000 samples give it to 1/sqrt(8000), or 1 %.
         assert check.nrmse < 1.05 * 0.01 / np.sqrt(np.mean(y[check.cart - 1] ** 2))
 
 
@@ -278,8 +278,8 @@ def test_noise_at_a_fast_sample_is_no_scale_of_the_log():
         (StateFeedback(gains=np.array([0.03, 0.006, -0.03, 0.0]), prefilter=0.06), None),
     ],
 )
-def test_the_timing_of_the_bench_is_found(law, sample_time):
-    """The simulations leave only noise for slow and fast controllers, with and without a model."""
+def test_fast_and_slow_controllers_are_simulated_to_the_noise(law, sample_time):
+    """For slow and fast controllers, with or without a model, the simulations err only by noise."""
     y, u = bench(TWO, law, sample_time=sample_time)
     controller: submission.Controller
     if isinstance(law, Pid):
@@ -294,12 +294,12 @@ def test_the_timing_of_the_bench_is_found(law, sample_time):
     checks = check_hardware(record(y, u=u, reference=STEPS), TWO, controller=controller)
 
     for check in of(checks, "closed").values():
-        # Differences of rounded readings make the controller restless: twice the noise.
+        # Differences of rounded readings make the controller restless, which doubles the noise.
         assert check.nrmse < 2 * noise_floor(y[check.cart - 1])
 
 
-def test_saturation_is_read_off_the_log():
-    """If nobody stated the input limit, it is found as a plateau in the log and simulated."""
+def test_an_unstated_input_limit_is_found_in_the_log():
+    """If the input limit is not stated, it is found as a plateau in the log and simulated."""
     law = Pid(kp=0.2, kd=0.01)
     y, u = bench(TWO, law, limit=0.06)
     assert np.sum(np.abs(u) >= 0.06) > 5
@@ -314,8 +314,8 @@ def test_saturation_is_read_off_the_log():
     assert of(checks, "closed")[1].nrmse < 2 * noise_floor(y[0])
 
 
-def test_a_pid_is_closed_around_the_controlled_cart_unless_it_names_one():
-    """A PID controller that names no cart reads the one given as `controlled_cart`."""
+def test_a_pid_reads_the_controlled_cart_unless_it_names_one():
+    """A PID controller that names no cart uses the one given as `controlled_cart`."""
     law = Pid(kp=0.008, kd=0.0008, cart=2)
     y, u = bench(TWO, law)
     run = record(y, u=u, reference=STEPS)
@@ -327,10 +327,10 @@ def test_a_pid_is_closed_around_the_controlled_cart_unless_it_names_one():
         assert of(checks, "closed")[2].nrmse < 2 * noise_floor(y[1])
 
 
-def test_only_the_cart_that_is_steered_has_the_set_point():
+def test_only_the_controlled_cart_has_a_set_point():
     """Only the controlled cart is compared with the set point.
 
-    If the controlled cart is not stated, no cart is.
+    If no controlled cart is stated, it is the one that the controller reads.
     """
     y, u = bench(TWO, Pid(kp=0.008, kd=0.0008, cart=2))
     run = record(y, u=u, reference=STEPS)
@@ -353,8 +353,8 @@ def test_a_pid_acts_on_the_files_own_counts():
     assert of(checks, "closed")[2].nrmse < 2 * noise_floor(y[1])
 
 
-def test_a_displaced_rest_is_no_error_of_the_model():
-    """If encoders were not zeroed at rest, the open-loop simulation still leaves only noise."""
+def test_a_displaced_rest_does_not_change_the_error():
+    """If encoders were not zeroed at rest, the open-loop simulation's error is still only noise."""
     y = encoder(simulate_linear(TWO, CLOCK, 0.06 * STEPS) + np.array([[3.0], [-2.0]]))
 
     checks = check_hardware(record(y, u=0.06 * STEPS, kind="step"), TWO)
@@ -377,13 +377,13 @@ def test_a_record_that_begins_in_motion_has_its_start_fitted():
 
     for check in checks:
         assert check.nrmse < 1.1 * noise_floor(y[check.cart - 1] - 0.7)
-        # Motion of 1 cm, noise of 0.0012 cm, 500 samples.
+        # The motion is 1 cm and the noise 0.0012 cm, over 500 samples.
         assert_allclose(known(check.input_scale), 1.0, atol=5e-4)
         assert check.overshoot_measured is None
 
 
 @pytest.mark.parametrize("start", [0, 30, 57, 90, 240])
-def test_a_closed_loop_cut_anywhere_is_checked_from_there(start):
+def test_a_cut_closed_loop_is_checked_from_the_cut(start):
     """If a closed-loop run is cut, its motion at the cut is found and simulated from there.
 
     The cut may be at rest, just after the step, or after settling.
@@ -397,12 +397,12 @@ def test_a_closed_loop_cut_anywhere_is_checked_from_there(start):
     opened = of(check_hardware(run, TWO, controller=stated(design)), "open")[2]
 
     assert_allclose(known(opened.input_scale), 1.0, atol=0.01)
-    # A rest known from one reading is off by up to a count throughout.
+    # A rest position known from one reading is off by up to a count for the whole run.
     assert opened.nrmse < 1.35 * whole + COUNT / np.sqrt(np.mean(y[1] ** 2))
 
 
 def test_uneven_and_rounded_time_does_no_harm():
-    """If samples are lost and times are rounded to a millisecond, the simulation still fits."""
+    """If samples are missing and times are rounded to 1 ms, the simulation still fits."""
     rng = np.random.default_rng(3)
     kept = np.sort(rng.permutation(CLOCK.size)[:600])
     t = np.round(CLOCK[kept], 3)
@@ -413,7 +413,7 @@ def test_uneven_and_rounded_time_does_no_harm():
     assert all(check.nrmse < 1.1 * noise_floor(y[check.cart - 1]) for check in checks)
 
 
-def test_a_cart_held_and_a_cart_not_measured_have_no_check():
+def test_held_and_unmeasured_carts_have_no_check():
     """Only carts that were free and measured are checked; a held cart acts as a wall."""
     u = 0.06 * STEPS
     held = simulate_linear(TWO, CLOCK, u, free=[1])
@@ -454,7 +454,7 @@ def test_without_gains_the_measured_input_alone_is_checked(controller):
     assert all(check.overshoot_measured is not None for check in checks)
 
 
-def test_an_unstable_statement_is_said():
+def test_gains_that_make_the_loop_unstable_are_noted():
     """If the stated gains make the loop unstable, a note says so.
 
     The simulation with the measured input is still made.
@@ -467,16 +467,16 @@ def test_an_unstable_statement_is_said():
     with pytest.raises(DataError, match="stated controller makes it unstable"):
         check_hardware(stub, TWO, controller=wild)
 
-    # If the log contradicts even the sign of the statement, the loop is closed as logged.
+    # The log contradicts even the stated sign, so the loop is simulated with the sign of the log.
     checks = check_hardware(record(y, u=u, reference=STEPS), TWO, controller=wild)
     assert all(np.isfinite(check.nrmse) for check in checks)
     assert {check.loop for check in checks} >= {"open"}
 
 
-def test_gains_that_do_not_fit_leave_the_open_check():
+def test_with_the_wrong_number_of_gains_only_the_open_loop_is_simulated():
     """If the number of gains does not fit the carts, the closed loop is not simulated.
 
-    The result of the simulation with the measured input gives the reason.
+    A note on the simulation with the measured input gives the reason.
     """
     y, u = bench(TWO, Pid(kp=0.02, kd=0.001))
     short = submission.StateFeedbackController(
@@ -526,7 +526,7 @@ def ucsd(folder: Path, name: str, *, sign: float) -> Record:
 
 
 UCSD_MASS, UCSD_SPRING = np.array([5.5e-6, 3.7e-6]), np.array([1.79e-3, 1.03e-3, 0.0])
-UCSD = Chain(  # V, count, s; damping of about a tenth
+UCSD = Chain(  # units V, count and s; damping ratio about 0.1
     m=UCSD_MASS, c=0.2 * UCSD_MASS * np.array([22.6, 16.6]), k=UCSD_SPRING
 )
 
@@ -541,7 +541,7 @@ UCSD = Chain(  # V, count, s; damping of about a tenth
     ],
 )
 def test_the_ucsd_logs_differ_in_sign_and_scale(real_data, name, gains, closed_limit, sign):
-    """The real closed-loop logs fit if their input is reversed and two to four times as large."""
+    """The real closed-loop logs fit if their input is scaled by two to four, with either sign."""
     run = ucsd(real_data / "ecp210-ucsd", name, sign=sign)
 
     checks = check_hardware(
@@ -557,12 +557,12 @@ def test_the_ucsd_logs_differ_in_sign_and_scale(real_data, name, gains, closed_l
     assert "the logged input explains the motion only if multiplied by" in opened.note
     assert ("opposite sign" in closed.note) == (sign < 0)
     assert closed.nrmse < closed_limit
-    if name == "closed_loop_pid.csv":  # by integral action: within a percent of 1000 counts
+    if name == "closed_loop_pid.csv":  # because of integral action
         assert_allclose(known(closed.steady_state_measured), 1000.0, rtol=0.01)
         assert_allclose(known(closed.steady_state_model), 1000.0, rtol=0.01)
 
 
-# ----------------------------------------------------------------- anything goes
+# ----------------------------------------------------------------- arbitrary records
 
 
 @given(
@@ -588,10 +588,10 @@ def test_the_ucsd_logs_differ_in_sign_and_scale(real_data, name, gains, closed_l
     seed=st.integers(0, 2**32 - 1),
 )
 @settings(max_examples=150, deadline=None)
-def test_whatever_is_recorded_gives_finite_numbers_or_a_clear_error(
+def test_any_record_gives_finite_numbers_or_a_clear_error(
     n, n_carts, kind, shape, with_input, with_reference, controller, seed
 ):
-    """Short, wild or senseless records never crash the check, and no result is NaN."""
+    """Short or absurd records never crash the check, and no result is NaN."""
     rng = np.random.default_rng(seed)
     t = np.cumsum(rng.uniform(1e-4, 0.02, n))
     base = {

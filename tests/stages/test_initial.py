@@ -15,7 +15,7 @@ def test_the_mean_of_repeats_has_the_error_of_their_spread():
     assert got.std == pytest.approx(np.std(values, ddof=1) / np.sqrt(5), rel=1e-12)
 
 
-def test_errors_that_are_larger_than_the_spread_win():
+def test_stated_errors_count_if_the_spread_is_smaller():
     """If repeats agree better than their errors claim, the mean's error comes from these errors."""
     got = combine_repeats([1.0, 1.0], std=[0.3, 0.4], source="step")
     assert got.std == pytest.approx(0.25, rel=1e-12)  # √(0.3² + 0.4²) / 2

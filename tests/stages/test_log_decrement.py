@@ -16,16 +16,16 @@ from pipeline.stages.log_decrement import fit_log_decrement
 from pipeline.submission import load_submission
 from tests.helpers.ucsd import write_two_cart_submission
 
-COUNT = 0.00227  # cm, the encoder of the ECP 210
-FS = 113.1  # Hz, its usual sampling rate
+COUNT = 0.00227  # cm, encoder of the ECP 210
+FS = 113.1  # Hz, the usual sampling rate of the ECP 210
 OMEGA, RELEASE = 20.0, 0.4  # rad/s, s
 
 
 def held_then_free(t, *, zeta, omega_n=OMEGA, start=1.2, release=RELEASE, d=0.0):
     """Return the exact motion of a cart held at `start` and released, with friction band d = F/k.
 
-    In each half cycle the cart swings about a point d away from its rest position. It stops as soon
-    as it turns within d of the rest position.
+    In each half cycle the cart oscillates about a point at distance d from its rest position. It
+    stops if it turns within d of the rest position.
     """
     omega_d, decay = omega_n * np.sqrt(1 - zeta**2), zeta * omega_n
     half = np.pi / omega_d
@@ -56,7 +56,10 @@ def record(t, y, *, u=None, kind: Kind = "decay", count=COUNT):
 
 
 def released(*, zeta, fs=FS, duration=None, count=COUNT, noise=0.0, rng=None, **motion):
-    """Return a record of a release by hand that lasts 4.5 time constants or more."""
+    """Return a record of a release by hand;
+
+    by default it lasts 4.5 time constants, at most 10 s.
+    """
     t = np.arange(0, duration or RELEASE + min(4.5 / (zeta * OMEGA), 10.0), 1 / fs)
     y = held_then_free(t, zeta=zeta, **motion)
     if rng is not None:
@@ -70,7 +73,7 @@ def friction_of(got):
     return got.friction
 
 
-# ------------------------------------------------------------------ the numbers
+# ---------------------------------------------------------- damping and frequency
 
 
 @pytest.mark.parametrize("zeta", [0.01, 0.03, 0.07, 0.15])
@@ -81,8 +84,8 @@ def test_recovers_the_damping_that_made_the_data(zeta, fs, start):
     got = fit_log_decrement(released(zeta=zeta, fs=fs, start=start), cart=1)
     assert_allclose(got.zeta, zeta, rtol=2e-3)
     assert_allclose(got.omega_n, OMEGA, rtol=2e-4)
-    # Rounding: 0.29 count on each turning point, of at most 500 counts and only six at ζ = 0.15; at
-    # the smallest, 4 counts, it moves the turning point by 0.07 rad of the 19 rad they span.
+    # Each turning point is rounded by 0.29 count rms. At ζ = 0.15 there are only six, and the
+    # smallest, of 4 counts, moves by 0.07 rad of the 19 rad in between.
     assert_allclose(got.zeta_peaks, zeta, rtol=1e-2)
     assert_allclose(got.omega_n_peaks, OMEGA, rtol=4e-3)
     assert_allclose(got.delta, 2 * np.pi * zeta / np.sqrt(1 - zeta**2), rtol=1e-2)
@@ -90,8 +93,8 @@ def test_recovers_the_damping_that_made_the_data(zeta, fs, start):
     assert got.note == ""
 
 
-def test_an_exact_decay_comes_back_exactly():
-    """Without rounding, the exponential fit is exact, and the peaks are nearly so."""
+def test_an_exact_decay_is_fitted_exactly():
+    """Without rounding, the exponential fit is exact, and the peaks are nearly exact."""
     got = fit_log_decrement(released(zeta=0.05, count=0.0), cart=1)
     assert_allclose([got.zeta, got.omega_n], [0.05, OMEGA], rtol=1e-9)
     assert_allclose(got.zeta_peaks, 0.05, rtol=2e-4)
@@ -111,7 +114,7 @@ def test_the_error_of_clean_decays_is_half_a_per_mille():
 
 @pytest.mark.parametrize("zeta", [0.3, 0.45, 0.6])
 def test_heavy_damping_still_gives_an_answer(zeta):
-    """A cart that swings only once or twice is fitted from its release on."""
+    """A cart that oscillates only once or twice is fitted from its release on."""
     got = fit_log_decrement(released(zeta=zeta, duration=3.0), cart=1)
     assert_allclose(got.zeta, zeta, rtol=5e-3)
     assert_allclose(got.omega_n, OMEGA, rtol=5e-3)
@@ -134,7 +137,7 @@ def test_the_figure_shows_the_fit_within_its_envelope():
     assert np.all(got.fit_y <= got.envelope_upper + 1e-9)
     assert np.all(got.fit_y >= got.envelope_lower - 1e-9)
     assert got.fit_t[0] == got.release
-    # Turning points are on the exponential itself, not on the envelope: lower by 1 - zeta²/2.
+    # Turning points are on the exponential, which is below the envelope by zeta²/2.
     inside = np.interp(got.peak_t, got.fit_t, got.fit_y)
     assert_allclose(got.peak_y, inside, atol=COUNT)
     assert got.amplitude.size == got.peak_t.size - 2
@@ -160,8 +163,8 @@ def test_a_record_may_begin_at_the_release():
 
 
 @pytest.mark.parametrize("hand", [12.0, 18.0, 20.0, 25.0])
-def test_a_hand_that_shakes_the_cart_is_told_from_the_decay(hand):
-    """If a hand swings the cart before the release, only the motion after it is fitted."""
+def test_a_hand_that_moves_the_cart_before_the_release_is_left_out(hand):
+    """If a hand moves the cart to and fro before the release, only the later motion is fitted."""
     t, zeta, release = np.arange(0, 6, 1 / FS), 0.04, 1.9
     decay, omega_d = zeta * OMEGA, OMEGA * np.sqrt(1 - zeta**2)
     x0 = 0.8 * np.sin(hand * release)
@@ -186,7 +189,7 @@ def test_a_touch_after_the_decay_is_left_out():
 @pytest.mark.parametrize("on_off", [True, False])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_the_ring_down_of_a_step_is_a_decay(on_off, sign):
-    """The ring-down after an edge of a step is a decay about the new rest position."""
+    """The ring-down after an edge of a step is used as a decay about the new rest position."""
     chain, t = PRESETS["throne-1dof"], np.arange(0, 8, 1 / FS)
     u = sign * 0.03 * ((t > 0.5) & ((t < 4.0) | (not on_off)))
     run = record(t, simulate_linear(chain, t, u)[0], u=u, kind="step")
@@ -209,7 +212,7 @@ def test_the_driven_part_of_a_decay_is_left_out():
 # --------------------------------------------------------------- real conditions
 
 
-def test_a_noisy_log_of_an_input_at_rest_is_no_drive():
+def test_noise_in_the_input_is_not_a_drive():
     """Noise about zero in the input column is not taken for a drive."""
     run = released(zeta=0.05)
     noise = 1e-3 * np.random.default_rng(0).normal(size=run.t.size)
@@ -255,28 +258,25 @@ def test_a_small_decay_is_measured_within_its_error():
 
 @pytest.mark.parametrize("d", [0.002, 0.01, 0.03])
 @pytest.mark.parametrize("zeta", [0.01, 0.05, 0.1])
-def test_dry_friction_is_found_and_taken_out(d, zeta):
+def test_dry_friction_and_viscous_damping_are_separated(d, zeta):
     """If a decay has dry friction, both the friction and the viscous damping are found.
 
-    The note says so.
+    A note names the dry friction.
     """
     got = fit_log_decrement(released(zeta=zeta, d=d, duration=4.0), cart=1)
     assert friction_of(got).present
     assert abs(friction_of(got).drop - d) < 4 * friction_of(got).drop_std + 1e-5
     assert abs(friction_of(got).zeta - zeta) < 4 * friction_of(got).zeta_std + 1e-5
     assert_allclose(friction_of(got).drop, d, rtol=0.15)
-    assert got.zeta > friction_of(got).zeta  # viscous damping alone claims the friction's share
+    assert got.zeta > friction_of(got).zeta  # a viscous fit needs more damping
     assert "dry friction" in got.note
-    # As friction's share of the loss grows, so does the change of damping from swing to swing.
+    # Small oscillations lose more to friction, so their damping is larger.
     local = got.zeta_at_amplitude
     assert local[1, local[0].argmin()] > local[1, local[0].argmax()]
 
 
-def test_damping_that_grows_with_amplitude_is_no_friction():
-    """Quadratic drag is not called dry friction.
-
-    The note says that the decay is not exponential.
-    """
+def test_damping_that_grows_with_amplitude_is_not_dry_friction():
+    """Quadratic drag is not called dry friction; the note says that damping grows with amplitude."""
     fine = np.linspace(0, 4, 40001)
     y, x, v = np.empty_like(fine), 1.2, 0.0
     for i in range(fine.size):
@@ -290,7 +290,7 @@ def test_damping_that_grows_with_amplitude_is_no_friction():
 
 
 def flags(seeds, *, d):
-    """Return how many of these decays with friction band d are said to have friction."""
+    """Return in how many of these decays with friction band d friction is found."""
     found = []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
@@ -308,7 +308,7 @@ def flags(seeds, *, d):
     return np.array(found)
 
 
-def test_friction_is_told_from_none():
+def test_friction_is_found_only_if_there_is_some():
     """Dry friction is found in all of twenty decays with d = 0.01 cm, and in none without it."""
     assert not flags(20, d=0.0).any()
     assert flags(20, d=0.01).all()
@@ -342,7 +342,7 @@ def standardised(seeds):
 def test_the_standard_errors_are_about_right():
     """Over 60 noisy decays, actual errors are about as large as the standard errors."""
     spread = np.sqrt(np.mean(standardised(60) ** 2, axis=0))
-    assert np.all((0.65 < spread[:2]) & (spread[:2] < 1.35))  # 1 ± 4/sqrt(120)
+    assert np.all((0.65 < spread[:2]) & (spread[:2] < 1.35))  # the limits are 1 ± 4/sqrt(120)
     assert spread[2] < 1.35
 
 
@@ -397,10 +397,10 @@ def real_records(real_data, tmp_path_factory):
 
 
 @pytest.mark.parametrize("repeat", range(1, 6))
-def test_the_real_first_cart(real_records, repeat):
+def test_both_edges_of_real_steps_give_the_damping_of_cart_1(real_records, repeat):
     """Both edges of a real step of cart 1 give its damping.
 
-    The damping is larger while the motor holds.
+    The damping is larger while the motor holds the cart.
     """
     run = real_records[f"alone-1-{repeat}"]
     off = fit_log_decrement(run, cart=1)
@@ -412,7 +412,7 @@ def test_the_real_first_cart(real_records, repeat):
 
 
 @pytest.mark.parametrize("repeat", range(1, 6))
-def test_the_real_second_cart_pulled_by_hand(real_records, repeat):
+def test_friction_is_found_in_real_decays_of_cart_2(real_records, repeat):
     """In each real decay of cart 2, dry friction and little viscous damping are found."""
     got = fit_log_decrement(real_records[f"alone-2-{repeat}"], cart=2)
     assert 15.6 <= got.omega_n <= 15.9
@@ -422,17 +422,17 @@ def test_the_real_second_cart_pulled_by_hand(real_records, repeat):
     assert 0.06 <= got.zeta <= 0.08
 
 
-def test_a_crest_of_equal_readings_turns_in_its_middle():
+def test_a_flat_peak_turns_in_its_middle():
     """If a coarse encoder makes a peak flat, the turning point is in the middle of the peak."""
     zeta = 0.05
     run = released(zeta=zeta, count=0.03)
     got = fit_log_decrement(run, cart=1)
-    # A parabola is fitted within half a radian to either side, if there is one.
+    # A parabola is fitted to the samples within half a radian of the peak.
     crests = [run.y[0, np.abs(run.t - peak) <= 0.5 / OMEGA] for peak in got.peak_t]
     flat = got.peak_t[[np.ptp(crest) == 0 for crest in crests]]
     assert flat.size >= 3
     half = np.pi / (OMEGA * np.sqrt(1 - zeta**2))
-    # The middle of a whole number of samples; the first and the last may be one sample off.
+    # The middle of whole samples: the first and last sample of a crest may each be off by one.
     assert_allclose((flat - RELEASE) / half, np.round((flat - RELEASE) / half), atol=1 / FS / half)
 
 

@@ -1,4 +1,4 @@
-"""Amplitude, phase and frequency of a dwell are found, and where its steady part begins."""
+"""Amplitude, phase, frequency and the start of the steady part of a dwell are found."""
 
 from dataclasses import asdict, replace
 
@@ -13,15 +13,15 @@ from pipeline.results import Record
 from pipeline.stages.sine import Dwell, fit_sine
 
 CHAIN = PRESETS["throne-1dof"]
-COUNT = 0.00227  # cm, the encoder of the ECP 210
-FS = 113.1  # Hz, its usual sampling rate
+COUNT = 0.00227  # cm, encoder of the ECP 210
+FS = 113.1  # Hz, the usual sampling rate of the ECP 210
 
 
 def dwell(t, *, hertz=3.0, amplitude=1.0, chain=CHAIN, noise=0.0, count=COUNT, rng=None):
     """Return a dwell from rest that moves cart 1 by about `amplitude`, and the true response."""
     omega = 2 * np.pi * hertz
     truth = chain.frequency_response(np.array([omega]))[:, 0]
-    half = omega * np.mean(np.diff(t)) / 2  # a held sine is smaller by sin(half)/half
+    half = omega * np.mean(np.diff(t)) / 2  # holding a sine reduces it by sin(half)/half
     u = amplitude / abs(truth[0]) * half / np.sin(half) * np.sin(omega * t)
     y = simulate_linear(chain, t, u)
     if rng is not None:
@@ -45,7 +45,7 @@ def record(t, u, y, *, omega, count=COUNT):
 
 
 def cut(run, keep):
-    """Keep some of the samples."""
+    """Return the run with only some of its samples."""
     assert run.u is not None
     return replace(run, t=run.t[keep], u=run.u[keep], y=run.y[:, keep])
 
@@ -62,24 +62,24 @@ def test_one_centimetre_is_measured_to_half_a_per_mille(hertz, fs):
     got = fit_sine(run, cart=1)
     assert got.settled
     assert got.note == ""
-    # The rounding of 200 and more samples leaves 0.29 count sqrt(2/200) = 7e-5 of 440 counts; what
-    # is left of a transient at resonance adds up to 3e-4.
+    # The rounding of 200 or more samples causes 0.29 count · sqrt(2/200), or 7e-5 of 440 counts;
+    # the rest of a transient at resonance adds up to 3e-4.
     assert_allclose(got.amplitude, 1.0, rtol=5e-4)
     assert_allclose(got.gain, abs(truth[0]), rtol=5e-4)
     assert_allclose(got.phase, np.angle(truth[0]), atol=5e-4)
 
 
-def test_an_exact_steady_state_comes_back_exactly():
+def test_an_exact_steady_state_gives_the_exact_response():
     """Without rounding, a steady dwell gives the exact frequency response of the chain."""
     run, truth = dwell(sampled(40.0), hertz=4.0, count=0.0)
-    late = slice(int(30 * FS), None)  # 40 time constants: the transient is down to 1e-17
+    late = slice(int(30 * FS), None)  # after 40 time constants, the transient is below 1e-17
     run = cut(run, late)
     got = fit_sine(run, cart=1)
-    # A staircase also contains images about the sampling rate, which fold back onto the sine; the
-    # plant passes (4/113)² of their 4/113: 5e-5 each.
+    # The held input also contains images about the sampling rate, which fold back onto the sine.
+    # They are 4/113 of it, and the plant passes (4/113)² of them, or 5e-5.
     assert_allclose(got.gain, abs(truth[0]), rtol=2e-4)
     assert_allclose(got.phase, np.angle(truth[0]), atol=2e-4)
-    assert got.steady_from < run.t[0] + 0.25 / 6  # from the first half amplitude of the input on
+    assert got.steady_from < run.t[0] + 0.25 / 6  # from half an amplitude of the input on
 
 
 def test_a_smooth_input_is_taken_as_sampled():
@@ -99,8 +99,8 @@ def test_every_cart_of_a_chain_has_its_own_amplitude_and_phase():
         assert_allclose(np.exp(1j * got.phase), np.exp(1j * np.angle(truth[cart - 1])), atol=2e-3)
 
 
-def test_what_the_carts_of_a_dwell_share_changes_none_of_their_numbers():
-    """A cart fitted together with others, in any order, has the same numbers as when alone."""
+def test_a_cart_has_the_same_numbers_alone_and_together():
+    """A cart fitted together with others, in any order, gives the same numbers as when alone."""
     run, _ = dwell(sampled(6.0), chain=PRESETS["throne-3dof"], hertz=3.0)
     together = Dwell(run)
     for cart in (3, 1, 2):
@@ -111,14 +111,14 @@ def test_the_transient_is_left_out():
     """The steady part begins when the transient from rest has died away."""
     run, _ = dwell(sampled(9.0), hertz=3.0)
     got = fit_sine(run, cart=1)
-    # 1 cm e^(-1.32 t) is one encoder step at 4.6 s.
+    # The transient of 1 cm e^(-1.32 t) is one encoder step at 4.6 s.
     assert 3.0 < got.steady_from < 7.0
-    # The input's last sine is used to 30 degrees before its end: 0.03 s at 3 Hz.
+    # The last cycle is used up to 30 degrees before its end, which is 0.03 s at 3 Hz.
     assert 0 <= np.count_nonzero(run.t >= got.steady_from) - got.n_points <= 4
 
 
 @pytest.mark.parametrize("clock", ["jittered", "rounded", "gap"])
-def test_the_measured_times_are_used_as_they_are(clock):
+def test_uneven_times_do_not_change_the_amplitude(clock):
     """Uneven samples and gaps do not change the amplitude, since measured times are used."""
     rng = np.random.default_rng(3)
     t = np.sort(sampled(9.0) + rng.uniform(-0.3, 0.3, size=sampled(9.0).size) / FS)
@@ -129,7 +129,7 @@ def test_the_measured_times_are_used_as_they_are(clock):
         keep = np.delete(np.arange(run.t.size), np.arange(800, 840))
         run = cut(run, keep)
     got = fit_sine(run, cart=1)
-    assert_allclose(got.gain, abs(truth[0]), rtol=2e-3)  # the hold of the input is uneven too
+    assert_allclose(got.gain, abs(truth[0]), rtol=2e-3)  # the input is held for uneven times too
 
 
 def test_an_offset_and_a_drift_do_no_harm():
@@ -144,14 +144,14 @@ def test_without_a_stated_frequency_it_is_found():
     """If no frequency is stated, it is found from the input."""
     run, truth = dwell(sampled(9.0), hertz=3.217)
     got = fit_sine(replace(run, omega=None), cart=1)
-    assert_allclose(got.omega, 2 * np.pi * 3.217, rtol=1e-9)  # the input is exact
+    assert_allclose(got.omega, 2 * np.pi * 3.217, rtol=1e-9)  # the input has no noise
     assert_allclose(got.gain, abs(truth[0]), rtol=5e-4)
 
 
-def test_a_frequency_that_the_input_contradicts_is_not_believed():
+def test_a_stated_frequency_that_the_input_contradicts_is_not_used():
     """If the stated frequency contradicts the input, the input's own frequency is used.
 
-    For example, rad/s was typed for Hz, or a clock runs wrong.
+    The cause may be rad/s typed for Hz, or a wrong clock.
     """
     run, truth = dwell(sampled(9.0), hertz=3.0)
     got = fit_sine(replace(run, omega=2 * np.pi * 3.0 * 1.01), cart=1)
@@ -160,7 +160,7 @@ def test_a_frequency_that_the_input_contradicts_is_not_believed():
     assert "stated 3.03 Hz" in got.note
 
 
-def test_a_noisy_input_leaves_the_stated_frequency():
+def test_with_a_noisy_input_the_stated_frequency_is_used():
     """If the logged input is noisy, the stated frequency is still used."""
     rng = np.random.default_rng(4)
     run, truth = dwell(sampled(9.0), hertz=3.0)
@@ -173,7 +173,7 @@ def test_a_noisy_input_leaves_the_stated_frequency():
 
 
 def test_an_input_that_stops_ends_the_dwell():
-    """Samples before the input's start or after its end are not used."""
+    """Samples before the start or after the end of the input are not used."""
     t = sampled(14.0)
     omega = 2 * np.pi * 3.0
     truth = CHAIN.frequency_response(np.array([omega]))[0, 0]
@@ -185,8 +185,8 @@ def test_an_input_that_stops_ends_the_dwell():
     assert_allclose(got.gain, abs(truth), rtol=5e-4)
 
 
-def test_a_dwell_cut_short_is_said_not_to_be_settled():
-    """If the transient has not died away, the estimate is marked and has a large error."""
+def test_a_dwell_that_is_too_short_is_called_unsettled():
+    """If the transient has not died away, a note says so and the estimate has a large error."""
     run, truth = dwell(sampled(1.6), hertz=2.4)
     got = fit_sine(run, cart=1)
     assert not got.settled
@@ -203,7 +203,7 @@ def test_two_cycles_of_steady_state_are_enough_for_an_estimate():
     assert abs(got.gain - abs(truth[0])) < 4 * got.gain_std
 
 
-def test_few_counts_are_mentioned():
+def test_an_amplitude_of_few_counts_is_noted():
     """If the amplitude is below twenty encoder counts, a note says so."""
     run, _ = dwell(sampled(9.0), amplitude=10 * COUNT)
     got = fit_sine(run, cart=1)
@@ -211,8 +211,8 @@ def test_few_counts_are_mentioned():
     assert_allclose(got.amplitude, 10 * COUNT, rtol=0.02)
 
 
-def test_a_motion_that_is_no_sine_is_mentioned():
-    """If friction adds a third harmonic, a note gives its size and the error includes it."""
+def test_a_third_harmonic_is_noted():
+    """If friction adds a third harmonic, a note gives its size."""
     t, omega = sampled(6.0), 2 * np.pi * 3.0
     y = np.sin(omega * t) + 0.05 * np.sin(3 * omega * t)
     got = fit_sine(record(t, np.sin(omega * t), y[None], omega=omega), cart=1)
@@ -220,7 +220,7 @@ def test_a_motion_that_is_no_sine_is_mentioned():
     assert_allclose(got.amplitude, 1.0, rtol=1e-3)
 
 
-def test_without_an_input_the_error_says_what_to_do():
+def test_without_an_input_a_run_is_refused():
     """A file without the input is refused, since amplitude and phase are relative to it."""
     run, _ = dwell(sampled(9.0))
     with pytest.raises(DataError, match=r"needs the input as well as the positions.*`columns`"):
@@ -245,7 +245,7 @@ def test_less_than_a_cycle_is_refused():
 def coverage(seeds, *, from_rest):
     """Return the errors of gain and phase, divided by their standard errors.
 
-    They are those of random dwells of one to three carts.
+    The dwells are random, on benches of one to three carts.
     """
     errors = []
     for seed in range(seeds):
@@ -273,7 +273,7 @@ def coverage(seeds, *, from_rest):
 def test_the_standard_errors_are_about_right():
     """Over 60 dwells, actual errors are about as large as the standard errors."""
     spread = np.sqrt(np.mean(coverage(60, from_rest=False) ** 2, axis=0))
-    assert np.all((0.75 < spread) & (spread < 1.35))  # 1 ± 4/sqrt(120)
+    assert np.all((0.75 < spread) & (spread < 1.35))  # the limits are 1 ± 4/sqrt(120)
 
 
 def test_another_signal_is_refused():

@@ -84,7 +84,7 @@ def test_lqr_gains_agree_with_control(name, weight):
     got = lqr_gains(phi, gamma, Q)
 
     expected, _, _ = control.dlqr(phi, gamma[:, None], Q, np.eye(1))
-    # Both programs solve a Riccati equation whose condition number is below 1e6 here.
+    # Both programs solve a Riccati equation with a condition number below 1e6.
     assert_allclose(got, np.asarray(expected)[0], rtol=1e-8, atol=1e-10 * np.abs(got).max())
 
 
@@ -101,11 +101,11 @@ def test_lqr_gains_of_many_weights_are_those_of_each():
 
 @pytest.mark.parametrize("name", PLANTS)
 @pytest.mark.parametrize("sample_time", [T, 0.001])
-def test_placed_poles_are_where_they_were_asked_for(name, sample_time):
-    """The eigenvalues of phi - gamma G are the poles that were asked for."""
+def test_placed_poles_are_the_requested_ones(name, sample_time):
+    """The eigenvalues of phi - gamma G are the requested poles."""
     chain = PLANTS[name]
     phi, gamma = discretise(chain, sample_time)
-    unit = np.tile([1.0, 20.0], chain.n)  # positions and velocities of one size
+    unit = np.tile([1.0, 20.0], chain.n)  # gives positions and velocities similar sizes
     phi, gamma = phi * unit / unit[:, None], gamma / unit
     decay, turn = np.linspace(-4, -10, chain.n), np.linspace(5, 45, chain.n)
     wanted = np.exp(sample_time * np.array([decay + 1j * turn, decay - 1j * turn]).T.ravel())
@@ -114,12 +114,12 @@ def test_placed_poles_are_where_they_were_asked_for(name, sample_time):
 
     away = np.abs(wanted[:, None] - got[None, :])
     rows, columns = linear_sum_assignment(away)
-    # Poles 0.4 T apart and more: eight such poles have a condition number up to 1e8 at 1 ms.
+    # Poles at least 0.4 T apart: eight such poles have a condition number up to 1e8 at 1 ms.
     assert away[rows, columns].max() < 1e-7
 
 
 def test_placed_gains_agree_with_control():
-    """Gains by pole placement equal those of python-control, since they are unique."""
+    """Gains by pole placement equal those of python-control, since the solution is unique."""
     phi, gamma = discretise(PRESETS["throne-2dof"], T)
     gamma = gamma / np.abs(gamma).max()
     wanted = np.exp(T * np.array([-5 + 6j, -5 - 6j, -8 + 30j, -8 - 30j]))
@@ -130,7 +130,7 @@ def test_placed_gains_agree_with_control():
 
 
 @pytest.mark.parametrize("name", ["throne-2dof", "throne-3dof", "four"])
-def test_level_error_is_what_wrong_springs_do(name):
+def test_level_error_is_the_effect_of_wrong_springs(name):
     """The stated error of the level is the sum of the errors caused by 3 % in each spring."""
     chain, cart = PLANTS[name], 2
     gains = design(chain, cart=cart, method="poles").gains
@@ -144,11 +144,11 @@ def test_level_error_is_what_wrong_springs_do(name):
     moved = [level(chain.k * (1 + h * spring)) - level(chain.k) for spring in np.eye(chain.n + 1)]
     expected = 100 * MASS_SPRING_ERROR * np.abs(moved).sum() / h / abs(level(chain.k))
 
-    # A one-sided difference errs by h times the curvature, some ten times the slope here.
+    # A one-sided difference errs by h times the curvature, about ten times the slope here.
     assert_allclose(level_error_percent(chain, gains, cart=cart), expected, rtol=1e-3)
 
 
-def test_robust_stability_sees_a_loop_on_the_edge():
+def test_a_loop_at_the_edge_of_stability_is_not_robust():
     """The designed gains count as robustly stable; gains at the edge of stability do not."""
     chain = PRESETS["throne-3dof"]
     gains = design(chain, cart=3).gains
@@ -172,7 +172,7 @@ def test_robust_stability_sees_a_loop_on_the_edge():
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("name", "cart"), EVERY_CART)
 def test_the_design_meets_its_goal_on_the_true_plant(name, cart, method):
-    """Simulated finely, the designed loop keeps the overshoot and settling time of its goal."""
+    """In a fine simulation, the designed loop meets its overshoot and settling time."""
     chain = PLANTS[name]
     got = design(chain, cart=cart, method=method)
 
@@ -187,7 +187,7 @@ def test_the_design_meets_its_goal_on_the_true_plant(name, cart, method):
     settled = float(settling_time(t, y, before=0.0, level=np.float64(1.0)))
     assert overshoot < 10.0
     assert settled < 1.0
-    # The design checks the ticks only; between them the step changes by little.
+    # The design checks only the ticks; between the ticks the position changes little.
     assert_allclose(overshoot, got.overshoot_percent, atol=0.2)
     assert got.settling_time is not None
     assert_allclose(settled, got.settling_time, atol=T)
@@ -198,7 +198,7 @@ def test_the_design_meets_its_goal_on_the_true_plant(name, cart, method):
 def test_lqr_hardly_overshoots_the_presets_and_forgives_model_error(name, cart):
     """LQR designs overshoot by at most 0.6 %.
 
-    They stay stable on plants that are a few percent off.
+    They stay stable if the plant differs from the model by a few percent.
     """
     chain, rng = PRESETS[name], np.random.default_rng(7)
     got = design(chain, cart=cart)
@@ -231,7 +231,8 @@ def test_poles_and_prefilter_are_those_of_the_gains(name, method):
         assert method == "lqr"
     else:
         assert method == "poles"
-        # Double real poles, of a pair without overshoot, move by the root of the rounding.
+        # A goal without overshoot gives double real poles, which move by the square root of
+        # rounding.
         assert_allclose(got.poles, got.requested_poles, rtol=1e-4)
 
 
@@ -242,13 +243,13 @@ def test_poles_and_prefilter_are_those_of_the_gains(name, method):
 )
 @settings(max_examples=6, deadline=None)
 def test_units_do_not_matter(position, force, method):
-    """In other units of position and input the same controller comes out."""
+    """In other units of position and input, the design gives the same controller."""
     chain = PRESETS["throne-2dof"]
     other = Chain(**{name: getattr(chain, name) * force / position for name in ("m", "c", "k")})
     base = design(chain, cart=2, limit=0.08, method=method)
     same = design(other, cart=2, limit=0.08 * force, reference=position, method=method)
 
-    # The choice among candidates could change by rounding only if two were equal to 1e-12.
+    # Rounding could change the chosen candidate only if two were equal to within 1e-12.
     assert_allclose(same.gains, base.gains * force / position, rtol=1e-7)
     assert_allclose(same.prefilter, base.prefilter * force / position, rtol=1e-7)
     assert_allclose(same.overshoot_percent, base.overshoot_percent, atol=1e-6)
@@ -268,7 +269,7 @@ def test_a_step_down_mirrors_the_step_up(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_input_limit_is_kept(method):
-    """If the input limit allows the goal, the design meets it within the limit."""
+    """If the input limit allows the goal, the design meets the goal within the limit."""
     chain = PRESETS["throne-3dof"]
     roomy = design(chain, cart=3, method=method)
     got = design(chain, cart=3, limit=0.075, method=method)
@@ -279,7 +280,7 @@ def test_the_input_limit_is_kept(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_level_beyond_the_input_is_said_to_be_out_of_reach(method):
+def test_a_level_beyond_the_input_limit_is_out_of_reach(method):
     """If the input limit is too small to hold the step, the message gives the level it can hold."""
     chain = PRESETS["throne-2dof"]
     got = design(chain, cart=2, limit=0.05, method=method)
@@ -291,7 +292,7 @@ def test_a_level_beyond_the_input_is_said_to_be_out_of_reach(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_settling_time_beyond_the_input_names_what_is_reachable(method):
+def test_an_unreachable_settling_time_gives_the_best_design(method):
     """If the input limit is too small for the settling time, the best possible design is given.
 
     The message names its overshoot and settling time.
@@ -307,8 +308,8 @@ def test_a_settling_time_beyond_the_input_names_what_is_reachable(method):
     assert got.peak_input <= 1.05 * holding + 1e-12
 
 
-def test_cancelling_gains_are_warned_of():
-    """If poles are far from a soft plant's own, a warning gives the level's error.
+def test_gains_that_cancel_a_soft_plant_give_a_warning():
+    """If requested poles are far from those of a soft plant, a warning gives the level's error.
 
     The level is then sensitive to errors in the springs.
     """
@@ -319,9 +320,9 @@ def test_cancelling_gains_are_warned_of():
 
 
 def test_a_fast_plant_is_sampled_faster():
-    """If no sample time is stated, the design takes one that suits the fastest mode."""
+    """If no sample time is stated, the design chooses one that suits the fastest mode."""
     chain = PRESETS["throne-2dof"]
-    fast = Chain(m=chain.m / 400, c=chain.c / 20, k=chain.k)  # twenty times as fast
+    fast = Chain(m=chain.m / 400, c=chain.c / 20, k=chain.k)  # twenty times as fast as `chain`
     got = design(fast, cart=2, settling=0.05)
 
     assert got.sample_time <= 0.5 / np.abs(fast.poles).max() * (1 + 1e-9)
@@ -332,7 +333,7 @@ def test_a_fast_plant_is_sampled_faster():
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("speed", [0.1, 10.0])
-def test_goals_much_slower_or_faster_than_the_plant_are_judged_rightly(method, speed):
+def test_slow_and_fast_goals_are_judged_from_the_designed_step(method, speed):
     """Whether the goal is met is judged from the designed step, at any time scale."""
     chain = PRESETS["throne-2dof"]
     other = Chain(m=chain.m / speed**2, c=chain.c / speed, k=chain.k)
@@ -349,7 +350,7 @@ def test_goals_much_slower_or_faster_than_the_plant_are_judged_rightly(method, s
     assert got.reachable or speed < 1
 
 
-def test_no_overshoot_at_all_can_be_asked_for():
+def test_a_goal_without_overshoot_is_met():
     """A goal without any overshoot is met."""
     assert design(PRESETS["throne-2dof"], cart=1, overshoot=0.0).overshoot_percent < 1e-3
 
@@ -368,6 +369,6 @@ def test_no_overshoot_at_all_can_be_asked_for():
     ],
 )
 def test_impossible_tasks_are_refused(chain, cart, reference, message):
-    """A missing cart, a reference of zero, and a cart that the motor cannot reach are errors."""
+    """A missing cart, a reference of zero, and a cart that the motor cannot reach are refused."""
     with pytest.raises(DataError, match=message):
         design(chain, cart=cart, reference=reference)

@@ -1,4 +1,4 @@
-"""Static gains are found from step runs, with friction, and unusable records are refused."""
+"""Static gains are found from steps, also with friction, and unusable recordings are refused."""
 
 from dataclasses import replace
 
@@ -16,8 +16,8 @@ from pipeline.stages.step_gain import fit_step_gain
 from pipeline.submission import load_submission
 from tests.helpers.ucsd import write_two_cart_submission
 
-COUNT = 0.00227  # cm, the encoder of the ECP 210
-FS = 113.1  # Hz, its usual sampling rate
+COUNT = 0.00227  # cm, encoder of the ECP 210
+FS = 113.1  # Hz, the usual sampling rate of the ECP 210
 FOUR = Chain(
     m=np.array([3e-4, 2.5e-4, 2e-4, 2e-4]),
     c=np.array([1.5e-3, 8e-4, 6e-4, 6e-4]),
@@ -57,7 +57,7 @@ def seconds(duration):
     return np.arange(0, duration, 1 / FS)
 
 
-# ------------------------------------------------------------------ the numbers
+# ------------------------------------------------------------------ static gains
 
 
 @pytest.mark.parametrize("name", ["throne-1dof", "throne-2dof", "throne-3dof"])
@@ -72,7 +72,7 @@ def test_every_cart_has_its_static_gain(name, size):
     run = run_of(chain, t, staircase(t, (0.5, size), (7.0, 0.0)), offset=0.3)
     for cart, truth in enumerate(chain.static_gains(), start=1):
         got = fit_step_gain(run, cart=cart)
-        # Rounding moves each of two levels by up to half a count: one count of |size| K in all.
+        # Rounding moves each of the two levels by up to half a count, together by one count.
         assert_allclose(got.gain, truth, atol=COUNT / abs(size))
         assert abs(got.gain - truth) < 3 * got.gain_std
         assert len(got.edges) == 2
@@ -82,7 +82,7 @@ def test_every_cart_has_its_static_gain(name, size):
         assert abs(got.rest_shift) <= COUNT
 
 
-def test_four_carts():
+def test_a_step_gives_the_gains_of_four_carts():
     """A step gives the gains of four carts too."""
     t = seconds(16.0)
     run = run_of(FOUR, t, staircase(t, (0.5, 0.03), (8.0, 0.0)))
@@ -98,7 +98,7 @@ def test_an_exact_record_gives_the_exact_gain():
     assert_allclose(got.gain, chain.static_gains()[1], rtol=1e-7)
 
 
-def test_several_sizes_and_signs_in_one_record():
+def test_each_step_in_a_record_gives_a_gain():
     """If a record has several steps of different size and sign, each of them gives a gain."""
     chain, t = PRESETS["throne-1dof"], seconds(24.0)
     u = staircase(t, (0.5, 0.02), (5.0, 0.04), (10.0, -0.03), (15.0, 0.0), (20.0, -0.01))
@@ -114,13 +114,13 @@ def test_several_sizes_and_signs_in_one_record():
     assert all(abs(edge.gain - got.gain) < 4 * edge.gain_std for edge in got.edges)
 
 
-def test_the_windows_are_found():
-    """A level is read where nothing moves: just before an edge, and after the ringing."""
+def test_a_level_is_read_while_nothing_moves():
+    """A level is read while nothing moves: just before an edge, and after the ringing."""
     t = seconds(14.0)
     run = run_of(PRESETS["throne-1dof"], t, staircase(t, (2.0, 0.03), (8.0, 0.0)))
     on, off = fit_step_gain(run, cart=1).edges
     assert on.window_before == (0.0, t[t < 2.0][-1])
-    # 0.87 cm e^(-1.32 t) is 1.5 counts at 4.2 s.
+    # The ringing of 0.87 cm e^(-1.32 t) is 1.5 counts at 4.2 s.
     assert 5.0 < on.window_after[0] < 7.0
     assert on.window_after[1] == t[t < 8.0][-1] == off.window_before[1]
     assert (on.t, off.t) == (t[t >= 2.0][0], t[t >= 8.0][0])
@@ -131,10 +131,10 @@ def test_the_windows_are_found():
 
 @pytest.mark.parametrize("wait", [0.9, 1.5, 3.0])
 @pytest.mark.parametrize("name", ["throne-1dof", "throne-2dof", "throne-3dof"])
-def test_a_record_that_ends_before_the_carts_settle(name, wait):
+def test_if_a_record_ends_early_a_fit_gives_the_level(name, wait):
     """If a record ends before the carts settle, a fit of damped sinusoids gives the level.
 
-    The gain then has the error of this fit, and a note.
+    The gain then has the error of this fit, and a note says so.
     """
     chain, t = PRESETS[name], seconds(0.5 + wait)
     run = run_of(chain, t, staircase(t, (0.5, 0.03)), noise=0.2 * COUNT)
@@ -145,8 +145,8 @@ def test_a_record_that_ends_before_the_carts_settle(name, wait):
         assert "still oscillates" in got.note
 
 
-def test_an_edge_before_the_carts_have_settled():
-    """If the input goes off before the carts settle, both edges still count."""
+def test_an_edge_before_the_carts_settle_is_used():
+    """If the input ends before the carts settle, both edges are still used."""
     chain, t = PRESETS["throne-2dof"], seconds(8.0)
     got = fit_step_gain(run_of(chain, t, staircase(t, (0.5, 0.03), (1.7, 0.0))), cart=1)
     assert len(got.edges) == 2
@@ -163,7 +163,7 @@ def test_a_cart_that_never_settles_is_refused():
 # --------------------------------------------------------------- real conditions
 
 
-def test_an_input_that_is_on_from_the_first_sample():
+def test_with_input_from_the_start_the_first_position_is_the_rest():
     """If the input is on from the first sample, the first position counts as the rest position."""
     chain, t = PRESETS["throne-1dof"], seconds(6.0)
     got = fit_step_gain(run_of(chain, t, np.full_like(t, 0.03), offset=-0.2), cart=1)
@@ -172,7 +172,7 @@ def test_an_input_that_is_on_from_the_first_sample():
     assert got.edges[0].t == 0.0
 
 
-def test_a_single_sample_of_rest_before_the_edge():
+def test_one_sample_of_rest_before_the_edge_is_enough():
     """One sample before the edge, as in the UCSD logs, is enough for the rest position."""
     chain, t = PRESETS["throne-1dof"], seconds(6.0)
     got = fit_step_gain(run_of(chain, t, staircase(t, (t[1], 0.03))), cart=1)
@@ -186,7 +186,7 @@ def test_noise_is_averaged(noise):
     u = staircase(t, (1.0, 0.03), (7.0, 0.0))
     got = fit_step_gain(run_of(chain, t, u, noise=noise * COUNT), cart=1)
     assert abs(got.gain - chain.static_gains()[0]) < 4 * got.gain_std
-    assert got.gain_std < noise * COUNT / 0.03 / 1.5  # below that of a single sample
+    assert got.gain_std < noise * COUNT / 0.03 / 1.5  # below the noise of a single sample
 
 
 def test_a_noisy_input_still_has_its_edges():
@@ -209,8 +209,8 @@ def test_a_slow_edge_is_one_edge():
     assert_allclose(got.gain, chain.static_gains()[0], atol=COUNT / 0.03)
 
 
-def test_a_drift_is_taken_out():
-    """If the rest position drifts steadily, the drift is removed from the gain."""
+def test_a_drift_does_not_change_the_gain():
+    """If the rest position drifts steadily, the drift does not change the gain."""
     chain, t = PRESETS["throne-1dof"], seconds(16.0)
     u = staircase(t, (3.0, 0.03), (9.0, 0.0))
     y = simulate_linear(chain, t, u) + 0.01 * t
@@ -224,7 +224,7 @@ def test_a_drift_is_taken_out():
 
 
 def sticking(t, *, rests, levels=(0.0, 0.9, 0.0)):
-    """Return exponential moves between levels, each too short by the friction band."""
+    """Return exponential moves between levels, each short of its level by the friction band."""
     y = np.full_like(t, rests[0])
     for edge, level, miss in zip((1.0, 6.0), levels[1:], rests[1:], strict=True):
         after = t >= edge
@@ -232,8 +232,8 @@ def sticking(t, *, rests, levels=(0.0, 0.9, 0.0)):
     return y
 
 
-def test_a_rest_point_that_does_not_return_is_reported():
-    """If a cart sticks, its gain gets an interval, which contains the gain without friction."""
+def test_a_cart_that_sticks_gets_an_interval():
+    """If a cart sticks, its gain gets an interval that contains the gain without friction."""
     t = seconds(11.0)
     u = staircase(t, (1.0, 0.03), (6.0, 0.0))
     got = fit_step_gain(record(t, u, sticking(t, rests=(0.0, -0.01, 0.03))[None]), cart=1)
@@ -244,12 +244,12 @@ def test_a_rest_point_that_does_not_return_is_reported():
     assert low < 30.0 < high
     assert low < got.gain < high
     assert "away from where it began" in got.note
-    # The two edges differ by the shift, so the standard error includes their spread.
+    # The gains of the two edges differ because of the shift; the standard error includes this.
     assert got.gain_std > 0.4 * 0.03 / 0.03 / 2
 
 
-def test_a_step_too_small_to_move_the_cart():
-    """If friction holds the cart during an edge, a note names the edge, and it is not used."""
+def test_a_step_too_small_to_move_the_cart_is_not_used():
+    """If friction holds the cart at an edge, a note names the edge, and the edge is not used."""
     t = seconds(11.0)
     u = staircase(t, (1.0, 0.03), (6.0, 0.035))
     got = fit_step_gain(
@@ -263,7 +263,7 @@ def test_a_step_too_small_to_move_the_cart():
 # ----------------------------------------------------------------------- refused
 
 
-def test_without_an_input_the_error_says_what_to_do():
+def test_without_an_input_a_run_is_refused():
     """A file without the input is refused, since a gain is per input unit."""
     run = run_of(PRESETS["throne-1dof"], seconds(4.0), seconds(4.0) * 0)
     with pytest.raises(DataError, match=r"^step: step gain needs the input.*`columns`$"):
@@ -288,7 +288,7 @@ def test_a_held_cart_is_refused():
 
 
 def test_a_cart_that_does_not_move_is_refused():
-    """A cart that does not move is refused, since an unplugged encoder is not a gain of zero."""
+    """A cart that does not move is refused, since a broken encoder does not mean a zero gain."""
     t = seconds(8.0)
     u = staircase(t, (0.5, 0.03), (4.0, 0.0))
     with pytest.raises(DataError, match="needs motion, cart 1 does not move"):
@@ -303,19 +303,19 @@ def test_a_cart_that_does_not_move_is_refused():
 def test_real_steps_agree_within_their_spread(real_data, tmp_path):
     """The gains of the real two-cart steps 2 to 5 agree within 5 %.
 
-    Friction still shifts the rest position.
+    Friction shifts the rest position by less than 10 counts.
     """
     folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(2, 3, 4, 5))
     runs = [r for r in read_data(load_submission(folder)).records if r.id.startswith("both")]
-    for cart, truth in ((1, 560.0), (2, 550.0)):  # counts per volt: 281 and 275 counts at 0.5 V
+    for cart, truth in ((1, 560.0), (2, 550.0)):  # in counts per volt
         got = [fit_step_gain(run, cart=cart) for run in runs]
         assert_allclose([abs(g.gain) for g in got], truth, rtol=0.05)
         assert all(g.rest_shift is not None and abs(g.rest_shift) < 10 for g in got)
         assert any(g.interval is not None for g in got)
 
 
-def test_a_real_repeat_that_sticks_far_off(real_data, tmp_path):
-    """In the first real repeat, cart 2 stops 32 counts off its rest position.
+def test_a_real_repeat_that_sticks_has_a_wide_interval(real_data, tmp_path):
+    """In the first real repeat, cart 2 stops 32 counts from its rest position.
 
     The interval of its gain shows this.
     """

@@ -1,4 +1,4 @@
-"""The joint fit on time records finds unknown chains without a start value."""
+"""The joint fit to time records finds unknown chains without starting values."""
 
 from dataclasses import replace
 
@@ -52,13 +52,13 @@ def misfit(record: Record, chain: Chain, parametrisation: Parametrisation, *, at
     return compare(replace(open_window(record), at_rest=at_rest), modes)
 
 
-# ------------------------------------------------------------------ the response
+# ------------------------------------------------------- response and Jacobian
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.5])
 @pytest.mark.parametrize("free", [(1, 2, 3), (1, 3), (1,)])
 def test_modes_and_simulation_agree(free, jitter):
-    """The response computed by modes equals the simulated one.
+    """The response computed from the modes equals the simulated one.
 
     This holds for any free carts and sample times.
     """
@@ -67,7 +67,7 @@ def test_modes_and_simulation_agree(free, jitter):
     record = step_record(chain, rng=rng, free=free, jitter=jitter, noise=0.0, count=0.0, x0=x0)
     parametrisation = Parametrisation(bench=Bench(springs=(True, True, True, True)))
     left = misfit(record, chain, parametrisation, at_rest=False)
-    # Intervals are rounded to 1e-12 s in the simulation: 1e-12 s times some 100 cm/s.
+    # The simulation rounds intervals to 1e-12 s; velocities are about 100 cm/s.
     sigma = open_window(record).sigma
     assert np.max(np.abs(left.residual * sigma[:, None])) < 1e-9
 
@@ -92,15 +92,15 @@ def test_the_jacobian_is_that_of_the_misfit(zeta, at_rest):
     gradient = np.einsum("pij,ij->p", here.jacobian, here.residual)
     step = 1e-5 * np.eye(theta.size)
     numeric = [(cost(theta + e) - cost(theta - e)) / 2e-5 for e in step]
-    # Central differences err by the step's square times the third derivative: 1e-10 of a cost of
-    # 1e5 to 1e6 over gradients of 1e3 to 1e5.
+    # Central differences err by the squared step times the third derivative: 1e-10 of a cost of 1e5
+    # to 1e6, compared with gradients of 1e3 to 1e5.
     assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-5 * np.max(np.abs(gradient)))
 
 
 def test_a_band_limited_input_is_used_as_such():
     """If an input is declared band-limited, its response is computed to 1e-4 of the motion.
 
-    If the input were treated as held between samples, the error would be larger.
+    If the input were treated as held between samples, the error would be above 1e-2.
     """
     chain, rng = PRESETS["throne-2dof"], np.random.default_rng(2)
     t = np.arange(600) / 113.0
@@ -115,7 +115,7 @@ def test_a_band_limited_input_is_used_as_such():
         left = misfit(record, chain, parametrisation)
         return np.max(np.abs(left.residual * open_window(record).sigma[:, None])) / np.ptp(y)
 
-    # Held at eight times the rate, its middle: (15 rad/s / 8 / 113 Hz)² / 24 = 1e-5.
+    # The input is held at eight times the rate, which errs by (15 rad/s / 8 / 113 Hz)² / 24 = 1e-5.
     assert off(record) < 1e-4
     assert off(replace(record, hold="zero_order")) > 1e-2
 
@@ -124,7 +124,7 @@ def test_a_band_limited_input_is_used_as_such():
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
-def test_exact_records_give_the_chain_back(n):
+def test_exact_records_give_the_chain(n):
     """From records without noise or rounding, the fit finds the chain without starting values."""
     rng = np.random.default_rng(n)
     chain, springs = random_chain(n, rng)
@@ -132,7 +132,7 @@ def test_exact_records_give_the_chain_back(n):
     fit = fit_records([record], bench=Bench(springs=springs))
     assert fit.converged
     assert fit.n_starts == 1
-    # The search ends at 1e-9 of the cost left by sample times rounded to 1e-12 s.
+    # The search stops at 1e-9 of the cost, which sample times rounded to 1e-12 s leave above zero.
     assert_allclose(fit.chain.m, chain.m, rtol=1e-6)
     assert_allclose(fit.chain.c, chain.c, rtol=1e-5)
     assert_allclose(fit.chain.k, chain.k, rtol=1e-6)
@@ -153,15 +153,14 @@ def test_unseen_chains_are_found_from_noisy_records(n, all_springs):
             records, bench=Bench(springs=(True,) * (n + 1) if all_springs else springs)
         )
         assert fit.converged
-        # Of 3 × 4 × at most 17 numbers, one is beyond 4.5 standard errors in only 1 of 700 such
-        # tests.
+        # Of 3 × 4 × at most 17 errors, one exceeds 4.5 standard errors in only 1 of 700 such tests.
         assert np.max(np.abs(errors(fit, chain))) < 4.5
-        # chi² of over 2000 positions is within 0.1 of 1; a rounding error that is not uniform (a
-        # cart at rest stays on one count) lowers it by up to 0.3.
+        # chi² of over 2000 positions is within 0.1 of 1. A cart at rest stays on one count, which
+        # lowers chi² by up to 0.3.
         assert 0.6 < fit.chi_square_per_dof < 1.15
 
 
-def test_held_carts_and_hand_releases_join_in():
+def test_held_carts_and_decays_are_fitted_together_with_steps():
     """Steps with a held cart and decays of single carts are fitted together with other steps."""
     rng = np.random.default_rng(3)
     chain = PRESETS["throne-3dof"]
@@ -175,12 +174,12 @@ def test_held_carts_and_hand_releases_join_in():
     assert fit.converged
     assert np.max(np.abs(errors(fit, chain))) < 4
     alone = fit_records(records[:1], bench=Bench(springs=(True,) * 4))
-    # Decays of cart 3 determine it better than a step that reaches it through two springs.
+    # Decays of cart 3 determine it better than a step that acts through two springs.
     assert std(fit, "zeta_3") < 0.8 * std(alone, "zeta_3")
 
 
-def test_a_record_that_starts_in_motion_is_told_from_one_at_rest():
-    """If a record begins in motion, a note says so, and the fit is as good as with rest."""
+def test_a_record_that_starts_in_motion_is_fitted_with_a_note():
+    """If a record begins in motion, a note says so, and the fit is as good as from rest."""
     rng = np.random.default_rng(4)
     chain = PRESETS["throne-2dof"]
     x0 = np.array([0.3, -4.0, -0.2, 3.0])  # cm, cm/s
@@ -205,11 +204,11 @@ def test_a_cart_that_was_not_measured_is_still_found():
 
 
 def test_a_long_fast_sweep_is_fitted_whole():
-    """All samples of a sweep of 20 s at 1 kHz are fitted, with one start value."""
+    """All samples of a sweep of 20 s at 1 kHz are fitted, from a single start."""
     rng = np.random.default_rng(17)
     chain = PRESETS["throne-2dof"]
     t = np.arange(20_000) / 1000.0
-    u = 0.02 * np.sin(2 * np.pi * (0.2 * t + 0.17 * t**2))  # 0.2 to 7 Hz
+    u = 0.02 * np.sin(2 * np.pi * (0.2 * t + 0.17 * t**2))  # from 0.2 to 7 Hz
     y = simulate_linear(chain, t, u)
     record = measure(y, t, u, kind="sweep", carts=(1, 2), rng=rng, noise=0.001)
     fit = fit_records([record], bench=Bench(springs=(True,) * 3))
@@ -233,7 +232,7 @@ def test_a_body_on_no_spring_has_mass_and_damping():
     assert "held at zero, their bound: k_1" in fit.message
 
 
-def test_a_damping_at_its_bound_is_no_measurement():
+def test_a_damping_at_its_bound_has_no_standard_error():
     """If the fit holds the damping of an undamped cart at zero, it has no standard error."""
     chain = Chain(m=np.array([2e-3]), c=np.array([0.0]), k=np.array([0.6, 0.0]))
     fits = [
@@ -248,11 +247,11 @@ def test_a_damping_at_its_bound_is_no_measurement():
         zeta = fit.parameters["zeta"]
         assert (zeta.value, zeta.std, zeta.at_bound) == (0.0, None, True)
         assert fit.at_bound == ("c_1",)
-        assert fit.names == ("m_1", "c_1", "k_1")  # with its own standard error
+        assert fit.names == ("m_1", "c_1", "k_1")  # also for a damping at its bound
         assert fit.covariance[1, 1] > 0
 
 
-def test_a_spring_that_is_not_there_is_held_at_zero():
+def test_a_missing_spring_is_held_at_zero():
     """If the last spring is declared but missing, the fit holds it at zero, with a note."""
     rng = np.random.default_rng(1)
     chain = Chain(m=np.array([3e-4, 2e-4]), c=np.array([6e-4, 4e-4]), k=np.array([0.1, 0.06, 0]))
@@ -277,17 +276,17 @@ def test_the_same_records_give_the_same_fit():
 # ------------------------------------------------------------- what cannot be done
 
 
-def test_without_an_input_there_is_no_scale():
+def test_decays_alone_are_refused():
     """Decays alone cannot give a mass in units of the input, and the error says what is needed."""
     record = decay_record(PRESETS["throne-2dof"], free=(1, 2), rng=np.random.default_rng(8))
     with pytest.raises(DataError, match="needs a record that drives cart 1, found none"):
         fit_records([record], bench=Bench(springs=(True,) * 3))
 
 
-def test_what_the_records_do_not_determine_is_named():
+def test_an_undetermined_parameter_is_named():
     """If the records do not determine a parameter, the error names it.
 
-    Here cart 2 was held, so its mass is unknown.
+    In the test, cart 2 was held, so its mass is unknown.
     """
     record = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(9), free=(1,))
     with pytest.raises(DataError, match=r"the records do not determine \w_\d"):
@@ -295,13 +294,13 @@ def test_what_the_records_do_not_determine_is_named():
 
 
 def test_a_broken_chain_is_refused():
-    """If no spring joins two carts, the fit is refused, since the motor cannot reach the second."""
+    """If no spring joins two carts, the fit is refused, since the motor moves only the first."""
     record = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(9))
     with pytest.raises(DataError, match="spring between carts 1 and 2"):
         fit_records([record], bench=Bench(springs=(True, False, True)))
 
 
-def test_a_record_without_motion_is_left_out_and_said():
+def test_a_record_without_motion_is_left_out_with_a_message():
     """A record without motion is left out of the fit, and the message names it."""
     rng = np.random.default_rng(11)
     chain = PRESETS["throne-1dof"]
@@ -312,7 +311,7 @@ def test_a_record_without_motion_is_left_out_and_said():
     assert np.max(np.abs(errors(fit, chain))) < 4
 
 
-def test_an_input_that_explains_nothing_is_not_called_a_fit():
+def test_records_that_no_chain_explains_give_no_fit():
     """If no chain explains the records, as with a reversed input, the fit says so."""
     rng = np.random.default_rng(12)
     record = step_record(PRESETS["throne-1dof"], rng=rng)
@@ -322,7 +321,7 @@ def test_an_input_that_explains_nothing_is_not_called_a_fit():
     assert "no chain reproduces the recordings" in fit.message
 
 
-def test_a_search_that_nothing_ends_is_cut_short_with_the_best_so_far():
+def test_a_search_at_its_limit_returns_the_best_so_far():
     """If a search reaches its limit of comparisons, it returns the best result so far."""
     rng = np.random.default_rng(12)
     record = step_record(PRESETS["throne-1dof"], rng=rng)
@@ -344,14 +343,14 @@ def test_a_decay_is_used_from_its_release_on():
     """A decay is used from its release on, whatever the encoder's zero."""
     record = decay_record(PRESETS["throne-1dof"], free=(1,), rng=np.random.default_rng(13))
     start = record.t[usable_segment(record)][0]
-    # Released at 1.5 s; half the swing is lost within a quarter of the 0.48 s period.
+    # The release is at 1.5 s; a quarter of the period of 0.48 s later, half the swing is lost.
     assert 1.5 < start < 1.5 + 0.12
 
 
 # ------------------------------------------------------------- standard errors
 
 
-def test_correlated_residuals_count_for_less():
+def test_correlated_residuals_widen_the_error():
     """For correlated residuals, the error of a sum follows from their spectrum."""
     rng = np.random.default_rng(14)
     n, phi, runs = 1000, 0.8, 60
@@ -364,10 +363,10 @@ def test_correlated_residuals_count_for_less():
         ratios[0] += long_run_variance(residual) * (1 - phi) ** 2
         ratios[1] += score_covariance(residual, slow)[0, 0] / n * (1 - phi) ** 2
         ratios[2] += score_covariance(residual, fast)[0, 0] / n * (1 + phi) ** 2
-    # Parzen's window over n/3 lags has 11 degrees of freedom, half of them at either end of the
-    # spectrum: sqrt(2/5.5) = 0.6, and 0.08 for the mean of 60.
+    # Parzen's window over n/3 lags has 11 degrees of freedom, but only half as many at either end
+    # of the spectrum: one ratio errs by sqrt(2/5.5) = 0.6, and the mean of 60 by 0.08.
     assert_allclose(ratios / runs, 1.0, atol=0.3)
-    assert long_run_variance(fast[0]) == 1.0  # never below the mean square
+    assert long_run_variance(fast[0]) == 1.0  # not below the mean square
 
 
 def test_a_long_rest_before_the_step_is_one_reading():
@@ -383,12 +382,12 @@ def test_a_long_rest_before_the_step_is_one_reading():
         )
         fit = fit_records([record], bench=Bench(springs=(True, True)))
         off.append(errors(fit, chain))
-        moving = t >= 5.0 - 1.5 / rate  # the same without a rest before it
+        moving = t >= 5.0 - 1.5 / rate  # without the rest before the step
         short = replace(record, t=t[moving] - t[moving][0], u=u[moving], y=record.y[:, moving])
         white.append(
             std(fit, "K") / std(fit_records([short], bench=Bench(springs=(True, True))), "K")
         )
-    # 24 draws determine a spread to 14 %.
+    # From 24 records, a spread is known to 14 %.
     assert 0.6 < np.sqrt(np.mean(np.square(off)[:, 0])) < 1.4
     assert 0.5 < np.median(white) < 1.1
 
@@ -409,17 +408,17 @@ def test_readings_of_a_rest_share_an_error():
 # -------------------------------------------------------------------- real carts
 
 
-def test_real_repeats_give_the_masses_and_springs_found_before(real_data, tmp_path):
+def test_real_steps_give_the_known_masses_and_springs(real_data, tmp_path):
     """Four real steps give the masses and springs that an independent fit also found."""
     folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(2, 3, 4, 5))
     records = [r for r in read_data(load_submission(folder)).records if r.free == (1, 2)]
     steps = [record for record in records if record.kind == "step"]
     fit = fit_records(steps, bench=Bench(springs=(True, True, False)))
     assert fit.converged
-    # The reference is given to two digits, and a chain without friction is not the whole truth.
+    # The reference values have two digits, and real carts have friction, unlike the chain.
     assert_allclose(fit.chain.m, [5.5e-6, 3.7e-6], rtol=0.1)
     assert_allclose(fit.chain.k, [1.79e-3, 1.03e-3, 0], rtol=0.1)
     assert_allclose(fit.parameters["omega_1"].value, 22.6, rtol=0.1)
     assert_allclose(fit.parameters["omega_2"].value, 16.6, rtol=0.1)
-    # Friction leaves far more than encoder noise, and the residuals show it.
+    # Friction leaves residuals far above the encoder noise.
     assert fit.chi_square_per_dof > 10

@@ -122,9 +122,7 @@ def test_a_recordings_own_scale_counts_only_under_feedback(folder):
 
 
 @pytest.mark.parametrize("turned", [True, False])
-def test_the_data_decide_between_two_stated_signs(
-    folder, honest, tmp_path, turned
-):
+def test_the_data_decide_between_two_stated_signs(folder, honest, tmp_path, turned):
     """If a step states another sign than the rubric, the sign that fits the data is used."""
     other = tmp_path / "team-07"
     shutil.copytree(folder, other)

@@ -127,9 +127,7 @@ LONG = [pytest.mark.slow, pytest.mark.sample]
 
 
 def _cases() -> Iterator[Any]:
-    """Yield each case without a stated sign, and those that look like a wrong sign also with one.
-
-    """
+    """Yield each case without a stated sign; with a sign only cases that look like a wrong one."""
     for case in SPOILT:
         yield pytest.param(case, "", marks=LONG if case in SEARCHED else ())
         if "turned" in case or "exchanged" in case:
@@ -202,9 +200,7 @@ def test_dwells_that_are_too_short_are_flagged(bench, tmp_path):
     ("kind", "stated", "word"),
     [("step", "decay", "free decay"), ("sine", "step", "not a step"), ("step", "cut", "truncated")],
 )
-def test_a_cut_recording_or_one_of_another_kind_is_flagged(
-    kind, stated, word, bench, tmp_path
-):
+def test_a_cut_recording_or_one_of_another_kind_is_flagged(kind, stated, word, bench, tmp_path):
     """A recording that is cut off or of another kind is flagged, and a check of the report fails.
 
     No estimate uses the recording.
@@ -300,7 +296,7 @@ def test_a_sound_repeat_is_kept_if_most_have_swapped_columns(bench, tmp_path):
 
 
 def test_times_in_milliseconds_throughout_fail_a_check(bench, tmp_path):
-    """If all times are in milliseconds, a check finds the dwells' frequencies off by 1000."""
+    """If all times are in milliseconds, a check finds all dwell frequencies off by 1000."""
     folder = shutil.copytree(bench, tmp_path / "slow")
     for path in files(folder, ""):
         spoil(path, in_milliseconds)

@@ -94,9 +94,7 @@ def of_kind(records, kind):
 
 
 def test_honest_teams_on_one_bench_share_nothing(teams):
-    """Teams that drive the same bench with the same inputs are not flagged, as their noise differs.
-
-    """
+    """Teams that drive one bench with the same inputs are not flagged, as their noise differs."""
     assert find_shared([prints(str(i), records) for i, records in enumerate(teams)]) == {}
 
 
@@ -237,7 +235,7 @@ def test_a_copy_from_an_earlier_batch_is_found(teams):
 
 @pytest.fixture
 def compared(monkeypatch):
-    """Record each compared pair of recordings and the number of its time shifts."""
+    """Return a list that gets a pair of recordings for each comparison at one time shift."""
     pairs, compare = [], shared.compare
 
     def counted(a, b, **how):
