@@ -44,7 +44,7 @@ def fitted(
 
 
 def vanishing(checks: tuple[Check, ...]) -> dict[str, str]:
-    """Return a message for each parameter that may not exist, with the names as keys."""
+    """Return the message for each parameter that may not exist, by parameter name."""
     return {check.about: check.message for check in checks if check.kind == "vanishing"}
 
 
@@ -59,10 +59,10 @@ def vanishing(checks: tuple[Check, ...]) -> dict[str, str]:
         ("m_2", 3e-6, 1e-7, "0.96 % of m_1"),
     ],
 )
-def test_what_may_as_well_not_be_there_fails_with_its_question(name, value, std, found):
-    """A check fails if a parameter is zero within its error, or tiny beside its neighbour.
+def test_a_part_that_may_not_exist_fails_a_check(name, value, std, found):
+    """A check fails if a parameter is zero within its error, or tiny compared with its neighbour.
 
-    The message asks whether it exists and gives the line to change.
+    The message asks whether the part exists and gives the line to change.
     """
     plant = PRESETS["throne-2dof"]
     values = {"m": plant.m.copy(), "c": plant.c.copy(), "k": plant.k.copy()}
@@ -80,7 +80,7 @@ def test_what_may_as_well_not_be_there_fails_with_its_question(name, value, std,
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
-def test_a_spring_that_is_said_to_be_missing_is_not_asked_about(preset):
+def test_a_spring_declared_as_missing_is_not_asked_about(preset):
     """If a spring is declared as missing, no check asks about it.
 
     The paper's plants have no spring wall-1.
@@ -97,7 +97,7 @@ def test_a_spring_that_is_said_to_be_missing_is_not_asked_about(preset):
 
 
 def test_the_shipped_examples_pass():
-    """In the shipped examples, the checks doubt no parameter."""
+    """In the shipped examples, no check doubts that a parameter exists."""
     for name in ("one-cart", "two-cart", "three-cart"):
         assert vanishing(analysed(name).checks) == {}
 
@@ -118,10 +118,10 @@ def test_a_spring_too_many_is_found_on_the_examples(name, tmp_path):
 
 
 @pytest.mark.skipif(not (REAL_DATA / "ecp210-ucsd").is_dir(), reason="the recordings are not here")
-def test_a_far_spring_that_the_real_rig_has_not_is_asked_about(tmp_path):
-    """If the real bench's missing far spring is declared, a check asks about it.
+def test_a_far_spring_that_the_real_rig_lacks_is_asked_about(tmp_path):
+    """If a far spring is declared that the real bench lacks, a check asks about it.
 
-    The fit gives it 1 % of its neighbour, to explain dry friction.
+    The fit explains dry friction by a far spring of 1 % of its neighbour's stiffness.
     """
     folder: Path = write_two_cart_submission(tmp_path / "s", REAL_DATA, steps=(1, 2, 3, 4, 5))
     assert vanishing(analyse(load_submission(folder), design=False).checks) == {}

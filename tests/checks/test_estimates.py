@@ -13,8 +13,8 @@ from pipeline.workflow import analyse
 from tests.helpers.examples import analysed
 
 
-def test_the_interval_of_a_cart_that_sticks_is_no_bound():
-    """If a cart sticks, gain intervals of two steps need not overlap or contain the gain."""
+def test_gain_intervals_of_a_sticking_cart_may_be_disjoint():
+    """If a cart sticks, gain intervals of two steps may be disjoint and miss the gain."""
     steps = [
         StepGain(
             experiment=f"step-{i}",
@@ -33,10 +33,10 @@ def test_the_interval_of_a_cart_that_sticks_is_no_bound():
     assert all("the true gain may be outside" in check.message for check in checks)
 
 
-def test_a_step_that_friction_holds_off_does_not_pass_as_settled(tmp_path):
+def test_a_step_that_friction_stops_short_does_not_pass(tmp_path):
     """If friction stops a cart short at every edge, the step does not pass the check.
 
-    One gain fits all edges, but other records show the friction.
+    In the test, one gain fits all edges, but other records show the friction.
     """
     hidden = "coulomb_friction:cart=1,force=0.003"
     done = CliRunner().invoke(
@@ -47,7 +47,7 @@ def test_a_step_that_friction_holds_off_does_not_pass_as_settled(tmp_path):
     assert done.exit_code == 0
     analysis = analyse(load_submission(tmp_path / "s"), design=False)
     alike = [gain for gain in analysis.step_gains if gain.interval is None]
-    assert alike  # some steps show one gain at all edges
+    assert alike  # some steps have the same gain at all edges
     outcomes = {check.about: check for check in analysis.checks if check.kind == "step"}
     for gain in alike:
         check = outcomes[f"{gain.experiment}.cart_1"]
@@ -56,7 +56,7 @@ def test_a_step_that_friction_holds_off_does_not_pass_as_settled(tmp_path):
     assert not any(check.outcome == "pass" for check in outcomes.values())
 
 
-def test_one_edge_does_not_tell_whether_a_cart_sticks():
+def test_one_edge_does_not_show_whether_a_cart_sticks():
     """A step with one edge cannot show whether a cart sticks, so the check is skipped.
 
     A step on and off again is checked.
@@ -85,7 +85,7 @@ def row(name: str, source: str, final: str) -> ParameterRow:
     )
 
 
-def test_advice_looks_only_at_what_there_is():
+def test_advice_mentions_only_the_sources_of_the_estimates():
     """Advice mentions dwells, decays or steps only if the estimates come from them."""
     said = {
         (name, source, final): check_rows([row(name, source, final)])[0].message

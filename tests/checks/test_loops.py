@@ -23,7 +23,7 @@ LIGHTLY_DAMPED = replace(PRESETS["throne-2dof"], c=PRESETS["throne-2dof"].c / 10
 UNDAMPED = replace(PRESETS["throne-2dof"], c=np.zeros(2))
 PLANTS = {**PRESETS, "rigid": RIGID, "free pair": FREE_PAIR, "lightly damped": LIGHTLY_DAMPED}
 CASES = [(name, method) for name in PLANTS for method in ("lqr", "poles")]
-# Sample time and settling time, s: the usual ones, a quick sampler, a slow goal, a quick goal.
+# Sample time and settling time in s: default, fast sampling, slow goal, fast goal.
 PACES = [(None, 1.0), (1e-4, 1.0), (None, 30.0), (0.02, 0.3)]
 
 
@@ -45,8 +45,8 @@ def designed(
 
 
 @pytest.mark.parametrize(("name", "method"), CASES)
-def test_the_closed_loop_makes_the_step_of_the_design(name, method):
-    """The closed loop, as a python-control model, has named states and the step of the design."""
+def test_the_closed_loop_gives_the_step_of_the_design(name, method):
+    """The closed loop, as a python-control model, has named states and gives the design's step."""
     chain = PLANTS[name]
     design, controller = designed(chain, method)
 
@@ -61,13 +61,13 @@ def test_the_closed_loop_makes_the_step_of_the_design(name, method):
     ]
     ticks = np.arange(design.t.size)
     response = control.step_response(loop, ticks * loop.dt)
-    # Both are exact between the samples; rounding adds up over some hundred of them.
+    # Both are exact; a few hundred rounding errors add up.
     assert_allclose(response.outputs.reshape(chain.n, -1), design.y, atol=1e-10)
 
 
 @pytest.mark.parametrize(
     ("name", "method", "sample_time", "settling_time"),
-    # Placed poles are as good or bad a loop at any pace as at the usual one.
+    # Placed poles are tested only at the default pace, since other paces make no difference.
     [
         (name, method, *pace)
         for pace in PACES
@@ -78,8 +78,8 @@ def test_the_closed_loop_makes_the_step_of_the_design(name, method):
 def test_margins_are_the_edge_of_stability(name, method, sample_time, settling_time):
     """Within its margins the loop is stable, and just beyond them it is unstable.
 
-    A change of phase is a gain of size one, so the loop's poles show both margins exactly. |1 + L|
-    is never below the modulus margin, and reaches it.
+    A gain or a phase multiplies the loop by a factor, so the poles show both margins exactly. |1 +
+    L| is never below the modulus margin, and reaches it.
     """
     chain = PLANTS[name]
     design, controller = designed(
@@ -106,13 +106,14 @@ def test_margins_are_the_edge_of_stability(name, method, sample_time, settling_t
     for exponent in (gain, turn):
         assert all(is_stable(np.exp(share * exponent)) for share in np.linspace(-0.99, 0.99, 23))
         assert not is_stable(np.exp(1.002 * exponent))
-    # A crossing is found to 1e-11 of its frequency; near a light mode the curve turns 1e4 faster.
+    # A crossing is found to 1e-11 of its frequency; near a lightly damped mode, L varies 1e4 times
+    # as fast.
     assert_allclose(found.gain * response(found.omega_gain), -1.0, atol=1e-6)
     assert_allclose(np.exp(turn) * response(found.omega_phase), -1.0, atol=1e-6)
     grid = np.geomspace(1e-2, np.pi / design.sample_time, 3000)
     nearest = np.abs(1 + response(grid)).min()
     assert nearest > 0.999 * found.modulus
-    if name != "lightly damped":  # the grid misses the modes there
+    if name != "lightly damped":  # there, the grid misses the modes
         assert nearest < 1.01 * found.modulus
 
 
@@ -129,7 +130,7 @@ def test_an_unstable_loop_has_no_margins():
 def test_undamped_carts_have_no_margins():
     """If a fit puts a damping at zero, no margins are given.
 
-    The largest stable gain would then say nothing about the bench.
+    Otherwise, the largest stable gain would say nothing about the bench.
     """
     design, _ = designed(UNDAMPED, "lqr")
     with pytest.raises(DataError, match="a mode of the carts has no damping"):
@@ -167,11 +168,11 @@ def test_python_control_finds_the_same_loop(name, method, sample_time):
     def polynomial(gains):
         return np.poly(np.linalg.eigvals(sampled.A - sampled.B @ np.reshape(gains, (1, -1))))
 
-    # As far as it reaches itself: its gains leave up to 1e-8 of a coefficient.
+    # The designed gains themselves have errors of up to 1e-8 of a coefficient.
     assert_allclose(polynomial(design.gains), polynomial(theirs), atol=1e-6)
 
 
-def test_poles_asked_for_twice_are_verified_too():
+def test_double_poles_are_verified_too():
     """A design with double poles passes the check of its gains."""
     chain = PRESETS["throne-3dof"]
     design, _ = designed(chain, "poles", settling_time=0.1)

@@ -38,7 +38,7 @@ def test_pack_and_unpack_are_inverse(chain):
 
     back = P.unpack(P.pack(chain))
 
-    # |ln p| < 10, so a rounding of 1e-16 of it is 2e-15 of p.
+    # |ln p| < 10, so an error of 1e-16 in it causes 2e-15 in p.
     assert_allclose(P.physical(back), P.physical(chain), rtol=1e-14)
 
 
@@ -49,7 +49,7 @@ def test_matrices_are_the_sum_of_the_directions(chain):
 
     for derivative, matrix in zip(P.matrix_derivatives, chain.matrices()[:3], strict=True):
         built = np.einsum("pij,p->ij", derivative, P.physical(chain))
-        # Sums of two springs: one rounding of the larger.
+        # Sums of two springs have one rounding of the larger spring.
         assert_allclose(built, matrix, rtol=1e-14, atol=1e-14 * np.max(np.abs(matrix)))
 
 
@@ -61,12 +61,12 @@ def test_dp_dtheta_is_the_derivative_of_the_physical_parameters():
 
     for i, e in enumerate(np.eye(theta.size)):
         ends = [P.physical(P.unpack(theta + sign * h * e)) for sign in (1, -1)]
-        # The difference errs by h²/6 and by rounding, 1e-16 / h.
+        # The difference has errors of h²/6, and of 1e-16 / h from rounding.
         assert_allclose((ends[0] - ends[1])[i] / (2 * h), P.dp_dtheta(theta)[i], rtol=1e-9)
 
 
-def test_only_a_spring_that_may_be_missing_is_linear():
-    """In the vector, k_1 is linear if the far wall holds the carts too, else a logarithm."""
+def test_only_a_spring_that_may_be_missing_has_no_logarithm():
+    """The vector has the logarithm of k_1, or k_1 itself if it may be missing."""
     both = Parametrisation(bench=Bench(springs=(True, True, True)))
     near = Parametrisation(bench=Bench(springs=(True, True, False)))
 
@@ -86,13 +86,13 @@ def test_zero_parameters_leave_the_vector():
     assert chain.k[0] == 0
 
 
-def test_one_cart_has_one_stiffness_whichever_springs_hold_it():
-    """The vector of one cart is the same whether its spring is at the near or the far wall."""
+def test_one_cart_has_one_stiffness():
+    """One cart has a single stiffness k_1 in the vector, and none if no spring holds it."""
     assert Parametrisation(bench=Bench(springs=(False, True))).names == ("m_1", "c_1", "k_1")
     assert Parametrisation(bench=Bench(springs=(False, False))).names == ("m_1", "c_1")
 
 
-def test_carts_that_nothing_drives_are_refused():
+def test_a_missing_spring_between_carts_is_refused():
     """If the spring between two carts is missing, the error names the two carts."""
     with pytest.raises(DataError, match="between carts 2 and 3, found none"):
         Parametrisation(bench=Bench(springs=(True, True, False, True)))
@@ -101,7 +101,7 @@ def test_carts_that_nothing_drives_are_refused():
 def test_standard_errors_of_one_cart_follow_its_formulas():
     """The standard errors of one cart's K, ω_n and ζ equal those derived by hand."""
     m, c, k = 2e-4, 5e-4, 0.035
-    relative = np.array([0.02, 0.05, 0.01])  # of m, c, k, independent
+    relative = np.array([0.02, 0.05, 0.01])  # relative errors of m, c, k, independent
     covariance = np.diag((relative * [m, c, k]) ** 2)
 
     got = named_estimates(
@@ -114,12 +114,12 @@ def test_standard_errors_of_one_cart_follow_its_formulas():
     std = np.array([estimate.std for estimate in got.values()])
     value = np.array([estimate.value for estimate in got.values()])
     expected = [0.01, np.hypot(0.02, 0.01) / 2, np.sqrt(0.05**2 + (0.02**2 + 0.01**2) / 4)]
-    # The forward difference errs by its step, 1e-6.
+    # The forward difference has an error of about its step, 1e-6.
     assert_allclose(std / value, expected, rtol=1e-5)
 
 
 def test_standard_errors_agree_with_a_sample():
-    """In a sample of chains, named parameters scatter as their standard errors state."""
+    """In a random sample of chains, named parameters scatter as their standard errors state."""
     chain = PRESETS["throne-3dof"]
     P = Parametrisation(bench=Bench(springs=(True,) * 4))
     p = P.physical(chain)
@@ -132,7 +132,7 @@ def test_standard_errors_agree_with_a_sample():
         for _ in range(1000)
     ]
 
-    # A standard deviation from 1000 draws is good to 2.2 %; 4 of those for 19 parameters.
+    # A standard deviation from 1000 draws has an error of 2.2 %; the limit is four times that.
     ratio = np.std(sample, axis=0) / [estimate.std for estimate in got.values()]
     assert_allclose(ratio, 1.0, rtol=0.09)
 
@@ -154,17 +154,17 @@ def test_a_start_is_a_possible_chain():
 
 @settings(max_examples=20)
 @given(n=st.integers(1, 4), gain=st.floats(0.1, 1e4), omega=st.floats(0.5, 300.0))
-def test_an_even_chain_has_the_gain_it_is_asked_for(n, gain, omega):
+def test_an_even_chain_has_the_given_gain_and_frequency(n, gain, omega):
     """The chain of equal carts has the given gain of cart 1 and the given lowest frequency."""
     got = even_chain({"K_1": gain, "omega_a": omega}, bench=Bench(springs=(True,) * (n + 1)))
 
     values = got.parameters()
-    # Exact except for some ten roundings in the solve; the added damping does not move omega_a.
+    # The solution has about ten rounding errors; the added damping does not change omega_a.
     assert_allclose(values["K" if n == 1 else "K_1"], gain, rtol=1e-12)
     assert_allclose(np.min(np.abs(got.poles)), omega, rtol=1e-6)
 
 
-def test_an_even_chain_needs_something_to_go_by():
+def test_an_even_chain_needs_a_gain_and_a_resonance():
     """A chain of equal carts can be guessed only from a gain and a resonance."""
     with pytest.raises(DataError, match="gain of cart 1 and a resonance"):
         even_chain({"K_1": 1.0}, bench=Bench(springs=(True,) * 3))

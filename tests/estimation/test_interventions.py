@@ -1,4 +1,4 @@
-"""Touches by hand are found in recordings, and effects of the bench are not taken for them."""
+"""Touches by hand are found in recordings, and effects of the bench are not taken for touches."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from pipeline.results import Intervention
 from tests.truth.bench import Hand
 from tests.truth.cases import EFFECTS, Case, make_case
 
-TO = 0.08  # s, half a window of 0.1 s and the time in which a pluck's grip fades
+TO = 0.08  # s; half a window of 0.1 s plus the time in which a hand lets go
 
 
 def pulls(case: Case) -> list[tuple[str, Hand]]:
@@ -19,7 +19,7 @@ def pulls(case: Case) -> list[tuple[str, Hand]]:
 
 
 def unmatched(case: Case) -> tuple[list[tuple[str, Hand]], list[Intervention]]:
-    """Return the touches that were not found, and the finds without a touch."""
+    """Return the touches that were not found, and the interventions found without a touch."""
     found = list(find_interventions(case.records))
     missed = []
     for name, hand in pulls(case):
@@ -41,9 +41,9 @@ def unmatched(case: Case) -> tuple[list[tuple[str, Hand]], list[Intervention]]:
     [(1, 113.1, ()), (2, 250.0, ()), (3, 1000.0, ()), (2, 250.0, ("coulomb_friction",))],
 )
 def test_hands_are_found_and_nothing_else(n, rate, effect):
-    """Plucks, a nudge and a push are found on benches with any effect, and nothing else is.
+    """Plucks, a nudge and a push are found on benches with any effect, and nothing else is found.
 
-    On such benches 476 of 486 touches were found; a short pull may be missed.
+    In many such cases 476 of 486 touches were found; a short pull may be missed.
     """
     case = make_case(seed=60 + n, n=n, rate=rate, effects=effect, handled=True, dirt=True)
     missed, more = unmatched(case)
@@ -52,7 +52,7 @@ def test_hands_are_found_and_nothing_else(n, rate, effect):
     assert more == []
 
 
-def test_a_hand_is_found_where_it_was():
+def test_the_start_and_end_of_a_touch_are_found():
     """The start and end of a touch are found to within the length of a window."""
     case = make_case(seed=71, n=1, rate=250.0, handled=True)
     found = find_interventions(case.records)
@@ -95,7 +95,7 @@ def test_a_recording_that_is_listed_twice_keeps_its_hands():
         *(("stiction",), ("load_friction",), ("input_delay",), ()),
     ],
 )
-def test_no_effect_is_a_hand(effect):
+def test_no_effect_is_taken_for_a_hand(effect):
     """Stops, play, sticking, resonances and late inputs are not taken for touches."""
     case = make_case(seed=80, n=2, rate=200.0, effects=effect, severity=1.5, dirt=True)
 
@@ -103,7 +103,7 @@ def test_no_effect_is_a_hand(effect):
 
 
 def test_a_record_is_cut_at_its_hands():
-    """A record is cut at its touches, and no sample outside them is lost."""
+    """A record is cut at its touches, and no sample outside the touches is lost."""
     record = make_case(seed=71, n=1, rate=113.1).records[0]
     hands = [
         Intervention(experiment=record.id, cart=1, start=1.0, end=1.5),
@@ -120,8 +120,8 @@ def test_a_record_is_cut_at_its_hands():
     assert between(record, hands[2:]) == [record]
 
 
-def test_what_is_not_understood_is_not_judged():
-    """No touch is reported for runs under feedback, or beside a cart that was not measured."""
+def test_closed_loops_and_unmeasured_carts_have_no_touches():
+    """No touch is reported for closed-loop runs, or beside a cart that was not measured."""
     case = make_case(seed=62, n=2, rate=250.0, handled=True)
     assert find_interventions(case.records) != ()
 
@@ -138,7 +138,7 @@ def test_what_is_not_understood_is_not_judged():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(38))
-def test_no_effect_of_any_size_is_a_hand(seed):
+def test_no_effect_of_any_size_is_taken_for_a_hand(seed):
     """Neither single effects nor pairs of them, small or large, are taken for touches."""
     effects = [EFFECTS[seed % len(EFFECTS)], *EFFECTS[(5 * seed) % 17 : (5 * seed) % 17 + seed % 2]]
     case = make_case(seed=300 + seed, n=2 + seed % 2, effects=effects, dirt=True, wide=True)

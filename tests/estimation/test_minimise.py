@@ -1,4 +1,4 @@
-"""At each point the model is computed only once for residual and derivatives."""
+"""For one set of parameters, the model is computed only once for residual and derivatives."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from pipeline.estimation.minimise import evaluated_once
 
 
 class _Decay:
-    """A residual exp(-p t) that stores the rate p for which it was made."""
+    """A model exp(-p t) that keeps the array p it was made with."""
 
     def __init__(self, t, p):
         self.t, self.p = t, p
@@ -20,7 +20,7 @@ class _Decay:
         return -self.t[:, None] * self.columns * linear
 
 
-def test_what_was_worked_out_keeps_its_point_when_the_caller_goes_on_in_its_array():
+def test_a_stored_result_is_unaffected_by_later_changes_of_its_argument():
     once = evaluated_once(lambda p: p)
     p = np.array([1.0, 2.0])
     first = once(p)
@@ -29,7 +29,7 @@ def test_what_was_worked_out_keeps_its_point_when_the_caller_goes_on_in_its_arra
     assert once(p)[0] == 5.0
 
 
-def test_the_same_point_is_worked_out_once():
+def test_the_same_point_is_computed_once():
     seen = []
     once = evaluated_once(lambda p: seen.append(p) or len(seen))
     assert [once(np.ones(2)), once(np.ones(2)), once(np.zeros(2))] == [1, 1, 2]

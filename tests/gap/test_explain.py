@@ -1,4 +1,4 @@
-"""The gap workflow on a few fixed benches whose hidden physics is known."""
+"""The gap workflow is run on a few fixed benches whose hidden physics is known."""
 
 import json
 import subprocess
@@ -48,15 +48,15 @@ def test_a_bench_without_hidden_effects_reports_none(n, dirt):
 
 
 def test_friction_that_varies_from_run_to_run_stays_one_effect():
-    """Friction that varies from run to run gets one effect with a scatter, not several effects."""
+    """Friction that varies from run to run is one effect with a scatter, not several effects."""
     case = make_case(seed=43, n=1, effects=["coulomb_friction"], rate=200.0, dirt=True)
 
     gap = explain(case)
 
     assert names(gap) == [("coulomb_friction", 1)]
-    # 4 % was hidden; from seven runs a spread is known within a factor of two.
+    # The hidden scatter is 4 %; seven runs determine it within a factor of two.
     assert 0.02 < gap.spread[1] < 0.08
-    # The stated errors are those of the returned model, on the held-out runs as drawn.
+    # The stated errors are those of the returned model on the held-out runs in the figures.
     held_out = [trace for trace in gap.traces if trace.held_out]
     before, after = (
         sum(float(np.sum((trace.measured - model) ** 2)) for trace, model in drawn)
@@ -69,7 +69,7 @@ def test_friction_that_varies_from_run_to_run_stays_one_effect():
     assert gap.effects[-1].nrmse_after == gap.final
 
 
-def test_what_the_catalogue_lacks_is_not_misnamed():
+def test_an_effect_that_the_catalogue_lacks_is_not_misnamed():
     """If the catalogue lacks the true effect, no effect is named, and suspects are listed."""
     case = make_case(seed=10700, n=1, effects=["cubic_spring"], rate=113.1)
     known = [e for e in CATALOGUE if e.key not in ("cubic_spring", "slack_spring")]
@@ -81,8 +81,8 @@ def test_what_the_catalogue_lacks_is_not_misnamed():
     assert all(s.nrmse_after > 0.5 * gap.baseline for s in gap.suspects)
 
 
-def test_a_part_is_called_a_part():
-    """If the catalogue has one of two true effects, it is named with the verdict `partial`."""
+def test_one_of_two_effects_is_called_partial():
+    """If the catalogue has only one of two true effects, it is named with the verdict `partial`."""
     case = make_case(seed=53, n=1, effects=["coulomb_friction", "saturation"], rate=113.1)
     known = [e for e in CATALOGUE if e.key in ("coulomb_friction", "cubic_spring", "drive_damping")]
 
@@ -97,8 +97,8 @@ def test_a_part_is_called_a_part():
 
 
 @pytest.mark.parametrize("irregular", [False, True])
-def test_blocks_of_fast_samples_are_readings_at_their_middle(irregular):
-    """Four samples at 1 kHz become one reading, taken from a curve through them."""
+def test_fast_samples_are_combined_into_readings(irregular):
+    """Four samples at 1 kHz become one reading, taken from a curve through the samples."""
     t = np.arange(4001) / 1000.0
     if irregular:
         t = t + np.random.default_rng(0).uniform(-2e-4, 2e-4, t.size)
@@ -115,13 +115,13 @@ def test_blocks_of_fast_samples_are_readings_at_their_middle(irregular):
     assert thin.shots == (0, thin.t.size) == (0, 1001)
     assert thin.t[0] == run.t[0]
     assert not thin.weight[0, 0]
-    # The motion's fourth derivative leaves (omega h)⁴ / 1000, 1e-7 here; at irregular times its
-    # third leaves (omega h)³ / 100. A mean alone would err by 4e-4.
+    # The fourth derivative of the motion causes an error of (omega h)⁴ / 1000, or 1e-7. At
+    # irregular times, the third causes (omega h)³ / 100. A plain mean would have an error of 4e-4.
     limit = 2e-5 if irregular else 1e-6
     np.testing.assert_allclose(thin.y[0, 2:-1], np.cos(omega * thin.t[2:-1]), atol=limit)
 
 
-def test_the_time_allowed_ends_the_search():
+def test_without_time_the_linear_model_is_returned():
     """Without any time for the search, the linear model is returned and marked as incomplete."""
     case = make_case(seed=45, n=1, effects=["dead_zone"], rate=113.1)
 
@@ -131,7 +131,7 @@ def test_the_time_allowed_ends_the_search():
     assert gap.final == gap.baseline
 
 
-def test_repeats_are_compared_by_the_edge_of_their_input():
+def test_repeats_are_aligned_at_the_edge_of_their_input():
     """Repeats are aligned at the edge of their input, so they differ only by noise."""
     case = make_case(seed=49, n=1, rate=113.1)
     first = next(record for record in case.records if record.kind == "step")
@@ -155,7 +155,7 @@ def test_repeats_are_compared_by_the_edge_of_their_input():
 
 @pytest.mark.parametrize("said", [(1,), (1, 2)])
 def test_a_cart_held_in_all_runs_is_a_wall(said):
-    """If all runs of a two-cart folder have cart 2 held, the result is that of one cart."""
+    """If cart 2 is held in all runs of a two-cart folder, the result is that of one cart."""
     hidden = Hidden(effect="coulomb_friction", place=1, parameters={"force": 0.0025})
     case = make_case(seed=45, n=2, effects=[hidden], rate=113.1)
     alone = [r for r in case.records if r.id.startswith("decay-1")]
@@ -179,11 +179,11 @@ def test_a_cart_held_in_all_runs_is_a_wall(said):
 
 @pytest.fixture(scope="module")
 def one_gap() -> Gap:
-    """A gap that the tests examine: a dead zone on one cart."""
+    """Return the gap of one cart with a dead zone, which several tests examine."""
     return explain(make_case(seed=45, n=1, effects=["dead_zone"], rate=113.1))
 
 
-def test_document_is_what_was_agreed(one_gap):
+def test_gap_json_has_the_documented_keys(one_gap):
     """`gap.json` has the documented keys, no NaN, and figures that agree with each other."""
     document = json.loads(json.dumps(plain(one_gap), allow_nan=False))
 
@@ -204,7 +204,7 @@ def test_document_is_what_was_agreed(one_gap):
         assert 0.0 < window["share"] <= 1.0
 
 
-def test_same_records_give_the_same_document_however_busy_the_machine(one_gap):
+def test_the_same_records_give_the_same_document(one_gap):
     """The same records give the same bytes, even on a busy machine."""
     case = make_case(seed=45, n=1, effects=["dead_zone"], rate=113.1)
 
@@ -219,8 +219,8 @@ def test_same_records_give_the_same_document_however_busy_the_machine(one_gap):
     assert json.dumps(plain(again)) == json.dumps(plain(one_gap))
 
 
-def test_duplicate_files_do_not_judge_their_twin():
-    """A run that is listed twice is used once, so it is not held out against itself."""
+def test_a_run_listed_twice_is_used_once():
+    """A run that is listed twice is used once, so that it is not held out to test itself."""
     case = make_case(seed=46, n=1, rate=113.1)
     twin = case.records[0]
     copy = Record(**{**vars(twin), "id": "copy-of-a"})
@@ -262,8 +262,8 @@ def test_no_motion_is_one_clear_error():
 def positioning_stage(*, friction: float, seed: int, reference, push: float = 0.0) -> Record:
     """Return one run of a cart without springs under PD feedback, simulated in steps of 80 µs.
 
-    `push` is a constant force, V. u = 0.05 e + 0.004 de/dt (V, cm), sampled at 250 Hz; m = 2e-4, c
-    = 5e-4 in V, s, cm.
+    `push` is a constant force in V. The controller is u = 0.05 e + 0.004 de/dt (V, cm), sampled at
+    250 Hz; m = 2e-4 and c = 5e-4 in V, s and cm.
     """
     m, c, h, count = 2e-4, 5e-4, 8e-5, 0.00227
     rng = np.random.default_rng(seed)
@@ -301,11 +301,11 @@ REFERENCES = (
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.003])
-def test_a_rigid_body_under_feedback(friction):
-    """For a cart without springs, runs under feedback show whether there is dry friction.
+def test_friction_of_a_rigid_body_is_found_under_feedback(friction):
+    """For a cart without springs, closed-loop runs show whether there is dry friction.
 
-    A simulation of a whole run, without any fit to it, then ends within two encoder counts: the
-    start is known to half a count, and errors of the parameters add up.
+    A simulation of a whole run then stays within two encoder counts, although it is not fitted to
+    the run.
     """
     records = [
         positioning_stage(friction=friction, seed=i, reference=r) for i, r in enumerate(REFERENCES)
@@ -323,8 +323,8 @@ def test_a_rigid_body_under_feedback(friction):
         assert gap.verdict == "none"
 
 
-def test_a_constant_force_without_springs():
-    """Without springs, a tilted track makes the cart drift, and force and friction are named."""
+def test_a_constant_force_without_springs_is_found():
+    """If a cart without springs drifts on a tilted track, constant force and friction are named."""
     records = [
         positioning_stage(friction=0.003, push=0.0008, seed=i, reference=r)
         for i, r in enumerate(REFERENCES)
@@ -340,17 +340,17 @@ def test_a_constant_force_without_springs():
 
 
 def test_a_single_decay_is_cut_where_it_still_moves():
-    """Of a single decay, a part is held out in which the cart still moves."""
+    """From a single decay, the held-out part is one in which the cart still moves."""
     case = make_case(seed=47, n=1, effects=["coulomb_friction"], rate=113.1)
     (decay, *_) = (r for r in case.records if r.kind == "decay")
 
     gap = explain_gap([decay], Bench(springs=case.springs))
 
-    assert 0.0 < gap.noise_floor < 0.5  # the noise is below half of the motion
+    assert 0.0 < gap.noise_floor < 0.5  # the noise is less than half of the motion
     assert all(r.noise_floor < 0.5 for r in gap.by_record)
 
 
-def test_carts_that_no_run_shows_do_no_harm():
+def test_a_cart_without_recordings_does_not_change_the_verdict():
     """If only decays of cart 2 are recorded, a linear bench still gets the verdict `none`."""
     case = make_case(seed=48, n=2, effects=[], rate=113.1)
     decays = [r for r in case.records if r.kind == "decay" and r.free == (2,)]
@@ -373,7 +373,7 @@ def test_a_run_without_its_input_is_left_out_with_a_message():
 
 
 def _late(*, seed: int) -> Record:
-    """Return a sweep of a cart whose cubic spring shows only in the last 40 %."""
+    """Return a sweep of a cart with a cubic spring that shows only in the last 40 %."""
     chain = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.array([0.05, 0.0]))
     term = make_term(
         find_effect("cubic_spring"), place=1, values={"coefficient": 0.004}, chain=chain
@@ -391,9 +391,9 @@ def _late(*, seed: int) -> Record:
 
 
 def test_an_effect_only_in_the_held_out_data_is_found():
-    """An effect that only the held-out part shows is found.
+    """If only the held-out part shows an effect, the effect is still found.
 
-    The part is exchanged with the fitted one, and a note says so.
+    The held-out part is exchanged with the fitted one, and a note says so.
     """
     gap = explain_gap([_late(seed=0)], Bench(springs=(True, False)))
     assert names(gap) == [("cubic_spring", 1)]
@@ -402,8 +402,8 @@ def test_an_effect_only_in_the_held_out_data_is_found():
     assert any("changed sides" in note for note in gap.notes)
 
 
-def test_a_slope_that_is_no_number_ends_a_fit(monkeypatch):
-    """If a derivative is not a number, the fit keeps its start."""
+def test_an_overflow_in_the_derivatives_ends_a_fit(monkeypatch):
+    """If the derivatives overflow, the fit keeps its start."""
     module = "pipeline.gap.fit.levenberg_marquardt.linearise"
     monkeypatch.setattr(
         module,

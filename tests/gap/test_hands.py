@@ -1,4 +1,4 @@
-"""Samples in which a hand moves a cart are not used for fits and errors; those after them are."""
+"""Only the samples in which a hand moves a cart are left out of fits and errors."""
 
 import numpy as np
 import pytest
@@ -12,14 +12,14 @@ from tests.truth.cases import Case, make_case
 
 @pytest.fixture(scope="module", params=[1, 2])
 def explained(request) -> tuple[Case, Gap]:
-    """The gap of a linear bench on which hands pluck, nudge and loosely hold the carts."""
+    """Return the gap of a linear bench on which hands pluck, nudge and loosely hold the carts."""
     n = request.param
     case = make_case(seed=8999 + n, n=n, rate=200.0, handled=True)
     return case, explain_gap(case.records, Bench(springs=case.springs))
 
 
-def test_a_linear_bench_with_hands_is_linear(explained):
-    """On a linear bench neither a hand nor a loose hold is taken for an effect."""
+def test_a_hand_on_a_linear_bench_is_not_an_effect(explained):
+    """On a linear bench, neither a pluck nor a loose hold is taken for an effect."""
     _, gap = explained
 
     assert gap.verdict == "none"
@@ -27,7 +27,7 @@ def test_a_linear_bench_with_hands_is_linear(explained):
 
 
 def test_interventions_by_hand_are_reported(explained):
-    """`gap.json` lists each hand with its record, cart and times."""
+    """`gap.json` lists each touch by hand with its record, cart and times."""
     case, gap = explained
     hands = [(name, h) for name, laid in case.hands.items() for h in laid if h.end < 1e9]
     told = plain(gap)["interventions"]
@@ -39,7 +39,7 @@ def test_interventions_by_hand_are_reported(explained):
 
 
 def test_data_after_an_intervention_by_hand_are_used(explained):
-    """Every plucked record is used in the gap, without the samples in which a hand acts."""
+    """Every plucked record is used in the gap, except for the samples in which a hand acts."""
     case, gap = explained
 
     assert {*gap.training, *gap.held_out} == {record.id for record in case.records}

@@ -13,7 +13,7 @@ NAMES = {name for effect in CATALOGUE for name in (effect.key, effect.family) if
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.stem)
-def test_no_effect_is_written_in_the_search(path):
+def test_the_search_names_no_effect(path):
     """The code of the search names no effect and no family of effects."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     written = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}

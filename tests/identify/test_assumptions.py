@@ -1,4 +1,4 @@
-"""All results rest on assumptions, which are listed together with their support in the data."""
+"""All assumptions behind the results are listed, each with its support in the data."""
 
 import json
 import shutil
@@ -23,7 +23,7 @@ UNITS = 'input = { unit = "V", sign = 1 }\nposition = { unit = "cm" }\n'
 
 
 def edited(folder: Path, *changes: tuple[str, str], head: str = "") -> Analysis:
-    """Return the analysis of a changed two-cart example; `head` is the head of its CSV files."""
+    """Return the analysis of a changed two-cart example; `head` is the heading of its CSV files."""
     shutil.copytree(EXAMPLES / "two-cart", folder)
     toml = folder / "submission.toml"
     text = toml.read_text(encoding="utf-8")
@@ -45,7 +45,7 @@ def by_key(analysis: Analysis) -> dict[str, Assumption]:
     }
 
 
-def test_what_an_example_states_is_listed_with_its_support():
+def test_stated_values_are_listed_with_their_support():
     """Each stated value is listed with its origin and whether the data support it."""
     found = by_key(analysed("two-cart"))
     assert {key: (a.value, a.origin, a.support) for key, a in found.items()} == {
@@ -67,7 +67,7 @@ def test_what_an_example_states_is_listed_with_its_support():
 
 
 def test_an_unstated_value_is_a_default(tmp_path):
-    """Springs, unit and sign that nobody states are defaults; data contradict one spring."""
+    """Unstated springs, unit and sign are listed as defaults; the data contradict one spring."""
     analysis = edited(tmp_path / "s", (SPRINGS, ""), (UNITS, ""))
     found = by_key(analysis)
     assert {key: (a.value, a.origin, a.support) for key, a in found.items()} == {
@@ -82,7 +82,7 @@ def test_an_unstated_value_is_a_default(tmp_path):
         "experiments.carts (1, 2)": ((1, 2), "default", "supported"),
     }
     findings = [line for line in terminal_summary(analysis).splitlines() if line.startswith("- ")]
-    assert findings[0].startswith("- Unit of the positions: ")  # at the top
+    assert findings[0].startswith("- Unit of the positions: ")  # at the top of the list
     assert findings[1].startswith("- Assumed: system.input.unit (V)")
     assert (
         sum(
@@ -102,8 +102,8 @@ def test_headings_support_a_unit(tmp_path):
     assert len(found["system.position.unit"].experiments) == len(analysis.records)
 
 
-def test_the_report_and_results_json_hold_them():
-    """The report has a section with a row per assumption, and results.json has the same."""
+def test_the_report_and_results_json_list_the_assumptions():
+    """The report has a section with a row for each assumption, and `results.json` has the same."""
     analysis = analysed("two-cart")
     document = build_document(analysis)
     (section,) = (s for s in document.sections if s.id == "assumptions")
@@ -129,7 +129,7 @@ def test_a_held_cart_that_was_not_measured_is_open(tmp_path):
     assert found["system.position.unit"].support == "supported"
     sign = found["system.input.sign"]
     assert (sign.value, sign.origin, sign.support) == (-1.0, "data", "supported")
-    assert "pid" not in sign.experiments  # the log's sign is opposite
+    assert "pid" not in sign.experiments  # the logged input has the opposite sign
     assert "the opposite sign is shown by pid" in sign.reason
 
 

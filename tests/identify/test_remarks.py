@@ -1,4 +1,4 @@
-"""Warnings about the records as such."""
+"""Some recordings get warnings about themselves, for example about their unit."""
 
 from dataclasses import replace
 
@@ -12,10 +12,10 @@ from pipeline.submission import load_submission
 
 
 @pytest.mark.parametrize("name", ["one-cart", "two-cart", "three-cart"])
-def test_centimetres_said_to_be_metres_are_asked_about(name):
-    """Carts that would move at 60 km/h get the question whether metres are the right unit.
+def test_centimetres_stated_as_metres_raise_a_question(name):
+    """Carts that would move at 60 km/h raise the question whether metres are the right unit.
 
-    Centimetres, millimetres and counts get no such question.
+    Data stated in centimetres, millimetres or counts do not.
     """
     data = read_data(load_submission(EXAMPLES / name))
     (said,) = [one for one in reading_remarks(data, unit="m") if "m/s" in one]
@@ -26,7 +26,7 @@ def test_centimetres_said_to_be_metres_are_asked_about(name):
         ]
 
 
-def test_one_kind_of_recording_or_a_jump_accuses_no_unit():
+def test_one_kind_of_recording_or_a_jump_questions_no_unit():
     """If only one kind of recording is too fast, or an encoder jumps, no unit is doubted."""
     data = read_data(load_submission(EXAMPLES / "one-cart"))
     steps = replace(data, records=tuple(r for r in data.records if r.kind == "step"))

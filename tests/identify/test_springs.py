@@ -1,4 +1,4 @@
-"""`fill` decides from steps which springs there are, and marks the others as unsure."""
+"""`fill` finds from steps which springs exist, and marks the others as unsure."""
 
 import shutil
 from pathlib import Path
@@ -16,12 +16,12 @@ from pipeline.results import Record
 from pipeline.submission import load_submission
 from tests.helpers.places import REAL_DATA
 
-STEP = 0.00227  # cm, of the encoder
+STEP = 0.00227  # cm, one encoder step
 MASS, DAMPING, SPRING = 2.5e-4, 1.5e-3, 0.06
 
 
 def step(k: list[float], *, seconds: float = 8.0) -> Record:
-    """Return an encoder's reading of a step on and off, on a bench with these springs."""
+    """Return encoder readings of a step on and off, on a bench with these springs."""
     n = len(k) - 1
     chain = Chain(m=np.full(n, MASS), c=np.full(n, DAMPING), k=np.array(k))
     t = np.arange(0.0, seconds, 0.00884)
@@ -37,7 +37,7 @@ def step(k: list[float], *, seconds: float = 8.0) -> Record:
 @pytest.mark.parametrize(
     ("k", "present", "not_told"),
     [
-        ([SPRING, 0], [True, True], ()),  # of one cart only the sum can be known
+        ([SPRING, 0], [True, True], ()),  # for one cart only the sum can be known
         ([SPRING, SPRING, 0], [True, True, False], ()),
         ([2 * SPRING, SPRING / 2, SPRING, 0], [True, True, True, False], ()),
         ([0, SPRING, SPRING], [True, True, True], (1,)),
@@ -49,7 +49,7 @@ def step(k: list[float], *, seconds: float = 8.0) -> Record:
         ([0, SPRING, SPRING, 0], [False, True, True, False], ()),
     ],
 )
-def test_steps_tell_the_far_spring_and_whether_any_holds_the_carts(k, present, not_told):
+def test_steps_show_which_wall_springs_there_are(k, present, not_told):
     """If all gains are equal, there is no far spring; if carts do not return, no wall spring."""
     found = decide_springs([step(k)], n=len(k) - 1)
     assert found.present == tuple(present)
@@ -69,7 +69,7 @@ def folder_of(data: Path, folder: Path) -> Path:
     return folder
 
 
-def test_fill_marks_what_the_files_do_not_tell(tmp_path):
+def test_fill_marks_what_the_files_do_not_show(tmp_path):
     """`fill` prints open questions and marks them in the file, until a person answers."""
     folder = folder_of(EXAMPLES / "two-cart" / "data", tmp_path / "s")
     done = CliRunner().invoke(app, ["fill", str(folder)], standalone_mode=False)
@@ -82,7 +82,7 @@ def test_fill_marks_what_the_files_do_not_tell(tmp_path):
     assert "# unsure: counts are whole numbers" in position
     assert "springs: unsure: is there a spring wall-1?" in done.stderr
     assert "position: unsure: counts are whole numbers" in done.stderr
-    assert "or an encoder that is stuck" not in done.stdout  # its table says that it is held
+    assert "or an encoder that is stuck" not in done.stdout  # the cart was held
     assert fill(folder).doubts == tuple(
         line.removeprefix("cartlab: ") for line in done.stderr.splitlines() if "unsure: " in line
     )
@@ -94,8 +94,8 @@ def test_fill_marks_what_the_files_do_not_tell(tmp_path):
 
 
 @pytest.mark.parametrize(("unit", "said"), [("furlong", "is not known"), ("count", "decimals")])
-def test_fill_speaks_of_a_unit_that_somebody_else_wrote(unit, said, tmp_path):
-    """On a doubtful unit in an existing file, `fill` prints a message but sets no mark."""
+def test_fill_prints_a_doubt_about_an_existing_unit(unit, said, tmp_path):
+    """If an existing file has a doubtful unit, `fill` prints a message but marks nothing."""
     folder = folder_of(EXAMPLES / "one-cart" / "data", tmp_path / "s")
     text = f'version = 1\n[system]\ncarts = 1\nposition = {{ unit = "{unit}" }}\n'
     (folder / "submission.toml").write_text(text, encoding="utf-8")

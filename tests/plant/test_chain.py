@@ -1,4 +1,4 @@
-"""The plant: matrices, poles, zeros, and the conversion between chain and named parameters."""
+"""The linear plant: matrices, poles, zeros, and conversion to named parameters and back."""
 
 from itertools import pairwise
 
@@ -16,7 +16,7 @@ from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.recovery import recover_chain, recover_from_parameters
 from pipeline.set_up import PAPER_UNITS
 
-# The paper's final estimates. Presets agree with Tables 1 and 2; no real chain agrees with Table 3.
+# The paper's final estimates. No real chain agrees with Table 3.
 TABLE_1 = {"K": 28.9, "omega_n": 13.2, "zeta": 0.10}
 TABLE_2 = {
     "K_1": 24.3, "K_2": 16.4, "omega_a": 10.1, "omega_b": 37.3,
@@ -30,13 +30,13 @@ TABLE_3 = {
 
 
 def logarithmic(low, high):
-    """Numbers spread evenly over decades."""
+    """Draw numbers spread evenly over decades."""
     return st.floats(np.log(low), np.log(high)).map(lambda x: float(np.exp(x)))
 
 
 @st.composite
 def chains(draw, min_carts=1, max_carts=4, max_zeta=0.3):
-    """Chains like those of the laboratory: masses and springs within a factor of four."""
+    """Draw chains like those of the laboratory: masses and springs within a factor of four."""
     n = draw(st.integers(min_carts, max_carts))
     m = np.array([draw(logarithmic(1e-4, 4e-4)) for _ in range(n)])
     k = np.array([draw(logarithmic(0.03, 0.12)) for _ in range(n + 1)])
@@ -64,15 +64,15 @@ def test_chain_to_parameters_and_back(chain):
     """The named parameters of one to three carts give the chain back, with zero redundancies."""
     got = recover_from_parameters(chain.parameters())
 
-    # Poles come from an eigenvalue routine with errors near 1e-14; a weak coupling, the
-    # difference of numbers up to 100 times as large, is hundreds of times less exact.
+    # Poles have errors near 1e-14. A weak coupling is the difference of numbers up to 100 times as
+    # large, so its error is hundreds of times larger.
     assert_same_chain(got, chain, rtol=1e-9)
     assert max(got.residuals.values(), default=0.0) < 1e-9
 
 
 @given(chains())
-def test_static_gains_and_tails_give_the_chain_back(chain):
-    """Static gains and the chain's polynomials give all numbers of up to four carts back."""
+def test_static_gains_and_polynomials_give_the_chain(chain):
+    """Static gains and the chain's polynomials give back all numbers of up to four carts."""
     got = recover_chain(chain.static_gains(), chain.tails()[:-1])
 
     assert_same_chain(got, chain, rtol=1e-9)
@@ -100,7 +100,7 @@ def test_an_inconsistent_table_shows_in_the_redundancies(name, broken):
 
 
 def test_the_names_of_the_tables():
-    """Parameter names are in the order of the paper's tables; a rigid body has two of its own."""
+    """Parameter names are in the order of the paper's tables; a rigid body has its own two."""
     assert parameter_names(2) == [
         "K_1", "K_2", "omega_a", "omega_b", "zeta_a", "zeta_b",
         "omega_1", "omega_2", "zeta_1", "zeta_2",
@@ -122,17 +122,17 @@ def test_units_of_parameters():
     }  # fmt: skip
 
 
-# ----------------------------------------------------------- against an oracle
+# ----------------------------------------------------------- independent computations
 
 
 @given(chains())
 @settings(max_examples=40)
-def test_poles_are_those_of_the_state_matrix(chain):
-    """Poles, eigenvalues and the common denominator agree."""
+def test_poles_are_roots_of_the_common_denominator(chain):
+    """All poles are stable roots of the common denominator."""
     got = chain.poles
 
     T = chain.tails()[0]
-    # |T| relative to its terms: an error of 1e-13 in a root changes it by as much.
+    # An error of 1e-13 in a root changes |T| by about as much, relative to the terms of T.
     for pole in got:
         terms = np.abs(T * pole ** np.arange(T.size - 1, -1, -1))
         assert abs(np.polyval(T, pole)) < 1e-9 * terms.sum()
@@ -149,10 +149,10 @@ def test_zeros_make_each_response_vanish(chain):
         assert zeros.size == 2 * (chain.n - cart)
         A, B, C, D = chain.state_space()
         oracle = control.zeros(control.ss(A, B, C[[cart - 1]], D[[cart - 1]]))
-        finite = oracle[np.abs(oracle) < 1e4]  # its infinite zeros come out huge
+        finite = oracle[np.abs(oracle) < 1e4]  # infinite zeros come out as huge numbers
         matched = [np.min(np.abs(finite - zero)) / abs(zero) for zero in zeros]
-        # The eigenvalue routine of python-control mixes scales of 1 and 1e4 (k/m): 1e-6 is its own
-        # error.
+        # python-control's eigenvalue routine mixes scales of 1 and 1e4 (k/m), which limits it to
+        # 1e-6.
         assert max(matched) < 1e-6
 
 
@@ -167,7 +167,7 @@ def test_frequency_response_matches_state_space(chain):
     A, B, C, _ = chain.state_space()
     eye = np.eye(A.shape[0])
     expected = np.stack([(C @ np.linalg.solve(1j * w * eye - A, B))[:, 0] for w in omega], axis=1)
-    # Near a sharp null the terms of both methods cancel to a hundredth.
+    # Near a sharp null, the terms of both methods cancel to a hundredth.
     scale = np.abs(expected).max(axis=1, keepdims=True)
     assert_allclose(got / scale, expected / scale, atol=1e-10)
 
@@ -182,7 +182,7 @@ def test_frequency_response_of_a_preset_by_python_control():
 
 
 def test_the_response_at_an_undamped_pole_is_infinite():
-    """Only at an undamped pole is the response infinite, whatever the number of carts."""
+    """The response is infinite only at an undamped pole, whatever the number of carts."""
     one = Chain(m=np.array([1.0]), c=np.array([0.0]), k=np.array([4.0, 0.0]))
     two = Chain(m=np.ones(2), c=np.zeros(2), k=np.array([1.0, 1.5, 1.0]))
     for chain in (one, two):
@@ -226,12 +226,12 @@ def test_rows_of_the_state_matrix():
 
 @given(chains(max_zeta=0.05))
 def test_gains_fall_along_the_chain(chain):
-    """Static gains fall along the chain, and their ratios are those of the springs."""
+    """Static gains fall along the chain, and their ratios follow from the springs."""
     K, k = chain.static_gains(), chain.k
 
     assert np.all(K > 0)
     assert np.all(np.diff(K) <= 1e-12 * K[0])
-    beyond = k[-1]  # the stiffness that supports a cart after spring i, from the far wall inwards
+    beyond = k[-1]  # stiffness behind a cart, from the far wall inwards
     for i in range(chain.n - 1, 0, -1):
         assert_allclose(K[i] / K[i - 1], k[i] / (k[i] + beyond), rtol=1e-9)
         beyond = k[i] * beyond / (k[i] + beyond)
@@ -240,7 +240,7 @@ def test_gains_fall_along_the_chain(chain):
 @given(chains(min_carts=2, max_carts=3, max_zeta=0.02))
 def test_frequencies_interlace(chain):
     """Resonances enclose nulls and single-cart frequencies (exact without damping)."""
-    # Damping moves a frequency by about zeta² = 4e-4; pairs closer than that prove nothing.
+    # Damping moves a frequency by about zeta² = 4e-4, so closer pairs need not be in order.
     values = chain.parameters()
     if chain.n == 2:
         order = [("omega_a", "omega_1"), ("omega_1", "omega_b")]
@@ -256,7 +256,7 @@ def test_frequencies_interlace(chain):
 
 @given(chains(min_carts=2), st.data())
 def test_a_held_cart_is_a_wall(chain, data):
-    """A cart that moves alone has the frequency and damping that bear its number."""
+    """If all others are held, a cart has the frequency and damping with its number."""
     cart = data.draw(st.integers(1, chain.n))
 
     A, B, _, _ = chain.state_space(free=[cart])
@@ -272,14 +272,14 @@ def test_the_order_of_free_carts_does_not_matter():
     assert_allclose(chain.state_space(free=[3, 1])[0], chain.state_space(free=(1, 3))[0])
 
 
-def test_a_cart_that_is_not_there_cannot_be_free():
-    """If cart 3 of two is named as free, the caller gets an error."""
+def test_a_missing_cart_cannot_be_free():
+    """If cart 3 of two carts is named as free, there is an error."""
     with pytest.raises(ValueError, match=r"free carts \[3\] are not among 1 to 2"):
         PRESETS["throne-2dof"].state_space(free=[3])
 
 
 def test_a_missing_spring_uncouples():
-    """Without the spring between them the second cart neither moves nor has a gain."""
+    """If the spring between two carts is missing, the second cart does not move and has no gain."""
     chain = Chain(m=np.array([2e-4, 3e-4]), c=np.array([1e-4, 1e-4]), k=np.array([0.1, 0.0, 0.1]))
 
     assert_allclose(chain.static_gains(), [10.0, 0.0], atol=1e-15)
@@ -314,7 +314,7 @@ def test_carts_tied_only_to_each_other_have_no_static_gain():
 
 
 def test_an_overdamped_factor_has_zeta_above_one():
-    """Two real roots make one quadratic factor."""
+    """Two real roots make one quadratic factor with a damping ratio above one."""
     omega, zeta = quadratic_factors(np.array([-2.0 + 0j, -8.0 + 0j, -1 + 9j, -1 - 9j]))
 
     assert_allclose(omega, [4.0, np.sqrt(82)], rtol=1e-12)
@@ -322,7 +322,7 @@ def test_an_overdamped_factor_has_zeta_above_one():
 
 
 @given(chains(max_carts=3, max_zeta=3.0))
-def test_heavy_damping_survives_the_maps(chain):
+def test_overdamped_carts_are_recovered(chain):
     """Overdamped carts are recovered too, as long as the real poles are distinct."""
     roots = [chain.poles, *(chain.zeros(cart) for cart in range(1, chain.n))]
     gaps = [
@@ -333,8 +333,8 @@ def test_heavy_damping_survives_the_maps(chain):
 
     got = recover_from_parameters(chain.parameters())
 
-    # A root whose neighbour is 1e-3 away is known to 1e-15/1e-3. Large damping also cancels squares
-    # up to (2 zeta)^4 = 1300 times larger.
+    # If a root's neighbour is 1e-3 away, the root is known to 1e-15/1e-3. Large damping also
+    # cancels squares up to (2 zeta)^4 = 1300 times larger.
     assert_same_chain(got, chain, rtol=1e-6)
 
 
@@ -361,20 +361,20 @@ def test_presets_round_to_the_paper(preset, table):
 
 
 def test_the_three_cart_preset_is_near_table_3():
-    """The three-cart preset is near Table 3: within 1.3 %, or 15 % for dampings but zeta_b."""
+    """The three-cart preset is within 1.3 % of Table 3, or 15.5 % for dampings except zeta_b."""
     values = PRESETS["throne-3dof"].parameters()
 
     for name, printed in TABLE_3.items():
         if name == "zeta_b":
             continue
         limit = 0.155 if name.startswith("zeta") else 0.013
-        # Printed dampings of one digit are known only to half of 0.01.
+        # A damping printed with two decimals is known to 0.005.
         rounding = 0.005 if name.startswith("zeta") else 0.0
         assert abs(values[name] - printed) <= limit * printed + rounding, name
 
 
 def test_table_2_obeys_its_redundancy_within_rounding():
-    """Table 2 violates its redundancy R1 by no more than rounding, and no spring is negative."""
+    """Table 2 obeys its redundancy R1 up to rounding, and its springs give ω_1 = 20.27."""
     got = recover_from_parameters(TABLE_2)
 
     assert got.residuals["R1"] < 0.15

@@ -1,4 +1,4 @@
-"""Where compiled functions are stored, and that a change in another file is noticed."""
+"""Compiled functions are stored on disk, and a change in a file that they use is noticed."""
 
 import ast
 import os
@@ -32,7 +32,7 @@ def inner(x):
 
 @pytest.fixture
 def package(tmp_path):
-    """A copy of the package with two more compiled functions, one of which calls the other."""
+    """Return a copy of the package with two more compiled functions; one calls the other."""
     shutil.copytree(
         ROOT / "pipeline", tmp_path / "pipeline", ignore=shutil.ignore_patterns("__pycache__")
     )
@@ -56,7 +56,7 @@ def _outer(package: Path, **environment: str) -> tuple[str, str]:
 def test_a_change_in_another_file_is_noticed_and_the_old_folder_removed(package):
     """If a called function's file changes, the caller is compiled again.
 
-    The code compiled before is removed.
+    The previously compiled code is removed.
     """
     first = _outer(package)
     again = _outer(package)
@@ -69,7 +69,7 @@ def test_a_change_in_another_file_is_noticed_and_the_old_folder_removed(package)
     assert len(list((package / "pipeline/__pycache__/compiled").iterdir())) == 1
 
 
-def test_where_the_package_cannot_be_written_the_users_cache_is_used(package):
+def test_in_a_read_only_package_the_users_cache_is_used(package):
     """If the package's folder is read-only, compiled code is stored in the user's cache."""
     (package / "pipeline" / "__pycache__").write_text("a file where the folder would be")
     home = package / "home"
@@ -86,8 +86,8 @@ def test_where_the_package_cannot_be_written_the_users_cache_is_used(package):
     assert "no folder can keep it" in nowhere[1]
 
 
-def test_the_folders_name_covers_each_file_that_a_compiled_function_may_hold():
-    """A compiled function uses only files of which a change makes it compile again."""
+def test_the_folders_name_covers_each_file_that_a_compiled_function_uses():
+    """If a file changes that a compiled function uses, the name of its folder changes."""
     types_only = ROOT / "pipeline/arrays.py"
     rooms = set()
     for path in (ROOT / "pipeline").rglob("*.py"):

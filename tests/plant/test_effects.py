@@ -38,18 +38,18 @@ def test_an_entry_has_all_texts_a_student_needs(effect):
 
 
 def faint_term(effect: Effect, *, share: float, chain: Chain) -> EffectTerm:
-    """Return an effect at `share` of a clearly visible size, with the same shape."""
+    """Return an effect with `share` of a clearly visible size, and with the same shape."""
     place = {"cart": 1, "spring": 2, "input": 0}[effect.place]
     scales = chain_scales(chain, place=effect.place, at=place, input=0.05)
     sized = {p.unit for p in effect.parameters if p.neutral is not None}
     values = {}
     for parameter in effect.parameters:
         value, neutral = parameter.typical * parameter.size(scales), parameter.neutral or 0.0
-        if not sized:  # a limit that is not reached has no effect
+        if not sized:  # a limit that is never reached changes nothing
             value /= share
         elif parameter.neutral is not None or (parameter.reported and parameter.unit in sized):
             value = neutral + share * (value - neutral)
-        elif not parameter.reported:  # what meets is as stiff as can be, or as soft as the rest
+        elif not parameter.reported:  # a contact is as stiff as allowed, or scaled like the rest
             stiff = parameter.upper < np.inf
             value = parameter.upper * parameter.size(scales) if stiff else share * value
         values[parameter.name] = value
@@ -57,7 +57,7 @@ def faint_term(effect: Effect, *, share: float, chain: Chain) -> EffectTerm:
 
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda e: e.key)
-def test_an_effect_of_no_size_is_the_linear_bench(effect):
+def test_an_effect_of_zero_size_is_the_linear_bench(effect):
     """As the size of an effect goes to zero, the motion becomes that of the linear chain."""
     chain = PRESETS["throne-2dof"]
     t = np.linspace(0.0, 3.0, 601)
@@ -71,13 +71,12 @@ def test_an_effect_of_no_size_is_the_linear_bench(effect):
 
     plain = departs(1.0)
     assert plain > 3e-3
-    # In proportion to the size, or to its root if a speed is involved; a contact stays a little
-    # soft.
+    # The difference is proportional to the size, or to its root; a contact stays slightly soft.
     assert departs(1e-4) < 0.02 * plain
 
 
-def test_what_an_effect_is_follows_from_its_law():
-    """From its law follows whether an effect is dry, a contact, hides a mass or needs an input."""
+def test_the_properties_of_an_effect_follow_from_its_law():
+    """Whether an effect is dry, a contact, a hidden mass or driven follows from its law."""
 
     def those(is_so: Callable[[Effect], bool]) -> set[str]:
         return {effect.key for effect in CATALOGUE if is_so(effect)}
@@ -92,7 +91,7 @@ def test_what_an_effect_is_follows_from_its_law():
 
 
 def test_single_cart_has_one_spring_place():
-    """Only the sum of one cart's wall springs matters, so an effect is offered at only one."""
+    """For one cart, only the sum of the springs matters, so an effect has only one place."""
     assert find_effect("cubic_spring").places((True, True)) == (1,)
     assert find_effect("cubic_spring").places((False, True)) == (2,)
     assert find_effect("cubic_spring").places((True, True, False)) == (1, 2)
@@ -110,7 +109,7 @@ def test_single_cart_has_one_spring_place():
     ],
 )
 def test_a_word_of_a_name_finds_the_effects_that_have_it(typed, meant):
-    """A word of an effect's name finds the effects with it; a misspelt name, the nearest."""
+    """A word of an effect's name finds the effects with it; a misspelt name finds the nearest."""
     with pytest.raises(ConfigError, match=rf"did you mean {meant}\?"):
         find_effect(typed)
 

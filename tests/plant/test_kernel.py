@@ -20,7 +20,7 @@ from pipeline.plant.nonlinear.tables import Cart, Tables, linear_tables
 from tests.helpers.effects import SIZES, make_term
 from tests.truth.bench import Hidden, simulate_truth
 
-COUNT = 0.00227  # cm, the encoder step
+COUNT = 0.00227  # cm, one encoder step
 
 
 def sample_times(count: int, interval: float) -> Array:
@@ -31,7 +31,7 @@ def sample_times(count: int, interval: float) -> Array:
 def simulate(
     tables: Tables, t, u, *, x0=None, v0=None, free=None, refine=1.0, guided=None, knots=None
 ):
-    """Return the readings (n, samples) of one run, simulated from one initial state."""
+    """Return the readings (n, samples) of one run from one initial state."""
     n = tables.cart.shape[0]
     x0, v0 = (np.zeros((1, n)) if one is None else np.array([one]) for one in (x0, v0))
     moving = [free is None or i + 1 in free for i in range(n)]
@@ -53,8 +53,8 @@ def test_linear_chain_is_exact(preset, irregular):
 
     got = simulate(linear_tables(chain), t, u)
 
-    # The rest of the series is (omega h)^6 / 720 of a step's motion, 1e-7 a step with omega h <=
-    # 0.2, and changes sign with the motion; 1e-6 is promised.
+    # The series is cut off at (omega h)^6 / 720, or 1e-7 per step for omega h <= 0.2. These errors
+    # change sign with the motion; 1e-6 is promised.
     assert_allclose(got, simulate_linear(chain, t, u), atol=1e-6 * np.abs(got).max())
 
 
@@ -71,9 +71,9 @@ def test_held_cart_is_a_wall():
 
 
 def friction_decay(m, k, force, x0, t):
-    """Return the exact decay of one cart with dry friction only, computed by half swings."""
+    """Return the exact decay of one cart with dry friction only, computed by half cycles."""
     omega, x, y, start = np.sqrt(k / m), x0, np.empty(t.size), 0.0
-    centre = force / k  # the rest point of a half swing lies on the side of the motion's start
+    centre = force / k  # the centre of a half cycle is on the side where the motion starts
     while True:
         side = np.sign(x)
         inside = (t >= start) & (t <= start + np.pi / omega)
@@ -85,7 +85,7 @@ def friction_decay(m, k, force, x0, t):
             return y
 
 
-def test_a_held_cart_that_is_moved_moves_its_neighbour():
+def test_a_guided_cart_moves_its_neighbour():
     """If a cart is guided along its own free motion, the other cart moves as before."""
     tables = linear_tables(PRESETS["throne-2dof"])
     t = sample_times(2000, 1e-3)
@@ -94,14 +94,14 @@ def test_a_held_cart_that_is_moved_moves_its_neighbour():
 
     got = simulate(tables, t, np.where(t < 0.5, 1.0, 0.0), free=(1,), guided=guided)
 
-    # Straight lines between samples err by an eighth of the curvature, always inwards. A swinging
-    # cart follows such an error by up to twice as much.
+    # Straight lines between samples have an error of an eighth of the curvature, always inwards. An
+    # oscillating cart responds with up to twice this error.
     np.testing.assert_allclose(got, both, atol=np.abs(np.diff(both[1], n=2)).max() / 4)
 
 
 @pytest.mark.parametrize("rate", [113.1, 250.0, 1000.0])
 def test_friction_decay_follows_the_events(rate):
-    """With dry friction only, each half swing of a decay is exact, and the cart stays at rest."""
+    """With dry friction only, each half cycle of a decay is exact, and the cart stays at rest."""
     m, k, force = 2e-4, 0.035, 0.004
     chain = Chain(m=np.array([m]), c=np.array([0.0]), k=np.array([k, 0.0]))
     tables = linear_tables(chain)
@@ -110,7 +110,7 @@ def test_friction_decay_follows_the_events(rate):
 
     got = simulate(tables, t, 0 * t, x0=[2.0])[0]
 
-    # 0.5 count is the requirement; reversals are found as the root of the velocity.
+    # 0.5 count is required; reversals are found as roots of the velocity.
     assert np.abs(got - friction_decay(m, k, force, 2.0, t)).max() < 0.05 * COUNT
     assert np.ptp(got[-50:]) == 0.0
 
@@ -156,7 +156,7 @@ def test_every_effect_agrees_with_the_fine_step_truth(key):
         free=(1, 2),
     )
 
-    # The 50-µs steps err by 0.1 count; a contact of that simulator is softer by one step.
+    # The 50-µs steps cause 0.1 count, and a contact of the other simulator is softer by one step.
     limit = {"end_stop": 1.5, "backlash": 0.6}.get(key, 0.25)
     assert np.sqrt(np.mean((got - truth) ** 2)) < limit * COUNT
     linear = simulate(linear_tables(chain), t, u)
@@ -168,7 +168,7 @@ DISSIPATIVE = ("coulomb_friction", "stiction", "presliding_friction", "quadratic
 
 @pytest.mark.parametrize("key", DISSIPATIVE)
 def test_energy_never_grows_without_input(key):
-    """Without an input the swings only become smaller, whatever the effect."""
+    """With a dissipative effect and no input, the peaks become smaller and smaller."""
     chain = PRESETS["throne-1dof"]
     effect = find_effect(key)
     term = make_term(effect, place=1, values=SIZES[key], chain=chain)
@@ -178,7 +178,7 @@ def test_energy_never_grows_without_input(key):
 
     v = np.gradient(y, t)
     peaks = np.abs(y[1:-1][np.diff(np.sign(v[1:])) != 0])
-    # A stop's spring stores energy past its position, so peaks on its side are not comparable.
+    # An end stop stores energy beyond its position, so peaks on its side are not comparable.
     peaks = peaks[::2] if key == "end_stop" else peaks
     assert peaks.size > 3
     assert np.all(np.diff(peaks) < 1e-3)
@@ -243,7 +243,7 @@ def test_a_hidden_mass_starts_at_the_given_position():
         m=np.array([1.7e-4, mass]), c=np.array([4e-4, 0.0]), k=np.array([0.034, stiffness, 0.0])
     )
     t = sample_times(800, 0.002)
-    cart, offset = (0.8, -3.0), (0.15, 2.0)  # cm and cm/s
+    cart, offset = (0.8, -3.0), (0.15, 2.0)  # position in cm and velocity in cm/s
 
     got = simulate(
         AugmentedChain(chain=chain, terms=(term,)).tables(),
@@ -282,12 +282,12 @@ assert [dict(one.cache_misses) for one in stats] == before
 """
 
 
-def test_once_compiled_nothing_is_left_to_compile():
+def test_after_compile_simulator_nothing_is_compiled():
     """After `compile_simulator`, no later call of the simulator compiles anything."""
     subprocess.run([sys.executable, "-c", _NOTHING_LEFT], check=True)
 
 
-def test_arrays_of_any_kind_meet_the_same_simulator():
+def test_arrays_of_any_kind_use_the_same_compiled_code():
     """Views, integer arrays and read-only arrays use the code that is compiled already."""
     tables = linear_tables(PRESETS["throne-2dof"])
     t = sample_times(50, 0.005)
@@ -305,11 +305,11 @@ def test_arrays_of_any_kind_meet_the_same_simulator():
     modules = (contacts, kernel, laws, sensitivity, state, step)
     mine = {id(one): one for module in modules for one in vars(module).values()}
     twice = [one for one in mine.values() if len(getattr(one, "signatures", ())) > 1]
-    assert twice in ([], [state.stretch])  # this function takes the row that it reads as a constant
+    assert twice in ([], [state.stretch])  # `stretch` is also called with a constant row
 
 
-def test_no_array_is_counted():
-    """Compiled code counts no references to arrays, for which two threads would wait."""
+def test_compiled_code_counts_no_references():
+    """Compiled code counts no references to arrays, as two threads would wait for each other."""
     compile_simulator()
     folder = kernel._simulate.stats.cache_path
     assert folder is not None
@@ -319,10 +319,10 @@ def test_no_array_is_counted():
 
 
 @pytest.mark.parametrize("preset", list(PRESETS))
-def test_an_input_that_changes_within_a_step_moves_the_carts_in_time(preset):
+def test_an_input_that_changes_within_a_step_is_exact(preset):
     """If the input changes within a simulation step, the motion is still right to 1e-4.
 
-    With only the input's mean over a step, (omega h)² / 12 of the motion, 2e-3, would be wrong.
+    Using the mean input over a step would cause an error of (omega h)² / 12, or 2e-3 of the motion.
     """
     chain = PRESETS[preset]
     t = sample_times(3001, 0.001)
@@ -335,7 +335,7 @@ def test_an_input_that_changes_within_a_step_moves_the_carts_in_time(preset):
     assert_allclose(got, exact, atol=1e-4 * np.abs(exact).max())
 
 
-def test_an_input_that_jumps_inside_a_step_frees_a_held_cart_at_once():
+def test_a_jump_within_a_step_frees_a_held_cart_at_once():
     """If the input jumps within a step, a cart held by friction is freed at the jump."""
     chain = PRESETS["throne-1dof"]
     dry = make_term(find_effect("coulomb_friction"), place=1, values={"force": 6e-3}, chain=chain)
@@ -349,10 +349,10 @@ def test_an_input_that_jumps_inside_a_step_frees_a_held_cart_at_once():
     assert np.abs(run(1.0) - run(64.0)).max() < 0.02 * COUNT
 
 
-def test_what_stands_behind_the_last_sample_is_no_time():
+def test_memory_behind_the_last_sample_is_not_read():
     """A run ends with its last sample, and memory beyond the array of times is not read."""
     chain = Chain(m=np.array([1e-4]), c=np.zeros(1), k=np.zeros(2))
-    t = np.append(sample_times(100, 4e-3), 2e4)[:-1]  # a view: the time behind is its neighbour
+    t = np.append(sample_times(100, 4e-3), 2e4)[:-1]  # a view, followed in memory by a wrong time
     x = simulate(linear_tables(chain), t, np.full(t.size, 0.02))
     assert_allclose(x[0], 0.5 * (0.02 / 1e-4) * t**2, rtol=1e-6, atol=1e-12)
 
@@ -361,7 +361,7 @@ def test_what_stands_behind_the_last_sample_is_no_time():
     ("key", "values"),
     [("actuator_lag", {"time_constant": 2.8e-3}), ("input_delay", {"delay": 2.8e-3})],
 )
-def test_what_is_late_is_as_late_in_long_steps(key, values):
+def test_lag_and_delay_are_right_in_long_steps(key, values):
     """In a fast sweep with four ticks per step, lag and delay are right to a tenth of a count."""
     chain = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.array([0.05, 0.0]))
     term = make_term(find_effect(key), place=0, values=values, chain=chain)

@@ -1,4 +1,4 @@
-"""Each law is written once, and the code generated from it agrees with it and its derivatives."""
+"""Each law is written once; the code generated from it gives the same force and derivatives."""
 
 import ast
 import sys
@@ -32,20 +32,20 @@ STATES = [(0.4, 0.7, 0.02, 1.0), (-0.9, -0.3, -0.05, 1.0), (1.3, -1.1, 0.03, 0.0
 
 
 @pytest.mark.parametrize("name", MADE)
-def test_what_stands_there_is_made_from_the_laws(name):
+def test_generated_files_are_up_to_date(name):
     """The generated files are what `python -m docs.codegen` writes from the laws."""
     stored, made = (ROOM / name).read_text(encoding="utf-8"), MADE[name](CATALOGUE)
     assert ast.dump(ast.parse(stored)) == ast.dump(ast.parse(made)), "run python -m docs.codegen"
 
 
 def coordinates_of(effect: Effect) -> np.ndarray:
-    """Return coordinates (.,) of an effect at which its law is neither large nor small."""
+    """Return fit coordinates of an effect at which its law is neither large nor small."""
     shapes = {"end_stop": (2.0, 0.8, 0.1), "cogging": (0.3, -0.2, 0.7)}
     return np.array(shapes.get(effect.key, (0.3, 0.8, 0.5)[: len(effect.grown.coordinates)]))
 
 
 def terms_of(kind: int, p: np.ndarray, x: float, v: float, u: float, on: float) -> np.ndarray:
-    """Return the law of a kind and its derivatives: those by x, v, u and each coordinate."""
+    """Return the law of a kind and its derivatives by x, v, u and each coordinate."""
     out = np.zeros(terms.TERMS)
     terms.terms(kind, p, 0, x, v, 0.1, u, on, out)
     return out
@@ -67,12 +67,12 @@ def test_derivatives_are_those_of_the_law(effect, state):
         for s in (step, -step)
     ]  # fmt: skip
     by = (np.array(sides[0]) - sides[1]) / (2 * step)
-    # Differences of numbers near one over 2e-6: rounding errs by 1e-10, curvature by less.
+    # Differences over 2e-6 have rounding errors of 1e-10 and smaller errors from curvature.
     assert_allclose(out[1 : 4 + p.size], by, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("key", ["end_stop", "slack_spring"])
-def test_contacts_are_those_of_the_law(key):
+def test_contacts_give_the_force_of_the_law(key):
     """The stiffness, damping and start of a contact give the force of its law."""
     effect = find_effect(key)
     law, kind = effect.law, CATALOGUE.index(effect)
@@ -96,8 +96,8 @@ def test_contacts_are_those_of_the_law(key):
 
 
 @pytest.mark.parametrize("v", [0.7, -0.3])
-def test_hysteresis_settles_as_its_rate_says(v):
-    """The hysteresis state settles at the rate of its law, in both simulators."""
+def test_hysteresis_settles_at_the_rate_of_its_law(v):
+    """The hysteresis state settles at the rate of its law, in the simulator and in the fit."""
     effect = find_effect("presliding_friction")
     law = effect.law
     assert isinstance(law, HysteresisLaw)
@@ -165,7 +165,7 @@ def test_a_law_vanishes_with_its_coefficients(effect):
 
 
 def test_dead_zone_and_saturation_shape_the_input():
-    """A dead zone makes the input zero, or smaller by its width; saturation limits it."""
+    """A dead zone makes the input zero, or smaller by its width; saturation limits the input."""
     drive = np.zeros(len(TABLES["input"]))
     for key in ("dead_zone", "saturation"):
         effect = find_effect(key)
@@ -175,8 +175,8 @@ def test_dead_zone_and_saturation_shape_the_input():
     assert_allclose(got, [0.0, -0.010, 0.03, -0.03], atol=1e-18)
 
 
-def test_friction_at_rest_is_what_the_law_says():
-    """If a law of friction has a separate force at rest, that force acts at zero speed."""
+def test_friction_at_rest_is_that_of_the_law():
+    """If a law of friction has a separate force at rest, this force acts at zero speed."""
     for effect in CATALOGUE:
         if isinstance(effect.law, FrictionLaw) and effect.law.at_rest:
             row = np.zeros((1, len(TABLES["cart"])))
@@ -252,6 +252,6 @@ def test_a_new_effect_needs_only_its_own_file(tmp_path, monkeypatch):
         ),
     ],
 )
-def test_equations_read_as_in_a_book(key, equation):
+def test_equations_are_written_as_in_a_book(key, equation):
     """Equations have factors side by side, no needless brackets and no details of contacts."""
     assert to_tex(find_effect(key).formula) == equation

@@ -1,4 +1,4 @@
-"""The sampled loop: the order of its events, its exactness and its limits."""
+"""The sampled loop is simulated exactly, with the right order of events and its limits."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ TWO = PRESETS["throne-2dof"]
 GAINS = np.array([0.03, 0.007, -0.04, -0.001])
 CLOCK = T * np.arange(300.0)
 
-# Some 300 products of matrices of norm near one, each rounded to 1e-16.
+# about 300 products of matrices of norm near one, each rounded to 1e-16
 ROUNDING = 1e-11
 
 
@@ -33,7 +33,7 @@ def feedback(chain: Chain, gains: Array = GAINS, prefilter: float = 0.07) -> Sta
 
 
 def test_without_gains_the_prefilter_drives_the_open_loop():
-    """With zero gains the run is the open-loop response to prefilter times r, one sample late."""
+    """With zero gains, a run is the open-loop response to prefilter times r, a sample late."""
     run = simulate_loop(TWO, feedback(TWO, np.zeros(4)), t=CLOCK, reference=1.0)
 
     assert_allclose(run.u[:2], [0.0, 0.07])
@@ -41,8 +41,8 @@ def test_without_gains_the_prefilter_drives_the_open_loop():
 
 
 @pytest.mark.parametrize("delay", [0, 1])
-def test_an_exact_prediction_makes_the_delayed_loop_the_undelayed_one(delay):
-    """With the true model, a loop with delay moves as Phi - Gamma G, only later."""
+def test_with_an_exact_prediction_a_delay_only_shifts_the_motion(delay):
+    """With the true model, a loop with delay moves as Phi - Gamma G, but later."""
     run = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=1.0, setup=LoopSetup(delay=delay))
 
     phi, gamma = discretise(TWO, T)
@@ -54,27 +54,27 @@ def test_an_exact_prediction_makes_the_delayed_loop_the_undelayed_one(delay):
 
 
 @pytest.mark.parametrize("model", [None, PRESETS["throne-2dof"]])
-def test_the_loop_matrix_is_the_loop(model):
+def test_the_loop_matrix_gives_the_motion_of_the_loop(model):
     """Powers of the loop matrix give the motion after a start from a displacement."""
     controller = StateFeedback(gains=GAINS, prefilter=1.0, model=model)
     x0 = np.array([0.5, 3.0, -0.2, 1.0])
     run = simulate_loop(TWO, controller, t=CLOCK, reference=0.0, start=x0)
 
     matrix = loop_matrix(TWO, controller, sample_time=T)
-    state = np.concatenate([x0, [0.5, 0.0, -0.2, 0.0], [0.0]])  # the observer starts at rest
+    state = np.concatenate([x0, [0.5, 0.0, -0.2, 0.0], [0.0]])  # observer at rest
     for tick in range(CLOCK.size):
         assert_allclose(run.x[:, tick], state[[0, 2]], atol=ROUNDING)
         assert_allclose(run.u[tick], state[-1], atol=ROUNDING)
         state = matrix @ state
 
 
-def test_an_exact_observer_adds_its_own_poles_and_moves_none():
+def test_an_exact_observer_moves_no_pole():
     """The poles of Phi - Gamma G are poles of the whole loop (separation)."""
     phi, gamma = discretise(TWO, T)
     wanted = np.linalg.eigvals(phi - np.outer(gamma, GAINS))
     found = np.linalg.eigvals(loop_matrix(TWO, feedback(TWO), sample_time=T))
 
-    # A simple eigenvalue moves by the rounding times its condition number, below 1e4 here.
+    # A simple eigenvalue errs by rounding times its condition number, which is below 1e4.
     assert_allclose(np.abs(wanted[:, None] - found[None, :]).min(axis=1), 0.0, atol=1e-10)
 
 
@@ -91,7 +91,7 @@ def test_the_input_stays_within_its_limit():
 
     assert_allclose(roomy.x, free.x, rtol=0, atol=0)
     assert np.abs(tight.u).max() == 0.5 * peak
-    # The observer gets the clipped input, so the motion is exactly that of the clipped input.
+    # The observer gets the clipped input, so the carts respond exactly to the clipped input.
     assert_allclose(tight.x, simulate_linear(TWO, CLOCK, tight.u), atol=ROUNDING)
 
 
@@ -102,11 +102,11 @@ def test_proportional_control_holds_a_share_of_the_reference():
     run = simulate_loop(chain, Pid(kp=kp), t=t, reference=2.0, setup=LoopSetup(delay=0))
 
     share = 28.9 * kp / (1 + 28.9 * kp)  # K of the preset is 28.9
-    # With the zero-order hold its poles have a real part of -1.2: exp(-12) is 6e-6 at the end.
+    # The slowest poles have a real part of -1.2 rad/s, so exp(-12) = 6e-6 is left at the end.
     assert_allclose(run.x[0, -1], 2.0 * share, rtol=1e-4)
 
 
-def test_the_pid_terms_are_sum_and_difference():
+def test_the_pid_uses_sums_and_differences():
     """The first two inputs of a PID follow from sums and differences of the error."""
     pid = Pid(kp=0.3, ki=2.0, kd=0.004, scale=0.1)
     run = simulate_loop(
@@ -120,16 +120,16 @@ def test_the_pid_terms_are_sum_and_difference():
 
 
 def test_integral_action_removes_the_error():
-    """With integral action any cart ends at the reference."""
+    """With integral action, the controlled cart ends at the reference."""
     t = T * np.arange(4000.0)
     run = simulate_loop(TWO, Pid(kp=0.002, ki=0.02, cart=2), t=t, reference=1.0)
 
-    # The slowest pole lies near -ki K = -0.3 rad/s: exp(-0.3 * 35) is 3e-5.
+    # The slowest pole is near -ki K = -0.3 rad/s: exp(-0.3 * 35) is 3e-5.
     assert_allclose(run.x[1, -1], 1.0, atol=1e-3)
 
 
 def test_the_controller_sees_whole_encoder_steps():
-    """Proportional inputs are multiples of the gain times the encoder step."""
+    """The inputs of a proportional controller are multiples of the gain times the encoder step."""
     step = np.array([0.01, 0.0])
     run = simulate_loop(
         TWO, Pid(kp=0.02), t=CLOCK, reference=1.0, setup=LoopSetup(encoder_step=step, delay=0)
@@ -146,7 +146,7 @@ def test_positions_between_the_ticks_are_those_of_the_held_input():
     run = simulate_loop(TWO, feedback(TWO), t=t, reference=1.0, setup=LoopSetup(sample_time=T))
 
     assert np.count_nonzero(np.diff(run.u)) <= 200  # the input is held over five samples
-    # Cubic interpolation errs by (omega T)^4 / 384 of the fast mode's part: 0.36^4 / 384 = 4e-5.
+    # Cubic interpolation errs by (omega T)^4 / 384 = 4e-5 of the fast mode, with omega T = 0.36.
     assert_allclose(run.x, simulate_linear(TWO, t, run.u), atol=5e-5)
 
 
@@ -168,12 +168,12 @@ def test_rounded_time_stamps_keep_the_reference_at_its_sample():
     exact = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=reference)
     rounded = simulate_loop(TWO, feedback(TWO), t=np.round(CLOCK, 3), reference=reference)
 
-    # A stamp is off by at most 0.5 ms, and the carts move at up to 16 cm/s; a sample lasts 8.84 ms.
+    # A time stamp is off by at most 0.5 ms, and a sample lasts 8.84 ms.
     assert np.abs(rounded.x - exact.x).max() < 0.0005 * np.abs(np.diff(exact.x)).max() / T * 1.1
     assert_allclose(rounded.u, exact.u, atol=1e-3 * np.abs(exact.u).max())
 
 
-def test_a_drive_of_the_other_sign_wants_the_other_gains():
+def test_a_reversed_drive_needs_negated_gains():
     """If the drive is reversed, negated gains give the same forces."""
     mirrored = Pid(kp=-0.02, kd=-0.0005)
     run = simulate_loop(TWO, Pid(kp=0.04, kd=0.001), t=CLOCK, reference=1.0)
@@ -184,7 +184,7 @@ def test_a_drive_of_the_other_sign_wants_the_other_gains():
 
 
 def test_the_rest_adds_to_the_readings():
-    """An encoder zeroed away from rest shifts the readings, and the controller reacts to that."""
+    """An encoder zeroed away from rest shifts the readings, and the controller reacts to them."""
     shift = np.array([0.3, -0.1])
     run = simulate_loop(TWO, Pid(kp=0.02), t=CLOCK, reference=1.0, setup=LoopSetup(rest=shift))
     same = simulate_loop(TWO, Pid(kp=0.02), t=CLOCK, reference=1.0 - 0.3)
@@ -193,7 +193,7 @@ def test_the_rest_adds_to_the_readings():
 
 
 def test_held_carts_are_walls():
-    """With cart 2 of two held, cart 1 moves as a single cart on both its springs."""
+    """If cart 2 of two is held, cart 1 moves as a single cart on two springs."""
     alone = Chain(m=TWO.m[:1], c=TWO.c[:1], k=TWO.k[:2])
     pid = Pid(kp=0.02, kd=0.001)
     run = simulate_loop(TWO, pid, t=CLOCK, reference=1.0, setup=LoopSetup(free=[1]))
@@ -201,7 +201,7 @@ def test_held_carts_are_walls():
     assert_allclose(run.x, simulate_loop(alone, pid, t=CLOCK, reference=1.0).x, atol=ROUNDING)
 
 
-def test_a_replay_gives_the_efforts_that_were_logged():
+def test_a_replay_gives_the_logged_input():
     """From the readings of a PID run without delay, the control law gives the logged input."""
     pid = Pid(kp=0.02, ki=0.01, kd=0.0004, scale=0.7, cart=2)
     run = simulate_loop(TWO, pid, t=CLOCK, reference=1.0, setup=LoopSetup(delay=0))
@@ -218,6 +218,6 @@ def test_gains_that_do_not_fit_the_carts_are_refused():
 
 
 def test_a_pid_on_a_held_cart_is_refused():
-    """A PID on a held cart is refused, as it cannot steer it."""
+    """A PID on a held cart is refused, as the cart cannot be controlled."""
     with pytest.raises(DataError, match=r"its cart 2 free, found \[1\]"):
         simulate_loop(TWO, Pid(kp=1.0, cart=2), t=CLOCK, reference=1.0, setup=LoopSetup(free=[1]))

@@ -17,7 +17,7 @@ from tests.helpers.effects import make_term
 
 CHAIN = PRESETS["throne-2dof"]
 T = np.arange(0.0, 1.5, 0.002)
-ON, OFF, LEVEL = 0.1, 0.9, 0.05  # s, s, V
+ON, OFF, LEVEL = 0.1, 0.9, 0.05  # switch-on and switch-off in s, level in V
 
 
 def usual(effect: Effect) -> AugmentedChain:
@@ -31,7 +31,7 @@ def usual(effect: Effect) -> AugmentedChain:
 
 
 def respond(model: AugmentedChain, x0, *, driven: bool):
-    """Return the readings (carts, samples) of python-control's system with an adaptive solver."""
+    """Return readings (carts, samples), integrated from python-control's system."""
     motion = EquationsOfMotion(model)
     system = motion.to_control()
     state, readings = motion.start(x0), []
@@ -58,7 +58,7 @@ def respond(model: AugmentedChain, x0, *, driven: bool):
 def test_the_system_moves_as_the_simulator_does(effect, driven):
     """python-control's system and the simulator agree to half a percent, in steps and releases.
 
-    A stuck cart creeps by force / mass * stop at most, some 0.01 cm/s in motions of 2 cm.
+    In python-control's system a stuck cart creeps, at up to about 0.01 cm/s.
     """
     model = usual(effect)
     x0 = np.zeros(2) if driven else np.array([1.5, 0.5])
@@ -84,7 +84,7 @@ def test_without_effects_it_is_the_linear_chain():
     assert system.params == {"stop": STOP_TIME}
 
 
-def test_effects_have_states_of_their_own():
+def test_some_effects_have_their_own_states():
     """A hidden mass, and an input with memory, add named states to the system."""
     own = {
         "extra_mode": ["x2_hidden", "v2_hidden"],
@@ -99,7 +99,7 @@ def test_effects_have_states_of_their_own():
 
 
 def test_a_drive_that_leads_its_log_has_no_system():
-    """A negative delay would need future input, so it has no system, and the error says so."""
+    """A negative delay would need future input, so there is no system, and the error says so."""
     term = make_term(find_effect("input_delay"), place=0, values={"delay": -0.01}, chain=CHAIN)
 
     with pytest.raises(DataError, match="leads its log"):

@@ -31,7 +31,7 @@ CUBIC_DRAG = Effect(
 
 
 def function_of(name: str, source: str, **known: object) -> Any:
-    """Return one function of a generated file, not compiled."""
+    """Return one function of a generated file, without compiling it."""
     tree = ast.parse(source)
     (found,) = (n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == name)
     found.decorator_list = []
@@ -56,7 +56,7 @@ def made() -> dict[str, str]:
     return {name: source((*CATALOGUE, CUBIC_DRAG)) for name, source in MADE.items()}
 
 
-def test_its_columns_force_and_slopes_are_made(made):
+def test_columns_force_and_derivatives_are_generated(made):
     """The simulator gets a column for the new parameter, and the new law with derivatives."""
     columns = kinds_of(made["columns.py"], "Cart")
     Cart = type("Cart", (), columns)
@@ -70,8 +70,8 @@ def test_its_columns_force_and_slopes_are_made(made):
     assert_allclose(slopes(row, 0, 0.3, 0.5, 0.0), (0.0, -6.0 * 0.5**2))
 
 
-def test_a_model_that_follows_knows_it(made):
-    """The fit gets the new law with its derivatives, also that by the coefficient."""
+def test_the_fit_gets_the_new_law(made):
+    """The fit gets the new law with its derivatives, also the one by the coefficient."""
     source = made["simulator/terms.py"]
     kinds = kinds_of(source, "Kind")
     terms = function_of("terms", source, Kind=type("Kind", (), kinds))
@@ -92,10 +92,10 @@ PLAIN = [
 
 
 @pytest.mark.parametrize("effect", PLAIN, ids=lambda effect: effect.key)
-def test_no_other_file_of_the_plant_names_it(effect):
-    """Only an effect's own file names it, unless its law has a state of its own.
+def test_only_its_own_file_names_an_effect(effect):
+    """Only an effect's own file names it, except for effects whose law has its own state.
 
-    Only laws that need trial shapes are also named, in `gap.follow.score`.
+    Laws that need trial shapes are also named in `gap.follow.score`.
     """
     files = {
         path.relative_to(ROOM).as_posix()
@@ -104,6 +104,6 @@ def test_no_other_file_of_the_plant_names_it(effect):
         if re.search(rf"\b({effect.key}|{effect.key.upper()}\w*)\b", path.read_text("utf-8"))
     }
     allowed = {f"plant/nonlinear/{name}" for name in MADE} | {"gap/follow/score.py"}
-    allowed |= {"gap/follow/choose.py"}  # of two laws of dry friction on a cart one goes
+    allowed |= {"gap/follow/choose.py"}  # keeps one of two dry frictions
     named = {name for name in files if not name.startswith("plant/nonlinear/effects/")}
     assert named <= allowed

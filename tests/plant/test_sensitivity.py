@@ -18,7 +18,7 @@ from pipeline.plant.nonlinear.simulator.sensitivity import (
 from pipeline.plant.nonlinear.tables import Cart, Spring, Tables
 from tests.helpers.effects import SIZES, make_term
 
-# Small enough that the change of a difference neither adds nor removes a contact or jump.
+# The effects are small, so that a difference neither adds nor removes a contact or jump.
 CASES = {
     **SIZES,
     "nothing": {},
@@ -31,7 +31,7 @@ CASES = {
 }
 
 
-# Carts at rest are for effects that act only while the motor pulls.
+# Carts that start at rest test effects that act only while the motor pulls.
 @pytest.mark.parametrize(
     ("effect", "speed"), [*((effect, 1.0) for effect in CASES), ("load_friction", 0.0)]
 )
@@ -61,7 +61,7 @@ def test_derivatives_are_those_of_the_readings(preset, effect, speed):
         if by in (BY_MASS, BY_DAMPING):
             tables[0][at, Cart.MASS if by == BY_MASS else Cart.DAMPING] += change
         elif by == BY_STIFFNESS:
-            # The change of stiffness after a stretch is given as a share of the stiffness.
+            # The change of stiffness after a stretch is stored as a share of the stiffness.
             tables[1][at, Spring.STIFFNESS] += change
         elif by in (BY_POSITION, BY_VELOCITY):
             tables[2 if by == BY_POSITION else 3][0, at] += change
@@ -80,12 +80,11 @@ def test_derivatives_are_those_of_the_readings(preset, effect, speed):
             BY_DAMPING: chain.c[min(at, n - 1)],
             BY_STIFFNESS: chain.k[at],
         }.get(by, 1.0)
-        # Small enough that no event appears or disappears, large enough above the kernel's
-        # rounding.
+        # Small enough that no event appears or disappears, but well above the rounding errors.
         step = 1e-5 * size
         difference = (simulate(by, at, step)[0] - simulate(by, at, -step)[0]) / (2.0 * step)
         scale = max(float(np.linalg.norm(difference)) * size, 1e-6)
         error = float(np.linalg.norm(derivative - difference)) * size / scale
-        # Impulses in place of forces err by (omega h)² / 12, at most 4e-3. The change of friction
-        # inside a step is a tenth of its part in the derivative.
+        # Impulses in place of forces cause (omega h)² / 12, at most 4e-3. The change of friction
+        # within a step is a tenth of its part in the derivative.
         assert error < 0.03, (by, at, error)

@@ -1,4 +1,4 @@
-"""The exact linear simulator."""
+"""The simulator of linear chains is exact."""
 
 import control
 import numpy as np
@@ -41,12 +41,12 @@ def test_step_of_one_cart_is_the_textbook_step(zeta):
     expected = 2.0 * (
         1 - np.exp(-sigma * t) * (np.cos(omega_d * t) + sigma / omega_d * np.sin(omega_d * t))
     )
-    # 300 products of 2 x 2 matrices, each off by a few 1e-16.
+    # Rounding: 300 products of 2 x 2 matrices, each off by a few 1e-16.
     assert_allclose(x[0], expected, atol=1e-12)
 
 
 def test_free_decay_from_a_state():
-    """A cart released at 1 cm with a velocity follows the damped cosine and sine."""
+    """A cart released at 1 cm with a velocity follows a damped cosine and sine."""
     chain = PRESETS["throne-1dof"]
     t = irregular_times(np.random.default_rng(2), 400)
 
@@ -68,13 +68,13 @@ def test_agrees_with_python_control():
     sampled = control.sample_system(control.ss(*THREE.state_space()), SAMPLE_TIME, method="zoh")
     expected = control.forced_response(sampled, T=t, U=u).outputs
 
-    # Both matrix exponentials are right to about 1e-13 of the largest motion.
+    # Both matrix exponentials have errors of about 1e-13 of the largest motion.
     assert_allclose(simulate_linear(THREE, t, u), expected, atol=1e-10 * np.abs(expected).max())
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3))
 @settings(max_examples=25)
-def test_a_sample_between_two_changes_nothing(seed, carts):
+def test_a_sample_between_two_others_changes_nothing(seed, carts):
     """Sampling a held input more often does not change the motion."""
     rng = np.random.default_rng(seed)
     chain = PRESETS[f"throne-{carts}dof"]
@@ -88,11 +88,12 @@ def test_a_sample_between_two_changes_nothing(seed, carts):
     x = simulate_linear(chain, t, u)
 
     finer = simulate_linear(chain, finer_t, finer_u)[:, order < t.size]
-    # Intervals equal to 1e-12 s count as one: 60 steps at up to 50 cm/s add 60 x 5e-11 at most.
+    # Intervals that differ by less than 1e-12 s count as equal: 60 steps at up to 50 cm/s add at
+    # most 60 x 5e-11 cm.
     assert_allclose(finer, x, atol=3e-9 * np.abs(x).max())
 
 
-def test_motions_add():
+def test_responses_add():
     """The response to a sum of inputs and starts is the sum of the responses."""
     rng = np.random.default_rng(4)
     t = irregular_times(rng, 200)
@@ -105,7 +106,7 @@ def test_motions_add():
 
 
 def test_held_carts_are_walls():
-    """With cart 3 held, carts 1 and 2 move as a chain of two with a wall in its place."""
+    """If cart 3 is held, carts 1 and 2 move as a chain of two with a wall in its place."""
     short = Chain(m=THREE.m[:2], c=THREE.c[:2], k=THREE.k[:3])
     t = clock(300)
     u = np.full(t.size, 0.02)
@@ -139,29 +140,30 @@ def test_energy_never_grows_without_input(seed):
 
 
 def test_steady_state_of_a_held_sine():
-    """A sine held between samples moves the carts half a sample late and slightly less."""
+    """A held sine moves the carts half a sample late and with a slightly smaller amplitude."""
     omega = 2 * np.pi * 4.0
     t = clock(1500)
     x = simulate_linear(THREE, t, np.sin(omega * t))
 
-    # The first harmonic of the held samples; the images, 28 times faster, move the carts by 28^-3.
+    # This is the first harmonic of the held samples; the images are 28 times faster and 28^-3 as
+    # large.
     half = omega * SAMPLE_TIME / 2
     response = THREE.frequency_response(np.array([omega]))[:, 0] * np.sin(half) / half
     expected = np.imag(response[:, None] * np.exp(1j * (omega * t - half)))
-    late = t > 12.0  # 13 time constants: 2e-6
+    late = t > 12.0  # after 13 time constants, 2e-6 is left
     assert_allclose(x[:, late], expected[:, late], atol=1e-4 * np.abs(response).max())
 
 
 def test_steady_state_of_a_band_limited_sine():
-    """A band-limited input is the smooth sine itself between its few samples."""
+    """A band-limited input is a smooth sine between its few samples."""
     omega = 2 * np.pi * 4.0
-    t = clock(500, 0.03)  # 8 samples a period
+    t = clock(500, 0.03)  # 8 samples per period
     x = simulate_linear(THREE, t, np.sin(omega * t), hold="band_limited")
 
     response = THREE.frequency_response(np.array([omega]))[:, 0]
     expected = np.imag(response[:, None] * np.exp(1j * omega * t))
     inner = (t > 11.0) & (t < 14.5)  # the interpolation is cut off at the ends
-    # Straight lines between 64 points per period err by (2 pi / 64)^2 / 12 = 8e-4 of the amplitude.
+    # Straight lines between 64 points per period have an error of (2 pi / 64)^2 / 12 = 8e-4.
     assert_allclose(x[:, inner], expected[:, inner], atol=1.2e-3 * np.abs(response).max())
     held = simulate_linear(THREE, t, np.sin(omega * t))
     assert rms(held[:, inner] - expected[:, inner]) > 0.2 * rms(expected[:, inner])
@@ -177,8 +179,8 @@ def test_a_band_limited_constant_is_a_constant():
     assert_allclose(x, simulate_linear(THREE, t, u), atol=1e-12)
 
 
-def test_input_that_runs_straight_between_samples():
-    """A ramp input on a free mass gives x = t³ / 6m, whatever the sample times."""
+def test_a_linearly_rising_input_is_exact():
+    """For a linearly rising input, a free mass moves as x = t³ / 6m at any sample times."""
     A, B, C, _ = Chain(m=np.array([2.0]), c=np.zeros(1), k=np.zeros(2)).state_space()
     t = irregular_times(np.random.default_rng(5), 80, mean=0.02)
 
@@ -189,7 +191,7 @@ def test_input_that_runs_straight_between_samples():
 
 @pytest.mark.parametrize("n", [2, 3, 4, 10, 101])
 def test_even_and_uneven_times_agree(n):
-    """Records with even times are simulated in blocks, with the result of sample by sample."""
+    """Records with even times are simulated in blocks, with the same result as sample by sample."""
     rng = np.random.default_rng(n)
     t, u, x0 = clock(n), rng.standard_normal(n), rng.standard_normal(6)
     uneven = t.copy()
@@ -198,7 +200,7 @@ def test_even_and_uneven_times_agree(n):
     assert_allclose(ours, others, rtol=0, atol=1e-8 * np.abs(others).max())
 
 
-def test_the_last_input_has_no_time_to_act():
+def test_the_last_input_has_no_effect():
     """The input at the last sample acts only after the end of the record."""
     t = clock(20)
     u = np.ones(t.size)
@@ -208,7 +210,7 @@ def test_the_last_input_has_no_time_to_act():
     assert_array_equal(changed, simulate_linear(THREE, t, u))
 
 
-def test_arguments_are_left_alone():
+def test_arguments_are_not_changed():
     """The simulator does not change the arrays of times, input and start."""
     t, u, x0 = clock(20), np.ones(20), np.ones(6)
     for array in (t, u, x0):

@@ -23,22 +23,23 @@ def test_overshoot_is_the_closed_form(zeta, before, level):
 
     got = overshoot_percent(y, before=before, level=level)
 
-    # The peak of the samples is low by (omega dt)²/2 = 2e-6 of the swing.
+    # The highest sample is below the peak by (omega dt)²/2 = 2e-6 of the oscillation.
     assert_allclose(got, 100 * np.exp(-np.pi * zeta / np.sqrt(1 - zeta**2)), atol=1e-3)
 
 
-def test_settling_is_the_last_entry_into_the_band():
-    """The settling time is the last instant outside two percent, to within a sample."""
+def test_settling_time_is_the_last_entry_into_the_band():
+    """The settling time is the last time the response enters the 2 % band, to within a sample."""
     y = second_order(20.0, 0.2)
     got = float(settling_time(T, y, before=0.0, level=1.0))
 
     assert np.all(np.abs(y[T >= got] - 1) <= 0.02)
     assert np.abs(y[np.searchsorted(T, got) - 1] - 1) > 0.02
-    # The envelope reaches 2 % at 4 / (zeta omega), less ln of its factor: within half a swing.
+    # The envelope reaches 2 % at about 4 / (zeta omega), and the response within half a cycle of
+    # that.
     assert_allclose(got, np.log(50) / 4.0, atol=np.pi / 20)
 
 
-def test_many_responses_at_once_are_each_judged_alone():
+def test_responses_of_an_array_are_judged_separately():
     """Each response of an array gets its own results; one that never settles gets NaN."""
     y = np.stack([second_order(20.0, 0.5), second_order(20.0, 0.1), np.zeros(T.size)])
     level = np.ones(3)
@@ -55,7 +56,7 @@ def test_many_responses_at_once_are_each_judged_alone():
 
 
 def test_noise_widens_the_band():
-    """A response that has settled apart from noise counts as settled."""
+    """A response that is outside the band only because of noise counts as settled."""
     y = second_order(20.0, 0.5) + 0.03 * np.sin(2000 * T)
 
     assert np.isnan(settling_time(T, y, before=0.0, level=1.0))

@@ -66,7 +66,7 @@ def test_a_late_channel_is_reported_with_its_delay(tmp_path):
 @pytest.mark.parametrize("kinds", [("step",), ("sweep",), ("decay",)])
 @pytest.mark.parametrize("cart", [1, 2, 3])
 def test_a_late_channel_is_found_without_dwells(kinds, cart):
-    """A late channel is found from steps, a sweep or one decay, to half a sample."""
+    """From steps, a sweep or a decay, a late channel is found with its delay to half a sample."""
     late = find_late_channels(motions(kinds, late=cart), carts=3)
     told = {one.cart: one.delay / SAMPLE for one in late}
     assert told == pytest.approx(
@@ -88,7 +88,7 @@ def test_a_channel_late_only_in_the_sweep_is_reported_only_for_it():
 
 
 @pytest.mark.parametrize(("late", "told"), [(0, []), (LATE, [2])])
-def test_the_channels_of_a_real_bench_are_of_one_moment(late, told, real_data, tmp_path):
+def test_the_channels_of_a_real_bench_are_not_late(late, told, real_data, tmp_path):
     """Real steps with much dry friction pass, unless cart 2 is made late."""
     folder = write_two_cart_submission(tmp_path / "real", real_data, steps=(1, 2, 3, 4, 5))
     records = [
@@ -103,12 +103,12 @@ def test_the_channels_of_a_real_bench_are_of_one_moment(late, told, real_data, t
 
 
 def delayed(x: Array, samples: int) -> Array:
-    """Return a channel that is read that number of samples later."""
+    """Return a channel that is read this number of samples later."""
     return np.concatenate([np.repeat(x[:1], samples), x[: x.size - samples]])
 
 
 def motions(kinds: tuple[Kind, ...], *, late: int = 0) -> list[Record]:
-    """Return motions of three carts, read by encoders of 0.00227 cm, with one read late."""
+    """Return recordings of three carts; the channel of cart `late` is read late."""
     chain, rng = PRESETS["throne-3dof"], np.random.default_rng(5)
     t = np.linspace(0.0, 1399 * SAMPLE, 1400)
     hold = 1.0 / float(np.max(chain.static_gains()))
@@ -154,7 +154,7 @@ def motions(kinds: tuple[Kind, ...], *, late: int = 0) -> list[Record]:
         ("input_delay:delay=0.03",),
     ],
 )
-def test_friction_and_a_late_input_are_no_late_channel(tmp_path, hide):
+def test_friction_and_a_late_input_are_not_a_late_channel(tmp_path, hide):
     """Neither friction nor a delay of the motor is reported as a late channel."""
     analysis = analyse(load_submission(hand_in(tmp_path / "team", hide=hide)), design=False)
     assert not [c for c in analysis.checks if c.kind == "late_channel"]

@@ -1,4 +1,4 @@
-"""A wrong factor in all records of a kind is a unit; otherwise it is no team's mistake."""
+"""A wrong factor in all records of a kind is a wrong unit; otherwise it is not called a mistake."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -31,7 +31,7 @@ def record(name: str, *, size: float = 1.0, step: float = 0.01) -> Record:
 
 
 def kept(found: Mapping[str, Misread], *others: Record, sizes: Mapping[str, float]) -> set[str]:
-    """Return the suspected mistakes that remain if the other records fit as they are."""
+    """Return the suspected mistakes that remain if all other records fit as they are."""
     records = [*(record(name, size=size) for name, size in sizes.items()), *others]
     follows = {r.id: 1.0 if r.id in found else 0.0 for r in records}
     fits = {
@@ -45,23 +45,23 @@ def kept(found: Mapping[str, Misread], *others: Record, sizes: Mapping[str, floa
     ("misread", "sizes", "others", "unit"),
     [
         (TENTH, {"step-1": 1.0, "step-2": 2.0}, (), True),
-        (TENTH, {"step-1": 1.0, "step-2": 1.0}, (), False),  # a limit does so
+        (TENTH, {"step-1": 1.0, "step-2": 1.0}, (), False),  # an input limit has the same effect
         (TENTH, {"step-1": 1.0, "step-2": 1.0}, (record("sine-1", size=1.0),), True),
         (TENTH, {"step-1": 1.0, "step-2": 1.0}, (record("sine-1", size=0.1),), False),
-        (TENFOLD, {"step-1": 1.0, "step-2": 1.0}, (), True),  # no limit makes carts move further
+        (TENFOLD, {"step-1": 1.0, "step-2": 1.0}, (), True),  # a limit never adds motion
         (TENFOLD, {"step-1": 1.0}, (record("sine-1"),), False),
         (TENTH, {"step-1": 1.0, "step-2": 2.0}, (record("step-3"),), False),
         (TENFOLD, {"step-1": 1.0, "step-2": 1.0}, (record("step-3"),), False),
     ],
 )
-def test_a_unit_is_that_of_all_records_of_a_kind(misread, sizes, others, unit):
+def test_a_unit_must_be_wrong_in_all_records_of_a_kind(misread, sizes, others, unit):
     """A factor is taken for a unit if all records of a kind share it and no limit explains it."""
     found = {name: misread for name in sizes}
     assert kept(found, *others, sizes=sizes) == (set(sizes) if unit else set())
 
 
-def test_one_record_with_another_clock_is_sampled_otherwise():
-    """A single dwell is said to have another clock only if it was sampled otherwise."""
+def test_another_clock_needs_another_sampling_rate():
+    """A single dwell is said to have another clock only if its sampling rate differs."""
     others = [record("sine-2"), record("sine-3")]
     assert kept({"sine-1": SLOW}, *others, sizes={"sine-1": 1.0}) == set()
     slow = replace(record("sine-1"), t=np.linspace(0.0, 1.98, 100))
@@ -72,6 +72,6 @@ def test_one_record_with_another_clock_is_sampled_otherwise():
     assert without_lone_factors({"sine-1": SLOW}, [slow, *others], fits=fits) == {"sine-1": SLOW}
 
 
-def test_an_inverted_channel_belongs_to_one_record():
-    """An inverted channel counts even in one record, as no limit or friction inverts it."""
+def test_an_inverted_channel_counts_even_in_one_record():
+    """An inverted channel counts even in one record, as no limit or friction inverts a channel."""
     assert kept({"step-1": TURNED}, record("step-2"), sizes={"step-1": 1.0}) == {"step-1"}

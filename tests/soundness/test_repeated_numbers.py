@@ -1,4 +1,4 @@
-"""Runs that measure the same number: whether they agree, which run is odd, and why."""
+"""Repeats of one number are compared: whether they agree, which run is odd, and why."""
 
 from dataclasses import replace
 
@@ -51,7 +51,7 @@ def test_repeats_that_agree_pass():
 
 
 def test_two_different_numbers_do_not_show_which_is_wrong():
-    """If two repeats differ by a factor 1000, the check fails, but neither run is called odd."""
+    """If two repeats differ by a factor of 1000, the check fails, but neither run is called odd."""
     found = compared([decay("a", 20.0), decay("b", 0.02)])
     assert [c.outcome for c in found.checks if c.id == "repeats.omega_1"] == ["fail"]
     assert found.odd == {}
@@ -59,7 +59,7 @@ def test_two_different_numbers_do_not_show_which_is_wrong():
 
 
 def test_the_fit_shows_which_of_two_numbers_is_wrong():
-    """If the other records agree with 20 rad/s, the run that gives 0.02 is called odd."""
+    """If the other records agree with 20 rad/s, a run that gives 0.02 rad/s is called odd."""
     found = compared([decay("a", 20.0), decay("b", 0.02)], omega_1=20.3)
     assert list(found.odd) == ["b"]
     assert found.odd["b"].is_wrong
@@ -75,8 +75,8 @@ def test_without_a_fit_the_majority_of_repeats_decides():
     assert [check.outcome for check in found.checks] == ["fail"]
 
 
-def test_a_run_is_odd_by_the_number_that_it_gives_otherwise():
-    """A run that is odd by its K_1 is named, but the check of its agreeing K_2 still passes."""
+def test_a_run_with_one_odd_number_is_named():
+    """A run with an odd K_1 is named, but the check of K_2, which agrees, passes."""
     steps = [step(run, gain, cart=cart) for run in "abc" for cart, gain in ((1, 2.0), (2, 1.5))]
     steps += [step("d", 2.3, cart=1), step("d", 1.5, cart=2)]
     found = compared(steps=steps)
@@ -88,8 +88,8 @@ def test_a_run_is_odd_by_the_number_that_it_gives_otherwise():
     }
 
 
-def test_a_reading_within_the_errors_of_those_like_the_fit_stays():
-    """A run whose large error covers the gain of the fit is not left out; a certain one is."""
+def test_a_run_with_a_large_error_is_not_odd():
+    """A run with a gain off by a quarter is odd, unless its error is large."""
     steps = [step("a", 2.0), step("b", 2.6), step("c", 2.05), step("vague", 2.5, std=0.2)]
     assert list(compared(steps=steps, K_1=2.0).odd) == ["b"]
 
@@ -108,7 +108,7 @@ def test_dampings_of_repeats_are_compared():
     assert compared([damped("a", 0.03), damped("b", 0.09, std=0.02)]).undecided == ()
 
 
-def test_wide_errors_are_no_contradiction_and_no_agreement():
+def test_uncertain_numbers_neither_agree_nor_contradict():
     """Two uncertain gains that differ by a third neither pass nor fail the check."""
     found = compared(steps=[step("a", 2.0, std=0.2), step("b", 2.7, std=0.2)])
     assert [check.outcome for check in found.checks] == ["skip"]
@@ -116,7 +116,7 @@ def test_wide_errors_are_no_contradiction_and_no_agreement():
     assert found.undecided == ()
 
 
-def test_gains_that_depend_on_the_size_of_the_step_are_no_odd_runs():
+def test_gains_that_depend_on_the_step_size_are_not_odd():
     """If a cart sticks and small steps give less gain, the check fails, but no run is odd."""
     found = compared(
         steps=[

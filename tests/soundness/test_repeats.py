@@ -1,4 +1,4 @@
-"""A repeat that differs from the others is named, and no other repeat."""
+"""A repeat that differs from the others is named, and no other repeat is named."""
 
 from dataclasses import replace
 
@@ -35,17 +35,17 @@ def strange(record, rng):
 
 @pytest.mark.parametrize("count", [3, 4, 5, 8])
 def test_a_repeat_with_another_mass_is_named(count):
-    """If a weight was left on cart 1 in one of several repeats, that repeat is named."""
+    """If a weight was left on cart 1 in one of several repeats, this repeat is named."""
     rng = np.random.default_rng(count)
     records = repeats(count, rng=rng)
     records[1] = strange(records[1], rng)
     (outlier,) = find_outlier_repeats(records, unit="cm").values()
     assert outlier.run == records[1].id
-    assert not outlier.is_wrong  # its own motion is that of real carts
+    assert not outlier.is_wrong  # a cart with a weight still moves like a real cart
     assert all(r.id in outlier.reason for r in records if r is not records[1])
 
 
-def test_one_of_two_is_never_named():
+def test_neither_of_two_repeats_is_named():
     """If two repeats differ, neither is named, as nobody can know which one is wrong."""
     rng = np.random.default_rng(0)
     records = repeats(2, rng=rng)
@@ -74,24 +74,24 @@ def test_other_experiments_are_not_repeats():
     assert find_outlier_repeats([*repeats(4, rng=rng), *others], unit="cm") == {}
 
 
-def test_a_motor_switched_off_later_is_no_outlier():
+def test_a_run_with_another_input_is_not_odd():
     """A run is not odd if it differs only because its input differs."""
     rng = np.random.default_rng(4)
     records = [step_record(CHAIN, rng=rng, id=f"{i}") for i in range(4)]
-    # The input ends at half time, and in the last run 0.1 s later.
+    # The input ends at half time, but in the last run 0.1 s later.
     records.append(step_record(CHAIN, rng=rng, duration=6.2, id="longer"))
     assert find_outlier_repeats(records, unit="cm") == {}
 
 
-def test_an_encoder_that_was_not_zeroed_makes_no_outlier():
-    """Positions are compared from the start of each record, so an encoder may start anywhere."""
+def test_an_encoder_that_was_not_zeroed_is_not_odd():
+    """Positions are compared from the start of each record, so encoders need not start at zero."""
     rng = np.random.default_rng(3)
     records = repeats(5, rng=rng)
     records[2] = replace(records[2], y=records[2].y + 3.0)
     assert find_outlier_repeats(records, unit="cm") == {}
 
 
-def test_the_first_real_repeat_is_named_and_no_other(real_data, tmp_path):
+def test_only_the_first_real_repeat_is_named(real_data, tmp_path):
     """Of five real repeats with two carts the first is odd; repeats with one cart all agree."""
     folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(1, 2, 3, 4, 5))
     records = read_data(load_submission(folder)).records

@@ -56,10 +56,7 @@ def record(t, y, *, u=None, kind: Kind = "decay", count=COUNT):
 
 
 def released(*, zeta, fs=FS, duration=None, count=COUNT, noise=0.0, rng=None, **motion):
-    """Return a record of a release by hand;
-
-    by default it lasts 4.5 time constants, at most 10 s.
-    """
+    """Return a record of a release by hand, which lasts 4.5 time constants or 10 s."""
     t = np.arange(0, duration or RELEASE + min(4.5 / (zeta * OMEGA), 10.0), 1 / fs)
     y = held_then_free(t, zeta=zeta, **motion)
     if rng is not None:
@@ -276,7 +273,7 @@ def test_dry_friction_and_viscous_damping_are_separated(d, zeta):
 
 
 def test_damping_that_grows_with_amplitude_is_not_dry_friction():
-    """Quadratic drag is not called dry friction; the note says that damping grows with amplitude."""
+    """Quadratic drag is not called dry friction; a note says that damping grows with size."""
     fine = np.linspace(0, 4, 40001)
     y, x, v = np.empty_like(fine), 1.2, 0.0
     for i in range(fine.size):

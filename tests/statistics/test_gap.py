@@ -30,8 +30,8 @@ LONG = [pytest.mark.slow, pytest.mark.sample]
         pytest.param("cogging", 1, marks=LONG),
     ],
 )
-def test_names_the_hidden_effect(effect, n):
-    """A single hidden effect is named with place and size, and only noise is left."""
+def test_a_hidden_effect_is_named(effect, n):
+    """A single hidden effect is named with place and size, and only noise remains."""
     case = make_case(seed=41, n=n, effects=[effect], rate=113.1)
     (hidden,) = case.hidden
 
@@ -40,20 +40,20 @@ def test_names_the_hidden_effect(effect, n):
     assert gap.verdict == "named"
     assert names(gap) == [(hidden.effect, hidden.place)]
     assert gap.baseline > 4.0 * gap.noise_floor
-    # The limits: 1.2 times the noise floor, and three times beyond an end stop.
+    # The limit is 1.2 times the noise floor, or three times for an end stop.
     assert gap.final < (3.0 if effect == "end_stop" else 1.2) * gap.noise_floor
-    assert gap.spread == {}  # the friction of this bench is the same in every run
+    assert gap.spread == {}  # because friction is the same in every run of this bench
     for name, true in hidden.parameters.items():
         found = gap.effects[0].parameters[name]
-        # Contact stiffness depends on the law of contact, in which the two simulators differ.
+        # The two simulators differ in the law of contact, and so in the contact's stiffness.
         limit = 0.2 if effect == "end_stop" and name == "stiffness" else 0.02
         assert found.value == pytest.approx(true, rel=limit, abs=5 * (found.std or 0.0))
 
 
 @pytest.mark.slow
 @pytest.mark.sample
-def test_a_hidden_mass_that_moves_when_a_hand_lets_go(tmp_path):
-    """A hidden mass is found even if it moves already when a hand releases the cart."""
+def test_a_hidden_mass_that_moves_at_the_release_is_found(tmp_path):
+    """A hidden mass is found even if it is already moving when a hand releases the cart."""
     bench = prepare_bench(preset="throne-2dof", model=None, hide=["extra_mode"])
     write_submission(tmp_path / "bench", bench, seed=3, reported=False)
 
@@ -86,10 +86,10 @@ def test_two_effects_are_found_together():
         pytest.param("slack_spring", 8.0, 0.6, marks=pytest.mark.slow),
     ],
 )
-def test_a_stop_and_a_stiffening_spring_are_told_apart(effect, hardness, part):
+def test_a_stop_and_a_stiffening_spring_are_distinguished(effect, hardness, part):
     """Neither an end stop nor a stiffening spring is taken for the other, wherever it begins.
 
-    A stop may be soft and lossless. If a stiffening spring fits equally well, both are listed.
+    An end stop may be soft and lossless. If a stiffening spring fits equally well, both are listed.
     """
     bare = make_case(seed=7, n=1, rate=200.0)
     top = part * max(float(r.y.max()) for r in bare.records if r.kind == "step")
@@ -111,10 +111,10 @@ def test_a_stop_and_a_stiffening_spring_are_told_apart(effect, hardness, part):
 @pytest.mark.sample
 @pytest.mark.parametrize("n", [2, 3])
 def test_friction_on_all_carts_is_found_at_once(n):
-    """Friction on all carts of a realistic rig is found in one step, each with its own force.
+    """On a realistic rig, friction on all carts is found in one step, with a force for each cart.
 
-    The rig also has damping while the motor drives, and hands that release carts. Errors fall to
-    the noise.
+    The rig also has damping while the motor drives, and carts released by hand. The remaining error
+    is only noise.
     """
     case = make_rig(seed=1, n=n)
 
@@ -131,5 +131,5 @@ def test_friction_on_all_carts_is_found_at_once(n):
             if (f.effect.key, f.where.get("cart", 0)) == (hidden.effect, hidden.place)
         )
         for name, true in hidden.parameters.items():
-            # Each run has a scatter of 8 %, so the force common to all is known to 3 or 4 %.
+            # The force of each run scatters by 8 %, so the common force is known to 3 or 4 %.
             assert found.parameters[name].value == pytest.approx(float(true), rel=0.1)

@@ -1,4 +1,4 @@
-"""The gap workflow on real recordings, given only what was published about the benches."""
+"""The gap workflow is given real recordings and what was published about the benches."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 
 
 def explain_five(folder: Path, name: str, *, column: int, kind: str) -> Gap:
-    """Explain five repeats of one cart."""
+    """Explain the gap of five repeats of one cart."""
     records = [
         ecp_record(folder / f"{name}_test{i}.csv", column=column, kind=kind) for i in range(1, 6)
     ]
@@ -31,9 +31,9 @@ def explain_five(folder: Path, name: str, *, column: int, kind: str) -> Gap:
 
 
 def test_driven_cart_has_dry_friction(real_data):
-    """In five steps of a real cart dry friction is found, and unseen repeats are right to 2.7 %.
+    """In five steps of a real cart, dry friction is found, and unseen repeats are right to 2.7 %.
 
-    No model can do better than the difference between the repeats.
+    No model can have a smaller error than the difference between the repeats.
     """
     folder = real_data / "ecp210-ucsd"
 
@@ -46,7 +46,7 @@ def test_driven_cart_has_dry_friction(real_data):
 
 
 def test_released_cart_has_dry_friction(real_data):
-    """In five hand-released decays dry friction is found first, and errors are within 4 %."""
+    """In five decays after release by hand, dry friction is found first; errors are below 4 %."""
     folder = real_data / "ecp210-ucsd"
 
     gap = explain_five(folder, "DOF1_en2_manual2", column=3, kind="decay")
@@ -70,7 +70,7 @@ def test_a_cart_held_in_all_runs_is_a_wall(real_data, tmp_path):
 
 
 def test_all_runs_of_two_carts_have_friction_on_both(real_data, tmp_path):
-    """From all runs of two real carts, friction is found on both."""
+    """From all runs of two real carts, friction is found on both carts."""
     folder = write_two_cart_submission(tmp_path / "lab", real_data, steps=(1, 2, 3, 4, 5))
     analysis = analyse(load_submission(folder), design=False)
 
@@ -82,7 +82,7 @@ def test_all_runs_of_two_carts_have_friction_on_both(real_data, tmp_path):
 
 
 def test_an_axis_on_no_spring_is_simulated_over_a_whole_record(real_data):
-    """From one record of the EMPS axis, the other record is simulated within 4.6 mm.
+    """From one record of the EMPS axis, the other record is simulated to within 4.6 mm.
 
     The model has friction, a constant force and cogging. The best published error by the same rule
     is 5.17 mm (`benchmarks/emps.py`).
@@ -102,7 +102,7 @@ def test_an_axis_on_no_spring_is_simulated_over_a_whole_record(real_data):
 
 
 def test_silverbox_has_a_hardening_spring(real_data):
-    """In the Silverbox the cubic spring is named first, and it alone explains the gap."""
+    """In the Silverbox, the cubic spring is named first, and it alone explains the gap."""
     data = loadmat(real_data / "silverbox" / "SNLS80mV.mat")
     u, y = data["V1"].ravel(), data["V2"].ravel()
     interval = 2**14 / 1e7

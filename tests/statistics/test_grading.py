@@ -19,12 +19,12 @@ def test_no_honest_team_is_flagged(start):
         assert flags(team) == [], (seed, team.bench)
 
 
-NAMED = 0.9  # of the mistakes; on such varied benches some cannot be recognised
+NAMED = 0.9  # some mistakes cannot be recognised on such varied benches
 
 
 @pytest.mark.slow
-def test_mistakes_get_their_codes():
-    """On benches without friction nearly every mistake in three-digit numbers is named."""
+def test_mistakes_get_their_flags():
+    """On benches without friction, nearly every mistake in three-digit numbers is named."""
     named, missed = 0, []
     for seed in range(2001, 2019, 2):
         team = make_team(seed, friction=0.0, digits=3)

@@ -1,4 +1,4 @@
-"""In recordings of a real rig, every hand that a person sees in a plot is found, and no other."""
+"""In recordings of a real rig, exactly those hands are found that a person sees in a plot."""
 
 import numpy as np
 import pytest
@@ -9,21 +9,21 @@ from pipeline.workflow import analyse
 
 pytestmark = pytest.mark.slow
 
-# From plots of all 17 files: when somebody moves the free cart. In the last five, under feedback,
-# and in the steps, nobody does.
+# When somebody moves the free cart, read from plots of all 17 files. Nobody does in the steps and
+# in the last five files, which are closed-loop runs.
 SEEN = {
-    "07-Feb-2025_10_34_21": [(0.0, 0.55)],  # held where the encoders were zeroed, then released
-    "07-Feb-2025_11_28_21": [(5.45, 5.6)],  # begins in motion; pulled out and released
+    "07-Feb-2025_10_34_21": [(0.0, 0.55)],  # held while the encoders were zeroed, then released
+    "07-Feb-2025_11_28_21": [(5.45, 5.6)],  # begins in motion; the cart is pulled out and released
     "14-Feb-2025_09_22_43": [(1.18, 1.32), (4.8, 4.93), (9.73, 9.95)],  # three plucks
-    "14-Feb-2025_09_44_21": [(0.73, 1.2), (1.55, 1.68)],  # a pluck that is stopped, and another
+    "14-Feb-2025_09_44_21": [(0.73, 1.2), (1.55, 1.68)],  # two plucks, the first stopped
 }
-TO = 0.16  # s, read from a plot; the hand that stops a cart stays on it longer than one can see
-ALONE = ("09_26", "09_29", "09_35", "21-Feb-2025_09")  # cart 1; the other is held by hand
+TO = 0.16  # s; in a plot one cannot see how long a stopping hand stays on the cart
+ALONE = ("09_26", "09_29", "09_35", "21-Feb-2025_09")  # cart 1 moves; cart 2 is held by hand
 
 
 @pytest.fixture(scope="module")
 def rig(real_data, tmp_path_factory):
-    """Return the 17 files as a submission."""
+    """Return the analysis of a submission with the 17 files."""
     folder = tmp_path_factory.mktemp("rig")
     lines = ["version = 1", 'title = "Two carts"', "[system]", "carts = 2",
              "springs = [true, true, false]"]  # fmt: skip
@@ -44,7 +44,7 @@ def rig(real_data, tmp_path_factory):
     return analyse(load_submission(folder), design=False)
 
 
-def test_hands_are_where_a_person_sees_them(rig):
+def test_hands_are_found_where_a_person_sees_them(rig):
     """The seven interventions by hand in four files are found where the plots show them."""
     assert len(rig.records) == 17
     found: dict[str, list[tuple[float, float]]] = {}
@@ -57,11 +57,8 @@ def test_hands_are_where_a_person_sees_them(rig):
         np.testing.assert_allclose(found[name], seen, atol=TO)
 
 
-def test_three_plucks_are_three_decays(rig):
-    """Three plucks in one recording count as three decays, with one frequency within 1 %.
-
-    Their damping depends on the swing, as with dry friction.
-    """
+def test_three_plucks_give_three_decays(rig):
+    """Three plucks in one recording count as three decays, with equal frequencies to 1 %."""
     decays = [d for d in rig.log_decrements if d.experiment == "14-Feb-2025_09_22_43"]
 
     assert [decay.number for decay in decays] == [1, 2, 3]
@@ -69,8 +66,8 @@ def test_three_plucks_are_three_decays(rig):
     assert all(1.3 < d.release < 1.6 or 4.9 < d.release < 5.2 or d.release > 9.9 for d in decays)
 
 
-def test_a_hold_that_was_none_is_said(rig):
-    """A check reports the decay in which the held cart moved by 7 % of the other."""
+def test_a_held_cart_that_moved_fails_a_check(rig):
+    """A check reports a decay in which the held cart moved by 7 % of the other cart's motion."""
     held = [check for check in rig.failed_checks if check.kind == "held"]
 
     assert [check.about for check in held] == ["14-Feb-2025_09_44_21.cart_1"]

@@ -1,4 +1,4 @@
-"""On benches that are not linear, no honest team's recording or number is called wrong."""
+"""On nonlinear benches, no honest team's recording or number is called wrong."""
 
 import pytest
 
@@ -6,8 +6,8 @@ from tests.helpers.honest_benches import grade_honest_team
 
 PRESETS = ("throne-1dof", "throne-2dof", "throne-3dof")
 
-# One bench for each effect that was once mistaken for a unit, a clock or a mistake: a dead zone,
-# stiction, an end stop, and an amplifier at its limit.
+# One bench for each effect that was once taken for a wrong unit, a wrong clock or a mistake: a dead
+# zone, stiction, an end stop, and an amplifier at its limit.
 ONCE_ACCUSED = [
     ("throne-2dof", 10),
     ("throne-2dof", 15),
@@ -20,7 +20,7 @@ STARTS = range(0, 40, 10)
 @pytest.mark.slow
 @pytest.mark.sample
 @pytest.mark.parametrize(("preset", "seed"), ONCE_ACCUSED)
-def test_benches_that_once_were_accused_are_not(preset, seed, tmp_path):
+def test_benches_once_misjudged_get_no_flag(preset, seed, tmp_path):
     """Honest teams on these benches get no flag of any kind, and no recording is called wrong."""
     grade, analysis, term = grade_honest_team(tmp_path, preset=preset, seed=seed)
     assert [flag.message for flag in grade.flags] == [], term
@@ -30,7 +30,7 @@ def test_benches_that_once_were_accused_are_not(preset, seed, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("start", STARTS)
-def test_no_honest_recording_is_accused(preset, start, tmp_path):
+def test_no_honest_recording_is_called_wrong(preset, start, tmp_path):
     """For each effect at up to three times its usual size, no recording is called wrong."""
     for seed in range(start, start + 10):
         grade, analysis, term = grade_honest_team(tmp_path / f"{seed}", preset=preset, seed=seed)

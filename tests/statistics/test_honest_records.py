@@ -29,8 +29,8 @@ LONG = "sticking at every small step"
         pytest.param(LONG, marks=[pytest.mark.slow, pytest.mark.sample]),
     ],
 )
-def test_no_honest_record_is_accused(case, tmp_path):
-    """Without noise carts may rest exactly or stick, and still no recording is called faulty."""
+def test_no_honest_record_is_called_faulty(case, tmp_path):
+    """Without noise, carts may rest exactly or stick, and still no recording is called faulty."""
     force = HONEST[case].get("hide")
     hidden = [f"coulomb_friction:cart={cart},force={force}" for cart in (1, 2)] if force else []
     made = prepare_bench(preset=PRESET, hide=tuple(hidden))

@@ -1,4 +1,4 @@
-"""In classes that share one bench, no honest team is accused, and copied files are found."""
+"""In classes that share one bench, no honest team is flagged, and copied files are found."""
 
 from dataclasses import replace
 
@@ -33,10 +33,10 @@ def member(name, records):
     ],
     ids=lambda x: "-".join(x) if isinstance(x, tuple) else "",
 )
-def test_the_bench_is_no_copy_and_a_copy_is_no_bench(number, bench):
-    """On each bench twelve honest teams are not accused, and four copied files are found.
+def test_copies_are_found_and_honest_teams_are_not_flagged(number, bench):
+    """On each bench, twelve honest teams are not flagged, and four copied files are found.
 
-    One of the four may move too little to show that it is a copy.
+    One of the four files may contain too little motion to show that it is a copy.
     """
     preset, effect = bench
     count = COUNT if bench in SAMPLE else COUNTS[number % len(COUNTS)]

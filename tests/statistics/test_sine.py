@@ -8,10 +8,10 @@ from tests.stages.test_sine import coverage
 
 @pytest.mark.slow
 @pytest.mark.parametrize("from_rest", [True, False])
-def test_the_standard_errors_are_honest(from_rest):
-    """Over 400 dwells the 95 % intervals of gain and phase hold the truth in about 95 %."""
+def test_the_standard_errors_are_right(from_rest):
+    """Over 400 dwells, 95 % intervals of gain and phase contain the true value in about 95 %."""
     covered = np.mean(np.abs(coverage(400, from_rest=from_rest)) < 1.96, axis=0)
-    # The binomial spread is 1.1 %. The error of rounding is not normal, and after seven time
+    # The binomial standard error is 1.1 %. Rounding errors are not normal, and after seven time
     # constants 0.1 % of a transient is left.
     assert np.all(covered > 0.89)
     assert np.all(covered < 0.985)

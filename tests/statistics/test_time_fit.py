@@ -13,8 +13,8 @@ from tests.stages.test_time_fit import errors
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 0.0005, 0.00227])
 @pytest.mark.parametrize("preset", PRESETS)
-def test_intervals_cover_the_truth_at_their_rate(preset, noise):
-    """The 95 % intervals hold the truth 95 times in 100, even if rounding is the only error."""
+def test_95_percent_intervals_contain_95_percent_of_the_true_values(preset, noise):
+    """95 % intervals contain the true value in 95 % of cases, even if the only error is rounding."""
     chain, rng = PRESETS[preset], np.random.default_rng(15)
     seeds = 120
     inside = np.zeros(len(chain.parameters()))
@@ -34,10 +34,10 @@ def test_intervals_cover_the_truth_at_their_rate(preset, noise):
         fit = fit_records(records, bench=Bench(springs=(True,) * (chain.n + 1)))
         assert fit.converged
         inside += np.abs(errors(fit, chain)) < 1.96
-    # Each count is binomial, 120 draws at 0.95, with a standard error of 0.02; the worst of 19 is
-    # within 3.5 of them.
+    # Each count is binomial, with 120 draws at 0.95 and a standard error of 0.02. The worst of 19
+    # counts is within 3.5 standard errors.
     assert np.min(inside / seeds) > 0.88
-    # The mean over parameters varies less. Rounding alone errs less than its intervals allow.
+    # The mean over parameters varies less. If rounding is the only error, intervals are too wide.
     assert 0.92 < np.mean(inside / seeds) < 0.995
 
 
@@ -63,5 +63,5 @@ def test_every_random_chain_is_found():
         ]
         fit = fit_records(records, bench=Bench(springs=springs))
         assert fit.converged
-        # Of 200 × some 10 numbers, one is beyond 5.5 standard errors once in 10 000 such tests.
+        # Of 200 × about 10 errors, one is beyond 5.5 standard errors once in 10 000 such tests.
         assert np.max(np.abs(errors(fit, chain))) < 5.5

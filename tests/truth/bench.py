@@ -1,8 +1,8 @@
 """A bench with known, hidden physics, simulated independently of `pipeline.plant`.
 
-It has fine fixed steps (50 µs, velocity Verlet), dry friction as an inclusion solved at every step
-(Moreau's time stepping), penalty contacts, and the delay as a look-up in past commands. It is slow
-and simple on purpose, because the simulator of the workflow is judged by it.
+It uses fixed steps of 50 µs (velocity Verlet), dry friction as an inclusion solved at every step
+(Moreau's time stepping), penalty contacts, and past commands for the delay. It is slow and simple
+on purpose, because it is the reference for the workflow's simulator.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,10 +12,10 @@ import numpy as np
 from numba import njit
 
 STEP = 5e-5  # s
-CONTACT_STEP = 2e-6  # s; bounces multiply the error of each impact
+CONTACT_STEP = 2e-6  # s; short, since each bounce multiplies the error of an impact
 _CONTACTS = ("backlash", "end_stop")
 
-# Numbers of one cart and one spring, in tables of this simulator's own.
+# Parameters of one cart and one spring, in this simulator's own tables.
 _CART = (
     "m c coulomb excess stribeck dahl delta mu drag offset stop stop_k stop_c gain hm hk hc"
 ).split()
@@ -25,7 +25,7 @@ _DRIVE = "dead limit delay lag braking gap motor contact contact_c cog pitch pha
 
 @dataclass(frozen=True, kw_only=True)
 class Hidden:
-    """One effect hidden in the bench: its name, place (0 for the input) and parameters."""
+    """One effect hidden in the bench, with its place (0 for the input) and parameters."""
 
     effect: str
     place: int = 0
@@ -36,10 +36,10 @@ class Hidden:
 class Hand:
     """An unmeasured hand on one cart from `start` to `end` (s).
 
-    The hand may grip the cart with a spring and a damper, move it by `pull` (position units) until
-    the share `there` of its time, hold it, and release it over the last tenth. Or it pushes with a
-    force that rises to `push` (input units) and falls again. A soft hold is a grip that never
-    pulls.
+    The hand may grip the cart with a spring and a damper. It then moves the cart by `pull`
+    (position units) until the share `there` of its time, holds it, and releases it over the last
+    tenth. Otherwise it pushes with a force that rises to `push` (input units) and falls again. A
+    soft hold is a grip that never pulls.
     """
 
     cart: int
@@ -48,7 +48,7 @@ class Hand:
     pull: float = 0.0
     push: float = 0.0
     there: float = 0.8
-    grip: float = 8.0  # as a multiple of the stiffness of the springs beside the cart
+    grip: float = 8.0  # stiffness of the grip, as a multiple of that of the springs beside the cart
 
 
 @njit(cache=True)
@@ -84,7 +84,7 @@ def _motion(cart, spring, drive, hands, free, t, times, command, x0, v0, scatter
     xh, vh = x0.copy(), v0.copy()
     lag = command[0]
     xm, vm = x0[0], v0[0]
-    # Velocities in the middle of a step are continued from the last step: second order.
+    # Velocities in the middle of a step are extrapolated from the last step, to second order.
     v_last, vh_last = v0.copy(), v0.copy()
     w, wh = v0.copy(), v0.copy()
     has_gap = drive[5] > 0.0
@@ -98,7 +98,7 @@ def _motion(cart, spring, drive, hands, free, t, times, command, x0, v0, scatter
     on = 0
     first = True
     while sample < t.size:
-        # Readings are straight within one 50-µs step.
+        # Readings are interpolated linearly within one 50-µs step.
         while sample < t.size and t[sample] <= now + h:
             part = t[sample] - now
             for i in range(n):
@@ -108,7 +108,7 @@ def _motion(cart, spring, drive, hands, free, t, times, command, x0, v0, scatter
         while on < times.size - 1 and times[on + 1] <= mid:
             on += 1
         # The delayed command over this step. Steps are far shorter than samples, so at most one
-        # edge falls into a step; it counts for the part of the step after it.
+        # edge is within a step; it counts for the rest of the step.
         begin = now - drive[2]
         while at < times.size - 1 and times[at + 1] <= begin:
             at += 1
@@ -218,10 +218,10 @@ def simulate_truth(
     scatter: np.ndarray | None = None,
     step: float | None = None,
 ) -> np.ndarray:
-    """Return the true readings (n, samples), before noise and encoder.
+    """Return the true readings (n, samples), without noise and encoder steps.
 
-    `t` are the sample times; the input is held from sample to sample. By default `step` (s) is as
-    small as the effects need.
+    `t` are the sample times; the input is held between samples. By default `step` (s) is as small
+    as the effects need.
     """
     if step is None:
         step = CONTACT_STEP if any(e.effect in _CONTACTS for e in hidden) else STEP
@@ -277,7 +277,8 @@ def _hide(effect: Hidden, cart: np.ndarray, spring: np.ndarray, drive: np.ndarra
         case "force_offset":
             cart[i, 9] = p["force"]
         case "end_stop":
-            # This simulator's own contact law: a fifth of critical damping on the contact spring.
+            # This simulator has its own contact law: a fifth of critical damping on the contact
+            # spring.
             damping = p.get("damping", 0.4 * np.sqrt(p["stiffness"] * cart[i, 0]))
             cart[i, 10:13] = p["position"], p["stiffness"], damping
         case "sensor_gain":

@@ -8,8 +8,8 @@ import numpy as np
 from pipeline.results import Record
 from tests.truth.bench import Hand, Hidden, simulate_truth
 
-COUNT = 0.00227  # cm, the encoder step
-_SMALLER = (0.7, 0.95)  # as a share of a case's largest input: the input of its further records
+COUNT = 0.00227  # cm, one encoder step
+_SMALLER = (0.7, 0.95)  # input of the further records, as a share of the largest input of a case
 RATES = (113.1, 200.0, 250.0, 500.0, 1000.0)  # Hz
 
 _M = ([1.98587e-4], [3.128204e-4, 1.737182e-4], [3.2732e-4, 2.516715e-4, 1.960671e-4])
@@ -74,10 +74,10 @@ def make_case(
     Some of these cases are hard to recognise or fit.
 
     `dirt` adds features of real benches: friction that varies by 4 % between runs, encoders zeroed
-    where the cart happens to rest, time stamps rounded to a tenth of a millisecond.
+    where the cart happens to rest, and time stamps rounded to 0.1 ms.
 
-    With `handled`, people pluck carts once or twice per record, nudge them, push at the end, and
-    hold them with a hand that yields.
+    If `handled` is true, people pluck carts once or twice per record, nudge them, push at the end,
+    and hold them with a hand that yields.
     """
     rng = np.random.default_rng(seed)
     m = np.array(_M[n - 1]) * rng.uniform(0.8, 1.25, n)
@@ -88,7 +88,7 @@ def make_case(
     rate = float(rng.choice(RATES)) if rate is None else rate
     stiffness = np.diag(k[:-1] + k[1:]) - np.diag(k[1:-1], 1) - np.diag(k[1:-1], -1)
     gain = float(np.linalg.inv(stiffness)[0, 0])
-    large = rng.uniform(1.0, 1.5) / gain  # moves cart 1 by 1 to 1.5 cm, with overshoot twice that
+    large = rng.uniform(1.0, 1.5) / gain  # 1 to 1.5 cm, twice that with overshoot
     plan = _plan(n, large, rng, rate)
     linear = [
         simulate_truth(m=m, c=c, k=k, t=t, u=u, free=free, x0=x0, step=2e-4)
@@ -110,7 +110,7 @@ def make_case(
         scatter = 1.0 + (0.04 * rng.standard_normal(n) if dirt else np.zeros(n))
         lead = 0.0
         if dirt and kind != "decay":
-            # The cart was left somewhere within its friction band, and the encoder zeroed there.
+            # The cart was left within its friction band, and its encoder was zeroed there.
             x0 = np.array([_rest_band(h, stiffness, i, rng) for i, h in _by_cart(hidden, n)])
             x0 = np.where([i + 1 in free for i in range(n)], x0, 0.0)
         y = simulate_truth(
@@ -127,7 +127,7 @@ def make_case(
 
 
 def further_records(case: Case, *, seed: int) -> tuple[Record, ...]:
-    """Return new records of a clean case's bench.
+    """Return new records of the bench of a case that has neither hands nor dirt.
 
     Steps and sweep have other sizes, no larger than before; releases and noise differ too.
     """
@@ -147,9 +147,8 @@ def make_rig(*, seed: int, n: int, trials: int = 3) -> Case:
     """Make a realistic bench with several effects, none of which alone explains the gap.
 
     Every cart has dry friction of nearly the same size, which differs between runs. The viscous
-    damping of cart 1 doubles while the motor drives. Decays are released by hand, with a speed and
-    a zero of their own. The encoder is coarse; each run has `trials` repeats, and there are no
-    other sizes.
+    damping of cart 1 doubles while the motor drives. Decays start from a hand's release, each with
+    its own speed and zero. The encoder is coarse. Each run has `trials` repeats of a single size.
     """
     rng = np.random.default_rng(seed)
     m = np.array(_M[n - 1]) * rng.uniform(0.8, 1.25, n)
@@ -233,7 +232,7 @@ def _rest_band(h, stiffness, i, rng):
 
 
 def _plan(n, large, rng, rate):
-    """Return the plan: steps of two sizes (one repeated), a sweep, and hand-released decays."""
+    """Return the plan: steps of two sizes (one repeated), a sweep, and decays released by hand."""
     dt = 1.0 / rate
     everything = tuple(range(1, n + 1))
     plan = []
@@ -289,7 +288,7 @@ def _lay_hands(n, large, rng) -> dict[str, tuple[Hand, ...]]:
 
 
 def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng, wide=False) -> Hidden:
-    """Draw a place and sizes of an effect; `severity` scales its difference from linear."""
+    """Draw place and size of an effect; `severity` scales its difference from a linear bench."""
     s = severity * float(np.exp(rng.uniform(np.log(0.3), np.log(1.5)))) if wide else severity
     i = int(rng.integers(n))
     present = [j for j in range(n + 1) if k[j] > 0]
@@ -367,7 +366,7 @@ def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng, wide=
         case "backlash":
             return Hidden(effect=name, parameters={"gap": s * draw(0.03, 0.12)})
         case "cogging":
-            # At most 0.6 of the size at which the cart would snap from tooth to tooth.
+            # At most 0.6 of the size at which the cart would jump from tooth to tooth.
             pitch = draw(0.2, 0.6)
             force = s * draw(0.2, 0.6) * stiffness[0, 0] * pitch / (2 * np.pi)
             parameters = {"force": force, "pitch": pitch, "phase": draw(-np.pi, np.pi)}

@@ -19,12 +19,12 @@ from pipeline.workflow import analyse
 from tests.helpers.time_records import decay_record, step_record
 
 CHAIN = PRESETS["throne-1dof"]
-HEAVIER = Chain(m=1.4 * CHAIN.m, c=CHAIN.c, k=CHAIN.k)  # a weight was left on the cart
+HEAVIER = Chain(m=1.4 * CHAIN.m, c=CHAIN.c, k=CHAIN.k)  # an extra weight on the cart
 
 
 @pytest.fixture(scope="module")
 def analysis(tmp_path_factory):
-    """The analysis of a linear bench with steps, decays and one repeat with an extra weight."""
+    """Return the analysis of a linear bench; one repeat was recorded with an extra weight."""
     folder = tmp_path_factory.mktemp("bench")
     rng = np.random.default_rng(5)
     records = [
@@ -47,8 +47,8 @@ def analysis(tmp_path_factory):
     return analyse(load_submission(folder), design=False)
 
 
-def test_what_the_report_leaves_out_is_in_no_figure_of_the_gap(analysis):
-    """The odd repeat is used neither for fitting nor as a test; gap.json has the reason."""
+def test_a_run_that_the_report_leaves_out_is_not_used(analysis):
+    """The run with the weight is neither fitted nor a test, and `gap.json` has the reason."""
     (odd,) = analysis.left_out
     assert (odd.experiment, odd.is_wrong) == ("step-4", False)
 
@@ -64,8 +64,8 @@ def test_what_the_report_leaves_out_is_in_no_figure_of_the_gap(analysis):
     assert read_gap(text).left_out == (odd,)
 
 
-def test_a_gap_file_of_before_is_still_read(analysis):
-    """A gap.json without `left_out`, as older versions wrote it, is read as an empty list."""
+def test_an_older_gap_file_is_still_read(analysis):
+    """A `gap.json` written by an older version, without `left_out`, is read as an empty list."""
     document = json.loads(json_text(investigate(analysis, progress=lambda text: None)))
     del document["left_out"]
     assert read_gap(json.dumps(document)).left_out == ()
@@ -82,7 +82,7 @@ def test_a_cart_at_rest_before_a_release_is_not_a_run():
         t=np.arange(wait.size + decay.t.size) * decay.sample_time,
         y=np.concatenate((decay.y[0, 0] + settling, decay.y[0]))[None],
     )
-    # The hand pulls from 2.0 s on and lets go at 3.5 s.
+    # The hand pulls from 2.0 s on and releases at 3.5 s.
     hand = Intervention(experiment=record.id, cart=1, start=2.0, end=3.6)
 
     (run,) = prepare([record], springs=(True, True), interventions=[hand], notes=[])
@@ -90,7 +90,7 @@ def test_a_cart_at_rest_before_a_release_is_not_a_run():
     assert run.t[0] > hand.end
 
 
-def test_nothing_left_is_an_error_that_says_why(analysis):
+def test_without_any_recording_the_error_gives_the_reasons(analysis):
     """If every recording is left out, the error gives the reasons."""
     out = tuple(
         LeftOut(experiment=record.id, reason="its clock stood still", is_wrong=True)

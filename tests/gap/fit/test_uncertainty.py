@@ -23,7 +23,7 @@ from tests.truth.cases import make_case
 
 
 def standardised(folder, *, preset, hide, seed):
-    """Return the error of each parameter of the true model in standard errors."""
+    """Return the error of each parameter of the true model, in standard errors."""
     bench = VirtualBench(prepare_bench(preset=preset, model=None, hide=hide), seed=seed)
     hidden = bench.carts._bench
     springs = tuple(bool(k > 0) for k in hidden.chain.k)
@@ -57,11 +57,11 @@ def standardised(folder, *, preset, hide, seed):
         ),
     ],
 )
-def test_parameters_are_off_by_what_is_stated(tmp_path, preset, hide, seeds):
+def test_stated_standard_errors_are_right(tmp_path, preset, hide, seeds):
     """Standard errors are right even if friction holds a cart still for seconds.
 
-    From so few numbers, the root mean square scatters by a quarter. If the noise were taken as
-    white, it would be four.
+    For these few numbers, the root mean square scatters by a quarter. If noise were taken as white,
+    it would be about four.
     """
     z = np.array(
         [
@@ -82,7 +82,7 @@ def fitted(case):
 
 
 def test_a_model_that_runs_away_has_no_errors():
-    """A spring that softens until the cart runs away gives no standard errors."""
+    """If a spring softens until the cart runs away, there are no standard errors."""
     fit, runs = fitted(make_case(seed=42, n=1, rate=113.1))
     chain = fit.structure.chain(fit.theta)
     soft = make_candidate(find_effect("cubic_spring"), 1, (-1.0,), runs=runs, chain=chain)
@@ -92,7 +92,7 @@ def test_a_model_that_runs_away_has_no_errors():
 
 
 def test_every_record_has_encoder_errors_of_its_own():
-    """If a record is listed twice, its errors are drawn twice, so variances are not just halved."""
+    """If a record is listed twice, each copy gets its own encoder errors."""
     fit, runs = fitted(make_case(seed=42, n=1, rate=113.1))
     once = covariance(replace(fit, nuisance=fit.nuisance[:1]), runs[:1]).covariance
     twice = covariance(replace(fit, nuisance=fit.nuisance[:1] * 2), runs[:1] * 2).covariance

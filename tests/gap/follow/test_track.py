@@ -13,7 +13,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.simulator.terms import Kind
 from tests.truth.cases import make_case
 
-# Relative to the largest input, position and the parameters of cart 1 and spring 2.
+# Sizes relative to the largest input, the largest position, cart 1's mass and spring 2.
 SIZES = {
     Kind.COULOMB_FRICTION: lambda u, x, m, k: (0.02 * u,),
     Kind.LOAD_FRICTION: lambda u, x, m, k: (0.02,),
@@ -32,13 +32,13 @@ SIZES = {
     Kind.BACKLASH: lambda u, x, m, k: (0.1 * x, 0.3 * m, 0.6),
 }
 DRIVEN = (Kind.DRIVE_DAMPING, Kind.COGGING, Kind.BACKLASH)
-# The error jumps when a cart's turn, or the contact of bodies, moves past a reading.
+# The error jumps when the turning point of a cart or a contact moves past a reading.
 JUMPS = (*DRY, Kind.BACKLASH)
 
 
 @pytest.mark.parametrize("gain", [0.5, 0.1, 0.0])
 @pytest.mark.parametrize("kind", SIZES)
-def test_derivatives_are_those_of_what_is_computed(kind, gain):
+def test_derivatives_agree_with_differences_of_the_errors(kind, gain):
     """Derivatives by all parameters, and by a run's start, agree with differences."""
     case = make_case(seed=44, n=2, rate=113.1)
     chain = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
@@ -66,7 +66,7 @@ def test_derivatives_are_those_of_what_is_computed(kind, gain):
         _, J = errors(at, derive=True)
         steps = np.diag(1e-5 * np.where(at == 0.0, 1e-3, np.abs(at)))
         present = at != 0.0
-        present[p.size : p.size + 2] = True  # zeros, which mean no effect here
+        present[p.size : p.size + 2] = True  # the zero of an encoder has an effect even if it is 0
         for lane in np.flatnonzero(present):
             above, below = (errors(at + sign * steps[lane])[0] for sign in (1.0, -1.0))
             numeric = (below - above) / (2.0 * steps[lane, lane])
@@ -77,8 +77,8 @@ def test_derivatives_are_those_of_what_is_computed(kind, gain):
                 assert off.max() < 1e-4, lane
 
 
-def test_a_model_that_runs_away_is_told():
-    """A spring that softens until the cart runs away gives neither errors nor derivatives."""
+def test_a_model_that_runs_away_gives_no_errors():
+    """If a spring softens until the cart runs away, there are neither errors nor derivatives."""
     case = make_case(seed=44, n=2, rate=113.1)
     chain = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
     track = make_track(make_run(case.records[0], n=2))

@@ -1,4 +1,4 @@
-"""The laws that are searched for, and the hypotheses that are judged."""
+"""The search tries the right laws and hypotheses."""
 
 from pipeline.gap.limits import BIC_DROP
 from pipeline.gap.search.find import find_hypotheses
@@ -7,8 +7,8 @@ from tests.gap.search.begun import COULOMB, DELAY, begun
 from tests.truth.bench import Hidden
 
 
-def test_what_hides_below_the_floor_is_looked_for():
-    """Small friction is looked for even if, with a delay, only noise seems to be left."""
+def test_friction_below_the_noise_floor_is_tried():
+    """Small friction is tried even if a delay alone already reduces the error to the noise."""
     fit, study = begun(
         Hidden(effect="coulomb_friction", place=1, parameters={"force": 2.4e-6}),
         Hidden(effect="input_delay", parameters={"delay": 0.014}),

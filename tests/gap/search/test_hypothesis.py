@@ -1,4 +1,4 @@
-"""The gain in fit that justifies an effect."""
+"""An effect is accepted only if it improves the fit enough."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -32,17 +32,17 @@ def judged(
 @pytest.mark.parametrize(
     ("child", "worth"),
     [
-        ({"chi": 2.0, "held": 2.0}, True),  # 100 ln 3 in the training runs and in the held-out runs
+        ({"chi": 2.0, "held": 2.0}, True),  # improves both by 100 ln 3
         (
             {"chi": 2.0, "held": 2.0, "n_independent": 5.0},
             False,
-        ),  # what is left swings: little is n_independent
-        ({"chi": 1.0, "held": 7.0}, False),  # a gain in the fitted runs only
-        ({"chi": 5.6, "held": 5.7}, False),  # too small a gain for the criterion
+        ),  # few residuals are independent, because they oscillate
+        ({"chi": 1.0, "held": 7.0}, False),  # improves only the training runs
+        ({"chi": 5.6, "held": 5.7}, False),  # improves too little for the criterion
     ],
 )
-def test_an_effect_is_worth_it_by_independent_residuals(child, worth):
-    """An effect must improve training and held-out runs, by independent residuals."""
+def test_an_effect_must_improve_training_and_held_out_runs(child, worth):
+    """An effect must improve training and held-out runs, counted in independent residuals."""
     parent = judged(CUBIC, chi=6.0, held=6.0)
     both = judged(CUBIC, DELAY, **child)
     study: Any = SimpleNamespace(explains=lambda h: True)
@@ -54,8 +54,8 @@ def test_an_effect_is_worth_it_by_independent_residuals(child, worth):
     [(0.014, False, 0.0, True), (0.012, False, 0.0, False), (0.014, True, 0.0, False),
      (0.014, False, 0.01, False)],
 )  # fmt: skip
-def test_a_name_that_leaves_more_than_noise_says_so(error, contact, repeatability, said):
-    """If more than noise is left, effects may be missing, except with contacts or poor repeats."""
+def test_more_than_noise_may_mean_missing_effects(error, contact, repeatability, said):
+    """If more than noise remains, effects may be missing, except with contacts or poor repeats."""
     chosen: Any = SimpleNamespace(error=error, has_contact=contact)
     study: Any = SimpleNamespace(floor=0.01, repeatability=repeatability)
     assert Study.may_be_half(study, chosen) == said

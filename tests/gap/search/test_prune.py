@@ -14,8 +14,8 @@ from tests.gap.search.begun import COULOMB, DAHL, DELAY, begun
 from tests.truth.bench import Hidden
 
 
-def test_a_richer_law_that_explains_no_more_gives_way():
-    """Friction that yields over almost no distance is replaced by plain dry friction."""
+def test_a_richer_law_that_explains_no_more_is_replaced():
+    """Presliding friction that yields over almost no distance is replaced by plain dry friction."""
     fit, study = begun(
         Hidden(effect="coulomb_friction", place=1, parameters={"force": 0.0006}),
         Hidden(effect="input_delay", parameters={"delay": 0.015}),
@@ -37,8 +37,8 @@ def test_a_richer_law_that_explains_no_more_gives_way():
 
 
 @pytest.mark.parametrize(("value", "nothing"), [(0.015, False), (1e-4, True)])
-def test_an_effect_of_zero_within_its_error_is_reported(value, nothing):
-    """A delay is named only if it is three standard errors from zero."""
+def test_an_effect_of_zero_within_its_error_is_not_significant(value, nothing):
+    """With a standard error of 1 ms, a delay of 15 ms is significant, and one of 0.1 ms is not."""
     fit, study = begun(Hidden(effect="input_delay", parameters={"delay": 0.015}))
     chain = fit.structure.chain(fit.theta)
     delay = make_candidate(
@@ -50,4 +50,4 @@ def test_an_effect_of_zero_within_its_error_is_reported(value, nothing):
 
     (found,) = significance(replace(known, covariance=sure))
     assert (found < SURE) == nothing
-    assert significance(known) == [np.inf]  # without a standard error no statement is possible
+    assert significance(known) == [np.inf]  # without a standard error nothing can be said

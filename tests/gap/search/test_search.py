@@ -33,8 +33,8 @@ def searched(*hidden: Hidden, seconds: float | None = None) -> Search:
         ((LATE, FRICTION), "named", {COULOMB, DELAY}),
     ],
 )
-def test_what_is_hidden_is_named(hidden, verdict, found):
-    """The search names the hidden effects, if any, one in each step."""
+def test_hidden_effects_are_named(hidden, verdict, found):
+    """The search names the hidden effects, if there are any, one at each step."""
     search = searched(*hidden)
 
     assert search.verdict == verdict
@@ -49,7 +49,7 @@ def test_what_is_hidden_is_named(hidden, verdict, found):
 
 
 def test_without_time_the_linear_model_is_the_answer():
-    """Past the time limit no effect is tried, and the linear model is returned."""
+    """After the time limit, no effect is tried, and the linear model is returned."""
     search = searched(FRICTION, seconds=0.0)
 
     assert search.deadline.cut

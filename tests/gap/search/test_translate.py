@@ -1,4 +1,4 @@
-"""From laws to effects and back: places, columns, adding and removing an effect."""
+"""Effects are translated to laws of the fit and back."""
 
 import numpy as np
 import pytest
@@ -21,11 +21,11 @@ ALL = frozenset().union(*(filled(effect) for effect in CATALOGUE))
         (Kind.COULOMB_FRICTION, [(True, True)], [0, 1]),
         (Kind.COULOMB_FRICTION, [(False, True), (False, True)], [1]),  # cart 1 is always held
         (Kind.CUBIC_SPRING, [(True, True)], [0, 1, 2]),
-        (Kind.CUBIC_SPRING, [(True, False)], [0]),  # springs 1 and 2 stretch equally, 3 never
+        (Kind.CUBIC_SPRING, [(True, False)], [0]),  # springs 1, 2 stretch equally
     ],
 )
-def test_a_law_is_looked_for_where_it_would_show(kind, free, places):
-    """Effects are tried only at places where they would show, and once for equal springs."""
+def test_an_effect_is_tried_only_where_it_would_show(kind, free, places):
+    """An effect is tried only at places where it would show, and once for equal stretches."""
     bench = FollowedBench(
         chain=PRESETS["throne-2dof"], springs=(True,) * 3, largest=1.0, free=tuple(free)
     )
@@ -34,8 +34,8 @@ def test_a_law_is_looked_for_where_it_would_show(kind, free, places):
 
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
-def test_values_are_read_back_from_the_columns(effect):
-    """The values of an effect are recovered, even if one is stored as a difference."""
+def test_values_are_recovered_from_the_columns(effect):
+    """The values of an effect are recovered from the simulator's columns."""
     values = tuple(0.3 * (1.0 + i) for i in range(len(effect.names)))
     columns = effect.columns(effect.named(values))
     np.testing.assert_allclose(values_of(effect, columns), values, rtol=1e-12)
@@ -43,13 +43,13 @@ def test_values_are_read_back_from_the_columns(effect):
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
 def test_every_effect_has_its_law(effect):
-    """Each effect has a law in the fit for every column of the simulator that it uses."""
+    """Each column of the simulator that an effect uses belongs to a law of the fit."""
     laws = column_set([column for columns in COLUMNS for column in columns])
     assert filled(effect) <= laws | column_set(DRIVE_COLUMNS)
 
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
-def test_an_effect_put_into_a_model_and_taken_out_leaves_it(effect):
+def test_adding_and_removing_an_effect_changes_nothing(effect):
     """An effect added to a model and removed again leaves the model unchanged."""
     chain = PRESETS["throne-2dof"]
     case = make_case(seed=44, n=2, rate=113.1)

@@ -51,7 +51,7 @@ def verdict_on(*steps: Any, others: tuple[Any, ...] = ()) -> tuple[str, set[Any]
     return verdict, set(stand[-1].key), close
 
 
-def test_an_effect_beside_which_another_does_as_well_alone_is_taken_back():
+def test_an_effect_that_a_later_one_makes_needless_is_removed():
     """If the effect found second explains as much alone, the first is taken back."""
     delay = hypothesis(DELAY, error=0.25, bic=-10)
     both = hypothesis(DELAY, COULOMB, error=0.2, bic=-500)
@@ -70,7 +70,7 @@ def test_an_effect_beside_which_another_does_as_well_alone_is_taken_back():
         ((DRAG, SECOND), "ambiguous"),
     ],
 )
-def test_effects_that_only_together_explain_have_rivals_too(rival, verdict):
+def test_two_effects_with_equal_rivals_are_ambiguous(rival, verdict):
     """If two other effects explain as much as the two found, the verdict is "ambiguous"."""
     one = hypothesis(COULOMB, error=0.2, bic=-100)
     both = hypothesis(COULOMB, SECOND, error=0.015, bic=-1000)
@@ -80,7 +80,7 @@ def test_effects_that_only_together_explain_have_rivals_too(rival, verdict):
     assert close == ([same] if verdict == "ambiguous" else [])
 
 
-def test_a_rival_far_less_likely_is_none():
+def test_a_much_less_likely_hypothesis_is_no_rival():
     """A hypothesis whose BIC is higher by forty is no rival."""
     one = hypothesis(COULOMB, error=0.2, bic=-100)
     both = hypothesis(COULOMB, SECOND, error=0.015, bic=-1000)
@@ -89,7 +89,7 @@ def test_a_rival_far_less_likely_is_none():
 
 
 @pytest.mark.parametrize(("held", "verdict"), [(1.0, "ambiguous"), (1.05, "named")])
-def test_runs_held_out_are_evidence_too(held: float, verdict: str):
+def test_held_out_runs_are_evidence_too(held: float, verdict: str):
     """A rival is excluded by training and held-out runs together."""
     drag = hypothesis(DRAG, error=0.01, bic=-1000)
     cubic = hypothesis(CUBIC, error=0.01, bic=-970, held=held)

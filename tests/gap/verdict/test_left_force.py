@@ -16,9 +16,9 @@ from pipeline.plant.nonlinear.effects import CATALOGUE
 from pipeline.results import Kind, Record
 from pipeline.set_up import Bench
 
-Law = Callable[[float, float, float], float]  # of position, velocity and input
+Law = Callable[[float, float, float], float]  # arguments: position, velocity and input
 
-COUNT = 0.00227  # cm, of an encoder
+COUNT = 0.00227  # cm, one encoder step
 RATE, SUBSTEPS, DURATION = 250.0, 4, 8.0
 CARTS = {
     1: Chain(m=np.array([2e-4]), c=np.array([4e-4]), k=np.array([0.035, 0.0])),
@@ -27,9 +27,10 @@ CARTS = {
 
 
 def record(chain: Chain, law: Law, *, cart: int, kind: Kind, size: float, seed: int) -> Record:
-    """Return one run of carts on springs, with an extra law of force on one cart.
+    """Return one run of carts on springs, with an additional force on one cart.
 
-    It uses Heun's method with steps of 1 ms, whole encoder steps, and noise of a third of a step.
+    It is simulated by Heun's method with steps of 1 ms. Readings are whole encoder steps, with
+    noise of 0.3 steps.
     """
     n = chain.n
     t = np.arange(int(DURATION * RATE)) / RATE
@@ -70,7 +71,7 @@ def record(chain: Chain, law: Law, *, cart: int, kind: Kind, size: float, seed: 
 
 
 def recordings(law: Law, *, carts: int = 1, cart: int = 1) -> list[Record]:
-    """Return a lab with sweeps, steps and decays."""
+    """Return the recordings of a lab with sweeps, steps and decays."""
     plan: tuple[tuple[Kind, float], ...] = (
         ("sweep", 0.05), ("sweep", 0.03), ("step", 0.08), ("step", 0.05), ("decay", 2.0),
         ("decay", 1.2),
@@ -102,10 +103,10 @@ def left_by_the_chain(records: list[Record], *, springs: tuple[bool, ...]) -> tu
     ],
     ids=["drag", "root friction", "van der Pol", "force by place", "two laws"],
 )
-def test_a_law_is_read_off_what_it_leaves(law, terms):
-    """From the unexplained force the terms of a law are found to 6 %, and no other terms.
+def test_a_law_is_found_from_the_unexplained_force(law, terms):
+    """The terms of a law are found from the unexplained force to 6 %, and no other terms.
 
-    That is three stated standard errors of the least certain term, the square root.
+    The least certain term, the square root, has a standard error of 2 %.
     """
     (residual,) = left_by_the_chain(recordings(law), springs=(True, False))
 
@@ -117,15 +118,15 @@ def test_a_law_is_read_off_what_it_leaves(law, terms):
 
 
 def test_noise_has_no_formula():
-    """The residual of a right model gets no formula."""
+    """If the model is right, the residual gets no formula."""
     (residual,) = left_by_the_chain(recordings(lambda x, v, u: 0.0), springs=(True, False))
 
     assert residual.formula is None
     assert all(shown.formula is None for shown in residual.against)
 
 
-def test_the_force_is_on_the_cart_that_it_acts_on():
-    """Of two carts only the one on which the law acts gets a formula."""
+def test_the_formula_is_for_the_cart_on_which_the_law_acts():
+    """If the law acts on cart 2, cart 2 gets the formula, and the force on cart 1 is small."""
     records = recordings(lambda x, v, u: -6e-5 * v * abs(v), carts=2, cart=2)
 
     first, second = left_by_the_chain(records, springs=(True, True, True))
@@ -141,7 +142,7 @@ def test_the_force_is_on_the_cart_that_it_acts_on():
 
 
 def test_an_effect_that_the_catalogue_lacks_is_described():
-    """If the catalogue lacks drag, the gap is unexplained, and the formula of drag is found."""
+    """If the catalogue lacks drag, drag is not named, but its formula is found."""
     catalogue = [effect for effect in CATALOGUE if effect.key != "quadratic_drag"]
 
     gap = explain_gap(

@@ -349,10 +349,7 @@ def test_every_needed_package_is_pinned_to_its_installed_version():
     ],
 )
 def test_export_refuses_arguments_that_do_not_go_together(tmp_path, arguments, said):
-    """`export` accepts grades and a platform, or a rubric and a zip file;
-
-    other mixtures are errors.
-    """
+    """`export` accepts grades and a platform, or a rubric and a zip file, but no mixture."""
     done = cartlab_here("export", *arguments, cwd=tmp_path)
     assert done.returncode == 2
     assert said in done.stderr

@@ -51,10 +51,7 @@ def school(tmp_path_factory):
 
 
 def run(paths, out, *, jobs=1, time_limit=PATIENCE, execute=None, progress=lambda *_: None):
-    """Grade into a new gradebook;
-
-    return the batch, and the outcome and grade of each submission.
-    """
+    """Grade into a new gradebook; return the batch, and outcome and grade of each submission."""
     scratch = out / "scratch"
     scratch.mkdir(parents=True, exist_ok=True)
     with Gradebook(out, create=True) as book:

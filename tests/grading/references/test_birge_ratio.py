@@ -26,10 +26,7 @@ def with_gain_off(analysis: Analysis, *, sigmas: float) -> Analysis:
 
 @pytest.mark.parametrize("sigmas", [0.0, 30.0])
 def test_the_errors_grow_with_the_contradiction(sigmas):
-    """All fitted gains' standard errors grow by the gains' Birge ratio;
-
-    those of frequencies do not.
-    """
+    """All standard errors of fitted gains grow by the gains' Birge ratio, and no others."""
     analysis = with_gain_off(student(2).analysis, sigmas=sigmas)
     apart = [
         (row.initial.value - row.final.value) / np.hypot(row.initial.std or 0, row.final.std or 0)
