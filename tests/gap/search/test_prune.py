@@ -50,4 +50,4 @@ def test_an_effect_of_zero_within_its_error_is_not_significant(value, nothing):
 
     (found,) = significance(replace(known, covariance=sure))
     assert (found < SURE) == nothing
-    assert significance(known) == [np.inf]  # without a standard error nothing can be said
+    assert significance(known) == [np.inf]  # without a standard error it counts as significant
