@@ -24,13 +24,13 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-# One thread per tool, so that processor time is that of one core. Set before numpy is loaded.
+# With one thread per tool, processor time is that of one core. This must be set before numpy is
+# loaded.
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 
 from benchmarks.page import section, write_page
 
-# The comparisons with other tools, those on published data, and the promises about cartlab's own
-# results.
+# comparisons with other tools, on published data, and of what cartlab promises about itself
 PAGES = {
     "README.md": ("bode", "gap_tools", "grading", "report"),
     "published.md": ("silverbox", "emps", "friction"),
@@ -41,7 +41,7 @@ FOLDER = Path(__file__).parent
 
 
 def main() -> None:
-    """Make the sections of the benchmarks that the user names."""
+    """Run the benchmarks that the user names, and write their sections."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks")
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS))
     parser.add_argument("--quick", action="store_true", help="small, to test that it runs")

@@ -1,4 +1,4 @@
-"""How reliable acquisition is: speed, faults, limits, a killed host.
+"""How reliable acquisition is: speed, faults, limits, and a killed host.
 
     python -m benchmarks.acquire [--minutes 10] [--faulty-seconds 30] [--stops 20] [--kills 100]
 
@@ -32,7 +32,7 @@ FAULTS = ("drop", "garble", "merge", "delay")
 
 
 class _Once(Notes):
-    """An observer that never repeats a recording and keeps no lines."""
+    """An observer that never repeats a recording and ignores all lines."""
 
     def confirm(self, instruction: str) -> None:
         """Refuse, as nobody is there to confirm."""
@@ -43,7 +43,7 @@ class _Once(Notes):
 
 
 def stream(folder: Path, *, minutes: float) -> None:
-    """Stream at 1 kHz; print lost lines and the processor time of host and emulator."""
+    """Stream at 1 kHz; print the lost lines, and the processor time of host and emulator."""
     write_work(folder, [sine("long", seconds=60 * minutes)])
     with emulator() as bench:
         process = psutil.Process(bench.pid)
@@ -68,7 +68,7 @@ def stream(folder: Path, *, minutes: float) -> None:
 
 
 def faults(folder: Path, *, seconds: float) -> None:
-    """Damage 1 % of the lines in each way; check that good lines are kept, faults counted."""
+    """Damage 1 % of the lines by each kind of fault; check that the good lines are kept."""
     write_work(folder, [sine("faulty", seconds=seconds)])
     options = [option for kind in FAULTS for option in ("--fault", f"{kind}=0.01")]
     with emulator(*options) as bench:
@@ -90,7 +90,7 @@ def faults(folder: Path, *, seconds: float) -> None:
 
 
 def stops(folder: Path, *, n: int) -> None:
-    """Pass the travel limit; print the ms from the line that passes it to the bench's last line."""
+    """Pass the travel limit; print the time from the first line beyond it to the last line, ms."""
     delays = []
     with emulator() as bench:
         for trial in range(n):
@@ -110,7 +110,7 @@ def stops(folder: Path, *, n: int) -> None:
 
 
 def kills(folder: Path, *, n: int) -> None:
-    """Kill the host at random; print what the raw file lacks, and when the motor stops."""
+    """Kill the host at random; print how much the raw file lacks, and when the motor stops."""
     rng, missing, off = np.random.default_rng(0), [], []
     with emulator() as bench:
         for trial in range(n):
@@ -125,8 +125,8 @@ def kills(folder: Path, *, n: int) -> None:
             sent = bench.event("run")["lines"]
             run = read_raw(raw)
             kept = readings_of(run)
-            # The bench streams on until its watchdog acts; the host was killed up to 30 ms after
-            # its last heartbeat.
+            # The bench streams until its watchdog acts; the last heartbeat was up to 30 ms before
+            # the kill.
             missing.append(1.0024 * sent - silent - (kept[-1].ms if kept else 0))
             off.append(silent)
             while not _is_quiet(bench):

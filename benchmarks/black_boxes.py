@@ -19,13 +19,13 @@ from scipy.optimize import least_squares
 
 from pipeline.arrays import Array
 
-_NEAR = 1.1  # times the least error: within this factor, fewer terms are preferred
-_FAR = 1e3  # times the largest motion: a run that gets that far has diverged
+_NEAR = 1.1  # a model within this factor of the least error is preferred if it has fewer terms
+_FAR = 1e3  # times the largest motion; a run that gets so far has diverged
 
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """One record of one cart at even times: input and position, both (n,).
+    """One record of one cart at even times, with input and position, both of shape (n,).
 
     `source` is cartlab's run of the same record, for its own model.
     """
@@ -33,8 +33,8 @@ class Part:
     dt: float
     u: Array
     y: Array
-    held: bool = True  # the input is held from sample to sample; otherwise it is band-limited
-    first: int = 48  # first sample to judge: the samples before it start a model that has a memory
+    held: bool = True  # true: the input is held between samples; false: it is band-limited
+    first: int = 48  # first sample to judge; earlier samples start a model that has a memory
     source: Any = None
 
 
@@ -56,7 +56,7 @@ def error(model: Model, parts: Sequence[Part]) -> float:
             warnings.simplefilter("ignore")
             found = model.run(part)
         judged = slice(-(-part.first // model.every), None)
-        y = part.y[:: model.every][: found.size][judged]  # thinned, the last few may be left over
+        y = part.y[:: model.every][: found.size][judged]  # thinning may leave over a few
         if not np.all(np.abs(found) < _FAR * np.abs(part.y).max()):
             return np.inf
         off += float(np.sum((found[judged] - y) ** 2))
@@ -83,7 +83,7 @@ def _thinned(part: Part, every: int) -> tuple[Array, Array]:
 
 # -------------------------------------------------------------------------- PySINDy
 
-# By name: terms of position, velocity and input that an engineer would put into the library.
+# Terms of position, velocity and input that an engineer would put into the library, by name.
 FEATURES: dict[str, Callable[[Any, Any, Any], Any]] = {
     "1": lambda x, v, u: 1.0 + 0 * x,
     "x": lambda x, v, u: x,
@@ -105,8 +105,8 @@ FEATURES: dict[str, Callable[[Any, Any, Any], Any]] = {
 }
 LINEAR = ("x", "v", "u")
 _SUBSTEPS = 2
-_ORDER, _SHARP = 4, 6  # of the differences, with and without smoothing
-_THRESHOLDS = (0.003, 0.006, 0.01, 0.02, 0.035, 0.06)  # of the acceleration
+_ORDER, _SHARP = 4, 6  # of the finite differences, with and without smoothing
+_THRESHOLDS = (0.003, 0.006, 0.01, 0.02, 0.035, 0.06)  # as a share of the acceleration
 
 
 def sindy(parts: Sequence[Part], *, windows: Sequence[int] = (5, 7, 11, 15)) -> Iterator[Model]:
@@ -123,8 +123,8 @@ def sindy(parts: Sequence[Part], *, windows: Sequence[int] = (5, 7, 11, 15)) -> 
                 order=_ORDER,
             )
         )
-        # The derivative belongs to the middle of an interval: between the input held before a
-        # sample and the one held after it.
+        # The derivative belongs to a sample, so its input is the mean of those held before and
+        # after it.
         u = [(part.u + np.roll(part.u, 1)) / 2 if part.held else part.u for part in parts]
         v = [np.asarray(smooth(part.y, part.dt)).ravel() for part in parts]
         states = [np.column_stack([part.y, slope]) for part, slope in zip(parts, v, strict=True)]
@@ -142,12 +142,12 @@ def sindy(parts: Sequence[Part], *, windows: Sequence[int] = (5, 7, 11, 15)) -> 
                 differentiation_method=smooth,
             )
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # a threshold above every term
+                warnings.simplefilter("ignore")  # ignores a threshold that removes all terms
                 model.fit(
                     states, t=[part.dt * np.arange(part.y.size) for part in parts],
                     u=[held[:, None] for held in u],
                 )  # fmt: skip
-            acceleration = np.asarray(model.coefficients())[1]  # dx/dt = v is known
+            acceleration = np.asarray(model.coefficients())[1]  # because dx/dt = v is known
             yield Model(
                 run=_integrated(acceleration, names, smooth),
                 every=1,
@@ -234,7 +234,7 @@ def frols(
             try:
                 model.fit(X=u if driven else None, y=y)
             except (ValueError, np.linalg.LinAlgError):
-                continue  # fewer terms than were asked for
+                continue  # there are fewer terms than requested
 
         def run(part: Part, model: Any = model, every: int = every) -> Array:
             u, y = _thinned(part, every)
@@ -283,7 +283,7 @@ def network(
             random_state=0,
         )
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the network has not converged yet
+            warnings.simplefilter("ignore")  # ignores that the network has not converged
             net.fit((X - mean) / std, Y / scale)
         layers = list(zip(net.coefs_, net.intercepts_, strict=True))
 
@@ -342,7 +342,7 @@ def recurrent(
         return params[2] @ x
 
     def by_state(params: Any, x0: Any) -> Any:
-        """Return the sum over the states of the norm of all weights that touch a state."""
+        """Return the sum over all states of the norm of the weights that belong to a state."""
         A, B, C, W1, _, _, W3 = params
         own = jnp.concatenate([A, A.T, B, C.T, W1.T, W3], axis=1)
         return jnp.sum(jnp.sqrt(jnp.sum(own**2, axis=1) + 1e-12))
@@ -382,7 +382,7 @@ def recurrent(
             near = [
                 *weights[2].ravel(),
                 1e-2,
-            ]  # the smallest state that explains the first readings
+            ]  # prefers a small state that explains the first readings
 
             def off(x0: Array) -> Array:
                 return _recurrent(weights, x0, u[:known]) - y[:known]
@@ -397,7 +397,7 @@ def recurrent(
 
 
 def _recurrent(weights: Sequence[Array], x0: Array, u: Array) -> Array:
-    """Return the network's free run from a state."""
+    """Return the network's free run from a given state."""
     A, B, C, W1, W2, b, W3 = weights
     x, out = x0, np.zeros(u.size)
     drive, push = W2[:, 0], B[:, 0]
@@ -410,9 +410,9 @@ def _recurrent(weights: Sequence[Array], x0: Array, u: Array) -> Array:
 
 
 STATES, CELLS = 4, 6
-ADAM, LBFGS = 1000, 1000  # as in its documentation
-_GONE = 1e-3  # a weight below it counts as removed by the lasso
-_SATURATED = 1000.0  # jax-sysid limits states to this size, also while it learns
+ADAM, LBFGS = 1000, 1000  # as in the tool's documentation
+_GONE = 1e-3  # below this, the lasso has removed a weight
+_SATURATED = 1000.0  # jax-sysid limits states to this size, also during learning
 TOOLS: tuple[tuple[str, str, Callable[..., Iterator[Model]]], ...] = (
     ("PySINDy", "pysindy", sindy),
     ("SysIdentPy, FROLS", "sysidentpy", frols),

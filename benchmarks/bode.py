@@ -40,8 +40,8 @@ measurements are wasted.
 TOOLS = ("control", "scikit-rf", "sdypy-EMA", "sippy_unipi")
 OURS = "cartlab"
 SEEDS = 24
-NOISES = (0.3, 1.0, 3.0)  # times 1 % of the amplitude and half an encoder count
-RECORD_NOISES = (0.0007, 0.00227, 0.007)  # cm; an encoder count is 0.00227
+NOISES = (0.3, 1.0, 3.0)  # times the usual noise: 1 % of the amplitude and half an encoder count
+RECORD_NOISES = (0.0007, 0.00227, 0.007)  # in cm; an encoder count is 0.00227 cm
 RATE, PERIODS = 50.0, 3  # Hz
 LARGEST = 1.0  # cm
 CARTS = (1, 2, 3)
@@ -51,7 +51,7 @@ _MARKS = "oDsv^P"
 
 @dataclass(frozen=True, kw_only=True)
 class Try:
-    """One fit: errors in units of the bound (infinite if it failed), whether right, CPU ms."""
+    """One fit: errors in units of the bound (infinite if it failed), success, CPU time in ms."""
 
     modes: float
     gains: float
@@ -63,12 +63,12 @@ Trials = dict[tuple[str, int, float], list[Try]]  # by tool, carts, noise
 
 
 def judged(find: Callable[[], Modes], *, truth: Modes, least: Modes) -> Try:
-    """Run one method and compare its result with the truth, in units of the bound."""
+    """Run one method and compare its result with the true values, in units of the bound."""
     start = time.process_time()
     try:
         found = find()
     except (DataError, RuntimeError, ValueError, ArithmeticError, LookupError):
-        found = None  # raised by methods that find no answer
+        found = None  # these errors mean that a method finds no answer
     milliseconds = 1e3 * (time.process_time() - start)
     if found is None:
         return Try(modes=np.inf, gains=np.inf, right=False, milliseconds=milliseconds)
@@ -92,7 +92,7 @@ def _rms(values: Array) -> float:
 
 
 def modes_named(chain: Chain, values: Sequence[float]) -> Modes:
-    """Return the resonances and gains among named parameters, which are what is compared."""
+    """Return the resonances and gains among named parameters; only these are compared."""
     named = dict(zip(chain.parameters(), values, strict=True))
     keys = "n" if chain.n == 1 else "abc"[: chain.n]
     zetas = ["zeta"] if chain.n == 1 else [f"zeta_{key}" for key in keys]
@@ -192,7 +192,7 @@ def from_records(*, seeds: int) -> Trials:
 def rows_of(
     data: str, trials: Trials, *, tools: Sequence[tuple[str, str]], middle: float
 ) -> list[list[str]]:
-    """Return a row for each tool: its error at the middle noise by carts, share right, and time."""
+    """Return a row for each tool: errors at the middle noise by carts, successes, and time."""
     rows = []
     for name, tool in ((OURS, ""), *tools):
         if tool and not installed(tool):
@@ -224,7 +224,7 @@ _HEAD += ("right", "ms of a core: 1, 2, 3 carts")
 
 
 def _speed(trials: Trials) -> list[float]:
-    """Return, for each chain, the median time of cartlab over that of `curve_fit`."""
+    """Return cartlab's median time divided by that of `curve_fit`, by number of carts."""
     times = {
         (name, n): np.median(
             [one.milliseconds for noise in NOISES for one in trials[name, n, noise]]
@@ -238,7 +238,7 @@ def _speed(trials: Trials) -> list[float]:
 def picture(
     kinds: Sequence[tuple[str, Trials, Sequence[float]]],
 ) -> Figure:
-    """Draw the error in units of the bound against the noise, by data and by carts."""
+    """Draw the error in units of the bound against the noise, for each kind of data and chain."""
     figure = Figure(figsize=(6.5, 5.2), layout="constrained")
     grid = figure.subplots(len(kinds), 3, sharey=True, squeeze=False)
     shown = list(dict.fromkeys(name for _, trials, _ in kinds for name, _, _ in trials))

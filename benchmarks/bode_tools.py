@@ -1,6 +1,6 @@
 """Find the resonances of a chain with other tools, each used as its documentation shows.
 
-`DWELL_TOOLS` use dwells. Those that fit a rational function use the paper's: a common denominator,
+`DWELL_TOOLS` use dwells. Some of them fit the paper's rational functions: a common denominator,
 K_i, and the zeros of cart i, as factors 1 + 2 ζ s/ω + (s/ω)². `RECORD_TOOLS` use time records.
 """
 
@@ -18,12 +18,12 @@ from benchmarks.identification import PAPER_STARTS
 from pipeline.arrays import Array, ComplexArray
 from pipeline.results import FrequencyResponse, Record
 
-_TINY = 1e-9  # position unit per input unit: a logarithm needs more than zero
+_TINY = 1e-9  # keeps a logarithm finite
 
 
 @dataclass(frozen=True, kw_only=True)
 class Modes:
-    """Resonances, ascending, and static gains by cart, as (n,); a modal analysis gives no gains."""
+    """Resonances in ascending order, and static gains by cart; a modal analysis gives no gains."""
 
     omega: Array
     zeta: Array
@@ -35,7 +35,7 @@ def modes_of(poles: ComplexArray, *, n: int, gains: Array | None) -> Modes:
 
     Raises
     ------
-    ArithmeticError : fewer than n modes oscillate.
+    ArithmeticError : if fewer than n modes oscillate.
     """
     upper = poles[np.imag(poles) > 0]
     if upper.size < n:
@@ -48,7 +48,7 @@ def modes_of(poles: ComplexArray, *, n: int, gains: Array | None) -> Modes:
 
 
 def factors(n: int) -> list[tuple[str, ...]]:
-    """Return the names of the factors: first the denominator's, then each numerator's."""
+    """Return the names of the factors, first of the denominator, then of each numerator."""
     of_carts = {1: ("",), 2: ("2", ""), 3: ("xy", "3", "")}[n]
     return [("n",) if n == 1 else tuple("abc"[:n]), *(tuple(cart) for cart in of_carts)]
 
@@ -64,7 +64,7 @@ def start_of(n: int) -> Array:
 
 
 def rational(p: Array, omega: Array, *, n: int) -> ComplexArray:
-    """Return the responses (n, n_w) of a vector of parameters."""
+    """Return the responses (n, n_w) for a vector of parameters."""
     s, at = 1j * omega, n
     products = []
     for keys in factors(n):
@@ -79,7 +79,7 @@ def rational(p: Array, omega: Array, *, n: int) -> ComplexArray:
 def _modes_of_vector(p: Array, *, n: int, phases: bool) -> Modes:
     omega, zeta = np.abs(p[n : 3 * n : 2]), p[n + 1 : 3 * n : 2] * np.sign(p[n : 3 * n : 2])
     order = np.argsort(omega)
-    # Magnitudes do not show the sign of a damping, but the user knows that it is positive.
+    # Magnitudes do not show the sign of a damping, but users know that dampings are positive.
     return Modes(omega=omega[order], zeta=(zeta if phases else np.abs(zeta))[order], gains=p[:n])
 
 
@@ -94,7 +94,7 @@ class Dwells:
 
     @classmethod
     def of(cls, responses: Sequence[FrequencyResponse]) -> "Dwells":
-        """Take the responses that cartlab fits."""
+        """Return the responses that cartlab fits, in this form."""
         turns = [np.exp(1j * (0.0 if r.phase is None else r.phase)) for r in responses]
         return cls(
             omega=responses[0].omega,
@@ -125,8 +125,8 @@ def nelder_mead(dwells: Dwells, *, log: bool) -> Modes:
             off[n:] = np.angle(np.exp(1j * off[n:]))
         return float(np.sum(off**2))
 
-    # xatol, fatol, 200 evaluations per parameter and the 5 % simplex are the defaults of both
-    # programs.
+    # These options are the defaults of both programs: xatol, fatol, 200 evaluations per parameter,
+    # and a simplex of 5 %.
     return _modes_of_vector(
         minimize(misfit, start_of(n), method="Nelder-Mead").x, n=n, phases=dwells.phases
     )
@@ -141,7 +141,7 @@ def curve_fitted(dwells: Dwells) -> Modes:
         return dwells.parts(rational(np.array(p), omega, n=n)).ravel()
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a covariance that could not be estimated
+        warnings.simplefilter("ignore")  # ignores that the covariance could not be estimated
         p, _ = curve_fit(
             model,
             dwells.omega,
@@ -165,7 +165,7 @@ def vector_fitted(dwells: Dwells) -> Modes:
         S[:, row, column] = G / scale
     hertz = dwells.omega / (2 * np.pi)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # warnings about passivity, which does not matter here
+        warnings.simplefilter("ignore")  # ignores passivity, which does not matter here
         fit = fitting.VectorFitting(skrf.Network(f=hertz, f_unit="hz", s=S, z0=50))
         fit.vector_fit(
             n_poles_real=0,
@@ -181,7 +181,7 @@ def vector_fitted(dwells: Dwells) -> Modes:
 
 CURVE_FIT = "scipy curve_fit"
 DWELL_TOOLS: tuple[tuple[str, str, bool, Callable[[Dwells], Modes]], ...] = (
-    # name, distribution, needs phases, how
+    # name, distribution, whether it needs phases, function
     ("Nelder–Mead, linear", "scipy", False, lambda d: nelder_mead(d, log=False)),
     ("Nelder–Mead, logarithms", "scipy", False, lambda d: nelder_mead(d, log=True)),
     (CURVE_FIT, "scipy", False, curve_fitted),
@@ -189,7 +189,7 @@ DWELL_TOOLS: tuple[tuple[str, str, bool, Callable[[Dwells], Modes]], ...] = (
 )
 
 
-# ------------------------------------------------------------------ from time records
+# ------------------------------------------------------------------ fits to time records
 
 
 def subspace(record: Record) -> Modes:
@@ -211,7 +211,7 @@ def subspace(record: Record) -> Modes:
 
 
 def realised(record: Record) -> Modes:
-    """Identify Markov parameters and realise them (ERA), both by python-control."""
+    """Estimate Markov parameters and realise them (ERA), both by python-control."""
     control = import_module("control")
     assert record.u is not None
     markov = control.markov(record.y, record.u[None], _MARKOV, dt=record.sample_time)
@@ -231,8 +231,8 @@ def _of_state_model(model: object, record: Record, *, scale: Array) -> Modes:
 def modal(record: Record, *, method: str) -> Modes:
     """Analyse the frequency responses of a periodic record by sdypy-EMA.
 
-    The first period is left out. Frequencies are multiplied by 100, because the windows in which
-    the tool gathers poles suit structures of hundreds of Hz.
+    Frequencies are multiplied by 100, because the windows in which the tool gathers poles suit
+    structures of hundreds of Hz.
     """
     ema = import_module("sdypy.EMA")
     n = len(record.y)
@@ -255,7 +255,7 @@ def modal(record: Record, *, method: str) -> Modes:
 
 
 def responses_of(record: Record) -> tuple[Array, ComplexArray]:
-    """Return frequencies (Hz) and X_i/U (n, n_w) without the first period and the hold's effect."""
+    """Return frequencies (Hz) and X_i/U (n, n_w), without first period and effect of the hold."""
     period = round(PERIOD / record.sample_time)
     assert record.u is not None
     U, Y = (
@@ -265,11 +265,11 @@ def responses_of(record: Record) -> tuple[Array, ComplexArray]:
     hertz = np.fft.rfftfreq(period, record.sample_time).astype(np.float64)
     hold = np.sinc(hertz * record.sample_time) * np.exp(-1j * np.pi * hertz * record.sample_time)
     G = np.zeros(Y.shape, dtype=np.complex128)
-    G[:, 1:-1] = Y[:, 1:-1] / U[1:-1] / hold[1:-1]  # neither mean nor Nyquist is excited
+    G[:, 1:-1] = Y[:, 1:-1] / U[1:-1] / hold[1:-1]  # without mean and Nyquist
     return hertz, G
 
 
-PERIOD = 10.0  # s, of the multisine
+PERIOD = 10.0  # period of the multisine in s
 MODAL_BAND = (0.3, 8.0)  # Hz
 _HORIZON, _MARKOV = 40, 400
 _ORDERS = {"lscf": 40, "rfp": 20}

@@ -20,18 +20,18 @@ from pipeline.simulated.emulator.carts import TRUE_PERIOD
 from pipeline.simulated.hidden import default_values, prepare_bench
 from pipeline.submission import Submission
 
-_SPREAD = 0.3  # scatter of the logarithms of masses, dampings and springs around those of a preset
+_SPREAD = 0.3  # scatter of the logarithms of masses, dampings and springs around a preset
 USUAL = (0.6, 1.6)  # times the usual size of an effect
-# In every driven run this effect acts as damping of the first cart. A constant force is never drawn
-# either, because cartlab looks for it in the rest points.
+# In every driven run, this effect acts as damping of the first cart. A constant force is never
+# drawn either, because cartlab finds it from the rest positions.
 _UNSEEN = ("drive_damping",)
 PAGE = Path(__file__).with_name("next.md")
-Named = tuple[str, int]  # an effect and where it sits
+Named = tuple[str, int]  # an effect and its place
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Drawn:
-    """A bench, its springs, and the effects hidden in it."""
+    """A bench, with its springs and hidden effects."""
 
     bench: SimulatedBench
     springs: tuple[bool, ...]
@@ -57,7 +57,7 @@ def draw(seed: int, *, effects: int, sizes: tuple[float, float] = USUAL) -> Draw
         if effect.only_rest or effect.key in _UNSEEN or not places:
             continue
         place = places[int(rng.integers(len(places)))]
-        # The size of a limit or a stop is its distance: a smaller distance has more effect.
+        # The size of a limit or a stop is its distance, and a smaller distance has more effect.
         mine = sizes if effect.parameters[0].neutral is not None else USUAL
         term = _sized(effect, place, chain, float(np.exp(rng.uniform(*np.log(mine)))))
         if not any(_alike(term.effect, other.effect) for other in terms):
@@ -67,10 +67,11 @@ def draw(seed: int, *, effects: int, sizes: tuple[float, float] = USUAL) -> Draw
 
 
 def counted(effect: Effect, place: int, value: float) -> Named:
-    """Return an effect under the name that counts: effects that data cannot separate share a name.
+    """Return an effect and its place as counted in the study.
 
-    The data show only the ratios of the sensors' gains, so all sensors count as one. A lag much
-    shorter than a tick of the bench counts as a delay.
+    Effects that the data cannot separate share a name. The data show only ratios of the sensors'
+    gains, so all sensors count as one. A lag much shorter than a tick of the bench counts as a
+    delay.
     """
     if effect.same_as == effect.key:
         return effect.key, 0
@@ -94,10 +95,10 @@ def acted(drawn: Drawn, submission: Submission) -> list[list]:
 
 
 def _sized(effect: Effect, place: int, chain: Chain, share: float) -> EffectTerm:
-    """Return the effect with its first parameter, and those tied to it, at a share of its size.
+    """Return an effect at a share of its usual size.
 
-    The share is of the difference from no effect. Both forces of dry friction grow together,
-    because a static force below the sliding one is impossible.
+    The first parameter's difference from no effect is multiplied by `share`. All forces of dry
+    friction are scaled together, because a static force below the sliding one is impossible.
     """
     values = default_values(effect, chain, place=place, travel=1.0)
     forces = [p.name for p in effect.parameters if p.unit == "input"] or [effect.names[0]]
@@ -122,7 +123,7 @@ def _alike(one: Effect, other: Effect) -> bool:
 def kept_rows(
     path: Path, wanted: Iterable[int], make: Callable[[int], dict], *, until: float
 ) -> list[dict]:
-    """Return the rows of a study: one JSON line each in the file, to which missing rows are added.
+    """Make the missing rows of a study, add them to its file as JSON lines, and return all rows.
 
     No new row is begun once the clock (`time.monotonic`) is past `until`.
     """
@@ -149,7 +150,7 @@ def run_study(
     first: int,
     count: int,
 ) -> None:
-    """Add the missing rows of a study, with options of the command line, and write its table."""
+    """Read the command line, add the missing rows of a study, and write its table."""
     parser = argparse.ArgumentParser(description=doc)
     parser.add_argument("--count", type=int, default=count)
     parser.add_argument("--minutes", type=float, default=np.inf, help="begin no bench after")

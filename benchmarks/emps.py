@@ -31,7 +31,7 @@ TOOLS = ()
 FILES = {"train": "DATA_EMPS.mat", "test": "DATA_EMPS_PULSES.mat"}
 SPRINGS = (False, False)
 
-# mm on the test record, from papers that cite the baselines.
+# errors on the test record in mm, from papers that cite the baselines
 _BASELINES = "baselines"
 PUBLISHED = (
     ("polynomial NARX", "5.17", _BASELINES),
@@ -59,14 +59,14 @@ def emps_record(name: str) -> Record:
 
 
 def free_run(model: AugmentedChain, record: Record) -> float:
-    """Return the error (m) of one simulation of a whole record, with nothing fitted to it."""
+    """Return the error (m) of one simulation of a whole record, without any fit to this record."""
     (run,) = prepare([record], springs=SPRINGS, notes=[])
     read = simulate_run(start_at(model, springs=SPRINGS), run, fresh_nuisance(run))
     return float(np.sqrt(np.mean((run.y - read) ** 2)))
 
 
 def tables(*, quick: bool) -> list[Table]:
-    """Return the errors on the test record, with the published ones."""
+    """Return the errors on the test record, together with published ones."""
     head = ["tool", "test record, mm", "training record, mm", "s of a core", "answer"]
     title = "One free run of each whole record: root mean square of the error"
     if quick or not (REAL_DATA / "emps" / FILES["test"]).exists():

@@ -4,7 +4,7 @@
     python -m benchmarks.endurance exploration [--hours 2]
     python -m benchmarks.endurance page
 
-The first two commands keep endurance.json, and the last writes endurance.md. With `--quick`, the
+The first two commands write endurance.json, and the last writes endurance.md. With `--quick`, the
 first two take about a minute each and only print. All random choices come from a seed, and servers
 listen at 127.0.0.1 only. The class needs PostgreSQL.
 """
@@ -67,18 +67,18 @@ from tests.helpers.waiting import PATIENCE, kill, until
 KEPT = Path(__file__).with_name("endurance.json")
 PAGE = Path(__file__).with_name("endurance.md")
 PRESET, ASSIGNMENT = "throne-2dof", "lab"
-SLIPS = (1.1, 0.9, 2.0, 0.5, 1 / (2 * np.pi), 100.0)  # factors by which a number is made wrong
-# After a start memory rises for some seconds, through imports, caches and cycles of dead objects.
-# These programs look for such cycles only after 300,000 new objects.
+SLIPS = (1.1, 0.9, 2.0, 0.5, 1 / (2 * np.pi), 100.0)  # factors of wrong numbers
+# After a start, memory rises for some seconds, because of imports, caches and cycles of dead
+# objects. Such cycles are collected only after 300,000 new objects.
 SETTLING = 480.0
 BLOCK = 60.0  # s over which memory is averaged, because neighbouring samples are not independent
-KILLED = {"desk": 5, "worker": 3, "connection": 2}  # how often each, while the desk is killed
-FOLDERS = 4  # number for each student
+KILLED = {"desk": 5, "worker": 3, "connection": 2}  # relative frequencies
+FOLDERS = 4  # folders of each student
 
 
 @dataclass(frozen=True, kw_only=True)
 class Size:
-    """The size of a run of the class; `rest` is the mean time between two kills, s."""
+    """The size of a run of the class; `rest` is the mean time between two kills in s."""
 
     minutes: float
     teams: int
@@ -95,8 +95,8 @@ class Size:
 def graded_class(place: str, size: Size, *, folder: Path, seed: int) -> list[Files]:
     """Grade a class into a gradebook and release it; return the recordings of each base submission.
 
-    A few simulated submissions, the bases, are analysed. Each team reports the numbers of one base,
-    with mistakes of its own, and is graded on them. Its figures are those of its base.
+    A few simulated submissions, called bases, are analysed. Each team reports the numbers of one
+    base with its own mistakes, and is graded on them. Its figures are those of its base.
     """
     rubric, draw = load_rubric(Path(PRESET)), random.Random(f"{seed} class")
     bases = [_base(folder / f"base-{n}", rubric, seed=seed + n) for n in range(size.bases)]
@@ -154,13 +154,13 @@ def _with_slips(base: Reporter, draw: random.Random) -> Reporter:
 
 @dataclass(kw_only=True)
 class Memory:
-    """Resident memory of some processes over time: s since the start, and MB."""
+    """Resident memory of some processes in MB, and the time since the start in s."""
 
     at: list[float] = field(default_factory=list)
     mb: list[float] = field(default_factory=list)
 
     def add(self, at: float, processes: Sequence[psutil.Process]) -> None:
-        """Note the memory of the processes now; an ended process counts as 0."""
+        """Record the memory of the processes now; an ended process counts as 0."""
         total = 0.0
         for process in processes:
             with suppress(psutil.NoSuchProcess):
@@ -193,7 +193,7 @@ class Memory:
 
 @dataclass(kw_only=True)
 class Server:
-    """The desk of a lab server in its own process, killed and started again at its port."""
+    """The desk of a lab server in its own process, killed and started again at the same port."""
 
     users: Path
     port: int
@@ -218,7 +218,7 @@ class Server:
         until(ready, "the desk")
 
     def tree(self) -> tuple[list[psutil.Process], list[psutil.Process]]:
-        """Return the desk, and the workers that it started."""
+        """Return the process of the desk, and those of its workers."""
         assert self.process is not None
         own = psutil.Process(self.process.pid)
         workers = [
@@ -229,7 +229,7 @@ class Server:
         return [own], workers
 
     def kill(self) -> None:
-        """Kill only the desk; its own processes end with it."""
+        """Kill only the desk, and count its child processes that do not end by themselves."""
         assert self.process is not None
         children = psutil.Process(self.process.pid).children(recursive=True)
         self.process.kill()
@@ -238,7 +238,7 @@ class Server:
         self.outlived += len(left)
 
     def stop(self) -> float:
-        """End the desk as an administrator does; return how long that took, s."""
+        """End the desk as an administrator does, and return how long this took in s."""
         assert self.process is not None
         began = time.monotonic()
         self.process.terminate()
@@ -254,7 +254,7 @@ def _words(process: psutil.Process) -> list[str]:
 
 
 def write_lab(base: Path, place: str, *, students: int) -> Path:
-    """Make the folders of a lab and its file of users."""
+    """Make the folders of a lab and the file of its users; return the file."""
     users = [_user(name, "ta", gradebooks=[place]) for name in ("Ada", "Bob")]
     for number, team in enumerate(team_names(students)):
         folders = [student_folder(number, k) for k in range(FOLDERS)]
@@ -314,7 +314,7 @@ def run_class(size: Size, *, seed: int) -> dict[str, Any]:
     """Let a class be graded while students upload and processes are killed; return the findings."""
     with tempfile.TemporaryDirectory() as scratch, postgres.running() as place:
         base = Path(scratch)
-        os.environ["XDG_STATE_HOME"] = str(base / "state")  # the desks' log
+        os.environ["XDG_STATE_HOME"] = str(base / "state")  # for the desk's log
         recordings = graded_class(place, size, folder=base / "bases", seed=seed)
         users = write_lab(base, place, students=size.students)
         lab = Lab(port=_free_port(), teams=team_names(size.teams), pace=size.pace)
@@ -437,7 +437,7 @@ def _count_said(log: Path) -> dict[str, int]:
 
 
 def _page_times(journal: Journal) -> dict[str, dict[str, float]]:
-    """Return for each page the number of answers and how long they took, s."""
+    """Return for each page the number of answers and their times in s."""
     times: Mapping[str, list[float]] = defaultdict(list)
     for page, seconds in journal.times:
         times[page].append(seconds)
@@ -454,9 +454,9 @@ def _page_times(journal: Journal) -> dict[str, dict[str, float]]:
 
 
 def run_exploration(*, hours: float, speed: float, seed: int) -> dict[str, Any]:
-    """Explore a fast virtual bench until its time is up; return how its memory developed.
+    """Explore a fast virtual bench until its time is up; return its memory over time.
 
-    The goal cannot be reached, so that only the time ends the exploration.
+    The goal is unreachable, so that only the time limit ends the exploration.
     """
     memory, load = Memory(), []
     allowed = 3600 * hours
@@ -591,7 +591,7 @@ def class_words(made: Mapping[str, Any]) -> str:
 
 
 def exploration_words(made: Mapping[str, Any]) -> str:
-    """Return how an exploration ended, and what memory it took."""
+    """Return how an exploration ended and how much memory it took."""
     return "\n".join(
         [
             f"- {made['bench_seconds'] / 60:.0f} minutes at the bench of "
@@ -618,7 +618,7 @@ def load_words(made: Mapping[str, Any]) -> str:
 
 
 def page_table(pages: Mapping[str, Mapping[str, float]]) -> str:
-    """Return a Markdown table of answer times: slow pages first, most others together."""
+    """Return a Markdown table of answer times, with slow pages first and most others together."""
     lines = [
         "| page or form | answers | median | 99 % | most | over 1 s |",
         "|---|---|---|---|---|---|",

@@ -21,7 +21,7 @@ class Found:
     spoilt: list[str] = field(default_factory=list)
 
     def count(self, change: Change, times: int) -> None:
-        """Note a change that should be stored once, but was stored this number of times."""
+        """Record an error if a change was lost, or was stored more than once."""
         if change.confirmed and times == 0:
             self.lost.append(_say(change))
         if times > 1:
@@ -33,7 +33,7 @@ def _say(change: Change) -> str:
 
 
 def check_book(place: str, journal: Journal, *, teams: Sequence[str], found: Found) -> None:
-    """Look for each change in the gradebook: once if it was confirmed, else at most once."""
+    """Check that each confirmed change is stored once, and any other at most once."""
     with RequestBook(place) as book:
         given: dict[tuple[str, str, str], list[Any]] = defaultdict(list)
         for team, one in book.changes_since(0):
@@ -73,7 +73,7 @@ def check_book(place: str, journal: Journal, *, teams: Sequence[str], found: Fou
         elif change.kind == "answer":
             told = steps[team, criterion, "answered", change.token]
             found.count(change, told)
-            # An answer and the points that it gives are stored together, or not at all.
+            # An answer and its points must be stored together, or neither of them.
             if len(given[team, criterion, change.token]) > told:
                 found.spoilt.append(f"{_say(change)}: its points without it")
         if change.kind in ("points", "together"):
@@ -87,7 +87,7 @@ def check_book(place: str, journal: Journal, *, teams: Sequence[str], found: Fou
 def check_folders(
     folders: Mapping[tuple[str, str], Path], journal: Journal, *, found: Found
 ) -> None:
-    """Look for each recording and each note in the folders, by student and number."""
+    """Check that the folders have each recording and each note, by student and folder number."""
     mine: dict[tuple[str, str], list[Change]] = defaultdict(list)
     for change in journal.sent:
         if change.kind in ("upload", "row"):

@@ -1,7 +1,7 @@
 """Scripted TAs and students of a lab server, and a journal of everything that they sent.
 
-Each person is a browser without scripts, in its own thread, and chooses its next action by chance.
-When the desk is killed, all wait until it is back and open their page again.
+Each person is a browser without scripts, in its own thread, and chooses its next action at random.
+If the desk is killed, all wait until it is back and open their page again.
 """
 
 import hashlib
@@ -20,7 +20,7 @@ from tests.helpers.desks import Answer, Visitor, through_proxy
 
 RESTS_OF_TA = (1.0, 4.0)  # s between two actions
 RESTS_OF_STUDENT = (10.0, 30.0)
-FULL = 40  # recordings in one folder; then a student continues in the next folder
+FULL = 40  # when a folder has this many recordings, the student continues in the next one
 _MOST_TOGETHER = 8  # teams that get the same points in one change
 
 Files = Sequence[tuple[str, bytes]]
@@ -32,11 +32,11 @@ class Change:
 
     Attributes
     ----------
-    kind : points, together, request, answer, reopened, upload, row.
-    where : team and criterion; or number of the folder, file or experiment.
+    kind : one of points, together, request, answer, reopened, upload and row.
+    where : team and criterion, or the number of the folder and the file or experiment.
     token : a text that nobody else sends, or the digest of a file.
-    teams : the teams that get the same points.
-    confirmed : whether the desk answered that the change is done.
+    teams : teams that get the same points.
+    confirmed : whether the desk answered that the change is stored.
     """
 
     kind: str
@@ -50,12 +50,12 @@ class Change:
 
 @dataclass(kw_only=True)
 class Journal:
-    """Everything that was sent, the time of each answer, and wrong answers.
+    """Everything that was sent, the time of each answer, and all refused forms.
 
     Attributes
     ----------
-    times : page and s of each answer.
-    refused : status and page of each form that was refused.
+    times : page and seconds of each answer.
+    refused : status, page and message of each form that was refused.
     """
 
     sent: list[Change] = field(default_factory=list)
@@ -73,11 +73,11 @@ class Gone(Exception):
 
 @dataclass(kw_only=True)
 class Lab:
-    """State shared by all people: the desk's port, whether it runs, whether the lab is over.
+    """State shared by all people: the desk's port, whether it runs, and whether the lab is over.
 
     Attributes
     ----------
-    pace : factor by which the pauses between two actions are shorter.
+    pace : factor by which the pauses between two actions are shortened.
     """
 
     port: int
@@ -89,7 +89,7 @@ class Lab:
 
 
 class Person(threading.Thread):
-    """A person who does one action after another; errors of the script itself are kept."""
+    """A person who does one action after another; `fault` is an error of the script."""
 
     rests = RESTS_OF_TA
 
@@ -113,11 +113,11 @@ class Person(threading.Thread):
             raise
 
     def habits(self) -> Mapping[Callable[[], None], float]:
-        """Return the actions of this person, each with its frequency."""
+        """Return the actions of this person with their relative frequencies."""
         raise NotImplementedError
 
     def finish(self) -> None:
-        """Do the remaining work when the lab is over."""
+        """Do what remains when the lab is over."""
 
     def _rest(self, least: float) -> None:
         self.lab.over.wait(self.draw.uniform(least, self.rests[1]) / self.lab.pace)
@@ -144,7 +144,7 @@ class Person(threading.Thread):
         return answer.text
 
     def post(self, page: str, path: str, change: Change, fields: Mapping[str, Any]) -> None:
-        """Send a form; the change is confirmed by the answer."""
+        """Send a form; the desk's answer confirms the change."""
         body = urlencode(fields, doseq=True).encode()
         kind = "application/x-www-form-urlencoded"
         self._send(page, change, lambda: self._visitor.send(path, body, kind=kind))
@@ -175,14 +175,14 @@ class Person(threading.Thread):
 
 
 class Assistant(Person):
-    """A TA: reviews teams, gives points, decides for several at once, answers requests."""
+    """A TA who reviews teams, gives points, also to several teams, and answers requests."""
 
     def habits(self) -> Mapping[Callable[[], None], float]:
-        """Return the actions: mostly reviews."""
+        """Return the actions, which are mostly reviews."""
         return {self.look: 2, self.review: 6, self.decide: 1, self.answer: 3, self.read: 1}
 
     def look(self) -> None:
-        """Open the class page, filtered or not, with its figure and its news, as a browser does."""
+        """Open the class page, perhaps filtered, with its figure and news, as a browser does."""
         asked = self.draw.choice([{}, {"seen": "no"}, {"state": "remark"}, {"order": "points"},
                                   {"page": "3"}, {"q": "12"}])  # fmt: skip
         text = self.get("class", f"/grades/0/?{urlencode(asked)}")
@@ -276,11 +276,11 @@ class Assistant(Person):
 
 
 class Student(Person):
-    """A student: uploads recordings, saves rows, reads feedback, asks for another review.
+    """A student who uploads recordings, saves rows, reads feedback and asks for reviews.
 
     Parameters
     ----------
-    recordings : to upload, one after another; each upload has fewer lines than the last.
+    recordings : files to upload in turn; each later upload of a file has fewer lines.
     """
 
     rests = RESTS_OF_STUDENT
@@ -293,22 +293,22 @@ class Student(Person):
         self._uploaded = self._folder = 0
 
     def habits(self) -> Mapping[Callable[[], None], float]:
-        """Return the actions: mostly uploads."""
+        """Return the actions, which are mostly uploads."""
         return {self.send: 6, self.save: 3, self.ask: 2, self.read: 1}
 
     @property
     def room(self) -> str:
-        """The address of the student's current folder."""
+        """Address of the student's current folder."""
         return f"/student/{self._folder}/"
 
     def finish(self) -> None:
-        """Let the desk write tables that it had no time to write before it was killed."""
+        """Let the desk write the tables that it could not write before it was killed."""
         for number in range(self._folder + 1):
             self._folder = number
             self._complete(self.get("submission", self.room))
 
     def send(self) -> None:
-        """Upload one to three recordings; if a table is missing then, have it written."""
+        """Upload one to three recordings; if a table is then missing, let the desk write it."""
         files = [self._next() for _ in range(self.draw.randint(1, 3))]
         changes = [
             Change(kind="upload", by=self.name, where=(str(self._folder), name), token=digest(raw))
@@ -338,7 +338,7 @@ class Student(Person):
         self.get("feedback in full", "/feedback/0/whole")
 
     def ask(self) -> None:
-        """Ask for another review of a criterion, if there is one to ask about."""
+        """Ask for a review of a criterion for which this is allowed."""
         text = self.get("feedback", "/feedback/0/")
         open_ = re.findall(r'class="asking">\s*<input type="hidden" name="criterion" value="(.*?)"',
                            text)  # fmt: skip
@@ -350,7 +350,7 @@ class Student(Person):
             ), {"criterion": criterion, "why": why})  # fmt: skip
 
     def _next(self) -> tuple[str, bytes]:
-        """Return a recording that nobody has uploaded yet: one without its last lines."""
+        """Return a recording that nobody has uploaded yet, made by leaving out the last lines."""
         rounds, number = divmod(self._uploaded, len(self._recordings))
         self._uploaded += 1
         name, raw = self._recordings[number]
@@ -369,6 +369,6 @@ def digest(raw: bytes) -> str:
 
 
 def wrong_in(answer: Answer) -> str:
-    """Return the first message of a page that says that something is wrong."""
+    """Return the first error message of a page."""
     found = re.search(r'class="wrong"[^>]*>([^<]*)<', answer.text)
     return " ".join(unescape(found[1]).split()) if found else answer.text[:200]

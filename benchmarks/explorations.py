@@ -3,9 +3,9 @@
     python -m benchmarks.explorations [--count 100] [--minutes 60]
 
 Each random bench has one to three carts and up to two hidden effects. It has the carts, encoders
-and controller of the emulator, simulated tick by tick without a serial line. `cartlab explore`
-knows which springs are present and aims at an error of 1 % in all parameters within ten minutes. A
-study that was stopped continues where it stopped.
+and controller of the emulator, simulated tick by tick without a serial line. `cartlab explore` gets
+the list of springs, and aims at an error of 1 % in all parameters within ten minutes. A study that
+was stopped continues where it stopped.
 """
 
 import os
@@ -32,12 +32,12 @@ from tests.helpers.virtual import LimitPassed, VirtualBench, VirtualSession
 
 ROWS = Path(__file__).with_name("explorations.jsonl")
 FIRST_SEED = 71_000
-ALLOWED = 600.0  # s at the bench
+ALLOWED = 600.0  # in s of bench time
 SCALE = "sensor_gain"
 
 
 def run(seed: int) -> dict:
-    """Explore one bench; return its verdict and the truth."""
+    """Explore one bench; return the verdict and the hidden effects."""
     drawn = draw(seed, effects=seed % 3)
     bench = VirtualBench(drawn.bench, seed=seed)
     began = time.process_time()
@@ -57,12 +57,12 @@ def run(seed: int) -> dict:
             return row | {"ended": f"{type(error).__name__}: {error}"[:200]}
         submission = load_submission(folder)
         row["hidden"] = acted(drawn, submission)
-        # What `cartlab plan` would propose next: decays by hand and dwells, but no sweep and steps.
+        # The next proposal of `cartlab plan`: decays by hand and dwells, but no sweep and no steps.
         plan = propose_plan(submission, bench=bench.description)
         try:
             fixed = session_time(extend_plan(plan, submission).recordings)
         except DataError:
-            fixed = None  # dwells need a linear chain, and no chain fits these records
+            fixed = None  # dwells need a linear chain, but none fits these records
         gap_file = folder / "gap" / "gap.json"
         gap = json.loads(gap_file.read_text(encoding="utf-8")) if gap_file.exists() else {}
     found = [counted_of(effect) for effect in gap.get("effects", ())]
@@ -82,25 +82,25 @@ def run(seed: int) -> dict:
 
 
 def named_of(effect: dict) -> tuple[str, int]:
-    """Return an effect of gap.json and where it sits."""
+    """Return an effect of gap.json and its place."""
     return effect["effect"], next(iter(effect["where"].values()), 0)
 
 
 def counted_of(effect: dict) -> tuple[str, int]:
-    """Return an effect of gap.json under the name that counts."""
+    """Return an effect of gap.json and its place, as counted in the study."""
     key, place = named_of(effect)
     first = next(iter(effect["parameters"].values()))["value"]
     return counted(find_effect(key), place, first)
 
 
 def off(gap: dict, drawn: Drawn) -> dict[str, float]:
-    """Return how many standard errors each parameter of the chain and the named effects is off."""
+    """Return the errors of all chain and effect parameters, in standard errors."""
     chain, errors = drawn.bench.chain, {}
     terms = {(term.effect.key, term.place): term for term in drawn.bench.effects}
     named = {named_of(effect) for effect in gap.get("effects", ())}
     if any(key == SCALE and (key, place) not in named for key, place in terms):
-        return {}  # with a wrong scale of a sensor, another chain moves in the same way
-    if chain.n == 1:  # only the sum of its two springs matters
+        return {}  # another chain moves in the same way if a sensor's scale is wrong
+    if chain.n == 1:  # only the sum of the two springs matters
         chain = replace(chain, k=np.array([chain.k.sum(), 0.0]))
     for letter in "mck":
         for i, true in enumerate(getattr(chain, letter), start=1):

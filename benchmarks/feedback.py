@@ -1,4 +1,4 @@
-"""How good the designed controllers are, also on a plant that is not quite the modelled one."""
+"""How good the designed controllers are, also on a plant that differs slightly from the model."""
 
 import numpy as np
 
@@ -38,7 +38,7 @@ def design(chain: Chain, cart: int, method: Method) -> FeedbackDesign:
 def on_other_plants(
     chain: Chain, result: FeedbackDesign, *, plants: int
 ) -> tuple[int, list[float]]:
-    """Return the number of unstable loops, and the worst overshoot, settling and level error."""
+    """Return how many loops are unstable, and the worst overshoot, settling and level error."""
     rng = np.random.default_rng(1)
     controller = StateFeedback(gains=result.gains, prefilter=result.prefilter, model=chain)
     T = result.sample_time

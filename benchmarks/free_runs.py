@@ -1,4 +1,4 @@
-"""The same records and the same measure of error for all tools that learn models."""
+"""All tools that learn models get the same records and the same measure of error."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,7 +22,7 @@ OURS, LINEAR_CART = "cartlab", "linear"
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """One tool's result on one bench: its model (None if all diverge), errors, and seconds."""
+    """One tool's result on one bench: its model (None if all diverge), error, and time in s."""
 
     model: Model | None
     error: float
@@ -30,7 +30,7 @@ class Answer:
 
 
 def part_of(record: Record, *, first: int = 48) -> Part:
-    """Return a record in the form that all tools get: as read, but only from the release on."""
+    """Return a record in the form that all tools get; a decay begins at its release."""
     run = make_run(record, n=1)
     u = np.zeros(record.t.size) if record.u is None else record.u
     return Part(
@@ -58,7 +58,7 @@ def start_at(model: AugmentedChain, *, springs: tuple[bool, ...]) -> FitModel:
 def ours(model: AugmentedChain, gap: Gap, *, springs: tuple[bool, ...]) -> Model:
     """Return cartlab's model in a form that runs freely, without any fit to the record.
 
-    The zero of the encoder is also learnt from the training records.
+    The zero of the encoder is the mean over the training records.
     """
     of = start_at(model, springs=springs)
     zero = np.array([np.mean([trace.zero for trace in gap.traces if not trace.held_out])])
@@ -71,7 +71,7 @@ def ours(model: AugmentedChain, gap: Gap, *, springs: tuple[bool, ...]) -> Model
 
 
 def words_of(gap: Gap) -> str:
-    """Return the effects found, with their numbers."""
+    """Return the effects found, with their parameters."""
     found = [
         f"{f.effect.key.replace('_', ' ')} ("
         + ", ".join(
@@ -93,7 +93,7 @@ def others(
 ) -> Iterator[tuple[str, Answer]]:
     """Yield each installed tool's model, chosen by its error on the held-out records.
 
-    If `settings` is given, only the tools named in it run.
+    If `settings` is given, only the tools that it names are run.
     """
     for name, tool, learn in TOOLS:
         if installed(tool) and (settings is None or name in settings):
@@ -105,11 +105,11 @@ def others(
 
 
 def percent(value: float) -> str:
-    """Return a share of the motion."""
+    """Return a share of the motion in percent."""
     return f"{significant(100 * value)} %" if np.isfinite(value) else "diverges"
 
 
 def left_out(what: str, *, quick: bool, columns: int) -> list[str]:
-    """Return the row for a part that was not measured."""
+    """Return a row that says why a part was not measured."""
     why = "in a quick run" if quick else "its recordings are not on this machine"
     return [what, f"left out: {why}", *[""] * (columns - 2)]

@@ -1,4 +1,4 @@
-"""Which laws of friction a servo and a cart need, by models with more and more laws.
+"""Which laws of friction a servo and a cart need, found by models with more and more laws.
 
 The search of `cartlab gap` runs once for each model, with only the laws of that model.
 """
@@ -44,7 +44,7 @@ CART = "DOF1_en1_input1"
 
 @dataclass(frozen=True, kw_only=True)
 class Axis:
-    """A real axis: its records and its springs."""
+    """A real axis with its records and its springs."""
 
     words: str
     records: Sequence[Record]
@@ -52,7 +52,7 @@ class Axis:
 
 
 def axes() -> Iterator[Axis]:
-    """Yield the axes whose recordings are on this machine."""
+    """Yield the axes for which there are recordings on this machine."""
     if (REAL_DATA / "emps" / FILES["train"]).exists():
         yield Axis(
             words="EMPS, training record",

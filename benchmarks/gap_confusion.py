@@ -2,9 +2,9 @@
 
     python benchmarks/gap_confusion.py singles --count 300 --jobs 2 --out singles.jsonl
 
-Benches are random, and an independent simulator gives the truth (tests/truth). Thresholds were set
-on other seeds than those that `--report` uses. A run that was stopped continues where it stopped,
-with one JSON line per case.
+Benches are random, and are simulated by an independent program (tests/truth). Thresholds were set
+on other seeds than those that `--report` uses. A run that was stopped continues where it stopped;
+its file has one JSON line per case.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-# Cases run side by side, so each gets one BLAS thread. Set before numpy is loaded.
+# Several cases run at the same time, so each gets one BLAS thread. Set before numpy is loaded.
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
@@ -28,12 +28,12 @@ SUITES = [
     "singles", "small", "tiny", "weak", "dirt", "pairs", "clean", "clean-dirt", "wide", "wide-pairs"
 ]  # fmt: skip
 SEVERITY = {"small": 0.3, "weak": 0.2, "tiny": 0.05}
-# Two of these on one cart would act as a single friction law, so they are never paired.
+# On one cart, two of these would act as a single law of friction, so they are never paired.
 DRY = ("coulomb_friction", "stiction", "presliding_friction")
 
 
 def plan(suite: str, index: int) -> tuple[int, tuple[str, ...], float, bool]:
-    """Return carts, effects, severity and dirt of a case."""
+    """Return the number of carts, the effects, the severity and the dirt of a case."""
     from tests.truth.cases import EFFECTS
 
     rng = np.random.default_rng([SUITES.index(suite), index])
@@ -52,7 +52,7 @@ def plan(suite: str, index: int) -> tuple[int, tuple[str, ...], float, bool]:
 
 
 def run_case(job: tuple[str, int, int]) -> dict:
-    """Make one case, explain it, and return how well that worked."""
+    """Make one case, explain its gap, and return the result together with the hidden effects."""
     suite, index, base = job
     from pipeline.gap.explain import explain_gap
     from pipeline.set_up import Bench
@@ -79,7 +79,7 @@ def run_case(job: tuple[str, int, int]) -> dict:
         for f in gap.effects:
             if (f.effect.key, next(iter(f.where.values()), 0)) == (hidden.effect, hidden.place):
                 for name, true in hidden.parameters.items():
-                    if name not in f.parameters:  # a detail of the contact, not reported
+                    if name not in f.parameters:  # internal to a contact, and not reported
                         continue
                     value = f.parameters[name]
                     z.append((value.value - float(true)) / value.std if value.std else None)
@@ -103,7 +103,7 @@ def run_case(job: tuple[str, int, int]) -> dict:
 
 
 def outcome(truth: list, found: list, listed: set, verdict: str, baseline: float) -> str:
-    """Classify a case; `equivalent` lists pairs of effects that no data can tell apart."""
+    """Classify a case; "equivalent" means that no data can separate the answer from the truth."""
     if verdict == "unexplained":
         return "unexplained"
     if verdict == "partial":
@@ -163,7 +163,7 @@ def _name(row: dict) -> str:
 
 
 def summarise(rows: list[dict]) -> None:
-    """Print outcomes and times by effect and carts, the gap that is left, and coverage."""
+    """Print outcomes and times by effect and carts, the remaining error, and coverage."""
     outcomes = Counter(row["outcome"] for row in rows)
     print(f"\n{len(rows)} cases: " + ", ".join(f"{k} {v}" for k, v in outcomes.most_common()))
     by_effect: dict[str, Counter] = {}

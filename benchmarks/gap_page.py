@@ -2,8 +2,8 @@
 
     python benchmarks/gap_page.py RESULTS.jsonl… [--rig FOLDER]
 
-The results are those of `gap_confusion.py --report`, and FOLDER holds the recordings of an ECP 210.
-If one is not given, its part of the page stays as it is.
+RESULTS are files from `gap_confusion.py --report`, and FOLDER has recordings of an ECP 210. If
+either is not given, its part of the page stays as it is.
 """
 
 import argparse
@@ -61,7 +61,7 @@ PLUCKED = (
 )
 RIGHT = ("exact", "equivalent", "ambiguous, right first")
 _MUCH = 2.0  # noises left
-_THINNED = 2  # samples per point of a picture
+_THINNED = 2  # samples per point of a figure
 
 
 # ----------------------------------------------------------------------------- tables
@@ -109,7 +109,7 @@ def _bounds(right: int, of: int) -> str:
 
 
 def confusion_of(rows: Sequence[dict]) -> str:
-    """Return the answers about each single effect."""
+    """Return a table of the answers for each single effect."""
     out = []
     singles = [row for row in rows if row["suite"] in ("singles", "small", "wide")]
     for key in sorted({row["truth"][0][0] for row in singles}):
@@ -139,7 +139,7 @@ def _times(rows: Sequence[dict]) -> str:
 
 
 def pairs_of(rows: Sequence[dict]) -> str:
-    """Return the pairs of effects that were not named exactly."""
+    """Return a table of the pairs of effects that were not named exactly."""
     pairs = [row for row in rows if row["suite"].endswith("pairs")]
     out = [
         [" + ".join(_named(key) for key, _ in row["truth"]), str(row["n"]), _said(row)]
@@ -152,7 +152,7 @@ def pairs_of(rows: Sequence[dict]) -> str:
 
 
 def sureness_of(rows: Sequence[dict]) -> str:
-    """Return how often the truth lies within the stated errors."""
+    """Return how often the true values lie within the stated errors."""
     z = np.array(
         [v for row in rows if row["outcome"] == "exact" for v in row["z"] if v is not None]
     )
@@ -167,7 +167,7 @@ def sureness_of(rows: Sequence[dict]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Rig:
-    """Recordings of a real rig, and the carts that are free in them."""
+    """Recordings of a real rig, with the carts that are free in them."""
 
     name: str
     words: str
@@ -215,7 +215,7 @@ def rigs_in(folder: Path) -> Iterator[Rig]:
 
 
 def _write_plucked(lab: Path, folder: Path) -> Path:
-    """Write a submission with the recordings in which a hand plucks cart 2 and cart 1 is held."""
+    """Write a submission with the recordings in which cart 1 is held and a hand plucks cart 2."""
     lab.mkdir()
     text = ['version = 1\ntitle = "Plucked"\n[system]\ncarts = 2\nsprings = [true, true, false]\n']
     for number, name in enumerate(PLUCKED, start=1):
@@ -229,7 +229,7 @@ def _write_plucked(lab: Path, folder: Path) -> Path:
 
 
 def explain_rig(rig: Rig, tell: Callable[[str], None]) -> str:
-    """Return the account of one rig, and draw a picture of each step."""
+    """Return the text on one rig, and draw a figure for each step."""
     cpu = time.process_time()
     gap = explain_gap(
         rig.records, Bench(springs=rig.springs, units=Units(position="count", input="V"))
@@ -276,7 +276,7 @@ def _hands(gap: Gap) -> list[str]:
 
 
 def _steps(gap: Gap, rig: Rig) -> Iterator[tuple[Study, Hypothesis, Hypothesis]]:
-    """Yield the linear model and those with one effect, two, …, all fitted to training runs."""
+    """Yield the linear model together with the model with one effect, two, …, all fitted."""
     hands = find_interventions(rig.records)
     runs = prepare(rig.records, springs=rig.springs, interventions=hands, notes=[])
     training, held_out = take_sides(runs, notes=[])
@@ -296,7 +296,7 @@ def _steps(gap: Gap, rig: Rig) -> Iterator[tuple[Study, Hypothesis, Hypothesis]]
 
 
 def _where_it_helps(before: Hypothesis, after: Hypothesis, study: Study) -> Trace:
-    """Return the cart and held-out run in which the effects reduce the error most."""
+    """Return the trace of the held-out run and cart in which the effects reduce the error most."""
 
     def gained(trace: Trace) -> float:
         left = [((trace.measured - model) ** 2).sum() for model in (trace.baseline, trace.final)]
@@ -328,7 +328,7 @@ def main() -> None:
     parts: dict[str, str] = {}
     if options.results:
         lines = [json.loads(line) for path in options.results for line in path.open()]
-        # If a case was run again, the later file has it.
+        # if a case is in several files, the last file counts
         rows = list({(row["suite"], row["base"], row["index"]): row for row in lines}.values())
         parts["rates"] = summary_of(rows) + "\n" + sureness_of(rows)
         parts["confusion"] = confusion_of(rows)
@@ -337,7 +337,7 @@ def main() -> None:
         rigs = list(rigs_in(options.rig))
         explain_gap(
             rigs[0].records, Bench(springs=rigs[0].springs), budget=0.0
-        )  # compiles the simulator
+        )  # compiles the simulator before times are measured
         parts["rigs"] = "\n".join(explain_rig(rig, print) for rig in rigs)
     page = PAGE.read_text(encoding="utf-8")
     for name, text in parts.items():

@@ -40,12 +40,12 @@ records. Then they predict **further records that no tool has seen**: other step
 other releases. "Linear" is the best linear cart.
 """
 TOOLS = ("pysindy", "sysidentpy", "scikit-learn", "jax-sysid")
-RATE = 113.1  # Hz, the ECP's usual
+RATE = 113.1  # Hz, the usual rate of the ECP 210
 FIRST_SEED = 950_000
-FURTHER = 1_000_000  # added to a seed for the further records
-REPEATS = 3  # number of each run on a class's bench; as many again are for judging
+FURTHER = 1_000_000  # is added to a seed for the further records
+REPEATS = 3  # runs of each kind on a class's bench, and as many again for judging
 OF_ONE_CART = tuple(e for e in EFFECTS if e not in ("coupling_damper", "sensor_gain"))
-# The term of the library that is the effect itself, or that a person would take for it.
+# The library's term for an effect, or the one that a person would take for it.
 TERM = {
     "coulomb_friction": "sign v",
     "stiction": "sign v",
@@ -55,7 +55,7 @@ TERM = {
     "cubic_spring": "x³",
     "force_offset": "1",
 }
-SHOWN = "coulomb_friction"  # the bench whose equations are shown
+SHOWN = "coulomb_friction"  # equations are shown for this bench
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +76,7 @@ def compare(
     hidden: tuple[str, ...],
     unit: str,
 ) -> Bench:
-    """Let every tool learn from cartlab's training runs, and judge it on further records."""
+    """Let every tool learn from cartlab's training runs, and test its model on further records."""
     began = time.process_time()
     gap = explain_gap(records, SetUp(springs=springs, units=Units(position=unit, input="V")))
     seconds = time.process_time() - began
@@ -101,7 +101,7 @@ def compare(
 
 
 def benches(*, quick: bool) -> list[Bench]:
-    """Return twenty benches of one cart, with up to two effects, and one bench of a class."""
+    """Return benches of one cart with up to two effects, and one bench of a class."""
     plans: list[tuple[str, ...]] = [(), *((e,) for e in OF_ONE_CART)]
     plans.append(("coulomb_friction", "cubic_spring"))
     found = []
@@ -130,7 +130,7 @@ def is_named(bench: Bench) -> bool:
 
 
 def sindy_says(bench: Bench) -> tuple[bool, int]:
-    """Return whether PySINDy's equation has the hidden effect, and how many other terms it has."""
+    """Return whether PySINDy's equation has the hidden effect, and its number of other terms."""
     answer = bench.answers.get("PySINDy")
     found = set() if answer is None or answer.model is None else set(answer.model.terms)
     own = {TERM[key] for key in bench.hidden if key in TERM}
@@ -161,7 +161,7 @@ def each(found: Sequence[Bench]) -> Table:
 
 
 def picture(found: Sequence[Bench]) -> Figure:
-    """Draw the error on every bench against its noise, with a marker for each tool."""
+    """Draw each tool's error on every bench against the bench's noise."""
     figure = Figure(figsize=(6.5, 3.2), layout="constrained")
     axes = figure.subplots()
     names = (OURS, *(name for name, _, _ in OTHERS), LINEAR_CART)
@@ -236,7 +236,7 @@ def summary(found: Sequence[Bench]) -> Table:
 
 
 def equations(found: Sequence[Bench]) -> Table:
-    """Return the tools' own equations for one bench."""
+    """Return each tool's own equation for one bench."""
     rows = []
     for bench in found:
         if bench.hidden == (SHOWN,):
@@ -319,7 +319,9 @@ changes from run to run, which no model of other runs can predict.
 def tables(*, quick: bool) -> list[Table]:
     """Compare on simulated benches and on real carts."""
     warm = make_case(seed=FIRST_SEED, n=1, rate=RATE)
-    explain_gap(warm.records, SetUp(springs=warm.springs), budget=0.0)  # compiles the simulator
+    explain_gap(
+        warm.records, SetUp(springs=warm.springs), budget=0.0
+    )  # compiles the simulator before the clock starts
     found = benches(quick=quick)
     return [
         summary(found),

@@ -1,7 +1,7 @@
 """How often grading names a mistake and spares an honest team, its cost, and other graders.
 
 Benches cover everything that a lab may have (`tests/helpers/grading_class.py`). Each team is graded
-as it is, and then with a few kinds of mistakes made with its own recordings and numbers
+as it is, and then with a few kinds of mistakes in its own recordings and numbers
 (`tests/helpers/grading_slips.py`). The command for a closer look:
 
     python -m benchmarks.grading --start 50000 --count 300 --out grading.jsonl
@@ -41,7 +41,7 @@ simulated, so every mistake is known.
 TOOLS = ("nbgrader", "otter-grader")
 
 HONEST = "honest"
-WRONG_RUBRIC = "honest, rubric lacks a spring"  # one in ANEW_EVERY, each analysed again
+WRONG_RUBRIC = "honest, rubric lacks a spring"  # tested on one of ANEW_EVERY benches
 DATA = "data_problem"
 ANEW_EVERY = 5
 ONE = "one number: "
@@ -112,7 +112,7 @@ def named_mistakes(rows: Sequence[dict[str, Any]]) -> Table:
 
 
 def _group(kind: str) -> str:
-    """Return the line of the table to which a kind of mistake belongs."""
+    """Return the row of the table to which a kind of mistake belongs."""
     if kind.startswith(HONEST):
         return WRONG_RUBRIC if kind == WRONG_RUBRIC else HONEST
     if kind == DATA:
@@ -123,7 +123,7 @@ def _group(kind: str) -> str:
 
 
 def _is_right(row: dict[str, Any]) -> bool:
-    """Return whether a mistake got all its flags, and an honest team none."""
+    """Return whether a mistake got all its flags, or an honest team no flag."""
     if not row["codes"]:
         return not row["found"]
     return set(row["codes"]) <= set(row["found"])
@@ -170,13 +170,13 @@ def gradings(seed: int, *, slips: int) -> Iterator[tuple[str, Team, set[str]]]:
         if team.bench.chain.n == 1 and not OF_SEVERAL_CARTS.isdisjoint(codes):
             continue
         slipped = replace(team, rng=np.random.default_rng([9, seed, turn]))
-        unchanged = False  # this team cannot make one of the mistakes
+        unchanged = False  # the team cannot make one of the mistakes
         for slip in made:
             before, slipped = slipped, slip(slipped)
             unchanged |= slipped.submission is before.submission
         if unchanged:
             continue
-        # A team without recordings also gets the flag for them.
+        # A team without recordings also gets the flag for missing ones.
         beside = {"missing"} if "initial_final_disagree" in codes else set()
         yield kind, slipped, {*codes, *beside}
     if seed % ANEW_EVERY == 0:
@@ -288,7 +288,7 @@ def _judged(done: Graded, slips: dict[str, str]) -> list[str]:
     ]
 
 
-# ----------------------------------------------------------------------------- to look into
+# --------------------------------------------------------------------------- a closer look
 
 
 def main() -> None:

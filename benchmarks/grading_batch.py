@@ -1,10 +1,10 @@
-"""A class to grade: the cost of a batch, disguised copies that it finds, and the effect of kills.
+"""A class to grade: the cost of a batch, disguised copies that are found, and kills.
 
     python -m benchmarks.grading_batch [--kills 300]
 
-This kills the grader with -9 at random moments, and compares the result with an undisturbed run. It
-works on a copy of the code, because a grade belongs to the code that made it. The tables are part
-of `benchmarks/grading.py`.
+The command kills the grader with -9 at random moments, and compares the result with that of an
+undisturbed run. It works on a copy of the code, because a grade depends on the code that made it.
+The tables are part of `benchmarks/grading.py`.
 """
 
 import argparse
@@ -39,7 +39,7 @@ from pipeline.submission import load_submission
 
 ROOT = Path(__file__).parents[1]
 PRESET = "throne-2dof"
-# Noise added to a copy, in encoder steps, and other changes of the copy.
+# Noise added to a copy in encoder steps, and other changes of the copy.
 DISGUISES = {
     "as it is": {},
     "cut to 60 %": {"keep": 0.6},
@@ -50,7 +50,7 @@ DISGUISES = {
     "noise 1, cut, rescaled": {"noise": 1.0, "keep": 0.8, "scale": 1.3},
     "noise 2": {"noise": 2.0},
 }
-IN_CLASS = 10  # honest teams, besides the original and its copy
+IN_CLASS = 10  # honest teams in a class, besides the original and its copy
 COPIED_KINDS = ("decay", "step", "sweep", "closed_loop")
 
 
@@ -82,7 +82,7 @@ class Cost:
 
 @contextmanager
 def measured(costs: list[Cost]) -> Iterator[None]:
-    """Add the cost of the work in this block."""
+    """Append the cost of the work in this block to `costs`."""
     process = psutil.Process()
     start, before = time.perf_counter(), process.cpu_times()
     yield
@@ -225,7 +225,7 @@ of its own. Added noise is in encoder counts.
 
 
 def main() -> None:
-    """Kill batches at random moments."""
+    """Kill batches at random moments, and print the results."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--kills", type=int, default=300)
     with tempfile.TemporaryDirectory() as folder:

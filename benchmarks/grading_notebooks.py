@@ -56,7 +56,7 @@ def _hertz(reported: Numbers) -> None:
         table["omega_n"] /= 2 * math.pi
 
 
-# Each kind of mistake with the flag that names it.
+# each kind of mistake, with the flag that names it
 SLIPS: dict[str, Callable[[Numbers], None]] = {
     "hz_for_rad_s": _hertz,
     "log10_for_ln": _times("initial", zeta=math.log10(math.e)),
@@ -121,7 +121,7 @@ def cartlab(folder: Path, base: Path) -> Graded:
 
 
 def nbgrader(folder: Path, base: Path) -> Graded | None:
-    """Grade with nbgrader, feedback pages included; None if it is not installed."""
+    """Grade with nbgrader, feedback pages included; return None if it is not installed."""
     if not installed("nbgrader"):
         return None
     from nbgrader.api import Gradebook as Book  # pyright: ignore[reportMissingImports]
@@ -146,7 +146,7 @@ def nbgrader(folder: Path, base: Path) -> Graded | None:
 
 
 def otter(folder: Path, base: Path) -> Graded | None:
-    """Grade with otter-grader, one submission after another; None if it is not installed."""
+    """Grade with otter-grader, one submission after another; return None if it is not installed."""
     if not installed("otter-grader"):
         return None
     tests = base / "otter" / "tests"
@@ -179,7 +179,7 @@ def otter(folder: Path, base: Path) -> Graded | None:
 
 def _run(module: str, *arguments: str | Path, cwd: Path) -> None:
     command = [sys.executable, "-m", module, *map(str, arguments)]
-    programs = Path(sys.executable).parent  # nbgrader calls alembic by its name
+    programs = Path(sys.executable).parent  # nbgrader starts alembic by its name
     environment = os.environ | {"PATH": os.pathsep.join((str(programs), os.environ["PATH"]))}
     done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, env=environment)
     if done.returncode:

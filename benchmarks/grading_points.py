@@ -10,7 +10,7 @@ from pipeline.grading.rubric import FlagCosts, Parameters, Rubric, matching
 from pipeline.submission import Reported
 from tests.helpers.grading_class import Team
 
-# What each check grades: a table of the report, or a part of its state feedback.
+# Part of the report that each check grades.
 GRADED_TABLE = {
     "initial": "initial",
     "final": "final",
@@ -20,16 +20,16 @@ GRADED_TABLE = {
     "prefilter": "feedback",
 }
 Grading = tuple[str, Team, set[str]]  # kind of mistake, team, and the codes of the right flags
-STRICT, LENIENT = 0.5, 2.0  # factors of all tolerances
+STRICT, LENIENT = 0.5, 2.0  # tolerances are multiplied by these factors
 
 
 @dataclass(frozen=True, kw_only=True)
 class Judged:
-    """One grading: its share of the points, and the criteria that lost points by the mistake.
+    """One grading: its share of the points, and how many criteria lost points by the mistake.
 
     Attributes
     ----------
-    wrong, wrong_lost : number of criteria about changed numbers; number of these that lost points.
+    wrong, wrong_lost : number of criteria about changed numbers, and how many of them lost points.
     right, right_lost : the same for criteria about numbers that the mistake did not change.
     """
 
@@ -55,7 +55,7 @@ def three_rubrics(rubric: Rubric) -> dict[str, Rubric]:
 
 
 def _scaled(rubric: Rubric, factor: float) -> Rubric:
-    """Return a rubric with every tolerance multiplied."""
+    """Return a rubric with every tolerance multiplied by a factor."""
     criteria = []
     for criterion in rubric.criteria:
         limits = [
@@ -110,7 +110,7 @@ def _judge_bench(bench: Iterable[Grading]) -> Iterator[tuple[str, bool, Judged]]
     reported: Reported | None = None
     for _, team, codes in bench:
         if codes & {"data_problem", "missing"} or (honest and not codes):
-            continue  # other recordings, no recordings, or another rubric
+            continue  # mistakes in recordings or the rubric
         for name, rubric in three_rubrics(team.rubric).items():
             grade = replace(team, rubric=rubric).grade()
             share_of = grade.points / grade.out_of
@@ -123,7 +123,7 @@ def _judge_bench(bench: Iterable[Grading]) -> Iterator[tuple[str, bool, Judged]]
 
 
 def _compare(team: Team, before: Reported, honest: Grade, grade: Grade, rubric: Rubric) -> Judged:
-    """Return which criteria lost points through a mistake."""
+    """Return how many criteria lost points by a mistake."""
     had = {criterion.id: criterion.points for criterion in honest.criteria}
     has = {criterion.id: criterion.points for criterion in grade.criteria}
     counts = {True: [0, 0], False: [0, 0]}
@@ -136,7 +136,7 @@ def _compare(team: Team, before: Reported, honest: Grade, grade: Grade, rubric: 
             names = matching(criterion.parameters, rubric.names)
             old, new = ([numbers.get(name) for name in names] for numbers in (old, new))
         elif table == "state_space" and before.final != team.reported.final:
-            continue  # this table is compared with the final one
+            continue  # A and B are compared with the final table
         changed = old != new
         counts[changed][0] += 1
         counts[changed][1] += has.get(criterion.id, 0.0) < had[criterion.id]

@@ -29,7 +29,7 @@ BAND_HZ = (0.3, 7.0)
 POINTS = {1: 20, 2: 25, 3: 30}
 LARGEST_MOTION = 1.0  # cm
 LARGEST_INPUT = 1.0  # V
-RIGHT = 0.02  # a fit is right if every resonance is within 2 % of its true frequency
+RIGHT = 0.02  # a fit is right if every resonance is within this share of its true frequency
 
 PAPER_STARTS = {
     1: {"K": 30.6, "omega_n": 13.2, "zeta": 0.10},
@@ -47,7 +47,7 @@ PAPER_STARTS = {
 
 
 def dwell_errors(chain: Chain, omega: Array, *, noise: float = 1.0) -> Array:
-    """Return the standard error (n, n_w) of each magnitude; `noise` is a factor on all of them."""
+    """Return the standard error (n, n_w) of each magnitude; all are multiplied by `noise`."""
     size = np.abs(chain.frequency_response(omega))
     amplitude = np.minimum(LARGEST_MOTION / size.max(axis=0), LARGEST_INPUT)
     return noise * np.hypot(RELATIVE_STD * size, ABSOLUTE_STD / amplitude)
@@ -83,7 +83,7 @@ def least_possible_std(chain: Chain, *, phases: bool = False, noise: float = 1.0
     def log_response(of: Chain) -> Array:
         G = np.log(of.frequency_response(omega)).astype(
             np.complex128
-        )  # the real part is the error in size, the imaginary part that in phase
+        )  # its real part has the relative error, its imaginary part the phase error
         size = np.abs(chain.frequency_response(omega)) * weight
         return np.concatenate([G.real * size, G.imag * size] if phases else [G.real * size])
 
@@ -109,7 +109,7 @@ def bound(chain: Chain, measured: Callable[[Chain], Array]) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Quality:
-    """Over many seeds: coverage and efficiency (n_named,), and time in ms and chi² (n_seeds,)."""
+    """Coverage and efficiency of each named parameter, and time in ms and chi² of each seed."""
 
     names: tuple[str, ...]
     coverage: Array
@@ -119,7 +119,7 @@ class Quality:
 
 
 def quality(chain: Chain, *, seeds: int, phases: bool = False, first_seed: int = 0) -> Quality:
-    """Fit many noisy data sets from the paper's start; compare with the truth and the bound."""
+    """Fit many noisy data sets from the paper's start; compare with true values and the bound."""
     truth = np.array(list(chain.parameters().values()))
     values, stds, times, chi = [], [], [], []
     for seed in range(first_seed, first_seed + seeds):
@@ -148,7 +148,7 @@ def fit_from(
 
 
 def drawn_start(chain: Chain, *, rng: np.random.Generator, wide: bool) -> dict[str, float]:
-    """Draw a start around the truth, as the module's docstring says."""
+    """Draw a start around the true values, as the module's docstring says."""
     start = {}
     for name, value in chain.parameters().items():
         if name.startswith("zeta"):
@@ -179,7 +179,7 @@ def converged_share(chain: Chain, *, kind: str, seeds: int) -> float:
 
 
 def is_right(fit: ChainFit, chain: Chain) -> bool:
-    """Return whether every frequency of the fit is within 2 % of the truth."""
+    """Return whether every frequency of the fit is within 2 % of its true value."""
     return all(
         abs(fit.parameters[name].value / value - 1) < RIGHT
         for name, value in chain.parameters().items()

@@ -1,8 +1,8 @@
 """Compute the numbers of the one-cart lab from a team's own files, as a TA would write it.
 
 nbgrader and otter-grader get this file together with the assignment (`grading_notebooks.py`). It
-uses numpy, scipy and the textbook's methods: the level of a step, the logarithms of a decay's
-peaks, a sine fitted to the end of each dwell, and one cart fitted to the ratios.
+uses numpy, scipy and textbook methods: the level of a step, the logarithms of a decay's peaks, a
+sine fitted to the end of each dwell, and one cart fitted to the amplitude ratios.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,7 +17,7 @@ from scipy.optimize import curve_fit
 Table = Mapping[str, float]
 TOLERANCE = {"K": 0.08, "omega_n": 0.05, "zeta": 0.15}
 _DATA = Path("data")
-_SEEN = 0.05  # share of the largest swing; smaller peaks come from the encoder
+_SEEN = 0.05  # share of the largest amplitude; smaller peaks may come from the encoder
 
 
 def check(table: str, name: str, reported: Mapping[str, Table], dwells: Table) -> None:
@@ -69,7 +69,7 @@ def _gain(data: NDArray) -> float:
 def _decrement(data: NDArray) -> tuple[float, float]:
     y = data["x1"] - data["x1"][-len(data) // 10 :].mean()
     crossings = np.flatnonzero(np.diff(np.sign(y)) != 0)
-    halves = pairwise(crossings)  # until then the hand moves the cart
+    halves = pairwise(crossings)  # before this sample, the hand moves the cart
     peaks = [int(a + np.argmax(np.abs(y[a : b + 1]))) for a, b in halves]
     large = [peak for peak in peaks if abs(y[peak]) > _SEEN * np.abs(y).max()]
     first, last, cycles = large[0], large[-1], (len(large) - 1) / 2
@@ -80,7 +80,7 @@ def _decrement(data: NDArray) -> tuple[float, float]:
 
 
 def ratio(data: NDArray, omega: float) -> float:
-    """Return the amplitude of the cart over that of the input, at omega in rad/s."""
+    """Return the amplitude of the cart divided by that of the input, at omega in rad/s."""
     half = data[len(data) // 2 :]
     t = half["time"]
     X = np.column_stack([np.sin(omega * t), np.cos(omega * t), np.ones_like(t)])

@@ -4,8 +4,8 @@
 
 Each bench is a preset with the carts, encoders and controller of the emulator, simulated tick by
 tick without a serial line. It records two steps and a sweep, then the experiment that `cartlab plan
---next` chooses. For comparison it records as many log-spaced dwells as the paper, and the carts are
-fitted to these dwells alone. The program writes the table and the figure of `benchmarks/next.md`.
+--next` chooses. For comparison, it records as many log-spaced dwells as the paper, and the carts
+are fitted to these dwells alone. The table and the figure of `benchmarks/next.md` are written.
 """
 
 import argparse
@@ -45,7 +45,7 @@ FIGURE = Path(__file__).with_name("figures") / "next.svg"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Stage:
-    """The relative errors of all named parameters after a given time at the bench, s."""
+    """The relative errors of all named parameters after `seconds` of bench time."""
 
     seconds: float
     stated: Array
@@ -53,7 +53,7 @@ class Stage:
 
 
 def known_after(bench: VirtualBench, analysis: Analysis, chain: Chain) -> Stage:
-    """Return the errors of the identified carts, compared with the truth."""
+    """Return the stated and the true errors of the identified carts."""
     assert analysis.fit is not None
     found = analysis.fit.parameters.values()
     true = np.array(list(chain.parameters().values()))
@@ -62,7 +62,7 @@ def known_after(bench: VirtualBench, analysis: Analysis, chain: Chain) -> Stage:
 
 
 def log_spaced(known: Knowledge, plan: Plan, *, n: int) -> list[Recording]:
-    """Return the paper's dwells, as long as `cartlab plan` makes them and as large as allowed."""
+    """Return log-spaced dwells like the paper's, as large as the limits allow."""
     resonances = np.sort(np.abs(known.chain.poles)) / (2 * np.pi)
     wait = settling_wait(known.chain, time_constants=SETTLED_DWELL)
     dwells = []
@@ -110,7 +110,7 @@ def run(preset: str, *, seed: int, n: int, dwells: int, scratch: Path) -> tuple[
 
 
 def row(preset: str, runs: list[tuple[list[Stage], Array]]) -> list[str]:
-    """Return a line of the table: errors as root mean squares over parameters and seeds."""
+    """Return a row of the table; errors are root mean squares over parameters and seeds."""
     stages = [stage for stage, _ in runs]
     first, chosen = ([run[i] for run in stages] for i in (0, 1))
     dwells = [run[2] for run in stages if len(run) > 2]
@@ -153,7 +153,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         for preset in PRESETS:
             for seed in range(asked.seeds):
-                dwells = 0 if seed else asked.dwells  # slow, and the same each time
+                dwells = 0 if seed else asked.dwells  # takes long, and gives the same each time
                 one = run(preset, seed=seed, n=asked.next, dwells=dwells, scratch=Path(scratch))
                 results.setdefault(preset, []).append(one)
                 print(preset, seed, [round(stage.seconds) for stage in one[0]], flush=True)

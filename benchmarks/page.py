@@ -1,7 +1,7 @@
 """The page of the benchmarks: its tables, the notes below them, and how a section is replaced.
 
-The page itself stores the results, with each section between two comments. A run replaces only the
-sections that it made, and notes the machine and the versions.
+The page itself stores the results, with each section between two comments. A run replaces only its
+own sections, and records the machine and the versions.
 """
 
 import csv
@@ -36,14 +36,14 @@ WIDTH = 118  # characters in a line of the page
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """A table of the page, the figure below it, and the method.
+    """A table of the page, with its figure and its method.
 
     Attributes
     ----------
-    rows : cells as text; for a tool that is not installed, a row of `missing`.
-    better : in which respect other tools are better: Markdown, above the table.
-    note : the method, and how each tool was used: Markdown, below the table.
-    picture : draws the figure, in the style of the reports.
+    rows : cells as text; if a tool is not installed, its row comes from `missing`.
+    better : in which respect other tools are better, as Markdown above the table.
+    note : the method and how each tool was used, as Markdown below the table.
+    picture : function that draws the figure in the style of the reports.
     in_file : if true, the page has only the figure, and the rows are in a CSV file beside it.
     """
 
@@ -94,7 +94,7 @@ def significant(value: float, *, digits: int = 2) -> str:
 
 
 def share(hits: int, of: int) -> str:
-    """Return a share in percent with the two counts that it is made of."""
+    """Return a share in percent, with its two counts."""
     if not of:
         return "–"
     digits = 1 if 0 < hits < of and not 0.5 < 100 * hits / of < 99.5 else 0
@@ -113,7 +113,7 @@ def write_page(page: Path, made: dict[str, str], *, order: Sequence[str]) -> Non
 def section(
     name: str, module: ModuleType, tables: Sequence[Table], *, seconds: float, figures: Path | None
 ) -> str:
-    """Return a benchmark's part of the page; write its figures into a folder, if there is one."""
+    """Return a benchmark's part of the page; write its figures, if a folder is given."""
     parts = [f"<!-- {name} -->", f"## {module.TITLE}", wrapped(module.WORDS)]
     for number, table in enumerate(tables, start=1):
         parts += [f"### {table.title}", wrapped(table.better)]
@@ -171,7 +171,7 @@ def markdown(table: Table) -> str:
 
 
 def machine() -> str:
-    """Return the facts about the machine on which times depend, without its name."""
+    """Return the facts about the machine that affect times, without its name."""
     memory = psutil.virtual_memory().total / 1e9
     return (
         f"{os.cpu_count()} cores ({platform.machine()}), {memory:.0f} GB, {platform.system()}, "

@@ -40,7 +40,7 @@ _DOCUMENT = Path(__file__).with_name("lab_document.py")
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """Seconds of the processor and on the clock, and the largest memory of a process, MB."""
+    """Processor seconds, seconds on the clock, and the largest memory of a process in MB."""
 
     cpu: float
     clock: float
@@ -70,7 +70,7 @@ def run(command: Sequence[str | Path], *, cwd: Path = _ROOT, **environment: str)
     )
     _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode not in (0, 1):  # 1: done, but a check of the recordings failed
+    if process.returncode not in (0, 1):  # status 1: done, but a check of the recordings failed
         raise RuntimeError(f"{' '.join(map(str, command))}: exit status {process.returncode}")
     kilo = 1024 if sys.platform == "darwin" else 1
     return Cost(
@@ -112,7 +112,7 @@ def by_carts(base: Path, *, runs: int, examples: Sequence[str]) -> Table:
 
 
 def by_records(base: Path, *, records: Sequence[int]) -> Table:
-    """Return the costs of submissions with these numbers of records, which all differ."""
+    """Return the costs of submissions with these numbers of records, which are all different."""
     costs = []
     for count in records:
         folder = base / f"records-{count}"
@@ -159,7 +159,7 @@ def write_records(folder: Path, count: int) -> None:
     """Write a submission of `count` different records, taken from several sessions on one bench."""
     kept: list[Any] = []
     document: Any = None
-    for session in range(count):  # one session has some thirty records
+    for session in range(count):  # because one session has about thirty records
         part = folder.with_name(f"{folder.name}-part")
         write_submission(part, "throne-1dof", seed=session, compact=True)
         document = tomlkit.parse((part / NAME).read_text(encoding="utf-8"))
@@ -202,7 +202,7 @@ def documents(base: Path, *, runs: int) -> Table:
             rows.append(missing(name, columns=4))
             continue
         cwd = folder if tool else _ROOT
-        warmed = runs > 1  # then the first run does not count
+        warmed = runs > 1  # the first run is not counted
         costs = [run(command, cwd=cwd) for _ in range(runs + warmed)][warmed:]
         rows.append(
             [

@@ -3,9 +3,9 @@
     python -m benchmarks.rivals [--count 480] [--minutes 60]
 
 Each random bench has one or two small hidden effects and records one sweep, as `cartlab explore`
-does first. If the verdict is "ambiguous" or "partial", it records the experiment that `cartlab gap`
-proposes and searches again, at most twice. The program knows which springs are present. A study
-that was stopped continues where it stopped.
+does first. If the verdict is "ambiguous" or "partial", the experiment that `cartlab gap` proposes
+is recorded and the search repeated, at most twice. The search gets the list of springs. A
+study that was stopped continues where it stopped.
 """
 
 import os
@@ -31,10 +31,10 @@ from tests.helpers.virtual import VirtualBench, VirtualSession
 
 ROWS = Path(__file__).with_name("rivals.jsonl")
 FIRST_SEED = 80_000
-SMALL = (0.02, 0.3)  # times the usual size: larger effects are named after one sweep
-MORE = 2  # proposed experiments, one after another
+SMALL = (0.02, 0.3)  # times the usual size; larger effects are named after one sweep
+MORE = 2  # largest number of proposed experiments
 OPEN = ("ambiguous", "partial")
-BUDGET = 300.0  # s for one search for the gap, as in an exploration
+BUDGET = 300.0  # s for one search, as in an exploration
 
 
 def run(seed: int) -> dict:
@@ -71,7 +71,7 @@ def look(folder: Path) -> Gap:
 
 
 def told(gap: Gap) -> dict:
-    """Return the verdict of a gap, and its proposal."""
+    """Return a row with the verdict of a gap and its proposal."""
     return {
         "verdict": gap.verdict,
         "found": sorted(
@@ -89,7 +89,7 @@ def first_of(found: FoundEffect) -> float:
 
 
 def right(row: dict, *, after: int) -> bool:
-    """Return whether the hidden effect is named after at most this number of experiments."""
+    """Return whether the hidden effects are named after at most `after` further experiments."""
     last = row["looks"][: after + 1][-1]
     return last["verdict"] == "named" and last["found"] == row["hidden"]
 

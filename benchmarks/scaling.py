@@ -3,7 +3,7 @@
     python -m benchmarks.scaling measure [--teams 6]    # some minutes; keeps scaling.json
     python -m benchmarks.scaling page                   # simulates, writes benchmarks/scaling.md
 
-Times are processor times. Other work on the machine lengthens them only through shared memory and
+Times are processor times, which other work on the machine lengthens only through shared memory and
 caches. The simulation draws its service times from the measured ones.
 """
 
@@ -37,10 +37,10 @@ from pipeline.submission import load_submission
 COSTS = Path(__file__).with_name("scaling.json")
 PAGE = Path(__file__).with_name("scaling.md")
 PRESETS = ("throne-1dof", "throne-2dof", "throne-3dof")
-COMPARED = (50, 100, 200, 400)  # submissions at once
+COMPARED = (50, 100, 200, 400)  # numbers of submissions
 NIGHT = 8 * 3600.0  # s
 HOUR = 3600.0
-PRICES = (0.02, 0.05)  # price of a core-hour in a rented cluster, in dollars or euros
+PRICES = (0.02, 0.05)  # per core-hour in a rented cluster, in dollars or euros
 
 # ------------------------------------------------------------------------------- costs
 
@@ -58,7 +58,7 @@ def measure(*, teams: int) -> dict[str, Any]:
                 task = Task(id=team.name, key=team.name, sources=(str(team),))
                 start = time.process_time()
                 grading = grade_task(task, rubric=rubric, scratch=base)
-                if number:  # the first one also loads the code that all use
+                if number:  # the first task also loads code that all tasks use
                     seconds.append(round(time.process_time() - start, 3))
                 book = len(grading.grade) + len(grading.fingerprints)
                 start = time.process_time()
@@ -68,11 +68,11 @@ def measure(*, teams: int) -> dict[str, Any]:
             costs["seconds"][preset] = seconds
         handed_in, kept = np.mean(sizes, axis=0)
         costs |= {"handed_in": round(handed_in), "kept": round(kept)}
-        costs["pack"] = round(packing / len(sizes), 4)  # only on a cluster
-        # The client process handles each submission: hash, send, store, compare, write.
+        costs["pack"] = round(packing / len(sizes), 4)  # needed only on a cluster
+        # The client process hashes, sends, stores, compares and writes each submission.
         write_class(base / "few", teams, preset=PRESETS[0])
         write_class(base / "many", 4 * teams, preset=PRESETS[0])
-        grade(base / "few", base / "first", preset=PRESETS[0])  # loads the code that is needed
+        grade(base / "few", base / "first", preset=PRESETS[0])  # loads the code
         few, many = (
             grade(base / name, base / f"out-{name}", preset=PRESETS[0]).parent
             for name in ("few", "many")
@@ -96,7 +96,7 @@ def measure(*, teams: int) -> dict[str, Any]:
 
 
 def comparison(costs: dict[str, Any]) -> tuple[float, float]:
-    """Return seconds per submission and seconds per pair of them, by least squares."""
+    """Return seconds per submission and seconds per pair of submissions, by least squares."""
     n = np.array([float(x) for x in costs["compare"]])
     seconds = np.array(list(costs["compare"].values()))
     a, b = np.linalg.lstsq(np.column_stack([n, n**2]) / seconds[:, None], np.ones(n.size))[0]
@@ -112,9 +112,9 @@ class Cluster:
 
     Attributes
     ----------
-    loss : rate at which each machine is lost; another repeats its work, and it returns after
+    loss : rate at which each machine fails. Another one repeats its work; it returns after
         `repair`.
-    hang : share of submissions that reach the time limit; each becomes a row with its reason.
+    hang : share of submissions that reach the time limit and so are not graded.
     """
 
     machines: int
@@ -130,7 +130,7 @@ class Cluster:
 
 @dataclass(frozen=True, kw_only=True)
 class Night:
-    """The result of a run: seconds to the last stored result, and core-seconds of work."""
+    """Seconds until the last result is stored, and core-seconds of work."""
 
     seconds: float
     busy: float
@@ -143,7 +143,7 @@ def simulate(n: int, service: np.ndarray, *, cluster: Cluster, seed: int) -> Nig
     rng = np.random.default_rng(seed)
     length = rng.choice(service, n)
     length[rng.random(n) < cluster.hang] = cluster.time_limit
-    order, events = count(), []  # (time, order, event, number of its object)
+    order, events = count(), []  # (time, order, event, number of the task or machine)
     ready: deque[int] = deque()
     inbox, unsent, sent = 0, n, 0
     free = [cluster.cores] * cluster.machines
@@ -161,7 +161,7 @@ def simulate(n: int, service: np.ndarray, *, cluster: Cluster, seed: int) -> Nig
         for machine in range(cluster.machines):
             at(rng.exponential(HOUR / cluster.loss), "lost", machine)
     while stored < n:
-        # Half of a client's work is sending and half is storing; storing goes first.
+        # Half of a client's work is sending and half is storing; storing has priority.
         while clients and (inbox or (unsent and sent - stored < window)):
             clients -= 1
             client_busy += cluster.client_cost / 2

@@ -1,4 +1,4 @@
-"""The Silverbox, an electronic mass on a hardening spring, with its official split of the data."""
+"""The Silverbox, an electronic mass on a hardening spring, with the official split of its data."""
 
 import time
 
@@ -35,7 +35,7 @@ TOOLS = ("pysindy", "sysidentpy", "scikit-learn")
 INTERVAL = 2**14 / 1e7  # s
 TRAIN = (40650, 105712)
 TESTS = {"multisine": (105712, 127400), "arrow": (100, 40575), "no extrapolation": (100, 32100)}
-START = 50  # first samples of a test part, which are not judged
+START = 50  # number of samples at the start of a test part that are not judged
 
 
 # Published errors in mV on the parts of `TESTS`; `_NOTE` says how far they were checked.
@@ -74,7 +74,7 @@ def tables(*, quick: bool) -> list[Table]:
 
 
 def free_runs(*, quick: bool) -> Table:
-    """Return a line for each tool."""
+    """Return a row for each tool."""
     head = ["tool", *(f"{name}, mV" for name in TESTS), "s of a core", "answer"]
     file = REAL_DATA / "silverbox" / "SNLS80mV.mat"
     title = "Free runs of the test parts: root mean square of the error"
@@ -118,7 +118,7 @@ def free_runs(*, quick: bool) -> Table:
 
 
 def millivolts(model: Model | None, part: Part) -> str:
-    """Return the root-mean-square error of a free run."""
+    """Return the root-mean-square error of a free run in mV."""
     relative = np.inf if model is None else error(model, [part])
     if not np.isfinite(relative):
         return "diverges"
@@ -127,7 +127,7 @@ def millivolts(model: Model | None, part: Part) -> str:
     )
 
 
-# The effects that an electronic circuit has: its cubic feedback, and an offset voltage.
+# Effects of an electronic circuit: its cubic feedback, and an offset voltage.
 _IN_IT = ("cubic_spring", "force_offset")
 _STAND_IN = """
 cartlab's names are those of carts. An electronic circuit has no {effects}: that name describes the

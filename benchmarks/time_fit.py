@@ -16,8 +16,8 @@ WORDS = """
 Other tools are compared in the [benchmarks](README.md).
 """
 TOOLS = ()
-NOISES = (0.0, 0.0005, 0.00227)  # cm: rounding only, a fifth of a count, a count
-INSIDE = 1.96  # standard errors: 95 % of the estimates are within, if the standard errors are right
+NOISES = (0.0, 0.0005, 0.00227)  # in cm: only rounding, a fifth of a count, a count
+INSIDE = 1.96  # 95 % of the estimates are within this many standard errors, if these are right
 
 
 def tables(*, quick: bool) -> list[Table]:
@@ -25,7 +25,7 @@ def tables(*, quick: bool) -> list[Table]:
 
 
 def coverage(seeds: int) -> Table:
-    """Return how many standard errors the named parameters are off, for each preset."""
+    """Return a table of errors in standard errors, for each preset."""
     rows = []
     for name, chain in PRESETS.items():
         truth = np.array(list(chain.parameters().values()))

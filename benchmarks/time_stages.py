@@ -20,7 +20,7 @@ COUNT = 0.00227  # cm
 RATES = (113.1, 333.0, 1000.0)  # Hz
 DWELL_RATES = (113.1, 500.0)  # Hz
 ZETAS = (0.01, 0.03, 0.07, 0.15)
-INSIDE = 1.96  # standard errors: 95 % of the estimates are within, if the standard errors are right
+INSIDE = 1.96  # 95 % of the estimates are within this many standard errors, if these are right
 
 
 def record(t: Array, y: Array, *, kind: Kind, u: Array | None = None, omega: float | None = None):
@@ -38,7 +38,7 @@ def record(t: Array, y: Array, *, kind: Kind, u: Array | None = None, omega: flo
 
 
 def release(t: Array, *, omega_n: float, zeta: float, start: float, d: float) -> Array:
-    """Position of a cart released at `start` at 0.4 s; dry friction holds it within d of rest."""
+    """Return the position of a cart released at 0.4 s; dry friction holds it within d of rest."""
     omega_d, decay = omega_n * np.sqrt(1 - zeta**2), zeta * omega_n
     half, turning, y = np.pi / omega_d, start, np.full_like(t, start)
     for k in range(int((t[-1] - 0.4) / half) + 1):
@@ -69,7 +69,7 @@ def tables(*, quick: bool) -> list[Table]:
 
 
 def errors(*, decays: int, dwells: int) -> Table:
-    """Return a row for each kind of number, from the given decays and dwells."""
+    """Return a row for each kind of number, from this many decays and dwells."""
     damping = np.concatenate([_decay_errors(decays, zeta, fs) for zeta in ZETAS for fs in RATES])
     rows = [
         _row("ζ of a clean decay: fit of the record", damping[:, 0]),
@@ -107,7 +107,7 @@ def _decay_errors(seeds: int, zeta: float, fs: float) -> Array:
 
 
 def friction(seeds: int) -> Table:
-    """Return how often dry friction is reported in a decay, by its size."""
+    """Return how often dry friction is reported in a decay, by the size of the friction."""
     rows = []
     for d in (0.0, 0.002, 0.01):
         present = []
