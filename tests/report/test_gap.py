@@ -255,7 +255,8 @@ def test_suspects_are_listed_with_their_errors():
     gap = replace(make_gap("unexplained", ()), final=0.153, suspects=(suspect,))
     text = page_of(gap).text
 
-    assert "Suspected, though not proven: backlash between motor and cart 1 (leaves 12.0 %)" in text
+    assert "Suspected, though not proven: backlash between motor and cart 1" in text
+    assert "cart 1 (leaves an error of 12.0 %)" in text
     assert read_gap(json_text(gap)).suspects == gap.suspects
 
 

@@ -123,8 +123,8 @@ def check_comparable(before: Draft, *, bench: Bench) -> None:
     then, units = before["submission"], Units(**before["submission"]["units"])
     if (then["carts"], units) != (bench.n, bench.units):
         raise ConfigError(
-            f"the earlier draft is of {count(then['carts'], 'cart')} in {units.position} and "
-            f"{units.input}, this one of {bench.n} in {bench.units.position} and "
+            f"the earlier draft has {count(then['carts'], 'cart')} in {units.position} and "
+            f"{units.input}, this one has {bench.n} in {bench.units.position} and "
             f"{bench.units.input}: they cannot be compared"
         )
 

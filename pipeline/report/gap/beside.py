@@ -37,7 +37,7 @@ def _find(folder: Path, analysis: Analysis) -> "tuple[Gap | None, str]":
             text = read_text(path, where=place, limit=_MOST_BYTES, error=ConfigError)
             gap = read_gap(text)
             if gap.linear.chain.n != analysis.bench.n:
-                raise ConfigError(f"it is of {gap.linear.chain.n} carts")
+                raise ConfigError(f"it has {gap.linear.chain.n} carts")
         except ConfigError as error:
             return None, f"{place} cannot be used: {error}"
         if gap.provenance.files != analysis.files:

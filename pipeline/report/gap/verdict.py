@@ -180,7 +180,8 @@ def _suspicion(gap: Gap) -> str:
     if not gap.suspects:
         return ""
     named = [
-        f"{effect_name(s.effect, s.where)} (leaves {share(s.nrmse_after)})" for s in gap.suspects
+        f"{effect_name(s.effect, s.where)} (leaves an error of {share(s.nrmse_after)})"
+        for s in gap.suspects
     ]
     also = "Also suspected" if gap.effects else "Suspected, though not proven"
     return f" {also}: {listing(named)}."

@@ -44,7 +44,7 @@ def with_answer(notes: str, id_: str, answer: str) -> str:
     if any(at <= level for at, *_ in _headings(text)):
         least = "#" * (level + 1)
         raise SubmissionError(
-            f"a heading in an answer must start with {least}, or it would end there"
+            f"a heading in an answer must start with {least}, or the answer would end there"
         )
     if len(_headings(f"{text}\n\n# end")) != len(_headings(text)) + 1:
         raise SubmissionError(_OPEN)
