@@ -82,7 +82,7 @@ class Record:
     hold : how the input behaves between samples.
     source : path of the data file inside the submission.
     notes : corrections made while reading.
-    turned : whether the sign of the input was reversed to agree with the other recordings.
+    turned : whether the input's sign was reversed, so that it agrees with the other recordings.
     position_scale, input_scale : signed factors from the file's own numbers to y and u. A
         controller's gains may be in the file's units.
     heading_units : the units that the headings of the position and input columns state.
@@ -124,7 +124,7 @@ class Record:
 
     @property
     def sample_time(self) -> float:
-        """The mean sample interval, s."""
+        """The mean sample interval in s."""
         return float((self.t[-1] - self.t[0]) / (self.t.size - 1))
 
 
@@ -798,7 +798,10 @@ class Analysis:
     @property
     @computed(key="hardware")
     def hardware_by_cart(self) -> tuple[HardwareCheck, ...]:
-        """One entry per run and cart: the simulated loop, with the measured-input check inside."""
+        """One entry per run and cart:
+
+        the simulated loop, which contains the check on the measured input.
+        """
         found: dict[tuple[str, int], HardwareCheck] = {}
         for check in sorted(self.hardware, key=lambda check: check.loop):  # "closed" before "open"
             key = (check.experiment, check.cart)

@@ -164,7 +164,7 @@ def _noise(gap: Gap) -> Array:
 
 
 def _pinned(gap: Gap) -> Array:
-    """Return how far each parameter of the chain may vary according to the records."""
+    """Return how far the records allow each parameter of the chain to vary."""
     chain = gap.model.chain
     return np.array(
         [
@@ -284,7 +284,7 @@ def _separate(
 def _need_input(one: AugmentedChain, other: AugmentedChain) -> bool:
     """Return whether two models differ only in effects on an input, such as a lag and a delay.
 
-    Their free motions should then agree; any difference is chance, such as bounces at a contact.
+    Their free motions should then agree; bounces at a contact may make accidental differences.
     """
     mine, others = ({(t.effect.key, t.place): t for t in m.terms} for m in (one, other))
     lone = [(mine | others)[key] for key in mine.keys() ^ others.keys()]

@@ -182,7 +182,7 @@ def _typed(value: float) -> float:
 
 
 def _law(loop: StateLoop, design: FeedbackDesign | None) -> StateFeedback:
-    """Return the gains stated in the plan, else those of the design, in the bench's form."""
+    """Return the gains in the bench's form, as stated in the plan or else as designed."""
     if loop.gains and loop.prefilter is not None:
         return StateFeedback(gains=np.array(loop.gains), prefilter=loop.prefilter)
     if design is None:

@@ -55,7 +55,7 @@ class Knowledge:
     sample_time : sample time of the bench in s.
     beyond : ratio of the measured variances to those that encoder errors alone would cause.
         Friction, for example, increases it.
-    dwells : the dwells so far. If there are any, the carts are identified from dwells alone.
+    dwells : the dwells so far. If there are any, only they are used to identify the carts.
     misfit : how far a dwell is from the carts beyond its standard error, as a share of the dwell's
         magnitude.
     """
@@ -207,7 +207,7 @@ class Knowledge:
         return np.tile(J.T @ J, (2, 1, 1))
 
     def of_lines(self, omega: Array, *, amplitude: Array, seconds: float) -> Array:
-        """Return H and S (n, 2, n_p, n_p) of each steady sine of omega (n,), rad/s, by itself.
+        """Return H and S (n, 2, n_p, n_p) of single steady sines; `omega` (n,) is in rad/s.
 
         The sines move the carts by many counts, so rounding errors are white.
         """
@@ -275,7 +275,7 @@ def _fitted_records(analysis: Analysis, fit: ChainFit) -> list[Record]:
 
     Raises
     ------
-    DataError : the fit is to a table, so there are no records.
+    DataError : the fit used a table, which has no records.
     """
     kinds = ("sine",) if fit.method == "bode_fit" else ("step", "sweep")
     out = {one.experiment for one in analysis.left_out}

@@ -113,7 +113,8 @@ def plan_next(
     Raises
     ------
     DataError : the recorded data do not identify the carts, so nothing can be predicted.
-    ConfigError : there is no such goal; gap.json is broken, or belongs to other data or limits.
+    ConfigError : there is no such goal, or gap.json is broken or was made from other data or
+        limits.
     """
     path = plan_path(submission)
     old, new = current_plan(submission), not path.exists()
@@ -240,7 +241,7 @@ def _decisive(submission: Submission, limits: PlanLimits) -> tuple[Recording, fl
     Raises
     ------
     DataError : there is no gap.json, or it contains no proposal.
-    ConfigError : gap.json is broken, or belongs to other data or limits than these.
+    ConfigError : gap.json is broken, or was made from other data or limits.
     """
     path = submission.folder / "gap" / "gap.json"
     command = f"`cartlab gap {submission.folder}`"

@@ -100,7 +100,7 @@ def make_plan(submission: Submission, *, stock: bool = False, progress: Progress
 def propose_plan(submission: Submission, *, bench: Description | None = None) -> Plan:
     """Propose the first recordings from the submission's statements about the bench, without data.
 
-    Existing recordings are not proposed again. `extend_plan` continues from there.
+    Recordings that the submission already has are not proposed. `extend_plan` adds later ones.
 
     Parameters
     ----------
@@ -195,14 +195,14 @@ def _limits(system: System, design: Design | None, bench: Description | None) ->
 
 
 def _decays(cart: int, system: System) -> list[Recording]:
-    """Return releases of one cart by hand, with the others held; empty if it has no spring."""
+    """Return releases of one cart by hand; a cart without a spring gives no release."""
     if not (system.springs[cart - 1] or system.springs[cart]):
         return []
     return [let_go(cart, name=f"decay-{cart}{repeat}", seconds=10.0) for repeat in _REPEATS]
 
 
 def let_go(cart: int, *, name: str, seconds: float) -> Recording:
-    """Return the recording of one cart released by hand, with the others held."""
+    """Return the recording of one cart that is released by hand while the others are held."""
     return Recording(
         id=name,
         kind="decay",
@@ -338,7 +338,7 @@ def _loop(
             f"no closed loop can be proposed: {_reason(analysis, Stage.STATE_FEEDBACK)}"
         )
     task = submission.design or Design(cart=feedback.cart)
-    # Carts before the controlled one may move further than it does.
+    # Carts between the motor and the controlled cart may move further than the controlled cart.
     furthest = float(np.max(np.abs(feedback.y)) / abs(feedback.reference))
     size = min(abs(task.reference), FURTHEST * limits.travel / furthest)
     edge = max(3.0 * task.settling_time, 2.0)  # s between steps of the set point

@@ -18,7 +18,7 @@ _WHY_WORSE = (
 
 @dataclass(frozen=True, kw_only=True)
 class Weighed:
-    """Relative errors: now, after the proposed recording alone, and after the best one alone.
+    """Relative errors: now, after only the proposed recording, and after only the best recording.
 
     Attributes
     ----------

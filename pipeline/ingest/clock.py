@@ -17,7 +17,7 @@ from pipeline.ingest.formats.table import FileTable
 
 SLOW = 0.5  # s between samples; no bench records more slowly
 FEWEST_SAMPLES = 8  # fewest samples for any estimate
-_GAP = 4.0  # time is missing where an interval is so many times the usual one
+_GAP = 4.0  # time is missing if an interval is this many times the usual one
 # Largest distance of a stamp from its line, in rounding steps: half a step, plus the fit's error.
 _ROUNDING_BAND = 0.65
 # Widths of a strip around a line, in rounding steps: 1 if stamps are only rounded, more if some
@@ -51,17 +51,17 @@ class Clock:
 
     @property
     def interval(self) -> float:
-        """The usual sample interval, s."""
+        """The usual sample interval in s."""
         return float(np.median(np.diff(self.t))) if self.pieces == 0 else self.mean_interval
 
     @property
     def mean_interval(self) -> float:
-        """The mean sample interval, s."""
+        """The mean sample interval in s."""
         return float((self.t[-1] - self.t[0]) / (self.t.size - 1))
 
     @property
     def jitter(self) -> float:
-        """Root-mean-square deviation of the intervals from their median, without gaps, s."""
+        """Root-mean-square deviation of the intervals (except gaps) from their median, in s."""
         steps = np.diff(self.t)
         usual = np.median(steps)
         return float(np.sqrt(np.mean((steps[steps < _GAP * usual] - usual) ** 2)))
@@ -185,7 +185,7 @@ def decimal_step(values: Array) -> float:
         # A double near 1e5 s, in steps of 1e-9 s, is itself accurate only to a hundredth of the
         # step.
         rounding = 1e-6 + 4 * np.finfo(np.float64).eps * np.abs(multiples).max()
-        # In steps; a value further off is not a multiple.
+        # In steps; a value that deviates more is not a multiple.
         if np.abs(multiples - np.round(multiples)).max() < min(rounding, 0.02):
             return step
     return 0.0

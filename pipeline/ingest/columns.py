@@ -17,7 +17,8 @@ _POSITION = re.compile(
     r"x ?(\d)|enc(?:oder)? ?(\d)(?: pos(?:ition)?)?|(?:cart|pos|position) ?(\d) ?(?:pos(?:ition)?)?"
 )
 _ONE_POSITION = re.compile(r"x|y|pos|position|displacement")
-_NO_ROLE = re.compile(r"|sample|samples|index|n|no|nr")  # known headings without a role
+# known headings of columns that have no role
+_NO_ROLE = re.compile(r"|sample|samples|index|n|no|nr")
 _IN_UNITS = ("csv", "workbook", "lvm", "tdms")  # formats whose values are in the submission's units
 _COUNTED = re.compile(r"\benc|counts?\b|commanded pos", re.IGNORECASE)
 # A unit as in "time [ms]", "x1 (cm)" or "x1_cm". The last form is not for every unit: "u_in" does

@@ -27,7 +27,7 @@ from pipeline.words.numbers import abridge
 
 _NARROWEST = 8  # fewest samples under a bump
 _BUMPS = 6  # bumps side by side in a record
-FEW_NAMES = 6  # names to list; further ones are only counted
+FEW_NAMES = 6  # most names listed; further ones are only counted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +143,7 @@ def find_signs(records: Sequence[Record], *, stated: Mapping[str, int]) -> dict[
 
     Parameters
     ----------
-    stated : stated sign of each record; records without one count as 1.
+    stated : stated sign of each record; records that are not listed count as 1.
     """
     weighed = {record.id: found for record in records if (found := _weigh(record)) is not None}
     if not weighed:

@@ -209,7 +209,7 @@ def _name_them(told: Roles) -> str:
 
 
 def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str]) -> Clock | None:
-    """Return the clock, or None without one; its notes are added to `problems`.
+    """Return the clock, or None if the file has none; notes on the clock are added to `problems`.
 
     Raises
     ------
@@ -295,7 +295,7 @@ def is_stepped(u: Array) -> bool:
 
 
 def line_frequency(t: Array, u: Array) -> float | None:
-    """Return the frequency (Hz) of an input that is a single sine, otherwise None."""
+    """Return the frequency (Hz) of an input that is a single sine; otherwise None."""
     even = np.linspace(t[0], t[-1], t.size)
     signal = np.interp(even, t, u)
     power = np.abs(np.fft.rfft((signal - signal.mean()) * np.hanning(t.size))) ** 2

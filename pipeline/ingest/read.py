@@ -271,7 +271,7 @@ def _check_carts(table: FileTable, experiment: Experiment, positions: list[Colum
 
 
 def _window(clock: Clock, experiment: Experiment) -> slice:
-    """Return the samples inside the experiment's window; all of them without a window."""
+    """Return the samples inside the experiment's window, or all samples if it has no window."""
     if experiment.window is None:
         return slice(None)
     start, end = experiment.window

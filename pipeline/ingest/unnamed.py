@@ -117,7 +117,7 @@ def _other_clock(values: Array) -> tuple[str, ...]:
 
 
 def _without_copies(table: FileTable, signals: Sequence[int]) -> list[int]:
-    """Return the columns without a commanded position that only repeats a later encoder column."""
+    """Return the columns, but not a commanded position that repeats a later encoder column."""
     values, whole = table.values, table.whole
     return [
         i for i in signals
@@ -126,7 +126,7 @@ def _without_copies(table: FileTable, signals: Sequence[int]) -> list[int]:
 
 
 def _without_rates(values: Array, signals: Sequence[int], *, interval: float) -> list[int]:
-    """Return the columns without those that are the velocity of another."""
+    """Return the columns, leaving out those that are the velocity of another column."""
     parts = _averages(values, signals)
     if parts is None:
         return list(signals)
@@ -194,7 +194,7 @@ def _by_jumps(
 def _by_law(
     values: Array, signals: Sequence[int], left: Mapping[int | None, float]
 ) -> tuple[int | None, None] | None:
-    """Return the input as the column that explains the motion of the others; None if not clear."""
+    """Return the input if one column clearly explains the motion of the others, or None."""
     if not left:
         return None
     if left[None] < _FREE:  # no input is needed, or all columns are sines

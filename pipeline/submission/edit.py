@@ -95,7 +95,7 @@ def edit_submission(
 def append_experiment(
     document: tomlkit.TOMLDocument, entry: Mapping[str, Value], *, remarks: Sequence[str] = ()
 ) -> None:
-    """Add an `[[experiments]]` table after the others; remarks become comments at its end."""
+    """Add an `[[experiments]]` table after the last one, with remarks as comments at its end."""
     there: Any = document.get("experiments")
     inline = isinstance(there, Array)
     table: Any = tomlkit.inline_table() if inline else tomlkit.table()

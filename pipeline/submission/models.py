@@ -103,7 +103,7 @@ class System(TomlTable):
 
     @property
     def states_springs(self) -> bool:
-        """Whether the springs were stated; otherwise all of them are assumed."""
+        """Whether the springs were stated; if not, all springs are assumed."""
         return "springs" in self.model_fields_set
 
     @property

@@ -18,7 +18,8 @@ from pipeline.submission.models import Submission
 
 Value: TypeAlias = "str | bool | int | float | Sequence[Value] | Mapping[str, Value]"
 _LONGEST_LINE, _SHOWN = 300, 60  # characters of a line that are checked, and that are shown
-_LARGEST = 30  # exponent; above that of any physical number, but numbers can still be multiplied
+# exponent; larger than that of any physical number, yet numbers can still be multiplied
+_LARGEST = 30
 _AT = re.compile(r" \(at line (\d+), column (\d+)\)$")
 
 

@@ -11,7 +11,7 @@ class TypedNumber(str):
 
 
 def toml_section(heading: str, entries: Mapping[str, Value]) -> str:
-    """Return one table as TOML; without a heading, keys for the top of the file."""
+    """Return one table as TOML or, without a heading, the keys for the top of the file."""
     lines = [f"{key} = {_toml(value)}" for key, value in entries.items()]
     return "\n".join([heading, *lines] if heading else lines) + "\n"
 

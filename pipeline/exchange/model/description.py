@@ -162,7 +162,7 @@ class Description:
     springs: tuple[SpringTension, ...]
     forces: tuple[Force, ...]
     links: tuple[tuple[str, Force], ...]
-    play: tuple[str, str, str] | None  # gap, stiffness, damping; None without play
+    play: tuple[str, str, str] | None  # gap, stiffness, damping; None if there is no play
     frictions: tuple[Force, ...]
     bristles: tuple[Bristle, ...]
     inputs: tuple[tuple[str, str], ...]

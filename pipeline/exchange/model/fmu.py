@@ -101,7 +101,7 @@ def _variables(description: Description) -> list[Variable]:
 
 
 def compile_library(sources: Mapping[str, str]) -> bytes | None:
-    """Return the sources compiled to a library for this computer; None without a compiler."""
+    """Return the sources compiled to a library for this computer; None if there is no compiler."""
     compiler = next(filter(None, map(shutil.which, _COMPILERS)), None)
     if compiler is None or sys.platform not in _LIBRARY:
         return None

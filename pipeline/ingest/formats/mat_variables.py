@@ -43,7 +43,7 @@ _NUMBERS = frozenset(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MatVariable:
-    """A variable: its numbers (rows, columns), or None and a description.
+    """A variable with its numbers (rows, columns), or with a description if `values` is None.
 
     `bytes` is the variable's size in the file if its numbers are not read.
     """
@@ -304,7 +304,7 @@ def _holds_numbers(dtype: np.dtype) -> bool:
 
 
 def _class_of(item: Any) -> str:
-    """Return MATLAB's class of a data set; without one, the class of its numbers."""
+    """Return MATLAB's class of a data set or, if it is not stated, the class of the numbers."""
     if "MATLAB_empty" in item.attrs:
         return "empty"
     of = item.attrs.get("MATLAB_class", b"double" if item.dtype.kind in "fiu" else b"unknown")

@@ -89,7 +89,7 @@ def read_tdms(raw: bytes, *, source: str) -> FileTable:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Channel:
-    """A channel: its numbers (or None and a description), and its unit and clock if stated."""
+    """A channel with its unit and clock if stated; `values` is None if it holds no numbers."""
 
     group: str
     name: str
@@ -246,7 +246,7 @@ def _recording(channels: Sequence[_Channel], *, source: str) -> tuple[str, list[
 
     Raises
     ------
-    SubmissionError : there is no recording, there are several, or channel lengths differ.
+    SubmissionError : there is no recording, there are several, or its channels differ in length.
     """
     signals = [one for one in channels if one.values is not None and one.samples > 1]
     if not signals:

@@ -106,7 +106,7 @@ class _Sheet:
 
         Raises
         ------
-        SubmissionError : there are two of about the same length.
+        SubmissionError : two tables have about the same length.
         """
         blocks = self._blocks()
         if not blocks:

@@ -222,7 +222,7 @@ def _named(i: int, n: int) -> list[str]:
 
 
 def couplings(n: int) -> list[Equation]:
-    """Return the ratios of springs to masses, and the input's entry 1/m_1."""
+    """Return equations for the ratios of springs to masses, and for the entry 1/m_1 of B."""
     if n == 1:
         return [Equation("inverse_m", "K*omega_n**2")]
     first = Equation("inverse_m_1", f"K_1*d_0/{_constant(2, n)}")

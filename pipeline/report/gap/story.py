@@ -294,7 +294,7 @@ def _interventions(page: Page, gap: Gap) -> list[Block]:
 
 
 def _touched(page: Page, gap: Gap, trace: Trace) -> list[tuple[Array, Array]]:
-    """Return the stretches just before and after a run during which a cart was moved by hand."""
+    """Return the recorded stretches, next to a run, in which a cart was moved by hand."""
     record = page.records.get(trace.experiment)
     if record is None:
         return []

@@ -18,7 +18,7 @@ WORDS = phrases("gap")
 
 
 def added_name(gap: Gap) -> str:
-    """Return the name of the model with effects; "" without effects."""
+    """Return the name of the model with effects; "" if it has no effects."""
     if not gap.effects:
         return ""
     return WORDS.text("with_suspects" if gap.verdict == "unexplained" else "with_effects")

@@ -51,7 +51,7 @@ def render_html(document: Document) -> str:
 
 
 def render_fragment(blocks: Sequence[Block]) -> str:
-    """Return blocks as HTML for another page, such as a notebook; without scripts."""
+    """Return blocks as HTML without scripts, for another page such as a notebook."""
     return _environment().get_template("fragment.html.j2").render(blocks=blocks)
 
 

@@ -82,7 +82,7 @@ def _file(picture: Picture) -> str:
 
 @cache
 def _fonts() -> typst.Fonts:
-    """Return the fonts, without those of the system, so that all computers make the same pages."""
+    """Return cartlab's own fonts, so that all computers make the same pages."""
     return typst.Fonts(include_system_fonts=False, font_paths=[_font_folder()])
 
 

@@ -96,7 +96,7 @@ def fill_pages(lay_out: Callable[[Choices], Pages]) -> Choices:
     """Return the changes to the layout that leave the least white space.
 
     Pages are filled from first to last. A change may leave white space on a later page, which is
-    then filled in its turn. In the end, the best of all layouts is returned.
+    filled when its turn comes. In the end, the best of all layouts is returned.
 
     Parameters
     ----------

@@ -175,7 +175,7 @@ def _nothing_left(analysis: Analysis) -> Spans:
 def set_up_in_doubt(analysis: Analysis) -> tuple[bool, Spans] | None:
     """Return the problems that make every number wrong, as one finding, or None.
 
-    They are shown first.
+    The summary shows this finding first.
     """
     wrong = [check for check in analysis.failed_checks if _group(check) in _AT_THE_TOP]
     if not wrong:

@@ -24,7 +24,7 @@ def named(heading: str) -> str:
 
 
 def written_answer(notes: str, id_: str) -> str:
-    """Return the answer to a question as typed; "" without one."""
+    """Return the answer to a question as typed; "" if there is no answer."""
     lines = _lines(notes)
     found = _span(notes, id_)
     return "".join(lines[found[2] : found[3]]).strip() if found else ""

@@ -60,7 +60,7 @@ class Page(PageBuilder):
 
 
 def remarks(notes: Sequence[str]) -> list[Block]:
-    """Return notes as a list; empty without notes."""
+    """Return notes as a list; empty if there are no notes."""
     return [bullet_list(rich(clean(note)) for note in notes)] if notes else []
 
 

@@ -216,7 +216,7 @@ def _staged_differences(analysis: Analysis) -> Block | None:
 
 
 def chain_table(page: Page, chain: Chain, *, std: Mapping[str, float]) -> Table:
-    """Return masses, dampings and springs, with standard errors for those that were fitted."""
+    """Return masses, dampings and springs, with the standard errors of the fitted ones."""
     units = page.units
     kinds = (
         ("m", "mass", chain.m, units.mass),

@@ -307,7 +307,7 @@ def open_questions(
 
     Parameters
     ----------
-    by_model : the answers are model answers, not those of students.
+    by_model : whether the answers are model answers instead of the students' answers.
     """
     if not asked:
         return []

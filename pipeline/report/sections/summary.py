@@ -172,7 +172,7 @@ def _number_tile(name: str, final: Estimate, *, unit: str, is_sure: bool, error:
         told = _WORDS.text(error, share=f"{significant(100 * share, digits=1)} %")
         unit = f"{unit}, {told}" if unit else told
     else:
-        # If the error is 1 % or more, two digits of it give the value about four digits.
+        # If the error is 1 % or more, the value has about four digits when the error has two.
         value = with_error(final.value, final.std, digits=2 if share >= 0.01 else 1)
     return Tile(label=spans(name_span(name)), value=spans(value), note=spans(unit))
 
