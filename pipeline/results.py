@@ -798,10 +798,7 @@ class Analysis:
     @property
     @computed(key="hardware")
     def hardware_by_cart(self) -> tuple[HardwareCheck, ...]:
-        """One entry per run and cart:
-
-        the simulated loop, which contains the check on the measured input.
-        """
+        """One entry per run and cart: the simulated loop, with its check on the measured input."""
         found: dict[tuple[str, int], HardwareCheck] = {}
         for check in sorted(self.hardware, key=lambda check: check.loop):  # "closed" before "open"
             key = (check.experiment, check.cart)

@@ -77,7 +77,7 @@ class Knowledge:
 
         Raises
         ------
-        DataError : the carts are not identified, or only from a table.
+        DataError : the carts are not identified, or they are identified only from a table.
         """
         chain = identified_chain(analysis)
         fit = analysis.fit

@@ -30,7 +30,7 @@ class PlanLimits(TomlTable):
 
 
 class PidLoop(TomlTable):
-    """Gains of the bench's own PID on one cart; it turns encoder counts into duty counts."""
+    """Gains of the bench's own PID on one cart, from encoder counts to duty counts."""
 
     type: Literal["pid"] = "pid"
     kp: Finite

@@ -37,7 +37,7 @@ class Weighed:
 def weigh(
     analysis: Analysis, proposed: Recording, plan: Plan, *, goal: str, commands: frozenset[str]
 ) -> Weighed:
-    """Compare a recording with the best one for a goal within the limits of the plan.
+    """Compare a recording with the best recording for a goal that the plan's limits allow.
 
     Raises
     ------

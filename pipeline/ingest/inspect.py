@@ -20,14 +20,14 @@ from pipeline.words.numbers import by_note, first_few
 
 NO_CLOCK = "no time column: state `sample_rate`"
 _MOST_COLUMNS = 16  # most columns listed in a sentence
-_COPIED = 0.999  # correlation above which a target is the input itself
+_COPIED = 0.999  # correlation above which a reference is the input itself
 
 
 @dataclass(frozen=True, kw_only=True)
 class ColumnInspection:
     """One column: its heading, its likely role, its range and the encoder step found.
 
-    `whole` is true if it holds only whole numbers, like an encoder's counts.
+    `whole` is true if the column holds only whole numbers, like an encoder's counts.
     """
 
     name: str
@@ -265,9 +265,9 @@ def _guess(
 
 
 def _follows(u: Array, reference: Array) -> bool:
-    """Return whether the target is the commanded input itself, as in open loop.
+    """Return whether the reference is the commanded input itself, as in open loop.
 
-    It may be rounded to counts, and logged up to one sample apart from the input.
+    The reference may be rounded to counts, and logged up to one sample apart from the input.
     """
     if np.ptp(reference) == 0.0:
         return False

@@ -379,7 +379,7 @@ def _apart_names(
 ) -> tuple[str, str]:
     """Return names for two models, made from the effects that only one of them has.
 
-    If the first model has all effects of the second, the second is "without it" or "without them".
+    If only the first model has effects of its own, the second is "without it" or "without them".
     """
     one = f"with {listing(first, most=most)}"
     if second:
