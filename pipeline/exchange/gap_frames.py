@@ -10,7 +10,8 @@ from pipeline.json_files import keys, plain
 from pipeline.results import Analysis
 
 if TYPE_CHECKING:
-    import pandas as pd  # late: importing it takes a fifth of a second
+    # Imported late, because this takes a fifth of a second.
+    import pandas as pd
 
 _PARAMETER = ("effect", "cart", "spring", "parameter", "value", "std", "unit")
 _LEFT = ("experiment", "time", "cart", "position", "velocity", "input", "force")

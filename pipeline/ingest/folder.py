@@ -57,7 +57,7 @@ def files_not_read(folder: Path, *, root: Path) -> list[NotRead]:
 
 
 def refused(root: Path, name: str) -> NotRead | None:
-    """Return why a file below `root` must not be opened; None if it may be."""
+    """Return why a file below `root` must not be opened; None if it may be opened."""
     problem = outside(root, name)
     if problem is None:
         return None

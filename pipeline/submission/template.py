@@ -42,7 +42,8 @@ def write_templates(folder: Path, *, carts: int) -> None:
 
     An existing `submission.toml` or `notes.md` stays as it is.
     """
-    import jinja2  # late: importing it takes 50 ms
+    # Imported late, because this takes 50 ms.
+    import jinja2
 
     source = (TEMPLATES / f"{NAME}.j2").read_text(encoding="utf-8")
     environment = jinja2.Environment(

@@ -207,7 +207,7 @@ def check_number(value: float | Decimal, at: Location) -> None:
 
 
 def _decimal(text: str) -> Decimal:
-    """Return a number as typed; if its exponent is too large for a decimal, an unusable one."""
+    """Return a number as typed; a number with a huge exponent becomes one that is refused."""
     try:
         return Decimal(text)
     except InvalidOperation:

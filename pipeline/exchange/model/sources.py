@@ -31,7 +31,8 @@ def render(
     name: str, description: Description, *, code: Callable[[str], str] = in_c, **more: Any
 ) -> str:
     """Fill in a template of `templates/model`; `code` translates expressions."""
-    import jinja2  # late: importing it takes 50 ms
+    # Imported late, because this takes 50 ms.
+    import jinja2
 
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES / "model"),

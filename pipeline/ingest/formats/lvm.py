@@ -207,7 +207,7 @@ def _with_one_clock(rows: Rows, names: Sequence[str], *, place: str) -> Rows:
 
 
 def _with_times(table: FileTable, segment: _Segment, dialect: _Dialect) -> FileTable:
-    """Return the table with the times that the header states, if it does."""
+    """Return the table with the times that the header states, if it states any."""
     start, interval = (_stated(tag, segment, dialect) for tag in ("X0", "Delta_X"))
     if not interval:
         return table

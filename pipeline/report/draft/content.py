@@ -137,10 +137,11 @@ def _model(page: Page) -> list[Block]:
 
 
 def _about_gap(gap: "Gap | None") -> tuple[Blocks, Blocks, Blocks]:
-    """Return functions that build blocks on the gap: a paragraph, runs, and the section."""
+    """Return three functions that build blocks on the gap, for three places in the report."""
     if gap is None:
         return _nothing, _nothing, _nothing
-    from pipeline.report.gap import section  # late: loads the catalogue of effects
+    # Imported late, because it loads the catalogue of effects.
+    from pipeline.report.gap import section
 
     return (
         lambda _: section.gap_in_short(gap),

@@ -91,7 +91,8 @@ def render_report(
     write_document(document, out, name="report", pdf=files.pdf)
     clear_files(out, PLOTS)  # left by an earlier report
     if files.plots:
-        from pipeline.report.plots.page import write_plots  # late: loads the catalogue of effects
+        # Imported late, because it loads the catalogue of effects.
+        from pipeline.report.plots.page import write_plots
 
         write_plots(analysis, out, gap=gap, progress=progress)
 

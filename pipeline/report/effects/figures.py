@@ -157,7 +157,7 @@ def _fingerprint(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart: i
 
 
 def _against_motion(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart: int) -> None:
-    """Plot the force that the linear chain does not explain over its cause."""
+    """Plot the unexplained force (vertical axis) against the motion that causes it."""
     motion = run.rate() if term.effect.axis == "velocity" else run.with_it
     force, seen, word = run.residual_force(chain)[cart - 1], motion[cart - 1], f"of cart {cart}"
     if term.effect.place == "spring":

@@ -146,7 +146,7 @@ def force_figure(
     units: tuple[str, str],
     added: str = ADDED,
 ) -> Figure | None:
-    """Return a figure of the force that the linear part does not explain, over its cause.
+    """Return a figure of the unexplained force (vertical axis) against its cause.
 
     Returns None if no run shows it, because a neighbouring cart was not measured or the effect
     changes only the timing.

@@ -31,7 +31,8 @@ def _find(folder: Path, analysis: Analysis) -> "tuple[Gap | None, str]":
         path = folder / place
         if not path.is_file():
             continue
-        from pipeline.gap.types import read_gap  # late: loads the catalogue of effects
+        # Imported late, because it loads the catalogue of effects.
+        from pipeline.gap.types import read_gap
 
         try:
             text = read_text(path, where=place, limit=_MOST_BYTES, error=ConfigError)
