@@ -49,13 +49,12 @@ def effects_page() -> str:
 def _entry(effect: Effect) -> Iterator[str]:
     term = usual_term(effect, PRESETS[BENCH])
     yield f"## {effect.title}"
-    yield _wrapped(f"`{effect.key}`: {effect.sentence}")
+    yield _wrapped(f"`{effect.key}` (acts on {_ACTS_ON[effect.place]}): {effect.sentence}")
     yield f"```math\n{to_tex(effect.formula)}\n```"
     picture = (IMAGES / f"{effect.key}.svg").as_posix()
-    yield f"![Fingerprint and example]({picture})"
+    yield f"![Fingerprint]({picture})"
     parameters = ", ".join(parameter_text(p) for p in effect.parameters if p.reported)
     facts = {
-        "Acts on": _ACTS_ON[effect.place],
         "Parameters": parameters,
         "Option": f"`{hiding_option(term)}`",
         "Fingerprint": effect.fingerprint,

@@ -185,8 +185,8 @@ def rows(analysis: Analysis, gap: Gap) -> Iterator[str]:
     for cart in sorted({d.cart for d in rubbed}):
         own = [d for d in rubbed if d.cart == cart]
         decays = f"{len(own)} decay{'s' * (len(own) > 1)}"
-        yield f"| ζ of cart {cart} from {decays}, friction ignored | {span(own, _apparent)} |"
-        yield f"| ζ of cart {cart} from {decays}, friction included | {span(own, _viscous)} |"
+        ratios = f"{span(own, _apparent)} → {span(own, _viscous)}"
+        yield f"| ζ of cart {cart} from {decays}: friction ignored → included | {ratios} |"
     for found in gap.effects:
         place = next((f", {what} {number}" for what, number in found.where.items()), "")
         values = ", ".join(

@@ -23,7 +23,7 @@ EFFECT = Effect(
     ),
     fingerprint="In every run the cart rests off zero, as if pushed by the same force.",
     deciding_run="Runs with different carts held: the stiffer the springs on the cart, the less a "
-    "force displaces it. A wrong encoder zero shifts it equally in all runs.",
+    "force displaces it. A wrong encoder zero shifts the reading equally in all runs.",
     reference="the balance of forces in the chain at rest",
     axis="position",
     only_rest=True,

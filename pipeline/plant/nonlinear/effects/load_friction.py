@@ -12,7 +12,6 @@ EFFECT = Effect(
     parameters=(EffectParameter("coefficient", "μ", "", scale="1", typical=0.03, neutral=0.0),),
     fingerprint="While the motor pushes, there is more dry friction than in a free decay.",
     deciding_run="Steps of two sizes: doubling the input doubles the added friction.",
-    reference="G. Amontons' law applied to the rack; see Armstrong-Hélouvry, Control of Machines "
-    "with Friction, chapter 2",
+    reference="B. Armstrong-Hélouvry, Control of Machines with Friction, chapter 2",
     axis="velocity",
 )
