@@ -162,7 +162,7 @@ def make(name: str, folder: Path) -> None:
     analysis = run_report(folder, out=None, files=Files(pdf=False))
     for figure, own in lab.figures.items():
         shutil.copyfile(folder / figure, IMAGES / f"real-{own}")
-    lines = ["| number | value |", "|---|---|", *rows(analysis, gap)]
+    lines = rows(analysis, gap)
     begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->\n"
     page = PAGE.read_text(encoding="utf-8")
     head, rest = page.split(begin)
@@ -170,34 +170,35 @@ def make(name: str, folder: Path) -> None:
 
 
 def rows(analysis: Analysis, gap: Gap) -> Iterator[str]:
-    """Yield the rows of a lab's table."""
+    """Yield the lines of a lab's list of numbers."""
     for row in analysis.rows:
         if row.final is not None:
             number = with_unit(row.final.value, row.final.std, row.unit)
-            yield f"| {with_symbols(row.name)} | {number} |"
+            yield f"- {with_symbols(row.name)}: {number}"
     driven = any(record.u is not None and np.any(record.u) for record in analysis.records)
     if analysis.fit is None and driven:
         # The report needs a run in open loop; the search for effects does not.
         chain, units = gap.chain, gap.chain.units
-        yield f"| mass | {with_unit(chain.m[0], gap.chain_std['m_1'], units.m)} |"
-        yield f"| damping | {with_unit(chain.c[0], gap.chain_std['c_1'], units.c)} |"
+        yield f"- mass: {with_unit(chain.m[0], gap.chain_std['m_1'], units.m)}"
+        yield f"- damping: {with_unit(chain.c[0], gap.chain_std['c_1'], units.c)}"
     rubbed = [d for d in analysis.log_decrements if d.friction and d.friction.present]
     for cart in sorted({d.cart for d in rubbed}):
         own = [d for d in rubbed if d.cart == cart]
         decays = f"{len(own)} decay{'s' * (len(own) > 1)}"
         ratios = f"{span(own, _apparent)} → {span(own, _viscous)}"
-        yield f"| ζ of cart {cart} from {decays}: friction ignored → included | {ratios} |"
+        yield f"- ζ of cart {cart} from {decays}, friction ignored → included: {ratios}"
     for found in gap.effects:
         place = next((f", {what} {number}" for what, number in found.where.items()), "")
         values = ", ".join(
             f"{what.replace('_', ' ')} {with_unit(v.value, v.std, v.unit)}"
             for what, v in found.parameters.items()
         )
-        yield f"| {found.effect.key.replace('_', ' ')}{place} | {values} |"
-    repeats = f"; repeats differ by {gap.repeatability:.1%}" if gap.repeatability else ""
-    left = f"{gap.baseline:.1%} → {gap.final:.1%} of the motion; noise {100 * gap.noise_floor:.2g}%"
-    what = "error on held-out runs: linear model → with effects"
-    yield f"| {what} | **{gap.verdict}**: {left}{repeats} |"
+        yield f"- {found.effect.key.replace('_', ' ')}{place}: {values}"
+    errors = f"{gap.baseline:.1%} → {gap.final:.1%} of the motion ({gap.verdict})"
+    yield f"- error on held-out runs, linear model → with effects: {errors}"
+    repeats = gap.repeatability
+    spread = f"; difference between repeats: {repeats:.1%}" if repeats else ""
+    yield f"- noise: {100 * gap.noise_floor:.2g}%{spread}"
 
 
 def with_unit(value: float, std: float | None, unit: str) -> str:
