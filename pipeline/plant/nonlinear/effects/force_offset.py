@@ -6,8 +6,7 @@ from pipeline.plant.nonlinear.effects.law import ForceLaw
 EFFECT = Effect(
     key="force_offset",
     title="A constant force",
-    sentence="A constant force pushes the cart: the track is tilted, or the motor pushes even at "
-    "zero input.",
+    sentence="The track is tilted, or the motor pushes even at zero input.",
     place="cart",
     law=ForceLaw("F"),
     parameters=(
