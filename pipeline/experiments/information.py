@@ -237,7 +237,7 @@ class Knowledge:
         ]
 
     def input(self, recording: Recording) -> tuple[Array, Array]:
-        """Return the bench's sample times (n,), s, and the input (n,) at unit amplitude."""
+        """Return the bench's sample times (n,) in s, and the input (n,) at unit amplitude."""
         return sampled_input(recording, period=self.sample_time)
 
     def at_its_limits(self, recording: Recording, *, limits: PlanLimits, share: float) -> float:

@@ -125,8 +125,8 @@ def propose_plan(submission: Submission, *, bench: Description | None = None) ->
 def extend_plan(plan: Plan, submission: Submission, *, bench: Description | None = None) -> Plan:
     """Add what the recorded data make possible: dwells after a sweep, the loop after dwells.
 
-    Existing entries stay unchanged and in place. Dwells or a loop are added only if there are none
-    yet. A bench without state feedback gets a PID on cart 1.
+    Existing entries stay unchanged and in place. Dwells and loops are added only if no such
+    recording exists yet. A bench without state feedback gets a PID on cart 1.
 
     Raises
     ------
@@ -164,7 +164,7 @@ def _wants_dwells(plan: Plan, submission: Submission) -> bool:
 
 
 def _wants_loop(plan: Plan, submission: Submission) -> bool:
-    """Return whether to add a loop: there is none, and all planned dwells are recorded."""
+    """Return whether to add a loop: no loop exists, and all planned dwells are recorded."""
     ids = {e.id for e in submission.experiments}
     kinds = {e.kind for e in submission.experiments}
     kinds_planned = {r.kind for r in plan.recordings}

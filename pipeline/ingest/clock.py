@@ -220,7 +220,7 @@ class _Rounded:
         return t, len(self.stretches)
 
     def slopes(self, band: float) -> tuple[float, float]:
-        """Return the least and greatest period that fit all stretches; (inf, 0) if there is none.
+        """Return the least and greatest period that fit all stretches; (inf, 0) if no period fits.
 
         The usual stamps must be within a strip of `band` rounding steps around one line.
         """

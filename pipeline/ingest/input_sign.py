@@ -135,7 +135,7 @@ class _Weighed:
 
 @np.errstate(all="ignore")  # overflow gives no finite number and no sign
 def find_signs(records: Sequence[Record], *, stated: Mapping[str, int]) -> dict[str, int]:
-    """Return by record the sign of its logged input; 0 or no entry if the data are unclear.
+    """Return the sign of each record's logged input; 0 or no entry if the data are unclear.
 
     A bench has one sign. A record gets the opposite sign only if its input is opposite to the force
     that the equation of the other records gives. A signal logged under feedback may not be the
@@ -206,7 +206,7 @@ def _bench(weighed: Sequence[_Weighed], signs: Sequence[int]) -> tuple[int, Arra
         drive = np.concatenate([s * w.drive[shift] for s, w in zip(signs, weighed, strict=True)])
         (ahead, left), (back, right) = (_explain(motion / size, s * drive) for s in (1, -1))
         share = np.array([left, right]) ** 2 / len(weighed)  # each record's input has norm 1
-        # A sign is excluded if it leaves more of the input's power unexplained, by this margin. The
+        # A sign is excluded if it explains less of the input's power, by this margin. The
         # margin is far above the effect of an encoder's steps, and below that of a cart's damping.
         sure = abs(share[0] - share[1]) > 1e-3 + 0.1 * share.min()
         found.add((1 if share[0] < share[1] else -1) if sure else 0)

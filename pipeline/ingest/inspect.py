@@ -194,7 +194,7 @@ def unread_entry(file: Path, state: str, problem: str, *, advice: str = "") -> d
 
 
 def _name_them(told: Roles) -> str:
-    """Return how to name columns without headings, as far as their signals show it."""
+    """Return how to name columns without headings, as far as the signals show it."""
     said = "the columns have no names: state their roles in submission.toml"
     line = ", ".join(f"{role} = {number}" for role, number in told.columns.items())
     if line and not told.doubts:
@@ -209,7 +209,7 @@ def _name_them(told: Roles) -> str:
 
 
 def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str]) -> Clock | None:
-    """Return the clock, or None if the file has none; notes on the clock are added to `problems`.
+    """Return the clock of the file, or None; notes on the clock are added to `problems`.
 
     Raises
     ------

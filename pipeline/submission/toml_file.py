@@ -234,7 +234,7 @@ def _with_floats(value: Any, at: tuple[int | str, ...], slips: list[tuple[int, s
 
 
 def _long_number(text: str) -> int:
-    """Return the line of the first whole number that is too long to read; 0 if none is."""
+    """Return the line of the first whole number that is too long to read; 0 if all are short."""
     found = re.search(r"(?<![\w.])[-+]?\d[\d_]{4299,}", text)  # Python reads at most 4,300 digits
     return text.count("\n", 0, found.start()) + 1 if found else 0
 

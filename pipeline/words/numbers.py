@@ -128,7 +128,7 @@ def by_note(notes: Iterable[tuple[str, str]]) -> list[str]:
 
 
 def subscript(n: int) -> str:
-    """Return "₁" for 1, for plain text."""
+    """Return a number as an index in plain text: "₁" for 1."""
     return str(n).translate(_SUBSCRIPT)
 
 

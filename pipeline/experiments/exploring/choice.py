@@ -79,7 +79,11 @@ def choose_recording(
 
 
 def _reach_far_out(analysis: Analysis, limits: PlanLimits) -> Iterator[tuple[Recording, str]]:
-    """Yield recordings that show effects at large motion, each with the range that it adds."""
+    """Yield recordings that show effects at large motion, each with the range that it adds.
+
+    The recordings are a step that moves the carts as far as they may rest, and a sweep that swings
+    them to both sides. The range is in words; it is empty if the recording adds no range.
+    """
     chain = identified_chain(analysis)
     driven = [record for record in analysis.records if record.kind in ("step", "sweep")]
     inputs = [float(np.abs(record.u).max()) for record in driven if record.u is not None]
