@@ -38,7 +38,7 @@ def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
     """While one process writes into a folder, a second run is refused and removes nothing.
 
     Once the first process is dead, the next run gets the lock, and removes the scratch folders of
-    both.
+    both runs.
     """
     refused = pytest.raises(
         ConfigError, match=rf"another cartlab \(process {other.pid}\) is writing"

@@ -53,10 +53,7 @@ def test_a_recording_is_simulated_by_both_models(gap):
 
 
 def test_the_systems_are_those_of_the_models(gap):
-    """The linear system is the chain;
-
-    the full one has a lag, and its friction stops a released cart.
-    """
+    """The linear system is the chain; the full one adds a lag and friction that stops a cart."""
     assert gap.linear.state_labels == ["x1", "v1"]
     assert_allclose(gap.linear.A, gap.results.linear.chain.state_space()[0])
     assert isinstance(gap.system, control.NonlinearIOSystem)
@@ -79,10 +76,7 @@ def test_the_systems_are_those_of_the_models(gap):
 
 
 def test_residual_forces_are_a_table(gap):
-    """The table of residual forces has columns with units;
-
-    with the right model the forces are small.
-    """
+    """Residual forces are a table with units; with the right model the forces are small."""
     assert list(gap.residual.columns) == [
         "experiment", "time", "cart", "position", "velocity", "input", "force",
     ]  # fmt: skip

@@ -35,10 +35,7 @@ def test_a_file_is_replaced_whole(tmp_path):
 
 
 def test_simultaneous_writes_leave_one_whole_file(tmp_path):
-    """If several threads write a file, it holds the text of one;
-
-    a failed write leaves no file behind.
-    """
+    """If many threads write a file, it holds the text of one; a failed write leaves no file."""
     path, texts = tmp_path / "notes.md", [str(i) * 300_000 for i in range(8)]
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda text: write_file(path, text), 5 * texts))
@@ -154,7 +151,7 @@ _HIDING = [
 @pytest.mark.parametrize("hidden", _HIDING)
 @pytest.mark.parametrize("before", ["", "x;", 'x;"', "x; '"])
 def test_formulas_are_neutralised(before, hidden, sign):
-    """A formula at a cell's start or after a semicolon is quoted, even after invisible letters."""
+    """A formula is quoted at a cell's start or after a semicolon, even behind hidden characters."""
     text = harmless(before + hidden + sign)
     assert text.isprintable()
     assert re.match(r"(x;)?'[ \"']*" + re.escape(sign), text)

@@ -67,7 +67,7 @@ def test_shapes_agree_with_the_number_of_carts(results):
 
 
 def test_hardware_has_one_entry_per_run_and_cart(results):
-    """There is one entry per closed-loop run and cart, with the error under the measured input."""
+    """`hardware` has one entry per closed-loop run and cart, each with an error below 5 %."""
     keys = [(entry["experiment"], entry["cart"]) for entry in results["hardware"]]
     assert len(keys) == len(set(keys)) == 2
     assert all(entry["loop"] == "closed" for entry in results["hardware"])

@@ -75,7 +75,7 @@ def test_grades_obey_the_schema(tmp_path):
 
 
 def test_a_broken_file_is_refused():
-    """The schema refuses an unknown outcome, a text for a number and a missing key."""
+    """The schema refuses an unknown outcome, a text in place of a number and a missing key."""
     schema = json.loads(schema_text("results"))
     validator = jsonschema.Draft202012Validator(schema)
     good = json.loads(json_text(make_analysis(1)))

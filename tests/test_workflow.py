@@ -31,7 +31,7 @@ def test_examples_give_back_the_carts_that_made_them(analyses, name):
     for parameter, estimate in final.items():
         # With four standard errors and 32 parameters, one in 500 fixed seeds would fail by chance.
         assert abs(estimate.value - truth[parameter]) < 4 * estimate.std, parameter
-        # The standard errors themselves are small: about 30 dwells at 0.1 %.
+        # About 30 dwells of 0.1 % each make the standard errors small.
         assert estimate.std < 2e-3 * truth[parameter], parameter
 
 
@@ -125,10 +125,7 @@ def test_no_controller_is_designed_without_a_goal():
 
 
 def test_the_design_can_be_computed_later(analyses):
-    """An analysis may leave out the design, as in grading;
-
-    the same design can be computed later.
-    """
+    """A design that an analysis left out, as in grading, can be computed later with equal gains."""
     submission, whole = load_submission(EXAMPLES / "one-cart"), analyses["one-cart"].feedback
     without = analyse(submission, design=False)
     assert without.feedback is None

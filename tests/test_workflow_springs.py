@@ -49,7 +49,7 @@ def record(folder: Path, chain: Chain, name: str, u: Array, *, rng: np.random.Ge
 
 
 def analysed(folder: Path, *, springs: str, carts: int, runs: dict[str, str]) -> Analysis:
-    """Analyse a submission; `runs` gives the table of each experiment, without id and file."""
+    """Analyse a submission; `runs` maps each experiment's id to the other lines of its table."""
     text = f'version = 1\ntitle = "Few springs"\n[system]\ncarts = {carts}\n'
     text += f'springs = {springs}\nposition = {{ unit = "cm" }}\n'
     for name, lines in runs.items():
@@ -61,10 +61,7 @@ def analysed(folder: Path, *, springs: str, carts: int, runs: dict[str, str]) ->
 def dwells(
     folder: Path, frequencies: list[float], *, rng: np.random.Generator, chain: Chain = BODY
 ) -> dict[str, str]:
-    """Write sine dwells of about 1 cm at `frequencies` (Hz);
-
-    return their experiments for `analysed`.
-    """
+    """Write sine dwells of about 1 cm at `frequencies` (Hz); return their tables for `analysed`."""
     runs = {}
     for frequency in frequencies:
         omega = 2 * np.pi * frequency
@@ -153,10 +150,7 @@ def test_two_carts_without_wall_springs_are_found(tmp_path):
     "springs", [(False, True, False), (True, False, False)], ids=["no wall", "not joined"]
 )
 def test_wrongly_stated_springs_are_questioned(tmp_path, springs):
-    """If no carts fit the stated springs, the summary asks about them;
-
-    no section has an empty heading.
-    """
+    """If no carts fit the stated springs, the summary asks about them, and no section is empty."""
     shutil.copytree(EXAMPLES / "two-cart", tmp_path / "bench")  # its cart 2 has a spring to a wall
     toml = tmp_path / "bench" / "submission.toml"
     text = re.sub("springs = .*", f"springs = {json.dumps(springs)}", toml.read_text("utf-8"))

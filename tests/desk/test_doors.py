@@ -71,7 +71,7 @@ def test_nobody_gets_in_without_the_cookie(visitor, path):
 def test_another_cookie_of_the_same_name_locks_nobody_out(visitor):
     """A second cookie of the same name does not lock the visitor out.
 
-    Any page on this computer may set one.
+    Any page on this computer could set such a cookie.
     """
     real = visitor.headers["Cookie"]
     other = f"cartlab-{visitor.port}=guess"
@@ -306,7 +306,7 @@ def test_each_role_has_its_pages(lab, path):
             assert lab(name).get(path).status in (200, 303, 405), name
 
 
-def test_people_come_from_the_page_of_a_login(lab):
+def test_a_link_from_another_site_opens_only_whole_pages(lab):
     """A link from another site may open a whole page, but no part of a page and no form."""
     led = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"}
     page = led | {"Sec_Fetch_Dest": "document"}
@@ -343,7 +343,7 @@ def test_nobody_names_a_folder_of_the_server(lab, tmp_path):
 def test_an_instructor_writes_only_in_the_workshop(lab, root):
     """An instructor writes exercises and rubrics only in the workshop.
 
-    Ports come from the list of users.
+    Only the ports in the file of users can be used.
     """
     who = lab("w")
     bench = {"preset": "throne-1dof", "folders": "1", "seed": "0"}

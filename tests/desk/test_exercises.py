@@ -133,7 +133,7 @@ def test_a_custom_chain_is_used_or_its_error_named(visitor):
 
 
 def test_a_picture_is_inert(visitor):
-    """The picture of an effect is an SVG without scripts, and a forged address of it is refused."""
+    """The picture of an effect is an SVG without scripts, and a forged address is refused."""
     (address,) = re.findall(r'src="(/exercises/picture[^"]+)"', shown(visitor, **FRICTION))
     drawn = visitor.get(address)
     assert drawn.headers["content-type"] == "image/svg+xml"

@@ -61,10 +61,7 @@ HOSTILE = (
 
 @pytest.fixture
 def lab(tmp_path, request):
-    """Start a desk with a graded class that is not yet released;
-
-    yield a function that gives visitors.
-    """
+    """Start a desk with a graded, unreleased class; yield a function that returns a visitor."""
     write_class(tmp_path / "grades", anonymous=getattr(request, "param", False))
     a_submission(tmp_path / "five")
     with DeskServer(users=write_users(tmp_path, USERS)) as server:
@@ -332,7 +329,7 @@ def test_a_missing_gradebook_reveals_nothing_of_the_server(released, tmp_path):
 def test_students_who_must_find_the_numbers_see_none(tmp_path, by_class):
     """Students who must find the numbers see points, outcomes and flags, but no numbers.
 
-    The student's own rubric decides this, or without one the class's rubric.
+    The student's own rubric decides this; without one, the class's rubric does.
     """
     write_class(tmp_path / "grades")
     a_submission(tmp_path / "five")

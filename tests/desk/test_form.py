@@ -35,7 +35,7 @@ def fields(text: str) -> dict[str, Field]:
 
 
 def changed(text: str, **values: str) -> str:
-    """Return the file after these fields were typed."""
+    """Return the file after these fields were filled in."""
     document = tomlkit.parse(text)
     write_fields(document, find_changes(fields(text).values(), values, lambda path: []))
     return tomlkit.dumps(document)
@@ -56,7 +56,7 @@ NUMBER = st.from_regex(r"-?(0|[1-9][0-9]{0,5})(\.[0-9]{1,8})?", fullmatch=True)
 def test_numbers_are_written_as_typed(initial, final, title):
     """Numbers are written with the digits typed, and every other line stays as it was.
 
-    If the table is missing, it is added first.
+    A missing table is added first.
     """
     values = {"title": title, "reported.initial.K_1": initial, "reported.final.K_1": final}
     new = changed(WHOLE, **values)

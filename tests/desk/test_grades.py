@@ -575,7 +575,7 @@ def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
 
 
 def test_each_line_of_a_class_equals_its_grade(grades):
-    """Each line of the class page equals its grade, even if it comes from the cache."""
+    """Each line of the class page equals its team's grade, even if cached."""
     from pipeline.grading.gradebook.class_lines import Line
 
     with OpenBook(grades) as book:
@@ -592,7 +592,7 @@ def test_each_line_of_a_class_equals_its_grade(grades):
 
 
 def test_an_older_gradebook_gets_what_it_lacks(grades):
-    """An older gradebook gets the tables that it lacks once, and keeps its content.
+    """An older gradebook gets its missing tables just once, and keeps its content.
 
     A gradebook that was already open still works.
     """

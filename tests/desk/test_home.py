@@ -160,7 +160,7 @@ def test_a_task_is_chosen_then_a_folder(root):
     assert "no plan yet" in home
 
 
-def test_the_line_of_rooms_stays_short(root):
+def test_the_line_of_links_stays_short(root):
     """The line of links has only the current folder and the folders opened last.
 
     The link to a folder's bench is there only while the folder is shown.

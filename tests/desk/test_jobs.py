@@ -27,7 +27,7 @@ def jobs():
 
 
 def test_a_slow_folder_delays_no_other_folder(tmp_path):
-    """A slow task of one folder does not delay another, however many requests wait for it."""
+    """A slow task in one folder delays no other folder, however many requests wait for the task."""
     slow, workers = a_submission(tmp_path / "slow"), WorkerPool()
 
     def ask(task: str) -> threading.Thread:

@@ -154,7 +154,7 @@ def test_a_page_begins_with_what_the_rubric_is(visitor, lab):
     assert '<p class="result">20 points in 13 criteria; fits submissions with 1 cart</p>' in page
 
 
-def test_late_work_at_half_is_one_number(visitor, lab):
+def test_one_number_changes_one_line(visitor, lab):
     """Changing one number in the form changes one line of the file."""
     page = editor(visitor, lab)
     answer = visitor.post("/rubric/save", **sent(page, lab, **{"late.percent_per_day": "50"}))

@@ -274,7 +274,7 @@ def test_invisible_characters_in_a_file_name_are_replaced(room, packed):
 def test_moving_aside_waits_for_other_changes(filled, named):
     """A recording is moved aside only after other changes of the folder have ended.
 
-    If a table then names the file, or it is gone, nothing moves.
+    If a table then names the file, or the file is gone, nothing moves.
     """
     visitor, folder = filled
     recording = folder / "data" / "late.csv"
@@ -688,10 +688,7 @@ def test_a_linked_data_folder_is_refused(tmp_path, workers):
 
 
 def test_an_uploaded_archive_must_obey_the_limits(tmp_path, workers):
-    """Recordings in an uploaded zip file are stored;
-
-    zip bombs, links and paths outside are refused.
-    """
+    """Recordings in a zip file are stored; zip bombs, links and paths outside are refused."""
 
     def zipped(*members: tuple[str, bytes]) -> io.BytesIO:
         buffer = io.BytesIO()

@@ -92,7 +92,7 @@ def state_gains_of(identified, loop) -> StateGains:
 def on_the_bench(chain: Chain | None, gains, *, encoder: int) -> tuple[Array, Array]:
     """Run the chain under the bench's own controller.
 
-    Return positions (n_carts, n), inputs (n,).
+    Return positions (n_carts, n) and inputs (n,).
     """
     assert chain is not None
     core, period = ReferenceCore(BENCH), BENCH.period

@@ -163,7 +163,7 @@ def test_dwells_bracket_every_resonance_and_null(extended):
 
 
 def test_dwells_move_the_carts_well_within_the_limit(extended):
-    """Dwells move the carts by 0.3 to 1.3 of the distance aimed at, within the travel limit."""
+    """Dwells move the carts by 0.3 to 1.3 times the wanted distance, within the travel limit."""
     chain, plan, _ = extended
     aim = AIM * plan.limits.travel
     wait = settling_wait(chain, time_constants=SETTLED_DWELL)
@@ -180,7 +180,7 @@ def test_dwells_move_the_carts_well_within_the_limit(extended):
 
 
 def test_steps_rest_near_the_aim_and_overshoot_within_the_limit(extended):
-    """Steps end at 0.5 to 1 of the distance aimed at, and overshoot within the limit."""
+    """Steps end at 0.5 to 1 times the wanted distance, and overshoot within the limit."""
     chain, plan, _ = extended
     aim, amplitudes = AIM * plan.limits.travel, [r.amplitude for r in of_kind(plan, "step")]
     assert amplitudes[0] == -amplitudes[1]

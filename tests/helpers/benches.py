@@ -51,7 +51,7 @@ def emulator(
 ) -> Iterator[Emulator]:
     """Run `cartlab emulate` with these options while the block runs.
 
-    Its watchdog waits longer (s) than that of a real bench, since the machine may be busy.
+    The bench's watchdog waits longer than that of a real bench, since the machine may be busy.
     """
     words = ["cartlab", "emulate", *options]
     if "--model" not in options:

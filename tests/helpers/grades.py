@@ -30,7 +30,7 @@ from pipeline.set_up import PAPER_UNITS
 
 
 def two_cart_rubric() -> Rubric:
-    """Return the shipped rubric for two carts: 20 points, 10 % a day."""
+    """Return the shipped rubric for two carts, with 20 points and 10 % off per day late."""
     return load_rubric(RUBRICS / "throne-2dof.toml")
 
 

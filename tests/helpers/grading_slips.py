@@ -183,7 +183,7 @@ def physically_impossible(team: Team) -> Team:
 def transient_used(team: Team) -> Team:
     """Read amplitudes from the first cycles of every dwell, and fit them if that is possible."""
     if any(e.note for e in team.submission.experiments if e.kind == "sine"):
-        return team  # the dwell was recorded after the transient, so nobody can use it
+        return team  # the dwells begin after the transient
     truth = team.bench.chain.parameters()
     for cycles in team.rng.permutation([2.0, 3.0]):
         try:

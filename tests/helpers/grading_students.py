@@ -87,7 +87,7 @@ def typed(value: float | Decimal) -> Decimal:
 
 @cache
 def student(carts: int, *, hide: tuple[str, ...] = ()) -> Student:
-    """Return an honest student of a preset's bench in which effects are hidden."""
+    """Return an honest student on a preset's bench with hidden effects."""
     preset = f"throne-{carts}dof"
     bench = prepare_bench(preset=preset, hide=hide)
     rubric = load_rubric(Path(preset))

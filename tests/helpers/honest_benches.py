@@ -39,10 +39,7 @@ _SHRINKS = {"saturation": "limit", "end_stop": "position"}
 
 
 def draw_effect(chain: Chain, seed: int) -> EffectTerm:
-    """Return the effect for a seed;
-
-    seeds 0 to 18 give each effect once, as do 19 to 37 and so on.
-    """
+    """Return the effect for a seed; seeds 0 to 18 give every effect once, then again 19 to 37."""
     rng = np.random.default_rng([16, seed, chain.n])
     turn, place = divmod(seed, len(CATALOGUE))
     effect = CATALOGUE[int(np.random.default_rng([16, turn]).permutation(len(CATALOGUE))[place])]

@@ -28,7 +28,7 @@ def xlsx(columns: Mapping[str, np.ndarray]) -> bytes:
 
 
 def saved(book: openpyxl.Workbook) -> bytes:
-    """Return the file of a workbook."""
+    """Return the bytes of a workbook's file."""
     stream = BytesIO()
     book.save(stream)
     return stream.getvalue()

@@ -167,10 +167,7 @@ def final_table(records: Sequence[Record], n: int, initial: dict[str, float]) ->
 
 
 def _recomputed(p: dict[str, float], n: int) -> dict[str, float]:
-    """Return the carts' numbers computed from the coefficients;
-
-    the table is empty if no carts fit.
-    """
+    """Return the carts' numbers computed from the coefficients, without impossible ones."""
 
     def quadratic(x: str) -> Array:
         return np.array([1.0, 2 * p[f"zeta_{x}"] * p[f"omega_{x}"], p[f"omega_{x}"] ** 2])

@@ -117,7 +117,7 @@ def test_gaps_are_found():
     ("values", "step"),
     [([0.0, 0.009, 0.018], 1e-3), ([1.5, 2.0], 0.1), ([3.0, 4.0], 1.0), ([0.1 / 3, 1.0], 0.0)],
 )
-def test_the_decimal_step_of_stamps(values, step):
+def test_the_decimal_step_of_stamps_is_found(values, step):
     """`decimal_step` is the last decimal place in use, and zero for full precision."""
     assert decimal_step(np.array(values)) == step
 
@@ -154,7 +154,7 @@ def test_small_jitter_does_not_split_a_session(interval):
     """Jitter far below the rounding of stamps does not split a session into several periods."""
     clocks = read_clocks(a_session(interval, jitter=2e-5))
     assert len({clock.period for clock in clocks}) == 1
-    # The jitter of 20 µs is taken three times, at both ends of the longest record of 15 s.
+    # Three times the jitter of 20 µs, at both ends of the longest record of 15 s.
     assert_allclose(clocks[0].mean_interval, interval, rtol=6 * 2e-5 / 15)
 
 

@@ -92,7 +92,7 @@ def test_a_second_run_prints_as_much_as_the_first(tmp_path):
 
 @pytest.mark.parametrize("command", ["inspect", "fill"])
 def test_an_old_spreadsheet_is_named_as_not_read(tmp_path, command):
-    """An old spreadsheet in `data/` is named as not read, with other files or alone."""
+    """An old spreadsheet in `data/` is named as not read, whether alone or with other files."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     (tmp_path / "data" / "b.xls").write_bytes(b"PK")
     done = cartlab_here(command, tmp_path)
@@ -250,7 +250,7 @@ def test_a_moving_column_without_a_cart_is_asked_about(tmp_path, carts, asked):
 
 
 def test_a_stated_held_cart_is_not_questioned(tmp_path):
-    """A cart written as held is mentioned once; if its line is removed, `fill` asks about it."""
+    """A cart that its table states as held is mentioned once; without that line, `fill` asks."""
     put(tmp_path, "run.csv", time=T, input=STEP, x1=RING, x2=0.4 * RING)
     put(tmp_path, "pull.csv", time=T, input=0 * T, x1=RING, x2=0 * T)
     first, second = fill_submission(tmp_path), fill_submission(tmp_path)
@@ -428,7 +428,7 @@ def test_an_outdated_change_is_refused(tmp_path):
 
 
 def test_stated_columns_identify_a_file(tmp_path):
-    """Stated `columns` identify a file: those of `[system]` any file, those of a table its own."""
+    """`columns` of `[system]` identify any file, and those of an experiment its own file."""
     put(tmp_path, "a.csv", clock=T, volts=STEP, sled=2 * RING)
     put(tmp_path, "b.csv", time=T, input=SINE, x1=RING)
     put(tmp_path, "c.csv", clock=T, volts=STEP, other=RING)

@@ -132,7 +132,7 @@ def test_delimiter_and_decimal_mark_are_found(content):
         assert_array_equal(row, expected)
 
 
-def test_whole_numbers_with_decimal_commas_are_no_decimals():
+def test_commas_between_whole_numbers_are_not_decimal_marks():
     """In a table of whole numbers separated by commas, no comma is read as a decimal mark."""
     got = table("time,x1\n" + "".join(f"{i},{i % 3}\n" for i in range(20)))
     assert_array_equal(got.values, [np.arange(20), np.arange(20) % 3])
@@ -165,7 +165,7 @@ def test_a_row_of_units_goes_into_the_headings():
 
 
 def test_a_bench_log_is_distinguished_from_an_ecp_export():
-    """A bench log has the headings of an ECP export, but is recognised by tabs and no brackets."""
+    """A bench log has the headings of an ECP export; tabs and missing brackets distinguish it."""
     lines = ["Sample\tTime\tEncoder 1 Pos\tEncoder 2 Pos\tControl Effort"]
     lines += [
         f"{i + 1}\t{t:g}\t{a:g}\t{b:g}\t410"

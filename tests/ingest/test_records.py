@@ -33,7 +33,7 @@ def read(folder: Path, system: str, experiment: str, content: str | bytes) -> In
 
 
 def csv(**columns: np.ndarray) -> str:
-    """Write columns as CSV; "__" in a name stands for a space and brackets its unit."""
+    """Write columns as CSV; the name `Time__us` gives the heading `Time [us]`."""
     heading = ",".join(name.replace("__", " [") + "]" if "__" in name else name for name in columns)
     rows = zip(*columns.values(), strict=True)
     return heading + "\n" + "".join(",".join(f"{v:.7g}" for v in row) + "\n" for row in rows)
@@ -192,7 +192,7 @@ def test_an_unknown_unit_is_asked_about(system, ids, tmp_path):
 
 
 def test_a_heading_in_another_unit_is_asked_about(tmp_path):
-    """If the heading says centimetres and the submission counts, a question asks which is right."""
+    """If a heading states cm but the submission states counts, cartlab asks which is right."""
     folder = tmp_path / "s"
     data = read(folder, "", STEP, csv(time=T, input__N=U, x1__cm=Y[0] / 440, x2=X2))
     checks = check_units(data.records, bench=load_submission(folder).system.bench)
@@ -431,7 +431,7 @@ def test_a_wrong_sign_of_a_session_is_one_sentence(tmp_path):
 
 
 def test_signs_may_differ_between_experiments(tmp_path):
-    """Records with the other sign are found; an unclear record gets the sign of its kind."""
+    """A record with the other sign is found; an unclear one gets the sign of others of its kind."""
     toml = "version = 1\n[system]\ncarts = 2\n"
     runs = {
         "step": ("step", csv(time=T, input=-U, x1=X1)),

@@ -125,7 +125,7 @@ def reversed_in(records: Sequence[Record], names: Collection[str]) -> list[Recor
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_late_input_does_not_turn_the_sign_of_dwells(bench, sign):
-    """With a late input a fast dwell may seem reversed, but all dwells together are right."""
+    """With a late input a fast dwell may seem reversed, but all dwells give the right sign."""
     records = driven(bench)
     names = {record.id for record in records}
     found = find_signs(reversed_in(records, names if sign < 0 else ()), stated={})
@@ -148,7 +148,7 @@ def test_a_stated_sign_is_not_doubted_because_the_input_is_late(bench, sign, sai
 
 
 def test_a_record_that_counts_the_other_way_is_found(bench):
-    """Records logged with the other sign are found: a single one, all dwells, every second one.
+    """Records logged with the other sign are found: one record, all dwells, or every second record.
 
     Only dwells so fast that a delay could explain their sign may stay open.
     """

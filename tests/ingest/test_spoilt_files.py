@@ -177,7 +177,7 @@ def try_everything(submission: Submission, raw: bytes) -> None:
 
 @pytest.mark.parametrize("name", FILES)
 def test_the_undamaged_file_is_read(name, submission):
-    """The file that the tests damage is read without an error before."""
+    """The file that the tests damage is read without an error while it is whole."""
     assert parse_table(FILES[name], source="a.dat").values.shape[1] >= N - 1
 
 

@@ -220,7 +220,7 @@ def test_closed_loops_agree_with_the_independent_bench(key):
     truth = simulate_truth(
         m=TWO.m, c=TWO.c, k=TWO.k, hidden=[hidden], t=run.t, u=moved.u, free=(1, 2)
     )
-    # The phase errs as for the steps, at each sample, since the input changes at each sample.
+    # As for the steps, the phase errs by omega h / 2; here the input has an edge at each sample.
     assert_allclose(moved.x, truth, atol=0.5 * COUNT)
     # The effect changes the loop: the controller asks for other inputs than on the linear bench.
     assert np.abs(moved.u - bench().move(run).u).max() > 1e-4

@@ -78,7 +78,7 @@ def with_number(text: str, number: str, at: int) -> tuple[str, str]:
 
 
 def assert_read_or_refused(read: Callable[[], object], key: str, file: str) -> None:
-    """Check that the file is read, or refused with its name and the key or line."""
+    """Check that the file is read, or refused with its name and with the key or the line."""
     try:
         read()
     except PipelineError as error:

@@ -199,7 +199,7 @@ def test_every_problem_is_listed(folder):
 
 
 def test_an_unknown_table_does_not_hide_other_mistakes(folder):
-    """A misspelt table does not hide a misspelt key in another or a wrong value."""
+    """A misspelt table does not hide a misspelt key in another table, or a wrong value."""
     text = FULL.replace("[design]", "[desing]").replace("version = 1", "version = 1\ncolour = 3")
     text = text.replace("carts = 2\n", 'carts = "two"\n')
     (folder / "submission.toml").write_text(text, encoding="utf-8")

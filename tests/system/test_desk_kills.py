@@ -1,6 +1,7 @@
 """If the desk's server is killed at random, confirmed changes stay complete.
 
-The answer to its form confirms a change; the page that says so confirms a new grading.
+A change is confirmed by the answer to its form. A new grading is confirmed when the page says that
+it is done.
 """
 
 import http.client

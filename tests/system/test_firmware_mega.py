@@ -241,7 +241,7 @@ STEP = 1e-3  # s between exchanges of data between carts and board
 def _serve(mega: Mega, carts: VirtualCarts, link: Link, until: Callable[[], bool]) -> None:
     """Connect board and simulated carts, in real time or as fast as possible."""
     at, ahead = carts.counts(), mega.clock - time.monotonic()
-    volts = 5 / 4096 / carts.input_per_count  # per duty count of the sketch, in the carts' counts
+    volts = 5 / 4096 / carts.input_per_count  # carts' duty counts per count of the sketch
     while not until():
         time.sleep(max(0.0, mega.clock - time.monotonic() - ahead))
         mega.send(link.receive())
@@ -267,6 +267,6 @@ def test_acquire_records_with_the_board(mega, tmp_path):
     with closing(open_link("pty")) as link, kept_going(partial(_serve, mega, carts, link)):
         acquire(tmp_path, port=link.address, only=["step"])
     [gain] = analyse(load_submission(tmp_path)).step_gains
-    # The level is 390 encoder counts and the noise a fifth of one: a tenth of a percent. After 5 s
-    # a swing of 1 % is left, which changes the mean by as much.
+    # The level is 390 encoder counts, and the noise of a fifth of a count is under 0.1 %. After 5
+    # s, 1 % of the swing is left, which changes the mean by up to 1 %.
     assert gain.gain == pytest.approx(bench.chain.static_gains()[0], rel=0.01)

@@ -80,7 +80,7 @@ def folder(tmp_path):
 
 @pytest.fixture
 def page(folder) -> Iterator[LivePage]:
-    """A page with a plan, of which one run is done."""
+    """Yield a live page with a plan, of which one run is done."""
     with LivePage(folder) as page:
         page.planned(PLAN, frozenset({"decay-1"}))
         yield page
@@ -440,7 +440,7 @@ def test_it_shows_plan_progress_counters_and_curves(page, show):
     expect(window.locator("#status")).to_have_text("Recording sine-01.")
     expect(window.locator("#plan .now b")).to_have_text("sine-01")
     expect(window.locator("#plan .done b")).to_have_text("decay-1")
-    expect(window.locator("#left")).to_have_text("16 s left")  # 21 s less 3 s and 2 s
+    expect(window.locator("#left")).to_have_text("16 s left")  # 21 s - 3 s of rest - 2 s of sine
     expect(window.locator(".counters .bad")).to_have_text("lost3")
     expect(window.locator(".counters")).to_contain_text("lines2000")
     expect(window.locator("#plots .keys").first).to_contain_text("cart 1 3.99")
@@ -558,10 +558,7 @@ def test_the_page_says_that_the_session_is_over(folder, browser):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_session_is_watched_and_confirmed_in_the_browser(tmp_path, browser):
-    """With `acquire --web`, a button on the page starts a recording;
-
-    no file contains the secret.
-    """
+    """With `acquire --web`, a button on the page starts a recording; no file has the secret."""
     work = write_work(tmp_path / "work", [sine("dwell", seconds=1, settle=0.3)])
     toml = work / "submission.toml"
     scaled = toml.read_text(encoding="utf-8").replace('"cm"', '"cm", per_count = 0.00227')

@@ -186,7 +186,7 @@ PRINTED = ("one", "two", "three", "gap", "solution")
 def test_no_page_of_the_print_is_a_third_empty(case, folder, request):
     """In print no page before the last is a third empty.
 
-    Figures shrink and tables are split to fill each page.
+    Figures shrink and tables are split so that each page is full.
     """
     (pdf,) = folder(case, request).glob("*.pdf")
     pages = subprocess.run(

@@ -109,7 +109,7 @@ def test_a_plan_becomes_a_submission(tmp_path, fast):
     assert "# ours" in (work / "submission.toml").read_text(encoding="utf-8")
     assert submission.system.position.per_count == 0.00227
     records = {record.id: record for record in read_data(submission).records}
-    # The throne-2dof bench holds 24.3 cm per volt: 0.02 V are 0.486 cm (friction-free).
+    # Without friction, 0.02 V move the first cart of throne-2dof by 0.486 cm, at 24.3 cm per volt.
     assert records["step"].y[0].max() > 0.45
     assert records["decay-1"].free == (1,)
     assert np.ptp(records["decay-1"].y[1]) == 0.0  # held
@@ -179,7 +179,7 @@ def test_a_pty_is_a_port_like_any_other(tmp_path):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_the_whole_loop_names_what_the_bench_hides(tmp_path):
-    """From a virtual bench, plan, recordings, report and gap lead to its hidden dry friction."""
+    """Plan, recordings, report and gap analysis find the dry friction hidden in a virtual bench."""
     work = tmp_path / "work"
     hidden = "coulomb_friction:cart=1,force=0.0025"
     with emulator("--hide", hidden, "--speed", "20", "--period", "8.84") as bench:
@@ -221,11 +221,11 @@ def test_faults_of_every_kind_are_counted_and_the_rest_is_kept(tmp_path):
     assert abs(outcome.anomalies.lost - struck["drop"]) <= 2
     submission = load_submission(work)
     assert f"{outcome.anomalies.garbled} garbled" in submission.experiments[0].note
-    # And the record is as good as a whole one: it gives the preset's gains at this frequency.
+    # The record is as good as a complete one: it gives the preset's gains at this frequency.
     points = analyse(submission).sine_points
     true = np.abs(PRESETS["throne-2dof"].frequency_response(np.array([points[0].omega])))[:, 0]
     for point in points:
-        # The input, here 10 mV, is sent in counts of 0.12 mV; stamps are good to half a ms of 500.
+        # The input of 10 mV is sent in counts of 0.12 mV; stamps are accurate to half a ms in 500.
         assert point.gain == pytest.approx(true[point.cart - 1], rel=3e-3)
 
 
@@ -381,7 +381,7 @@ def test_a_port_in_use_is_reported():
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 def test_a_device_that_is_not_a_bench_is_reported():
-    """If a device gives other answers than a bench, the message says so."""
+    """If a device does not answer like a bench, the message says so."""
     controller, device = os.openpty()
     echo = subprocess.Popen(
         [sys.executable, "-c", f"import os\nwhile os.read({controller}, 99): "

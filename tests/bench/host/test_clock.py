@@ -48,7 +48,7 @@ class OddBench(threading.Thread):
 
     Parameters
     ----------
-    lines : function that turns the lines that a run should have into the lines that are sent.
+    lines : function from a run's correct lines to the lines that are sent.
     late : further lines that arrive just after the first stop.
     """
 
@@ -143,7 +143,7 @@ def test_late_lines_of_the_previous_run_do_not_count(tmp_path):
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.6])
 def test_any_number_of_lost_lines_is_counted(tmp_path, share):
-    """As a bench's stated period is trusted, missing lines are counted as lost and noted."""
+    """If the bench states its period, any number of missing lines is counted as lost and noted."""
     lost = np.random.default_rng(5).random(RUN) < share
 
     def thinned(lines: list[Reading]) -> Iterator[Reading]:

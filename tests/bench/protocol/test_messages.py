@@ -60,7 +60,7 @@ def read(data: bytes, **options) -> list[Command]:
 
 
 @given(st.lists(commands, max_size=6), st.integers(1, 7))
-def test_commands_come_across(sent, chunk):
+def test_commands_are_read_as_sent(sent, chunk):
     """Every encoded command is read back, in order, however the bytes are cut into pieces."""
     data = b"".join(map(encode, sent))
     reader = CommandReader(encoders=ENCODERS)
@@ -72,7 +72,7 @@ def test_commands_come_across(sent, chunk):
 
 
 @given(st.binary(max_size=80), st.integers(1, 9))
-def test_the_pieces_do_not_matter_for_noise_either(data, chunk):
+def test_noise_may_be_cut_anywhere(data, chunk):
     """Noise gives the same commands and the same number of rejects, however it is cut."""
     whole, pieces = CommandReader(encoders=ENCODERS), CommandReader(encoders=ENCODERS)
     expected = whole.feed(data)
@@ -156,14 +156,14 @@ readings = st.builds(
 
 
 @given(readings)
-def test_lines_come_across(reading):
+def test_lines_are_read_as_sent(reading):
     """A line is read as the reading that was written, with or without its line end."""
     line = format_reading(reading)
     assert parse_reading(line) == parse_reading(line.rstrip()) == reading
 
 
 @given(readings, readings, st.integers(0, 255), st.data())
-def test_spoiled_lines_are_no_readings(first, second, byte, data):
+def test_spoilt_lines_are_not_readings(first, second, byte, data):
     """Two lines in one, or a byte that no line has, are not taken for a reading."""
     merged = format_reading(first)[:-1] + format_reading(second)
     assert parse_reading(merged) is None
@@ -190,7 +190,7 @@ descriptions = st.builds(
 
 
 @given(descriptions)
-def test_descriptions_come_across(bench):
+def test_descriptions_are_read_as_sent(bench):
     """A bench's answer to a query is read as the description that was written.
 
     Entries added in later versions are ignored.

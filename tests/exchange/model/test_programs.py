@@ -75,7 +75,7 @@ HARD = model_of("coulomb_friction", "backlash", "input_delay", last=False)
 @no_compiler
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
 def test_c_moves_as_the_simulator_does(effect: Effect, tmp_path):
-    """With each effect the C program agrees with the simulator, better with shorter steps.
+    """With each effect the C program agrees with the simulator; shorter steps agree better.
 
     In theory a quarter of the step gives a sixteenth of the error, but an event may spoil that.
     """

@@ -114,10 +114,7 @@ def test_an_exploration_writes_a_submission_and_a_diary(explored):
 
 
 def test_an_exploration_keeps_only_runs_that_its_diary_shows(explored):
-    """Each earlier decision keeps only the run that its picture shows;
-
-    the last one keeps all runs.
-    """
+    """An earlier decision keeps only the run in its picture; the last one keeps all runs."""
     folder, turns, _, _ = explored
     *earlier, last = [turn.gap for turn in turns]
     assert earlier
@@ -229,7 +226,7 @@ def test_an_exploration_ends_after_three_failures(tmp_path):
 def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
     """A recording that a person vetoes is replaced, and one that is added comes next.
 
-    gap.json is written again, and then proposes another deciding run than the vetoed one.
+    gap.json is then written again, and proposes another recording than the vetoed one.
     """
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     folder, offered, said = tmp_path / "work", [], []

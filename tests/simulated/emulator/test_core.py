@@ -77,8 +77,8 @@ def test_each_wave_has_its_shape():
     t = np.arange(0, 20, 1e-4)
     x = np.array([target_at(chirp, s, chirp_end=10.0) for s in t])
     rising = t[:-1][(x[:-1] < 0) & (x[1:] >= 0)]
-    # Between two upward zeros the mean frequency is that in their middle, except for curvature: (ln
-    # 10 / 20 / f)² / 24 of it, under 1e-3.
+    # The mean frequency between two upward zeros is the frequency halfway between them. Curvature
+    # changes it by (ln 10 / 20 / f)² / 24, less than 1e-3.
     np.testing.assert_allclose(
         1 / np.diff(rising), 10 ** ((rising[1:] + rising[:-1]) / 40), rtol=1e-3
     )

@@ -147,14 +147,14 @@ def test_a_released_cart_swings_at_its_own_frequency(fast_bench):
     fit = fit_log_decrement(record, cart=2)
     assert 0.3 <= fit.release <= 0.65
     omega_n = np.sqrt((chain.k[1] + chain.k[2]) / chain.m[1])
-    # The fit's own standard errors are some 1e-5 and 1e-4. Its start while the hand's force fades
-    # adds some error.
+    # The fit's own standard errors are some 1e-5 and 1e-4. The fit starts while the hand's force
+    # fades, which adds some error.
     assert fit.omega_n == pytest.approx(omega_n, rel=5e-4)
     assert fit.zeta == pytest.approx(chain.c[1] / (2 * chain.m[1] * omega_n), rel=5e-3)
 
 
 def test_a_hand_releases_the_cart_even_if_the_run_starts_early():
-    """If a run starts while a virtual hand still pulls, the hand releases the cart all the same."""
+    """If a run starts while a virtual hand still pulls, the hand still releases the cart."""
     carts = VirtualCarts(prepare_bench(preset="throne-1dof"), seed=1)
     carts.take_in_hand(Hands(released=1))
     carts.start()
@@ -324,7 +324,7 @@ def test_an_unknown_fault_is_reported(fault, message):
     ],
 )
 def test_an_invalid_port_is_reported(port, message):
-    """A malformed port, or one open to other computers, gives one clear message."""
+    """A malformed port, or one that other computers could reach, gives one clear message."""
     with pytest.raises(ConfigError, match=message):
         open_link(port)
 
