@@ -420,7 +420,7 @@ class ParameterRow:
         return self.final and self.final.source
 
     change_percent: float | None = written("change from the initial to the final estimate")
-    change_sigmas: float | None = written("the change in combined standard errors")
+    change_sigmas: float | None = written("the change divided by the combined standard error")
     consistent: bool | None = written(
         "null: there is nothing to compare, or the errors are too wide"
     )

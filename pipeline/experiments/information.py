@@ -132,7 +132,10 @@ class Knowledge:
         return replace(self, information=np.stack([H, H @ covariance @ H]), beyond=beyond)
 
     def by_parameters(self) -> Array:
-        """Return the relative change (n_named, n_p) of each named parameter, in table order."""
+        """Return how the named parameters (in table order) change with the physical ones.
+
+        The result (n_named, n_p) has relative changes of both.
+        """
         J = parameter_jacobian(self.chain, self.parametrisation.names) * self.size
         return J / np.array(list(self.chain.parameters().values()))[:, None]
 

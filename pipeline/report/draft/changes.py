@@ -53,14 +53,14 @@ class Change:
 
     @property
     def percent(self) -> float | None:
-        """The change in percent of the earlier value."""
+        """The change as a percentage of the earlier value."""
         if self.before is None or self.after is None or self.before.value == 0:
             return None
         return 100 * (self.after.value - self.before.value) / abs(self.before.value)
 
     @property
     def sigmas(self) -> float | None:
-        """The change in combined standard errors."""
+        """The change divided by the combined standard error."""
         old, new = self.before, self.after
         if old is None or new is None or old.std is None or new.std is None:
             return None
