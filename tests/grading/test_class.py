@@ -95,7 +95,7 @@ def test_a_model_from_coarse_numbers_is_not_flagged(seed, digits):
         (73025, 0, ("hz_for_rad_s",), {"hz_for_rad_s"}),  # one resonance read anywhere by eye
         # one decay read at its seventh period
         pytest.param(73026, 0, ("peak_count",), {"peak_count"}, marks=LONG),
-        # too coarse to differ from a factor of 6/5
+        # typed too coarsely to rule out a factor of 6/5
         pytest.param(72007, 3, ("initial_off",), {"initial_off"}, marks=LONG),
         pytest.param(
             72021, 0, ("hz_for_rad_s", "log10_for_ln"), {"hz_for_rad_s", "log10_for_ln"}, marks=LONG

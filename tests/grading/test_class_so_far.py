@@ -229,7 +229,7 @@ def test_teams_that_exchange_folders_keep_their_points(tmp_path):
 
 
 def test_submissions_are_recognised_by_number_files_or_authors(tmp_path):
-    """Two submissions count as one if the platform's number, else files, else authors agree."""
+    """Two submissions count as one if their platform numbers agree, or else files, or authors."""
     old = make_outcome(make_grade("old", authors=("ann",)), key="k-files", owner="A (canvas 7)")
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         book.put(old)

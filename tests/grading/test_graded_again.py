@@ -89,7 +89,7 @@ def test_files_that_change_during_the_grading_are_not_graded(task, tmp_path, sch
     assert outcome.reason == "its files changed during the grading: grade it again"
 
 
-def test_the_version_covers_what_it_computes_with(monkeypatch):
+def test_another_version_of_numpy_grades_everything_again(monkeypatch):
     """If numpy or scipy has another version, everything is graded again."""
     before = code_version()
     assert code_version() == before

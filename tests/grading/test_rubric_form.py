@@ -66,7 +66,7 @@ def test_a_form_keeps_comments_and_order(data):
             was = was.get(part, {}) if isinstance(was, dict) else was[part]
         cast(Any, was).pop(key[-1], None)
         if key[0] not in before:
-            assert document.pop(str(key[0])) == {}  # a table that is not inline
+            assert document.pop(str(key[0])) == {}  # nothing else is new
     assert document == before
     assert _comments(new) == _comments(text)
     left = iter(_without_numbers(new))

@@ -143,7 +143,7 @@ def test_dollar_signs_are_drawn_as_they_are():
 
 
 def test_an_unstable_model_does_not_hide_the_measurement():
-    """If a simulation grows without bound, the axis ends one span beyond the measurement."""
+    """If a simulation grows without bound, the axis ends at most one span beyond the data."""
     check = make_analysis(1).hardware[0]
     growth = np.append(np.exp(np.linspace(0, 700, check.t.size - 1)), np.inf)
     for model in (1e12 * check.model, growth):

@@ -503,7 +503,7 @@ def test_the_longest_names_in_a_legend_fit_in_the_figure():
 
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
-def test_every_effect_has_its_page(effect):
+def test_the_page_of_every_effect_is_complete(effect):
     """The page of every effect has its figure, its fingerprint and its reference."""
     page = page_of(make_gap("named", (effect.key,)))
 
@@ -535,7 +535,7 @@ def test_two_effects_have_two_letters_in_the_equations():
     "keys", list(permutations(("saturation", "actuator_lag", "dead_zone", "input_delay")))[::5]
 )
 def test_changes_of_the_input_are_applied_as_in_the_simulator(keys):
-    """In whatever order effects are listed, each change of the input starts from the last one.
+    """In whatever order effects are listed, each input change starts from the one before.
 
     Only the last change pushes cart 1, and the load-dependent friction uses this last change.
     """

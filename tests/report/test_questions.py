@@ -279,7 +279,7 @@ def test_a_question_is_printed_with_its_answer(answered):
     assert [text.count(asked) for text in texts] == [text.count(said) for text in texts]
 
 
-def test_a_new_submission_says_how_to_answer_without_answering(tmp_path):
+def test_a_new_submission_explains_how_to_answer(tmp_path):
     """A new submission explains in a comment how to answer; the comment is in no report."""
     new_submission(tmp_path / "team", carts=2)
     notes = tmp_path / "team" / "notes.md"

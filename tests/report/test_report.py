@@ -112,7 +112,7 @@ def test_every_part_is_there(carts, folders):
     expected += ["damping", "feedback", "hardware-1", "overview", "sine", "steps"]
     assert names == sorted(expected)
     bode = re.findall(r"Bode plot of cart (\d)", " ".join(page.values("aria-label")))
-    assert bode == [str(i) for i in range(carts, 0, -1)]  # as in the paper, from the last cart
+    assert bode == [str(i) for i in range(carts, 0, -1)]  # last cart first, as in the paper
     assert "Émilie du Châtelet (s1025)" in page.text
     assert "Émilie du Châtelet (s1025)" in pdf
 

@@ -192,7 +192,7 @@ def test_numbers_worked_step_by_step_give_the_state_model(chain):
     A, B, _, _ = chain.state_space()
     entries, column = derivation.state_entries(n)
     got = np.array([[evaluate(text, values) for text in line] for line in entries])
-    # kappa is a small difference of products of omega², so rounding grows by their ratio.
+    # kappa is a small difference of products of omega², so its rounding error is larger.
     scale = np.abs(A).max() * (chain.poles.__abs__().max() / np.abs(chain.poles).min()) ** 2
     assert_allclose(got, A, rtol=1e-9, atol=1e-13 * scale)
     assert_allclose([evaluate(text, values) for text in column], B[:, 0], rtol=1e-9)
@@ -332,7 +332,7 @@ def test_expected_values_pass_and_mistakes_fail():
     ("carts", "hide"), [(1, ()), (3, ()), pytest.param(1, ("dead_zone",), id="not linear")]
 )
 def test_bounds_in_the_solution_earn_all_points(carts, hide):
-    """A student's number at a bound in the solution earns all points, and beyond it fewer."""
+    """A student's number at a bound of the solution earns all points, and one beyond it fewer."""
     one = student(carts, hide=hide)
     expected = expected_parameters(one.analysis, one.rubric)
     assert len(expected) == len(one.rubric.names)
@@ -374,7 +374,7 @@ def test_another_rubric_has_other_bounds(tmp_path):
 @given(chains(min_carts=2, max_carts=3), st.integers(0, 2**32 - 1))
 @settings(max_examples=20)
 def test_tolerances_of_entries_cover_tolerated_tables(chain, seed):
-    """Errors of a third of a table's tolerances keep most entries of A and B within tolerance."""
+    """If a table's errors are a third of its tolerances, most entries of A and B are tolerated."""
     rng = np.random.default_rng(seed)
     table = derivation.given(chain)
     tolerances = {name: 1e-3 * value for name, value in table.items()}
@@ -388,7 +388,7 @@ def test_tolerances_of_entries_cover_tolerated_tables(chain, seed):
         worked = work_out(derivation.state_steps(chain.n), moved)
         A = np.array([[evaluate(text, worked) for text in line] for line in rows])
         inside.append(np.abs(A - model.A) <= model.A_tolerance + 1e-6 * np.abs(model.A))
-    # A third of the tolerance is one standard deviation, so the tolerance holds 99.7 %.
+    # A third of the tolerance is one standard deviation, so 99.7 % of the errors are tolerated.
     assert np.mean(inside) > 0.97
 
 

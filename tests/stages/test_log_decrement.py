@@ -56,7 +56,7 @@ def record(t, y, *, u=None, kind: Kind = "decay", count=COUNT):
 
 
 def released(*, zeta, fs=FS, duration=None, count=COUNT, noise=0.0, rng=None, **motion):
-    """Return a record of a release by hand, which lasts 4.5 time constants or 10 s."""
+    """Return a record of a release by hand of 4.5 time constants, or of 10 s if that is less."""
     t = np.arange(0, duration or RELEASE + min(4.5 / (zeta * OMEGA), 10.0), 1 / fs)
     y = held_then_free(t, zeta=zeta, **motion)
     if rng is not None:
@@ -119,7 +119,7 @@ def test_heavy_damping_still_gives_an_answer(zeta):
     assert ("too few" in got.note) == (got.peak_t.size < 4)
 
 
-def test_standard_errors_of_heavy_damping_are_those_of_the_fit():
+def test_with_few_peaks_the_decrement_is_that_of_the_fit():
     """If a decay has fewer than four peaks, the decrement comes from the exponential fit."""
     got = fit_log_decrement(released(zeta=0.6, duration=3.0), cart=1)
     assert got.peak_t.size < 4
@@ -273,7 +273,7 @@ def test_dry_friction_and_viscous_damping_are_separated(d, zeta):
 
 
 def test_damping_that_grows_with_amplitude_is_not_dry_friction():
-    """Quadratic drag is not called dry friction; a note says that damping grows with size."""
+    """Damping that grows with amplitude (quadratic drag) is noted and not called dry friction."""
     fine = np.linspace(0, 4, 40001)
     y, x, v = np.empty_like(fine), 1.2, 0.0
     for i in range(fine.size):
@@ -287,7 +287,7 @@ def test_damping_that_grows_with_amplitude_is_not_dry_friction():
 
 
 def flags(seeds, *, d):
-    """Return in how many of these decays with friction band d friction is found."""
+    """Return for each random decay with friction band d whether dry friction is found."""
     found = []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)

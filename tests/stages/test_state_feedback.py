@@ -195,7 +195,7 @@ def test_the_design_meets_its_goal_on_the_true_plant(name, cart, method):
 
 
 @pytest.mark.parametrize(("name", "cart"), [(n, c) for n, c in EVERY_CART if n in PRESETS])
-def test_lqr_hardly_overshoots_the_presets_and_forgives_model_error(name, cart):
+def test_lqr_hardly_overshoots_and_tolerates_model_error(name, cart):
     """LQR designs overshoot by at most 0.6 %.
 
     They stay stable if the plant differs from the model by a few percent.

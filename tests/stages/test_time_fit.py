@@ -132,7 +132,7 @@ def test_exact_records_give_the_chain(n):
     fit = fit_records([record], bench=Bench(springs=springs))
     assert fit.converged
     assert fit.n_starts == 1
-    # The search stops at 1e-9 of the cost, which sample times rounded to 1e-12 s leave above zero.
+    # The search stops at 1e-9 of the cost; rounding times to 1e-12 s keeps the cost above zero.
     assert_allclose(fit.chain.m, chain.m, rtol=1e-6)
     assert_allclose(fit.chain.c, chain.c, rtol=1e-5)
     assert_allclose(fit.chain.k, chain.k, rtol=1e-6)
@@ -247,7 +247,7 @@ def test_a_damping_at_its_bound_has_no_standard_error():
         zeta = fit.parameters["zeta"]
         assert (zeta.value, zeta.std, zeta.at_bound) == (0.0, None, True)
         assert fit.at_bound == ("c_1",)
-        assert fit.names == ("m_1", "c_1", "k_1")  # also for a damping at its bound
+        assert fit.names == ("m_1", "c_1", "k_1")  # c_1 is still a parameter
         assert fit.covariance[1, 1] > 0
 
 

@@ -274,7 +274,7 @@ def test_code_in_an_upload_is_not_run(root, team, shown, tmp_path):
 def test_a_grader_that_is_killed_leaves_a_result(root, team):
     """If the grader is killed, the result has 0 points and says to submit again.
 
-    Here the grader is killed because it has too little memory even to start.
+    In the test, the grader is killed because it has too little memory even to start.
     """
     put(root, team)
     done = start("bash", "-c", f"ulimit -v 100000; '{root}/run_autograder'")

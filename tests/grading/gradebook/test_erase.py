@@ -19,7 +19,12 @@ from tests.helpers.commandline import cartlab_here
 from tests.helpers.grades import make_grade, make_outcome, shared_flag, two_cart_rubric
 
 GONE, KEPT = "zebra-çelik", "team-2"
-TRACES = ("zebra", "s-zebra", "31.41592", "quagga")  # id, name, a reported number, a typed text
+TRACES = (
+    "zebra",
+    "s-zebra",
+    "31.41592",
+    "quagga",
+)  # a student's id, name, reported number and typed text
 
 
 def _fill(place: str, *, folder: Path | None = None) -> None:

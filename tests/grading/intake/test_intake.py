@@ -194,7 +194,7 @@ def test_a_folder_keeps_its_name_whatever_platform_it_looks_like(tmp_path):
 
 @pytest.mark.parametrize("wrapped", ["", "class/", "term/class/"])
 def test_a_refused_file_affects_only_its_own_submission(tmp_path, wrapped):
-    """If a file in a class archive is refused, only the submission with this file gets the reason.
+    """If a file in a class archive is refused, only the submission that contains it fails.
 
     The file gets no row of its own, unless its submission has no other files.
     """
@@ -234,7 +234,7 @@ def test_a_zip_of_two_submissions_keeps_its_own_name(tmp_path):
         opened(tmp_path, two)
 
 
-def test_one_students_zip_is_one_hand_in(tmp_path):
+def test_one_students_zip_is_one_submission(tmp_path):
     """A student's zip file is one submission, and a broken zip file gets a row."""
     good = archive(tmp_path / "team-07.zip", {"submission.toml": TOML})
     bad = tmp_path / "team-08.zip"
@@ -388,7 +388,7 @@ def test_a_name_of_many_numbers_is_read_at_once():
         parse_name(part * (1_000_000 // len(part)) + "\n")
 
 
-def test_archives_in_archives_are_opened_to_a_depth(tmp_path):
+def test_archives_in_archives_are_opened_to_a_limited_depth(tmp_path):
     """A zip file inside a zip file is opened, but not one that is ten levels deep."""
     content = zip_bytes(tmp_path, {"submission.toml": TOML})
     nested = zip_bytes(tmp_path, {"inner.zip": content})
@@ -459,7 +459,7 @@ def test_too_many_files_are_refused_with_one_reason(tmp_path):
     assert open_submission([team], tmp_path / "again").joinpath(NAME).is_file()
 
 
-def test_a_hand_in_travels_whole(tmp_path):
+def test_a_submission_is_unchanged_on_another_machine(tmp_path):
     """A submission sent to another machine has the same files and the same hash there."""
     folder = tree(tmp_path / "t", {"submission.toml": TOML, "data/ü.csv": "1", ".DS_Store": "x"})
     unpacked(packed([folder]), tmp_path / "there")
@@ -479,7 +479,7 @@ def test_an_empty_or_missing_folder_is_an_error(tmp_path):
 
 
 @given(st.lists(st.text(min_size=1, max_size=30), min_size=1, max_size=6))
-def test_any_name_becomes_a_folders(tmp_path_factory, names):
+def test_any_name_gives_a_valid_id(tmp_path_factory, names):
     """For any name, the id is unique, printable, not too long, and stays inside its folder."""
     from pipeline.grading.intake.hand_ins import HandIn, _with_ids
 

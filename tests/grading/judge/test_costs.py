@@ -77,7 +77,7 @@ def _flip_couplings(A: np.ndarray, B: np.ndarray) -> None:
     ],
 )
 def test_a_harmful_model_keeps_a_quarter_at_most(slip, said):
-    """A sign error that makes the model unstable or reversed costs at least three quarters."""
+    """A wrong sign that makes the model unstable or reversed costs at least 75 % of the points."""
     one = student(2)
     A, B = model(one)
     slip(A, B)

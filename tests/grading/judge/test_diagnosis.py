@@ -14,7 +14,7 @@ from tests.helpers.textbook_student import by_eye, final_table, initial_table
 
 TURN = 2 * np.pi
 FRICTION = ("coulomb_friction",)
-FROM_TABLES = {"initial", "final", "comparison", "laws", "state"}  # beginnings of criteria's ids
+FROM_TABLES = {"initial", "final", "comparison", "laws", "state"}  # ids begin with these
 
 
 def codes(one: Student) -> list[str]:
@@ -121,7 +121,7 @@ def test_frequencies_in_hz_are_flagged(carts, table):
     flag = only_flag(scaled(one, table, names, 1 / TURN))
     assert flag.code == "hz_for_rad_s"
     assert set(flag.parameters) == set(names)
-    assert flag.evidence["ratio"] == pytest.approx(1 / TURN, rel=0.15)  # read off by eye: 10 %
+    assert flag.evidence["ratio"] == pytest.approx(1 / TURN, rel=0.15)  # 10 % off, as by eye
     assert "/2π" in flag.message
     assert "also_in" not in flag.evidence
 

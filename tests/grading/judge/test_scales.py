@@ -72,7 +72,7 @@ def test_a_stated_length_of_a_count_makes_the_gain_known(in_counts):
     assert off["initial-gains"] == off["final-gains"] == "fail"
 
 
-def test_millivolts_stated_as_volts_fail_a_check(tmp_path):
+def test_an_input_in_a_wrong_unit_is_flagged(tmp_path):
     """If the input is 10,000 times too large, it is flagged, and no gain is judged."""
     graded = grade(scaled(tmp_path / "team", "input", 1e4))
     assert [flag.code for flag in graded.flags] == ["data_problem"]

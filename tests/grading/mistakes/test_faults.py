@@ -127,7 +127,7 @@ LONG = [pytest.mark.slow, pytest.mark.sample]
 
 
 def _cases() -> Iterator[Any]:
-    """Yield each case without a stated sign; with a sign only cases that look like a wrong one."""
+    """Yield each case with no sign stated; cases that look like a wrong sign also state one."""
     for case in SPOILT:
         yield pytest.param(case, "", marks=LONG if case in SEARCHED else ())
         if "turned" in case or "exchanged" in case:

@@ -43,7 +43,7 @@ def write(tmp_path: Path, *outcomes, platform, roster: str = "", overrides=(), *
     return list(csv.reader(io.StringIO(text, newline=""))), said
 
 
-def test_a_grade_is_better_than_none(tmp_path):
+def test_0_points_count_more_than_no_grade(tmp_path):
     """If an author has an ungraded submission and one with 0 points, the 0 points are exported."""
     unread = failed_grade("a", "too slow")
     unread = unread.model_copy(update={"authors": ("bob",)})
@@ -239,7 +239,7 @@ def test_a_canvas_gradebook_with_another_maximum_is_refused(tmp_path):
         write(tmp_path, HALF, platform="canvas", title="Lab 3", roster=roster.format("18.00"))
 
 
-def test_moodle_is_told_why_points_were_given_by_hand(tmp_path):
+def test_moodle_gets_the_reason_for_points_by_hand(tmp_path):
     """The comment for Moodle says why points were given by hand, even for full points."""
     first = RUBRIC.criteria[0]
     given = [("team-b", first.id, first.points)]

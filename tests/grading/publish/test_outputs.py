@@ -229,7 +229,7 @@ def test_an_anonymous_grading_reveals_no_name(tmp_path):
     assert names == sorted(key)
     for name, content in tree(out).items():
         if name != KEY_FILE:
-            told = re.sub(rb'url\("data:[^"]*"\)', b"", content)  # a font is no text
+            told = re.sub(rb'url\("data:[^"]*"\)', b"", content)  # fonts are no text
             assert not re.search(rb"zoe|\bann\b|bob", told), name
             assert not re.search(r"zoe|ann-|bob", name)
     (ann,) = [n for n, row in key.items() if row["authors"] == "ann"]
@@ -409,7 +409,7 @@ def test_only_full_points_are_100_percent(points, percent):
     assert cells[cells.index(str(points)) + 1] == percent
 
 
-def test_the_class_page_counts_what_there_is():
+def test_the_class_page_shows_statistics():
     """The class page shows mean and median, outcomes per criterion, and teams per mistake."""
     grades = [make_grade("a"), make_grade("b", share=0.5, flags=(hertz_flag(),)),
               make_grade("c", share=0.0, flags=(hertz_flag(), missing_flag()))]  # fmt: skip
@@ -428,7 +428,7 @@ def test_the_class_page_counts_what_there_is():
 def shares(*found: tuple[str, str, str]) -> Flag:
     """Return a flag for shared data.
 
-    Each argument has a recording of this submission, another submission, and its recording.
+    Each argument names a recording, another submission, and the other recording.
     """
     keys = ("experiment", "submission", "other_experiment")
     recordings = [{**dict(zip(keys, one, strict=True)), "sigmas": 9.5} for one in found]

@@ -83,7 +83,7 @@ def test_too_small_and_too_large_by_one_factor_are_the_same_error():
     """A number too small by some factor has the same error as one too large by that factor."""
     high = percent_off(Decimal("120.0000"), at(100.0), sigmas=0.0)
     low = percent_off(Decimal("83.33333"), at(100.0), sigmas=0.0)
-    # The typed digits differ: half a unit of the last digit is 1e-4 percent of 1e-4 or 1e-5.
+    # The numbers have different digits, which changes the errors by up to 1e-4 percent.
     assert abs(high - low) < Fraction(2, 10**4)
 
 

@@ -157,7 +157,7 @@ def test_a_link_is_not_followed(honest, tmp_path):
 def test_the_grade_says_how_often_the_check_was_run(in_hertz, tmp_path):
     """A note in the grade says how often the check was run, or that its file was changed.
 
-    It costs no points.
+    The note costs no points.
     """
     check(in_hertz)
     check(in_hertz)

@@ -235,7 +235,7 @@ def test_a_copy_from_an_earlier_batch_is_found(teams):
 
 @pytest.fixture
 def compared(monkeypatch):
-    """Return a list that gets a pair of recordings for each comparison at one time shift."""
+    """Return a list; each comparison at one time shift adds its pair of recordings."""
     pairs, compare = [], shared.compare
 
     def counted(a, b, **how):
