@@ -14,7 +14,7 @@ from tests.helpers.examples import analysed
 
 
 def test_gain_intervals_of_a_sticking_cart_may_be_disjoint():
-    """If a cart sticks, gain intervals of two steps may be disjoint and miss the gain."""
+    """If a cart sticks, gain intervals of two steps may be disjoint and exclude the true gain."""
     steps = [
         StepGain(
             experiment=f"step-{i}",

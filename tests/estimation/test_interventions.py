@@ -102,7 +102,7 @@ def test_no_effect_is_taken_for_a_hand(effect):
     assert find_interventions(case.records) == ()
 
 
-def test_a_record_is_cut_at_its_hands():
+def test_a_record_is_cut_at_its_touches():
     """A record is cut at its touches, and no sample outside the touches is lost."""
     record = make_case(seed=71, n=1, rate=113.1).records[0]
     hands = [

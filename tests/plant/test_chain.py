@@ -256,7 +256,7 @@ def test_frequencies_interlace(chain):
 
 @given(chains(min_carts=2), st.data())
 def test_a_held_cart_is_a_wall(chain, data):
-    """If all others are held, a cart has the frequency and damping with its number."""
+    """If all other carts are held, a cart has the frequency and damping that bear its number."""
     cart = data.draw(st.integers(1, chain.n))
 
     A, B, _, _ = chain.state_space(free=[cart])

@@ -126,7 +126,7 @@ def test_cart_stays_where_friction_holds_it():
 
 
 @pytest.mark.parametrize("key", list(SIZES))
-def test_every_effect_agrees_with_the_fine_step_truth(key):
+def test_every_effect_agrees_with_the_fine_step_simulator(key):
     """For each effect, this simulator and an independent one with 50-µs steps agree."""
     chain = PRESETS["throne-2dof"]
     effect = find_effect(key)
@@ -305,11 +305,11 @@ def test_arrays_of_any_kind_use_the_same_compiled_code():
     modules = (contacts, kernel, laws, sensitivity, state, step)
     mine = {id(one): one for module in modules for one in vars(module).values()}
     twice = [one for one in mine.values() if len(getattr(one, "signatures", ())) > 1]
-    assert twice in ([], [state.stretch])  # `stretch` is also called with a constant row
+    assert twice in ([], [state.stretch])  # compiled once for each row
 
 
 def test_compiled_code_counts_no_references():
-    """Compiled code counts no references to arrays, as two threads would wait for each other."""
+    """Compiled code counts no references to arrays, since counting makes threads wait."""
     compile_simulator()
     folder = kernel._simulate.stats.cache_path
     assert folder is not None

@@ -85,6 +85,6 @@ def test_derivatives_are_those_of_the_readings(preset, effect, speed):
         difference = (simulate(by, at, step)[0] - simulate(by, at, -step)[0]) / (2.0 * step)
         scale = max(float(np.linalg.norm(difference)) * size, 1e-6)
         error = float(np.linalg.norm(derivative - difference)) * size / scale
-        # Impulses in place of forces cause (omega h)² / 12, at most 4e-3. The change of friction
+        # Impulses in place of forces err by (omega h)² / 12, at most 4e-3. The change of friction
         # within a step is a tenth of its part in the derivative.
         assert error < 0.03, (by, at, error)

@@ -142,7 +142,7 @@ def test_the_staged_fit_is_reported_as_well():
 
 @pytest.mark.parametrize("phases", [False, True], ids=["magnitudes", "phases"])
 @pytest.mark.parametrize("preset", PRESETS)
-def test_intervals_cover_the_truth(preset, phases):
+def test_intervals_contain_the_true_values(preset, phases):
     """Over 16 noisy data sets, 95 % intervals contain the true value as often as they should."""
     got = quality(PRESETS[preset], seeds=16, phases=phases)
 

@@ -14,7 +14,7 @@ from tests.stages.test_time_fit import errors
 @pytest.mark.parametrize("noise", [0.0, 0.0005, 0.00227])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_95_percent_intervals_contain_95_percent_of_the_true_values(preset, noise):
-    """95 % intervals contain the true value in 95 % of cases, even if only rounding errs."""
+    """The 95 % intervals contain 95 % of true values, even if rounding is the only error."""
     chain, rng = PRESETS[preset], np.random.default_rng(15)
     seeds = 120
     inside = np.zeros(len(chain.parameters()))

@@ -32,7 +32,7 @@ def judged(
 @pytest.mark.parametrize(
     ("child", "worth"),
     [
-        ({"chi": 2.0, "held": 2.0}, True),  # improves both by 100 ln 3
+        ({"chi": 2.0, "held": 2.0}, True),  # both kinds of runs improve by 100 ln 3
         (
             {"chi": 2.0, "held": 2.0, "n_independent": 5.0},
             False,

@@ -52,7 +52,7 @@ def verdict_on(*steps: Any, others: tuple[Any, ...] = ()) -> tuple[str, set[Any]
 
 
 def test_an_effect_that_a_later_one_makes_needless_is_removed():
-    """If the effect found second explains as much alone, the first is taken back."""
+    """If the effect found second explains as much without the first, the first is removed."""
     delay = hypothesis(DELAY, error=0.25, bic=-10)
     both = hypothesis(DELAY, COULOMB, error=0.2, bic=-500)
     three = hypothesis(DELAY, COULOMB, CUBIC, error=0.195, bic=-600)
