@@ -15,7 +15,7 @@ from pipeline.plant.linear.presets import PRESETS
 @pytest.mark.parametrize("phases", [False, True], ids=["magnitudes", "phases"])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_fit_is_efficient_and_its_errors_are_right(preset, phases):
-    """Over 400 noisy data sets, intervals are right and the accuracy is nearly the best possible."""
+    """Over 400 noisy data sets, intervals are right and accuracy is nearly the best possible."""
     got = quality(PRESETS[preset], seeds=400, phases=phases)
 
     # The share of 400 intervals has a standard error of 1.1 %. The lower limit is three of these
