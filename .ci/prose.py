@@ -176,7 +176,9 @@ def check(*, lower: bool) -> int:
         return 1
     if not lower:
         if now != budget:
-            print("Fewer odd sentences than allowed. Keep it so: python .ci/prose.py --lower")
+            print(
+                "Fewer odd sentences than allowed. To lower the limits: python .ci/prose.py --lower"
+            )
         return 0
     lines = [f'"{name}" = {n}' for name, n in now.items()]
     head = "# Odd sentences that each folder may have, counted by prose.py. A number may only fall."

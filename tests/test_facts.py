@@ -69,7 +69,7 @@ MODULES = [path for path in sorted(PIPELINE.rglob("*.py")) if path != PIPELINE /
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PIPELINE)))
-def test_no_fact_is_read_back_from_words(path: Path):
+def test_no_fact_is_extracted_from_words(path: Path):
     """Only `names.py` splits names; no module splits messages, ids or stage names."""
     place = path.relative_to(PIPELINE).as_posix()
     of_parameters = place.startswith(tuple(f"{room}/" for room in ROOMS))

@@ -20,7 +20,7 @@ def results():
     return json.loads(text, parse_constant=refuse)
 
 
-def test_it_has_every_documented_key(results):
+def test_results_json_has_every_documented_key(results):
     """results.json has all top-level keys in the documented order, and the schema's name."""
     assert results["schema"] == "cartlab-results/1"
     page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8").split("\n## ")[0]

@@ -41,7 +41,7 @@ def checks(teams, monkeypatch):
     return failed
 
 
-def test_the_notebooks_tests_fail_for_what_a_team_got_wrong_and_for_nothing_else(teams, checks):
+def test_the_notebooks_tests_fail_only_for_wrong_numbers(teams, checks):
     wrong = {
         "": set(),
         "hz_for_rad_s": {("initial", "omega_n"), ("final", "omega_n")},
@@ -54,14 +54,14 @@ def test_the_notebooks_tests_fail_for_what_a_team_got_wrong_and_for_nothing_else
     assert {slip: checks(team) for team, slip in teams[1].items()} == wrong
 
 
-def test_the_notebooks_reference_is_the_bench(teams, checks):
+def test_the_notebooks_reference_finds_the_true_values(teams, checks):
     checks("team-000")
     truth = PRESETS[grading_notebooks.PRESET].parameters()
     found = lab_reference.final(tuple(sorted(_dwells(teams[0] / "team-000").items())))
     assert found == pytest.approx(truth, rel=0.01)
 
 
-def test_a_grader_is_judged_by_who_lost_points_and_who_was_told_why():
+def test_a_grader_is_judged_by_lost_points_and_named_mistakes():
     slips = {"a": "", "b": "hz_for_rad_s", "c": "final_off", "d": grading_notebooks.COPIED}
     done = grading_notebooks.Graded(
         cost=Cost(clock=9.0, parent=1.0, workers=7.0),

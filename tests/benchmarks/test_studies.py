@@ -28,7 +28,7 @@ def _explored(**changed) -> dict:
     return row | changed
 
 
-def test_errors_of_benches_wrongly_named_count_in_the_coverage():
+def test_errors_of_wrongly_named_benches_count_in_the_coverage():
     wrong = _explored(verdicts=["named"], found=[["cubic_spring", 1]], errors={"m_1": 9.0})
 
     cells = _cells(explorations.table([_explored(), wrong]), "all")
@@ -36,7 +36,7 @@ def test_errors_of_benches_wrongly_named_count_in_the_coverage():
     assert "(1 of 2;" in cells[4]
 
 
-def test_a_limit_passed_is_told_apart_from_other_ends():
+def test_a_passed_limit_is_distinguished_from_other_ends():
     rows = [
         _explored(),
         {"hidden": [], "ended": "LimitPassed: step-1: cart 1 beyond 2.5 cm"},
@@ -61,7 +61,7 @@ def test_a_recording_beyond_the_travel_limit_is_counted(tmp_path):
         bench.carry_out(step, submission=submission, limits=narrow)
 
 
-def test_benches_whose_first_look_failed_are_counted():
+def test_benches_whose_first_search_failed_are_counted():
     look = {"verdict": "ambiguous", "found": []}
     rows = [{"hidden": [], "looks": [look]}, {"hidden": [], "looks": []}]
 

@@ -98,7 +98,7 @@ def test_many_viewers_block_nobody(tmp_path, real):
         assert all(b"event: ended\n" in answer.read() for answer in watched)
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows ends no program so")
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signals")
 @pytest.mark.parametrize(
     ("name", "room", "fields"),
     [
@@ -159,7 +159,7 @@ def test_a_plan_is_made_and_errors_are_named(tmp_path):
     assert load_plan(load_submission(work)).recordings
 
 
-def test_exploring_has_a_form_of_its_own(tmp_path):
+def test_exploring_has_its_own_form(tmp_path):
     """Exploring has its own form with its own port, and Enter in a field starts exploring.
 
     Numbers may have a decimal comma, and an error names its field.
@@ -253,7 +253,7 @@ def test_ports_are_listed_and_the_one_used_is_remembered(tmp_path, real):
     assert first == [real.address]
 
 
-def test_what_is_new_in_the_plan_is_marked(tmp_path):
+def test_new_recordings_in_the_plan_are_marked(tmp_path):
     """The plan marks which runs are recorded, which is next, and which was added last."""
     work = write_work(tmp_path / "team", [sine("first", seconds=1), sine("second", seconds=1)])
     with DeskServer(folder=work) as server:

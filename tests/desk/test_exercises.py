@@ -59,7 +59,7 @@ def test_every_effect_has_valid_sizes_on_its_slider():
             assert all(p["slide"] == "0" for p in found["effects"][0]["parameters"])
 
 
-def test_a_slider_counts_when_moved_and_a_number_when_typed():
+def test_a_moved_slider_or_a_typed_number_counts():
     """A typed size is used; without a typed size, the slider counts if it was moved."""
 
     def force(preset: str, **size: str) -> dict[str, str]:
@@ -79,7 +79,7 @@ def test_a_slider_counts_when_moved_and_a_number_when_typed():
     assert other == force("throne-1dof")["value"] != usual
 
 
-def test_a_class_is_what_simulate_writes(visitor, tmp_path):
+def test_a_class_equals_what_simulate_writes(visitor, tmp_path):
     """A class of two folders has the same bytes as the class that `cartlab simulate` writes.
 
     No folder names the hidden effect.
@@ -144,7 +144,7 @@ def test_a_picture_is_inert(visitor):
     assert visitor.get(f"/exercises/picture.svg?{forged}").status == 422
 
 
-def test_a_solution_is_what_the_command_writes(tmp_path):
+def test_a_solution_equals_what_the_command_writes(tmp_path):
     """The desk makes the same solution as the command, and gives the expected values as JSON."""
     folder = a_submission(tmp_path / "reference")
     with DeskServer(folder=folder) as server:

@@ -477,7 +477,7 @@ def test_a_table_is_imported_whole_or_not_at_all(ta, grades):
 
 
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
-def test_the_export_is_that_of_the_command(ta, grades, tmp_path, platform):
+def test_the_export_equals_that_of_the_command(ta, grades, tmp_path, platform):
     """The desk's export equals that of the command byte by byte; several files come as a zip."""
     with Gradebook(grades) as book:
         done = export(book, platform, tmp_path / "out", title="Lab 3")

@@ -81,7 +81,7 @@ def test_a_lost_folder_is_named_on_its_page_and_breaks_no_other(tmp_path, instea
         assert [visitor.get(f"/{room}").status for room in ("student/0/", "grades/0/")] == [200] * 2
 
 
-def test_what_can_be_opened_comes_first_and_nothing_hidden_is_listed(root):
+def test_folders_that_can_be_opened_come_first(root):
     """Folders that can be opened are listed first, each once, with their kind.
 
     Hidden folders are left out, and so are links that lead outside the root.
@@ -122,7 +122,7 @@ def test_a_large_folder_is_cut_and_says_so(root):
     assert f"Only the first {MOST} folders are listed" in page
 
 
-def test_what_can_be_opened_is_never_cut_off(root):
+def test_a_submission_is_never_cut_off(root):
     """In a long list, a submission comes first, whatever its name, so it is never cut off."""
     for number in range(MOST + 5):
         (root / "years" / f"team-{number:03d}").mkdir()
@@ -176,7 +176,7 @@ def test_the_line_of_links_stays_short(root):
         assert unescape(visitor.get("/").text).count(">t0</a>") == 3  # the page lists them all
 
 
-def test_a_student_sees_nothing_of_the_instructor_s(root):
+def test_students_see_nothing_for_instructors(root):
     """Students and TAs see none of the tasks, links and lists of folders for instructors."""
     users = """
     [[users]]

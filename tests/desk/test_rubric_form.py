@@ -148,7 +148,7 @@ def test_a_workshop_shows_only_its_own_files(tmp_path):
 # --------------------------------------------------------------------------- the form
 
 
-def test_a_page_begins_with_what_the_rubric_is(visitor, lab):
+def test_a_page_begins_with_a_summary_of_the_rubric(visitor, lab):
     """A rubric's page begins with its points, criteria and carts."""
     page = editor(visitor, lab).text
     assert '<p class="result">20 points in 13 criteria; fits submissions with 1 cart</p>' in page
@@ -262,7 +262,7 @@ def test_a_preview_says_what_needs_the_recordings(tmp_path, lab):
     assert "No team of graded would have different points." in shown.text
 
 
-def test_a_preview_of_a_class_without_names_shows_none(tmp_path, lab):
+def test_a_preview_of_an_anonymous_class_shows_no_name(tmp_path, lab):
     """The preview of an anonymous class shows no name, and its order reveals none."""
     write_class_of_two(tmp_path / "graded", anonymous=True)
     with DeskServer() as server:

@@ -338,7 +338,7 @@ def test_handing_in_says_when_the_report_is_out_of_date(change, filled):
     assert ("report/report.pdf" in zipped(visitor).namelist()) == (change == "nothing")
 
 
-def test_what_is_handed_in_is_shown_before(filled):
+def test_the_content_of_the_zip_is_shown_before_handing_in(filled):
     """Before handing in, the page shows the zip's content, open questions and assumptions."""
     visitor, folder = filled
     text = (folder / NAME).read_text(encoding="utf-8")

@@ -160,7 +160,7 @@ def test_a_pid_is_sent_as_typed_and_runs_as_simulated(identified):
     assert abs(u - expected_u).mean() < 0.05 * abs(expected_u).max()
 
 
-def test_the_submission_records_what_ran(identified):
+def test_the_submission_gets_the_controller_that_ran(identified):
     """After a run `submission.toml` has the controller that ran, in V and cm."""
     submission, analysis = identified
     scales = bench_scales(submission, bench=BENCH, analysis=analysis)

@@ -223,7 +223,7 @@ def test_a_long_set_point_is_cut_to_the_travel():
     assert 0.2 < loop.amplitude < 0.4
 
 
-def test_new_recordings_take_names_of_their_own():
+def test_new_recordings_get_new_numbers():
     """New recordings get numbers that continue those of the submission."""
     submission = recorded("two-cart", *FIRST)
     taken = {e.id for e in submission.experiments}

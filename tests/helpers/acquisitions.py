@@ -97,7 +97,7 @@ def until_bytes(raw: Path, process: subprocess.Popen[str], *, least: int = 5_000
     """Wait until a host has written this many bytes of a run."""
 
     def written() -> bool:
-        assert process.poll() is None, "the host ended before"
+        assert process.poll() is None, "the host ended too early"
         return raw.exists() and raw.stat().st_size >= least
 
     until(written, "a run")

@@ -154,7 +154,7 @@ def test_one_column_alone_is_read():
     assert_array_equal(got.values[0], X1)
 
 
-def test_a_row_of_units_goes_into_the_headings():
+def test_a_row_of_units_is_joined_to_the_headings():
     """A row of units, as oscilloscopes write it, is joined to the headings."""
     got = table(
         "Time,Channel A\n(ms),(V)\n\n"

@@ -174,7 +174,7 @@ def test_columns_without_a_clock_get_no_suggestion(tmp_path):
     assert "state sample_rate = … (Hz)" in said
 
 
-@pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
+@pytest.mark.skipif(os.name == "nt", reason="links need a privilege on Windows")
 def test_a_link_may_be_inspected(tmp_path):
     """A link to one's own file may be inspected."""
     inspect(tmp_path, time=T, x1=X)

@@ -86,7 +86,7 @@ def test_every_dialect_of_lvm_gives_the_same_numbers(content):
     assert got.cut is None
 
 
-def test_units_of_the_header_go_into_the_headings():
+def test_units_of_the_header_are_joined_to_the_headings():
     """Units in the header, which LabVIEW writes in words, are added to the headings."""
     segment = lvm_segment(COLUMNS, tags={"Y_Unit_Label": ["Volts", "Millimeters"]})
     assert table(HEAD + segment).names == ("time", "input [V]", "x1 [mm]")

@@ -117,7 +117,7 @@ def test_every_sheet_gives_the_same_numbers(fill):
     assert got.cut is None
 
 
-def test_what_is_not_read_is_reported():
+def test_unread_rows_and_columns_are_reported():
     """A note names the rows and columns that are not read, and numbers that are stored as text."""
     got = table(sheet(titled))
     assert got.names == ("time [s]", "input [V]", "x1 [cm]")

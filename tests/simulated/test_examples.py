@@ -73,7 +73,7 @@ def test_same_seed_same_bytes(tmp_path, sessions):
     assert other["data/decay-1a.csv"] != first["data/decay-1a.csv"]
 
 
-def test_the_shipped_examples_are_what_the_program_writes(tmp_path):
+def test_the_shipped_examples_equal_what_the_program_writes(tmp_path):
     """The files in `submissions/` are what `python -m pipeline.simulated.examples` writes."""
     write_examples(tmp_path)
 

@@ -187,7 +187,7 @@ def test_a_tiny_effect_gives_the_linear_bench(key, make_run):
 
 
 @pytest.mark.parametrize("key", [key for key in KEYS if key not in OWN_CONTACT])
-def test_steps_agree_with_the_independent_bench(key):
+def test_steps_agree_with_the_independent_simulator(key):
     """A step with an effect agrees with the 50-µs simulator to a fifth of a count."""
     term, run = usual(key), step()
     hidden = Hidden(effect=key, place=term.place, parameters=named(term))
@@ -210,7 +210,7 @@ def test_steps_agree_with_the_independent_bench(key):
     ["coulomb_friction", "presliding_friction", "load_friction", "cubic_spring", "dead_zone",
      "input_delay", "actuator_lag", "extra_mode", "sensor_gain"],
 )  # fmt: skip
-def test_closed_loops_agree_with_the_independent_bench(key):
+def test_closed_loops_agree_with_the_independent_simulator(key):
     """The 50-µs simulator, driven by a closed loop's logged input, gives the logged motion."""
     term, run = usual(key), control()
 
@@ -227,7 +227,7 @@ def test_closed_loops_agree_with_the_independent_bench(key):
 
 
 @pytest.mark.parametrize("key", ["coulomb_friction", "quadratic_drag", "cubic_spring"])
-def test_releases_agree_with_the_independent_bench(key):
+def test_releases_agree_with_the_independent_simulator(key):
     """From the release on, the 50-µs simulator under the hand's force gives the same motion."""
     run, term = decay(), usual(key)
     hand = run.hand

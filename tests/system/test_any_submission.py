@@ -145,7 +145,7 @@ def mislabelled(draw: st.DrawFn, run: Experiment, n: int) -> Experiment:
 
 
 def refuse(constant: str) -> None:
-    raise AssertionError(f"{constant} is no JSON")
+    raise AssertionError(f"{constant} is not JSON")
 
 
 def check(case: Case) -> None:

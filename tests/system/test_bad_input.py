@@ -422,7 +422,7 @@ def test_a_file_without_the_free_cart_is_one_line(tmp_path):
     one_line(folder, r"step-a: .*the free carts are \[2\], but the file measures \[1\]")
 
 
-@pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
+@pytest.mark.skipif(os.name == "nt", reason="links need a privilege on Windows")
 @pytest.mark.parametrize("place", ["file", "folder", "toml", "notes", "loop", "chain"])
 def test_no_link_leads_out_of_the_submission(place, tmp_path):
     """A link that leads out of the submission, or in a loop, is refused wherever it is."""

@@ -84,7 +84,7 @@ def test_report_writes_all_files(tmp_path):
         (["rport"], "rport"),
     ],
 )
-def test_what_cannot_run_is_one_line_and_status_two(tmp_path, arguments, expected):
+def test_a_command_that_cannot_run_is_one_line_and_status_two(tmp_path, arguments, expected):
     """A wrong name or a blocked path gives one line on stderr that names it, and exit status 2."""
     (tmp_path / "blocked").write_text("in the way")
     done = cartlab_here(*arguments, cwd=tmp_path)

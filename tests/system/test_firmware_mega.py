@@ -29,7 +29,7 @@ from pipeline.workflow import analyse
 from tests.helpers.firmware_host import acquire, kept_going
 from tests.helpers.firmware_mega import Mega, build_sketch, memory, missing
 
-pytestmark = pytest.mark.skipif(bool(missing()), reason=f"{missing()} is not here")
+pytestmark = pytest.mark.skipif(bool(missing()), reason=f"{missing()} is not installed")
 
 PERIOD = 0.004  # s between two lines at 115200 baud, in the Mega's time
 
@@ -76,7 +76,7 @@ def _describe(mega: Mega) -> Description:
     return description
 
 
-def test_it_says_what_it_is(mega):
+def test_the_board_describes_itself(mega):
     """The board answers a query with a description in the form of the protocol."""
     description = _describe(mega)
     assert (description.encoders, description.period) == (2, PERIOD)
@@ -145,7 +145,7 @@ def test_waves_equal_those_of_the_reference(mega, wave):
     "gains",
     [PidGains(kp=0.8, ki=1.0, kd=0.04), StateGains(gains=(0.9, 0.05, 0.2, 0.01), prefilter=1.5)],
 )
-def test_it_closes_the_loop_over_its_pins(mega, gains):
+def test_the_board_closes_a_loop_over_its_pins(mega, gains):
     """Over the board's pins, a closed loop holds a simulated cart at the target.
 
     The reference computes from the board's own lines, so both differ only by rounding to 24 bits. A

@@ -25,7 +25,9 @@ from tests.helpers.commandline import cartlab_here
 from tests.helpers.hostile import SECRET, write_hostile
 from tests.helpers.places import ROOT
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pipes, links and rights of POSIX")
+pytestmark = pytest.mark.skipif(
+    sys.platform == "win32", reason="needs pipes and links of POSIX"
+)
 
 NOBODY = 65_534
 HONEST = ("honest-1", "honest-2")
@@ -138,7 +140,7 @@ def test_every_submission_has_a_row_with_a_reason(graded):
     assert [o.reason for o in outcomes if o and (o.detail or not o.settled)] == []
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="Linux says which file a descriptor belongs to")
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux names the file of a descriptor")
 def test_grading_writes_only_into_its_folder_and_makes_no_connection(graded):
     """Grading writes only into its own folder, makes no connection and starts only Python."""
     base, _, _ = graded
@@ -176,7 +178,7 @@ def test_the_honest_are_graded_as_if_they_were_alone(graded):
         assert (ours / "grade.json").read_bytes() == (theirs / "grade.json").read_bytes()
 
 
-def test_no_page_runs_or_fetches_anything_of_theirs(graded):
+def test_no_page_runs_or_loads_anything_hostile(graded):
     """Feedback pages hold only our scripts, no event handlers, no address of another host."""
     base, _, _ = graded
     out = base / "out-school"

@@ -231,7 +231,7 @@ def test_a_file_that_disappears_is_skipped(work, source):
 
 
 @pytest.mark.skipif(
-    sys.platform == "win32" or os.geteuid() == 0, reason="root and Windows lock otherwise"
+    sys.platform == "win32" or os.geteuid() == 0, reason="locks differ for root and on Windows"
 )
 def test_a_locked_file_is_imported_once_it_is_free(work, source):
     """A file that its program locks is reported once, and imported when the lock is gone."""

@@ -181,7 +181,7 @@ def news(page: LivePage, opened: ExitStack) -> http.client.HTTPResponse:
     return opened.enter_context(closing(connection.getresponse()))
 
 
-def test_it_is_served_to_this_computer_only_with_strict_headers(page):
+def test_the_page_is_served_to_this_computer_only(page):
     """Only this computer can open the page, which loads only its own scripts and is not cached."""
     assert urlsplit(page.url).hostname == "127.0.0.1"
     response, text = ask(page)
@@ -432,7 +432,7 @@ INK = """(id) => {
 BLUE, ORANGE = "0,114,178", "213,94,0"
 
 
-def test_it_shows_plan_progress_counters_and_curves(page, show):
+def test_the_page_shows_plan_progress_counters_and_curves(page, show):
     """The page shows the plan, progress, counters, and curves in the colours of their labels."""
     window = show()
     record(page)

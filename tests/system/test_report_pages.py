@@ -159,7 +159,7 @@ def test_no_word_of_the_pdf_is_cut_or_covered(made):
     """In the PDF each word lies on its page, and no word lies on another."""
     pdf = next(made.glob("*.pdf"), None)
     if pdf is None:
-        pytest.skip("a page alone, without a PDF")
+        pytest.skip("this page has no PDF")
     boxes = subprocess.run(
         ["pdftotext", "-bbox", pdf, "-"],
         capture_output=True,
@@ -396,7 +396,7 @@ SPLIT = """() => {
 }"""
 
 
-def test_a_phone_squeezes_no_column_and_splits_no_unit(three, show):
+def test_a_phone_does_not_squeeze_columns_or_split_units(three, show):
     """On a phone no cell of a table is higher than five lines, and a number stays with its unit."""
     page = show(page_of(three), size=PHONE)
     page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
@@ -487,7 +487,7 @@ def test_a_figure_shows_the_values_under_the_pointer(three, show):
     assert magnitude == pytest.approx(decibel, abs=0.01)
 
 
-def test_a_figure_zooms_where_it_is_dragged_and_comes_back(three, show):
+def test_dragging_zooms_a_figure_and_a_button_resets_it(three, show):
     """Dragging zooms all panels of a figure that share an axis, and the button shows all again."""
     page = show(page_of(three))
     figure = page.locator("figure").first

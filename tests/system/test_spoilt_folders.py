@@ -133,7 +133,7 @@ def run(command: str, folder: Path) -> None:
 
 
 def _refuse(constant: str) -> None:
-    raise AssertionError(f"{constant} is no JSON")
+    raise AssertionError(f"{constant} is not JSON")
 
 
 def try_seed(command: str, seed: int) -> None:

@@ -43,7 +43,7 @@ def read(text: str) -> tuple[float, float]:
         (5e6, 1e3, "(5.0000 ± 0.0010) × 10⁶"),
     ],
 )
-def test_rounds_value_and_error_together(value, std, expected):
+def test_value_and_error_are_rounded_together(value, std, expected):
     """A value and its error both end at the decimal place of the error's second digit."""
     assert with_error(value, std) == expected
 
@@ -81,7 +81,7 @@ def test_significant_digits(value, expected):
     assert significant(value) == expected
 
 
-def test_percentages_carry_their_sign_where_they_are_changes():
+def test_only_changes_in_percent_have_a_sign():
     """A percentage has a sign only if it is a change; a missing percentage is a dash."""
     assert percent(5.14, signed=True) == "+5.1 %"
     assert percent(-148.2, signed=True) == "−148 %"

@@ -138,7 +138,7 @@ def test_a_folder_without_a_submission_gets_one(tmp_path):
     assert {"decay-1a", "step-2", "sweep"} <= {r.id for r in load_plan(submission).recordings}
 
 
-def test_what_is_recorded_is_skipped(tmp_path, fast):
+def test_existing_recordings_are_skipped(tmp_path, fast):
     """A second session records only what is missing."""
     work = write_work(tmp_path, [sine("a", seconds=1), sine("b", seconds=1)])
     first = acquire(work, port=fast.address, observers=[Notes()], only=["a"])
@@ -178,7 +178,7 @@ def test_a_pty_is_a_port_like_any_other(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.sample
-def test_the_whole_loop_names_what_the_bench_hides(tmp_path):
+def test_the_whole_cycle_finds_the_hidden_effect(tmp_path):
     """Plan, recordings, report and gap analysis find the dry friction hidden in a virtual bench."""
     work = tmp_path / "work"
     hidden = "coulomb_friction:cart=1,force=0.0025"
@@ -518,6 +518,6 @@ def test_without_a_keyboard_nothing_is_confirmed(monkeypatch):
 @pytest.mark.parametrize(
     ("values", "bars"), [([5, 5], "▁▁"), ([0, 7], "▁█"), (range(8), "▁▂▃▄▅▆▇█")]
 )
-def test_a_sparkline_goes_from_the_least_to_the_greatest(values, bars):
+def test_a_sparkline_has_a_bar_for_each_value(values, bars):
     """A sparkline has a bar for each value, as high as the value; equal values are low."""
     assert sparkline(values) == bars

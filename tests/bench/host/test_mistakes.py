@@ -156,7 +156,7 @@ def test_no_report_is_offered_if_nothing_was_recorded(tmp_path, fast):
     assert "cartlab report" not in said
 
 
-def test_files_need_a_submission_to_go_to(tmp_path):
+def test_files_are_imported_only_into_a_submission(tmp_path):
     """If the folder for imported files does not exist, the message says how to make it."""
     where = str(tmp_path / "new")
     done = CliRunner().invoke(app, ["acquire", where, "--import", str(tmp_path), "--once"])

@@ -35,7 +35,7 @@ def raw(tmp_path):
     return path
 
 
-def test_what_was_written_is_read(raw):
+def test_a_raw_file_is_read_as_written(raw):
     """Header, bytes and chunks of a raw file are read as written, with rising times."""
     run = read_raw(raw)
     assert run.header == HEADER

@@ -347,7 +347,7 @@ def test_a_closed_terminal_stops_the_motor(tmp_path, real):
     assert (work / "data" / "dwell.partial.txt").exists()
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no file's size")
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows cannot limit file sizes")
 def test_a_full_disk_stops_the_motor_and_says_what_to_do(tmp_path, real):
     """If the disk is full, the run ends by a stop command, and the message names the folder."""
     work = write_work(tmp_path, [sine("dwell", seconds=30)])
@@ -469,7 +469,7 @@ print('held')"""
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 @pytest.mark.parametrize(("typed", "held"), [(b"\n", True), (b"\x04", False)])
-def test_only_what_is_typed_after_the_question_answers_it(typed, held):
+def test_only_a_later_enter_answers_the_question(typed, held):
     """Only an Enter typed after the question starts the motor, and Ctrl-D means no."""
     controller, terminal = os.openpty()
     pipes = {"stdin": terminal, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}

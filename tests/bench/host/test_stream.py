@@ -46,7 +46,7 @@ def join(readings) -> bytes:
 
 
 @given(lump=st.integers(1, 400))
-def test_lumps_of_any_size_give_the_same_lines(lump):
+def test_chunks_of_any_size_give_the_same_lines(lump):
     """However the bytes are cut into chunks, every line comes out once, in order."""
     sent = lines(60)
     got, stream = read(join(sent), lump=lump)
@@ -150,7 +150,7 @@ def test_a_line_with_an_impossible_number_is_garbled(field, wrong):
     assert stream.anomalies(stream.fit()).lost == 0
 
 
-def test_a_hard_hit_on_a_stop_is_no_fault():
+def test_a_hard_hit_on_a_stop_does_not_count_as_a_fault():
     """If a cart reverses within one line at an end stop, its lines are kept."""
     out = [*range(0, 600, 12), *range(600, 0, -12)]
     sent = [Reading(counts=(x, 0), target=0, duty=0, ms=i) for i, x in enumerate(out)]
@@ -207,7 +207,7 @@ def test_late_lines_are_counted_and_kept():
     )  # stamps 500 to 539; rounding decides on 540
 
 
-def test_a_host_that_was_busy_makes_no_line_late():
+def test_a_busy_host_makes_no_line_late():
     """Lines that waited because the host was busy do not count as late.
 
     The host counts from the last time when it read and found the port empty.

@@ -153,7 +153,7 @@ def test_an_exploration_ends_before_it_exceeds_its_time(tmp_path):
     assert "would run out before" in turn.said
 
 
-def test_less_time_than_the_sweep_takes_moves_no_cart(tmp_path):
+def test_too_little_time_for_the_sweep_moves_no_cart(tmp_path):
     """If the time is too short for the first sweep, nothing is recorded, and a message says so."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     virtual = VirtualBench(bench, seed=1)

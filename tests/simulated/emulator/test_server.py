@@ -275,7 +275,7 @@ def test_a_host_that_leaves_an_unguarded_bench_stops_nothing(fast_bench):
     assert ended["lines"] < 20_000
 
 
-def test_a_stock_bench_knows_no_query_and_no_stop():
+def test_a_stock_bench_has_no_query_and_no_stop():
     """A stock bench answers no query and has no cart two; only the stock stop ends its run."""
     with (
         emulator("--stock", "--period", "2.005", preset="throne-1dof") as bench,
