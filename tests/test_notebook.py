@@ -34,7 +34,7 @@ def lab() -> Lab:
 
 
 def test_the_package_exports_analyse(lab):
-    """`from pipeline import analyse` gives this function and the same results as a report."""
+    """`from pipeline import analyse` gives the notebook's function, with a report's results."""
     assert pipeline.analyse is analyse
     assert json_text(lab.results) == json_text(analysed("two-cart"))
 

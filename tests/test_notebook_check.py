@@ -28,7 +28,7 @@ def lab(tmp_path) -> Path:
 
 
 def test_the_package_exports_check():
-    """`from pipeline import check` is this function."""
+    """`from pipeline import check` gives the check for notebooks."""
     assert pipeline.check is check
 
 

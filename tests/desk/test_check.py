@@ -78,7 +78,7 @@ def ask_check(visitor: Visitor, **fields: str) -> Answer:
 
 
 def words_of(page: Answer) -> str:
-    """Return the words of a page without its frame."""
+    """Return the words in the main part of a page."""
     main = re.search(r"<main.*</main>", page.text, re.DOTALL)
     assert main
     return " ".join(unescape(re.sub(r"<[^>]*>", " ", main[0])).split())

@@ -677,7 +677,7 @@ def test_one_decision_for_several_teams_is_previewed(ta, grades):
 
 
 def test_a_comment_changes_no_points(ta, grades):
-    """A comment for several teams changes no points, and the teams read it."""
+    """A comment for several teams changes no points, and is shown to the teams."""
     page = ta.get(together())
     names = list(listed(page))
     with Gradebook(grades) as book:

@@ -20,7 +20,7 @@ HERE = "/student/0/"
 
 @pytest.fixture
 def jobs():
-    """Return the long tasks of a desk, which are ended after the test."""
+    """Return the long tasks of a desk; after the test they are ended."""
     jobs = Jobs()
     yield jobs
     jobs.close()

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("work_here")
 
 
 def test_a_session_is_watched_and_steered(show, tmp_path, real, monkeypatch):
-    """During a session, buttons keep one run, end another, and the session goes on to its end."""
+    """Buttons keep one run and end another, and the session still goes on to its end."""
     monkeypatch.chdir(tmp_path)
     work = write_work(
         tmp_path / "team",

@@ -214,7 +214,7 @@ controller = { type = "state_feedback", cart = 1 }
 """
 
 
-class SlowToBite(FirmwareCore):
+class PatientWatchdog(FirmwareCore):
     """A controller whose watchdog waits 10 s for a host on a busy machine."""
 
     def tick(self, counts: Sequence[int], *, stamp: int, now: int) -> int:
@@ -230,7 +230,7 @@ def test_acquire_records_with_the_firmware(library, tmp_path):
     (tmp_path / "submission.toml").write_text(SUBMISSION, encoding="utf-8")
     (tmp_path / "plan.toml").write_text(PLAN, encoding="utf-8")
     bench = prepare_bench(preset="throne-1dof")
-    server = Server(bench, EmulatorOptions(port="pty"), core=partial(SlowToBite, library))
+    server = Server(bench, EmulatorOptions(port="pty"), core=partial(PatientWatchdog, library))
     with closing(server), kept_going(lambda until: server.serve(until=until)):
         acquire(tmp_path, port=server.address, only=["step", "control"])
     analysis = analyse(load_submission(tmp_path))
@@ -246,7 +246,7 @@ def test_acquire_records_with_the_firmware(library, tmp_path):
 
 
 def test_the_motor_is_cut_100_ms_after_the_last_heartbeat(library):
-    """The first heartbeat arms the watchdog, which cuts the motor at 100 ms; a reset disarms it."""
+    """Once armed by a heartbeat, the watchdog cuts the motor after 100 ms; a reset disarms it."""
     core, _ = _both(library)
     start = encode(Start(wave=Wave.SQUARE, frequency=1e-3, amplitude=-900))
     core.receive(start)

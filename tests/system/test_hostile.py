@@ -1,4 +1,4 @@
-"""In a class with hostile submissions, each gets its row and none harms the honest ones."""
+"""In a class with hostile submissions, each gets a row, and none harms the honest ones."""
 
 import base64
 import csv
@@ -25,9 +25,7 @@ from tests.helpers.commandline import cartlab_here
 from tests.helpers.hostile import SECRET, write_hostile
 from tests.helpers.places import ROOT
 
-pytestmark = pytest.mark.skipif(
-    sys.platform == "win32", reason="needs pipes and links of POSIX"
-)
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs pipes and links of POSIX")
 
 NOBODY = 65_534
 HONEST = ("honest-1", "honest-2")

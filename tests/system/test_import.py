@@ -95,7 +95,7 @@ def test_files_become_the_recordings_that_the_plan_asks_for(work, source):
 
 
 def test_a_file_is_imported_once(work, source):
-    """A file that was imported before is recognised by a second session, under any name."""
+    """A second session recognises a file that was imported before, even under another name."""
     put(source, "A.txt", STEP, at=100)
     assert len(take(work, source)[0]) == 1
     put(source, "A again.txt", STEP, at=300)

@@ -415,7 +415,7 @@ def show(browser, page):
 
 
 def record(page: LivePage) -> None:
-    """Feed two seconds of a sine."""
+    """Show the page 3 s of rest and two seconds of a sine."""
     page.settling(SINE, 3.0)
     page.started(SINE)
     page.readings(lines(0, 2000), Anomalies(lost=3))

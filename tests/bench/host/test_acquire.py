@@ -44,7 +44,7 @@ class Alone(Notes):
     """A session without a person at the bench, in which every instruction is refused."""
 
     def confirm(self, instruction: str) -> None:
-        """Refuse."""
+        """Refuse the instruction."""
         raise ConfigError(f"{instruction}: nobody")
 
 

@@ -112,7 +112,7 @@ def leapt(lines: list[Reading]) -> Iterator[Reading]:
     ],
 )
 def test_a_clock_that_stops_or_leaps_ends_the_run(tmp_path, lines, said, kept):
-    """A run whose clock stands still or leaps is partial; its lines up to then are saved."""
+    """A run whose clock stands still or leaps is partial; the lines before that are saved."""
     work = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)])
     tracemalloc.start()
     outcomes = acquire(work, port=OddBench(lines).address, observers=[Notes()], only=["dwell"])

@@ -41,7 +41,7 @@ def read(raw: bytes, *, lump: int = 97, **options) -> tuple[list[Reading], Strea
 
 
 def join(readings) -> bytes:
-    """Return the stream of these lines."""
+    """Return the bytes of these lines."""
     return b"".join(map(format_reading, readings))
 
 
