@@ -615,7 +615,7 @@ def test_an_unreadable_submission_file_is_refused_and_can_be_replaced(broken, fi
 
 @pytest.mark.parametrize("broken", [b"\xff", b"x" * 1_000_001])
 def test_unreadable_notes_are_refused_and_can_be_replaced(broken, tmp_path, workers):
-    """Notes that are too long or not UTF-8 are refused; readable ones replace such notes."""
+    """Notes that are too long or not UTF-8 are refused, and can be replaced by readable ones."""
     for name in ("notes.md", "there/notes.md"):
         (said,) = take_upload(name, io.BytesIO(broken), tmp_path, workers=workers)
         assert "not uploaded" in said

@@ -270,7 +270,7 @@ def test_a_useless_proposal_gets_a_reason(known, change, words):
 
 
 def test_only_dwells_are_chosen_if_dwells_identified_the_carts():
-    """If the carts were fitted to dwells alone, only further dwells are chosen."""
+    """If the carts were fitted only to dwells, only further dwells are chosen."""
     analysis = analysed("two-cart")
     found = choose_next(analysis, Plan(limits=LIMITS), n=2, goal="zeta_2", commands=COMMANDS)
     assert {r.kind for r in found.recordings} == {"sine"}

@@ -105,7 +105,7 @@ def test_an_old_spreadsheet_is_named_as_not_read(tmp_path, command):
 
 
 def test_every_file_is_named_except_hidden_ones(tmp_path):
-    """Files that are no recordings are named, except files that a tool hides."""
+    """Files that are not recordings are named, except files that a tool hides."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     data = tmp_path / "data"
     for name in (".git/HEAD", ".cache/b.csv", "report/bode.svg", "plot.py", "Thumbs.db"):
@@ -235,7 +235,7 @@ def test_an_encoder_without_a_cart_gets_no_column(tmp_path):
 
 @pytest.mark.parametrize(("carts", "asked"), [(1, "x1 = …"), (2, "more carts")])
 def test_a_moving_column_without_a_cart_is_asked_about(tmp_path, carts, asked):
-    """If a column moves that belongs to none of the stated carts, `fill` asks about it.
+    """If a moving column belongs to none of the stated carts, `fill` asks about it.
 
     The file gets a table without `carts`.
     """

@@ -102,7 +102,7 @@ def test_every_table_of_the_format_is_read(folder):
 
 
 def test_reported_numbers_keep_their_digits(folder):
-    """Reported numbers keep their digits: 0.10 has two decimals, 25 none, 1.0e1 one.
+    """Reported numbers keep their decimals: two in 0.10, none in 25, one in 1.0e1.
 
     The last digit gives a tolerance.
     """

@@ -529,7 +529,7 @@ def test_a_file_of_another_experiment_is_not_proposed(tmp_path):
 
 @pytest.mark.parametrize("path", ["nowhere", "team-01/data", "team-01/data/step.csv"])
 def test_a_path_without_a_submission_is_one_line(path, tmp_path):
-    """A path that is no submission gives one line of error that says why.
+    """A path that is not a submission gives one line of error that says why.
 
     The paths are a missing folder, a folder without submission.toml, and a file of another kind.
     """

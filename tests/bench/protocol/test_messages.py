@@ -214,6 +214,6 @@ def test_descriptions_are_read_as_sent(bench):
     ],
 )
 def test_another_answer_is_refused(line, message):
-    """A text that is no description, or lacks a field, gives one clear message."""
+    """A text that is not a description, or that lacks a field, gives one clear message."""
     with pytest.raises(DataError, match=message):
         parse_description(line)

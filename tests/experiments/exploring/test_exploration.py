@@ -52,7 +52,7 @@ def test_durations_are_read_in_seconds_minutes_or_hours():
     "text", ["zeta", "zeta 1", "zeta omega 1%", "1.5", "0%", "200%", "%", "zeta 1% K 2%"]
 )
 def test_a_text_that_is_not_a_goal_is_refused(text):
-    """A text that is no goal is refused with an example."""
+    """A text that is not a goal is refused with an example."""
     with pytest.raises(ConfigError, match="expected a name and a percentage"):
         read_error_goal(text)
 
@@ -61,7 +61,7 @@ def test_a_text_that_is_not_a_goal_is_refused(text):
     "text", ["20", "min", "-3s", "20 parsec", "inf s", "1e999s", "1e308h", "nan s"]
 )
 def test_a_text_that_is_not_a_duration_is_refused(text):
-    """A text that is no duration is refused with an example."""
+    """A text that is not a duration is refused with an example."""
     with pytest.raises(ConfigError, match="expected a duration"):
         read_time(text)
 
