@@ -632,7 +632,8 @@ def page_table(pages: Mapping[str, Mapping[str, float]]) -> str:
         count, over = (sum(took[key] for took in others) for key in ("count", "over"))
         most = [max(took[key] for took in others) for key in ("median", "p99", "most")]
         seconds = " | ".join(f"at most {one:.2f} s" for one in most)
-        lines.append(f"| {len(others)} others | {count:,} | {seconds} | {over} |")
+        name = f"{len(others)} others" if slow else f"all {len(others)}"
+        lines.append(f"| {name} | {count:,} | {seconds} | {over} |")
     return "\n".join(lines)
 
 
