@@ -87,7 +87,7 @@ def test_lost_lines_are_distinguished_from_skips_of_the_clock(period, share):
 
 
 def test_a_short_run_counts_by_the_expected_period():
-    """In a short run the period of earlier runs decides, as 300 stamps cannot show it."""
+    """A short run uses the period of earlier runs, since 300 stamps cannot show the period."""
     stamps = np.delete(clock(300, period=1.0024, phase=0.0), [50, 51, 200])
     # In 300 lines the clock skips 0.7 times on average; one loss may be taken for a skip.
     assert fit_stamps(stamps, period=1.0024).missing == 2
