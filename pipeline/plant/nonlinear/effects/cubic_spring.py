@@ -22,8 +22,8 @@ EFFECT = Effect(
     ),
     fingerprint="The frequency depends on the amplitude, and the static gain depends on the size "
     "of the step.",
-    deciding_run="Free decay from a large distance: the first period differs from the last.",
+    deciding_run="A free decay from a large distance: the first period differs from the last.",
     reference="D. J. Inman, Engineering Vibration, 4th ed., section 1.10",
     axis="stretch",
-    equivalent="With only one cart, the same effect in the other wall spring.",
+    equivalent="The same effect in the other wall spring, if there is only one cart.",
 )

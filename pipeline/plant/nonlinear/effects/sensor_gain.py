@@ -19,5 +19,5 @@ EFFECT = Effect(
     fewest_carts=2,
     same_as="sensor_gain",
     equivalent="The gain of another cart's sensor, because the data show only ratios of gains. "
-    "With springs to both walls, the data of two carts show no gain at all.",
+    "If two carts have springs to both walls, the data show no gain at all.",
 )

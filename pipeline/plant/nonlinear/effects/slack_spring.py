@@ -28,6 +28,6 @@ EFFECT = Effect(
     "position is a line with a corner.",
     reference="S. W. Shaw, P. J. Holmes, Journal of Sound and Vibration 90 (1983), 129-155",
     axis="stretch",
-    equivalent="With only one cart, the same effect in the other wall spring at the opposite "
-    "stretch.",
+    equivalent="The same effect in the other wall spring at the opposite stretch, if there is "
+    "only one cart.",
 )
