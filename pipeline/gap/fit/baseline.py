@@ -1,10 +1,11 @@
 """Fit the linear chain to all runs at once, so that only missing effects are left."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.arrays import Array
 from pipeline.estimation.modulating import bump
@@ -26,8 +27,8 @@ def first_chain(runs: Sequence[GapRun], *, springs: Sequence[bool]) -> Chain:
     rows = [j for j, there in enumerate(springs) if there]
     rows = rows[:1] if n == 1 else rows
     columns = 2 * n + len(rows)
-    found = [one for run in runs for one in _equations(run, rows)]
-    A, b = np.array([equation for equation, _ in found]), np.array([right for _, right in found])
+    equations, sides = zip(*(_equations(run, rows) for run in runs), strict=True)
+    A, b = np.concatenate(equations), np.concatenate(sides)
     if not np.any(b):
         # With free decays alone, forces are relative to the first mass.
         A, b = np.vstack([A, np.zeros(columns)]), np.append(b, 0.0)
@@ -46,33 +47,42 @@ def first_chain(runs: Sequence[GapRun], *, springs: Sequence[bool]) -> Chain:
     return Chain(m=m, c=np.maximum(p[n : 2 * n], floor), k=k)
 
 
-def _equations(run: GapRun, rows: Sequence[int]) -> Iterator[tuple[Array, float]]:
-    """Yield one equation (coefficients and right side) per moving cart and window of a run."""
+def _equations(run: GapRun, rows: Sequence[int]) -> tuple[Array, Array]:
+    """Return coefficients and right sides of one equation per moving cart and window of a run."""
     # Windows of 0.3 s, every 50 ms, for a bench of carts.
     step = max(1, round(0.05 * run.pace / run.record.sample_time))
     width = max(8, round(0.3 * run.pace / run.record.sample_time))
-    x, u, n = run.by_cart(run.y, run.zero), run.input, run.zero.size
+    x, n = run.by_cart(run.y, run.zero), run.zero.size
+    columns = 2 * n + len(rows)
+    moving = [i for i in run.rows if run.free[i]]
+    if run.t.size <= width or not moving:
+        return np.zeros((0, columns)), np.zeros(0)
+
+    def windows(signal: Array) -> Array:
+        return sliding_window_view(signal, width, axis=-1)[..., :-1:step, :]
+
+    t = windows(run.t)
+    span = t[:, -1:] - t[:, :1]
+    # Weights of the trapezoidal rule, (windows, width).
+    dt = np.diff(t, axis=1, prepend=t[:, :1], append=t[:, -1:])
+    rule = 0.5 * (dt[:, 1:] + dt[:, :-1])
+    w, w1, w2 = (rule * one for one in bump((t - t[:, :1]) / span, span=span))
+    stretch = np.diff(x, axis=0, prepend=0.0, append=0.0)
+    # A held input acts during the interval after its sample.
+    u = windows(run.input)
+    force = 0.5 * (u + np.concatenate([u[:, :1], u[:, :-1]], axis=1))
+    A, b = np.zeros((len(moving), len(t), columns)), np.zeros((len(moving), len(t)))
+    for equation, right, i in zip(A, b, moving, strict=True):
+        equation[:, i] = (w2 * windows(x[i])).sum(1)
+        equation[:, n + i] = -(w1 * windows(x[i])).sum(1)
+        for at, j in enumerate(rows, start=2 * n):
+            if j in (i, i + 1):
+                pull = (w * windows(stretch[j])).sum(1)
+                equation[:, at] += pull if j == i else -pull
+        if i == 0:
+            right[:] = (w * force).sum(1)
     size = max(1e-12, float(np.abs(x).max()))
-    for first in range(0, run.t.size - width, step):
-        piece = slice(first, first + width)
-        t = run.t[piece]
-        span = t[-1] - t[0]
-        w, w1, w2 = bump((t - t[0]) / span, span=span)
-        local = x[:, piece]
-        stretch = np.vstack([local, np.zeros(width)]) - np.vstack([np.zeros(width), local])
-        for i in run.rows:
-            if not run.free[i]:
-                continue
-            equation = np.zeros(2 * n + len(rows))
-            equation[i] = np.trapezoid(local[i] * w2, t)
-            equation[n + i] = -np.trapezoid(local[i] * w1, t)
-            for at, j in enumerate(rows, start=2 * n):
-                if j in (i, i + 1):
-                    pull = np.trapezoid(stretch[j] * w, t)
-                    equation[at] += pull if j == i else -pull
-            # A held input acts during the interval after its sample.
-            force = 0.5 * (u[piece] + np.append(u[first], u[piece][:-1])) if i == 0 else 0 * t
-            yield equation / size, float(np.trapezoid(force * w, t)) / size
+    return A.reshape(-1, columns) / size, b.ravel() / size
 
 
 def fit_baseline(
