@@ -5,9 +5,8 @@ Every message is one line that says where the fault is, what was expected and wh
 
 import errno
 
-# File errors caused by a name that is too long, already taken, not encodable, or of a file of the
-# wrong kind.
-_OF_A_NAME = frozenset(
+# File errors caused by a name: too long, already taken, not encodable, the wrong kind of file.
+_NAME_FAULTS = frozenset(
     {
         errno.ENAMETOOLONG,
         errno.EEXIST,
@@ -18,8 +17,8 @@ _OF_A_NAME = frozenset(
     }
 )
 # These errors, and others of a user's file: it is missing, in a loop of links, or not permitted.
-_OF_A_FILE = _OF_A_NAME | {errno.ENOENT, errno.ELOOP, errno.EACCES, errno.EPERM}
-_OF_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+_FILE_FAULTS = _NAME_FAULTS | {errno.ENOENT, errno.ELOOP, errno.EACCES, errno.EPERM}
+_DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 class PipelineError(Exception):
@@ -47,14 +46,14 @@ def is_name_fault(error: OSError) -> bool:
 
     An error without a number comes from a text decoder, so it is about the file too.
     """
-    return error.errno is None or error.errno in _OF_A_NAME
+    return error.errno is None or error.errno in _NAME_FAULTS
 
 
 def is_file_fault(error: OSError) -> bool:
     """Return whether the file or its name caused the error, rather than the computer."""
-    return error.errno is None or error.errno in _OF_A_FILE
+    return error.errno is None or error.errno in _FILE_FAULTS
 
 
 def is_disk_full(error: OSError) -> bool:
     """Return whether a file could not be written because the disk is full."""
-    return error.errno in _OF_ROOM
+    return error.errno in _DISK_FULL

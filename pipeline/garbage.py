@@ -6,8 +6,8 @@ import gc
 # Number of new containers that triggers a search for garbage. With Python's default of 700, a
 # report searches a few hundred thousand objects 500 times. This takes a tenth of the report's time
 # and frees nothing.
-_MADE = 300_000
-_OF_A_SERVER = 30_000  # the same for a process that runs for hours
+_NEW_OBJECTS = 300_000
+_NEW_OBJECTS_SERVER = 30_000  # the same for a process that runs for hours
 
 
 def collect_seldom() -> None:
@@ -16,7 +16,7 @@ def collect_seldom() -> None:
     Skip the search at exit as well: the system frees the memory anyway, and the search takes an
     eighth of a report's time.
     """
-    gc.set_threshold(_MADE)
+    gc.set_threshold(_NEW_OBJECTS)
     atexit.register(gc.freeze)
 
 
@@ -26,4 +26,4 @@ def collect_for_hours() -> None:
     Each row saved in a desk creates about a thousand dead objects. With `collect_seldom` alone, 120
     rows filled 30 MB before the first search.
     """
-    gc.set_threshold(_OF_A_SERVER)
+    gc.set_threshold(_NEW_OBJECTS_SERVER)

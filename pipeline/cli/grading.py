@@ -77,12 +77,12 @@ def grade(
             show(done, total, last)
 
         done = grade_class(paths, rubric_file=rubric, out=out, options=options, progress=progress)
-    _say_what_came_of_it(done, out=out, rubric=rubric)
+    _report_outcome(done, out=out, rubric=rubric)
     if done.failed:
         raise typer.Exit(1)
 
 
-def _say_what_came_of_it(done: "Summary", *, out: Path, rubric: Path) -> None:
+def _report_outcome(done: "Summary", *, out: Path, rubric: Path) -> None:
     for remark in done.remarks:
         say(remark)
     if done.changes:

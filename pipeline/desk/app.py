@@ -47,12 +47,12 @@ Handler = Callable[[Ask], Any]  # returns a Response or a coroutine of one
 
 
 def _start(task: str, title: str, *, then: str = "") -> Handler:
-    """Return a handler that starts a long task in the folder of the address.
+    """Return a handler that starts a long task in the folder that the URL names.
 
     Parameters
     ----------
     task : name of a function in `tasks.py`.
-    then : end of the address that the page opens next.
+    then : last part of the URL to open next.
     """
 
     def start(ask: Ask) -> Response:
@@ -63,18 +63,18 @@ def _start(task: str, title: str, *, then: str = "") -> Handler:
 
 
 def _serve(inside: str) -> Handler:
-    """Return a handler that serves a file from the subfolder `inside` of the address's folder."""
+    """Return a handler that serves a file from the subfolder `inside` of the URL's folder."""
     return lambda ask: serve_file(ask.folder(), f"{inside}/{ask.request.path_params['name']}")
 
 
 def _stop(ask: Ask) -> Response:
-    """Stop the work in the folder of the address; what is already done stays."""
+    """Stop the work in the folder that the URL names; what is already done stays."""
     ask.stop(ask.folder())
     return ask.back(ask.here + ("#work" if ask.here.startswith("/grades/") else "#report"))
 
 
 async def _tell_news(ask: Ask) -> Response:
-    """Return a stream of events that report the work in the place of the address."""
+    """Return a stream of events that report the work in the place that the URL names."""
     return StreamingResponse(_news(ask, ask.place_or_404()), media_type="text/event-stream")
 
 

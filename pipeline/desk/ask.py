@@ -140,9 +140,9 @@ class Ask:
 
     @property
     def place(self) -> Place | None:
-        """The submission or gradebook of the address; None if the user has no such place.
+        """The submission or gradebook that the URL names; None if the user has no such place.
 
-        The number in an address counts only the user's own places, so no address leads to places of
+        The number in a URL counts only the user's own places, so no URL leads to places of
         others.
         """
         # A student may see only their own grade, not the gradebook.
@@ -154,11 +154,11 @@ class Ask:
         return places[number] if number < len(places) else None
 
     def folder(self) -> Path:
-        """Return the folder of the address: a submission, or the output of a grading.
+        """Return the folder that the URL names: a submission, or the output of a grading.
 
         Raises
         ------
-        ConfigError : the address is about a class in a database.
+        ConfigError : the URL names a class in a database.
         """
         place = self.place_or_404()
         if isinstance(place, str):
@@ -166,7 +166,7 @@ class Ask:
         return place
 
     def place_or_404(self) -> Place:
-        """Return the place of the address, a folder or a database; refuse a request without one."""
+        """Return the folder or database that the URL names; refuse a request without one."""
         if self.place is None:
             raise HTTPException(404, "you have no access to anything here")
         return self.place
@@ -187,7 +187,7 @@ class Ask:
 
     @property
     def job(self) -> Job | None:
-        """The last job in the place of the address.
+        """The last job in the place that the URL names.
 
         The job's text is hidden if this person may not read it.
         """
@@ -197,7 +197,7 @@ class Ask:
         return show_job(self.desk.jobs.of(place), self.user, place)
 
     def start(self, task: str, *, title: str, **given: Any) -> None:
-        """Start a long task in the folder of the address.
+        """Start a long task in the folder that the URL names.
 
         Parameters
         ----------
@@ -213,16 +213,16 @@ class Ask:
 
     @property
     def here(self) -> str:
-        """The address of the room: the first two parts of the request's address."""
+        """The URL of the room: the first two parts of the request's URL."""
         return "/".join(self.request.url.path.split("/")[:3]).rstrip("/") + "/"
 
     def _room(self, place: str = "") -> tuple[str, str]:
-        """Return the key for messages: the person, and the address with the part of the page."""
+        """Return the key for messages: the person, and the URL with the part of the page."""
         return self.user.name, self.here + place
 
     @property
     def sent(self) -> FormData | QueryParams:
-        """The form of a POST, or the query of the address."""
+        """The form of a POST, or the query of the URL."""
         return self.form if self.request.method == "POST" else self.request.query_params
 
     def text(self, name: str) -> str:
@@ -231,10 +231,7 @@ class Ask:
         return value.replace("\r\n", "\n").strip() if isinstance(value, str) else ""
 
     def query(self, name: str) -> str:
-        """Return a value from the query of the address, even if a form was sent.
-
-        "" if it is missing.
-        """
+        """Return a value from the URL's query, even if a form was sent; "" if it is missing."""
         return self.request.query_params.get(name, "")
 
     def page(self, template: str, *, status: int = 200, **context: Any) -> Response:

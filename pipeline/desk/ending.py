@@ -49,7 +49,7 @@ class Ending:
     def __enter__(self) -> Self:
         assert self._watch.stdin is not None
         faulthandler.enable(file=self._watch.stdin)
-        threading.excepthook = self._in_thread
+        threading.excepthook = self._report_thread_error
         # All signals that a program can catch: Ctrl-C, kill, a closed terminal or session.
         for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK"):
             number = getattr(signal, name, None)
@@ -85,7 +85,7 @@ class Ending:
         self._why = signal.Signals(number).name
         self.asked.set()
 
-    def _in_thread(self, raised: threading.ExceptHookArgs) -> None:
+    def _report_thread_error(self, raised: threading.ExceptHookArgs) -> None:
         """Report an exception that ended a thread; the desk itself continues."""
         if raised.exc_value is None or isinstance(raised.exc_value, SystemExit):
             return

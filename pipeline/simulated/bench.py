@@ -137,7 +137,8 @@ class SimulatedBench:
         if step < _SHORTEST_STEP:
             raise ConfigError(
                 f"{self.name}: with these effects a simulation needs steps of {step:.1g} s, and "
-                f"{_SHORTEST_STEP:g} s is the least: a stiffness is too large, or a mass too small"
+                f"steps below {_SHORTEST_STEP:g} s take too long: a stiffness is too large, or a "
+                "mass too small"
             )
 
     def move(self, run: BenchRun) -> TrueMotion:

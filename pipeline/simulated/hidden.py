@@ -315,8 +315,8 @@ def _chain(entry: object, *, where: str) -> Chain:
     motions = np.abs(chain.poles)
     if not _SLOWEST <= motions.min() <= motions.max() <= _FASTEST:
         raise ConfigError(
-            f"{where}: its motions have {motions.min():.3g} to {motions.max():.3g} rad/s; "
-            f"{_SLOWEST:g} to {_FASTEST:g} can be run on a bench"
+            f"{where}: its frequencies are {motions.min():.3g} to {motions.max():.3g} rad/s; "
+            f"expected {_SLOWEST:g} to {_FASTEST:g} rad/s, as on a bench"
         )
     return chain
 

@@ -440,7 +440,7 @@ def test_a_model_too_stiff_to_simulate_is_one_line(command, sizes, tmp_path):
         ({"chain": {"m": [1.0], "c": [0.1], "k": [1.0]}}, "k: expected shape"),
         ({"chain": {"m": [-1.0], "c": [0.1], "k": [1.0, 0.0]}}, "m must be positive"),
         ({"chain": {"m": [1e-320], "c": [0.1], "k": [1.0, 0.0]}}, "expected sizes of 1e-30 to"),
-        ({"chain": {"m": [1e-29], "c": [0.1], "k": [1.0, 0.0]}}, "can be run on a bench"),
+        ({"chain": {"m": [1e-29], "c": [0.1], "k": [1.0, 0.0]}}, "rad/s, as on a bench"),
         ({"chain": {"m": [1.0, 1.0], "c": [0.1, 0.1], "k": [1.7e308, 1.7e308, 1.0]}}, "1.7e[+]308"),
         (with_backlash(gap=1e-320), "gap: expected 0 or a size of 1e-30 to .*, found 9.*e-321"),
         (with_backlash(motor_mass=0.0), "motor_mass must be positive, found 0"),

@@ -194,13 +194,13 @@ class _Acquisition:
         if unsafe:  # a second try would be just as unsafe
             self._failed[name] = _TRIES
             less = (
-                "divide its amplitude in plan.toml by four"
+                "divide the amplitude in plan.toml by four"
                 if run.outcome.recording.amplitude
                 else "pull the cart out less far"
             )
             self._observer.remark(
-                f"{name} is not tried again now. If a limit was passed, {less}; or, if the bench "
-                "has room for it, raise the limit in plan.toml"
+                f"{name} is not tried again in this session. If a limit was exceeded, {less}. If "
+                "the bench has room for more, raise the limit in plan.toml instead"
             )
             return "skip"
         wish = self._buttons.pressed or self._answer(run)

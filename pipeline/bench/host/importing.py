@@ -124,13 +124,13 @@ class Importer:
     def _is_other(self, path: Path) -> bool:
         """Return whether a path cannot be a data file; if so, report it."""
         if path.is_dir():
-            why = "a folder"
+            why = "it is a folder"
         elif path.suffix.casefold() not in ENDINGS:
-            why = f"a data file ends in {', '.join(ENDINGS)}"
+            why = f"the name of a data file ends in {', '.join(ENDINGS)}"
         else:
             return not path.is_file()
         self._over.add(path)
-        self._observer.remark(f"{path.name}: not imported, {why}")
+        self._observer.remark(f"{path.name}: not imported: {why}")
         return True
 
     def _opens(self, path: Path) -> bool:
@@ -167,7 +167,7 @@ class Importer:
         self._over.add(path)
         if path.stat().st_size > MAX_DATA_BYTES:
             self._observer.remark(
-                f"{path.name}: not imported, larger than {MAX_DATA_BYTES:,} bytes"
+                f"{path.name}: not imported: larger than {MAX_DATA_BYTES:,} bytes"
             )
             return None
         if self._is_known(path):
@@ -181,20 +181,20 @@ class Importer:
             if not final and self._looks[path] < 20:  # its last line may still be written
                 self._over.discard(path)
             else:
-                self._observer.remark(f"{path.name}: not imported, {inspection.problems[0]}")
+                self._observer.remark(f"{path.name}: not imported: {inspection.problems[0]}")
             return None
         planned = self._match(inspection)
         kind = planned.kind if planned else inspection.kind
         if kind is None:
             why = "; ".join(inspection.problems)
-            self._observer.remark(f"{path.name}: not imported, its content is unclear: {why}")
+            self._observer.remark(f"{path.name}: not imported: its content is unclear ({why})")
             return None
         name = planned.id if planned else free_id(path.stem, self._done)
         data = own_folder(self._folder, "data")
         data.mkdir(exist_ok=True)
         target = data / f"{name}{path.suffix.casefold()}"
         if target.exists() or target.is_symlink():
-            self._observer.remark(f"{path.name}: not imported, {target} exists already")
+            self._observer.remark(f"{path.name}: not imported: {target} exists already")
             return None
         try:
             shutil.copyfile(path, target)

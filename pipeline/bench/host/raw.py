@@ -161,7 +161,7 @@ def free_raw_path(folder: Path, recording: Recording) -> Path:
 
 
 def known_commands(folder: Path) -> frozenset[str]:
-    """Return the extensions of the bench that made the latest recording.
+    """Return the extra commands of the bench that made the latest recording.
 
     Without a recording, assume only the chirp.
     """

@@ -169,7 +169,7 @@ class Session:
             partial = "no free cart moved: is one held, is an encoder unplugged, is the motor off?"
         fit = stream.fit()
         if stream.lines > 1000 and not partial:  # enough to determine the period of a clock
-            self._say_other_period(fit.period)
+            self._report_other_period(fit.period)
             self._period = fit.period
         return RunOutcome(
             recording=recording,
@@ -195,7 +195,7 @@ class Session:
         """The ms between lines, if the bench's wave is known to the ms; None for a stock bench."""
         return self._period if self._line.bench.commands else None
 
-    def _say_other_period(self, period: float) -> None:
+    def _report_other_period(self, period: float) -> None:
         """Report once if the measured `period` of the bench (ms) differs from the stated one."""
         stated = 1e3 * self._line.bench.period
         if not self._line.bench.commands or abs(self._period / stated - 1) > OTHER_PERIOD:
@@ -237,7 +237,7 @@ class Session:
                 # The last half second, in which the carts must be at rest.
                 since=1e3 * recording.settle - 500,
             )
-            self._look_on(nothing, watch)
+            self._watch_rest(nothing, watch)
             self._swings_out = False
             moving = {
                 cart: swing
@@ -252,7 +252,7 @@ class Session:
         swings = ", ".join(f"cart {cart} moved by {swing} counts" for cart, swing in moving.items())
         return f"not at rest when the run began: {swings} within half a second"
 
-    def _look_on(self, nothing: Order, watch: LineWatch) -> None:
+    def _watch_rest(self, nothing: Order, watch: LineWatch) -> None:
         """Carry out an order to rest.
 
         Raises
@@ -268,7 +268,7 @@ class Session:
 
     @property
     def _zeroed(self) -> int:
-        """The number of carts with a true zero: all or none."""
+        """The number of carts whose counts have a true zero: all or none."""
         return self._moving if self._line.resets == self._zeroed_at else 0
 
     def _zero_at_rest(self, recording: Recording) -> None:
@@ -286,7 +286,7 @@ class Session:
         self._beat = float("-inf")
         self._zeroed_at = self._line.resets
 
-    def _by_hand(self) -> str:
+    def _read_buttons(self) -> str:
         """Return why a person wants to end this run, or "".
 
         Raises
@@ -330,7 +330,7 @@ class Session:
         return partial
 
     def _start(self, commands: Sequence[Command]) -> None:
-        if why := self._by_hand():
+        if why := self._read_buttons():
             raise HardwareError(why)
         self._line.clear()  # discard lines of an earlier run
         self._heartbeat()
@@ -409,7 +409,7 @@ class Session:
                         return watch.stop(
                             "the bench's lines cannot be read, so no limit is watched"
                         )
-            if why := self._by_hand():  # after the limits, whose messages are more important
+            if why := self._read_buttons():  # after the limits, whose messages are more important
                 return why
             quiet = now - last
             if stream.latest >= end - 2 * self._period and quiet > _AFTER_END:

@@ -117,9 +117,9 @@ def _other_period(stamps: Stamps, stated: float) -> StampFit | None:
 
 
 def _comb(absent: Sequence[int]) -> list[int]:
-    """Return the longest comb among the missing stamps (ascending): the skips of the clock.
+    """Return the skips of the clock: the longest evenly spaced series of missing stamps.
 
-    Each of its teeth, up to the last missing stamp, must be a missing stamp.
+    No tooth of the series may be absent before the last missing stamp.
     """
     there = frozenset(absent)
     best: list[int] = []
@@ -133,7 +133,7 @@ def _comb(absent: Sequence[int]) -> list[int]:
 
 
 def _follow(first: int, second: int, *, there: frozenset[int], last: int) -> list[int]:
-    """Return the teeth that continue the first two; [] if a tooth before `last` is lacking."""
+    """Return the series that two missing stamps begin; [] if it breaks off before `last`."""
     if second - first < _CLOSEST_TEETH:
         return []
     teeth = [first, second]

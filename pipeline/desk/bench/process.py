@@ -24,7 +24,7 @@ def main() -> None:
     given = json.loads(next(sent))
     folder = Path(given["folder"])
     state, is_over = LiveState(folder), threading.Event()
-    threading.Thread(target=_press_as_told, args=(sent, state), daemon=True).start()
+    threading.Thread(target=_press_buttons, args=(sent, state), daemon=True).start()
     telling = threading.Thread(target=_tell_news, args=(state, say, is_over))
     telling.start()
     end: dict[str, Any] = {}
@@ -90,7 +90,7 @@ def _tell_news(state: LiveState, say: Callable[..., None], is_over: threading.Ev
         last = is_over.wait(FRAME)
 
 
-def _press_as_told(sent: Iterator[bytes], state: LiveState) -> None:
+def _press_buttons(sent: Iterator[bytes], state: LiveState) -> None:
     for line in sent:
         state.heed(**json.loads(line))
     state.press("stop", turn=0)

@@ -39,7 +39,7 @@ def take_table(ask: Ask) -> Response:
     done = open_book(ask).change_all(meant, by=by)
     said = f"{count(done.teams, 'change')} imported"
     if unchanged := len(meant) - done.teams:
-        said += f", {unchanged} were already the same"
+        said += f"; {count(unchanged, 'row')} changed nothing"
     return ask.back(ask.here, f"{said}.")
 
 

@@ -45,12 +45,12 @@ class Counted:
 
 
 def read_class(ask: Ask) -> Class:
-    """Return the class of the address."""
+    """Return the class that the URL names."""
     return ask.desk.books.of(ask.place_or_404())
 
 
 def open_book(ask: Ask) -> RequestBook:
-    """Return the gradebook of the address."""
+    """Return the gradebook that the URL names."""
     return ask.desk.books.book(ask.place_or_404())
 
 

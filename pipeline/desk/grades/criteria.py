@@ -83,7 +83,7 @@ def list_items(grade: Grade, now: TeamNow) -> list[Item]:
 
 
 def point_steps(out_of: float, *, step: float) -> list[float]:
-    """Return up to nine amounts of points, one for each key, including none and all.
+    """Return up to nine numbers of points, one for each key from 1 to 9, including none and all.
 
     These are the steps of the rubric if there are few, otherwise quarters rounded to a step.
     """

@@ -150,5 +150,5 @@ def _show_conflict(ask: Ask, shown: Class, conflict: Conflict) -> Response:
 
 
 def _write_address(ask: Ask, of: str) -> str:
-    """Return the address of the requests of the class or of one team."""
+    """Return the URL of the requests of the class or of one team."""
     return f"{ask.here}again" + (f"?{urlencode({'of': of})}" if of else "")

@@ -131,7 +131,7 @@ def _show_page(ask: Ask, *, wrong: str = "", status: int = 200) -> Response:
 
 
 def _find_chosen(ask: Ask, items: Sequence[Item], rubric: Rubric) -> Item:
-    """Return the criterion or flag that the address or the form names.
+    """Return the criterion or flag that the URL or the form names.
 
     If none is named, return the first row that is in doubt or has a figure.
     """
@@ -272,6 +272,6 @@ def sign(ask: Ask) -> str:
 
 
 def write_address(ask: Ask, name: str, **more: str) -> str:
-    """Return the address of a team's page; it keeps the filter, so that next and previous work."""
+    """Return the URL of a team's page; it keeps the filter, so that next and previous work."""
     wanted = Filter.read(ask.request.query_params).query
     return f"{ask.here}team?{urlencode({'of': name, **more})}" + (f"&{wanted}" if wanted else "")

@@ -100,7 +100,7 @@ def _undo(ask: Ask) -> Response:
 
 
 def _address(ask: Ask, *, done: str) -> str:
-    """Return the address of the page after a change; the page then offers to undo it.
+    """Return the URL of the page after a change; the page then offers to undo it.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def _address(ask: Ask, *, done: str) -> str:
 
 
 def _find_criterion(ask: Ask, shown: Class) -> Criterion:
-    """Return the criterion that the address names."""
+    """Return the criterion that the URL names."""
     for asked in shown.rubric.criteria:
         if asked.id == ask.query("criterion"):
             return asked

@@ -55,7 +55,7 @@ def preview(ask: Ask) -> Response:
 
 
 def draw_preview(ask: Ask) -> Response:
-    """Draw two distributions, whose bars are in the address."""
+    """Draw two distributions, whose bars are in the URL."""
     before, after = (_read_bars(ask.query(key)) for key in ("before", "after"))
     if len(before) != len(after):
         raise HTTPException(404, "there is no such drawing")

@@ -61,7 +61,7 @@ _UNREADABLE = "your grade cannot be read at the moment; tell your instructor"
 
 
 def _find_own(ask: Ask) -> OwnGrade:
-    """Return the grade of the address, if it belongs to the user."""
+    """Return the grade that the URL names, if it belongs to the user."""
     number = ask.request.path_params["n"]
     if number >= len(ask.user.grades):
         raise HTTPException(404, "you have no access to anything here")

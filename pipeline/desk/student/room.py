@@ -61,7 +61,7 @@ class Room:
 def look_around(
     ask: Ask, *, changed: Sequence[Field] = (), error: SubmissionError | None = None
 ) -> Room:
-    """Return the data of the room that the address names.
+    """Return the data of the room that the URL names.
 
     Parameters
     ----------

@@ -151,7 +151,7 @@ def test_no_report_is_offered_if_nothing_was_recorded(tmp_path, fast):
     with host(work, fast.address, "--only", "dwell", "--yes") as process:
         _, said = process.communicate()
     assert process.returncode == 1
-    assert "divide its amplitude in plan.toml by four; or, if the bench" in said
+    assert "divide the amplitude in plan.toml by four. If the bench" in said
     assert "again: counts as done" not in said
     assert "cartlab report" not in said
 
