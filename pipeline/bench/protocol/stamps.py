@@ -119,7 +119,7 @@ def _other_period(stamps: Stamps, stated: float) -> StampFit | None:
 def _comb(absent: Sequence[int]) -> list[int]:
     """Return the skips of the clock: the longest evenly spaced series of missing stamps.
 
-    No tooth of the series may be absent before the last missing stamp.
+    The spacing must hold up to the last missing stamp.
     """
     there = frozenset(absent)
     best: list[int] = []
