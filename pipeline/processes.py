@@ -1,9 +1,8 @@
 """Worker processes that do one task after another and can be stopped without harm to the parent.
 
 The parent uses a `Supervisor`, the worker calls `serve`; they exchange lines of JSON. The first
-line to the worker holds the settings for all its tasks, each further line holds one task. The
-worker answers `ready` first. For each task it sends any number of `stage` lines, then `done` or
-`failed`.
+line to the worker holds the settings, each further line holds one task. The worker answers `ready`
+first, then `done` or `failed` for each task, after any number of `stage` lines.
 """
 
 import faulthandler

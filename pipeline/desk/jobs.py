@@ -30,7 +30,6 @@ class Job:
 
     Attributes
     ----------
-    place : the folder that the job works in.
     asked : name and arguments of the task.
     said : the current stage; at the end the error, or the answer of the task if it is a text.
     news : number that grows with every change of state or stage.

@@ -36,10 +36,6 @@ def read_path(typed: str, *, wanted: str, inside: Path | None = None) -> Path:
 def read_whole_number(typed: str, *, name: str, least: int, most: int) -> int:
     """Return a typed whole number.
 
-    Parameters
-    ----------
-    name : name of the field, for the message.
-
     Raises
     ------
     ConfigError : the text is not a whole number from `least` to `most`.

@@ -80,7 +80,6 @@ class _InARow:
         Parameters
         ----------
         shows : whether this line meets the condition.
-        ms : stamp of this line.
         """
         if not shows:
             self._since = None

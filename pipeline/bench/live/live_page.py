@@ -1,8 +1,8 @@
 """A page in the browser that shows a session at the bench while it runs.
 
-The desk shows the same content on its own pages. `cartlab acquire --web` serves only this page, and
-only to visitors on this computer whose address contains the secret. Requests from other pages are
-refused. The server checks for changes itself, so a slow browser never delays the acquisition.
+`cartlab acquire --web` serves only this page, and only to visitors on this computer whose URL
+contains the secret. The server checks for changes itself, so a slow browser never delays the
+acquisition.
 """
 
 import asyncio

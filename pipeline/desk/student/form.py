@@ -77,9 +77,6 @@ class Field:
     kind : text, number, numbers, rows (of numbers, one per line), flags, authors, columns, or words
         (a text of several lines).
     choices : the possible values; "" means that the key is left out.
-    names : names of the flags.
-    value : the value as stored or typed.
-    wrong : what is wrong with the value.
     asked : question about a value that is doubtful but possible.
     symbol : symbol of the parameter, if the value is a parameter.
     """

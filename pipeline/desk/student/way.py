@@ -18,7 +18,6 @@ class Facts:
     missing : groups of the set-up in which something is missing.
     sound : whether `submission.toml` exists and is valid.
     report : state of the report: "none", "current", "answered" or "older"; see `find_state`.
-    making : whether the report is being made.
     questions, unanswered : numbers of questions in the last report.
     handed : whether the zip was downloaded in its current state.
     check : state of the check, in a lab that has it instead of the report.
