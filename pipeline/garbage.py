@@ -23,7 +23,7 @@ def collect_seldom() -> None:
 def collect_for_hours() -> None:
     """Search for dead objects more often than `collect_seldom`, in a process that runs for hours.
 
-    Each row saved in a desk creates about a thousand dead objects. With `collect_seldom` alone, 120
-    rows filled 30 MB before the first search.
+    Saving rows in a desk leaves many dead objects. With `collect_seldom` alone, 120 rows filled 30
+    MB before the first search.
     """
     gc.set_threshold(_NEW_OBJECTS_SERVER)

@@ -2,7 +2,7 @@
 
 A line is judged when the next line has arrived. The bench's clock never runs backwards, and no cart
 jumps out and back within two lines. So a readable line that differs from both neighbours was
-garbled. Each line is delayed by one line, but no valid line is lost.
+garbled. This delays each line by one but loses no valid line.
 """
 
 from array import array

@@ -37,7 +37,7 @@ class Wave(StrEnum):
     `delta` is a short pulse at the beginning of the period. `square` is zero for half a period,
     then the amplitude. `sine`, `triangle` and `sawtooth` start at zero and swing to both sides.
     `chirp` sweeps the frequency once over the whole run, logarithmically. `multisine` is the sum of
-    the stored tones. The formulas are in `pipeline.bench.protocol.waves`.
+    the stored tones.
     """
 
     DELTA = "d"

@@ -22,9 +22,8 @@ from pipeline.submission import Submission
 def show(ask: Ask) -> Response:
     """Show the last answer, and what the student can ask next."""
     folder = ask.folder()
-    # Read the job before the answers. If a check ends in between, the page shows the check as
-    # running and asks again. In the other order, the page would report the end of the check but
-    # show the earlier answers.
+    # Read the job before the answers. If a check ends in between, the page then shows it as running
+    # and asks again, instead of showing earlier answers as the result.
     job = ask.desk.jobs.of(folder)
     busy = job is not None and not job.over
     submission, problems = load_if_sound(folder)
