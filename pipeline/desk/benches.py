@@ -40,7 +40,7 @@ class BenchSession(ShownSession):
 
     @property
     def is_shown(self) -> bool:
-        """Whether the process has reported a state; if not, no bench may have answered yet."""
+        """Whether the process has reported a state; if not, perhaps no bench has answered yet."""
         return self.version > 0
 
     def snapshot(self) -> dict[str, Any]:
@@ -63,7 +63,7 @@ class BenchSession(ShownSession):
         return counts
 
     def press(self, wish: str, number: str) -> int:
-        """Send a pressed button to the process; return the HTTP status, 503 if it was not sent."""
+        """Send a pressed button to the process; return the HTTP status, 503 if it cannot be sent."""
         if not self.is_shown and wish != "stop":
             return 503
         try:

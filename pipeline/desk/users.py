@@ -59,8 +59,8 @@ class User:
 
     Attributes
     ----------
-    folders : the submissions that they may see, by number in URLs. An owner's list grows when they
-        open a folder.
+    folders : the submissions that they may see; a URL names one by its index. An owner's list grows
+        when they open a folder.
     gradebooks : the output folders of gradings, or addresses of databases, that they may see.
     grades : their own grades, if they are a student.
     workshop : the folder in which they make exercises and rubrics; an owner may use any.

@@ -31,8 +31,7 @@ class ReleasingHand:
     Attributes
     ----------
     position : where the hand holds the cart, in position units from rest.
-    release, fade : in s. At `release` the hand's force starts to fall linearly; after `fade` it is
-        zero.
+    release, fade : in s. The hand's force falls linearly from time `release` to zero within `fade`.
     tremor : (3,) phases of the hand's trembling, rad.
     """
 

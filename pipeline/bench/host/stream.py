@@ -15,8 +15,8 @@ from pipeline.bench.protocol.messages import FULL_SCALE, Reading, parse_reading
 from pipeline.bench.protocol.stamps import StampFit, even_period, fit_stamps
 
 # _WINDOW is in ms, _DRIVEN in duty counts. An encoder is stuck if it moved in one window and stands
-# still in the next, although the motor still drives. Below _DRIVEN, carts may stand still. An
-# encoder that never moved is stuck if the motor drives its cart, or if another cart moves.
+# still in the next, although the motor still drives. Below _DRIVEN, carts may stand still. If the
+# motor drives, an encoder that never moved is stuck if it is on cart 1 or if another cart moves.
 _WINDOW, _DRIVEN = 1000, 8
 
 
