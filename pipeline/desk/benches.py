@@ -63,7 +63,7 @@ class BenchSession(ShownSession):
         return counts
 
     def press(self, wish: str, number: str) -> int:
-        """Send a pressed button to the process; return the HTTP status, 503 if it cannot be sent."""
+        """Send a pressed button to the process; return the status, 503 if it cannot be sent."""
         if not self.is_shown and wish != "stop":
             return 503
         try:
