@@ -257,7 +257,7 @@ def application(desk: Desk) -> Starlette:
 
 
 def _answer(desk: Desk, handler: Handler, *, path: str) -> Callable[[Request], Awaitable[Response]]:
-    """Return a function that checks access, reads the form, calls the handler, reports errors."""
+    """Return a function that checks access, reads the form, runs the handler and reports errors."""
 
     async def answer(request: Request) -> Response:
         user, room = request.scope["user"], path.split("/")[1]
