@@ -130,7 +130,7 @@ def test_a_missing_file_is_refused(tmp_path):
 
 def test_other_benches_are_not_compared():
     """Drafts for different numbers of carts cannot be compared."""
-    with pytest.raises(ConfigError, match=r"2 carts in cm and V, this one of 3 in cm and V"):
+    with pytest.raises(ConfigError, match=r"2 carts in cm and V, this one has 3 in cm and V"):
         compare_drafts(draft_of(make_analysis(2)), make_analysis(3))
 
 
