@@ -145,9 +145,9 @@ def columns_source(catalogue: Sequence[Effect]) -> str:
     for place, what in (("cart", "a cart"), ("spring", "a spring"), ("input", "the drive")):
         out.append(f'\n\nclass {_TABLES[place]}(IntEnum):\n    """The row of {what}."""\n')
         out += [f"    {name} = {number}" for number, name in enumerate(own[place])]
-    out.append("\n\n# Dry friction, which may differ by a factor from run to run.")
+    out.append("\n\n# Columns of dry friction, which may differ by a factor from run to run.")
     out.append(f"DRY = ({', '.join(dry)})")
-    out.append("# Values without effect, for columns in which 0 has an effect.")
+    out.append("# Values for no effect, in columns where 0 would have an effect.")
     out.append(f"NEUTRAL = {neutral!r}")
     return "\n".join(out) + "\n"
 
@@ -303,13 +303,13 @@ def settling(effect: Effect) -> tuple[Expr, Expr, Expr]:
 def _hysteresis(catalogue: Iterable[Effect]) -> Iterator[str]:
     mine = [effect for effect in catalogue if isinstance(effect.law, HysteresisLaw)]
     yield "\n@inlined\ndef settling(cart, i, v):"
-    yield '    """Return the largest force of hysteresis, the limit and rate (1/s) of its state."""'
+    yield '    """Return the largest force of hysteresis; limit and rate (1/s) of its state."""'
     for effect in mine:
         values = ", ".join(code(in_table(one, effect)) for one in settling(effect))
         yield f"    if {_gate(effect)}:\n        return {values}"
     yield "    return 0.0, 0.0, 0.0\n"
     yield "\n@inlined\ndef settling_slopes(cart, i, v):"
-    yield '    """Return the derivatives by the velocity of the limit and rate of the state."""'
+    yield '    """Return the derivatives, by velocity, of the limit and rate of the state."""'
     for effect in mine:
         slopes = (derivative(one, v) for one in settling(effect)[1:])
         values = ", ".join(code(in_table(one, effect)) for one in slopes)
@@ -336,7 +336,7 @@ def _contacts(catalogue: Iterable[Effect]) -> Iterator[str]:
     yield from stops
     yield "    return 0.0, 0.0, 0.0\n"
     yield "\n@inlined\ndef slack_of(spring, j):"
-    yield '    """Return extra stiffness of spring j, its stretch, and the slope by k."""'
+    yield '    """Return extra stiffness of spring j, where it begins, and its derivative by k."""'
     yield from slacks
     yield "    return 0.0, 0.0, 0.0\n"
 
@@ -352,9 +352,9 @@ def _input(catalogue: Iterable[Effect]) -> Iterator[str]:
 
 
 def _steps(catalogue: Iterable[Effect]) -> Iterator[str]:
-    yield "\nON_CARTS, ON_SPRINGS, ON_DRIVE = 1, 2, 4  # places of smooth forces, to be added\n"
+    yield "\nON_CARTS, ON_SPRINGS, ON_DRIVE = 1, 2, 4  # flags for the places of smooth forces\n"
     yield "\n@jit\ndef reach_of(cart, spring, drive):"
-    yield '    """Return the longest step for the laws, in s, and places of smooth forces."""'
+    yield '    """Return the longest step for the laws, in s, and flags such as `ON_CARTS`."""'
     yield "    longest, smooth = inf, 0"
     loops = {
         "cart": "    for i in range(cart.shape[0]):",
@@ -395,7 +395,7 @@ def _followed(catalogue: Sequence[Effect]) -> Iterator[str]:
     shapes = [_coefficients(effect, catalogue) for effect in catalogue]
     yield '\nclass Kind(IntEnum):\n    """The effects, in the order of the catalogue."""\n'
     yield from (f"    {e.key.upper()} = {i}" for i, e in enumerate(catalogue))
-    yield "\n\n# By kind, the coordinates that vanish with the effect; the others are its shape."
+    yield "\n\n# For each kind, the coordinates that are zero without the effect."
     yield f"COEFFICIENTS = {tuple(shapes)!r}"
     on_spring = [e.key for e in catalogue if e.place == "spring"]
     friction = [e.key for e in catalogue if isinstance(e.law, FrictionLaw)]
@@ -403,12 +403,12 @@ def _followed(catalogue: Sequence[Effect]) -> Iterator[str]:
     for name, keys in (("ON_SPRING", on_spring), ("FRICTION", friction), ("HYSTERESIS", bristles)):
         yield f"{name} = ({''.join(f'Kind.{key.upper()}, ' for key in keys)})"
     sizes = [(isinstance(e.law, HysteresisLaw), len(e.grown.coordinates)) for e in catalogue]
-    yield "# Most numbers that `terms` or `settle` fill in."
+    yield "# Largest count of numbers that `terms` or `settle` write."
     yield f"TERMS = {max(5 + 3 * size if bristle else 4 + size for bristle, size in sizes)}\n"
     yield "\n@jit\ndef terms(kind, p, o, x, v, k, u, on, out):"
     yield '    """Fill `out` with the law of a kind and derivatives; coordinates start at p[o].\n'
     yield "    The derivatives are by position, velocity and input, then by each coordinate."
-    yield "    `x` and `v` are those of a cart or of a spring's stretch, `k` is its stiffness."
+    yield "    `x` and `v` are of a cart or a spring's stretch; `k` is the spring's stiffness."
     yield '    """'
     branch = "if"
     for effect in catalogue:
@@ -418,7 +418,7 @@ def _followed(catalogue: Sequence[Effect]) -> Iterator[str]:
         branch = "elif"
         yield from _terms_of(effect, catalogue)
     yield "\n\n@jit\ndef settle(kind, p, o, v, out):"
-    yield '    """Fill `out` with `settling`, its slopes, and derivatives by coordinate."""'
+    yield '    """Fill `out` with `settling`, its slopes, and its derivatives by coordinate."""'
     branch = "if"
     for effect in catalogue:
         if isinstance(effect.law, HysteresisLaw):

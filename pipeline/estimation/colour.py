@@ -1,9 +1,9 @@
 """The effect of correlated residuals on standard errors.
 
 A chain fitted to carts with dry friction leaves smooth residuals, and an encoder at rest rounds the
-same way for seconds. Neighbouring samples then carry the same information. Counting each sample as
-independent would make every standard error too small. This module computes the middle factor of the
-sandwich estimator, which corrects for it.
+same way for seconds. Neighbouring samples then carry the same information. If each sample counted
+as independent, every standard error would be too small. This module computes the middle factor of
+the sandwich estimator, which corrects for this.
 
 Reference: W. Newey & K. West, Econometrica 55, 1987; the lag window is Parzen's.
 """
@@ -26,8 +26,8 @@ def _parzen(x: Array) -> Array:
 def colour(residual: Array, *, angle: float) -> float:
     """Return the residual's spectral density at `angle` (rad per sample) over its mean.
 
-    The variance of a fitted sinusoid's coefficients is that of white noise times this factor. It
-    uses Parzen's lag window. It is at least 1, because the fit itself removes power at `angle`.
+    The factor multiplies the variance that a fitted sinusoid's coefficients have in white noise. It
+    is at least 1, because the fit itself removes power at `angle`.
     """
     n = residual.size
     # Use at least eight lags of the residual's correlation.
@@ -49,8 +49,8 @@ def _window(lags: int) -> Array:
 def long_run_variance(residual: Array) -> float:
     """Return the variance of residuals (p, n) that governs the standard error of their mean.
 
-    The residuals have mean zero. For white residuals it is the mean square. It is more if
-    neighbouring samples agree, and never less.
+    The residuals have mean zero. For white residuals the result is the mean square. If neighbouring
+    samples agree it is larger; it is never smaller.
     """
     n = residual.shape[1]
     correlation = _tapered_correlation(residual)

@@ -20,29 +20,29 @@ from pipeline.estimation.sliding import most_around
 from pipeline.results import Intervention, Record
 
 _BULK = 2.0  # standard deviations of the law's residual, as in its fit
-# A burst exceeds the first multiple of `_BULK`. It begins and ends at the second.
+# A burst must exceed the first multiple of `_BULK`. It begins and ends at the second multiple.
 _FAR, _BEGINS = 4.0, 1.5
-# Least share of the force on the cart that a burst has. Least multiple of the share that the law
-# usually leaves.
+# Least share of a burst in the force on the cart, and least ratio of this share to its usual value.
 _SHARE, _TYPICAL = 0.3, 3.0
-# s before and after a window. The force acting there is the largest within.
+# s before and after a window. A burst is compared with the largest force in this time.
 _AROUND = 0.15
-# s to each side of a window's middle; this part has most of the weight.
+# s on either side of a window's middle; this part has most of the weight.
 _REACH = 0.02
-_GAP = 0.1  # s. Closer bursts are merged
-_LASTS = 0.06  # s above half its peak. An impact has 0.04, the width of a window
-# s of a burst that must be in a known state, in which the law holds at other times.
+_GAP = 0.1  # s; closer bursts are merged
+_LASTS = 0.06  # s above half the peak of a burst; an impact has 0.04, the width of a window
+# s of a burst during which the cart must be in a state in which the law holds at other times.
 _KNOWN = 0.03
-_SWINGS = 3  # sign changes of a hand's force. An effect's force has many more
-_INSTANT = 0.03  # s. Nobody pushes twice at the same instant
-# Bins of a state's range. Of the windows in a bin, this share and this number must be quiet.
+_SWINGS = 3  # sign changes of a hand's force; an effect's force has many more
+_INSTANT = 0.03  # s; nobody pushes twice within this time of a recording
+# Number of bins for a variable of the state. At least this share and at least this number of
+# the windows in a bin must be quiet.
 _BINS, _MOST, _VISITS = 20, 0.5, 5
 
 
 def find_interventions(records: Sequence[Record]) -> tuple[Intervention, ...]:
     """Return the interventions of hands on free carts, by record, cart and time.
 
-    Runs under feedback are skipped: there, part of what drives the motor is often not logged.
+    Runs under feedback are skipped, because part of what drives their motor is often not logged.
     """
     open_loop = [record for record in records if record.kind not in ("closed_loop", "bode")]
     first = {record.id: _first_copy(record, open_loop) for record in open_loop}
@@ -109,7 +109,7 @@ def _bursts(cart: int, seen: Sequence[Seen]) -> list[Intervention]:
     for force, share, known in zip(forces, shares, _known(forces, size), strict=True):
         left = np.abs(force.left)
         bulk = size
-        if force.follows.any():  # a record that does not follow the law cannot show a hand
+        if force.follows.any():  # a record that departs from the law throughout cannot show a hand
             own = _BULK * MEDIAN_TO_SIGMA * float(np.median(left[force.follows]))
             bulk = max(size, own)
         strong = (left > _FAR * bulk) & (share > least) & ~force.jumps
@@ -136,9 +136,9 @@ def _bursts(cart: int, seen: Sequence[Seen]) -> list[Intervention]:
 
 
 def _recurs(one: Intervention, found: Sequence[Intervention], driven: Mapping[str, float]) -> bool:
-    """Return whether the same happens at the same instant in another driven run, unlike a hand.
+    """Return whether a burst occurs at the same instant in another driven run, unlike a hand.
 
-    `driven` gives for each driven run the time at which its input first acts.
+    `driven` gives, for each driven run, the time of its first sample.
     """
     if one.start == driven.get(one.experiment, one.start):
         return False
@@ -177,7 +177,7 @@ def _known(forces: Sequence[ForceLeft], size: float) -> list[NDArray[np.bool_]]:
         calm = np.bincount(at[follows & quiet], minlength=_BINS + 1)
         known &= inside & ((calm >= _MOST * visits) & (calm >= _VISITS))[at]
     bounds = np.cumsum([0, *(force.t.size for force in forces)])
-    # A window also sees a little of its neighbours.
+    # A window also shows a little of its neighbours.
     parts = [~most_around(~known[first:stop], 3) for first, stop in pairwise(bounds)]
     return [part | force.idle for part, force in zip(parts, forces, strict=True)]
 
@@ -194,7 +194,7 @@ def _stretches(above: NDArray[np.bool_], t: Array) -> list[tuple[int, int]]:
 
 
 def _runs(above: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return the first and the last of each run of true values."""
+    """Return the first and the last index of each run of true values."""
     edges = np.flatnonzero(np.diff(np.pad(above.astype(int), 1))).tolist()
     return [(first, behind - 1) for first, behind in zip(edges[::2], edges[1::2], strict=True)]
 
@@ -204,8 +204,8 @@ def _is_hand(
 ) -> bool:
     """Return whether a burst is due to a hand.
 
-    Below the level at which a burst begins, the unexplained force `left` is negligible. The windows
-    are `hop` s apart.
+    Where the unexplained force is below the level at which a burst begins, `left` is zero. The
+    windows are `hop` s apart.
     """
     swings = np.count_nonzero(np.diff(np.sign(left[left != 0.0])))
     lasts = understood = 0

@@ -18,14 +18,14 @@ from pipeline.estimation.modulating import bump_integral, window_weights
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA, grain
 from pipeline.results import Record
 
-_WINDOW = 0.1  # s. The middle 0.04 s have most of the weight
-_LAGS = (0.0, 0.02, 0.05)  # s. Trial delays of the input
+_WINDOW = 0.1  # s; the middle 0.04 s have most of the weight
+_LAGS = (0.0, 0.02, 0.05)  # trial delays of the input, s
 # Columns of the law, in this order: rest and gain of each record; positions and inputs; dampers,
 # drag and braking; dry friction, constant and proportional to the input.
 _OWN, _POSITION = 2, 3
 _SPRINGS, _DAMPERS, _DRY = slice(0, 8), slice(8, 13), slice(13, 15)
-_ROUNDS, _SETTLED = 30, 1e-3  # most rounds of reweighting; relative change of the bulk at the end
-_BULK = 2.0  # standard deviations of the bulk. Data beyond are ignored
+_ROUNDS, _SETTLED = 30, 1e-3  # most rounds of reweighting; change of the bulk at which they end
+_BULK = 2.0  # standard deviations of the residual; data beyond have little weight
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,14 +34,15 @@ class ForceLeft:
 
     Attributes
     ----------
-    left : (n,) unexplained acceleration. For a cart at rest, only the part that static friction
+    left : unexplained acceleration (n,). For a cart at rest, only the part that static friction
         cannot hold.
-    acting : (n,) size of the acceleration. If larger, the acceleration due to springs and input.
-    state : (5, n) the variables of the law. Position about the rest, stretches of both springs,
+    acting : size (n,) of the acceleration, or of the acceleration due to springs and input if that
+        is larger.
+    state : variables (5, n) of the law: position about the rest, stretches of both springs,
         velocity, input.
-    moves : (n,) whether the cart moves.
-    jumps : (n,) whether the cart moves and the input jumps. The jump may be just before the window.
-    idle : (n,) whether the cart rests without an input.
+    moves : whether the cart moves (n,).
+    jumps : whether the input jumps (n,), in the window or just before.
+    idle : whether the cart rests without an input (n,).
     """
 
     record: Record
@@ -55,7 +56,7 @@ class ForceLeft:
 
     @property
     def follows(self) -> NDArray[np.bool_]:
-        """(n,) whether the law should hold."""
+        """Whether the law should hold (n,)."""
         return self.moves & ~self.jumps
 
     @property
@@ -70,9 +71,10 @@ class Seen:
 
     Attributes
     ----------
-    x, v, acceleration : (carts, n) of the measured carts.
-    span : (carts, n) range of the readings in each window.
-    u, on : (3, n) the input at each of `_LAGS`. Share of the time that it is not zero.
+    x, v, acceleration : motion (carts, n) of the measured carts.
+    span : range (carts, n) of the readings in each window.
+    u, on : the input (3, n) at each of `_LAGS`, and the share of the time in which it is not zero
+        (n,).
     gain : standard deviation of the acceleration that white noise of size 1 causes.
     """
 
@@ -109,7 +111,7 @@ class _Windows:
         Each record has its own rest and gain, because a drive may treat levels differently.
         """
         v, u = self.v[1], driven * self.u
-        # In a window in which the cart turns round, this is its main direction.
+        # In a window in which the cart reverses, this is its main direction.
         turning = np.maximum(np.abs(self.acceleration) * _WINDOW / 4.0, 1e-12 * np.abs(v).max())
         side = np.clip(v / np.maximum(turning, 1e-300), -1.0, 1.0)
         rest = np.ones(v.size)
@@ -119,7 +121,7 @@ class _Windows:
 
 
 def forces_left(cart: int, seen: Sequence[Seen]) -> tuple[list[ForceLeft], float]:
-    """Return the unexplained force on a cart by record, and its usual size.
+    """Return, by record, the unexplained force on a cart, and its usual size.
 
     One law is fitted to all records. Records in which a free neighbour was not measured are left
     out. The list is empty if the cart moves too little to fit the law.
@@ -133,7 +135,7 @@ def forces_left(cart: int, seen: Sequence[Seen]) -> tuple[list[ForceLeft], float
     parts = [(c[use], w.acceleration[use])
              for c, w, use in zip(columns, windows, usable, strict=True)]  # fmt: skip
     unknowns = columns[0].shape[1] + _OWN * (len(windows) - 1)
-    # The fewest windows for a fit: three times the unknowns.
+    # A fit needs three times as many windows as unknowns.
     if sum(target.size for _, target in parts) < 3 * unknowns:
         return [], 0.0
     laws, size = _fit(parts, least=_BULK * float(np.median([w.noise for w in windows])))
@@ -163,23 +165,23 @@ def forces_left(cart: int, seen: Sequence[Seen]) -> tuple[list[ForceLeft], float
 
 
 def see(record: Record) -> Seen | None:
-    """Return the means over a record's windows, or None if the record is shorter than one."""
+    """Return the means over a record's windows, or None if the record is shorter than a window."""
     t, interval = record.t, record.sample_time
-    # Number of samples in a window.
+    # number of samples in a window
     width = max(round(_WINDOW / interval) + 1, 9)
     if width >= t.size:
         return None
     first = np.arange(0, t.size - width + 1, _hop(record))
     u = np.zeros(t.size) if record.u is None else record.u
     inputs = np.array([*(np.interp(t - lag, t, u) for lag in _LAGS), u != 0.0])
-    # At most 1000 windows at once, to limit the memory for long recordings.
+    # At most 1000 windows are computed at once, to limit the memory for long recordings.
     parts = np.array_split(first, -(-first.size // 1000))
     means = np.hstack([_means(t, record.y, inputs, part[:, None] + np.arange(width))
                        for part in parts])  # fmt: skip
     reach = round(_LAGS[-1] / interval) + 1
     # A jump is a change by 30 % of the input's range from one sample to the next.
     jump = np.abs(np.diff(u, prepend=u[0])) > 0.3 * np.ptp(u)
-    jumped = np.append(0, np.cumsum(jump))  # so many times before each sample
+    jumped = np.append(0, np.cumsum(jump))  # number of jumps before each sample
     x, v, acceleration, span = means[6:].reshape(4, len(record.carts), -1)
     return Seen(
         record=record,
@@ -204,7 +206,7 @@ def _between_neighbours(seen: Seen, cart: int) -> _Windows | None:
     still = np.zeros(seen.t.size)
     row = record.carts.index(cart)
     step = grain(record.t, record.position(cart), step=record.encoder_step(cart))
-    # Changes in a window below these mean that the cart rests.
+    # A cart rests if its readings change by at most three steps in a window.
     return _Windows(
         record=record,
         t=seen.t,
@@ -250,13 +252,13 @@ def _means(t: Array, y: Array, inputs: Array, at: NDArray[np.int64]) -> Array:
 
 
 def _fit(parts: Sequence[tuple[Array, Array]], *, least: float) -> tuple[list[Array], float]:
-    """Return the law that the bulk of the windows follows, by record, and its usual residual.
+    """Return, by record, the law that most windows follow, and the usual residual.
 
     Parameters
     ----------
     parts : columns (windows, unknowns) and accelerations (windows,) of each record. The first
-        columns are the record's own unknowns.
-    least : the smallest size of the bulk.
+        columns are for the record's own unknowns.
+    least : a lower limit for the usual residual.
     """
     shared = parts[0][0].shape[1] - _OWN
     behind = np.arange(_OWN * len(parts), _OWN * len(parts) + shared)

@@ -12,7 +12,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import Record
 
-_STILL = 0.02  # share of its range by which a constant signal may vary
+_STILL = 0.02  # share of a signal's range by which it may vary and count as constant
 _MIN_STEP_SAMPLES = 10
 
 
@@ -22,13 +22,13 @@ class MeasuredRun:
 
     Attributes
     ----------
-    y : (f, n) readings. Zero if a free cart was not measured.
-    seen : (f,) which carts were measured.
-    noise : (f,) standard deviation of the readings from sample to sample. At least that of
+    y : readings (f, n); zero if a free cart was not measured.
+    seen : whether each cart was measured (f,).
+    noise : standard deviation (f,) of the readings from sample to sample, at least that of
         rounding.
     quiet : number of samples before input or reference first change, at least one.
-    rest : (f,) readings at rest.
-    x0 : (2f,) state at the start, relative to the rest.
+    rest : readings at rest (f,).
+    x0 : state (2f,) at the start, relative to the rest.
     """
 
     record: Record
@@ -50,14 +50,14 @@ class MeasuredRun:
         return self.record.u is not None and bool(np.any(self.record.u[:-1] != 0))
 
     def forced(self) -> Array:
-        """The response (f, n) of the chain, from rest, to the logged input."""
+        """Return the response (f, n) of the chain, from rest, to the logged input."""
         record = self.record
         if record.u is None:
             raise DataError(f"{record.id}: the hardware check needs a logged input, found none")
         return self._simulated(record.u, x0=np.zeros(2 * len(self.free)))
 
     def unforced(self) -> Array:
-        """The readings (f, n) that the start alone causes."""
+        """Return the readings (f, n) that the start alone causes."""
         return self.rest[:, None] + self._ringing(self.x0)
 
     @property
@@ -72,7 +72,7 @@ class MeasuredRun:
         return float(np.sum(moved * forced) / np.sum(forced**2))
 
     def best_misfit(self) -> float:
-        """Return the misfit of the open loop with its input times the best factor."""
+        """Return the misfit of the open loop if its input is multiplied by the best factor."""
         return self.misfit(self.unforced() + self.input_scale() * self.forced())
 
     def misfit(self, model: Array) -> float:
@@ -84,7 +84,7 @@ class MeasuredRun:
         """Return the run with its rest and initial state fitted to the whole record.
 
         This is a linear least-squares fit. It includes a free factor on the input, so that a wrong
-        input does not affect the start.
+        scale of the input does not affect the start.
         """
         n = self.record.t.size
         states = np.eye(2 * len(self.free))
@@ -104,8 +104,8 @@ class MeasuredRun:
         """Return the samples from the first step of `signal` (n,) to the next, or None."""
         if signal is None or not np.any(signal):
             return None
-        # Before the record the signal was zero, so a signal that is on from the start steps there.
-        # A step is a change by 30 % of the range within one sample.
+        # Before the record the signal was zero, so a signal that is on at the first sample steps
+        # there. A step is a change by 30 % of the range within one sample.
         edges = np.flatnonzero(np.abs(np.diff(signal, prepend=0.0)) > 0.3 * np.ptp([0.0, *signal]))
         if edges.size == 0:
             return None
@@ -124,7 +124,7 @@ class MeasuredRun:
 
         Raises
         ------
-        DataError : they overflow, because the chain fits nothing.
+        DataError : the positions overflow, because the chain fits nothing.
         """
         record = self.record
         with np.errstate(over="ignore", invalid="ignore"):

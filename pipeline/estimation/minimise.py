@@ -46,7 +46,7 @@ def evaluated_once(at: Callable[[Array], T]) -> Callable[[Array], T]:
 
     def once(p: Array) -> T:
         if not (last and np.array_equal(last[0][0], p)):
-            own = p.copy()  # MINPACK goes on to change its array
+            own = p.copy()  # MINPACK changes its array later
             last[:] = [(own, at(own))]
         return last[0][1]
 

@@ -1,8 +1,8 @@
 """Modulating functions: average an equation of motion over windows, without derivatives of data.
 
-The equation is multiplied by a bump that vanishes at both ends of a window with its first three
-derivatives, and integrated by parts: the derivatives move from the data to the known bump. The
-result is linear in masses, dampings and springs.
+The equation is multiplied by a bump, which is zero at both ends of a window, as are its first three
+derivatives. Then it is integrated by parts: the derivatives move from the data to the known bump.
+The result is linear in masses, dampings and springs.
 
 References: M. Shinbrot, Trans. ASME 79 (1957), 579-588; H. A. Preisig & D. W. T. Rippin, Computers
 & Chemical Engineering 17 (1993).
@@ -20,24 +20,24 @@ def bump(s: Array, *, span: Array | float) -> tuple[Array, Array, Array]:
 
 
 def motion_period(x: Array) -> float:
-    """Return the period, in samples, of a sine as fast as this motion for its size."""
+    """Return the period, in samples, of a sine with the same size and speed as this motion."""
     return float(2 * np.pi * np.std(x) / np.sqrt(np.mean(np.diff(x) ** 2)))
 
 
 def bump_integral(s: Array) -> Array:
-    """Return the integral of the bump from 0 to s; it weights an input that is held."""
+    """Return the integral of the bump from 0 to s; these are the weights for a held input."""
     return s**5 * np.polyval([1 / 9, -1 / 2, 6 / 7, -2 / 3, 1 / 5], s)
 
 
 def window_weights(t: Array) -> tuple[Array, Array, Array]:
-    """Return weights (windows, samples) that give mean, minus mean slope and mean curvature.
+    """Return weights (windows, samples) that give mean, minus mean slope, and mean curvature.
 
     With few samples the bump's derivatives are integrated badly. So the weights are corrected to be
     exact for parabolas.
 
     Parameters
     ----------
-    t : (windows, samples) s, the times of the samples in each window.
+    t : times (windows, samples) of the samples in each window, s.
     """
     span = t[:, -1:] - t[:, :1]
     w, w1, w2 = bump((t - t[:, :1]) / span, span=span)

@@ -15,18 +15,19 @@ def local_noise(t: Array, y: Array) -> float:
     """Return the noise's standard deviation (rounding included), from sample to sample.
 
     Each sample is compared with the quintic through its six neighbours at their own times, so
-    neither the motion nor an uneven clock counts as noise. 0 for fewer than seven samples.
+    neither the motion nor an uneven clock counts as noise. The result is 0 for fewer than seven
+    samples.
     """
     if t.size < 7:
         return 0.0
     weights, size = _weights(t.tobytes())
     predicted = np.einsum("jn,jn->n", weights, _neighbours(y))
     scaled = (y[3:-3] - predicted) / size
-    moving = scaled[scaled != 0]  # the zeros of a cart at rest on one count do not show its noise
+    moving = scaled[scaled != 0]  # zeros, at rest on one count, do not show the noise
     return float(MEDIAN_TO_SIGMA * np.median(np.abs(moving))) if moving.size else 0.0
 
 
-@lru_cache(2)  # the carts of a record share their times
+@lru_cache(2)  # the carts of a record have the same times
 def _weights(clock: bytes) -> tuple[Array, Array]:
     """Return Lagrange's weights (6, n - 6) of the neighbours, and their gain for white noise."""
     t = np.frombuffer(clock)
@@ -44,7 +45,7 @@ def _neighbours(x: Array) -> Array:
 
 
 def difference_noise(y: Array, *, order: int) -> Array:
-    """Return the noise's standard deviation of evenly sampled signals (…, n), by differences.
+    """Return the noise's standard deviation of evenly sampled signals (…, n), from differences.
 
     The higher the order, the less of a smooth motion remains. The result comes from the median,
     which ignores jumps. It is zero for a cart that rests on one count.
@@ -59,7 +60,7 @@ def difference_gain(order: int) -> float:
 
 
 def high_frequency_noise(residual: Array, *, half_width: int = 4) -> float:
-    """Return the noise (standard deviation) of a residual that a moving quadratic cannot follow."""
+    """Return the standard deviation of a residual about a quadratic that moves along with it."""
     width = 2 * half_width + 1
     if residual.size < 2 * width:
         return float(residual.std())
@@ -73,10 +74,10 @@ def high_frequency_noise(residual: Array, *, half_width: int = 4) -> float:
 
 
 def grain(t: Array, y: Array, *, step: float) -> float:
-    """Return the smallest significant change: the encoder step, or the noise if larger.
+    """Return the smallest significant change: the encoder step, or the noise if that is larger.
 
-    Noise counts as the step with the same rounding error, sqrt(12) sigma. `step` is the encoder
-    step, 0 if unknown.
+    Noise sigma counts as the step with the same rounding error, sqrt(12) sigma. `step` is the
+    encoder step, 0 if unknown.
     """
     arithmetic = 1e-6 * float(np.ptp(y))  # for a simulation, which has neither noise nor steps
     return max(step, float(np.sqrt(12) * local_noise(t, y)), arithmetic)

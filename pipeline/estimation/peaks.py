@@ -9,15 +9,15 @@ from pipeline.estimation.noise import difference_noise
 def extrema(y: Array, *, prominence: float) -> list[int]:
     """Return the indices of the turning points, ends included; maxima and minima alternate.
 
-    A turning point counts once the signal has gone back by `prominence`. On a flat top the middle
+    A turning point counts once the signal has gone back by `prominence`. On a flat top, the middle
     sample is taken.
     """
     found: list[int] = []
     first = last = low = high = 0  # the current extreme is y[first] .. y[last]
     direction = 0
-    values = y.tolist()  # Python floats: read one by one, they take a third of the time
+    values = y.tolist()  # reading Python floats one by one takes a third of the time
     for i, value in enumerate(values):
-        if direction == 0:  # until the first move shows the direction
+        if direction == 0:  # until a first change shows the direction
             low = i if value < values[low] else low
             high = i if value > values[high] else high
             if values[high] - values[low] >= prominence:
@@ -35,7 +35,7 @@ def extrema(y: Array, *, prominence: float) -> list[int]:
             first = last = i
             direction = -direction
     if direction:
-        found.append(first)  # for a cart that has come to rest, the sample at which it did
+        found.append(first)  # where the cart came to rest, if it did
     return found
 
 

@@ -1,7 +1,7 @@
 """The transfer ratio of one step or sweep record, with any motion at its ends.
 
-A record that begins and ends at rest, even displaced, needs no window: the ratio FT(y')/FT(u') of
-the derivatives' transforms is exact. Any other record is evaluated by local polynomials. The
+If a record begins and ends at rest, even displaced, the ratio FT(y')/FT(u') of the derivatives'
+transforms is exact, without a window. Any other record is evaluated by local polynomials. The
 unknown motion before and after the record adds a smooth term in frequency, which is fitted too.
 
 Reference: Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2nd ed.,
@@ -18,21 +18,22 @@ from pipeline.arrays import Array, ComplexArray
 from pipeline.estimation.noise import difference_gain
 from pipeline.results import Record
 
-# Share of the input's strongest line. Where the input is weaker, it does not excite the plant.
+# Least input, as a share of its strongest line. A weaker input does not excite the plant.
 _LEAST_INPUT_SHARE = 0.01
-# The same relative to its strongest neighbour. At a null of the input's spectrum (every second
-# harmonic of a step on and off), any nonlinearity would be divided by almost zero.
+# Least input, as a share of its strongest neighbour. At a null of the input's spectrum (every
+# second harmonic of a step on and off), the effect of any nonlinearity would be divided by almost
+# zero.
 _LEAST_NEIGHBOUR_SHARE = 0.25
 _NEIGHBOURS = 2  # frequencies on each side
-# Share of the travel that a cart may have moved in the first samples of a record. After a step at
-# the first sample it moves by u t²/2m in two samples: 3 % with samples 9 ms apart and a mode at 20
-# rad/s.
+# Largest share of its travel that a cart may move in the first three samples of a record that
+# begins at rest. After a step at the first sample, it moves by u t²/2m in two samples. This is 3 %
+# with samples 9 ms apart and a mode at 20 rad/s.
 _START_SWING = 0.03
-_HALF_WINDOWS, _DEGREE = (4, 6), 2  # lines to each side, and degree, of the local polynomials
+_HALF_WINDOWS, _DEGREE = (4, 6), 2  # lines on each side, and degree, of the local polynomials
 
 
 class TransferRatio(NamedTuple):
-    """G (n_carts, n_w), and its standard error per component; infinite if not excited."""
+    """G (n_carts, n_w), and its standard error per component; infinite where not excited."""
 
     G: ComplexArray
     std: Array
@@ -53,9 +54,9 @@ def visible_band(run: Record) -> float:
     dt, duration = run.sample_time, run.t[-1] - run.t[0]
     omega = 2 * np.pi * np.fft.rfftfreq(run.t.size - 1, dt)
     floor = _noise(run)[:, None] * omega * np.sqrt(dt * duration)
-    # On a line, noise alone exceeds three sigma with probability e^-9: too rare to matter.
+    # At one frequency, noise alone exceeds three sigma with probability e^-9, too rarely to matter.
     visible = np.any(np.abs(np.fft.rfft(np.diff(run.y))) > 3 * floor, axis=0)
-    # Share of the Nyquist frequency to use; above it the encoders alias, as they have no filter.
+    # The encoders have no filter, so higher frequencies suffer from aliasing.
     visible &= omega <= 0.4 * np.pi / dt
     return float(np.max(omega[visible], initial=0.0))
 
@@ -65,8 +66,8 @@ def _derivative_transforms(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return FT(u') (n_w,) and FT(y') (n_carts, n_w) over the record, at its own sample times."""
     between = _turning((run.t[1:] + run.t[:-1]) / 2, omega)
-    # Between the samples y is taken as straight lines, so FT is the sum of increments times a sinc.
-    # Dividing by sinc² makes up for the part of a smooth signal that straight lines lose.
+    # Between the samples, y is assumed to be straight, so FT is the sum of increments times a sinc.
+    # Division by sinc² restores the part of a smooth signal that straight lines lose.
     smooth = 1.0 / np.sinc(omega * run.sample_time / (2 * np.pi))
     y_transform = np.diff(run.y) @ between * smooth
     if run.hold == "band_limited":
@@ -87,8 +88,8 @@ def _at_rest_ratio(run: Record, u: Array, omega: Array) -> TransferRatio | None:
     # The last tenth of the record must be at rest.
     tail = run.t >= run.t[-1] - 0.1 * (run.t[-1] - run.t[0])
     ring = np.ptp(run.y[:, tail], axis=1)
-    quiet = np.maximum(8 * noise, 2 * run.resolution)  # range of a cart that stands still
-    # At rest also means within a hundredth of the whole travel.
+    quiet = np.maximum(8 * noise, 2 * run.resolution)  # largest range of a cart that stands still
+    # A cart is also at rest if it moves by less than a hundredth of its whole travel.
     moving = np.ptp(u[tail]) > 0 or np.any(ring > np.maximum(quiet, 0.01 * travel))
     starts_moving = np.any(np.ptp(run.y[:, :3], axis=1) > np.maximum(quiet, _START_SWING * travel))
     if moving or starts_moving:
@@ -123,8 +124,8 @@ def _noise(run: Record) -> Array:
 def _local_ratio(run: Record, u: Array, omega: Array) -> TransferRatio:
     """Return G by local polynomials: FT(y') = G FT(u') + effect of the ends; both are smooth.
 
-    The difference between two widths of the polynomials is added to the standard error. Near a
-    sharp resonance of a short record it is the larger part.
+    The difference between the results for two widths of the polynomials is added to the standard
+    error. Near a sharp resonance of a short record, it is the larger part.
     """
     base = 2 * np.pi / (run.t[-1] - run.t[0])
     lines = np.arange(1, int(omega[-1] / base) + max(_HALF_WINDOWS) + 2)

@@ -1,6 +1,6 @@
-"""The most within a window that slides along a series.
+"""The largest value in a window that slides along a series.
 
-`scipy.ndimage` has it too, but takes longer to load than a submission to read.
+`scipy.ndimage` has such a filter too, but loading it takes longer than reading a submission.
 """
 
 from typing import TypeVar
@@ -13,6 +13,6 @@ T = TypeVar("T", bound=np.generic)
 
 
 def most_around(values: NDArray[T], width: int) -> NDArray[T]:
-    """Return the largest value among the `width` around each, an odd number."""
+    """Return, for each value, the largest of the `width` values around it (an odd number)."""
     padded = np.pad(values, width // 2, mode="edge")
     return sliding_window_view(padded, width).max(axis=-1)

@@ -43,8 +43,8 @@ from pipeline.words.progress import Progress, silent
 def investigate(analysis: Analysis, *, progress: Progress, budget: float | None = None) -> Gap:
     """Explain the gap of a submission's time records, starting from the identified chain.
 
-    Recordings that the identification left out are not used here. `budget` is a time limit in s,
-    without compilation; if it is reached, the result is the best answer so far.
+    Recordings that the identification left out are not used here either. `budget` is a time limit
+    in s, without compilation; if it is reached, the result is the best answer so far.
 
     Raises
     ------
@@ -79,9 +79,9 @@ def explain_gap(
 
     Parameters
     ----------
-    records : any kind except tables. Dwells beyond a few are left out. So are feedback runs, if
+    records : records of any kind except tables. Only a few dwells are used, and no feedback runs if
         there are open-loop runs.
-    chain : the identified chain, as one start of the fit.
+    chain : the identified chain, one of the starts of the fit.
     catalogue : the effects that may be named.
     budget : time limit in s. If it is reached, the result is the best answer so far. By default
         the search ends by itself, and the answer does not depend on the machine.
@@ -94,7 +94,7 @@ def explain_gap(
     interventions = find_interventions(records)
     runs = prepare(records, springs=bench.springs, interventions=interventions, notes=notes)
     training, held_out = take_sides(runs, notes=notes)
-    # There is one run more than before if the longest one was cut in time.
+    # If the longest run was cut in time, there is one run more than before.
     whole = runs if len(training) + len(held_out) > len(runs) and not any(bench.springs) else []
     # The matrices are small, so threads inside BLAS would only slow the workers down.
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(max_workers=2) as pool:
@@ -133,7 +133,7 @@ def _describe(search: Search, bench: Bench) -> Gap:
     study, path, chosen, final = search.study, search.path, search.chosen, search.final
     verdict, found, close = search.verdict, search.found, search.close
     driven = any(np.any(run.command) for run in study.training)
-    # Without an input, the first mass is set to 1, which gives forces this unit.
+    # Without an input, the first mass is set to 1, so this is the unit of forces.
     units = bench.units if driven else replace(bench.units, input=f"{bench.units.position}/s^2")
     effects = list_effects(path, final, found, units)
     traces = make_traces(path[0], chosen, study)
@@ -173,7 +173,7 @@ def _describe(search: Search, bench: Bench) -> Gap:
 
 
 def _notes(search: Search, budget: float | None) -> list[str]:
-    """Return the notes for the reader: on the search and on how it ended."""
+    """Return the notes on the search and on how it ended."""
     words, study, chosen, notes = phrases("gap"), search.study, search.chosen, search.notes.copy()
     times = f"{chosen.error / study.floor:.1f}"
     if search.verdict not in ("none", "unexplained") and not study.explains(chosen):

@@ -16,7 +16,7 @@ from pipeline.results import HardwareCheck, Record
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Replay:
-    """One cart under the measured input: the linear model, and the model with effects, (n,).
+    """One cart under the measured input, according to both models: linear, and with effects.
 
     `rest` is the cart's rest position, from which its motion is measured.
     """
@@ -34,9 +34,9 @@ def replay_driven(
 
     Parameters
     ----------
-    checks : the linear model under the same input, one for each cart.
+    checks : the linear model's result under the same input, one for each cart.
     """
-    # The linear report never needs this compiled code.
+    # imported here, because the linear report never needs this compiled code
     from pipeline.plant.nonlinear.augmented import rest_positions, simulate_augmented
 
     if record.u is None:
@@ -51,7 +51,7 @@ def replay_driven(
         found = [
             run.rest[:, None] + (y - rest[:, None])[rows]
             for factor in sorted(factors, key=lambda factor: factor != 1.0)
-            if factor == 1.0 or not 1 / 1.5 <= factor <= 1.5  # else the model is wrong
+            if factor == 1.0 or not 1 / 1.5 <= factor <= 1.5  # within 1.5, the model is wrong
             for y in [simulate_augmented(model, record.t, factor * record.u, free=run.free, x0=x0)]
         ]
     except DataError:
@@ -75,7 +75,7 @@ def prepare_run(record: Record, *, springs: tuple[bool, ...]) -> GapRun:
 
     Raises
     ------
-    DataError : it is too short, or no free cart moves.
+    DataError : the record is too short, or no free cart moves.
     """
     return prepare([record], springs=springs, notes=[])[0]
 

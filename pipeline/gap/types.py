@@ -16,7 +16,7 @@ from pipeline.submission.complaints import first_refusal, quote
 
 Quantity = Literal["position", "velocity", "input"]
 Verdict = Literal["named", "partial", "none", "ambiguous", "unexplained"]
-_WHERE = '{"cart": 1} or {"spring": 2}; empty: the input'
+_WHERE = 'place, as {"cart": 1} or {"spring": 2}; empty for an effect on the input'
 
 
 @result()
@@ -30,27 +30,27 @@ class NamedValue:
 
 @result()
 class Rival:
-    """Another effect that could take the place of this one, fitted in the same way."""
+    """Another effect that could take the place of the found effect, fitted in the same way."""
 
-    effect: Effect = written("its name in the catalogue")
+    effect: Effect = written("name of the effect in the catalogue")
     where: dict[str, int] = written(_WHERE)
     nrmse_after: Number = written()
-    confidence: Number = written("weight among the models it is listed with")
+    confidence: Number = written("weight among the models with which it is compared")
 
 
 @result()
 class FoundEffect:
-    """One effect, in the order found; errors are on held-out runs."""
+    """One effect, in the order in which effects were found; errors are on held-out runs."""
 
-    effect: Effect = written("its name in the catalogue")
+    effect: Effect = written("name of the effect in the catalogue")
     where: dict[str, int] = written(_WHERE)
     parameters: dict[str, NamedValue] = written()
-    details: dict[str, NamedValue] = written("what only describes a contact")
+    details: dict[str, NamedValue] = written("parameters that only describe a contact")
     confidence: Number = written(
         "weight by the Bayesian information criterion among all fitted models of the same size"
     )
-    nrmse_before: Number = written("before adding it")
-    nrmse_after: Number = written("after adding it")
+    nrmse_before: Number = written("without this effect")
+    nrmse_after: Number = written("with this effect")
     rivals: tuple[Rival, ...] = written()
 
 
@@ -68,14 +68,14 @@ class RecordGap:
 
 @result()
 class GapWindow:
-    """A stretch in which a run departs most from a model."""
+    """A stretch of time in which a run departs most from a model."""
 
     experiment: str = written()
     cart: int = written()
     start: float = written("s", key="from")
     end: float = written("s", key="to")
     what: str = written()
-    share: float = written("of the run's squared error")
+    share: float = written("share of the cart's squared error in this run")
 
 
 @result()
@@ -83,14 +83,14 @@ class FreeRun:
     """One simulation of a whole record, started from its first readings."""
 
     experiment: str = written()
-    error: float | None = written("root mean square, position unit; null: the carts diverge")
+    error: float | None = written("root mean square, position unit; null if the carts diverge")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trace:
     """One cart in one run, for figures: measured, linear model and final model (n,).
 
-    `zero` is the encoder's zero in that run, according to the final model.
+    `zero` is the encoder's zero in this run, according to the final model.
     """
 
     experiment: str
@@ -106,14 +106,15 @@ class Trace:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LeftForce:
-    """The unexplained force on one cart in one run: a mean over each window.
+    """The unexplained force on one cart in one run, as a mean over each window.
 
     Attributes
     ----------
-    t, x, v, u : (windows, samples) times, position, velocity, input. The input is 0 for carts other
-        than 1.
-    weight : (windows, samples) of each sample in the mean. The weights of a window add up to 1.
-    acceleration, force : (windows,) means.
+    t, x, v, u : times, positions, velocities and inputs (windows, samples). The input is 0 for
+        carts other than 1.
+    weight : weight (windows, samples) of each sample in the mean. The weights of a window add up to
+        1.
+    acceleration, force : means (windows,).
     """
 
     experiment: str
@@ -135,7 +136,7 @@ class LeftForce:
 class FormulaTerm:
     """One term of a formula, with its coefficient."""
 
-    term: str = written("in x, v and u of the cart, v|v| say")
+    term: str = written("in x, v and u of the cart, for example v|v|")
     coefficient: float = written()
     std: float = written()
     unit: str = written()
@@ -148,7 +149,7 @@ class ForceFormula:
     @property
     @computed()
     def text(self) -> str:
-        """The sum of the terms as text: "-0.0021 sqrt|v| sign v"."""
+        """The sum of the terms as text, such as "-0.0021 sqrt|v| sign v"."""
         signed = " ".join(
             f"{'-' if one.coefficient < 0 else '+'} {abs(one.coefficient):.3g} {one.term}"
             for one in self.terms
@@ -156,9 +157,9 @@ class ForceFormula:
         return f"-{signed[2:]}" if signed[0] == "-" else signed[2:]
 
     terms: tuple[FormulaTerm, ...] = written()
-    explains: float = written("share of the squared force")
+    explains: float = written("share of the squared force that the formula explains")
     in_catalogue: Literal[False] = written(
-        "a description of the data, not an effect of it", older=False, default=False
+        "the formula describes the data; it is not an effect", older=False, default=False
     )
 
 
@@ -171,9 +172,9 @@ class ForceAgainst:
     at: tuple[float, ...] = written("mean of the quantity in each bin")
     force: tuple[float, ...] = written("mean force")
     spread: tuple[float | None, ...] = written(
-        "standard deviation between runs; null where one run alone has the bin"
+        "standard deviation between runs; null if only one run has data in the bin"
     )
-    formula: tuple[float, ...] | None = written("mean of what the formula says")
+    formula: tuple[float, ...] | None = written("mean force by the formula")
 
 
 @result()
@@ -183,14 +184,14 @@ class Residual:
     cart: int = written()
     unit: str = written("of the force")
     against: tuple[ForceAgainst, ...] = written()
-    formula: ForceFormula | None = written("null where no term is better than none")
+    formula: ForceFormula | None = written("null if no formula is better than none")
 
 
 @result(eq=False)
 class Contender(AugmentedChain):
     """A model that may be the true one."""
 
-    weight: float = written("by the Bayesian criterion among the contenders")
+    weight: float = written("weight among the contenders, by the Bayesian criterion")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -199,10 +200,10 @@ class Prediction:
 
     Attributes
     ----------
-    pair : indices (from 0) of the two contenders that the recording separates best. The separation
-        counts by their weights.
-    t, u : (n,) time in s and input.
-    positions : (contenders, n) of `cart`.
+    pair : indices (from 0) of the two contenders that the recording separates best, weighted by how
+        likely they are.
+    t, u : time in s, and input (n,).
+    positions : positions (contenders, n) of `cart`.
     """
 
     pair: tuple[int, int]
@@ -218,11 +219,11 @@ class Proposal:
 
     Attributes
     ----------
-    recording : a table of plan.toml.
-    limits : the plan's limits for which it was chosen, by name.
-    separation : root mean square difference between the deciding two, in units of the noise. Only
-        the part counts that no refit of the other model absorbs.
-    prediction : None if the proposal was read from a file.
+    recording : the recording as a table of plan.toml.
+    limits : the limits of the plan for which the recording was chosen, by name.
+    separation : root mean square difference between the two contenders, in units of the noise,
+        without the part that a refit of the other contender absorbs.
+    prediction : the contenders' predictions; None if the proposal was read from a file.
     """
 
     recording: dict[str, Any]
@@ -254,27 +255,29 @@ class Gap:
 
     Attributes
     ----------
-    bench : the set-up that the numbers refer to.
-    traces, left_forces : for the figures. Missing in a gap that was read from a file.
-    chain_covariance : (n_p, n_p) covariance of the parameters in `chain_std`. None if it could not
+    bench : the set-up to which the numbers refer.
+    traces, left_forces : data for the figures, missing in a gap that was read from a file.
+    chain_covariance : covariance (n_p, n_p) of the parameters in `chain_std`. None if it could not
         be computed or the gap was read from a file.
-    proposal : the next recording, as in a plan. None if no candidate was evaluated.
+    proposal : the next recording; None if no candidate was evaluated.
     """
 
     schema: Literal["cartlab-gap/1"] = written(default="cartlab-gap/1")
     verdict: Verdict = written()
     complete: bool = written(
-        "false: the time allowed ended the search, and this is the best answer so far; another "
-        "run may come further",
+        "false if the time limit ended the search; this is then the best answer so far, and "
+        "another search may find more",
         older=True,
         default=True,
     )
     effects: tuple[FoundEffect, ...] = written(
-        "under `ambiguous` the last one's rivals explain as much; under `partial` each lowers the "
-        "error by a tenth or more, and more is left; under `unexplained` they are suspects only"
+        "if the verdict is `ambiguous`, the rivals of the last effect explain as much; if it is "
+        "`partial`, each effect lowers the error by a tenth or more, but a gap remains; if it is "
+        "`unexplained`, they are only suspects"
     )
     suspects: tuple[Rival, ...] = written(
-        "under `unexplained`, the single effects that help most, the best first", default=()
+        "if the verdict is `unexplained`, the single effects that help most, the best first",
+        default=(),
     )
     baseline: float
     final: float
@@ -286,17 +289,21 @@ class Gap:
         """Relative errors, pooled over the held-out runs."""
         return GapErrors(baseline=self.baseline, final=self.final, noise_floor=self.noise_floor)
 
-    repeatability: float | None = written("between runs of the same input")
+    repeatability: float | None = written("relative difference of runs with the same input")
     by_record: tuple[RecordGap, ...] = written()
     free_run: tuple[FreeRun, ...] = written(
-        "of each run, how far one simulation strays", older=(), default=()
+        "error of one simulation over each whole run", older=(), default=()
     )
     where: tuple[GapWindow, ...] = written("where the linear model fails most")
     left: tuple[GapWindow, ...] = written(
-        "where the final model does, under `partial` and `unexplained`", older=(), default=()
+        "where the final model fails most, if the verdict is `partial` or `unexplained`",
+        older=(),
+        default=(),
     )
     residual: tuple[Residual, ...] = written(
-        "where more is left than a name may leave, the force left by cart", older=(), default=()
+        "the unexplained force on each cart, if the error is too large for a name",
+        older=(),
+        default=(),
     )
     next_experiment: str = written()
 
@@ -309,27 +316,27 @@ class Gap:
     @property
     @computed(older=None)
     def next_limits(self) -> dict[str, float] | None:
-        """The limits of plan.toml for which it was chosen."""
+        """The limits of plan.toml for which the recording was chosen."""
         return self.proposal and self.proposal.limits
 
     @property
     @computed(older=None)
     def separation(self) -> float | None:
-        """Root mean square difference of the deciding two after refits, in units of the noise."""
+        """Root mean square difference of the two contenders after refits, in units of the noise."""
         return self.proposal and self.proposal.separation
 
     training: tuple[str, ...] = written("ids of the runs")
     held_out: tuple[str, ...] = written("ids of the runs")
     left_out: tuple[LeftOut, ...] = written(
-        "recordings that the identification did not use: no part of any figure here",
+        "recordings that the identification did not use; no figure here includes them",
         older=(),
         default=(),
     )
     interventions: tuple[Intervention, ...] = written(
-        "no part of any fit or error", older=(), default=()
+        "times at which a hand moved a cart, excluded from fits and errors", older=(), default=()
     )
     spread: dict[int, float] = written(
-        "run-to-run spread of the dry friction, by cart",
+        "relative spread of the dry friction from run to run, by cart",
         key="friction_spread",
         default_factory=dict,
     )
@@ -349,11 +356,12 @@ class Gap:
     linear: AugmentedChain
     model: AugmentedChain = written("the chain with the effects")
     contenders: tuple[Contender, ...] = written(
-        "unless only noise is left: models that may be true, the chosen first, then the likeliest",
+        "models that may be true, the chosen one first, then the likeliest; empty if only noise is "
+        "left",
         older=(),
         default=(),
     )
-    notes: tuple[str, ...] = written("what a reader must know", default=())
+    notes: tuple[str, ...] = written("notes for the reader", default=())
 
     @property
     @computed()
@@ -364,7 +372,7 @@ class Gap:
     @property
     @computed()
     def springs(self) -> tuple[bool, ...]:
-        """Which springs exist: wall-1, 1-2, …, n-wall."""
+        """Whether each spring exists: wall-1, 1-2, …, n-wall."""
         return self.bench.springs
 
     @property
@@ -374,7 +382,7 @@ class Gap:
         return ChainWithUnits.of(self.model.chain, self.bench.units)
 
     chain_std: dict[str, Number] = written(
-        "standard errors of its m_1, c_1, k_1, …", default_factory=dict
+        "standard errors of the chain's m_1, c_1, k_1, …", default_factory=dict
     )
     provenance: Provenance = written(default=Provenance(files={}))
     title: str = ""
@@ -402,7 +410,7 @@ class Gap:
         proposal = None
         if recording is not None and separation is not None:
             proposal = Proposal(recording=recording, limits=limits or {}, separation=separation)
-        del own["chain"]  # the model has it too
+        del own["chain"]  # also in the model
         bench = Bench(springs=springs, units=units)
         return cls(
             bench=bench,
@@ -422,11 +430,11 @@ def read_gap(text: str) -> Gap:
 
     Raises
     ------
-    ConfigError : the text is not a `gap.json`, or its model has effects unknown to this catalogue.
+    ConfigError : the text is not a `gap.json`, or the catalogue lacks effects of its model.
     """
     try:
         return read_json(Gap, text, readers={Effect: find_effect})
     except ValidationError as error:
         raise ConfigError(f"not what cartlab gap writes: {first_refusal(error)}") from None
-    except (ValueError, KeyError, TypeError) as error:  # such as null in place of a number
+    except (ValueError, KeyError, TypeError) as error:  # for example null for a number
         raise ConfigError(f"not what cartlab gap writes: {quote(str(error))}") from None

@@ -1,1 +1,1 @@
-"""Identify the carts from records, after leaving out records that do not hold what happened."""
+"""Identify the carts from records, after leaving out records that do not show what happened."""

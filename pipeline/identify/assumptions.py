@@ -1,6 +1,6 @@
 """The assumptions behind all numbers: springs, units, scales, sign, held carts.
 
-Each comes with the support that the data give it.
+Each assumption comes with the support that the data give it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -39,7 +39,7 @@ def _springs(
 ) -> Iterator[Assumption]:
     n, names = system.carts, spring_names(system.carts)
     springs = [any(system.springs)] if n == 1 else system.springs
-    abouts = [" and ".join(names)] if n == 1 else names  # for one cart only the sum is known
+    abouts = [" and ".join(names)] if n == 1 else names  # for one cart, only the sum is known
     values = physical_values(fit.chain, bench=system.bench) if fit else {}
     vanishing = {check.parameter for check in failed if check.kind == "vanishing"}
     unit = system.bench.units.stiffness
@@ -121,7 +121,7 @@ def _units(
 
 
 def _scales(submission: Submission, records: Sequence[Record]) -> Iterator[Assumption]:
-    """Yield the size of a count, if counts were converted in any recording."""
+    """Yield the size of a count, if the counts of any recording were converted."""
     system = submission.system
     own = {e.id: e.input.per_count for e in submission.experiments if e.input}
     for role, stated, scales in (

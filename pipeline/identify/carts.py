@@ -75,7 +75,7 @@ def identify(
 ) -> Identified:
     """Take the records, except those in `without`, through the stages up to the fit.
 
-    `measured` caches the results of single records for the next call, which leaves out other
+    `measured` keeps the results of single records for the next call, which leaves out other
     records.
     """
     log = Log(measured=measured)
@@ -92,7 +92,7 @@ def identify(
     gains = _step_gains(runs, bench=bench, log=log)
     progress("sine dwells: steady state")
     sines = _sine_points(used, log=log)
-    # A note is dropped if a check of the same decay or step says the same in full.
+    # A note is dropped if a check of the same decay or step says the same thing in full.
     notes = [
         *((f"{d.name} (cart {d.cart})", d.note) for d in decays if not _sticks(d)),
         *((f"{g.experiment} (cart {g.cart})", g.note) for g in gains if not g.interval),
@@ -125,7 +125,7 @@ def identify(
 def compare_estimates(found: Identified, *, bench: Bench) -> tuple[ParameterRow, ...]:
     """Return the initial and final estimates side by side.
 
-    Estimates that the fit leaves open are skipped.
+    Estimates that the fit does not determine are skipped.
     """
     fit, final = found.fit, found.fit.parameters if found.fit else {}
     if fit and not final:
@@ -150,7 +150,7 @@ def _counted(carts: Sequence[int]) -> str:
 def _driven(records: Sequence[Record], *, n: int, log: Log) -> list[Record]:
     """Return the steps and sweeps in which all carts are free.
 
-    Runs of single carts serve only for the initial estimates. So initial and final estimates use
+    Runs of single carts are used for initial estimates only. So initial and final estimates use
     different data, and comparing them is a check.
     """
     runs = [r for r in records if r.kind in ("step", "sweep") and r.u is not None]
@@ -168,7 +168,7 @@ def _driven(records: Sequence[Record], *, n: int, log: Log) -> list[Record]:
 def _log_decrements(
     runs: Runs, *, bench: Bench, interventions: Sequence[Intervention], log: Log
 ) -> list[LogDecrement]:
-    """Return for each cart by itself its decays, or the ringing after its steps without a decay."""
+    """Return each single cart's decays, or without a decay the ringing after its steps."""
     decays: list[LogDecrement] = []
     for cart, (before, after) in enumerate(pairwise(bench.springs), start=1):
         if not (before or after):
@@ -221,7 +221,7 @@ def _sticks(decay: LogDecrement) -> bool:
 def _skip_without(
     log: Log, stage: Stage, what: str, *, out: Sequence[Record], cart: int | None = None
 ) -> None:
-    """Note that records of some kind are missing, or that all of them are left out."""
+    """Note that records of some kind are missing, or that all of them were left out."""
     if out:
         reason = _WORDS.text("all_left_out", what=what, runs=abridge([r.id for r in out]))
         log.skip(stage, reason, cart=cart)
@@ -266,7 +266,7 @@ def _sine_points(records: Sequence[Record], *, log: Log) -> list[SinePoint]:
 def _frequency_response(
     data: Ingested, *, sines: Sequence[SinePoint], runs: Runs, log: Log
 ) -> Sequence[FrequencyResponse]:
-    """Return the response from dwells, else from the students' table, else from other records."""
+    """Return the response from dwells; otherwise from the students' table or from other records."""
     if sines:
         return collect_dwells(sines)
     if data.tables:

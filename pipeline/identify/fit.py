@@ -27,10 +27,10 @@ class Fitted:
 
     Attributes
     ----------
-    fits : how all records follow the fit. Unused records are included.
-    by_dwells : whether the fit uses dwells and they follow it.
-    conflict : by id, the records that contradict each other, with the reason. If nothing shows
-        which are right, there is no fit.
+    fits : how each record follows the fit, including unused records.
+    by_dwells : whether the fit uses dwells and the dwells follow it.
+    conflict : the records that contradict each other, by id, with the reason. If nothing shows
+        which of them are right, there is no fit.
     """
 
     fit: ChainFit | None = None
@@ -47,7 +47,7 @@ class Runs:
     ----------
     used : the records that identify the carts.
     left_out : records that are only compared with the fit.
-    driven : of the used ones, the steps and sweeps with all carts free.
+    driven : the steps and sweeps among the used records, with all carts free.
     """
 
     used: Sequence[Record]
@@ -63,7 +63,7 @@ def fit_carts(
     bench: Bench,
     log: Log,
 ) -> Fitted:
-    """Return the Bode fit if the records follow it, else the joint fit in time."""
+    """Return the Bode fit if the records follow it, or else the joint fit in time."""
     if not _is_seen(bench.n, runs.used, responses):
         log.skip(Stage.FINAL_ESTIMATES, _WORDS.text("unseen_cart", cart=bench.n))
         return Fitted()
@@ -93,7 +93,7 @@ def fit_carts(
             return Fitted(conflict=conflict)
     if contrary and _votes(mine) != _votes(theirs):
         better = _votes(mine) < _votes(theirs)
-    else:  # replace a fit that dwells follow only if they follow the other more closely
+    else:  # if dwells follow the Bode fit, they must follow the other fit more closely
         better = not bode.by_dwells or _is_closer(other, bode, dwells)
     if not better:
         return bode
@@ -104,7 +104,7 @@ def fit_carts(
 
 
 def _is_seen(cart: int, records: Sequence[Record], responses: Sequence[FrequencyResponse]) -> bool:
-    """Whether a cart moves in any recording; if the last cart does not, it may not exist."""
+    """Whether a cart moves in any recording. If the last cart does not, it may not exist."""
     return cart in {response.cart for response in responses} or any(
         cart in record.carts and np.ptp(record.position(cart)) > 0 for record in records
     )
@@ -130,10 +130,10 @@ def _fit_points(
 
 
 def _is_doubted(fitted: Fitted, dwells: Sequence[Record]) -> bool:
-    """Whether the fit does not explain the points, and most motions are only few encoder steps.
+    """Whether the fit does not explain the points, and most motions are only a few encoder steps.
 
-    Rounding then hides the rest of a transient. Near a sharp resonance, the amplitude of a dwell is
-    off by several standard errors.
+    Rounding then hides the rest of a transient. Near a sharp resonance, this changes the amplitude
+    of a dwell by several standard errors.
     """
     assert fitted.fit is not None
     motions = [(r.position(cart), r.encoder_step(cart)) for r in dwells for cart in r.carts]
@@ -143,7 +143,7 @@ def _is_doubted(fitted: Fitted, dwells: Sequence[Record]) -> bool:
 
 
 def _is_closer(fitted: Fitted, other: Fitted, dwells: Sequence[Record]) -> bool:
-    """Whether the first fit explains its own records, and the dwells follow it more closely."""
+    """Whether `fitted` explains its own records, and dwells follow it more closely than `other`."""
     assert fitted.fit is not None
     lost = [
         sum(one.fits[r.id].share for r in dwells if r.id in one.fits) for one in (fitted, other)
@@ -152,7 +152,7 @@ def _is_closer(fitted: Fitted, other: Fitted, dwells: Sequence[Record]) -> bool:
 
 
 def _held(fit: ChainFit | None, runs: Runs) -> Fitted | None:
-    """Return a fit with how all records follow it, used or not."""
+    """Return a fit, and how all records follow it, whether used or not."""
     records = [*runs.used, *runs.left_out]
     return Fitted(fit=fit, fits=follow(records, fit.chain)) if fit else None
 
@@ -169,13 +169,13 @@ def _kinds_that_follow(records: Sequence[Record], fitted: Fitted) -> set[str]:
 def _votes(kinds: Set[str]) -> int:
     """Return the number of kinds, with steps and sweeps as one kind.
 
-    They count as one because they are logged in the same way.
+    Steps and sweeps count as one kind because they are logged in the same way.
     """
     return len({"step" if kind == "sweep" else kind for kind in kinds})
 
 
 def _contrary_kinds(records: Sequence[Record], fitted: Fitted) -> set[str]:
-    """Return the kinds of which most records follow no carts similar to the fitted ones."""
+    """Return the kinds of record of which most follow no chain similar to the fitted one."""
     assert fitted.fit is not None
     chain, by_id = fitted.fit.chain, {record.id: record for record in records}
 
@@ -202,10 +202,10 @@ def _by_kind(records: Sequence[Record], fitted: Fitted) -> dict[str, list[str]]:
 def _conflict(
     records: Sequence[Record], fitted: Fitted, *, mine: Set[str], theirs: Set[str]
 ) -> dict[str, RecordingFault]:
-    """Return why kinds that follow different chains may not be used, by record.
+    """Return, by record, why kinds of experiment that follow different chains may not be used.
 
-    There is a conflict only if a known mistake would turn one into the other. Otherwise the carts
-    may really behave in both ways.
+    There is a conflict only if a known mistake would turn one chain into the other. Otherwise the
+    carts may really behave in both ways.
     """
     assert fitted.fit is not None
     chain, ids = fitted.fit.chain, _by_kind(records, fitted)
@@ -226,7 +226,7 @@ def _conflict(
 
 
 def _decay_dampings(initial: Mapping[str, Estimate], *, n: int) -> dict[int, Estimate]:
-    """Return by cart its own damping ratio, if decays give it."""
+    """Return each cart's own damping ratio, by cart, if decays give it."""
     own = {cart: initial.get(own_zeta(cart, n=n)) for cart in range(1, n + 1)}
     return {
         cart: zeta

@@ -16,12 +16,12 @@ class Log:
 
     skipped: list[Skipped] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-    measured: dict[Any, Any] = field(default_factory=dict)  # results by stage, run and cart
+    measured: dict[Any, Any] = field(default_factory=dict)  # results by stage, record and cart
 
     def attempt(self, stage: Stage, run: Callable[[], T], *, of: str = "") -> T | None:
         """Run one stage; if the data are unsuitable, note the reason and return None.
 
-        `of` is the id of the recording, if the stage uses a single one.
+        `of` is the id of the recording, if the stage uses only one.
         """
         try:
             return run()
@@ -30,7 +30,7 @@ class Log:
             return None
 
     def attempt_once(self, stage: Stage, run: Callable[[], T], *, of: str, cart: int) -> T | None:
-        """Run a stage of one record once, as its result does not depend on the other records."""
+        """Run a stage of one record only once; its result does not depend on other records."""
         key = stage, of, cart
         if key not in self.measured:
             try:
@@ -58,7 +58,7 @@ class Log:
         )
 
     def warn(self, texts: Iterable[str]) -> None:
-        """Add warnings that do not exist already."""
+        """Add warnings, except those that exist already."""
         self.warnings += [text for text in texts if text and text not in self.warnings]
 
     def add(self, other: "Log") -> None:

@@ -14,15 +14,15 @@ from pipeline.words.numbers import by_note
 from pipeline.words.phrases import phrases
 
 _WORDS = phrases("skipped")
-# m/s. The carts of a bench reach 0.4, those of inverted pendulums 3. Centimetres read as metres
+# m/s. The carts of a bench reach 0.4, and those of inverted pendulums 3. Centimetres read as metres
 # give 15 to 40.
 _FASTEST = 10.0
 
 
 def reading_remarks(data: Ingested, *, unit: str) -> list[str]:
-    """Return the notes from reading, decays in another unit, and a `unit` that fits no record.
+    """Return notes from reading the files, on decays in another unit, and if `unit` is wrong.
 
-    A wrong unit of decays does no harm.
+    The unit of a decay does not matter for its result.
     """
     units = find_other_units(data.records, decays=True)
     return [
@@ -56,7 +56,7 @@ def hand_remarks(interventions: Sequence[Intervention], *, records: Sequence[Rec
 def _too_fast(records: Sequence[Record], *, unit: str) -> list[str]:
     """Return a warning if the carts are impossibly fast in two kinds of experiments.
 
-    A single kind may be an accident.
+    If only one kind of experiment is too fast, it may be an accident.
     """
     metres = conversion(unit, "m")
     fastest: dict[str, tuple[float, str]] = {}
@@ -75,8 +75,8 @@ def _speed(record: Record) -> float:
     moved, took = record.y[:, span:] - record.y[:, :-span], record.t[span:] - record.t[:-span]
     if not took.size:
         return 0.0
-    # Taken over 20 ms and without the fastest hundredth, since a jump of the encoder is not a
-    # speed.
+    # The speed is taken over 20 ms and without the fastest hundredth, because a jump of the encoder
+    # is not a speed.
     return float(np.quantile(np.abs(moved) / took, 0.99, axis=1).max())
 
 

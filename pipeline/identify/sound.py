@@ -1,4 +1,4 @@
-"""Choose the records that identify the carts: those that hold what happened."""
+"""Choose the records that identify the carts: those that show what happened."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -19,7 +19,7 @@ from pipeline.soundness.repeats import find_outlier_repeats
 from pipeline.stages.bode_fit import fit_bode
 from pipeline.words.progress import Progress
 
-_ROUNDS = 4  # rounds. In each, the used records may show that others are wrong
+_ROUNDS = 4  # In each round, the used records may show that others are wrong
 
 
 def identify_from_sound(
@@ -35,8 +35,8 @@ def identify_from_sound(
     have this reading too.
     """
     driven = [r for r in data.records if r.kind in ("step", "sweep")]
-    # Faults that input or encoder show by themselves stay, because later rounds do not see these
-    # records.
+    # Faults that input or encoder show by themselves are kept, because later rounds do not see
+    # their records.
     shown = {
         **find_other_units(data.records),
         **find_stuck(data.records),
@@ -57,15 +57,16 @@ def identify_from_sound(
     )
     found = again(without=without)
     for _ in range(_ROUNDS):
-        # If too little is left to identify the carts, the earlier result stays.
+        # If too few records remain to identify the carts, the earlier result is kept.
         chain, fits = _witness(found, data, bench=bench) or (chain, fits)
         faults = find_faults(data.records, chain=chain, fits=fits)
         shown |= find_impossible_gains(found.gains)
         shown |= {**found.repeats.odd, **found.fitted.conflict}
-        # Search for odd repeats among good records only, because most repeats may be wrong.
+        # Search for odd repeats only among good records, because otherwise most repeats may be
+        # wrong.
         sound = [record for record in driven if record.id not in faults]
         odd = find_outlier_repeats(sound, unit=bench.units.position)
-        # A fault that says how a record is wrong has priority over one that only calls it odd.
+        # A fault that says how a record is wrong has priority over a fault that only calls it odd.
         doubted = {name: one for name, one in faults.items() if not one.is_wrong}
         left_out = {**odd, **doubted, **shown, **{n: f for n, f in faults.items() if f.is_wrong}}
         if left_out.keys() == without:
@@ -88,9 +89,9 @@ def identify_from_sound(
 def _witness(
     found: Identified, data: Ingested, *, bench: Bench
 ) -> tuple[Chain, Mapping[str, Followed]] | None:
-    """Return the chain that the records follow, and how they follow it.
+    """Return the chain that the records follow, and how each record follows it.
 
-    If swapping two columns gives a chain that explains the data, that one is returned.
+    If a chain explains the data only after two columns are swapped, it is returned.
     """
     if found.fit and found.fit.converged and most_follow(found.fitted.fits):
         return found.fit.chain, found.fitted.fits

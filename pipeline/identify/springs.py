@@ -1,4 +1,4 @@
-"""Find the springs of a new submission from its steps; mark the unsure ones.
+"""Find the springs of a new submission from its steps; mark springs that are uncertain.
 
 Beyond cart 1, all springs carry the same static force. So the static gains give ratios of
 stiffnesses: k_(n+1) / k_n = K_(n-1) / K_n - 1. Without a spring at the far wall all carts move
@@ -40,7 +40,7 @@ class Filled:
 
 @dataclass(frozen=True, kw_only=True)
 class Springs:
-    """The springs present, the reason, and the unsure springs (numbers from 1)."""
+    """The springs present, the reason, and the numbers (from 1) of uncertain springs."""
 
     present: tuple[bool, ...]
     why: str
@@ -48,11 +48,11 @@ class Springs:
 
 
 def fill(folder: Path) -> Filled:
-    """Write the tables of the files in `data/`, and into a new `submission.toml` the springs too.
+    """Write the tables of the files in `data/`, and the springs if `submission.toml` is new.
 
     Raises
     ------
-    ConfigError, SubmissionError : as `fill_submission`.
+    ConfigError, SubmissionError : as in `fill_submission`.
     """
     new = not (folder / NAME).exists()
     files = fill_submission(folder)
@@ -123,7 +123,7 @@ def decide_springs(records: Sequence[Record], *, n: int) -> Springs:
 
 
 def _stays_away(step: Record) -> bool:
-    """Whether the carts end a step far from their start, although the input is the same."""
+    """Whether the carts end a step far from their start, although the input is the same again."""
     u, moved = step.u, np.ptp(step.y, axis=1)
     if u is None or not np.all(moved > 0) or abs(u[-1] - u[0]) > 0.02 * np.ptp(u):
         return False
@@ -132,7 +132,7 @@ def _stays_away(step: Record) -> bool:
 
 
 def _gains(step: Record) -> list[StepGain]:
-    """Return the static gains of all carts, [] if a cart does not settle."""
+    """Return the static gains of all carts, or [] if a cart does not settle."""
     try:
         return [fit_step_gain(step, cart=cart) for cart in sorted(step.carts)]
     except DataError:
@@ -140,7 +140,7 @@ def _gains(step: Record) -> list[StepGain]:
 
 
 def _ratio(before: StepGain, last: StepGain) -> tuple[float, float]:
-    """Return the least and largest ratio of the last spring to the one before, as steps allow."""
+    """Return the range of ratios of the last spring to the one before that the steps allow."""
     (near, far), (low, high) = _bounds(before), _bounds(last)
     return near / high - 1, far / low - 1 if low > 0 else np.inf
 

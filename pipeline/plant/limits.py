@@ -1,15 +1,16 @@
 """Limits for verdicts on a plant, a loop or an effect, each with its reason."""
 
-HEAVY_DAMPING = 0.3  # damping ratio; above it the usual orders of frequencies may fail
-CALIBRATION = 1e-3  # relative; no encoder or motor of a teaching bench is known better
-SETTLING_BAND = 0.02  # of the change in level, the 2 % criterion
+HEAVY_DAMPING = 0.3  # damping ratio; above it, resonances and nulls may lose their usual order
+CALIBRATION = 1e-3  # relative error; encoders and motor of a bench are not known more accurately
+SETTLING_BAND = 0.02  # share of the change in level: the 2 % criterion
 
-# Relative errors that a design must tolerate: of an identified mass or spring, and of a damping.
-# The damping of a real cart differs by a quarter between driven and free motion, its spring by some
-# percent.
+# Relative errors that a design must tolerate: one for identified masses and springs, one for
+# dampings. Between driven and free motion, a real cart's damping differs by a quarter and its
+# spring by some percent.
 MASS_SPRING_ERROR, DAMPING_ERROR = 0.03, 0.30
 
-# Sample times. A delay and a lag of size T have the same mean delay. They first differ in the
-# second moment, by T²/2, which is here an eighth of a sample squared.
+# In sample times. A delay and a lag of the same size T delay the input equally on average. They
+# first differ in the second moment, by T²/2. At this limit that is an eighth of a squared sample
+# time.
 MUCH_SHORTER = 0.5
-LEAST_SLIDING = 0.01  # of the force at rest; no dry surface slides with less
+LEAST_SLIDING = 0.01  # share of the friction at rest; any dry surface has more while it slides

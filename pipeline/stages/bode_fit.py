@@ -1,7 +1,7 @@
 """Fit one chain to the frequency responses of all carts at once.
 
-The stage-by-stage result is turned into a physical chain. Then all carts are fitted jointly: first
-on a logarithmic scale to get near, then by maximum likelihood, each point with its standard error.
+The stage-by-stage result is turned into a physical chain. Then all carts are fitted together: first
+on a logarithmic scale to come near, then by maximum likelihood, with each point's standard error.
 """
 
 import itertools
@@ -27,12 +27,12 @@ from pipeline.plant.linear.recovery import recover_chain
 from pipeline.results import EXPLAINED, ChainFit, Estimate, FrequencyResponse
 from pipeline.set_up import Bench
 
-_START_SPREAD = 0.5  # of ln m and ln k of a random start, mostly half to double
+_START_SPREAD = 0.5  # standard deviation of ln m and ln k in random starts
 _START_ZETAS = (0.02, 0.3)
-_SEED = 2005  # of the random starts. Any number, but always the same
-_NEAR, _PRECISION = 1e-3, 1e-8  # relative change of the cost at the end of a fit: first, last
+_SEED = 2005  # of the random starts; any number, but always the same
+_NEAR, _PRECISION = 1e-3, 1e-8  # relative change of the cost at the end of the first and last fit
 _EVALUATIONS = 100  # a successful fit takes about ten
-_SHARES, _SHARE_PRECISION = (1e-6, 10.0), 0.01  # bounds of a missing relative error; its accuracy
+_SHARES, _SHARE_PRECISION = (1e-6, 10.0), 0.01  # bounds and precision of an added error
 
 
 def fit_bode(
@@ -48,21 +48,21 @@ def fit_bode(
     Phases are used if they agree with the magnitudes. Without more magnitudes than parameters, they
     are used without this check.
 
-    A parameter that the data put at or below zero is held at zero, and the others are fitted again.
-    A few dwells next to a sharp peak do not bound its damping away from zero. Then the damping
-    ratios of decays become further points of the fit, if they do not contradict the dwells.
+    If the data put a parameter at or below zero, it is held at zero and the others are fitted
+    again. A few dwells next to a sharp peak may put a damping at zero. Then the damping ratios of
+    decays become further points of the fit, if they do not contradict the dwells.
 
-    A misfit larger than the points' standard errors allow means that the chain does not describe
-    the bench that precisely. Then the same relative error is added to all points until it does, and
-    the chain is fitted once more. `chi_square_per_dof` and `standardised` use the stated errors.
-    For a table without errors, standard errors follow the misfit in any case.
+    If the misfit is larger than the points' standard errors allow, the chain does not describe the
+    bench that precisely. Then the same relative error is added to all points until it does, and the
+    chain is fitted once more. `chi_square_per_dof` and `standardised` still use the stated errors.
+    For a table without errors, standard errors follow from the misfit in any case.
 
     Parameters
     ----------
-    bench : its carts and springs.
+    bench : the carts and springs of the bench.
     initial : named parameters to start from, if known.
-    decays : by cart, its own damping ratio. Used only if the responses put it at zero.
-    near : a similar chain, fitted before. It then is the only start.
+    decays : each cart's own damping ratio, used only if the responses put it at zero.
+    near : a similar chain from an earlier fit, which is then the only start.
 
     Returns
     -------
@@ -70,8 +70,8 @@ def fit_bode(
 
     Raises
     ------
-    DataError : too few amplitudes and phases for the parameters, responses that do not determine
-        them, or no successful start.
+    DataError : there are too few amplitudes and phases for the parameters, the responses do not
+        determine them, or no start succeeds.
     """
     P, n = Parametrisation(bench=bench), bench.n
     data = Points.collect(responses, n=n)
@@ -122,7 +122,7 @@ def _stand_in(data: Points, known: Mapping[str, float], *, bench: Bench) -> Chai
 def _staged_start(
     data: Points, known: Mapping[str, float], *, bench: Bench, like: Chain
 ) -> tuple[StagedFit | None, Chain]:
-    """Fit stage by stage; return the implied chain, corrected to be physically possible."""
+    """Fit stage by stage; return this fit and its chain, corrected to be physically possible."""
     if not any(bench.springs):
         return None, like
     measured = {}
@@ -204,7 +204,7 @@ def _solve(P: Parametrisation, data: Points, theta: Array, scale: Scale) -> _Fit
 def _fit_from_starts(
     P: Parametrisation, data: Points, starts: Iterable[Chain]
 ) -> tuple[_Fitted, int]:
-    """Fit from one start after the other until the data are explained."""
+    """Return the best fit and the number of starts, tried until one explains the data."""
     fits: list[_Fitted] = []
     failed: list[DataError] = []
     for start in starts:
@@ -225,9 +225,8 @@ def _fit_phases(fitted: _Fitted, data: Points) -> tuple[_Fitted, str]:
     """Fit again with the phases, if there are any and they agree with the magnitudes."""
     if not data.n_phases:
         return fitted, ""
-    # The phases are rejected if they are this many times as far off as the magnitudes, as with a
-    # delay or a wrong sign. This cannot be checked with only as many magnitudes as parameters,
-    # because the fit does not predict phases then.
+    # Phases are rejected if they are this many times as far off as magnitudes, for example because
+    # of a delay. With only as many magnitudes as parameters, the fit does not predict phases.
     limit = 3.0 * max(1.0, fitted.chi_square_per_dof**0.5)
     if fitted.dof > 0 and _phase_misfit(fitted, data) > limit:
         return fitted, "only magnitudes are fitted: the phases do not agree with them"
@@ -235,9 +234,9 @@ def _fit_phases(fitted: _Fitted, data: Points) -> tuple[_Fitted, str]:
 
 
 def _widen(fitted: _Fitted, data: Points) -> tuple[_Fitted, float]:
-    """Fit again with the relative error that explains the misfit; 0 if not needed."""
+    """Return a fit with the relative error that explains the misfit, and this error (or 0)."""
     excess = fitted.chi_square_per_dof - 1
-    # χ² may exceed its mean by 3.1 standard deviations; by chance that happens once in a thousand.
+    # χ² may exceed its mean by 3.1 standard deviations; by chance this happens once in a thousand.
     if data.from_table or excess <= 3.1 * np.sqrt(2 / fitted.dof):
         return fitted, 0.0
     share = 0.0
@@ -270,14 +269,15 @@ def _chi_square(fitted: _Fitted, data: Points) -> float:
 def _hold_vanished(
     fitted: _Fitted, data: Points, decays: Mapping[int, Estimate]
 ) -> tuple[_Fitted, Points]:
-    """Fit again with all parameters held at zero that the data put there or below.
+    """Fit again with those parameters held at zero that the data put at or below zero.
 
-    If a decay gives one of these dampings, all decays join the fit: points that do not determine
-    one damping say little about the others. Also return the points, with these decays.
+    If a decay gives a damping that the data put at zero, all decays join the fit, because points
+    that do not determine one damping say little about the others. Also return the points, with the
+    decays in the fit.
     """
     P, chain = fitted.parametrisation, fitted.chain
     sizes = _natural_sizes(P, chain, data)
-    # A damping or far spring below 1e-4 of its usual size, and k_1 below zero.
+    # A damping or far spring has vanished below 1e-4 of its usual size, and k_1 below zero.
     vanished = [
         name
         for name, value, size in zip(P.names, P.physical(chain), sizes, strict=True)
@@ -286,7 +286,7 @@ def _hold_vanished(
     if not vanished:
         return fitted, data
     needed = {cart: zeta for cart, zeta in decays.items() if f"c_{cart}" in vanished}
-    k = chain.k[:-1] + chain.k[1:]  # not positive if k_1 is below zero; the cart then has no decay
+    k = chain.k[:-1] + chain.k[1:]  # not positive if k_1 is below zero; then decays are not used
     for told in (decays, needed) if needed and np.all(k > 0) else ():
         c = chain.c.copy()
         for cart, zeta in told.items():
@@ -295,7 +295,7 @@ def _hold_vanished(
         held = P.holding_at_zero(*(name for name in vanished if name not in names))
         along = replace(data, decays=told)
         both = _solve(held, along, held.pack(replace(chain, c=c)), fitted.scale)
-        # Each decay may add this to χ²; by chance it is three standard errors off.
+        # Each decay may add up to 9 to χ², which is three standard errors.
         if both.chi_square < fitted.chi_square + 9.0 * len(told):
             return _hold_vanished(both, along, {})
     held = P.holding_at_zero(*vanished)
@@ -337,12 +337,12 @@ def _result(
         covariance *= chi_square_per_dof
     G, _ = response_at(P, data, P.physical(chain))
     standardised = (data.magnitude - np.abs(G)) / data.std
-    remarks = [remark, *(f"{name} is at its bound, zero" for name in P.zero)]
+    remarks = [remark, *(f"{name} is held at zero" for name in P.zero)]
     told = [f"c_{cart}" for cart in data.decays]
     if told:
         remarks.append(
-            "the points of the response alone give zero, the bound, for a damping; so the damping "
-            f"ratio of the decays is part of the fit ({', '.join(told)})"
+            "the frequency response alone puts a damping at zero, so the fit also uses the damping "
+            f"ratios of decays ({', '.join(told)})"
         )
     parameters = named_estimates(chain, names=names, covariance=covariance, source="bode_fit")
     for cart in data.decays:
@@ -350,8 +350,8 @@ def _result(
         parameters[name] = replace(parameters[name], source=data.decays[cart].source)
     if share > 0:
         remarks.append(
-            f"the points are {100 * share:.2g} % off the model, more than their errors; the "
-            "standard errors of the parameters include this"
+            f"the points are {100 * share:.2g} % away from the model, more than their errors "
+            "allow; the standard errors of the parameters include this"
         )
     if not fitted.converged:
         remarks.append(f"not converged after {_EVALUATIONS} evaluations")
@@ -390,7 +390,7 @@ def _covariance(
         sizes = _natural_sizes(Q, chain, data)
         _, J = weighted_residuals(Q, data, scale, Q.physical(chain))
         _, singular, V = np.linalg.svd(J * sizes, full_matrices=False)
-        # The smallest singular value over the largest, with columns in natural sizes.
+        # Limit on the smallest singular value over the largest, with columns in natural sizes.
         if singular[-1] >= 1e-8 * singular[0]:
             root = (V / singular[:, None]) * sizes
             return Q.names, root.T @ root

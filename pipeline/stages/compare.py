@@ -12,12 +12,12 @@ from pipeline.names import read_name
 from pipeline.results import Estimate, ParameterRow
 from pipeline.set_up import Bench
 
-# From the paper's own tables: the two estimates of gains and frequencies differ by up to 14 %. For
-# one null, read by eye, it is 29 %. Damping ratios differ by half and more.
+# In Throne's tables, the two estimates of gains and frequencies differ by up to 14 %. For one null,
+# read by eye, it is 29 %. Damping ratios differ by half and more.
 GAIN_AND_FREQUENCY_LIMIT, DAMPING_LIMIT = 15.0, 50.0  # percent
-SIGMA_LIMIT = 3.0  # combined standard errors. A smaller difference may be chance
+SIGMA_LIMIT = 3.0  # combined standard errors; a smaller difference may be due to chance
 _UNDECIDED = "the two estimates are too uncertain to agree or to disagree"
-AT_BOUND = "the fit ends at its bound, zero: its data are too few, so there is no final value"
+AT_BOUND = "the fit puts it at zero because it has too few data, so there is no final value"
 NOT_DETERMINED = (
     "not determined: the standard error is {percent:.0f} % of the value, more than the "
     "{limit:.0f} % that initial and final may differ by"
@@ -37,7 +37,7 @@ def compare(
 
     Parameters
     ----------
-    fitted_to : the recordings behind the final estimates.
+    fitted_to : the recordings used for the final estimates.
     """
     rows = []
     for name in names:

@@ -25,16 +25,15 @@ from pipeline.results import Estimate, FrequencyResponse, Record, SinePoint
 # Largest relative standard error of a record's response; other frequencies are dropped.
 _LARGEST_RELATIVE_STD = 0.2
 # Two dwells are repeats if their frequencies differ by less than this. A fitted frequency is
-# accurate to some 1e-4. Within that, no response changes by more than its standard error.
+# accurate to some 1e-4. Within this limit, no response changes by more than its standard error.
 _SAME_FREQUENCY = 1e-3
-# No bench measures better, and exact data would get infinite weight.
+# No bench measures more accurately, and exact data would get infinite weight.
 _SMALLEST_RELATIVE_STD = 1e-6
 
 
-# Peaks and nulls.
-# A mode was passed if the response at twice its frequency is so many times below the low level.
+# A mode has been passed where the response has fallen by this factor from low frequencies.
 _CLEAR_FALL = 3.0
-# Share of the first resonance. Below it, the magnitude gives the static gain.
+# Share of the first resonance. At a lower frequency, the magnitude gives the static gain.
 _LOW_SHARE = 0.7
 
 
@@ -56,9 +55,9 @@ def dwell_fault(point: SinePoint) -> str:
 def collect_dwells(points: Sequence[SinePoint]) -> tuple[FrequencyResponse, ...]:
     """Collect dwells into one frequency response per cart; repeats become one point.
 
-    Repeats are combined to their weighted mean. Its standard error grows if they scatter by more
-    than their own errors allow. A dwell that did not settle is used with an added error of 5 %. A
-    dwell with a `dwell_fault` is not used.
+    Repeats are combined to their weighted mean. Its standard error grows if the repeats scatter by
+    more than their own errors allow. A dwell that did not settle is used with an added error of 5
+    %. A dwell with a `dwell_fault` is not used.
 
     Raises
     ------
@@ -84,7 +83,7 @@ def _collect_cart(points: Sequence[SinePoint], *, cart: int) -> FrequencyRespons
         groups[-1].append(point)
     rows = []
     for group in groups:
-        # A dwell that ends before its steady state is wrong by a few percent.
+        # The amplitude of a dwell that ends before its steady state is wrong by a few percent.
         extra = np.array([0.0 if p.settled else 0.05 for p in group])
         gain = np.array([p.gain for p in group])
         magnitude, magnitude_std = _weighted_mean(
@@ -133,8 +132,9 @@ def _weighted_mean(values: Array, std: Array) -> tuple[float, float]:
 def response_from_records(records: Sequence[Record]) -> tuple[FrequencyResponse, ...]:
     """Return the frequency response of each cart from step and sweep records with all carts free.
 
-    Each record gives a ratio of transforms (`record_transforms`). The records are averaged by
-    weight, with their scatter. Only frequencies at which the input moves the cart are returned.
+    Each record gives a ratio of transforms (`record_transforms`). These ratios are averaged with
+    weights, and their scatter is included in the standard error. Only frequencies at which the
+    input moves the cart are returned.
 
     Raises
     ------
@@ -211,11 +211,11 @@ class _Extremum(NamedTuple):
 
 
 def find_resonances(responses: Sequence[FrequencyResponse], *, n: int) -> dict[str, Estimate]:
-    """Estimate resonances, nulls and gains from the measured magnitudes, as the paper does.
+    """Estimate resonances, nulls and gains from the measured magnitudes, as in Throne's paper.
 
-    - Resonances are the peaks that the carts share. If the damping of a first mode is too large for
-      a peak, it is found from the fall of the last cart's response above the others. If fewer than
-      n are found, they get no names, as it is unknown which one is missing.
+    - Resonances are the peaks that the carts share. If one mode has too much damping for a peak, it
+      is found from the fall of the last cart's response above the other modes. If fewer than n
+      resonances are found, they get no names, because it is unknown which one is missing.
     - Nulls of cart 1 give omega_x and omega_y (three carts). Nulls of the last cart but one give
       the last cart's own frequency.
     - Gains are the magnitudes at the lowest frequency.
@@ -251,7 +251,7 @@ def find_resonances(responses: Sequence[FrequencyResponse], *, n: int) -> dict[s
 
 
 def _estimates(names: Sequence[str], extrema: Sequence[_Extremum]) -> Mapping[str, Estimate]:
-    """Name extrema in ascending order; {} if their number differs from that of the names."""
+    """Name extrema in ascending order; {} if there are more or fewer extrema than names."""
     if len(names) != len(extrema):
         return {}
     return {
@@ -272,19 +272,20 @@ def _strongest(extrema: Sequence[_Extremum], count: int) -> list[_Extremum]:
 
 
 def _extrema(response: FrequencyResponse, *, sign: int) -> list[_Extremum]:
-    """Find the maxima (sign 1) or minima (sign -1) of ln|G| beyond its standard errors."""
+    """Find the maxima (sign 1) or minima (sign -1) of ln|G| that exceed its standard errors."""
     seen = (response.omega > 0) & (response.magnitude > 0)
     omegas, magnitude = response.omega[seen], response.magnitude[seen]
     error = response.magnitude_std[seen] / magnitude
     level, position = sign * np.log(magnitude), np.log(omegas)
     found = []
     for i in range(1, level.size - 1):
-        # A point with a larger relative error shows no peak.
+        # A point with a larger relative error than 0.1 shows no peak.
         if not level[i - 1] < level[i] >= level[i + 1] or (sign > 0 and error[i] > 0.1):
             continue
         left, right = level[:i][::-1], level[i + 1 :]
         prominence = level[i] - max(_saddle(left, level[i]), _saddle(right, level[i]))
-        # Prominence of ln|G|: six standard errors, as noise alone reaches five in 40 points.
+        # Least prominence of ln|G|: six standard errors, because noise alone reaches five in 40
+        # points.
         if prominence < max(0.05, 6 * np.max(error[i - 1 : i + 2])):
             continue
         curve = np.polyfit(position[i - 1 : i + 2] - position[i], level[i - 1 : i + 2], 2)
@@ -301,12 +302,12 @@ def _saddle(side: Array, peak: float) -> float:
 
 
 def _shared_peaks(responses: Sequence[FrequencyResponse], *, n: int) -> list[_Extremum]:
-    """Return up to n peaks, those that most carts show most clearly."""
+    """Return up to n peaks: those that most carts show most clearly."""
     peaks = sorted((peak, r.cart) for r in responses for peak in _extrema(r, sign=1))
     clusters: list[dict[int, _Extremum]] = []  # at most one peak of each cart
     start = 0.0
     for peak, cart in peaks:
-        # In ln(omega); the carts share their resonances.
+        # The carts share their resonances, so peaks within 0.15 in ln(omega) are one.
         if not clusters or np.log(peak.omega / start) > 0.15:
             clusters.append({})
             start = peak.omega
@@ -325,8 +326,8 @@ def _shared_peaks(responses: Sequence[FrequencyResponse], *, n: int) -> list[_Ex
 def _with_damped_mode(response: FrequencyResponse, modes: Sequence[_Extremum]) -> list[_Extremum]:
     """Add the mode without a peak, from the decrease of the last cart above all other modes.
 
-    There |G_n| falls as K_n times the product of 1/|1 - (omega/omega_j)²|. Dividing by the known
-    modes leaves 1/((omega/omega_0)² - 1).
+    Above the modes, |G_n| falls as K_n times the product of 1/|1 - (omega/omega_j)²|. Dividing by
+    the factors of the known modes leaves 1/((omega/omega_0)² - 1).
     """
     top = max((mode.omega for mode in modes), default=0.0)
     above = (response.omega > 1.5 * top) & (response.magnitude > 0)
@@ -352,7 +353,7 @@ def _low_frequency_gain(response: FrequencyResponse, *, resonance: float | None)
     ratio = float(response.omega[0]) / resonance
     rise = abs(1 - ratio**2 + 2j * ASSUMED_ZETA * ratio)
     magnitude, std = float(response.magnitude[0]), float(response.magnitude_std[0])
-    doubt = abs(rise - 1) / 2 * magnitude  # the assumed damping, and the modes above
+    doubt = abs(rise - 1) / 2 * magnitude  # due to the assumed damping, and the modes above
     return Estimate(
         value=magnitude * rise, std=float(np.hypot(std, doubt)), source="frequency_response"
     )

@@ -1,8 +1,9 @@
 """Compare the identified chain with a run it was not fitted to: Figures 15-17.
 
-There are two simulations per cart. In "closed", the controller that ran closes the loop around the
-chain, with its delay and saturation. In "open", the measured input drives the chain. It also tests
-the logged input's sign and scale, since some benches change both when the loop is closed.
+There are two simulations of each cart. In "closed", the controller that ran on the hardware closes
+the loop around the chain, with its delay and saturation. In "open", the measured input drives the
+chain. This also tests the sign and scale of the logged input, because some benches change both when
+the loop is closed.
 """
 
 from dataclasses import dataclass, replace
@@ -20,13 +21,13 @@ from pipeline.plant.loop import sampled_loop
 from pipeline.plant.loop.sampled_loop import Controller, LoopRun, Pid, StateFeedback
 from pipeline.results import HardwareCheck, Record
 
-# A factor on the input within 1.5 is an error of the model, not of the log. Another sign or scale
+# A factor on the input of up to 1.5 is an error of the model, not of the log. Another sign or scale
 # is accepted if two conditions hold: the difference falls to 0.6 or less of what it was, and to at
 # most 0.7 of the motion.
 _TRUSTED, _WORTH_IT, _HALF = 1.5, 0.6, 0.7
-_WRONG = 0.1  # of the motion. With a larger error, the model does not belong to the run
-_SERVO_PERIOD = 0.000884  # s. Of the ECP controller, whose log keeps one sample in several
-_SETTLED_SHARE = 0.2  # of the time after a step. The mean of this end is the steady state
+_WRONG = 0.1  # share of the motion; with a larger error, the model does not belong to the run
+_SERVO_PERIOD = 0.000884  # of the ECP controller, s; its log keeps one sample in several
+_SETTLED_SHARE = 0.2  # share of the time after a step; the steady state is the mean of this end
 
 
 def check_hardware(
@@ -39,13 +40,13 @@ def check_hardware(
 ) -> tuple[HardwareCheck, ...]:
     """Compare the chain with one run, cart by cart: the closed loop first, then the open loop.
 
-    Any run with a logged input can be used. `controller` is what ran on the hardware. Without it,
-    or without its gains, the loop is not closed.
+    Any run with a logged input can be used. `controller` is what ran on the hardware. Without a
+    controller, or without its gains, the loop is not closed.
 
     Parameters
     ----------
-    controlled_cart : the cart whose position a PID controller fed back, unless the controller says
-        it.
+    controlled_cart : the cart whose position a PID controller fed back, unless the controller
+        states it.
     input_limit : limit of the input. A lower limit found in the log has priority.
 
     Raises
@@ -85,7 +86,7 @@ def check_hardware(
 class _Simulated:
     """Simulated readings (f, n) of the free carts.
 
-    `factor` is the factor used on the input, `scale` the best one. `u` (n,) is the input of a
+    `factor` is the factor used on the input, `scale` the best factor. `u` (n,) is the input of a
     simulated loop.
     """
 
@@ -132,7 +133,8 @@ def _plant_law(
 ) -> Controller | None:
     """Return the controller for the simulation; None if there is nothing to simulate.
 
-    A PID acts on the error in the file's own counts, which `position_scale` converted to positions.
+    A PID controller acts on the error in the file's own counts, which `position_scale` converted to
+    positions.
     """
     if isinstance(controller, submission.PidController):
         return Pid(
@@ -166,8 +168,8 @@ def _close(
 ) -> _Simulated:
     """Close the loop around the chain.
 
-    The logged input may be a multiple of what the stated law gives. If scaling the law by that
-    factor explains the run far better, it is scaled. Otherwise it is used as stated.
+    The logged input may be a multiple of what the stated law gives. If the law times this factor
+    explains the run far better, the multiple is used, otherwise the law as stated.
 
     Raises
     ------
@@ -188,7 +190,8 @@ def _close(
             note = f"the logged input {note} what the stated controller asks for"
     if loop is None:
         raise DataError("the stated controller makes it unstable")
-    # Under feedback, a bench may log the input with the opposite sign.
+    # If only the sign differs, the controller is not wrong: under feedback, a bench may log the
+    # input with the opposite sign.
     wrong = abs(times_stated) != 1.0 and misfit <= _WRONG
     return _Simulated(y=loop.x, u=loop.u, note=note, contradicted=wrong)
 
@@ -227,7 +230,7 @@ def _ways(
         chain = run.chain
         model = Chain(m=chain.m / drive, c=chain.c / drive, k=chain.k / drive)
         ways.insert(0, (replace(law, model=model), None, 1))
-    if run.record.sample_time > 3.0 * _SERVO_PERIOD:  # otherwise the two hardly differ
+    if run.record.sample_time > 3.0 * _SERVO_PERIOD:  # otherwise this hardly differs from the first
         ways.append((law, _SERVO_PERIOD, 1))
     return ways
 
@@ -235,7 +238,7 @@ def _ways(
 def _logged_per_stated(
     run: MeasuredRun, law: Controller, *, reference: Array, opened: _Simulated | None
 ) -> list[float]:
-    """Return factors other than 1 between the logged input and that of the law.
+    """Return factors other than 1 between the logged input and the input that the law gives.
 
     The law is evaluated twice: at the readings, and at the positions that the chain has under the
     logged input. With fast sampling, the velocity from readings is mostly noise. But an integral of
@@ -269,11 +272,11 @@ def _median_ratio(logged: Array, stated: Array) -> float:
 
 
 def _not_as_stated(run: MeasuredRun, closed: _Simulated, opened: _Simulated) -> str:
-    """Return a note that another controller ran, if the plant follows its actual input."""
+    """Return a note that another controller ran, if the plant follows the logged input."""
     loop, plant = run.misfit(closed.y), run.misfit(opened.y)
-    # Another loop ran if the plant is accurate to 2 % under its actual input, but the loop is off
-    # by a tenth of the motion and by five times as much. A stable loop increases a plant's error
-    # only a few times.
+    # Another controller ran if the plant is accurate to 2 % under the logged input, but the loop's
+    # error is a tenth of the motion and five times as large. A stable loop increases a plant's
+    # error only a few times.
     if opened.factor != 1.0 or not (plant <= 0.02 and loop > max(_WRONG, 5.0 * plant)):
         return ""
     return (
@@ -308,7 +311,7 @@ def _another_cart(
 
 
 def _plateau(u: Array | None) -> float:
-    """Return the largest input if the log stays at it for more than a sample, else infinity."""
+    """Return the largest input if the log stays at it for more than a sample, or else infinity."""
     if u is None:
         return np.inf
     size = np.abs(u)
@@ -331,7 +334,7 @@ def _compare(
     loop: Literal["closed", "open"],
     steered: int | None,
 ) -> list[HardwareCheck]:
-    """Return a check for each measured cart that moved; the first one has the note."""
+    """Return a check for each measured cart that moved; the first check has the note."""
     record, note = run.record, simulated.note
     steps = record.reference if record.kind == "closed_loop" else record.u
     window = run.step_window(steps) if record.kind in ("closed_loop", "step") else None
@@ -371,7 +374,7 @@ def _compare(
 
 
 class _Step(NamedTuple):
-    """Overshoot in percent, settling time in s and level; None for a value that does not exist."""
+    """Overshoot in percent, settling time in s, and level; None for a value that does not exist."""
 
     overshoot: float | None = None
     settling: float | None = None

@@ -1,4 +1,4 @@
-"""Initial estimates, as in the paper: steps, decays of single carts, peaks and nulls."""
+"""Initial estimates, as in Throne's paper: steps, decays of single carts, peaks and nulls."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ def combine_repeats(
 ) -> Estimate:
     """Combine repeats of one number to their mean.
 
-    Its standard error comes from the spread or from the single errors; the larger one is used.
+    Its standard error is that of the spread or of the single errors, whichever is larger.
     """
     v = np.array(values, dtype=float)
     within = float(np.sqrt(np.sum(np.square(std))) / v.size)

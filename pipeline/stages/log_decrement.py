@@ -10,12 +10,12 @@ from pipeline.estimation.decay.free_decay import FreeDecay, find_decay, fit_deca
 from pipeline.estimation.noise import grain
 from pipeline.results import LogDecrement, Record
 
-_PEAKS_FOR_REGRESSION = 4  # these give two amplitudes
+_PEAKS_FOR_REGRESSION = 4  # enough for two amplitudes
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Peaks:
-    """Turning points, and the decrement and damped frequency from them with standard errors."""
+    """Turning points, and the decrement and damped frequency from them, with standard errors."""
 
     t: Array
     y: Array
@@ -44,10 +44,10 @@ class _Peaks:
 def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
     """Estimate damping ratio and natural frequency of one cart from its free decay.
 
-    The decay is searched for: a hold, a hand or a driven part may come before it. There are two
-    estimates. One is the classical one from the peaks. The other is an exponential sinusoid with a
-    drifting rest point, fitted to every sample. Dry friction is tested for. The method is valid for
-    one free cart on at least one spring and damping ratios up to about 0.6.
+    The decay is searched for, because a hold, a hand or a driven part may precede it. There are two
+    estimates: the classical one from the peaks, and an exponential sinusoid with a drifting rest
+    point, fitted to every sample. Dry friction is tested for. The method is valid for one free cart
+    on at least one spring and damping ratios up to about 0.6.
 
     Raises
     ------
@@ -62,8 +62,8 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
     fit, pole = decay.fit, complex(decay.fit.poles[0])
     omega_n, zeta = abs(pole), -pole.real / abs(pole)
     unexplained = fit.rms / float(np.ptp(y[decay.first : decay.stop]))
-    # A fit with a larger residual describes another motion. Real carts with dry friction leave 1.3
-    # to 2.1 % (ten runs).
+    # A fit with a larger residual belongs to another kind of motion. Real carts with dry friction
+    # leave 1.3 to 2.1 % (ten runs).
     if not (0 < zeta < 1 and pole.imag > 0 and unexplained < 0.08):
         raise DataError(
             f"{record.id}: log decrement needs a decaying oscillation of cart {cart}, found "
@@ -119,7 +119,7 @@ def _pole_errors(pole: complex, covariance: Array) -> tuple[float, float]:
 
 
 def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
-    """Locate the turning points between samples and regress ln A on their number.
+    """Locate the turning points between samples, and regress the log amplitude on their number.
 
     With fewer than four turning points, the values are those of the exponential fit.
     """
@@ -142,18 +142,19 @@ def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
             omega_d=pole.imag,
             omega_d_std=float(omega_d_std),
         )
-    # The noise of A is constant, so ln A has the weight A². The standard errors follow from those
-    # of the turning points, which neighbouring amplitudes share.
+    # The noise of the amplitude A is constant, so ln A has the weight A². The standard errors
+    # follow from the errors of the turning points, because neighbouring amplitudes share them.
     per_log = _slope(amplitude)
     loss = -float(per_log @ np.log(amplitude))  # per half cycle
-    sigma = max(decay.fit.rms, floor)  # of one turning point, at worst
+    sigma = max(decay.fit.rms, floor)  # noise of one turning point, at most
     noise = sigma * float(np.linalg.norm((per_log / signed) @ swing))
     per_time = _slope(np.abs(np.gradient(peak_y)))
     interval = float(per_time @ peak_t)
     count = np.arange(n) - (n - 1) / 2
     late = peak_t - peak_t.mean() - interval * count
     interval_std = float(np.linalg.norm(per_time * late)) * np.sqrt(n / (n - 2))
-    # The decrement of samples at any phase can still differ by this relative amount.
+    # Because samples meet the motion at any phase, the decrement can still differ by this relative
+    # amount.
     return _Peaks(
         t=peak_t,
         y=peak_y,
@@ -193,7 +194,7 @@ def _vertex(t: Array, y: Array, index: int, *, half_width: float) -> tuple[float
 
 
 def _zeta_at_amplitude(amplitude: Array) -> Array:
-    """Return (2, n - 1) mean amplitudes, and the damping ratio from each amplitude to the next."""
+    """Return mean amplitudes and damping ratios (2, n - 1) from each amplitude to the next."""
     if amplitude.size < 2:
         return np.empty((2, 0))
     loss = np.log(amplitude[:-1] / amplitude[1:])
@@ -220,7 +221,7 @@ def _note(record: Record, decay: FreeDecay, *, zeta: float, n_peaks: int) -> str
             f"{test.drop:.3g} of its rest point. Without the friction, zeta would be "
             f"{test.zeta:.3g}; the fitted {zeta:.3g} holds for these amplitudes only"
         )
-    # Worth a note if the damping of large amplitudes is larger by 5 %.
+    # It is worth a note if the damping of large amplitudes is larger by 5 %.
     elif test and test.f_statistic > test.threshold and test.zeta > 1.05 * zeta:
         notes.append(
             "the decay is not exponential: the damping grows with the amplitude, and zeta is a mean"

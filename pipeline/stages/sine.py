@@ -1,4 +1,4 @@
-"""Sine dwell: amplitude and phase of the steady state, and where it begins."""
+"""Sine dwell: amplitude and phase of the steady state, and where the steady state begins."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,9 +11,9 @@ from pipeline.estimation.colour import colour
 from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_left
 from pipeline.results import Record, SinePoint
 
-FEW_COUNTS = 20  # encoder steps; a smaller amplitude is known only to a few percent
-_MIN_SAMPLES = 12  # for five unknowns, and a residual to judge the fit by
-_WINDOW_CYCLES, _WINDOW_TIME = 3.0, 0.6  # a sliding window: cycles or s, whichever is longer
+FEW_COUNTS = 20  # encoder steps; smaller amplitudes are known only to a few percent
+_MIN_SAMPLES = 12  # enough for five unknowns and a residual that shows how good the fit is
+_WINDOW_CYCLES, _WINDOW_TIME = 3.0, 0.6  # of a sliding window: cycles or s; the longer one counts
 _HOP_CYCLES, _HOP_TIME = 1.0, 0.2
 _LAST_WINDOWS = 4
 _PEAK_LINES = 4  # lines of the padded spectrum; a sine's frequency is no further from its peak
@@ -24,8 +24,8 @@ _ITERATIONS = 20
 class _Part:
     """Some samples and the columns fitted to them, solved once for all signals.
 
-    `columns` (n, p) are those of `_columns`, `inverse` (p, n) is their pseudo-inverse, and `angle`
-    is that of the sine, rad per sample.
+    `columns` (n, p) are those of `_columns`, and `inverse` (p, n) is their pseudo-inverse. The
+    phase of the sine advances by `angle` (rad) per sample.
     """
 
     columns: Array
@@ -53,17 +53,17 @@ class _Sine:
 
     @property
     def z(self) -> complex:
-        """Amplitude and phase against sin(omega t): a + jb of a sin(omega t) + b cos(omega t)."""
+        """Complex amplitude against sin(omega t): a + jb for a sin(omega t) + b cos(omega t)."""
         return complex(self.coefficients[0], self.coefficients[1])
 
     @property
     def rms(self) -> float:
-        """Root-mean-square of the residual."""
+        """Root mean square of the residual."""
         return float(np.sqrt(self.residual @ self.residual / self.residual.size))
 
     @cached_property
     def std(self) -> float:
-        """Standard error of |z|; that of the phase is std / |z|."""
+        """Standard error of |z|; the standard error of the phase is std / |z|."""
         return float(np.hypot(self.error(0), self.error(1)) / np.sqrt(2))
 
     def error(self, which: int) -> float:
@@ -89,21 +89,22 @@ class _Steady:
 def fit_sine(record: Record, *, cart: int) -> SinePoint:
     """Fit the sinusoidal steady state of one cart to a dwell.
 
-    The last windows show whether there is a steady part. It reaches back as far as its own sine
-    explains the record. The input is fitted over the same part. If it is held between samples, its
-    amplitude is that of the held staircase. The method is valid for one frequency and at least one
-    cycle.
+    The last windows show whether there is a steady part. It extends back as far as the sine fitted
+    to it explains the record. The input is fitted over the same part. If the input is held between
+    samples, its amplitude is that of the held staircase. The method is valid for one frequency and
+    at least one cycle.
 
     Reference: IEEE Std 1057-2017, section 4.6 (three- and four-parameter sine fits).
 
     Parameters
     ----------
-    record : the dwell. Without `omega` the frequency is fitted to the input.
-    cart : the cart whose position is fitted. Several carts share much work, see `Dwell`.
+    record : the dwell. Without `omega`, the frequency is fitted to the input.
+    cart : the cart whose position is fitted. For several carts, use `Dwell`.
 
     Raises
     ------
-    DataError : no input column, an input that does not oscillate, or less than a full cycle.
+    DataError : there is no input column, the input does not oscillate, or it has less than a full
+        cycle.
     """
     return Dwell(record).fit(cart=cart)
 
@@ -174,7 +175,7 @@ class Dwell:
 
     @cached_property
     def _u(self) -> Array:
-        assert self._record.u is not None  # otherwise nothing would be driven
+        assert self._record.u is not None  # checked when the driven part was found
         return self._record.u[self._driven]
 
     @cached_property
@@ -200,8 +201,7 @@ class Dwell:
         """Find where the steady part starts, and whether there is one.
 
         The dwell has settled if the complex amplitudes of the last windows agree. Their sine is
-        then extended back over the record, until it misses the record by more than its own
-        residual.
+        then extended back over the record for as long as it explains the record.
         """
         windows = _windows(self._t, omega=self._frequency[0])
         last = windows[-_LAST_WINDOWS:]
@@ -215,14 +215,14 @@ class Dwell:
             return _Steady(start=latest, settled=False, left=spread)
         start = self._carry_back(y, latest, floor=floor, stretches=len(windows))
         if start > 0:
-            # A third of the steady part is given up, as it may hold the rest of the transient.
+            # A third of the steady part is dropped, because it may hold the rest of the transient.
             start = min(start + (y.size - start) // 3, latest)
         start, left = self._drop_drifting(y, start, latest=latest, floor=floor)
         return _Steady(start=start, settled=True, left=left)
 
     def _carry_back(self, y: Array, start: int, *, floor: float, stretches: int) -> int:
         """Return the first sample from which the sine fitted from `start` explains the record."""
-        # Three rounds of extending the sine back; each roughly doubles the samples it is fitted to.
+        # Three rounds of extending the sine back. Each roughly doubles the samples of the fit.
         for _ in range(3):
             steady = self._fit(y, start)
             square = np.cumsum((y - self._columns @ steady.coefficients) ** 2)
@@ -241,10 +241,10 @@ class Dwell:
     def _drop_drifting(
         self, y: Array, start: int, *, latest: int, floor: float
     ) -> tuple[int, float]:
-        """Return a start, at most `latest`, from which two halves agree; and the remaining error.
+        """Return a start, at most `latest`, from which two halves agree, and the remaining error.
 
-        At a resonance, the transient has the dwell's own frequency and hides in its amplitude. If
-        the difference between the halves exceeds the noise, half of it is still in the mean.
+        At a resonance, the transient has the frequency of the dwell and is hidden in its amplitude.
+        If the difference between the halves exceeds the noise, half of it is still in the mean.
         """
         while True:
             middle = (start + y.size) // 2
@@ -257,7 +257,7 @@ class Dwell:
             # The two halves of the steady part may differ by three times the noise.
             if start == latest or difference <= 3.0 * noise:
                 return start, float(np.sqrt(max(difference**2 - 4 * noise**2, 0.0))) / 2
-            # Otherwise, drop a sixth of the part and compare again.
+            # Otherwise, a sixth of the part is dropped and the halves are compared again.
             start = min(start + (y.size - start) // 6, latest)
 
 
@@ -295,15 +295,16 @@ def _angle_std(z: complex, std: float) -> float:
 
 
 def _rounding_std(fit: _Sine, *, step: float) -> float:
-    """Return the amplitude error from rounding that remains after averaging any number of samples.
+    """Return the amplitude's rounding error that remains however many samples are averaged.
 
     Rounding offset + A sin adds sum_k (q / pi k) 2 J1(2 pi k A/q) cos(2 pi k offset/q) to the
-    amplitude. Its root mean square over A and offset is 0.111 q sqrt(q/A). Noise removes it.
+    amplitude. The root mean square of this error over A and offset is 0.111 q sqrt(q/A). Noise
+    removes it.
     """
     if step == 0:
         return 0.0
     left = rounding_left(noise_beyond_rounding(fit.rms, step=step), step=step)
-    # In encoder steps, times sqrt(step / amplitude): see the docstring.
+    # in encoder steps, times sqrt(step / amplitude): see the docstring
     return 0.111 * step * float(np.sqrt(step / max(abs(fit.z), step))) * left
 
 
@@ -355,8 +356,8 @@ def _frequency(t: Array, u: Array, *, stated: float | None) -> tuple[float, str]
         fitted = peak
     if stated is None:
         return fitted, ""
-    # A stated frequency is rejected if it is off by five standard errors, and by more than a
-    # clock's error.
+    # A stated frequency is rejected if it is off by five standard errors, and by more than the
+    # error of a clock.
     if abs(fitted - stated) <= max(5.0 * std, 2e-4 * stated):
         return stated, ""
     return fitted, (

@@ -1,14 +1,14 @@
 """Design state feedback with a prefilter, so that one cart follows a step.
 
-The design is sampled, and its model includes the computer's one-sample delay: the gains multiply
-the state predicted for the moment at which the effort acts (`plant.loop.sampled_loop`). So with 2n
-gains, the loop has the poles of Phi - Gamma G and one at z = 0 for the delay.
+The design is for sampled control, and its model includes the computer's one-sample delay: the gains
+multiply the state predicted for the moment at which the effort acts (`plant.loop.sampled_loop`). So
+with 2n gains, the loop has the poles of Phi - Gamma G, and one at z = 0 for the delay.
 
 Method "lqr" weights energy against the input, alpha times the potential and beta times the kinetic
-energy, and searches both weights. Method "poles" is the design by hand. A dominant pair replaces
-the plant's slowest pair. The further pairs keep the plant's own frequencies, with more damping, and
-are varied. Both methods take those candidates with the smallest inputs whose simulated step meets
-the goal, and of these the fastest.
+energy, and searches both weights. Method "poles" is the design by hand. A dominant pair of poles
+replaces the plant's slowest pair. The other pairs keep the plant's own frequencies, with more
+damping, and are varied. Among the candidates whose simulated step meets the goal, both methods
+consider those with the smallest inputs, and choose the fastest.
 """
 
 from dataclasses import dataclass, replace
@@ -38,32 +38,32 @@ from pipeline.submission import Design
 
 Method = Literal["poles", "lqr"]
 
-_POINTS = 512  # points of a candidate's step, a power of two, as it is computed by doubling
+_POINTS = 512  # points of a candidate's step; a power of two, because doubling computes them
 
 # Shares of the goal (settling time, overshoot) to aim at, the best first. The plant is known only
-# to a few percent and should still meet the goal.
+# to a few percent, but should still meet the goal.
 _AIMS = ((0.8, 0.05), (0.8, 0.5), (1.0, 1.0))
-_UNSEEN = 0.05  # percent of overshoot that nobody notices
+_UNSEEN = 0.05  # percent; nobody notices a smaller overshoot
 
 _WEIGHTS = np.logspace(-3, 4, 25)  # weights of energies, from no visible feedback to a stiff loop
 _HEAVY_WEIGHTS = np.logspace(-3, 12, 40)  # up to almost deadbeat control
-_DOMINANT_SETTLING = np.linspace(0.3, 1.0, 8)  # of the goal
-_FURTHER_ZETA = (0.0, 0.1, 0.2, 0.35, 0.5, 0.7)  # smallest damping ratios; a pair may have more
-_FURTHER_SPEED = (1.0, 1.25)  # of the plant's own frequency
+_DOMINANT_SETTLING = np.linspace(0.3, 1.0, 8)  # share of the goal
+_FURTHER_ZETA = (0.0, 0.1, 0.2, 0.35, 0.5, 0.7)  # least damping ratios; a pair may have more
+_FURTHER_SPEED = (1.0, 1.25)  # relative to the plant's own frequency
 
 
 def design_feedback(chain: Chain, task: Design) -> FeedbackDesign:
     """Design u = prefilter r - gains [x1, v1, x2, v2, …] for a step of one cart.
 
-    If the goal cannot be met, `reachable` is False. The result is the nearest design, with a
+    If the goal cannot be met, `reachable` is False. The result is then the nearest design, with a
     message that says what is reachable. The settling time counts from the step of the reference, so
     it includes the delay. If no sample time is stated, it is 0.00884 s, or less for a fast plant or
     goal.
 
     Raises
     ------
-    DataError : there is no such cart or no step, a missing spring leaves a cart out of reach, no
-        computer can design for the chain, or the run takes too many ticks to simulate.
+    DataError : there is no such cart or no step, a cart is out of reach, no design can be computed
+        for the chain, or the run takes too many ticks.
     """
     if not 1 <= task.cart <= chain.n:
         raise DataError(f"state feedback needs a cart from 1 to {chain.n}, found {task.cart}")
@@ -82,7 +82,7 @@ def design_feedback(chain: Chain, task: Design) -> FeedbackDesign:
         reference=task.reference,
     )
     try:
-        # A candidate may be unstable and diverge; its final numbers show that.
+        # A candidate may be unstable and diverge, which its final numbers show.
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             plant = SampledPlant.of(
                 chain, cart=task.cart, settling=task.settling_time, sample_time=task.sample_time
@@ -100,7 +100,7 @@ def _range(values: Array) -> str:
 
 
 def _design(plant: SampledPlant, goal: "_Goal", *, method: Method) -> FeedbackDesign:
-    """Choose among the candidates of a method and simulate the one chosen."""
+    """Choose among the candidates of a method, and simulate the chosen one."""
     if method == "lqr":
         requested, costs = None, energy_weights(plant, _WEIGHTS)
         candidates = _try_step(plant, lqr_gains(plant.phi, plant.gamma, costs), goal)
@@ -154,8 +154,9 @@ def _pole_candidates(plant: SampledPlant, goal: _Goal) -> ComplexArray:
             dominant_zeta, goal.settling * _DOMINANT_SETTLING, _FURTHER_ZETA, _FURTHER_SPEED
         )
     )
-    # exp(-4) is the 2 % of the settling time. No pair is made slower than the plant's own pair, as
-    # this would cancel stiffness and leave a small difference of large numbers.
+    # exp(-4) is about the 2 % that define the settling time. No pair is made slower than the
+    # plant's own pair, because a slower pair would cancel stiffness and leave a small difference of
+    # large numbers.
     dominant = np.maximum(4 / (z * settling), omega[0])
     pairs = [_pair(dominant, z)]
     for own_omega, own_zeta in zip(omega[1:], zeta[1:], strict=True):
@@ -180,7 +181,7 @@ class _Candidates:
 
     gains: Array
     overshoot: Array  # percent
-    settling: Array  # s. Estimated from the slowest pole if the simulated step ends earlier
+    settling: Array  # s; estimated from the slowest pole if the simulated step ends earlier
     peak: Array  # input units
     level_error: Array  # percent of the step, due to errors in the model
 
@@ -188,18 +189,19 @@ class _Candidates:
 def _try_step(plant: SampledPlant, gains: Array, goal: _Goal) -> _Candidates:
     """Simulate the step of every candidate at once, exactly at the sampled points.
 
-    The points are close enough to show every peak. If the simulation then ends before the goal's
-    settling time, the settling time is estimated.
+    The points are close enough to show every peak. If the simulation therefore ends before the
+    goal's settling time, the settling time is estimated.
     """
     loop = plant.phi - plant.gamma[:, None] * gains[:, None, :]
     fastest = np.abs(plant.chain.poles).max() + 4 / goal.settling
-    # The step is simulated for three times the goal's settling time, if the points suffice.
+    # The step is simulated for three times the goal's settling time, if there are enough points for
+    # this.
     apart = min(3.0 * goal.settling / _POINTS, RADIANS_PER_SAMPLE / fastest)
     stride = max(1, round(apart / plant.sample_time))
     level = np.linalg.solve(np.eye(plant.gamma.size) - loop, plant.gamma[:, None])
     prefilter = 1 / level[:, plant.row]
     level = level * prefilter[:, None]
-    # The distance to the level is multiplied by `loop` in each sample; each pass doubles the
+    # In each sample, the distance to the level is multiplied by `loop`. Each pass doubles the
     # points.
     to_go, ahead = -level, np.linalg.matrix_power(loop, stride)
     while to_go.shape[-1] < _POINTS:
@@ -207,7 +209,7 @@ def _try_step(plant: SampledPlant, gains: Array, goal: _Goal) -> _Candidates:
     points = np.arange(_POINTS, dtype=np.float64)
     t = plant.sample_time * (1 + stride * points)  # the first sample is the delay
     y = 1 + to_go[:, plant.row]
-    # Includes the input that holds the level, as a slow candidate may not be there yet.
+    # The input that holds the level is included, because a slow candidate may not be there yet.
     u = prefilter - np.einsum("ci,cin->cn", gains, np.append(to_go, 0 * level, axis=-1) + level)
     one = np.ones(len(gains))
     settling = t[0] + step_response.settling_time(t, y, before=0.0, level=one)
@@ -226,20 +228,19 @@ def _try_step(plant: SampledPlant, gains: Array, goal: _Goal) -> _Candidates:
 def _choose(plant: SampledPlant, candidates: _Candidates, goal: _Goal) -> tuple[int, bool]:
     """Return the index of the best candidate, and whether it meets the goal.
 
-    If no candidate meets the goal, it is the nearest one.
+    If no candidate meets the goal, the index is that of the nearest one.
     """
     within = candidates.peak <= goal.limit
     if not within.any():  # a step of this size is out of reach, so design for a smaller one
         within = np.full_like(within, True)
-    # Errors in the springs should move the level by at most 10 % of the step, if possible.
+    # Errors in the springs should move the steady position by at most 10 % of the step.
     for level_error, (settling, overshoot) in product((10.0, np.inf), _AIMS):
         good = within & (candidates.level_error <= level_error)
         good &= candidates.settling <= settling * goal.settling
         good &= candidates.overshoot <= max(overshoot * goal.overshoot, _UNSEEN)
         if not good.any():
             continue
-        # A faster candidate may take 1.25 times the peak input of the candidate with the least
-        # input.
+        # A faster candidate may need up to 1.25 times the least peak input of all good candidates.
         good &= candidates.peak <= 1.25 * candidates.peak[good].min()
         order = np.flatnonzero(good)[np.argsort(candidates.settling[good], kind="stable")]
         # The first eight are tried until one gives a loop that is stable for all errors of the
@@ -276,8 +277,8 @@ def _finish(
     if requested is not None:
         away = np.abs(requested[None, :] - poles[:, None])
         requested = requested[linear_sum_assignment(away)[1]]
-    # The result shows twice the goal's or the design's settling time, whichever is longer. A design
-    # that misses the goal is shown for at most 20 times the goal's.
+    # The result shows twice the goal's or the design's settling time, whichever is longer. If the
+    # design misses the goal, the result shows at most 20 times the goal's settling time.
     shown = 2.0 * min(max(goal.settling, settling), 10.0 * goal.settling)
     check_ticks(shown, T)
     t = T * np.arange(np.ceil(shown / T) + 1, dtype=np.float64)

@@ -14,18 +14,18 @@ from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_lef
 from pipeline.estimation.peaks import extrema, plateaus
 from pipeline.results import Record, StepEdge, StepGain
 
-_MOVED = 6.0  # grains (see `_FLAT`). A smaller motion does not count
+_MOVED = 6.0  # grains (see `_FLAT`); a smaller motion does not count
 # Largest residual and standard error of an extrapolated level, as shares of the motion.
 _EXTRAPOLATES = 0.02
-_STICKS_SIGMAS = 4.0  # standard errors. By chance one edge in 16,000 is as far off
+_STICKS_SIGMAS = 4.0  # standard errors; by chance, one edge in 16,000 is as far off
 _MIN_SAMPLES = 12
 # Motion is counted in grains. A grain is the encoder step, or the step whose rounding error equals
-# the noise.
-_FLAT = 3.0  # grains. A window with a smaller range is level
+# the noise if that is larger.
+_FLAT = 3.0  # grains; a window with a smaller range is level
 _PROMINENCE = 6.0
-_ARITHMETIC = 1e-3  # scatter of a level without noise or rounding
+_ARITHMETIC = 1e-3  # scatter, in grains, of a level without noise or rounding
 _DRIFT_PASSES = 4
-_SAME_INPUT = 0.02  # of the input's range
+_SAME_INPUT = 0.02  # share of the input's range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,14 +55,14 @@ class _Plateau:
 def fit_step_gain(record: Record, *, cart: int) -> StepGain:
     """Estimate the static gain of one cart from every edge of a stepped input.
 
-    A level is the mean of the samples after the last motion. If the end of the record or the next
-    edge cuts the ringing short, damped sinusoids are fitted to it, one for each free cart, and give
-    the level. The method is valid for any number of carts on at least one spring, and steps of any
-    size and sign.
+    A level is the mean of the samples after the last motion. If the record or the input ends a
+    level while the cart still rings, damped sinusoids are fitted to the ringing, one for each free
+    cart, and give the level. The method is valid for any number of carts on at least one spring,
+    and steps of any size and sign.
 
     Raises
     ------
-    DataError : there is no input column or no step in it, or the cart is held, does not move or
+    DataError : there is no input column or no step in it; or the cart is held, does not move or
         never settles.
     """
     t, y, step = record.t, record.position(cart), record.encoder_step(cart)
@@ -124,7 +124,7 @@ def _constant_parts(record: Record) -> list[tuple[int, int, float]]:
             f"{record.id}: step gain needs the input as well as the positions, found no input "
             "column: export it too, or name it under `columns`"
         )
-    # Halves of a constant stretch differ by less than 0.5 % of the input's range.
+    # The means of the halves of a constant stretch differ by less than 0.5 % of the input's range.
     creep = 0.005 * float(np.ptp(u))
     long = [
         (a, b)
@@ -186,7 +186,7 @@ def _pace(t: Array, y: Array, *, size: float) -> float:
 
 
 def _flat_from(y: Array, *, span: float) -> int:
-    """Return the first sample from which the range of y is at most `span`."""
+    """Return the first sample from which on the range of y is at most `span`."""
     backwards = y[::-1]
     spans = np.maximum.accumulate(backwards) - np.minimum.accumulate(backwards)
     return y.size - int(np.searchsorted(spans, span, side="right"))
@@ -240,7 +240,7 @@ def _extrapolated(t: Array, y: Array, *, n_modes: int, floor: float) -> _Level |
 def _with_unseen_start(
     t: Array, y: Array, found: list[_Plateau], *, size: float, step: float
 ) -> tuple[list[_Plateau], list[str]]:
-    """Add a rest in front, if the input is on at the start and the cart just begins to move."""
+    """Add a rest in front, if the input is on at the start and the cart only begins to move."""
     head = found[0]
     if head.u == 0 or not head.level or abs(head.level.value - y[0]) <= _MOVED * size:
         return found, []
@@ -257,7 +257,7 @@ def _with_unseen_start(
 
 
 def _drift(t: Array, y: Array, levels: Sequence[_Level], *, size: float) -> float:
-    """Return the slope that every settled window shares, per second; 0 without one."""
+    """Return the slope that every settled window shares, per second, or 0."""
     slopes, errors = [], []
     for level in levels:
         if level.extrapolated or level.stop - level.first < _MIN_SAMPLES:
@@ -273,7 +273,7 @@ def _drift(t: Array, y: Array, levels: Sequence[_Level], *, size: float) -> floa
         return 0.0
     weight = 1 / np.square(errors)
     drift = float(np.average(slopes, weights=weight))
-    # All settled windows must show the same drift clearly.
+    # All settled windows must clearly show the same drift.
     seen = abs(drift) > 5.0 / np.sqrt(weight.sum())
     alike = np.abs(np.array(slopes) - drift) <= 0.3 * abs(drift) + 3 * np.array(errors)
     return drift if seen and bool(np.all(alike)) else 0.0
@@ -283,7 +283,7 @@ def _drift(t: Array, y: Array, levels: Sequence[_Level], *, size: float) -> floa
 
 
 def _edges(t: Array, found: Sequence[_Plateau]) -> list[StepEdge]:
-    """Return the edges of the input with a settled cart on both sides."""
+    """Return the edges of the input before and after which the cart settled."""
     same = _SAME_INPUT * float(np.ptp([p.u for p in found]))
     edges = []
     for before, after in pairwise(found):
@@ -308,7 +308,8 @@ def _combine(edges: Sequence[StepEdge]) -> tuple[float, float]:
     """Return the weighted mean gain and its standard error.
 
     Edges share levels, and a cart at rest is rounded the same way each time. So the standard error
-    does not shrink with the number of edges. If the spread gives a larger one, that is used.
+    does not shrink with the number of edges. If the spread of the gains gives a larger standard
+    error, that one is used.
     """
     gains = np.array([edge.gain for edge in edges])
     std = np.array([edge.gain_std for edge in edges])
@@ -318,7 +319,7 @@ def _combine(edges: Sequence[StepEdge]) -> tuple[float, float]:
 
 
 def _rest_shift(found: Sequence[_Plateau]) -> tuple[float | None, float]:
-    """Return how far a later rest is from the first rest at the same input, and its error."""
+    """Return how far a later rest is from the first at the same input, with standard error."""
     span = max(p.u for p in found) - min(p.u for p in found)
     settled = [p for p in found if p.level]
     for last in reversed(settled[1:]):

@@ -1,12 +1,12 @@
 """Joint fit of one chain to time records: steps, sweeps, decays and closed loops at once.
 
 It is an output-error fit: the chain is simulated exactly from the measured input, and simulated
-positions are compared with the measured ones. Start and encoder zeros of each record enter linearly
-and are eliminated, so the search moves only the physical parameters. It starts from a linear
-regression and needs no initial guess.
+positions are compared with the measured ones. The start and encoder zeros of each record enter
+linearly and are eliminated, so the search moves only the physical parameters. It starts from a
+linear regression and needs no initial guess.
 
-Reference: L. Ljung, System Identification, 2nd ed., sections 7.5 and 10.2; for residuals that are
-not white section 9.5.
+Reference: L. Ljung, System Identification, 2nd ed., sections 7.5 and 10.2, and section 9.5 for
+residuals that are not white.
 """
 
 from collections.abc import Sequence
@@ -35,19 +35,19 @@ _TOLERANCE = 1e-9  # relative change of the cost; far below one standard error f
 def fit_records(records: Sequence[Record], *, bench: Bench, start: Chain | None = None) -> ChainFit:
     """Fit one chain to all records at once.
 
-    Records may differ in length, rate, free and measured carts; held carts are removed from the
-    chain. Decays are used from their release, a closed loop with its measured input. A record that
-    cannot be used is left out, and the fit's message says so.
+    Records may differ in length, sample rate, and free and measured carts; held carts are removed
+    from the chain. Decays are used from their release, and a closed loop with its measured input. A
+    record that cannot be used is left out, and the fit's message says so.
 
     Parameters
     ----------
-    bench : its carts and springs.
+    bench : the carts and springs of the bench.
     start : a chain to start from, in addition to the starts from the records.
 
     Returns
     -------
-    The fit. Its covariance allows for correlated residuals, as caused by dry friction. But
-    `chi_square_per_dof` compares the residuals with encoder step and local noise only.
+    The fit. Its covariance allows for correlated residuals, for example due to dry friction. But
+    `chi_square_per_dof` compares the residuals only with encoder step and local noise.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def fit_records(records: Sequence[Record], *, bench: Bench, start: Chain | None 
 
 
 def _open(records: Sequence[Record]) -> tuple[list[FitWindow], list[str]]:
-    """Return the windows of all usable records, and notes on those left out."""
+    """Return the windows of all usable records, and notes on the records left out."""
     windows, left_out = [], []
     for record in records:
         try:
@@ -94,7 +94,7 @@ def _open(records: Sequence[Record]) -> tuple[list[FitWindow], list[str]]:
 
 
 def _informed(attempt: Attempt, index: int) -> FitWindow:
-    """Return a window with standard errors from its residuals, and whether it starts at rest."""
+    """Return a window that has standard errors and a start according to its residuals."""
     window, misfit = attempt.windows[index], attempt.misfits[index]
     at_rest = window.kind != "decay" and _starts_at_rest(attempt, index)
     return window.informed(misfit.residual * window.sigma[:, None], at_rest=at_rest)
@@ -104,8 +104,8 @@ def _starts_at_rest(attempt: Attempt, index: int) -> bool:
     """Return whether a window starts at rest: a free start improves the fit only by chance.
 
     The improvement is that of the whole fit, to first order, with all parameters adjusted.
-    Residuals beyond the stated noise are an error of the chain itself; a record has few independent
-    values of it.
+    Residuals beyond the stated noise are an error of the chain itself, of which a record has few
+    independent values.
     """
     resting = replace(attempt.windows[index], at_rest=True)
     (held,) = look([resting], attempt.parametrisation, attempt.theta).misfits
@@ -124,7 +124,7 @@ def _covariance(attempt: Attempt) -> Array:
     """Return the covariance (n_p, n_p) of the free physical parameters.
 
     It is a sandwich of the Gauss-Newton Hessian and the long-run covariance of the scores. It is at
-    least that of white residuals of the same size.
+    least the covariance for white residuals of the same size.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def _covariance(attempt: Attempt) -> Array:
     long = np.concatenate([s.reshape(scale.size, -1) for s in jacobians], axis=1)
     R = np.asarray(np.linalg.qr(long.T, mode="r"))
     _, singular, Vt = np.linalg.svd(R)
-    # The smallest singular value of the scaled Jacobian over its largest.
+    # Limit on the smallest singular value of the scaled Jacobian over its largest.
     if singular[-1] < 1e-9 * singular[0]:
         raise _undetermined(names[int(np.argmax(np.abs(Vt[-1])))])
     whitening = np.linalg.inv(R)  # jacobians @ whitening are orthonormal
@@ -173,7 +173,7 @@ def _negligible(attempt: Attempt, covariance: Array) -> tuple[str, ...]:
 
 
 def _released(attempt: Attempt) -> Attempt:
-    """Return the attempt with those dampings free that were held at zero.
+    """Return the attempt in which dampings that were held at zero are free.
 
     Every cart has some damping, and numbers that depend on it must not look more certain than it
     is. A spring, however, may really be missing.
@@ -200,7 +200,7 @@ def _result(
     names, covariance = released.parametrisation.names, _covariance(released)
     try:
         parameters = named_estimates(chain, names=names, covariance=covariance, source="time_fit")
-    except DataError:  # several carts without a wall have no gains
+    except DataError:  # several carts without a spring to a wall have no gains
         parameters: dict[str, Estimate] = {}
     chi_square = 0.0
     standardised = {}
@@ -236,8 +236,8 @@ def _message(attempt: Attempt, remarks: Sequence[str]) -> str:
         *remarks,
     ]
     if attempt.parametrisation.zero:
-        said.append(f"held at zero, their bound: {', '.join(attempt.parametrisation.zero)}")
+        said.append(f"held at zero: {', '.join(attempt.parametrisation.zero)}")
     moving = [w.id for w in attempt.windows if w.kind != "decay" and not w.at_rest]
     if moving:
-        said.append(f"not at rest at their start: {', '.join(moving)}")
+        said.append(f"in motion at the start: {', '.join(moving)}")
     return "; ".join(said)

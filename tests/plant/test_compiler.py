@@ -83,7 +83,7 @@ def test_in_a_read_only_package_the_users_cache_is_used(package):
     assert again[1] == ""
     assert list(home.glob("cartlab/compiled-*/simulator-*/*/caller.outer*.nbc"))
     assert nowhere[0] == "21"
-    assert "no folder can keep it" in nowhere[1]
+    assert "it cannot be stored" in nowhere[1]
 
 
 def test_the_folders_name_covers_each_file_that_a_compiled_function_uses():

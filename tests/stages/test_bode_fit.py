@@ -170,7 +170,7 @@ def test_a_missing_spring_is_held_at_zero():
     # For a binomial of 20 with probability 1/2, this fails once in 2000 tries.
     assert 3 <= len(held) <= 17
     assert all(fit.chain.k[0] >= 0 for fit in fits)
-    assert all(fit.chain.k[0] == 0 and "k_1 is at its bound" in fit.message for fit in held)
+    assert all(fit.chain.k[0] == 0 and "k_1 is held at zero" in fit.message for fit in held)
 
 
 def test_a_missing_far_spring_and_damper_are_found_to_be_zero():
@@ -347,7 +347,7 @@ def test_a_misfit_widens_the_errors():
         [replace(r, magnitude_std=1e-4 * r.magnitude) for r in exact(chain)],
         bench=Bench(springs=(True,) * 3),
     )
-    assert "off the model" in got.message
+    assert "away from the model" in got.message
     assert got.chi_square_per_dof > 1e4
     for name, value in chain.parameters().items():
         estimate = got.parameters[name]
@@ -412,7 +412,7 @@ def test_few_points_are_refused():
     [
         ({"magnitude": np.full(20, np.nan)}, "must be finite"),
         ({"omega": np.linspace(-1, 1, 20)}, "must be finite"),
-        ({"cart": 2}, "a response of cart 2, with 1 in the system"),
+        ({"cart": 2}, "found a response of cart 2, but the system has 1"),
     ],
 )
 def test_impossible_responses_are_refused(change, message):

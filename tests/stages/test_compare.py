@@ -83,7 +83,7 @@ def test_a_final_value_at_its_bound_is_not_used():
         bench=Bench(springs=(True, True)),
     )
     assert (row.final, row.consistent, row.change_percent) == (None, None, None)
-    assert "bound" in row.note
+    assert "puts it at zero" in row.note
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The data of the Bode fit: all measured points in one array, and the chain's response there."""
+"""The data of the Bode fit: all measured points in one array, and the chain's response to them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,9 +19,9 @@ Scale = Literal["log", "magnitude", "polar"]
 class Points:
     """All measured points of the frequency responses in one array (N,).
 
-    `at` and `cart` give each point's frequency and cart, as indices from 0. `decays` holds
-    estimates of a cart's own damping ratio from decays, by cart (from 1). Each counts as one more
-    point.
+    `at` and `cart` are the indices, from 0, of each point's frequency and cart. `decays` holds
+    estimates of a cart's own damping ratio from decays, by cart (from 1). Each estimate counts as
+    one more point.
     """
 
     omega: Array  # (n_w,) the distinct frequencies
@@ -42,7 +42,7 @@ class Points:
         for response in responses:
             if not 1 <= response.cart <= n:
                 raise DataError(
-                    f"Bode fit: a response of cart {response.cart}, with {n} in the system"
+                    f"Bode fit: found a response of cart {response.cart}, but the system has {n}"
                 )
         omega = np.concatenate([r.omega for r in responses])
         magnitude = np.concatenate([r.magnitude for r in responses])
@@ -50,7 +50,7 @@ class Points:
             raise DataError("Bode fit: frequencies and magnitudes must be finite numbers")
         std = np.concatenate([r.magnitude_std for r in responses])
         stated = np.isfinite(std) & (std > 0)
-        # The relative error to assume for a magnitude without a standard error is 1 %.
+        # A magnitude without a standard error is assumed to have a relative error of 1 %.
         std = np.where(stated, std, 0.01 * np.maximum(magnitude, np.median(magnitude) / 1e3))
         phase = [np.zeros(r.omega.size) if r.phase is None else r.phase for r in responses]
         phase_std = [
@@ -113,7 +113,7 @@ def response_at(
     Z = ((powers * physical)[:, None, :] * b.T) @ b  # Σ p s^order b bᵀ
     try:
         inverse = np.linalg.inv(Z).astype(np.complex128, copy=False)
-    except np.linalg.LinAlgError:  # a step of the fit went astray; NaN makes it step back
+    except np.linalg.LinAlgError:  # the fit went astray; NaN makes it step back
         inverse = np.full_like(Z, np.nan)
     G = inverse[:, :, 0]
     stretch = (G @ b.T) * -powers  # (n_w, n_p)
@@ -136,7 +136,7 @@ def weighted_residuals(
 def _decay_residuals(
     P: Parametrisation, decays: Mapping[int, Estimate], physical: Array
 ) -> tuple[Array, Array]:
-    """Return ln ζ_i minus that of each decay, in standard errors; also its derivatives.
+    """Return ln ζ_i minus its value from each decay, in standard errors; also its derivatives.
 
     ζ² = c² / 4mk.
     """

@@ -1,11 +1,11 @@
-"""The delay of one channel against its neighbour's, from the carts' own law of motion.
+"""The delay of one cart's channel against its neighbour's, from the carts' own law of motion.
 
 A cart without a motor is moved by its neighbours alone, whatever the input is and however late it
 arrives. Its law of motion is
 
     k_i x_{i-1} = m_i x_i'' + c_i x_i' + (k_i + k_{i+1}) x_i - k_{i+1} x_{i+1}.
 
-So the best delay of each cart's channel against that of the cart before it is the one for which
+The best delay of a cart's channel, against the channel of the cart before it, is the one for which
 this law fits best. No data are differentiated: both sides are averaged with a bump that slides
 along the records (`modulating`). The coefficients may have any sign and size. So a cart in another
 unit, or with a reversed sign, gives the same delay.
@@ -28,15 +28,14 @@ _PARTS = 8  # fewest records, or parts of records, for a standard error
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelDelay:
-    """The delay of one cart's channel against that of the cart before it.
+    """The delay of one cart's channel against the channel of the cart before it.
 
     Attributes
     ----------
-    delay, std : delay in s and its standard error by jackknife over records. The delay is positive
-        if the channel is read later.
-    better : factor by which this delay lowers the residual of the carts' law. Friction, play and
-        stops look like a small delay, but no delay removes their residual.
-    experiments : the records used.
+    delay, std : delay in s, and its standard error by jackknife over records. The delay is positive
+        if the cart's channel is read later.
+    better : factor by which this delay lowers the residual of the cart's law. Friction, backlash
+        and end stops look like a small delay, but no delay removes their residual.
     """
 
     cart: int
@@ -47,7 +46,7 @@ class ChannelDelay:
 
 
 def find_channel_delays(records: Sequence[Record], *, n: int) -> dict[int, ChannelDelay]:
-    """Return by cart the delay of its channel against that of the cart before, if significant.
+    """Return, by cart, the delay of its channel against the channel before it, if significant.
 
     The last cart comes first, because the law of the cart before it needs its true times.
     """
@@ -66,9 +65,9 @@ class _Normal:
 
     Attributes
     ----------
-    power : (n_d,) sum of squares of the left side.
-    cross : (n_d, 4) products of the left with the right side.
-    square : (4, 4) products of the right side's columns.
+    power : sum of squares (n_d,) of the left side.
+    cross : products (n_d, 4) of the left side with the columns of the right side.
+    square : products (4, 4) of the columns of the right side.
     """
 
     power: Array
@@ -76,7 +75,7 @@ class _Normal:
     square: Array
 
     def without(self, other: "_Normal") -> "_Normal":
-        """Return these equations minus those of one part."""
+        """Return these equations minus the equations of one part."""
         return _Normal(
             power=self.power - other.power,
             cross=self.cross - other.cross,
@@ -117,7 +116,7 @@ def _channel_delay(records: Sequence[Record], cart: int, *, after: float) -> Cha
     )
     left = total.left()
     best, least = _lowest(left)
-    if abs(best) >= _MOST_LATE:  # longer always fits better: not a delay but other motion
+    if abs(best) >= _MOST_LATE:  # a still longer delay would fit better, so this is not a delay
         return None
     others = np.array([_lowest(total.without(one).left())[0] for one in equations])
     spread = float(np.sum((others - others.mean()) ** 2))
@@ -133,7 +132,8 @@ def _channel_delay(records: Sequence[Record], cart: int, *, after: float) -> Cha
 def _shows_delay(record: Record, cart: int) -> bool:
     """Return whether the record can show the delay.
 
-    All forces on the cart must have been measured, and both it and the cart before must move far.
+    All forces on the cart must have been measured, and both this cart and the cart before it must
+    move far.
     """
     if any(c not in record.carts or c not in record.free for c in (cart - 1, cart)):
         return False
@@ -146,10 +146,10 @@ def _shows_delay(record: Record, cart: int) -> bool:
 def _equations(
     record: Record, cart: int, *, after: float, step: float, period: float, parts: int
 ) -> list[_Normal]:
-    """Return the equations of each part of a record; [] if the record is too short."""
+    """Return the equations of each part of a record, or [] if the record is too short."""
     t = np.arange(record.t[0], record.t[-1], step)
-    # A bump lasts a quarter of the motion's period, because wider bumps would suppress the fast
-    # motion, the most informative part. With fewer than 16 samples under a bump, only the encoder's
+    # A bump lasts a quarter of the motion's period, because wider bumps would suppress fast motion,
+    # which is the most informative. With fewer than 16 samples under a bump, only the encoder's
     # steps would count.
     width = max(round(0.25 * period / step), 16)
     first, last = _MOST_LATE, t.size - width - _MOST_LATE
@@ -168,7 +168,7 @@ def _equations(
     before = under(cart - 1)
     shifts = range(-_MOST_LATE, _MOST_LATE + 1)
     left = np.array([before[places - shift] @ weight for shift in shifts])
-    # Encoder zeros cancel; each record has the same weight.
+    # Encoder zeros cancel, and each record has the same weight.
     left = left - left.mean(axis=1, keepdims=True)
     size = float(np.linalg.norm(left[_MOST_LATE]))
     if size == 0:
@@ -186,7 +186,7 @@ def _equations(
 
 
 def _lowest(left: Array) -> tuple[float, float]:
-    """Return the delay (in grid steps, interpolated) with the least residual, and that residual."""
+    """Return the delay (in grid steps, interpolated) with the least residual, and this residual."""
     i = int(np.argmin(left))
     between = 0.0
     if 0 < i < left.size - 1 and (bend := left[i - 1] - 2 * left[i] + left[i + 1]) > 0:

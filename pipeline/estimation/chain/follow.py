@@ -1,7 +1,7 @@
 """How well records follow a chain, and what correction would make a record follow it.
 
 Apart from start and encoder zeros, the residual of a record is linear in the record's columns. So
-the best factors on the columns show at once which column has the wrong sign or unit.
+the best factors on the columns directly show which column has the wrong sign or unit.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,10 +31,10 @@ class Followed:
 
     Attributes
     ----------
-    lost : by cart, the share of its motion's power. Neither chain nor noise explains this share.
-    missed : by cart, (n,) simulated minus measured position.
-    reach : by cart, the root-mean-square of its motion. Relative to that of the chain.
-    friction : by cart, the most dry friction that is compatible with `lost`. In input units.
+    lost : by cart, the share of its motion's power that neither chain nor noise explains.
+    missed : by cart, simulated minus measured position (n,).
+    reach : by cart, the root mean square of its motion, relative to the chain's motion.
+    friction : by cart, the largest dry friction that is compatible with `lost`, in input units.
     """
 
     lost: dict[int, float]
@@ -59,11 +59,11 @@ class Misread:
 
     Attributes
     ----------
-    words : description of the mistake.
+    words : a description of the mistake.
     legal : whether the record may be right as it is.
-    remedy : the correction to make. Applies if all records of a bench need it.
-    scale : the ratio of the motion's unit to the input's. Given if nothing else differs.
-    clock : the ratio of the record's time to the true time. Given if nothing else differs.
+    remedy : the correction to make, if all records of a bench need it.
+    scale : the ratio of the motion's unit to the input's, given if nothing else is wrong.
+    clock : the ratio of the record's time to the true time, given if nothing else is wrong.
     """
 
     words: str
@@ -74,7 +74,7 @@ class Misread:
 
 
 def is_driven(record: Record) -> bool:
-    """Return whether the carts are moved by a logged input that no controller chose."""
+    """Return whether a logged input that no controller chose moves the carts."""
     driven = record.kind in ("step", "sine", "sweep") and 1 in record.free
     return driven and record.u is not None and bool(np.ptp(record.u) > 0)
 
@@ -85,22 +85,22 @@ def measured(record: Record) -> list[int]:
 
 
 def follow(records: Sequence[Record], chain: Chain) -> dict[str, Followed]:
-    """Compare with the chain every driven record in which measured carts move; by record id."""
+    """Return, by id, how every driven record in which measured carts move follows the chain."""
     modes = _modes(chain)
     found = {r.id: _hold_against(r, chain, modes) for r in records if is_driven(r)}
     return {name: fit for name, fit in found.items() if fit}
 
 
 def most_follow(fits: Mapping[str, Followed]) -> bool:
-    """Return whether there are records and at least half of them follow the chain."""
+    """Return whether at least half of the records follow the chain; true without records."""
     return 2 * sum(fit.belongs for fit in fits.values()) >= len(fits)
 
 
 def near(record: Record, chain: Chain) -> list[Followed]:
     """Return how well a record follows slightly slower or faster copies of the chain.
 
-    A spring that stiffens, or a late input, shifts resonances by some percent. For a dwell at a
-    resonance this changes the whole motion.
+    A spring that stiffens, or an input that arrives late, shifts resonances by some percent. At a
+    resonance, this changes the whole motion of a dwell.
     """
     modes = _modes(chain)
     # Scaling the time of the record is the same as scaling the chain's frequencies.
@@ -115,7 +115,7 @@ def find_misread(
 
     Parameters
     ----------
-    fit : how the record follows without correction.
+    fit : how the record follows the chain without correction.
     better : smallest factor by which the residual must fall.
     """
     found, least = None, min(fit.share / better, FOLLOWED)
@@ -127,8 +127,8 @@ def find_misread(
     modes = _modes(chain)
     for misread, other in _readings(record, modes):
         held = _hold_against(other, chain, modes)
-        # A different sign is legal, but then the residual must be below 2 %, as a long delay gives
-        # a larger one.
+        # A different sign is legal, but then the residual must be below 2 %. With a long delay
+        # instead, it would be larger.
         if held and held.share <= (min(least, 0.02) if misread.legal else least):
             found, least = misread, held.share
     return found
@@ -144,13 +144,13 @@ def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record
         remedy = f'state columns = {{ x{i} = "x{j}", x{j} = "x{i}" }} for each'
         yield Misread(words=words, remedy=remedy), other
     for factor, words in TIME_FACTORS.items():
-        if record.sample_time >= factor * FASTEST:  # any curve fits a time that is too short
+        if record.sample_time >= factor * FASTEST:  # over too short a time, any curve fits
             yield Misread(words=words, clock=factor), replace(record, t=record.t / factor)
     try:
         window = open_window(record)
     except DataError:
         return
-    # The smallest motion, in encoder steps: rounding can change a smaller motion by any factor.
+    # Rounding can change a motion below five encoder steps by any factor.
     if np.any(np.ptp(window.y, axis=1) < 5.0 * np.sqrt(12) * window.stated_sigma):
         return
     if (said := _describe_mistake(window.carts, _weights(window, modes(window.free)))) is not None:
@@ -187,13 +187,13 @@ def _describe_mistake(carts: Sequence[int], weights: Array) -> tuple[Misread, Ar
         # A factor may be off by 10 %, as the known factors are at least 2.5 apart.
         if np.all(np.abs(size * scale - 1) < 0.1) and len(set(sign)) == 1:
             words = (
-                "its positions or its input seem to be in another unit: they move "
-                f"{scale:.3g} times as far as its input moves the carts"
+                "its positions or its input seem to be in another unit: the recorded motion is "
+                f"{scale:.3g} times the motion that the input causes"
             )
             return Misread(words=words, scale=scale), sign / scale
     turned = [f"x{cart}" for cart, s in zip(carts, sign, strict=True) if s < 0]
     if len(turned) == len(carts):
-        return Misread(words="its input seems to count the other way", legal=True), sign
+        return Misread(words="its input seems to have the opposite sign", legal=True), sign
     if turned:
         return Misread(words=f"the sign of {' and '.join(turned)} looks reversed"), sign
     return None

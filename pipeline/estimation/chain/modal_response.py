@@ -14,11 +14,11 @@ from pipeline.arrays import Array, ComplexArray
 from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.plant.linear.chain import Chain
 
-# Below this |lambda dt| the derivative of expm1(z)/z is computed from its series: rounding would
-# cost 1e-16/|z|, while the series errs by z²/8.
+# Below this |lambda dt| the derivative of expm1(z)/z is computed from its series. Rounding would
+# cause an error of 1e-16/|z|; the error of the series is z²/8.
 _SMALL_EXPONENT = 1e-6
-# Poles closer than this (relative) lose accuracy in the Jacobian, by the third power of their
-# distance. They are separated by more damping on one cart, too little to show in a record. It moves
+# Poles closer than this (relative) make the Jacobian inaccurate, by the third power of their
+# distance. Additional damping on one cart, too little to show in a record, separates them. It moves
 # them apart by twice its square root.
 _MEETING = 1e-3
 _PARTING = 1e-5
@@ -30,10 +30,10 @@ class Modes:
 
     Attributes
     ----------
-    poles : (n_m,) rad/s.
-    shapes : (f, n_m) the positions in each mode. Doubled for a conjugate pair, so that a position
-        is Re(shapes @ z).
-    entry : (n_m, 2f) with z(0) = entry @ x(0). The state is (x1, v1, x2, v2, …).
+    poles : poles (n_m,), rad/s.
+    shapes : positions (f, n_m) in each mode, doubled for a conjugate pair. So a position is
+        Re(shapes @ z).
+    entry : (n_m, 2f), with z(0) = entry @ x(0). The state is (x1, v1, x2, v2, …).
     drive : (n_m,) with z' = poles z + drive u.
     d_poles (n_p, n_m), d_shapes (n_p, f, n_m), d_entry (n_p, n_m, 2f), d_drive (n_p, n_m) :
         derivatives by theta.
@@ -54,7 +54,7 @@ def find_modes(
 ) -> Modes:
     """Decompose the free part of a chain into modes.
 
-    `dp_dtheta` (n_p,) is that of `Parametrisation`. If two poles meet (a critically damped cart)
+    `dp_dtheta` (n_p,) is that of `Parametrisation`. If two poles meet (a critically damped cart),
     there are no separate modes, and rounding near such a point spoils the derivatives. So these
     poles are moved apart first.
     """
@@ -137,8 +137,8 @@ def drive_modes(poles: ComplexArray, t: Array, u: Array) -> tuple[ComplexArray, 
 def _accumulate(growth: ComplexArray, forced: ComplexArray) -> ComplexArray:
     """Return q (n_m, n) with q[0] = 0 and q[i + 1] = growth[i] q[i] + forced[i].
 
-    By doubling: after s steps each entry holds the sum over its last 2^s inputs. `growth` is (n_m,
-    1) for uniform sample times, otherwise (n_m, n - 1).
+    The values are found by doubling: after s steps, each entry holds the sum over its last 2^s
+    inputs. `growth` is (n_m, 1) for uniform sample times, otherwise (n_m, n - 1).
     """
     q = np.zeros((forced.shape[0], forced.shape[1] + 1), dtype=np.complex128)
     total = q[:, 1:]

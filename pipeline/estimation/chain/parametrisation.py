@@ -1,8 +1,8 @@
 """Chain and fit vector, shared by the frequency-domain and the time-domain fit.
 
 A fit searches a vector theta of log m, log c and log k, so that no step leaves the physical range
-and all entries are of order one. Only the spring wall-1 is not a logarithm: it may be zero, as in
-the paper's plants, if the far wall holds the carts.
+and all entries are of order one. Only the spring wall-1 is not a logarithm, because it may be zero
+if the far wall holds the carts, as in the plants of Throne's paper.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,12 +19,12 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.results import Estimate
 from pipeline.set_up import Bench
 
-# Initial damping ratios for those that were not measured:
-START_ZETA = 0.05  # of each cart alone. Typical of a cart on bearings.
-ASSUMED_ZETA = 0.1  # of a resonance or a null. The usual guess of the paper.
-_FARTHEST = 100.0  # largest logarithm. A step that goes astray must not overflow.
-# A fit must start from a possible chain: springs below this share of the largest one (or masses)
-# that a measured table implies are raised to it.
+# Initial damping ratios for carts and modes without a measured one:
+START_ZETA = 0.05  # of a single cart; typical of a cart on bearings
+ASSUMED_ZETA = 0.1  # of a resonance or a null; the usual guess in Throne's paper
+_FARTHEST = 100.0  # largest logarithm; a step that goes astray must not overflow
+# A fit must start from a possible chain. Springs or masses of a measured table that are below this
+# share of the largest one are raised to it.
 _SMALLEST_SHARE = 0.02
 
 
@@ -35,7 +35,7 @@ class Parametrisation:
     Attributes
     ----------
     bench : the carts and springs that exist.
-    zero : names of parameters held at zero ("c_2", "k_1"), because a fit found them at their bound.
+    zero : names of parameters held at zero ("c_2", "k_1"), because a fit moved them to their bound.
 
     Raises
     ------
@@ -68,7 +68,7 @@ class Parametrisation:
 
     @cached_property
     def logarithmic(self) -> NDArray[np.bool_]:
-        """(n_p,) whether each parameter enters as its logarithm; only wall-1 does not."""
+        """Whether each parameter (n_p,) enters as its logarithm; only wall-1 does not."""
         may_vanish = "k_1" if self.n > 1 and f"k_{self.n + 1}" in self.names else None
         return np.array([name != may_vanish for name in self.names])
 
@@ -79,7 +79,7 @@ class Parametrisation:
 
     @cached_property
     def places(self) -> tuple[tuple[str, int], ...]:
-        """The free parameters as "m", "c" or "k" and the index within the chain's m, c or k."""
+        """The free parameters as "m", "c" or "k", with the index within the chain's m, c or k."""
         return tuple(_place(name) for name in self.names)
 
     @cached_property
@@ -127,12 +127,12 @@ class Parametrisation:
 
     @cached_property
     def orders(self) -> NDArray[np.intp]:
-        """Power of s of each parameter (n_p,): 2 for a mass, 1 for a damper, 0 for a spring."""
+        """Power of s for each parameter (n_p,): 2 for a mass, 1 for a damper, 0 for a spring."""
         return np.array(["kcm".index(symbol) for symbol, _ in self.places])
 
     @cached_property
     def matrix_derivatives(self) -> tuple[Array, Array, Array]:
-        """dM/dp, dC/dp, dK/dp, each (n_p, n, n): constant, as the matrices are linear in p."""
+        """dM/dp, dC/dp, dK/dp, each (n_p, n, n); constant, because the matrices are linear in p."""
         outer = self.directions[:, :, None] * self.directions[:, None, :]
         mass, damping, stiffness = (
             np.where((self.orders == order)[:, None, None], outer, 0.0) for order in (2, 1, 0)
@@ -159,11 +159,11 @@ def named_estimates(
     Parameters
     ----------
     names : the physical parameters ("m_1", …) with an error. All others are known exactly.
-    covariance : (n_p, n_p) of these parameters, in physical units.
+    covariance : covariance (n_p, n_p) of these parameters, in physical units.
 
     Returns
     -------
-    The estimates by name. A damping of zero is not a measurement and is marked as `at_bound`.
+    The estimates by name. A damping of zero is not a measurement, so it is marked as `at_bound`.
 
     Raises
     ------
@@ -172,8 +172,8 @@ def named_estimates(
     values = chain.parameters()
     J = parameter_jacobian(chain, names)
     variance = np.einsum("ij,jk,ik->i", J, covariance, J)
-    # A damping ratio up to this limit is zero. It is far below any bench's, and above the rounding
-    # of a pole on the imaginary axis.
+    # A damping ratio up to this limit is zero. The limit is far below any bench's damping, and
+    # above the rounding of a pole on the imaginary axis.
     return {
         name: Estimate(value=0.0, std=None, source=source, at_bound=True)
         if read_name(name).is_damping and value <= 1e-10
@@ -189,7 +189,8 @@ def parameter_jacobian(chain: Chain, names: Sequence[str]) -> Array:
     for name in names:
         symbol, i = _place(name)
         values: Array = getattr(chain, symbol)
-        # The step is 1e-6 relative: the forward difference errs by as much, rounding by 1e-9.
+        # With a relative step of 1e-6, the forward difference has an error of 1e-6, and rounding of
+        # 1e-9.
         step = 1e-6 * (values[i] or np.max(values) or critical_damping(chain))
         moved = {"m": chain.m.copy(), "c": chain.c.copy(), "k": chain.k.copy()}
         moved[symbol][i] += step
@@ -208,8 +209,8 @@ def physical_start(found: Chain, *, bench: Bench, zeta: float = START_ZETA) -> C
     """Return a possible chain near the one that a measured table implies.
 
     `found` may hold impossible values (a negative spring, a mass far too small); these are clipped.
-    Dampings are set from `zeta`, because those of a table are too uncertain. But a cart without a
-    spring keeps its own damping.
+    Dampings are set from `zeta`, because dampings from a table are too uncertain. But a cart
+    without a spring keeps its own damping.
     """
     k = np.where(bench.stiff, _raised(found.k), 0.0)
     m = _raised(found.m)
@@ -218,14 +219,14 @@ def physical_start(found: Chain, *, bench: Bench, zeta: float = START_ZETA) -> C
 
 
 def _raised(values: Array) -> Array:
-    """Return the values, with the smallest raised to a given share of the largest."""
+    """Return the values, with the smallest ones raised to a small share of the largest."""
     return np.maximum(values, _SMALLEST_SHARE * np.max(np.abs(values)))
 
 
 def even_chain(values: Mapping[str, float], *, bench: Bench) -> Chain:
     """Return a chain of equal carts and springs with the gain and mean frequency of `values`.
 
-    It starts a fit if there are too few estimates to compute a chain from. `values` needs the first
+    It starts a fit if there are too few estimates to compute a chain. `values` needs the first
     cart's gain (`K` or `K_1`) and at least one resonance (`omega_n`, `omega_a`, …).
     """
     omegas = [

@@ -1,7 +1,7 @@
-"""The paper's way to fit the Bode plots: the last cart first, then the numerators one by one.
+"""Throne's way to fit the Bode plots: the last cart first, then the numerators one by one.
 
-The last cart's transfer function has no zeros, so it gives the common denominator. Each cart before
-it then adds its gain and its zeros. Only magnitudes are used, on a logarithmic scale.
+The last cart's transfer function has no zeros, so its fit gives the common denominator. Each cart
+before it then adds its gain and its zeros. Only magnitudes are used, on a logarithmic scale.
 
 Reference: Throne (2005), sections on the two and three degree of freedom systems.
 """
@@ -18,7 +18,7 @@ from pipeline.plant.linear.chain import Chain, quadratic_factors
 from pipeline.plant.linear.recovery import recover_chain
 
 _FARTHEST = 50.0  # bound of a logarithm, so that a step that goes astray does not overflow
-_ZETA_RANGE = (0.01, 1.0)  # allowed damping ratios of a start; others do not converge
+_ZETA_RANGE = (0.01, 1.0)  # damping ratios allowed at the start; others do not converge
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,7 +49,7 @@ def fit_stage_by_stage(
     ----------
     measured : magnitudes by cart. A missing cart keeps its start values.
     initial : the named parameters to start from, as far as they are known.
-    like : a chain that supplies start values for the others.
+    like : a chain that gives start values for all other parameters.
     """
     known = {**like.parameters(), **initial}
     gains = np.array([known[gain_name(i, n=n)] for i in range(1, n + 1)])
@@ -69,9 +69,9 @@ def fit_stage_by_stage(
 
 
 def _start(known: Mapping[str, float], i: int, *, n: int, like: Chain) -> Array:
-    """Return ln omega and ln zeta (2, n - i) to start T_{i+1} from.
+    """Return ln omega and ln zeta (2, n - i) from which the fit of T_{i+1} starts.
 
-    They belong to the poles for i = 0, else to the zeros of cart i.
+    They belong to the poles for i = 0, otherwise to the zeros of cart i.
     """
     roots = like.poles if i == 0 else like.zeros(i)
     omega, zeta = quadratic_factors(roots)
@@ -82,7 +82,7 @@ def _start(known: Mapping[str, float], i: int, *, n: int, like: Chain) -> Array:
 
 
 def _suffixes(i: int, *, n: int) -> list[str]:
-    """Return the suffixes of T_{i+1}'s quadratic factors; empty if the tables do not list them."""
+    """Return the suffixes of T_{i+1}'s quadratic factors, empty if the tables do not name them."""
     if i == 0:
         return mode_suffixes(n)
     if i == n - 1:
@@ -112,7 +112,7 @@ def _fit(
         start,
         max_evaluations=100,
     ).x
-    # A logarithm that changed by 7 is a factor of 1000: the fit has gone astray.
+    # If a logarithm changes by 7, a factor of 1000, the fit has gone astray.
     if np.max(np.abs(found - start)) > 7.0:
         return gain, factors
     return float(np.exp(found[0])), found[1:].reshape(shape)
@@ -137,9 +137,9 @@ def _polynomial(factors: Array) -> Array:
 
 
 def _named(gains: Array, factors: list[Array], tails: list[Array]) -> dict[str, float]:
-    """Return the fitted values by name, with the carts' own frequencies computed from them.
+    """Return the fitted values by name, and the carts' own frequencies computed from them.
 
-    A frequency is left out if it does not exist.
+    A frequency that does not exist is left out.
     """
     n = gains.size
     values = {gain_name(i, n=n): float(gain) for i, gain in enumerate(gains, start=1)}

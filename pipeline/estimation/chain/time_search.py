@@ -16,19 +16,19 @@ from pipeline.estimation.minimise import minimise
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import EXPLAINED
 
-# Share of a record's power (about its mean) that a chain may leave unexplained: carts with dry
+# Share of a record's power (about its mean) that a chain may leave unexplained. Carts with dry
 # friction leave some 2 %, a wrong chain most of it.
 FOLLOWED = 0.1
 # Farthest that a logarithm may move from its start. The logarithm of a damping or spring that does
-# not exist goes towards minus infinity; e^-15 of a start counts as zero, and no step overflows.
+# not exist goes towards minus infinity. e^-15 of the start counts as zero, and no step overflows.
 _LOG_REACH = 15.0
 # Relative change of the cost at which a search ends. With n samples, 1/n is one standard error.
 _SEARCH_TOLERANCE = 1e-6
 _MOST_EVALUATIONS = 60
-# Most comparisons of a chain with a record, in all starts together, at about 1 ms each. With all
-# carts measured, a search takes up to 200. With an unmeasured cart, it takes some 3000 to reach the
-# noise. If dry friction or play prevents that, all starts together take 5000. Without this limit,
-# records that no chain explains would take any number.
+# Largest number of comparisons of a chain with a record, in all starts together, at about 1 ms
+# each. With all carts measured, a search takes up to 200. With an unmeasured cart, it takes some
+# 3000 to reach the noise. If dry friction or backlash prevents this, all starts together take 5000.
+# Without this limit, records that no chain explains could take any number.
 _MOST_COMPARISONS = 10_000
 
 
@@ -38,10 +38,10 @@ class Attempt:
 
     Attributes
     ----------
-    theta : (n_p,) see `Parametrisation`.
-    misfits : one for each window.
+    theta : the fit vector (n_p,) of `Parametrisation`.
+    misfits : the misfit of each window.
     converged : whether a search ended at this chain by itself.
-    n_evaluations : number of chains that the search compared on the way.
+    n_evaluations : number of chains that the search compared before it came to this one.
     """
 
     parametrisation: Parametrisation
@@ -131,8 +131,8 @@ def descend(
 def condense(misfits: Sequence[Misfit]) -> Array:
     """Condense Jacobians and residuals to (n_p + 1, n_p + 1), the residuals in the last column.
 
-    The result is the triangle of a QR decomposition. Its columns have the same products as the long
-    columns. So least squares has the same solution with n_p + 1 rows instead of thousands.
+    The result is the triangle of a QR decomposition, with the same products of columns as the full
+    matrix. So least squares has the same solution with n_p + 1 rows instead of thousands.
     """
     triangles = []
     for misfit in misfits:
@@ -149,7 +149,7 @@ class SearchOutcome:
     Attributes
     ----------
     best : the attempt with the lowest cost on the whole windows.
-    cut_short : whether starts were left untried although no chain explained the records.
+    cut_short : whether some starts were not tried although no chain explained the records.
     """
 
     best: Attempt
@@ -169,7 +169,7 @@ def search(
     Parameters
     ----------
     given : a chain to start from, or None.
-    most_comparisons : limit on the comparisons of a chain with a record.
+    most_comparisons : limit on the number of comparisons of a chain with a record.
 
     Raises
     ------
@@ -191,8 +191,8 @@ def search(
         found = descend(windows, parametrisation, theta)
         tried, comparisons = tried + 1, comparisons + found.n_evaluations * len(windows)
         best = found if best is None or found.cost < best.cost else best
-        # Chains of equal carts are far from the truth, so a search from them may end at a wrong
-        # chain. All of them are tried, unless one explains the records down to their noise.
+        # Chains of equal carts are far from the true chain, so a search from them may end at a
+        # wrong one. All of them are tried, unless one explains the records down to their noise.
         if best.follows if tried <= len(near) else best.cost < EXPLAINED * best.dof:
             break
     if best is None:

@@ -22,22 +22,23 @@ from pipeline.estimation.modulating import bump, bump_integral
 from pipeline.plant.linear.chain import Chain
 from pipeline.set_up import Bench
 
-WIDTHS = (0.15, 0.3, 0.6, 1.2)  # s. A bump should last about one period of the carts
-_HOP = 0.25  # distance of bumps over their width. They overlap, so closer bumps add little
-_MOST_BUMPS = 400  # bumps in a record. More only cost time
-_FEWEST_SAMPLES = 8  # samples in a bump. Fewer do not integrate φ'' well
+WIDTHS = (0.15, 0.3, 0.6, 1.2)  # s; a bump should last about one period of the carts
+_HOP = 0.25  # distance of bumps over their width; they overlap, so closer bumps add little
+_MOST_BUMPS = 400  # bumps in a record; more would only take time
+_FEWEST_SAMPLES = 8  # samples in a bump; fewer do not integrate φ'' well
 _FEWEST_PERIODS = 2  # periods of the slowest resonance to try, in the longest record
-_FEWEST_PER_PERIOD = 8  # samples in a period of the fastest
-_FREQUENCY_STEP = 1.5  # frequency ratio of successive chains. The fit converges from a third away
+_FEWEST_PER_PERIOD = 8  # samples in a period of the fastest resonance to try
+_FREQUENCY_STEP = 1.5  # frequency ratio of successive chains; the fit converges from a third away
 _SWING_OVER_GAIN = 1.6  # range of a lightly damped cart after a step, over its static change
-_SMALLEST_ZETA = 0.005  # noise may make a regressed damping negative
+_SMALLEST_ZETA = 0.005  # least damping ratio, because noise may make a regressed damping negative
 
 
 def regress_chain(windows: Sequence[FitWindow], *, bench: Bench, width: float) -> Chain | None:
     """Regress a chain from the windows, with bumps of `width` (s).
 
-    The result is None if some cart's equation cannot be set up (the cart and its free neighbours
-    must be measured) or gives an impossible value (a negative mass or coupling).
+    The result is None if some cart's equation cannot be set up, because the cart or a free
+    neighbour was not measured. It is also None if the equation gives an impossible value (a
+    negative mass or coupling).
     """
     n = bench.n
     m, c, k = np.zeros(n), np.zeros(n), np.zeros(n + 1)
@@ -81,8 +82,8 @@ def _equation(cart: int, bench: Bench, x: Array, force: Array) -> tuple[Array, A
     """Return the columns of m, c and the springs of a cart's equation, and its right side.
 
     The spring before the cart is a column only for cart 1; otherwise it is the right side. `x` (3,
-    n + 2, n_b) holds the moments of walls and carts with φ, φ', φ''; `force` (n_b,) is that of the
-    input.
+    n + 2, n_b) holds the moments of walls and carts with φ, φ', φ''; `force` (n_b,) holds the
+    moments of the input.
     """
     stretch = x[0, cart] - x[0, cart - 1], x[0, cart] - x[0, cart + 1]
     columns = [x[2, cart], -x[1, cart], stretch[1] * bench.stiff[cart]]
@@ -96,7 +97,7 @@ def _moments(window: FitWindow, *, n: int, width: float) -> tuple[Array, Array] 
     """Return the moments (3, n + 2, n_b) of the positions with φ, φ', φ'', and (n_b,) of the input.
 
     φ = (τ (1 - τ))⁴, with τ from 0 to 1 over the bump. Walls, held and unmeasured carts are at
-    zero. The result is None if the record is shorter than two bumps or a bump holds too few
+    zero. The result is None if the record is shorter than two bumps, or if a bump holds too few
     samples.
     """
     t, duration = window.t, window.t[-1]
@@ -107,7 +108,7 @@ def _moments(window: FitWindow, *, n: int, width: float) -> tuple[Array, Array] 
     around = _around(t, starts, width)
     tau = np.clip((t[around] - starts[:, None]) / width, 0.0, 1.0)
     bumps = np.stack(bump(tau, span=width))
-    bumps *= np.gradient(t)[around]  # trapezoid rule, accurate because a bump ends smoothly
+    bumps *= np.gradient(t)[around]  # trapezoidal rule, accurate because bumps end smoothly
     x = np.zeros((3, n + 2, count))
     for cart, y in zip(window.carts, window.y, strict=True):
         x[:, cart] = np.einsum("dbi,bi->db", bumps, y[around])
@@ -131,7 +132,7 @@ def _around(t: Array, starts: Array, width: float) -> np.ndarray:
 def even_chains(windows: Sequence[FitWindow], *, bench: Bench) -> list[Chain]:
     """Return chains of equal carts, from slow to fast, with about the static gain of the records.
 
-    They serve for records that a regression cannot use, such as one with an unmeasured cart. The
+    They serve for records that a regression cannot use, such as one with an unmeasured cart. Their
     frequencies cover all that the records can show.
     """
     driven = [window for window in windows if window.drive_u is not None]

@@ -11,8 +11,8 @@ from pipeline.estimation.noise import local_noise, noise_beyond_rounding, roundi
 from pipeline.plant.linear.simulate import OVERSAMPLING, interpolate_band_limited
 from pipeline.results import Kind, Record
 
-# A free decay is used after its largest swing has fallen to this share: by then the hand or stop
-# has let go of the cart.
+# A free decay is used after its largest swing has fallen to this share, because the hand or stop
+# has then let go of the cart.
 _RELEASED_BELOW = 0.5
 _FEWEST_SAMPLES = 16
 
@@ -23,17 +23,17 @@ class FitWindow:
 
     Attributes
     ----------
-    t : (n,) s, from 0.
-    y : (p, n) positions of the free measured carts.
-    drive_t, drive_u : (n_d,) the held input, on a grid `stride` times finer than t. Without an
-        input on a free cart, drive_u is None.
-    carts, free : as in `Record`. The held carts are removed.
-    stated_sigma : (p,) standard error of a position, from encoder step and local noise.
-    sigma : (p,) standard error for the weights. At least the stated one.
-    step : (p,) encoder steps, position units. Zero if unknown.
+    t : times (n,), s, from 0.
+    y : positions (p, n) of the free measured carts.
+    drive_t, drive_u : times and values (n_d,) of the held input, on a grid `stride` times finer
+        than t. Without an input on a free cart, drive_u is None.
+    carts, free : measured and free carts, as in `Record` but without held carts.
+    stated_sigma : standard error (p,) of a position, from encoder step and local noise.
+    sigma : standard error (p,) used for the weights, at least `stated_sigma`.
+    step : encoder steps (p,), position units; zero if unknown.
     at_rest : whether the carts start at rest. Otherwise position and speed at t = 0 are unknown.
-    shared : (p,) for the readings before the input begins, the variance of their common error over
-        sigma². While nothing moves, the encoder's rounding is one common error.
+    shared : variance (p,) of the common error of the readings before the input begins, over sigma².
+        While nothing moves, the encoder's rounding is one common error.
     """
 
     id: str
@@ -61,7 +61,8 @@ class FitWindow:
     def rms_in_motion(self, residual: Array) -> Array:
         """Return the root mean square (p,) of residuals (p, n) after the input begins.
 
-        At rest it is chance whether an encoder flickers between two counts or stays on one.
+        Before the input begins, it is chance whether an encoder flickers between two counts or
+        stays on one.
         """
         return np.sqrt(np.mean(residual[:, self.n_resting :] ** 2, axis=1))
 
@@ -72,8 +73,7 @@ class FitWindow:
 
         Parameters
         ----------
-        residual : (p, n) position units.
-        at_rest : whether the carts start at rest.
+        residual : residuals (p, n), position units.
         """
         sigma = np.maximum(self.stated_sigma, np.sqrt(np.mean(residual**2, axis=1)))
         moving = self.rms_in_motion(residual)
@@ -85,7 +85,7 @@ class FitWindow:
         return replace(self, sigma=sigma, at_rest=at_rest, shared=shared)
 
     def thinned(self, most: int) -> "FitWindow":
-        """Return this window with at most 2 × `most` samples; the input keeps all."""
+        """Return this window with at most 2 × `most` samples; the input keeps all samples."""
         step = max(self.t.size // most, 1)
         return replace(self, t=self.t[::step], y=self.y[:, ::step], stride=self.stride * step)
 
@@ -96,9 +96,9 @@ class Misfit:
 
     Attributes
     ----------
-    residual : (p, n) model minus measured, over sigma.
-    jacobian : (n_p, p, n) of the residual by theta. The nuisance parameters (start and encoder
-        zeros) are adjusted along.
+    residual : (p, n), model minus measured, over sigma.
+    jacobian : derivatives (n_p, p, n) of the residual by theta, with the nuisance parameters (start
+        and encoder zeros) adjusted.
     n_nuisance : number of eliminated nuisance parameters.
     """
 
@@ -110,12 +110,12 @@ class Misfit:
 def usable_segment(record: Record) -> slice:
     """Return the samples of a record that a linear chain can explain.
 
-    For a driven record this is all of them. For a decay it is the part after the release. It begins
-    when the largest swing about the final rest has halved, as hand and stop have let go by then.
+    For a driven record these are all samples. For a decay they begin after the release, when the
+    largest swing about the final rest has halved. The hand or stop has then let go of the cart.
 
     Raises
     ------
-    DataError : nothing moves, or nothing is left after the release.
+    DataError : nothing moves, or no sample remains after the release.
     """
     if record.kind != "decay":
         return slice(0, record.t.size)
@@ -159,13 +159,13 @@ def open_window(record: Record) -> FitWindow:
         drive_u = record.u[used]
         if record.hold == "band_limited":
             fine_t, fine_u = interpolate_band_limited(drive_t, drive_u)
-            # Holding the value at the middle of an eight times finer step errs by (omega dt / 8)² /
-            # 24.
+            # Holding the value at the middle of an eight times finer step has an error of (omega dt
+            # / 8)² / 24.
             drive_t, stride = fine_t, OVERSAMPLING
             drive_u = np.append((fine_u[1:] + fine_u[:-1]) / 2, fine_u[-1])
     steps = np.array([record.encoder_step(cart) for cart in carts])
     noise = np.array([local_noise(t, position) for position in y])
-    # The error to assume if the data show neither noise nor encoder steps, from the motion's range.
+    # The error assumed, from the motion's range, if the data show neither noise nor encoder steps.
     least = 1e-6 * float(np.max(np.ptp(y, axis=1)))
     sigma = np.maximum(np.maximum(noise, steps / np.sqrt(12)), least)
     return FitWindow(
@@ -188,9 +188,9 @@ def open_window(record: Record) -> FitWindow:
 def compare(window: FitWindow, modes: Modes) -> Misfit:
     """Compare a chain, given by its modes, with a window.
 
-    Start and encoder zeros enter linearly and are eliminated: residual and Jacobian are projected
-    onto the rest of the space. This is variable projection in Kaufman's form (G. Golub & V.
-    Pereyra, Inverse Problems 19, 2003, section 3).
+    Start and encoder zeros enter linearly, so they are eliminated: residual and Jacobian are
+    projected onto the rest of the space. This is variable projection in Kaufman's form (G. Golub &
+    V. Pereyra, Inverse Problems 19, 2003, section 3).
     """
     p, n = window.y.shape
     rows = [window.free.index(cart) for cart in window.carts]
@@ -245,8 +245,8 @@ def compare(window: FitWindow, modes: Modes) -> Misfit:
 def weighed(values: Array, window: FitWindow) -> Array:
     """Return values (…, p, n) over sigma, with less weight on the mean of the first rest.
 
-    This whitens n readings that share an error. Their covariance is 1 + shared: along the vector of
-    ones its eigenvalue is 1 + n shared, in all other directions 1.
+    This whitens n readings with a common error. Their covariance is 1 + shared; its eigenvalue is 1
+    + n shared along the vector of ones, and 1 in all other directions.
     """
     scaled = values / window.sigma[:, None]
     if np.any(window.shared) and (n := window.n_resting):

@@ -1,8 +1,8 @@
 """Dry friction in a free decay: fit and test its exact piecewise solution.
 
-With viscous damping and dry friction F, the cart swings about a point d = F/k to one side while it
-moves one way, and about a point d to the other side on the way back. So successive amplitudes
-follow A_{j+1} = rho A_j - (1 + rho) d.
+With viscous damping and dry friction F, a cart that moves one way swings about a point d = F/k to
+one side of its rest. On the way back it swings about a point d to the other side. So successive
+amplitudes follow A_{j+1} = rho A_j - (1 + rho) d.
 
 Reference: B. F. Feeny and J. W. Liang, J. Sound and Vibration 195 (1996) 149-154.
 """
@@ -20,10 +20,10 @@ from pipeline.estimation.decay.ringing import Ringing
 from pipeline.estimation.decay.separable import fit_separable
 from pipeline.results import FrictionTest
 
-_THRESHOLD = 10.8  # the F-statistic of 1 in 1000 decays without friction is larger
+_THRESHOLD = 10.8  # F-statistic exceeded by 1 in 1000 decays without friction
 _UNKNOWNS = 7
 _MOST_LOSS = 50.0  # bound of an exponent during the fit, against overflow
-_LESS_DAMPING = (1.0, 0.3)  # starts: shares of the fitted damping to keep, the rest being friction
+_LESS_DAMPING = (1.0, 0.3)  # starts: shares of the damping that stay viscous
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,21 +39,21 @@ def fit_friction(
 ) -> FrictionFit | None:
     """Fit a decay with viscous damping and dry friction; compare with viscous damping alone.
 
-    The search is over turning point, decay rate and frequency; rest point, drift, first amplitude
+    The search is over turning point, decay rate and frequency. Rest point, drift, first amplitude
     and friction band are linear. The F-statistic allows for a correlated residual.
 
     Parameters
     ----------
-    t, y : (n,) one free decay.
+    t, y : times and readings (n,) of one free decay.
     viscous : the fit without friction, to the same samples.
-    turning : time of a turning point, s. Approximate.
-    falling : whether y decreases after it.
-    floor : the smallest significant residual (root-mean-square). A smaller friction band does not
+    turning : approximate time of a turning point, s.
+    falling : whether y decreases after the turning point.
+    floor : the smallest significant residual (root mean square). A smaller friction band does not
         count as present.
 
     Returns
     -------
-    None if the samples do not determine the further unknowns or the fit does not converge.
+    None if the samples do not determine the further unknowns, or if the fit does not converge.
     """
     pole = complex(viscous.poles[0])
     if t.size <= _UNKNOWNS + 1 or pole.imag <= 0:
@@ -80,7 +80,7 @@ def fit_friction(
     gained = viscous.rms**2 * t.size - left
     covariance = variance * _inverse_normal(cut(t, best.p), linear)
     (_, decay, omega_d), omega_n = best.p.tolist(), float(np.hypot(*best.p[1:]))
-    per_pole = np.array([omega_d**2, -decay * omega_d]) / omega_n**3  # of zeta = decay / omega_n
+    per_pole = np.array([omega_d**2, -decay * omega_d]) / omega_n**3  # gradient of decay / omega_n
     statistic = max(gained / variance, 0.0)
     test = FrictionTest(
         f_statistic=statistic,
@@ -104,21 +104,21 @@ def _inverse_normal(fitted: "_Swings", linear: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Swings:
-    """A decay cut into half cycles at its turning points, also before the turning point of the fit.
+    """A decay cut into half cycles at its turning points, also before the fit's turning point.
 
     In each half cycle, y = rest + drift + (amplitude kept + friction pushed) swing - friction side.
-    Friction is the friction band d; it lies on the side that the cart moves to.
+    Friction is the friction band d, on the side towards which the cart moves.
 
     Attributes
     ----------
     p : turning point in s, decay rate and damped frequency in rad/s.
-    since : (n,) s since the turning point.
-    tau : (n,) s since the half cycle began.
-    swing : (n,) a cosine. It goes from 1 at the start of the half cycle to -1 at its end.
-    sine : (n,) the quadrature of `swing`.
-    cycle : (n,) index of the half cycle. One for each sample.
-    number : (n_cycles,) numbers of the half cycles. The one after the turning point has 0.
-    kept, pushed, side : (n_cycles,) see the equation above.
+    since : time (n,) since the turning point, s.
+    tau : time (n,) since the half cycle began, s.
+    swing : cosine (n,) from 1 at the start of the half cycle to -1 at its end.
+    sine : quadrature (n,) of `swing`.
+    cycle : index (n,) of each sample's half cycle.
+    number : numbers (n_cycles,) of the half cycles; 0 for the one after the turning point.
+    kept, pushed, side : (n_cycles,), as in the equation above.
     """
 
     p: Array
@@ -186,7 +186,7 @@ class _Swings:
         pushed_per_loss = self.side * ((1 + rho) * per_loss - rho * geometric)
         size = (amplitude * self.kept + band * self.pushed)[self.cycle]
         size_per_loss = (band * pushed_per_loss - amplitude * number * self.kept)[self.cycle]
-        longer = np.pi / omega_d**2 * number[self.cycle]  # tau by omega_d
+        longer = np.pi / omega_d**2 * number[self.cycle]  # derivative of tau by omega_d
         return np.array(
             [
                 -drift - size * per_tau,

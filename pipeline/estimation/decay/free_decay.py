@@ -12,22 +12,22 @@ from pipeline.estimation.decay.ringing import Ringing, fit_ringing
 from pipeline.estimation.peaks import extrema, plateaus
 from pipeline.results import Record
 
-# Ratio of residual to noise below which a model is complete. With 50 samples, chance changes it by
-# a tenth.
+# Ratio of residual to noise below which a model is complete. With 50 samples, chance changes the
+# ratio by a tenth.
 _ADEQUATE = 1.5
 # Smallest swing to count, in grains. A grain is the encoder step, or the step whose rounding error
-# equals the noise if that is larger.
+# equals the noise if this is larger.
 _PROMINENCE = 6.0
 _SMALLEST_SWING = 8.0
-_BASE_SKIPS, _BASE_NEEDS = 2, 4  # turning points that may be the hand, if enough others remain
+_BASE_SKIPS, _BASE_NEEDS = 2, 4  # turning points skipped for the hand, and needed after them
 _MIN_SAMPLES = 12
-# Continued back in time, a fit may be off by this many of its own residuals. A share of the
+# Extended back in time, a fit may miss the record by this many of its own residuals. A share of the
 # amplitude is added while only the smaller swings were fitted, or if the residual exceeds the noise
 # anyway.
 _BACK_SIGMAS = 4.0
 _BACK_SHARES = (0.05, 0.0, 0.0)
 _REAL_SHARE = 0.15
-_RELEASE_MARGIN = 1 / 40  # of a period, in which the fingers leave the cart
+_RELEASE_MARGIN = 1 / 40  # share of a period, in which the fingers leave the cart
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,15 +56,15 @@ class FreeDecay:
         return self.friction.model if self.friction and self.friction.test.present else self.fit
 
     def rms(self, t: Array, y: Array) -> float:
-        """Root-mean-square residual of the model over the decay; `t`, `y` are the record's."""
+        """Return the root-mean-square residual over the decay; `t` and `y` are the record's."""
         window = slice(self.first, self.stop)
         return float(np.sqrt(np.mean((y[window] - self.model(t[window])) ** 2)))
 
 
 def find_decay(record: Record, *, cart: int, size: float) -> tuple[Stretch, list[int]]:
-    """Return the turning points of the record's largest free decay, and the stretch it is in.
+    """Return the turning points of the record's largest free decay, and the stretch around it.
 
-    `size` is the smallest significant change. Parts without input are preferred.
+    `size` is the smallest significant change. Stretches without input are preferred.
 
     Raises
     ------
@@ -106,8 +106,8 @@ def _stretches(record: Record) -> list[list[Stretch]]:
 def _decaying_run(t: Array, y: Array, stretch: Stretch, *, size: float) -> list[int]:
     """Return the turning points of the largest run of decreasing swings at regular times."""
     part = y[stretch.first : stretch.stop]
-    # The first one is the start of the stretch, not a turning point. The last one is where the cart
-    # came to rest; it counts if the cart did so in time.
+    # The first point is the start of the stretch, not a turning point. The last one is where the
+    # cart came to rest; it counts if the cart came to rest in time.
     turning = [i + stretch.first for i in extrema(part, prominence=_PROMINENCE * size)][1:]
     swings = np.abs(np.diff(y[turning]))
     times = np.diff(t[turning])
@@ -115,8 +115,8 @@ def _decaying_run(t: Array, y: Array, stretch: Stretch, *, size: float) -> list[
     start = 0
     while start < swings.size:
         end = start + 1
-        # A swing may exceed the one before by this factor. The second factor bounds each interval
-        # by the intervals so far; motion by hand is not regular enough.
+        # A swing may exceed the one before by 2 %. Each interval must be within 30 % of the median
+        # of the earlier intervals, because motion by hand is less regular.
         while (
             end < swings.size
             and _SMALLEST_SWING * size <= swings[end] <= 1.02 * swings[end - 1]
@@ -129,7 +129,7 @@ def _decaying_run(t: Array, y: Array, stretch: Stretch, *, size: float) -> list[
 
 
 def _score(y: Array, run: list[int]) -> float:
-    """Rank a run: first by whether it has one swing or several, then by size."""
+    """Rank a run: first by whether it has several swings, then by size."""
     if len(run) < 2:
         return 0.0
     travelled = float(np.sum(np.abs(np.diff(y[run]))))
@@ -140,17 +140,17 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
     """Fit the free decay from its release to its last turning point.
 
     The later swings are fitted first. The fit is then extended back over the earlier ones as long
-    as they agree. This separates the hand from the cart. If not even the later swings fit to the
-    noise (real friction is not ideal), all swings count.
+    as they agree. This separates the hand from the cart. If not even the later swings fit down to
+    the noise (real friction is not ideal), all swings are used.
 
     Parameters
     ----------
     run : the turning points.
-    floor : the smallest significant residual (root-mean-square).
+    floor : the smallest significant residual (root mean square).
     """
     interval = float(np.median(np.diff(t[run])))
     stop = run[-1] + 1
-    # With fewer turning points, the fit also needs the rest that follows.
+    # With fewer turning points, the fit also needs the rest that follows them.
     if len(run) < 5:
         stop = int(np.searchsorted(t[: stretch.stop], t[run[-1]] + 2 * interval))
     pole = complex(-np.log(_ratio(y, run)) / interval, np.pi / interval)
@@ -178,8 +178,8 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
     latest = min(run[min(_BASE_SKIPS, max(len(run) - _BASE_NEEDS, 0))], enough)
     decay = fit_from(latest)
     if decay.rms(t, y) > _ADEQUATE * floor:
-        # The model does not cover the start of a real cart's motion, so begin at the first passage
-        # through rest.
+        # The model does not cover the start of a real cart's motion, so the fit begins at the first
+        # passage through rest.
         decay = fit_from(min(run[0], enough))
         passage = int(np.searchsorted(t, t[run[0]] - interval / 2))
         held = _carried_back(t, y, decay, latest=decay.first, share=_REAL_SHARE, floor=floor)
@@ -208,6 +208,6 @@ def _carried_back(
 
 
 def _ratio(y: Array, run: list[int]) -> float:
-    """Return the mean ratio of a swing to the one before; a guess for only two turning points."""
+    """Return the mean ratio of a swing to the one before, or a guess for two turning points."""
     swings = np.abs(np.diff(y[run]))
     return float((swings[-1] / swings[0]) ** (1 / (swings.size - 1))) if swings.size > 1 else 0.3

@@ -18,11 +18,11 @@ class Ringing:
 
     Attributes
     ----------
-    poles : (n_modes,) in the upper half plane, rad/s.
-    amplitudes : (n_modes,) complex, at `t0`.
-    covariance : of (level, slope, decay rates, frequencies). Allows for a correlated residual. The
-        row of the slope is zero if it was not fitted.
-    rms : root-mean-square of the residual.
+    poles : poles (n_modes,) in the upper half plane, rad/s.
+    amplitudes : complex amplitudes (n_modes,) at `t0`.
+    covariance : covariance of (level, slope, decay rates, frequencies), for a residual that may be
+        correlated. The row of the slope is zero if no slope was fitted.
+    rms : root mean square of the residual.
     converged : False if the fit ran out of steps.
     """
 
@@ -54,14 +54,14 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
 
     Parameters
     ----------
-    t, y : (n,), at least 4 n_modes + 3 samples.
-    poles : (n_modes,) start, upper half plane, rad/s.
+    t, y : times and readings (n,), at least 4 n_modes + 3 samples.
+    poles : starting values (n_modes,) in the upper half plane, rad/s.
     """
     n_modes, scale = poles.size, float(np.mean(np.abs(poles)))
     tau = scale * (t - t[0])
     level = np.array([np.ones_like(t), t - t[0]] if drift else [np.ones_like(t)])
     k = len(level)
-    # A start has at least this decay rate, as a share of the frequency.
+    # The decay rate at the start is at least this share of the frequency.
     fit = fit_separable(
         y,
         lambda p: _Waves.at(tau, p, level=level),
@@ -121,11 +121,11 @@ class _Waves:
 def find_poles(t: Array, y: Array, *, n_modes: int) -> ComplexArray:
     """Return rough poles of `n_modes` damped sinusoids about a level, upper half plane, rad/s.
 
-    Uses the matrix pencil method on evenly interpolated samples (Hua & Sarkar, IEEE Trans. ASSP 38,
-    1990). The level appears as one more pole, near zero. Fewer poles are returned if the data do
-    not oscillate in so many modes.
+    They are found by the matrix pencil method on evenly interpolated samples (Hua & Sarkar, IEEE
+    Trans. ASSP 38, 1990). The level appears as one more pole, near zero. Fewer poles are returned
+    if the data do not oscillate in so many modes.
     """
-    # The matrix pencil only starts the fit; more samples would only cost time.
+    # The matrix pencil is only a start for the fit; more samples would only take time.
     n = min(t.size, 300)
     grid = np.linspace(t[0], t[-1], n)
     hankel = np.lib.stride_tricks.sliding_window_view(np.interp(grid, t, y), n // 3)

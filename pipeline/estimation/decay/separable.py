@@ -1,4 +1,4 @@
-"""Least squares in which most unknowns are linear: these are solved for at every step.
+"""Least squares in which most unknowns are linear, and are solved for at every step.
 
 Reference: G. H. Golub and V. Pereyra, SIAM J. Numer. Anal. 10 (1973) 413-432, in Kaufman's form.
 """
@@ -32,7 +32,7 @@ class SeparableModel(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SeparableFit:
-    """The nonlinear unknowns p (n_p,) and the linear ones at the least residual.
+    """The nonlinear unknowns p (n_p,), and the linear unknowns with the least residual.
 
     `residual` (n,) is model - y; `converged` is False if the fit ran out of steps.
     """
@@ -61,8 +61,9 @@ def fit_separable(
         return J - point.basis @ (point.basis.T @ J)
 
     at = evaluated_once(lambda p: _solved(y, model(p)))
-    # `least_squares` runs the same MINPACK routine, but needs as long again to prepare each call.
-    with np.errstate(over="ignore"):  # from the covariance of p, which is not used
+    # `least_squares` runs the same MINPACK routine, but preparing each call takes as long as the
+    # fit.
+    with np.errstate(over="ignore"):  # in the covariance of p, which is not used
         p, *_, status = leastsq(
             lambda p: at(p).residual,
             start,
@@ -92,7 +93,7 @@ def _solved(y: Array, model: SeparableModel) -> _Point:
     """Return the model with the linear unknowns that give the least residual."""
     X = model.columns
     basis, sizes, turn = np.linalg.svd(X, full_matrices=False)
-    # Far from the solution, columns may be nearly equal; these share their contribution.
+    # Far from the solution, columns may be nearly equal; they then share their contribution.
     apart = np.maximum(sizes, np.finfo(np.float64).eps * len(X) * sizes[0])
     linear = (y @ basis / apart) @ turn
     return _Point(model=model, basis=basis, linear=linear, residual=X @ linear - y)

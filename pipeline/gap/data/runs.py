@@ -14,41 +14,41 @@ from pipeline.plant.linear.simulate import interpolate_band_limited
 from pipeline.plant.nonlinear.simulator.kernel import Excitation, describe_run
 from pipeline.results import Record
 
-_STILL = 2.6  # encoder steps, peak to peak. A smaller range counts as rest
-_SMOOTHING = 0.03  # s, half width of a local cubic. For a bench of carts
-# A hold at the top of the motion has at least so many samples. It lasts at least `_HELD_TIME` times
-# as long as a free passage of the top.
+_STILL = 2.6  # encoder steps, peak to peak; a smaller range counts as rest
+_SMOOTHING = 0.03  # s, half width of a local cubic for a bench of carts
+# A hand holds a cart at the top of its motion if the cart stays there for this many samples, and
+# `_HELD_TIME` times as long as in free motion.
 _HELD_SAMPLES = 4
 _HELD_TIME = 2.0
-_RESTING = 1.5  # encoder steps. The range of the readings of a cart at rest
-_ONE_READING = 0.07  # s. At rest, this time counts as one independent reading
+_RESTING = 1.5  # encoder steps; largest range of readings of a cart at rest
+_ONE_READING = 0.07  # s; at rest, this time counts as one independent reading
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GapRun:
-    """One record as the fits use it.
+    """One record in the form that the fits use.
 
     Attributes
     ----------
-    t : (samples,) times from the first sample used, s.
-    y : (rows, samples) readings.
-    rows : (rows,) cart index (from 0) of each row. Held carts are left out.
-    free : (n,) which carts move.
-    guided : (n, samples) motion of held carts that are not held firmly. Zero for all others.
-    knots, command : the input, held from knot to knot.
+    t : times (samples,) from the first sample used, s.
+    y : readings (rows, samples).
+    rows : cart index (from 0) of each row. Held carts have no row.
+    free : whether each cart moves (n,).
+    guided : motion (n, samples) of held carts that still move; zero for all other carts.
+    knots, command : times and values of the input, held from knot to knot.
     at_rest : whether the carts are at rest at the first sample.
-    start_known : whether the first readings determine the start. Otherwise it is fitted, since
-        springs make the carts forget it.
-    start, slope : (n,) first reading and velocity of each cart.
-    rest : (n,) rest positions. These are readings.
-    zero, zero_std : (n,) expected encoder zero, and its uncertainty. See `with_zeros`.
-    sigma : (rows,) noise of one sample.
-    weight : (rows, samples) square root of the weight of each sample. At most 1.
-    block : number of samples averaged to one residual, in `thin`.
-    pace : 1 for a bench of carts. Smaller in proportion for faster systems.
-    shots : (shots + 1,) bounds of pieces that have their own start. (0, samples) is the whole run.
-    shot_x, shot_v : (shots, n) smoothed states at the start of each shot. Encoder zeros are
-        included.
+    start_known : whether the first readings determine the start. Otherwise it is fitted, because
+        springs make the carts forget their start.
+    start, slope : first reading and velocity (n,) of each cart.
+    rest : rest positions (n,), as readings.
+    zero, zero_std : expected encoder zeros (n,) and their uncertainty; see `with_zeros`.
+    sigma : noise (rows,) of one sample.
+    weight : square root (rows, samples) of the weight of each sample; at most 1.
+    block : number of samples that `thin` averages to one residual.
+    pace : 1 for a bench of carts, and smaller in proportion for faster systems.
+    shots : bounds (shots + 1,) of pieces that have their own start. (0, samples) is the whole run.
+    shot_x, shot_v : smoothed positions (with encoder zeros) and velocities (shots, n) at the start
+        of each shot.
     """
 
     id: str
@@ -77,9 +77,9 @@ class GapRun:
 
     @property
     def start_std(self) -> tuple[Array, Array]:
-        """(n,) each: standard errors of `start` and `slope` from the first readings.
+        """Standard errors (n,) of `start` and of `slope` from the first readings.
 
-        They are infinite for a start that is fitted.
+        They are infinite if the start is fitted.
         """
         known = np.full(self.zero.size, np.inf)
         if self.start_known:
@@ -88,12 +88,12 @@ class GapRun:
 
     @property
     def swing(self) -> Array:
-        """(rows,) root-mean-square of the readings about their rest."""
+        """Root mean square (rows,) of the readings about their rest."""
         return np.sqrt(np.mean((self.y - self.rest[list(self.rows)][:, None]) ** 2, axis=1))
 
     @property
     def input(self) -> Array:
-        """(samples,) the input at each sample."""
+        """The input (samples,) at each sample."""
         if self.knots.size == self.t.size:
             return self.command
         return np.interp(self.t, self.knots, self.command)
@@ -101,7 +101,7 @@ class GapRun:
     def by_cart(self, rows: Array, zero: Array) -> Array:
         """Return the positions (n, samples) for readings (rows, samples) and encoder zeros (n,).
 
-        Carts without readings get 0.
+        Carts without readings get the position 0.
         """
         x = np.zeros((zero.size, self.t.size))
         x[list(self.rows)] = rows - zero[list(self.rows)][:, None]
@@ -113,19 +113,19 @@ class GapRun:
         return replace(self, sigma=np.array(own))
 
     def with_zeros(self, *, width: float) -> "GapRun":
-        """Return the run with the file's own encoder zeros, known to `width` times the noise."""
+        """Return the run whose encoder zeros are the file's, known to `width` times the noise."""
         std = np.full(self.zero.size, 1.0)
         std[list(self.rows)] = width * self.sigma
         return replace(self, zero=np.zeros(self.zero.size), zero_std=std)
 
     @cached_property
     def thin(self) -> "GapRun":
-        """The run as the fits use it: fast samples are averaged in blocks, pieces stay the same."""
+        """The run as the fits use it, with blocks of fast samples averaged, in the same pieces."""
         return _thin(self) if self.block > 1 else self
 
     @cached_property
     def excitation(self) -> Excitation:
-        """Return the run as the simulator takes it."""
+        """Return the run in the form that the simulator takes."""
         return describe_run(
             self.t,
             self.command,
@@ -139,9 +139,9 @@ class GapRun:
 def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
     """Prepare one record of a bench with n carts.
 
-    `in_motion` is true for a part of a longer record, which may begin in motion. A decay starts
-    after the hand has let go; the samples before that are cut. A part that begins in motion starts
-    at its first turning point, where no hand can still act.
+    `in_motion` is true for a part of a longer record, which may begin in motion. Such a part starts
+    at its first turning point, where no hand can still act. A decay starts after the hand has let
+    go; earlier samples are cut.
     """
     rows = tuple(cart - 1 for cart in record.carts if cart in record.free)
     y = np.array([record.position(row + 1) for row in rows])
@@ -149,7 +149,7 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
     guided = _guided(record, n=n)
     t, u = record.t, record.u if record.u is not None else np.zeros(record.t.size)
     still = np.maximum(_STILL * resolution, 4.0 * difference_noise(y, order=4))
-    # The rest point is known only if the carts are at rest in the last 12 %.
+    # The rest is known only if the carts do not move in the last 12 % of the record.
     tail = y[:, -max(3, int(0.12 * t.size)) :]
     settled = np.ptp(tail, axis=1) <= still
     frequency = _dominant_frequency(t, y)
@@ -191,7 +191,7 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
         zero_std=zero_std,
         sigma=np.maximum(resolution / np.sqrt(12.0), 1e-9 * span),
         weight=np.array([_weight(*row, length) for row in zip(y, resolution, strict=True)]),
-        block=max(1, int(rate * pace / 250.0)),  # Hz. Faster samples are averaged for fits
+        block=max(1, int(rate * pace / 250.0)),  # Hz; faster samples are averaged for fits
         pace=pace,
         shots=(0, t.size),
         shot_x=start[None],
@@ -201,7 +201,8 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
 
 def _begins_at_rest(y: Array, u: Array, still: Array, sample_time: float) -> tuple[bool, bool]:
     """Return whether a run starts at rest, and whether it is in equilibrium without an input."""
-    # Samples before the input changes. The first two count too, as the input has no effect yet.
+    # Samples before the input changes. The first two always count, because the input has no effect
+    # yet.
     quiet = max(2, int(np.argmax(u != u[0])) + 1)
     # A run without motion in its first 20 ms starts at rest.
     look = max(2, min(quiet, round(0.02 / sample_time)))
@@ -218,14 +219,14 @@ def _held_input(t: Array, u: Array) -> tuple[Array, Array]:
 
 
 def _guided(record: Record, *, n: int) -> Array:
-    """Return the motion (n, samples) of held carts, smoothed; zero if it is within a reading."""
+    """Return the smoothed motion (n, samples) of held carts; zero if it is within rounding."""
     guided = np.zeros((n, record.t.size))
-    # A local cubic over 20 ms to either side; a hand allows no faster motion.
+    # A local cubic over 20 ms on either side; a hand allows no faster motion.
     half = max(2, round(0.02 / record.sample_time))
     for cart in record.carts:
         y = record.position(cart)
         if cart not in record.free and np.ptp(y) > _STILL * record.encoder_step(cart):
-            from scipy.signal import savgol_filter  # takes half a second, so it is imported on use
+            from scipy.signal import savgol_filter  # takes half a second, so it is imported here
 
             guided[cart - 1] = savgol_filter(y, 2 * half + 1, polyorder=3)
     return guided
@@ -235,8 +236,8 @@ def _thin(run: GapRun) -> GapRun:
     """Return the run with one reading for each block of samples, at the middle of its times.
 
     The mean of a smooth motion exceeds its value in the middle by half the curvature times the
-    variance of the times. This is subtracted, so the model need not be simulated sample by sample.
-    The first sample of each piece defines its state and has no weight.
+    variance of the times. This excess is subtracted, so the model need not be simulated at every
+    sample. The first sample of each piece defines its state and has no weight.
     """
     q = run.block
     t, y, weight, shots = [], [], [], [0]
@@ -245,7 +246,7 @@ def _thin(run: GapRun) -> GapRun:
         times = run.t[first:last].reshape(-1, q)
         middle = times.mean(axis=1)
         mean = run.y[:, first:last].reshape(len(run.y), -1, q).mean(axis=2)
-        if middle.size >= 3:  # the fewest blocks for a curvature
+        if middle.size >= 3:  # a curvature needs three blocks
             slope = np.diff(mean, axis=1) / np.diff(middle)
             curvature = np.diff(slope, axis=1) / (0.5 * (middle[2:] - middle[:-2]))
             mean = mean - 0.5 * times.var(axis=1) * np.pad(curvature, ((0, 0), (1, 1)), mode="edge")
@@ -254,7 +255,7 @@ def _thin(run: GapRun) -> GapRun:
         y += [run.y[:, first : first + 1], mean]
         weight += [np.zeros((len(run.y), 1)), np.sqrt(share)]
         shots.append(shots[-1] + 1 + middle.size)
-    side = (1.0 - q**-2) / 24.0  # of each neighbour's mean, in the corrected mean
+    side = (1.0 - q**-2) / 24.0  # share of each neighbour's mean in the corrected mean
     return replace(
         run,
         t=np.concatenate(t),
@@ -268,9 +269,9 @@ def _thin(run: GapRun) -> GapRun:
 
 
 def _weight(readings: Array, step: float, length: int) -> Array:
-    """Return the weight of each reading of one encoder.
+    """Return the square root of the weight of each reading of one encoder.
 
-    A cart at rest repeats the same rounding error. So however long it rests, its readings count as
+    A cart at rest repeats the same rounding error. So, however long it rests, its readings count as
     `length` readings.
     """
     weight = np.ones(readings.size)
@@ -289,7 +290,7 @@ def _weight(readings: Array, step: float, length: int) -> Array:
 def cut_shots(run: GapRun, *, length: float) -> GapRun:
     """Cut a run into pieces, each with its own start state.
 
-    `length` is in s for a bench of carts; it is scaled by the pace.
+    `length` is in s for a bench of carts, and is scaled by the pace.
     """
     count = max(1, round(float(run.t[-1] - run.t[0]) / (length * run.pace)))
     bounds = np.linspace(0, run.t.size, count + 1).astype(int)
@@ -305,7 +306,7 @@ def cut_shots(run: GapRun, *, length: float) -> GapRun:
 
 
 def _dominant_frequency(t: Array, y: Array) -> float:
-    """Return the frequency (Hz) with the strongest velocity."""
+    """Return the frequency, Hz, at which the velocity is strongest."""
     uniform = np.linspace(t[0], t[-1], t.size)
     best, peak = 1.0, 0.0
     for row in y:
@@ -336,10 +337,10 @@ def _free_from(offset: Array, still: Array, *, radians: float | None) -> int:
     last = top + int(held[gaps[0]] if gaps.size else held[-1])
     passing = _HELD_TIME * np.sqrt(2.0 * slack / peak) / radians
     if last - top < max(_HELD_SAMPLES, passing):
-        # The carts were shaken, or released before the file begins: no hand acts after the largest
-        # swing.
+        # If the carts were shaken, or released before the file begins, no hand acts after the
+        # largest swing.
         return last if top > 0 else 0
-    # The first turning point after the release; no hand can still act there.
+    # the first turning point after the release, where no hand can still act
     side = np.sign(offset[leader, top])
     return last + int(np.argmin(side * offset[leader, last:]))
 

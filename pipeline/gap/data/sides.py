@@ -1,4 +1,4 @@
-"""Choose the records to use, cut them to runs, and hold some of the runs out."""
+"""Choose the records to use, cut them into runs, and hold some of the runs out."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -13,8 +13,8 @@ from pipeline.results import Intervention, LeftOut, Record
 from pipeline.words.numbers import by_note
 from pipeline.words.phrases import phrases
 
-_MOST_DWELLS = 4  # sine dwells to use. Further ones add little beyond their frequency
-_LEAST_MOTION = 8.0  # encoder steps, a smaller motion is not used
+_MOST_DWELLS = 4  # sine dwells to use; further ones add little but their frequency
+_LEAST_MOTION = 8.0  # encoder steps; a smaller motion is not used
 _FEWEST, _SHORTEST = 50, 0.5  # samples, s
 
 
@@ -43,7 +43,7 @@ def prepare(
     interventions: Sequence[Intervention] = (),
     notes: list[str],
 ) -> list[GapRun]:
-    """Return the runs worth fitting; append a note on each that is left out.
+    """Return the runs worth fitting; append a note on each record that is left out.
 
     The part of a record after an intervention is a separate run.
 
@@ -97,17 +97,17 @@ def _free_runs(record: Record, interventions: Sequence[Intervention], *, n: int)
                 let_go = piece.u is None or not np.any(piece.u)
                 piece = replace(piece, kind="decay" if let_go else "sweep")
             run = make_run(piece, n=n, in_motion=later)
-            # A cart that waits at rest for a hand shows nothing.
+            # A cart that rests until a hand moves it shows nothing.
             if piece.kind != "decay" or _last_away(run):
                 runs.append(run)
     return runs
 
 
 def _on_no_spring(run: GapRun) -> GapRun:
-    """Return a run without springs: readings are absolute positions, and the start is known.
+    """Return a run for a bench without springs: its readings are absolute, and its start is known.
 
-    Without springs there is no rest to define a zero, and a start has a lasting effect. If it were
-    free, it would absorb missing effects.
+    Without springs there is no rest that defines a zero, and a start has a lasting effect. If the
+    start were free, it would absorb missing effects.
     """
     # The zero counts as known to a thousandth of the noise.
     known = np.full(run.zero.size, 1e-3 * float(run.sigma.min()))
@@ -115,7 +115,7 @@ def _on_no_spring(run: GapRun) -> GapRun:
 
 
 def _is_usable(record: Record) -> bool:
-    """Return whether a free cart moves for long enough, and by forces that are known."""
+    """Return whether a free cart moves, for long enough, under forces that are known."""
     if not record.free or record.t.size < _FEWEST or record.t[-1] - record.t[0] < _SHORTEST:
         return False
     # Without a recorded input, only a release or a run with cart 1 held is usable.
@@ -133,7 +133,7 @@ def _span(record: Record, cart: int) -> float:
 
 
 def _with_still_carts_held(records: list[Record], *, notes: list[str]) -> list[Record]:
-    """Return the records, with carts that move in none of them marked as held."""
+    """Return the records in which carts that never move are marked as held."""
     seen = [(r, cart) for r in records for cart in r.free if cart in r.carts]
     # A cart whose readings stay within three encoder steps is at rest.
     moving = {cart for r, cart in seen if _span(r, cart) > 3.0 * r.encoder_step(cart)}
@@ -153,7 +153,7 @@ def take_sides(runs: list[GapRun], *, notes: list[str]) -> tuple[list[GapRun], l
     notes.append(phrases("gap").text("note_cut"))
     longest = max(range(len(runs)), key=lambda i: runs[i].t[-1] - runs[i].t[0])
     run = runs[longest]
-    cut = int((1.0 - 0.4) * _last_motion(run))  # 40 % of the motion is held out
+    cut = int((1.0 - 0.4) * _last_motion(run))  # the last 40 % of the motion is held out
     pieces = []
     for piece in (slice(0, cut), slice(cut, None)):
         record = replace(
@@ -182,7 +182,7 @@ def take_sides(runs: list[GapRun], *, notes: list[str]) -> tuple[list[GapRun], l
 
 
 def _last_motion(run: GapRun) -> int:
-    """Return the number of samples up to the last motion of a run."""
+    """Return the number of samples up to the last motion, but at least half of the run."""
     return max(_last_away(run) or run.t.size, run.t.size // 2)
 
 
@@ -207,17 +207,17 @@ def split(runs: Sequence[GapRun]) -> tuple[list[int], list[int]]:
 
     Whole runs are held out, by these rules:
 
-    - Every second one of repeats.
-    - The middle one of three or more sizes of a kind. So both extremes are trained on.
-    - The smaller one of two free decays.
-    - Never the last run of a kind.
-    - Nothing from a single run, or from only two sweeps. The caller then cuts a run in time.
+    - Every second repeat is held out.
+    - Of three or more sizes of a kind, the middle one is held out, so the extremes are trained on.
+    - Of two free decays, the smaller one is held out.
+    - At least one run of each kind is trained on.
+    - From a single run, or only two sweeps, none is held out. The caller then cuts a run in time.
     """
     groups: dict[tuple, list[int]] = defaultdict(list)
     for index, run in enumerate(runs):
         groups[run.record.kind, run.free].append(index)
     held: list[int] = []
-    pairs: list[list[int]] = []  # groups of two different runs, held out only as a last resort
+    pairs: list[list[int]] = []  # two different runs each, held out only as a last resort
     for (kind, _), members in groups.items():
         sizes = {i: _size(runs[i]) for i in members}
         clusters: list[list[int]] = []
@@ -231,13 +231,13 @@ def split(runs: Sequence[GapRun]) -> tuple[list[int], list[int]]:
             held += cluster[1::2]
         sizes_apart = [cluster[0] for cluster in clusters]
         if len(sizes_apart) >= 3:
-            # The order is by signed size, so the extremes of both signs are trained on.
+            # The order is by signed size, so the extremes of both signs are used for training.
             held.append(sizes_apart[len(sizes_apart) // 2])
         elif len(sizes_apart) == 2 and kind == "decay" and len(members) == 2:
             held.append(min(sizes_apart, key=lambda i: abs(sizes[i])))
         elif len(sizes_apart) == 2:
             pairs.append(sizes_apart)
-    # Each of two sweeps may cover what the other lacks, so both are trained on.
+    # Each of two sweeps may cover what the other lacks, so both are used for training.
     if not held and any(runs[i].record.kind != "sweep" for pair in pairs for i in pair):
         held = [min(pair, key=lambda i: abs(_size(runs[i]))) for pair in pairs[:1]]
     return [i for i in range(len(runs)) if i not in held], sorted(held)
@@ -246,7 +246,8 @@ def split(runs: Sequence[GapRun]) -> tuple[list[int], list[int]]:
 def _size(run: GapRun) -> float:
     """Return how hard a run was driven: its extreme input, or the start of a free decay.
 
-    Under feedback it is the extreme reference, because the controller only responds with the input.
+    Under feedback it is the range of the reference, because the controller's input only follows
+    from it.
     """
     if run.record.reference is not None and np.ptp(run.record.reference) > 0.0:
         return float(np.ptp(run.record.reference))

@@ -1,4 +1,4 @@
-"""Fit the linear chain to all runs at once, so that only missing effects are left."""
+"""Fit the linear chain to all runs at once, so that only the missing effects remain."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -33,7 +33,7 @@ def first_chain(runs: Sequence[GapRun], *, springs: Sequence[bool]) -> Chain:
         # With free decays alone, forces are relative to the first mass.
         A, b = np.vstack([A, np.zeros(columns)]), np.append(b, 0.0)
         first = int(np.argmax(np.abs(A[:, :n]).max(axis=0) > 0.0))  # the first cart that moves
-        # The equation m_1 = 1 gets a large weight, because nothing else sets a scale.
+        # The equation m_1 = 1 gets a large weight, because nothing else sets the scale.
         A[-1, first] = b[-1] = 1e3 * float(np.abs(A[:, first]).max())
     scale = np.linalg.norm(A, axis=0)
     scale[scale == 0.0] = 1.0  # a cart that never moves keeps the smallest values
@@ -48,7 +48,7 @@ def first_chain(runs: Sequence[GapRun], *, springs: Sequence[bool]) -> Chain:
 
 
 def _equations(run: GapRun, rows: Sequence[int]) -> tuple[Array, Array]:
-    """Return coefficients and right sides of one equation per moving cart and window of a run."""
+    """Return the coefficients and right sides of equations, one per moving cart and window."""
     # Windows of 0.3 s, every 50 ms, for a bench of carts.
     step = max(1, round(0.05 * run.pace / run.record.sample_time))
     width = max(8, round(0.3 * run.pace / run.record.sample_time))
@@ -90,8 +90,8 @@ def fit_baseline(
 ) -> tuple[GapFit, list[GapRun]]:
     """Fit the linear chain; return the fit and the runs with their measured noise.
 
-    The fit uses short pieces with their own start states first, then whole runs. It is done twice:
-    from the identified chain and from an independent estimate. The better result is kept.
+    The fit uses short pieces with their own start states first, then whole runs. It is done from
+    the identified chain and from an independent estimate. The better result is kept.
     """
     structure = Structure(springs=tuple(springs))
     # In pieces of 0.6 s, a missing effect does little harm.
@@ -106,14 +106,15 @@ def fit_baseline(
 
 
 def measure_noise(fit: GapFit, shots: Sequence[GapRun], runs: Sequence[GapRun]) -> list[GapRun]:
-    """Return the runs with the noise of each cart: encoder step or high-frequency residual."""
+    """Return the runs with each cart's noise, from its encoder step or high-frequency residual."""
     found: dict[int, list[float]] = {}
     resting: dict[int, list[float]] = {}
     for shot, nuisance in zip(shots, fit.nuisance, strict=True):
         model = simulate_run(fit, shot, nuisance)
         for j, row in enumerate(shot.rows):
             for part in (slice(a, b) for a, b in pairwise(shot.shots)):
-                # Only a moving encoder shows its noise, as one at rest repeats the same reading.
+                # Only a moving encoder shows its noise, because one at rest repeats the same
+                # reading.
                 moving = np.mean(shot.weight[j, part] ** 2) > 0.9
                 side = found if moving else resting
                 side.setdefault(row, []).append(high_frequency_noise((shot.y - model)[j, part]))
@@ -127,7 +128,7 @@ def measure_noise(fit: GapFit, shots: Sequence[GapRun], runs: Sequence[GapRun]) 
 
 
 def fit_nuisance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> GapFit:
-    """Fit only the nuisance parameters, for runs that the model was not fitted to."""
+    """Fit only the nuisance parameters of runs to which the model was not fitted."""
     how = Fitting(mapper=mapper, shared=False, iterations=10)
     fresh = tuple(fresh_nuisance(run) for run in runs)
     found = fit_model(replace(fit, nuisance=fresh), runs, how)

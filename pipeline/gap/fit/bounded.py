@@ -18,8 +18,8 @@ def bounded_step(
     """Return a step of the parameters `at` (size,) within their bounds and step limits.
 
     `bounds` are the lower bounds, the upper bounds, and the largest step of each parameter. `solve`
-    returns the step of the `active` parameters, given by index. If a parameter at a bound would
-    step outward, it is fixed and the others are solved again, at most `rounds` times.
+    returns the step of the `active` parameters, given by index. A parameter at a bound that would
+    step outward is fixed, and the others are solved again, at most `rounds` times.
     """
     low, high, reach = bounds
     delta = np.zeros(at.size)

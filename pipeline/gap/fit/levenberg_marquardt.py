@@ -35,15 +35,15 @@ class GapFit(GapModel):
 
     Attributes
     ----------
-    covariance : (size, size) of the parameter vector. None before the search ends.
+    covariance : covariance (size, size) of the parameter vector; None before the search ends.
     nuisance : the nuisance parameters of each run, in the order of the runs.
-    cost : sum of squared residuals over their noise. Prior terms are included.
+    cost : sum of squares of residuals in units of the noise, with prior terms.
     chi_square : the cost without prior terms.
     n_points : the number of residuals.
-    run_chi : (runs,) chi-square per residual. One for each run.
-    run_prior : (runs,) prior terms of each run.
-    run_points : (runs,) number of residuals of each run.
-    spread : (n,) run-to-run standard deviation of each cart's dry friction. It is relative.
+    run_chi : chi-square per residual (runs,) of each run.
+    run_prior : prior terms (runs,) of each run.
+    run_points : number of residuals (runs,) of each run.
+    spread : relative standard deviation (n,), from run to run, of each cart's dry friction.
     """
 
     nuisance: tuple[Nuisance, ...]
@@ -83,12 +83,13 @@ class Fitting:
 
     Attributes
     ----------
-    mapper : maps a function over the runs.
-    iterations : largest number of iterations.
+    mapper : a function that maps another function over the runs.
+    iterations : the largest number of iterations.
     tolerance : relative decrease of the cost below which the fit has converged.
-    shared : whether the shared parameters move. If not, only those of the runs do.
+    shared : whether the shared parameters are fitted. If not, only the parameters of single runs
+        are.
     scatter_free : whether dry friction may differ between runs.
-    learn_spread : whether the size of these differences is estimated too.
+    learn_spread : whether the size of the differences in friction is estimated too.
     """
 
     mapper: Mapper = map
@@ -151,7 +152,7 @@ def fit_model(start: GapModel, runs: Sequence[GapRun], how: Fitting) -> GapFit:
     low, high = structure.bounds()
     bounds = low, high, structure.reach()
     goes_on = start if isinstance(start, GapFit) else None
-    # The initial guess is that friction differs by 5 % between runs.
+    # At first, friction is assumed to differ by 5 % between runs.
     best = evaluate(
         GapModel(structure=structure, theta=np.clip(start.theta, low, high)),
         runs,
@@ -169,8 +170,8 @@ def fit_model(start: GapModel, runs: Sequence[GapRun], how: Fitting) -> GapFit:
         # If the simulation diverges, the square of its slope is not a number.
         if not np.all(np.abs(stacked) < 1e100):
             break
-        # Each attempt has six times the damping and so a shorter step. If none helps, the fit has
-        # converged.
+        # Each attempt has six times the damping of the last one, and so a shorter step. If none
+        # reduces the cost, the fit has converged.
         for _attempt in range(5):
             delta = _step(stacked, best.theta, bounds, damp=damp)
             trial = _follow(best, runs, linear, delta, how)
@@ -219,14 +220,14 @@ def _step(
         right = np.concatenate([r, np.zeros(active.size)])
         return np.asarray(np.linalg.lstsq(A, right, rcond=None)[0], dtype=np.float64)
 
-    # Three rounds are enough: rarely is more than one parameter at its bound.
+    # Three rounds are enough: more than one parameter is rarely at its bound.
     return bounded_step(theta, bounds, np.arange(J.shape[1]), solve=solve, rounds=3)
 
 
 def _follow(
     fit: GapFit, runs: Sequence[GapRun], linear: Sequence[Linear], delta: Array, how: Fitting
 ) -> GapFit:
-    """Return the fit after a step, with the nuisance parameters moved along.
+    """Return the fit after a step of the shared parameters, with nuisance parameters adjusted.
 
     If the cost of a run would rise, its nuisance parameters move less far.
     """
@@ -235,7 +236,7 @@ def _follow(
     def move(job: tuple[Linear, GapRun, Nuisance, float]) -> tuple[Nuisance, tuple[float, float]]:
         part, run, nuisance, before = job
         tried = []
-        # Shares of the run's own step to try until its cost does not rise.
+        # Shares of the run's own step, tried until its cost does not rise.
         for scale in (1.0, 0.3, 0.05):
             moved = move_nuisance(part, nuisance, delta[: part.reduced.shape[1] - 1], scale)
             cost = run_cost(model, run, moved, spread=fit.spread)
@@ -264,7 +265,7 @@ def anchor(runs: Sequence[GapRun], size: int) -> Array:
     if not size:
         return np.zeros((0, 1))
     row = np.zeros((1, size + 1))
-    # The weight: a million standard errors per unit of log mass.
+    # Its weight is a million standard errors per unit of log mass.
     row[0, int(np.argmax(np.any([run.free for run in runs], axis=0)))] = 1e6
     return row
 
@@ -284,7 +285,7 @@ def _learn_spread(fit: GapFit, runs: Sequence[GapRun], linear: Sequence[Linear])
         ]
         if not there:
             continue
-        weight, prior = 3.0, 0.04  # the prior on the spread counts as three runs with 4 %
+        weight, prior = 3.0, 0.04  # the prior counts as three runs with a spread of 4 %
         total = weight * prior**2
         for r, j in there:
             column = linear[r].run_wide[j, j]

@@ -3,11 +3,11 @@
 The nuisance parameters of a run are:
 
 - The states of the carts at its start, and at the start of each further piece.
-- The states of hidden masses. Only if the carts already move.
+- The states of hidden masses, but only if the carts already move.
 - The encoder zeros.
-- A factor on the dry friction of each cart. It varies between runs.
+- A factor on the dry friction of each cart, because dry friction varies between runs.
 
-They enter the residual almost linearly. So a QR factorisation of each run eliminates them and
+They enter the residual almost linearly. So a QR factorisation of each run eliminates them, which
 leaves a small problem in the shared parameters (variable projection).
 
 Reference: G. H. Golub, V. Pereyra, Inverse Problems 19 (2003), R1 (separable least squares).
@@ -25,7 +25,7 @@ from pipeline.plant.nonlinear.simulator import sensitivity
 from pipeline.plant.nonlinear.simulator.kernel import StartState, simulate
 
 _START_STEP = 1e-3  # step for numerical derivatives, relative to swing or friction
-_HOME = 0.1  # weight of the priors on starts. The data need not determine these
+_HOME = 0.1  # weight of the priors on starts that the data do not determine
 _HELD = 1e6  # weight of a velocity that is known to be zero
 _FACTOR_STEP = 0.3  # largest step of a friction factor
 _FACTORS = (0.3, 3.0)  # limits of a friction factor
@@ -33,10 +33,10 @@ _FACTORS = (0.3, 3.0)  # limits of a friction factor
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Nuisance:
-    """The parameters of one run: start states, encoder zeros (n,), friction factors `scatter` (n,).
+    """The parameters of one run: start states, encoder zeros, friction factors `scatter` (n,).
 
-    The start states `x0` and `v0` (shots, 2 n) are those of the carts, then those of their hidden
-    masses relative to the carts.
+    The start states `x0` and `v0` (shots, 2 n) are first those of the carts, then those of their
+    hidden masses relative to the carts.
     """
 
     x0: Array
@@ -46,7 +46,7 @@ class Nuisance:
 
     @property
     def start(self) -> StartState:
-        """The part that the simulator needs."""
+        """The parameters that the simulator needs."""
         return StartState(self.x0, self.v0, self.scatter)
 
 
@@ -78,8 +78,9 @@ def _simulate_variants(
 ) -> tuple[Array, Array]:
     """Return readings (b, rows, samples) of one run for b models and starts, without zeros.
 
-    Also return the derivatives (lanes, rows, samples) of the first. Each of the `lanes` names a
-    quantity in `pipeline.plant.nonlinear.simulator.sensitivity` and a cart or spring, from 0.
+    Also return the derivatives (lanes, rows, samples) for the first model. Each of the `lanes`
+    names a kind of variable from `pipeline.plant.nonlinear.simulator.sensitivity` and a cart or
+    spring, from 0.
     """
     variants = [(model.tables, start) for model, start in zip(models, starts, strict=True)]
     of = np.array(lanes, dtype=np.int64).reshape(-1, 2).T
@@ -96,13 +97,13 @@ def _simulate_variants(
 class Linear:
     """One run's contribution to a step.
 
-    It holds the reduced equations of the shared parameters, and the factors that give the nuisance
-    parameters afterwards.
+    It holds the equations that remain for the shared parameters, and the factors from which the
+    nuisance parameters follow.
     """
 
-    reduced: Array  # (rows, size + 1) of R. Columns: shared parameters and residual
-    run_wide: Array  # R of friction factors and zeros. Columns: these, shared, residual
-    shots: Array  # (shots, ., .) R of each shot. Columns: starts, run-wide, shared, residual
+    reduced: Array  # (rows, size + 1); R of the shared parameters and the residual
+    run_wide: Array  # R of friction factors, zeros, shared parameters and residual
+    shots: Array  # (shots, ., .); R of starts, factors and zeros, shared parameters and residual
     layout: "Layout"
 
 
@@ -124,7 +125,7 @@ class Layout:
 def layout_of(
     structure: Structure, run: GapRun, *, scatter_free: bool, shared: bool = True
 ) -> Layout:
-    """Return the nuisance parameters that a run has under a structure."""
+    """Return the nuisance parameters that a run has in a model of a given structure."""
     free = tuple(i for i, moves in enumerate(run.free) if moves)
     multiple = len(run.shots) > 2
     dry = structure.dry if scatter_free else (False,) * structure.n
@@ -161,8 +162,8 @@ def residual_points(run: GapRun) -> float:
 def triangle(matrix: Array) -> Array:
     """Return R of the QR factorisation of one matrix or of a stack of matrices.
 
-    A tall matrix is factorised in parts that fit the processor's cache. Then the results are
-    factorised together.
+    A tall matrix is factorised in parts that fit the processor's cache. The results are then
+    stacked and factorised again.
 
     Reference: J. Demmel, L. Grigori, M. Hoemmen, J. Langou, SIAM J. Sci. Comput. 34 (2012), A206.
     """
@@ -192,7 +193,7 @@ def linearise(
 ) -> Linear:
     """Return a run's residual and its Jacobian, with its nuisance parameters eliminated.
 
-    For the priors, `inflate` widens the noise to the misfit of a model that is still wrong.
+    For the priors, the noise is multiplied by `inflate`, because the model may still be wrong.
     """
     run = run.thin
     columns = columns_of(model, run, nuisance, layout)
@@ -221,7 +222,10 @@ def columns_of(model: GapModel, run: GapRun, nuisance: Nuisance, layout: Layout)
 
 
 def _eliminate_starts(points: Array, prior: Array) -> Array:
-    """Return R of each shot (columns, shots, points), with the prior (shots, starts, starts)."""
+    """Return R of the QR factorisation of each shot, in which the starts come first.
+
+    `points` is (columns, shots, points), and `prior` on the starts is (shots, starts, starts).
+    """
     wide = np.zeros((*prior.shape[:2], points.shape[0]))
     wide[:, :, : prior.shape[1]] = prior
     return triangle(np.concatenate([np.moveaxis(points, 0, -1), wide], axis=1))
@@ -247,7 +251,7 @@ def _derivatives(
     """Return the readings (rows, samples), and two sets of derivatives (., rows, samples).
 
     The first set is by the run's starts and friction factors, the second by the shared parameters.
-    Derivatives by the chain's parameters are integrated with the state, those by the effects'
+    Derivatives by the chain's parameters are integrated with the state. Derivatives by the effects'
     parameters are finite differences.
     """
     structure, theta = model.structure, model.theta
@@ -275,7 +279,7 @@ def _derivatives(
 def _differences(
     model: GapModel, run: GapRun, nuisance: Nuisance, layout: Layout
 ) -> tuple[Array, Array, Array]:
-    """Return the same as `_derivatives`, but only by finite differences.
+    """Return the same as `_derivatives`, but from finite differences alone.
 
     With contacts the misfit has many narrow valleys, and a finite difference averages over them.
     """
@@ -304,7 +308,7 @@ def _differences(
 
 
 def _varied(model: GapModel, steps: Array) -> list[GapModel]:
-    """Return models with one of the last parameters changed by its step."""
+    """Return models, each with one of the last parameters changed by its step."""
     thetas = np.repeat(model.theta[None], steps.size, axis=0)
     thetas[:, model.theta.size - steps.size :] += np.diag(steps)
     return [GapModel(structure=model.structure, theta=theta) for theta in thetas]
@@ -325,12 +329,13 @@ def start_prior(
 ) -> Array:
     """Return weak priors (shots, starts, starts) on starts that the data do not determine.
 
-    They are in units of the swing. If a run starts at rest, its first velocity is held at zero.
+    The priors are in units of the swing. If a run starts at rest, its first velocity is held at
+    zero.
     """
     position, velocity = sizes
     weight = 1.0 / np.concatenate([position[list(layout.x0)], velocity[list(layout.v0)]])
     prior = np.tile(np.diag(_HOME * inflate * weight), (len(run.shots) - 1, 1, 1))
-    # The readings say nothing about the hidden mass on a cart.
+    # The readings say nothing about the state of a hidden mass.
     known = [np.append(1.0 / std, np.zeros(std.size)) for std in run.start_std]
     known_start = np.concatenate([known[0][list(layout.x0)], known[1][list(layout.v0)]])
     prior[0] += np.diag(inflate * known_start)

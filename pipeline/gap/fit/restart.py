@@ -12,15 +12,15 @@ from pipeline.gap.fit.linearise import Nuisance, residual_points
 from pipeline.plant.nonlinear.simulator.laws import dropping, settling, sliding
 from pipeline.plant.nonlinear.tables import Drive, Tables
 
-_BAD_RUN, _BAD_SHARE = 1.5, 2.0  # limits of a run's chi-square: absolute, and over the median
+_BAD_RUN, _BAD_SHARE = 1.5, 2.0  # limits of a run's chi-square: absolute, and times the median
 _RESTARTS = ((0.8, 1.0), (-0.8, 1.0), (1.6, 1.0), (-1.6, 1.0), (0.0, 0.94), (0.0, 1.06))
 
 
 def restart_runs(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper) -> GapFit:
     """Restart the worst runs' nuisance parameters at other rest positions of the carts.
 
-    A cart may rest anywhere inside the band of friction or cogging, and its encoder is zeroed
-    there. So the misfit of a run has several valleys in encoder zero and friction. Shared
+    A cart may rest anywhere inside the band of friction or cogging, and its encoder is zeroed at
+    this rest. So the misfit of a run has several valleys in encoder zero and friction. The shared
     parameters stay the same.
     """
     if not fit.structure.many_rests:
@@ -58,7 +58,7 @@ def restart_runs(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper) -> GapFit:
 
 
 def _rest_band(fit: GapFit) -> Array:
-    """Return how far (n,) from its springs' equilibrium each cart may rest, about one sigma."""
+    """Return how far (n,) from its springs' equilibrium each cart usually rests."""
     chain = fit.structure.chain(fit.theta)
     force = holding_force(fit.tables)
     if not np.any(chain.k > 0):

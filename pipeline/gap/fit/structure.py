@@ -18,7 +18,7 @@ from pipeline.plant.nonlinear.effects.base import (
 )
 from pipeline.plant.nonlinear.tables import Cart, Tables
 
-_SMALLEST = 1e-7  # of a parameter's scale; an effect this small is absent
+_SMALLEST = 1e-7  # share of a parameter's scale; a smaller effect counts as absent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +45,7 @@ class Candidate:
         ]
 
     def coordinates(self, values: Sequence[float]) -> Array:
-        """Return the effect's part of the vector for these parameter values."""
+        """Return the effect's part of the vector for the given parameter values."""
         return np.array(
             [
                 v / scale if p.signed else np.log(max(abs(v), _SMALLEST * scale))
@@ -58,8 +58,8 @@ class Candidate:
 class Structure:
     """The springs and effects of a model, which define the parameter vector.
 
-    The vector holds log m, log c and log k of the existing springs (for one cart, of their sum).
-    Each effect's parameters follow: log |p| if the sign is known, otherwise p over its scale.
+    The vector holds log m, log c and log k of the existing springs (for one cart, log of their
+    sum). Each effect's parameters follow: log |p| if the sign is known, otherwise p over its scale.
     """
 
     springs: tuple[bool, ...]
@@ -83,7 +83,7 @@ class Structure:
 
     @cached_property
     def dry(self) -> tuple[bool, ...]:
-        """(n,) whether dry friction acts on each cart."""
+        """Whether dry friction acts on each cart (n,)."""
         places = {c.place for c in self.effects if c.effect.dry}
         return tuple(i + 1 in places for i in range(self.n))
 
@@ -94,7 +94,7 @@ class Structure:
 
     @cached_property
     def has_contact(self) -> bool:
-        """Whether an effect has a contact, in which bodies meet."""
+        """Whether some effect has a contact, in which bodies meet."""
         return any(c.effect.contact for c in self.effects)
 
     @cached_property
@@ -119,14 +119,14 @@ class Structure:
     # ------------------------------------------------------------ the vector
 
     def chain(self, theta: Array) -> Chain:
-        """Return the linear chain of a vector."""
+        """Return the linear chain that a vector describes."""
         n = self.n
         k = np.zeros(n + 1)
         k[list(self.rows)] = np.exp(theta[2 * n : self.base_size])
         return Chain(m=np.exp(theta[:n]), c=np.exp(theta[n : 2 * n]), k=k)
 
     def model(self, theta: Array) -> AugmentedChain:
-        """Return the chain with its effects for a vector."""
+        """Return the chain and the effects that a vector describes."""
         terms = []
         for index, candidate in enumerate(self.effects):
             coordinates = theta[self.span(index)]
@@ -140,7 +140,7 @@ class Structure:
         return AugmentedChain(chain=self.chain(theta), terms=tuple(terms))
 
     def start(self, chain: Chain, values: Sequence[Sequence[float]] = ()) -> "GapModel":
-        """Return the model with this chain and these parameter values of the effects."""
+        """Return the model with the given chain and parameter values of the effects."""
         tiny = 1e-3 * np.sqrt(chain.m * np.maximum(np.diag(chain.stiffness), 1e-12 * chain.m))
         parts = [np.log(chain.m), np.log(np.maximum(chain.c, tiny))]
         k = chain.k[list(self.rows)] if self.n > 1 else chain.k.sum(keepdims=True)[: len(self.rows)]
@@ -203,7 +203,7 @@ class Structure:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GapModel:
-    """A structure with its vector `theta` (size,): the start or the result of a fit."""
+    """A structure with its vector `theta` (size,), which is the start or the result of a fit."""
 
     structure: Structure
     theta: Array
@@ -252,7 +252,7 @@ class GapModel:
 def bench_scales(
     runs: Sequence[GapRun], chain: Chain, *, effect: Effect, place: int
 ) -> PlaceScales:
-    """Return the typical sizes of parameters at one place, from records and linear model."""
+    """Return the typical sizes of parameters at one place, from records and the linear model."""
     n = chain.n
     size = n if effect.place != "spring" else n + 1
     position, velocity = np.full(size + 1, 1e-12), np.full(size + 1, 1e-12)
@@ -267,7 +267,7 @@ def bench_scales(
         velocity[: len(x)] = np.maximum(velocity[: len(x)], np.abs(speed).max(axis=1))
         level = max(level, float(np.abs(run.command).max()))
         sample_time = min(sample_time, run.record.sample_time)
-    # Time constants of a drive are some milliseconds, whatever the sampling.
+    # Time constants of a drive are some milliseconds, whatever the sample time.
     return chain_scales(
         chain,
         place=effect.place,

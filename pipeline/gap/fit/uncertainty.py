@@ -2,12 +2,12 @@
 
 While a cart rests, its encoder repeats one reading, and friction lets it rest anywhere. All these
 readings share one rounding error, which limits how well friction is known. So the covariance is H⁻¹
-S H⁻¹. H is the information of the fit. S is the covariance that such encoder errors cause, from
-many random draws. A variance is at least that of white noise, and at least that implied by the
-residual's own correlation.
+S H⁻¹, where H is the information of the fit. S is the covariance caused by such encoder errors,
+computed from many random draws. A variance is at least that of white noise, and at least what the
+residual's own correlation implies.
 
-Reference: L. Ljung, System Identification, 2nd ed., section 9.5, for the sandwich; B. Efron, R. J.
-Tibshirani, An Introduction to the Bootstrap, 1993, section 6.5, for the drawing.
+Reference: L. Ljung, System Identification, 2nd ed., section 9.5, for this formula; B. Efron, R. J.
+Tibshirani, An Introduction to the Bootstrap, 1993, section 6.5, for the random draws.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,14 +31,14 @@ from pipeline.gap.fit.linearise import (
 )
 
 _DRAWS = 60  # random draws of encoder errors; a standard error is then accurate to 9 %
-_HIDDEN = 1e-9  # of the strongest direction; weaker ones count as unknown
+_HIDDEN = 1e-9  # share of the strongest direction; weaker ones count as unknown
 
 
 def covariance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> GapFit:
-    """Return the fit with the covariance of its parameters, or without if the model diverges.
+    """Return the fit with the covariance of its parameters, or without it if the model diverges.
 
-    If the fit used the same friction for all runs, the standard errors do not include its
-    variation.
+    If the fit used the same friction for all runs, the standard errors do not include the variation
+    of friction.
     """
 
     def weigh(job: tuple[int, tuple[GapRun, Nuisance]]) -> Array:
@@ -61,7 +61,7 @@ def covariance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> Gap
     least = np.maximum(np.diag(found), np.diag(inverse))
     more = np.sqrt(np.maximum(1.0, least / np.maximum(np.diag(expected), _HIDDEN * least)))
     cov = expected * np.outer(more, more)
-    # A direction that no run determines gets no error from the encoders; its variance is that of
+    # The encoders cause no error in a direction that no run determines; its variance is that of
     # H⁻¹.
     np.fill_diagonal(cov, np.maximum(np.diag(cov), least))
     return replace(fit, covariance=cov)
@@ -70,7 +70,7 @@ def covariance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> Gap
 def _weigh(fit: GapFit, run: GapRun, nuisance: Nuisance, *, rng: np.random.Generator) -> Array:
     """Return H, S from encoder errors, and S from the residual's correlation, each (size, size).
 
-    All are NaN if the model diverges at these parameters or next to them.
+    All of them are NaN if the model diverges at these parameters or next to them.
     """
     thin, inflate = run.thin, fit.inflation
     layout = layout_of(fit.structure, thin, scatter_free=fit.scattered)
@@ -102,7 +102,7 @@ def _weigh(fit: GapFit, run: GapRun, nuisance: Nuisance, *, rng: np.random.Gener
 
 
 def _by_piece(columns: Array, run: GapRun) -> Array:
-    """Return columns (starts, rows, samples) as (starts of all pieces, points)."""
+    """Rearrange columns (starts, rows, samples) to (starts of all pieces, points)."""
     pieces = np.zeros((len(run.shots) - 1, *columns.shape))
     for piece, (first, end) in enumerate(zip(run.shots, run.shots[1:], strict=False)):
         pieces[piece, :, :, first:end] = columns[:, :, first:end]

@@ -1,6 +1,7 @@
 """Choose the laws of force that the records need.
 
-First fit all laws at once from zero, then add laws with a shape, then drop needless ones.
+First fit all laws that can grow from zero, then add laws that need a shape (such as the position of
+an end stop), then drop needless ones.
 """
 
 from collections.abc import Sequence
@@ -18,10 +19,10 @@ from pipeline.plant.nonlinear.effects import CATALOGUE
 from pipeline.plant.nonlinear.simulator.terms import Kind
 from pipeline.words.progress import Progress, silent
 
-CLOSE, LOOSE, FREE = 0.5, 0.1, 0.0  # gains: the share of the error that corrects the model
-_FIRST = 25  # iterations of the first fit. Its chain may be far off.
+CLOSE, LOOSE, FREE = 0.5, 0.1, 0.0  # gains: share of the error that corrects the model
+_FIRST = 25  # iterations of the first fit, which may start far from the solution
 _FEW = 6  # iterations of a fit that only shows whether a rival comes near
-_SHORT_LIST = 4  # number of laws with a shape to refit
+_SHORT_LIST = 4  # number of laws with a shape for which the model is refitted
 
 
 def start_all(records: Records, *, springs: Sequence[bool], chains: Sequence[Chain]) -> Follow:
@@ -54,7 +55,7 @@ def choose_laws(
     """Return the model with the laws that are needed, fitted to free simulations if possible."""
     full = start_all(records, springs=springs, chains=chains)
     lean = let_go(full, records)
-    progress(f"all laws fitted together: {len(lean.laws.groups())} are left")
+    progress(f"all laws fitted together: {len(lean.laws.groups())} remain")
     # Add at most six laws with a shape; a real bench has several.
     for _ in range(6):
         if lean.gain == FREE and lean.chi < limits.AT_FLOOR:
@@ -84,23 +85,23 @@ def add_shaped(follow: Follow, records: Records) -> Follow | None:
             best = trial
     if best is None or not is_better(best, follow):
         return None
-    # The law of a contact is only approximate. A further law could absorb its error, so it must
-    # remove at least half of the excess.
+    # The law of a contact is only approximate, and a further law could absorb its error. So the
+    # further law must remove at least half of the excess.
     if is_rough(follow) and best.total > _half_way(follow):
         return None
     return best
 
 
 def _half_way(follow: Follow) -> float:
-    """Return the cost at which half of the excess over the noise is left."""
+    """Return the cost at which half of the excess over the noise remains."""
     return follow.points + limits.CONTACT_GAIN * max(follow.total - follow.points, 0.0)
 
 
 def let_go(full: Follow, records: Records) -> Follow:
     """Drop needless laws, then lower the gain to zero, dropping again at each step.
 
-    If the error grows with a lower gain, an effect is missing. That error swings with the carts,
-    and would be taken for laws that do not exist.
+    If the error grows with a lower gain, an effect is missing. The error of a missing effect swings
+    with the carts, and would be mistaken for laws that do not exist.
     """
     lean = _one_friction(drop_needless(full, records), records)
     for gain in (0.02, FREE):
@@ -113,7 +114,7 @@ def let_go(full: Follow, records: Records) -> Follow:
 
 
 def _look_again(lean: Follow, records: Records) -> Follow:
-    """Fit all laws once more to free simulations, which show small errors; drop needless ones."""
+    """Fit all laws once more to free simulations, which show small errors; drop needless laws."""
     everything = smooth_laws(lean.laws.bench, columns=records.columns)
     missing = [key for key in everything.keys if key not in lean.laws.keys]
     extra = [TrialLaw(kind=kind, place=place, values=(0.0,)) for kind, place in missing]
@@ -124,7 +125,7 @@ def _look_again(lean: Follow, records: Records) -> Follow:
 
 
 def _one_friction(follow: Follow, records: Records) -> Follow:
-    """Keep only one kind of dry friction on each cart, since two kinds exclude each other."""
+    """Keep only one kind of dry friction on each cart, because two kinds exclude each other."""
     for place in range(follow.laws.bench.n):
         here = [i for i, key in enumerate(follow.laws.keys) if key[1] == place]
         sides = [
@@ -140,7 +141,7 @@ def _one_friction(follow: Follow, records: Records) -> Follow:
 
 
 def rivals_of(lean: Follow, records: Records) -> list[Follow]:
-    """Return models with one law exchanged for another, fitted equally well, the best first."""
+    """Return models in which one law is exchanged for another, refitted, the best first."""
     everything = smooth_laws(lean.laws.bench, columns=records.columns)
     out: list[Follow] = []
     for group in lean.laws.groups():

@@ -6,21 +6,21 @@ from pipeline.gap import limits
 from pipeline.gap.follow.fit import Follow, Records
 from pipeline.plant.nonlinear.simulator.terms import Kind
 
-_RIDGE = 1e-10  # of the diagonal
+_RIDGE = 1e-10  # share of the diagonal that is added to it
 _CONTACTS = {Kind.BACKLASH}
 
 
 def is_rough(follow: Follow) -> bool:
-    """Return whether the model has contacts that it does not describe to the noise."""
+    """Return whether the model has contacts and does not fit down to the noise."""
     meets = _CONTACTS & {kind for kind, _ in follow.laws.keys}
     return bool(meets) and follow.chi > limits.AT_FLOOR
 
 
 def criterion(follow: Follow, n_independent: float) -> float:
-    """Return the Bayesian criterion for so many independent readings, with a price per effect.
+    """Return the Bayesian criterion for `n_independent` readings, with a price for every effect.
 
-    Two models are compared with the number of independent residuals of the fuller one, as only its
-    residual is due to chance.
+    When two models are compared, the independent residuals of the fuller model count for both,
+    because only its residual is due to chance.
     """
     low, high, _ = follow.laws.bounds()
     size = int(np.sum(low < high))
@@ -53,7 +53,7 @@ def drop_needless(follow: Follow, records: Records) -> Follow:
 
 
 def _needless(follow: Follow, records: Records) -> list[int]:
-    """Return the groups that may be dropped, in order, by the quadratic form of the cost."""
+    """Return the groups that may be dropped, least needed first, by the cost's quadratic form."""
     slope = records.slope(follow, factors=False)
     if not slope.sound:
         return []
@@ -61,7 +61,7 @@ def _needless(follow: Follow, records: Records) -> list[int]:
     off = follow.p - follow.laws.neutral()
     low, high, _ = follow.laws.bounds()
     power = np.maximum(np.diag(slope.H), 0.0)
-    # A parameter below this share of the strongest one's power is undetermined.
+    # A parameter with less than this share of the largest power is undetermined.
     usable = (power > 1e-20 * power.max()) & (low < high)
     order = [g for g, at in groups.items() if not np.any(np.abs(off[at]) > 0.0)]
     for g in order:

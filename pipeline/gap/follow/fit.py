@@ -16,14 +16,14 @@ from pipeline.gap.follow.laws import COLUMNS, Column, LawSet, TrialLaw, column_s
 from pipeline.gap.follow.track import Own, Track, errors_of
 
 _DAMP, _CHANGE, _LEAST_DAMP = 1e-4, 8.0, 1e-9
-_RIDGE = 1e-12  # of the diagonal of a run's own block
+_RIDGE = 1e-12  # share of the diagonal of each run that is added to it
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Follow:
-    """A model that follows the records: laws, vector, every run's own parameters, errors.
+    """A model that follows the records: its laws, its vector, the runs' own parameters, its errors.
 
-    `cost` is the sum of squared errors over their noise. `points` is the number of errors,
+    `cost` is the sum of squared errors in units of the noise. `points` is the number of errors,
     `n_independent` the number of independent ones. `gain` is the share of each error that corrects
     the state.
     """
@@ -66,7 +66,7 @@ class Slope:
 
     @property
     def sound(self) -> bool:
-        """Whether the simulation diverged nowhere."""
+        """Whether no simulation diverged."""
         return bool(np.all(np.isfinite(self.H)))
 
 
@@ -106,19 +106,19 @@ class Records:
         costs = np.array(list(self.mapper(one, zip(self.tracks, follow.own, strict=True))))
         points = sum(track.points for track in self.tracks)
         cost, prior, n_independent = costs.sum(axis=0).tolist()
-        # A reading counts as at most a quarter of an independent one.
+        # At most a quarter of the readings count as independent.
         n_independent = min(n_independent, points / 4.0)
         return replace(follow, cost=cost, points=points, prior=prior, n_independent=n_independent)
 
     def slope(self, follow: Follow, *, factors: bool = True) -> Slope:
-        """Return the normal equations; without `factors` dry friction is the same in all runs."""
+        """Return the normal equations; without `factors`, dry friction is the same in all runs."""
         laws, size, inflate = follow.laws, follow.p.size, follow.inflate
         dry = laws.dry & factors
 
         def one(pair: tuple[Track, Own]) -> tuple[Array, Array, Array]:
             track, own = pair
             run = errors_of(laws, follow.p, track, own, gain=follow.gain, derive=True)
-            # A nearly infinite slope has no finite square.
+            # An almost infinite slope has no finite square.
             if run is None or not np.all(np.abs(run[1]) < 1e100):
                 nothing = np.full((size, size), np.nan)
                 return nothing, nothing[0], nothing
@@ -143,7 +143,7 @@ class Records:
         return self.fit(replace(follow, laws=laws, p=p), **options)
 
     def fit(self, start: Follow, *, gain: float | None = None, iterations: int = 12) -> Follow:
-        """Fit from a start, with its own gain or another."""
+        """Fit a model from its present values, with its own gain or another one."""
         best = self.weigh(start if gain is None else replace(start, gain=gain))
         bounds = best.laws.steps_of_shape(best.p)
         damp = _DAMP

@@ -27,9 +27,9 @@ ROOM = OWN + TERMS
 class ActingLaws(NamedTuple):
     """The laws that act: their kinds, places and parameters.
 
-    `p` holds masses, dampings, springs (n + 1), the drive (4) and the laws' parameters; those of
-    each law begin at `first` (laws,). `play` is the index of the law of a play between motor and
-    cart 1, or -1.
+    `p` holds masses, dampings, springs (n + 1), the drive (4) and the laws' parameters. The
+    parameters of each law begin at `first` (laws,). `play` is the index of the law of backlash
+    between motor and cart 1, or -1.
     """
 
     p: Array
@@ -44,13 +44,13 @@ class FollowedRun(NamedTuple):
 
     Attributes
     ----------
-    t, y : (samples,) times and (samples, n) readings.
-    seen, free : (n,) which carts are compared. Which carts move.
-    guided : (samples, n) motion of held carts.
-    knots, command : the input, held from knot to knot.
-    held : (3, 2, knots) the input after dead zone and limit, and its derivatives by both. Each
-        comes with its integral.
-    zero, factor : (n,) this run's encoder zeros and factors on dry friction.
+    t, y : times (samples,) and readings (samples, n).
+    seen, free : whether each cart is compared, and whether it moves (n,).
+    guided : motion (samples, n) of held carts.
+    knots, command : times and values of the input, held from knot to knot.
+    held : input after dead zone and limit, its derivatives by these two, and the integrals of all
+        three, (3, 2, knots).
+    zero, factor : this run's encoder zeros and factors on dry friction (n,).
     gain : share of the error that corrects the state.
     longest : longest step, s.
     """
@@ -72,9 +72,9 @@ class FollowedRun(NamedTuple):
 class FollowedState(NamedTuple):
     """Positions and velocities (n,), and the laws' own states and terms `aux` (laws, ROOM).
 
-    `DX`, `DV` (n, lanes) and `DA` (2 laws, lanes) are their derivatives. The lanes are the
-    parameters `p`, then those of the run: zeros, starts, velocities and factors on dry friction (n
-    each). Without derivatives there are no lanes.
+    `DX`, `DV` (n, lanes) and `DA` (2 laws, lanes) are the derivatives. The lanes are the parameters
+    `p`, then those of the run: zeros, starts, velocities and factors on dry friction (n each).
+    Without derivatives there are no lanes.
     """
 
     x: Array
@@ -90,12 +90,12 @@ class Room(NamedTuple):
 
     Attributes
     ----------
-    xm : (n,) positions at mid-step.
-    f, R : (n,) forces and sliding friction.
-    K, C : (n, n) slopes of the forces by position and velocity.
-    du : (4,) derivatives of the input by the drive's parameters.
-    dlag : (4,) derivatives of the lag's state by the same parameters.
-    DF, DR : (n, lanes) derivatives of forces and friction.
+    xm : positions (n,) at mid-step.
+    f, R : forces and sliding friction (n,).
+    K, C : slopes (n, n) of the forces by position and velocity.
+    du : derivatives (4,) of the input by the drive's parameters.
+    dlag : derivatives (4,) of the lag's state by the drive's parameters.
+    DF, DR : derivatives (n, lanes) of forces and friction.
     """
 
     xm: Array
@@ -110,7 +110,7 @@ class Room(NamedTuple):
 
 
 class Step(NamedTuple):
-    """One step of `h` s: the input force `u`, and `on`, which is 1 while the drive is powered."""
+    """One step of `h` s with the input force `u`; `on` is 1 while the drive is powered."""
 
     u: float
     on: float
@@ -176,9 +176,9 @@ def add_forces(laws, run, state, work, step):
 
 @inlined
 def add_slopes(laws, run, state, work, h, crossing):
-    """Fill DF and DR: derivatives of forces and friction, directly and through the state.
+    """Fill DF and DR with derivatives of forces and friction, directly and through the state.
 
-    The parameters of the input have no effect while a play is being crossed.
+    The parameters of the input have no effect while the motor crosses the backlash.
     """
     p, factor, aux, v, xm = laws.p, run.factor, state.aux, state.v, work.xm
     DX, DV, DA, DF, DR = state.DX, state.DV, state.DA, work.DF, work.DR
@@ -229,7 +229,7 @@ def add_slopes(laws, run, state, work, h, crossing):
             a = p[o]
             apart = aux[law, 0] + 0.5 * h * aux[law, 1] - xm[at]
             rate = aux[law, 1] - v[at]
-            moved = lanes if a != 0.0 else 0  # a mass of nothing pulls at nothing
+            moved = lanes if a != 0.0 else 0  # a hidden mass of zero pulls at nothing
             for q in range(moved):
                 DA[2 * law, q] += 0.5 * h * DA[2 * law + 1, q]
                 DF[at, q] += a * (p[o + 1] * DA[2 * law, q] + p[o + 2] * DA[2 * law + 1, q])

@@ -5,11 +5,11 @@ At every sample the simulated state is corrected by a share `gain` of the error:
     e = y - x,   x <- x + gain e,   v <- v + 0.3 gain² e / Δt.
 
 Then it moves freely to the next sample. So the model is never far from the data, and the cost has
-one valley where a free simulation has many. With `gain` 0 the simulation is free. Derivatives by
-all parameters are integrated with the state and are exact for the numerical scheme.
+one valley where that of a free simulation has many. With `gain` 0 the simulation is free.
+Derivatives by all parameters are integrated with the state and are exact for the numerical scheme.
 
-The steps are those of the leapfrog method. Dry friction is set-valued, and a cart that turns inside
-a step turns at that instant.
+The steps are those of the leapfrog method. Dry friction is set-valued, and a cart that reverses
+within a step reverses at that instant.
 
 References: H. Abarbanel, D. Creveling, R. Farsian, M. Kostuk, SIAM J. Applied Dynamical Systems 8
 (2009) 1341-1381; L. Ljung, System Identification, 2nd ed., chapter 7 (fixed-gain predictors).
@@ -30,7 +30,7 @@ from pipeline.plant.nonlinear.simulator.compiler import jit
 from pipeline.plant.nonlinear.simulator.state import tie
 from pipeline.plant.nonlinear.simulator.terms import Kind
 
-_LEAST_SHARE = 0.02  # of cart 1's mass; at least this much is left without the motor
+_LEAST_SHARE = 0.02  # share of cart 1's mass that remains at least when the motor is separated
 _BLOWN_UP = 1e6  # position at which the simulation has diverged
 
 
@@ -38,7 +38,7 @@ _BLOWN_UP = 1e6  # position at which the simulation has diverged
 def follow_run(laws, run, state, work, E, J):
     """Simulate a run; fill its errors E (samples, n) and derivatives J (lanes, samples, n).
 
-    Return False if it diverges. `state` holds the start of the run and is overwritten.
+    Return False if the simulation diverges. `state` holds the start of the run and is overwritten.
     """
     p, kinds, places, first, play = laws.p, laws.kinds, laws.places, laws.first, laws.play
     t, knots, held, free, guided = run.t, run.knots, run.held, run.free, run.guided
@@ -53,7 +53,7 @@ def follow_run(laws, run, state, work, E, J):
     lagged = held[0, 0, 0]
     position = 0
     on = 0
-    # With a play, the motor is a separate body while it crosses the play. In contact it is one with
+    # The motor is a separate body while it crosses the backlash. In contact it is one body with
     # cart 1.
     side_of = 0.0
     gap = p[first[play]] if play >= 0 else 0.0
@@ -79,8 +79,7 @@ def follow_run(laws, run, state, work, E, J):
                 if lane_gain >= 0:
                     J[lane_gain, sample, i] += x[i]
             if gain > 0.0:
-                # Dry friction may hold the cart there, so only its position is corrected, without a
-                # jolt.
+                # Dry friction may hold the cart, so only its position is corrected, without a jolt.
                 x[i] += gain * e
                 # This share damps the correction a little more than critically.
                 kick = 0.3 * gain * gain / step
@@ -90,7 +89,7 @@ def follow_run(laws, run, state, work, E, J):
                         DX[i, q] -= gain * J[q, sample, i]
                         DV[i, q] -= kick * J[q, sample, i]
                 if i == 0 and play >= 0:
-                    # The motor is corrected too, since a correction of only the cart would cause
+                    # The motor is corrected too, because a correction of the cart alone would cause
                     # impacts.
                     aux[play, 0] += gain * e
                     aux[play, 1] += kick * e

@@ -1,4 +1,4 @@
-"""The laws of a model that follows a record, and its parameters as one physical vector."""
+"""The laws of a model that follows a record, with its parameters as one physical vector."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -16,27 +16,27 @@ from pipeline.plant.nonlinear.simulator.terms import COEFFICIENTS, Kind
 from pipeline.plant.nonlinear.tables import TABLES, Drive
 
 _CHAIN = (0.005, 20.0)  # limits of masses and springs, times the largest first estimate
-_REACH = 0.3  # largest step of a mass or spring, relative
-_SMALL = 0.1  # share of the largest. A smaller first estimate is not trusted
-_DELAY = (-0.05, 0.1)  # s, limits of a delay
-_SHORT = 0.01  # s, largest step of a delay or lag
-# For each kind, in the order of the catalogue, the coordinates in which a law grows from zero.
+_REACH = 0.3  # largest relative step of a mass or spring
+_SMALL = 0.1  # share of the largest first estimate; smaller ones are not trusted
+_DELAY = (-0.05, 0.1)  # limits of a delay, s
+_SHORT = 0.01  # largest step of a delay or lag, s
+# For each kind, in the order of the catalogue: the coordinates in which a law grows from zero.
 GROWTHS = tuple(effect.grown for effect in CATALOGUE)
 SIZES = tuple(len(growth.coordinates) for growth in GROWTHS)
 POSITIVE = {kind for kind, growth in enumerate(GROWTHS) if not growth.signed}
 DRY = tuple(kind for kind, effect in enumerate(CATALOGUE) if effect.dry)
-SIDED = (Kind.END_STOP, Kind.SLACK_SPRING)  # laws with a position whose sign gives the side
+SIDED = (Kind.END_STOP, Kind.SLACK_SPRING)  # laws with a position whose sign selects the side
 # The columns that each law fills in the simulator's tables.
 COLUMNS = tuple(
     tuple(effect.columns(dict.fromkeys((p.name for p in effect.own), 1.0))) for effect in CATALOGUE
 )
-# The laws that need no shape, so they can start from zero.
+# The laws that need no shape, so that they can start from zero.
 PLAIN = tuple(
     kind
     for kind, effect in enumerate(CATALOGUE)
     if isinstance(effect.law, ForceLaw | FrictionLaw) and len(COEFFICIENTS[kind]) == SIZES[kind]
 )
-Column = tuple[type[IntEnum], int]  # with its table: columns of different tables have equal numbers
+Column = tuple[type[IntEnum], int]  # table and number, because tables share numbers
 DRIVE_COLUMNS = (
     Drive.DEAD_ZONE_WIDTH,
     Drive.SATURATION_LIMIT,
@@ -76,11 +76,11 @@ class FollowedBench:
 
     Attributes
     ----------
-    chain : the first estimate.
-    springs : (n + 1,) which springs exist.
-    largest : the largest input. Zero without an input.
-    free : for each run, which carts move.
-    pinned : the cart whose mass is fixed at its first estimate. Used if no input sets a scale.
+    chain : the first estimate of the chain.
+    springs : whether each spring exists (n + 1,).
+    largest : the largest input; zero without an input.
+    free : for each run, whether each cart moves.
+    pinned : the cart whose mass is fixed at its first estimate, if no input sets a scale.
     """
 
     chain: Chain
@@ -91,12 +91,12 @@ class FollowedBench:
 
     @cached_property
     def shown(self) -> tuple[bool, ...]:
-        """(n,) whether each cart moves in some run."""
+        """Whether each cart moves in some run (n,)."""
         return tuple(any(moves) for moves in zip(*self.free, strict=True))
 
     @cached_property
     def rows(self) -> tuple[int, ...]:
-        """The springs that are stretched in some run; only one of those with equal stretch."""
+        """The springs that are stretched in some run; of springs with equal stretch, only one."""
         shown: dict[tuple, int] = {}
         for j in (j for j, there in enumerate(self.springs) if there):
             ends = [i for i in (j - 1, j) if 0 <= i < self.n]
@@ -113,7 +113,7 @@ class FollowedBench:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LawSet:
-    """The laws that act, which define the shape of the vector `p`.
+    """The laws that act; they determine the shape of the vector `p`.
 
     The vector holds masses, dampings, springs (n + 1), the four values of the drive, then each
     law's parameters.
@@ -125,12 +125,12 @@ class LawSet:
 
     @cached_property
     def kinds(self) -> np.ndarray:
-        """(laws,) the kinds."""
+        """The kinds of the laws (laws,)."""
         return np.array([kind for kind, _ in self.keys], dtype=np.int64)
 
     @cached_property
     def places(self) -> np.ndarray:
-        """(laws,) the carts or springs, from 0."""
+        """The carts or springs of the laws (laws,), from 0."""
         return np.array([place for _, place in self.keys], dtype=np.int64)
 
     @cached_property
@@ -140,7 +140,7 @@ class LawSet:
 
     @cached_property
     def first(self) -> np.ndarray:
-        """(laws,) index of each law's first parameter."""
+        """The index of each law's first parameter (laws,)."""
         sizes = [SIZES[kind] for kind, _ in self.keys]
         return self.base + np.cumsum([0, *sizes])[:-1].astype(np.int64)
 
@@ -151,7 +151,7 @@ class LawSet:
 
     @cached_property
     def dry(self) -> np.ndarray:
-        """(n,) whether dry friction acts on each cart."""
+        """Whether dry friction acts on each cart (n,)."""
         there = {place for kind, place in self.keys if kind in DRY}
         return np.array([i in there for i in range(self.bench.n)])
 
@@ -176,13 +176,13 @@ class LawSet:
         return p
 
     def chain(self, p: Array) -> Chain:
-        """Return the chain of a vector."""
+        """Return the chain that a vector describes."""
         n = self.bench.n
         k = p[2 * n : 3 * n + 1].copy()
         return Chain(m=p[:n].copy(), c=np.maximum(p[n : 2 * n], 0.0), k=k)
 
     def bounds(self) -> tuple[Array, Array, Array]:
-        """Return lower and upper bounds, and the largest steps."""
+        """Return lower bounds, upper bounds, and largest steps."""
         n, chain = self.bench.n, self.bench.chain
         low, high = np.full(self.size, -np.inf), np.full(self.size, np.inf)
         reach = np.full(self.size, np.inf)
@@ -238,7 +238,7 @@ class LawSet:
     def without(self, p: Array, groups: Sequence[int]) -> tuple["LawSet", Array]:
         """Return laws and vector without some groups.
 
-        A law's group is its index; the laws of the drive are -1 to -4.
+        The group of a law is its index; the laws of the drive are the groups -1 to -4.
         """
         kept = [i for i in range(len(self.keys)) if i not in groups]
         drive = tuple(free and -1 - q not in groups for q, free in enumerate(self.drive))
@@ -251,7 +251,7 @@ class LawSet:
         return laws, np.concatenate([base, *parts])
 
     def groups(self) -> dict[int, np.ndarray]:
-        """Return the groups that may be dropped: by number, the indices of their coefficients."""
+        """Return the groups that may be dropped, each with the indices of its coefficients."""
         out = {-1 - q: np.array([self.drive_at + q]) for q, free in enumerate(self.drive) if free}
         for i, ((kind, _), o) in enumerate(zip(self.keys, self.first, strict=True)):
             out[i] = np.array([o + q for q in COEFFICIENTS[kind]])
@@ -307,8 +307,8 @@ class LawSet:
     def _contact(self, p: Array, *, motor: float, bounce: float) -> tuple[float, float]:
         """Return stiffness and damping of a contact with a given coefficient of restitution.
 
-        The contact in this package is rigid, the simulator's slightly soft. See W. Goldsmith,
-        Impact (1960), chapter 4.
+        The contact in this package is rigid, but the simulator's contact is slightly soft. See W.
+        Goldsmith, Impact (1960), chapter 4.
         """
         firm = 40.0 * float(p[2 * self.bench.n] + p[2 * self.bench.n + 1])
         fall = -float(np.log(np.clip(bounce, 0.02, 0.9)))

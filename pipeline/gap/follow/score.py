@@ -1,7 +1,7 @@
 """Score laws that need a shape: how much each would lower the cost of the fitted model.
 
-A law of size zero moves nothing, but the derivatives give its first-order effect. Together with the
-other parameters its best size is a small linear problem.
+A law of size zero moves nothing, but the derivatives give its first-order effect. Its best size,
+together with the other parameters, follows from a small linear problem.
 
 Reference: T. Söderström, P. Stoica, System Identification, section 11.5 (score tests).
 """
@@ -19,14 +19,14 @@ from pipeline.plant.nonlinear.simulator.terms import Kind
 
 @dataclass(frozen=True, kw_only=True)
 class Scored:
-    """A law with its best values, and the decrease of the cost that they would give."""
+    """A law with its best values, and the decrease of the cost that these would give."""
 
     law: TrialLaw
     drop: float
 
 
 def score(follow: Follow, records: Records, trials: Sequence[TrialLaw]) -> list[Scored]:
-    """Return the trial laws that would help together with all laws of the model, the best first."""
+    """Return the trial laws that would help in addition to the model's laws, the best first."""
     laws, p = follow.laws.with_laws(follow.p, trials)
     wide = replace(follow, laws=laws, p=p)
     slope = records.slope(wide)
@@ -36,7 +36,7 @@ def score(follow: Follow, records: Records, trials: Sequence[TrialLaw]) -> list[
     power = np.maximum(np.diag(slope.H), 0.0)
     base = np.arange(follow.p.size)
     at_bound = (follow.p <= low) | (follow.p >= high)
-    # A parameter below this share of the strongest one's power is undetermined.
+    # A parameter with less than this share of the largest power is undetermined.
     base = base[(power[base] > 1e-20 * power.max()) & (low < high) & ~at_bound]
     size = np.sqrt(power[base])
     A = slope.H[np.ix_(base, base)] / np.outer(size, size) + 1e-10 * np.eye(base.size)
@@ -113,7 +113,7 @@ def shaped_laws(follow: Follow, records: Records) -> list[TrialLaw]:
 
 
 def _to_both_sides(most: Array, parts: Sequence[float]) -> list[float]:
-    """Return shares of the largest positions of either sign; skip a side that is hardly reached."""
+    """Return `parts` of the largest positions on both sides, unless a side is hardly reached."""
     sides = [(side, most[k]) for k, side in enumerate((1.0, -1.0)) if most[k] > 0.1 * most.max()]
     return [side * part * size for side, size in sides for part in parts]
 
@@ -126,13 +126,13 @@ def cogging_laws(follow: Follow, records: Records) -> list[TrialLaw]:
             span = max(span, float(np.ptp(track.y[:, 0] - own.zero[0])))
     if span == 0.0 or (Kind.COGGING, 0) in follow.laws.keys:
         return []
-    # Numbers of motor pitches in the travel; they differ by less than one half.
+    # Numbers of pitches in the travel, in steps of less than one half.
     counts = np.arange(1.5, 25.0, 0.4).tolist()
     return [TrialLaw(kind=Kind.COGGING, place=0, values=(0.0, 0.0, span / n)) for n in counts]
 
 
 def backlash_laws(follow: Follow, records: Records) -> list[TrialLaw]:
-    """Return a trial play between motor and cart 1, which no fit from zero can find."""
+    """Return trial laws for backlash at the motor, which no fit from zero can find."""
     spans = [
         float(np.ptp(track.y[:, 0]))
         for track in records.tracks
@@ -140,7 +140,7 @@ def backlash_laws(follow: Follow, records: Records) -> list[TrialLaw]:
     ]
     if not spans or (Kind.BACKLASH, 0) in follow.laws.keys:
         return []
-    # Size of the play, motor mass, and ratio of the speeds after and before an impact.
+    # Size of the gap, motor mass, and speed after an impact relative to the speed before it.
     values = 0.03 * max(spans), 0.15 * float(follow.p[0]), 0.4
     law = TrialLaw(kind=Kind.BACKLASH, place=0, values=values)
     return [law] if records.allows(law) else []

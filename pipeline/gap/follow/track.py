@@ -11,9 +11,9 @@ from pipeline.gap.follow.laws import DEAD_ZONE, LIMIT, FollowedBench, LawSet
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.simulator.terms import Kind
 
-_LONGEST = 2.5e-3  # s. Longest step, for a bench of carts
-_FREELY = 0.4  # Factor on it for a small gain. Step errors add up then
-_KNOCK = 0.25  # Factor on it if bodies may meet
+_LONGEST = 2.5e-3  # s; longest step for a bench of carts
+_FREELY = 0.4  # factor on the longest step for a small gain, where step errors add up
+_KNOCK = 0.25  # factor on the longest step if bodies may meet
 _SURE = 1e6  # weight of known quantities
 _FACTORS, _FACTOR_STEP = (0.3, 3.0), 0.3
 
@@ -33,9 +33,9 @@ class Own:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Track:
-    """One thinned run, arrays (samples, n).
+    """One thinned run, with arrays (samples, n).
 
-    `weight` is over the noise; `guided` is the motion of held carts.
+    `weight` is divided by the noise; `guided` is the motion of held carts.
     """
 
     t: Array
@@ -75,7 +75,7 @@ class Track:
         start = np.full(n, _SURE if self.at_rest else 1.0 / max(0.3 * self.swing, 1e-12))
         speed = np.where(self.free & (not self.at_rest), 1.0 / self.start_std[1], _SURE)
         start = np.where(np.isfinite(self.start_std[0]), 1.0 / self.start_std[0], start)
-        factor = np.where(dry, 1.0 / 0.05, _SURE)  # it differs by 5 % between runs
+        factor = np.where(dry, 1.0 / 0.05, _SURE)  # friction differs by 5 % between runs
         weight = np.concatenate([1.0 / self.zero_std, start, speed, factor])
         off = [self.zero - own.zero, -own.shift, self.slope - own.v0, 1.0 - own.factor]
         # An unknown velocity needs a weak prior, because following the record closely does not
@@ -96,7 +96,7 @@ class Track:
 
 
 def make_track(run: GapRun) -> Track:
-    """Thin a run to the rate that a swing needs."""
+    """Thin a run to the sample rate that is needed to describe a swing."""
     n = run.zero.size
     sampled = 1.0 / float(np.median(np.diff(run.t)))
     # 100 Hz for a bench of carts, which is some twenty readings per swing.
@@ -131,8 +131,8 @@ def errors_of(
 ) -> tuple[Array, Array] | None:
     """Return errors (samples, n) and derivatives of the simulated readings (lanes, samples, n).
 
-    The result is None if the simulation diverges. The lanes are the vector, then zeros, shifts,
-    velocities and factors.
+    The result is None if the simulation diverges. The lanes are the entries of the vector, then
+    zeros, shifts, velocities and factors.
     """
     n, count = laws.bench.n, len(laws.keys)
     lanes = p.size + 4 * n if derive else 0
@@ -191,7 +191,7 @@ def _shaped(track: Track, dead: float, limit: float) -> Array:
 def compile_follower() -> None:
     """Compile the simulation by running it on a record of two readings.
 
-    This takes seconds, unless the compiled code is stored.
+    This takes seconds, unless compiled code is stored.
     """
     one, two = np.ones(1), np.array([0.0, 0.01])
     track = Track(

@@ -1,4 +1,4 @@
-"""The time limit of a search; after it, the best answer so far is used."""
+"""The time limit of a search; when it is reached, the best answer so far is used."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -14,7 +14,7 @@ class OutOfTime(Exception):
 class Deadline:
     """Maps a function over runs until the time is up; all slow work goes through here.
 
-    `cut` is true if any work was refused, so that the answer depends on the machine.
+    `cut` is true if any work was refused. The answer then depends on the speed of the computer.
     """
 
     def __init__(self, mapper: Mapper, *, seconds: float | None) -> None:

@@ -1,8 +1,8 @@
 """Search the catalogue for the effects of a bench.
 
 Effects are not tried one by one. All laws at all places are fitted together, from zero, to a model
-that follows the measurement, and needless laws are dropped (`gap.follow`). The remaining ones are
-fitted to whole runs. Each effect must lower the error on runs that the fit has not seen. Rivals
+that follows the measurement. Needless laws are then dropped (`gap.follow`), and the remaining ones
+are fitted to whole runs. Each effect must lower the error on runs that the fit has not seen. Rivals
 come from the same fit with one law exchanged.
 """
 
@@ -46,7 +46,7 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
         for rival in rivals_of(lean, records):
             found.append(judge(fit_whole(_as_model(rival, study, records), study), study))
         found[1:] = [h for h in found[1:] if np.isfinite(h.error)]
-        # An effect at a bound is often not real, so it is removed; a sound remainder is kept.
+        # An effect with a parameter at its bound is often not real, so it is removed.
         chosen = prune(min(found, key=lambda h: h.bic_of_all), study, found)
         sound = [h for h in found if h.sound and np.isfinite(h.error)]
         if not chosen.sound:
@@ -59,10 +59,10 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
 
 
 def _as_model(follow: Follow, study: Study, records: Records) -> GapModel:
-    """Return the laws of a model that follows the record as effects of the catalogue."""
+    """Return a model that follows the record as a model with effects of the catalogue."""
     if not any(study.springs):
-        # Without springs, errors add up, and a missing effect would mislead a fit that starts free.
-        # So the gain is lowered step by step.
+        # Without springs, errors add up, and a missing effect would mislead a fit that starts with
+        # a free simulation. So the gain is lowered step by step.
         for gain in (0.02, 0.01, 0.005, 0.002, 0.0):
             follow = records.fit(follow, gain=gain) if gain < follow.gain else follow
     return as_model(follow, springs=study.springs, catalogue=study.catalogue, runs=study.training)

@@ -17,15 +17,15 @@ from pipeline.gap.fit.structure import GapModel
 from pipeline.plant.nonlinear.effects.base import Effect
 from pipeline.words.progress import Progress, silent
 
-_BOUND_MARGIN = 0.01  # in logarithms, or in scales
+_BOUND_MARGIN = 0.01  # in logarithms, or in multiples of the scale
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hypothesis:
     """A model with its fit to the training runs and its error on the held-out runs.
 
-    `at_floor` is true if only noise is left, on training and held-out runs. `n_independent` and
-    `n_held_independent` are the numbers of independent residuals in both.
+    `at_floor` is true if only noise remains, on training and held-out runs. `n_independent` and
+    `n_held_independent` are the numbers of independent residuals on training and held-out runs.
     """
 
     fit: GapFit
@@ -38,7 +38,7 @@ class Hypothesis:
 
     @property
     def bic_of_all(self) -> float:
-        """The criterion with the likelihood of the held-out runs, to which nothing is fitted."""
+        """The criterion with the likelihood of the held-out runs, which the fit did not use."""
         points = self.held.n_points / limits.THINNING
         return self.bic + points * float(np.log(max(self.held.chi, 1e-300)))
 
@@ -49,7 +49,7 @@ class Hypothesis:
 
     @property
     def has_contact(self) -> bool:
-        """Whether an effect has a contact."""
+        """Whether some effect has a contact."""
         return self.fit.structure.has_contact
 
     @property
@@ -79,8 +79,8 @@ class Study:
     """The context of the search: runs, springs, catalogue, and options of fits.
 
     `repeatability` is the relative difference of runs with the same input, 0 without repeats.
-    `whole` is filled for benches without springs. It holds the training runs, with the run that was
-    cut in time at its full length, so that slowly growing errors show.
+    `whole` is filled for benches without springs. It holds the training runs, among them at full
+    length the run that was cut in time, so that slowly growing errors show.
     """
 
     training: tuple[GapRun, ...]
@@ -102,7 +102,7 @@ class Study:
         return fit_model(start, self.training, replace(self.fitting, **how))
 
     def with_noise(self, training: Sequence[GapRun]) -> "Study":
-        """Return the study with these training runs, and their noise in all others."""
+        """Return the study with these training runs, and with their noise in all other runs."""
         sigma = {row: s for run in training for row, s in zip(run.rows, run.sigma, strict=True)}
         held_out = tuple(run.with_noise(sigma) for run in self.held_out)
         whole = tuple(run.with_noise(sigma) for run in self.whole)
@@ -121,16 +121,16 @@ class Study:
         return hypothesis.error <= enough
 
     def may_be_half(self, hypothesis: Hypothesis) -> bool:
-        """Return whether so much is left that half of the truth may be missing.
+        """Return whether the error is so large that half of the true effects may be missing.
 
-        The error must exceed what repeats explain, and the model must have no contact, whose law is
-        only approximate.
+        The error must exceed what repeats explain, and the model must have no contact, because the
+        law of a contact is only approximate.
         """
         enough = max(limits.FURTHER * self.floor, limits.ENOUGH_REPEATS * self.repeatability)
         return hypothesis.error > enough and not hypothesis.has_contact
 
     def is_noise(self, hypothesis: Hypothesis) -> bool:
-        """Return whether only noise is left in every run, or repeatability in held-out runs."""
+        """Return whether only noise is left, or in held-out runs only the difference of repeats."""
         quiet = hypothesis.error < limits.NOTHING * self.floor
         quiet = quiet and hypothesis.fit.chi < limits.AT_FLOOR
         as_repeats = hypothesis.error < limits.AS_REPEATS * self.repeatability
@@ -180,8 +180,8 @@ def _count_independent(fit: GapFit, runs: Sequence[GapRun]) -> float:
 def evidence(fuller: Hypothesis, other: Hypothesis) -> float:
     """Return by how much the fuller of two hypotheses is more likely, in units of the criterion.
 
-    Independent readings are counted in the residual of the fuller one, as only that is due to
-    chance. Held-out runs, to which neither is fitted, count equally.
+    Independent readings are counted in the residual of the fuller hypothesis, because only its
+    residual is due to chance. Held-out runs, to which neither hypothesis was fitted, count equally.
     """
     share = fuller.n_independent / (fuller.fit.n_points / limits.THINNING)
     taught = (other.bic - fuller.bic) * share
@@ -191,13 +191,13 @@ def evidence(fuller: Hypothesis, other: Hypothesis) -> float:
 def lowers_error(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
     """Return whether the held-out error falls enough.
 
-    It must fall by a tenth if so much is left that the gap cannot be named.
+    It must fall by a tenth if the remaining error is too large to call the gap named.
     """
     gain = 1.0 if study.explains(child) else limits.PARTIAL_GAIN
     return child.error < gain * parent.error
 
 
 def worth_it(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
-    """Return whether further effects help, also on runs that the fit has not seen."""
+    """Return whether the child's further effects help, also on runs that the fit has not seen."""
     drop = limits.BIC_DROP * (child.size - parent.size) or limits.SAME_LAW
     return lowers_error(child, parent, study) and evidence(child, parent) > drop

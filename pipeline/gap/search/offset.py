@@ -1,7 +1,7 @@
 """Find a constant force that explains the rest points of runs with different carts held.
 
-On a linear chain, a constant force only shifts the rest, like a wrong encoder zero. But if other
-carts are held, other springs carry the same force.
+On a linear chain, a constant force only shifts the rest position, like a wrong encoder zero. But if
+other carts are held, other springs balance the same force.
 """
 
 from collections.abc import Sequence
@@ -69,7 +69,7 @@ def find_offset(
 
 
 def _compliance(chain: Chain, run: GapRun, cart: int) -> Array:
-    """Return the displacement of the measured carts by a unit force on one cart."""
+    """Return the displacement of the measured carts under a unit force on one cart."""
     free = [i for i, moves in enumerate(run.free) if moves]
     if cart - 1 not in free:
         return np.zeros(len(run.rows))

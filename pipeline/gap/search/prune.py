@@ -1,4 +1,4 @@
-"""Remove needless effects, and order the others so that the most helpful comes first."""
+"""Remove needless effects, and order the others with the most helpful first."""
 
 from collections.abc import Sequence
 
@@ -12,15 +12,15 @@ from pipeline.gap.search.translate import make_candidate
 from pipeline.gap.search.whole import finish, fit_on
 from pipeline.plant.nonlinear.effects import find_effect
 
-_FEW = 4  # effects to try at a time. Certainty is only a rough guide to need
+_FEW = 4  # effects to try at a time; certainty is only a rough guide to which are needed
 
 
 def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothesis:
-    """Drop effects that are needless beside the others; append all that is tried to `found`.
+    """Drop effects that the others make needless; append every hypothesis tried to `found`.
 
-    An effect may also be replaced by a simpler law. An effect that may be zero within its standard
-    error is dropped too. Of the few least certain effects, the least needed goes first. Losses add
-    up, so each is compared with the best hypothesis so far.
+    An effect may also be replaced by a simpler law. An effect within three standard errors of zero
+    is dropped too. Of the few least certain effects, the least needed goes first. Losses add up, so
+    each hypothesis is compared with the best so far.
     """
     best = chosen
     while chosen.key:
@@ -51,7 +51,7 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
 
 
 def without_zero_effect(chosen: Hypothesis, final: GapFit, study: Study) -> Hypothesis | None:
-    """Return a hypothesis without the least certain effect, if that may be zero; or None.
+    """Return a hypothesis without the least certain effect, if it may be zero; otherwise None.
 
     `final` is the fit of `chosen` with its covariance.
     """
@@ -64,8 +64,8 @@ def without_zero_effect(chosen: Hypothesis, final: GapFit, study: Study) -> Hypo
 def _as_good(without: Hypothesis, chosen: Hypothesis, study: Study) -> bool:
     """Return whether a hypothesis without one of the effects does about as well.
 
-    If much is left for another reason, the criterion hardly changes. Then an effect stays if it
-    lowers the error of unseen runs by a tenth and the criterion does not oppose it.
+    If a large error remains for another reason, the criterion hardly changes. Then an effect stays
+    if it lowers the error of unseen runs by a tenth and the criterion does not oppose it.
     """
     if worth_it(chosen, without, study):
         return False
@@ -75,7 +75,7 @@ def _as_good(without: Hypothesis, chosen: Hypothesis, study: Study) -> bool:
 
 
 def significance(fit: GapFit) -> list[float]:
-    """Return each effect's distance from zero in standard errors (its least certain parameter)."""
+    """Return how many standard errors each effect's least certain parameter is from no effect."""
     structure = fit.structure
     if fit.covariance is None:
         return [np.inf] * len(structure.effects)
@@ -102,7 +102,7 @@ def _without(hypothesis: Hypothesis, effect: Candidate, study: Study) -> Hypothe
 
 
 def _plainer(hypothesis: Hypothesis, rich: Candidate, study: Study) -> Hypothesis | None:
-    """Return the hypothesis with the simpler law from which a richer one grew, or None."""
+    """Return the hypothesis with the simpler law from which a richer law grew, or None."""
     if rich.effect.grows_from is None:
         return None
     index = hypothesis.fit.structure.effects.index(rich)

@@ -22,19 +22,18 @@ from pipeline.words.phrases import phrases
 
 
 class Search:
-    """A search; each step continues from the state after the last one.
+    """A search; each step continues from the state after the last step.
 
     Attributes
     ----------
-    study : runs and options of fits. It is replaced if another noise or split is better.
+    study : runs and options of fits. It is replaced if another noise or another split of the runs
+        is better.
     linear : the linear chain that fits the training runs.
     chosen : the best hypothesis so far.
-    found : all hypotheses judged so far. The linear one comes first.
-    path : the hypotheses from the linear model to the chosen one. Each has one effect more.
-    verdict : the result.
-    close : under the verdict `ambiguous`, the rivals.
-    final : the chosen fit with its covariance. Its parameters come from whole runs.
-    notes : notes for the reader.
+    found : all hypotheses judged so far, the linear one first.
+    path : the hypotheses from the linear model to the chosen one, each with one effect more.
+    close : the rivals, if the verdict is `ambiguous`.
+    final : the chosen fit with its covariance; its parameters come from whole runs.
     """
 
     chosen: Hypothesis
@@ -67,7 +66,7 @@ class Search:
             self._try(self.study.with_noise(measure_noise(self.chosen.fit, training, training)))
 
     def change_sides(self) -> None:
-        """Exchange training and held-out runs and search again, if only the latter lack an effect.
+        """Exchange training and held-out runs and search again, if only the held-out ones misfit.
 
         An effect that acts only in the held-out runs cannot be found from the training runs.
         """
@@ -82,7 +81,7 @@ class Search:
         """Add a constant force if the rest points imply one.
 
         With the force in the model, the encoder zeros are those of the file, known to half the
-        noise. All hypotheses are then judged under this assumption.
+        noise. All hypotheses are then judged with these zeros.
         """
         self.path = steps_to(self.chosen, self.found, self.study)
         with suppress(OutOfTime):
@@ -103,7 +102,7 @@ class Search:
             without = without_zero_effect(self.chosen, self.final, study)
             if without is None:
                 break
-            # In a complete fit, an effect may turn out to be zero.
+            # After the complete fit, an effect may turn out to be zero.
             self.found = [*self.found, *self.path, without]
             self.path = steps_to(without, self.found, study)
         if not study.whole:
@@ -138,7 +137,7 @@ class Search:
         return find_hypotheses(baseline, self._timed(study))
 
     def _try(self, study: Study, *, only_at_floor: bool = False) -> bool:
-        """Search with another study; keep the result if it was complete, and return whether."""
+        """Search with another study; return whether its result was complete and is kept."""
         self.linear = fit_model(self.linear.without_nuisance, study.training, study.fitting)
         chosen, found = self._look(study)
         kept = not self.deadline.cut and (chosen.at_floor or not only_at_floor)
@@ -156,8 +155,8 @@ class Search:
             return
         holding = holding_force(chosen.fit.tables)
         if abs(offset.force) < holding[offset.cart - 1]:
-            # Effects such as friction can hold a cart this far from its equilibrium, so it is no
-            # proof.
+            # Effects such as friction can hold a cart this far from its equilibrium, so its rest
+            # proves nothing.
             return
         pinned, loose = (
             replace(
@@ -165,7 +164,7 @@ class Search:
                 training=tuple(run.with_zeros(width=width) for run in study.training),
                 held_out=tuple(run.with_zeros(width=width) for run in study.held_out),
             )
-            for width in (1e-4, 0.5)  # times the noise: zeros exact, or rounded
+            for width in (1e-4, 0.5)  # width of the zeros, times the noise: exact, or rounded
         )
         candidate = Candidate(
             effect=effect, place=offset.cart, signs=(1.0,), scales=(abs(offset.force),)
@@ -176,14 +175,15 @@ class Search:
         as_good = limits.OFFSET_AS_FREE * chosen.error
         if final.error > min(limits.OFFSET_GAIN * without[-1].error, as_good):
             return
-        # Replace the other hypotheses, which were judged with free encoder zeros.
+        # These replace the other hypotheses, which were judged with free encoder zeros.
         self.path, self.found = (*without, final), [*without, final]
         self.study = replace(loose, fitting=self.study.fitting)
 
     def _settle(self, study: Study) -> None:
-        """Continue the fit until the cost falls no more; a search stops earlier.
+        """Continue the fit until the cost no longer falls; the search stops fits earlier.
 
-        The `bic` is not changed, so that rivals and chosen one are compared at the same stage.
+        The `bic` is not changed, so that the chosen hypothesis and its rivals are compared at the
+        same stage of the fit.
         """
         fit = self.chosen.fit
         # A hundredth of chi-square is a tenth of a standard error.

@@ -24,8 +24,8 @@ def filled(effect: Effect) -> frozenset[Column]:
 def values_of(effect: Effect, columns: Mapping[IntEnum, float]) -> tuple[float, ...]:
     """Return the parameter values for given columns: the inverse of `effect.columns`.
 
-    The columns are linear in the parameters. So their values at one point, and one unit away for
-    each parameter, give the inverse.
+    The columns are linear in the parameters. So the inverse follows from the columns at one point,
+    and at one unit from it in each parameter.
     """
     order = list(effect.columns(dict.fromkeys(effect.names, 1.0)))
     base = np.arange(1.0, 1.0 + len(effect.names))
@@ -40,7 +40,7 @@ def values_of(effect: Effect, columns: Mapping[IntEnum, float]) -> tuple[float, 
 def as_model(
     follow: Follow, *, springs: Sequence[bool], catalogue: Iterable[Effect], runs: Sequence[GapRun]
 ) -> GapModel:
-    """Return the model whose effects express the laws found; richer effects are tried first."""
+    """Return the model whose effects express the found laws; richer effects are tried first."""
     by_size = sorted(catalogue, key=lambda effect: -len(filled(effect)))
     chain = follow.laws.chain(follow.p)
     candidates: list[Candidate] = []

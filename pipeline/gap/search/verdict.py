@@ -12,11 +12,11 @@ from pipeline.plant.nonlinear.effects import find_effect
 def reach_verdict(
     steps: tuple[Hypothesis, ...], found: Sequence[Hypothesis], *, study: Study, sample_time: float
 ) -> tuple[Verdict, tuple[Hypothesis, ...], list[Hypothesis]]:
-    """Return the verdict, the accepted steps, and under `ambiguous` the rivals.
+    """Return the verdict, the accepted steps, and the rivals if the verdict is `ambiguous`.
 
-    `steps` lead from the linear model to the chosen one; `found` are all hypotheses judged. If much
-    is left, a step is withdrawn if another effect could replace it, or if a hypothesis without it
-    does about as well.
+    `steps` lead from the linear model to the chosen one; `found` are all hypotheses judged. If a
+    large error remains, the last step is withdrawn if its effect is disputed. An effect is dropped
+    if a hypothesis without it does about as well.
     """
     baseline, chosen = steps[0], steps[-1]
     if not chosen.key:
@@ -65,7 +65,7 @@ def _place(key: tuple[str, int]) -> tuple[int, str]:
 
 
 def _same_kind(rival: Hypothesis, chosen: Hypothesis) -> bool:
-    """Return whether both have the same family of laws at the same places, such as dry friction."""
+    """Return whether the rival differs only by laws of the same families at the same places."""
     return all(
         mine[1] == other[1] and find_effect(mine[0]).family == find_effect(other[0]).family != ""
         for mine, other in _stand_ins(rival, chosen)

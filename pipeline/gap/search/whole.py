@@ -14,9 +14,9 @@ from pipeline.gap.fit.uncertainty import covariance
 from pipeline.gap.limits import AT_FLOOR
 from pipeline.gap.search.hypothesis import Study
 
-_LENGTHS = (0.3, 0.6, 1.2, 2.4)  # s. With a contact, pieces grow to whole runs
-# Factors on size and damping of a contact to start from. The contact in `gap.follow` is rigid, the
-# simulator's slightly soft.
+_LENGTHS = (0.3, 0.6, 1.2, 2.4)  # s; with a contact, pieces grow to whole runs
+# Factors on the size and damping of a contact at the start of a fit. The contact in `gap.follow` is
+# rigid, but the simulator's contact is slightly soft.
 _VARIED = ((1.0, 1.0), (1.2, 1.0), (1.0, 0.65), (1.2, 0.65))
 _NEAR = 8  # iterations of a fit that starts near its end
 # Options without springs: the cost of a whole run has many valleys, and small improvements add up.
@@ -38,7 +38,7 @@ def fit_whole(start: GapModel, study: Study) -> GapFit:
     fit = study.fit(start, scatter_free=False, **steps)
     if fit.chi > AT_FLOOR and any(c.effect.has_play for c in structure.effects):
         fit = min(fit, _fit_contact_on_pieces(start, study), key=lambda one: one.cost)
-    # Two rounds with friction by run; before each, the worst runs are restarted.
+    # Two rounds in which friction differs between runs. Before each, the worst runs are restarted.
     for attempt in range(2):
         if not structure.many_rests or fit.chi < AT_FLOOR:
             break

@@ -17,7 +17,7 @@ from pipeline.plant.nonlinear.effects.base import EffectTerm
 from pipeline.set_up import Units
 
 _MOST_RIVALS = 4  # rivals to list
-_SAME_LENGTH, _SAME_LEVEL = 0.9, 0.01  # shares of samples and of input, for a repeat
+_SAME_LENGTH, _SAME_LEVEL = 0.9, 0.01  # by these shares of samples and of input, repeats agree
 
 
 def list_effects(
@@ -38,7 +38,7 @@ def list_effects(
         index = places.index(added)
         term, rest = final.terms[index], chosen.key - {added}
         # A rival has one other effect in place of this one, or shares no effect with the chosen
-        # one.
+        # hypothesis.
         rivals = [
             h
             for key, h in same_size.items()
@@ -68,7 +68,7 @@ def list_effects(
 
 
 def _stand_in(effect: tuple[str, int], others: frozenset[tuple[str, int]]) -> tuple[str, int]:
-    """Return the rival's effect at the same place, or its first one."""
+    """Return the rival's effect at the same place, or else its first effect."""
     return min(others, key=lambda other: (other[1] != effect[1], other))
 
 
@@ -165,8 +165,8 @@ def make_traces(before: Hypothesis, after: Hypothesis, study: Study) -> tuple[Tr
 def compare_by_record(traces: Sequence[Trace], study: Study) -> tuple[RecordGap, ...]:
     """Return the relative error of every cart in every record, without and with effects.
 
-    The held-out part of a record is listed separately. The runs of a record between interventions
-    are pooled.
+    The held-out part of a record is listed separately. Runs of the same record, between
+    interventions, are pooled.
     """
     order = (*study.training, *study.held_out)
     rows = [(run, j) for run in order for j in range(len(run.rows))]
@@ -200,8 +200,8 @@ def compare_by_record(traces: Sequence[Trace], study: Study) -> tuple[RecordGap,
 def repeatability(runs: Sequence[GapRun]) -> float | None:
     """Return the relative difference of runs with the same input, or None without repeats.
 
-    The second of two runs is interpolated at the times of the first, with the first edges of their
-    inputs aligned. Two pieces of one record are not repeats, because the later one begins in
+    The second of two runs is interpolated at the times of the first, after the first edges of their
+    inputs are aligned. Two pieces of one record are not repeats, because the later piece begins in
     motion.
     """
     squares, sizes = 0.0, 0.0
@@ -216,7 +216,7 @@ def repeatability(runs: Sequence[GapRun]) -> float | None:
             difference = [
                 x[inside] - np.interp(t[inside], b.t, y) for x, y in zip(a.y, b.y, strict=True)
             ]
-            # Encoders are zeroed for every run, so a constant difference does not count.
+            # Encoders are zeroed before every run, so a constant difference does not count.
             squares += sum(float(((d - d.mean()) ** 2).sum()) for d in difference) / 2.0
             sizes += float((a.swing**2).sum()) * np.count_nonzero(inside)
     return float(np.sqrt(squares / sizes)) if sizes else None
@@ -235,15 +235,15 @@ def _same_input(a: GapRun, b: GapRun, t_a: Array, t_b: Array) -> bool:
         run.command[np.searchsorted(run.knots, t, side="right") - 1]
         for run, t in ((a, t_a), (b, t_b))
     )
-    # 2 % of the samples may differ, as an edge may be one sample off.
+    # 2 % of the samples may differ, because an edge may be one sample off.
     return bool(np.mean(np.abs(u - v) > _SAME_LEVEL * np.abs(u).max()) < 0.02)
 
 
 def list_contenders(chosen: Hypothesis, others: Sequence[Hypothesis]) -> tuple[Contender, ...]:
     """Return the models that may be true: the chosen one, then the likeliest others.
 
-    A model is not an alternative if it only lacks some of the chosen effects. Nor is one with
-    additional effects, if the chosen one leaves only noise.
+    A model with only some of the chosen effects is not an alternative. Nor is one with additional
+    effects, if the chosen model leaves only noise.
     """
     rivals = [one for one in others if one.key and not one.key <= chosen.key]
     if chosen.at_floor:

@@ -2,8 +2,8 @@
 
 The force is known as a mean over windows, and so is each term of a library. Masses, dampings,
 springs and encoder zeros were fitted without the missing law, so they are fitted again together
-with the terms. The formula is the sum of the few terms with the best criterion, if that is better
-than no term.
+with the terms. The formula is the sum of the few terms with the best criterion, if this is better
+than the criterion without a term.
 
 References: S. L. Brunton, J. L. Proctor, J. N. Kutz, PNAS 113 (2016), 3932-3937 (sparse regression
 for laws of motion); D. A. Messenger, D. M. Bortz, J. Computational Physics 443 (2021), 110525 (in
@@ -68,8 +68,8 @@ def find_formula(
 ) -> tuple[ForceFormula | None, Array]:
     """Return the formula for the force on one cart, and its value in every window (n,).
 
-    Without a formula the values are zero. `on_springs` means that a wrong encoder zero looks like a
-    constant force in its run, so each run gets a constant.
+    Without a formula the values are zero. `on_springs` is true if the carts have springs. A wrong
+    encoder zero then looks like a constant force in its run, so each run gets a constant.
     """
     force = np.concatenate([one.force for one in forces])
     linear = np.concatenate(
@@ -122,7 +122,7 @@ def find_formula(
 
 
 def _criterion(rest: Array, terms: int) -> float:
-    """Return the Bayesian criterion, with the extra price for trying many terms."""
+    """Return the Bayesian criterion, with an extra price because many terms are tried."""
     count = rest.size
     cost = count * float(np.log(max(float(rest @ rest), 1e-300) / count))
     return cost + terms * (float(np.log(count)) + BIC_DROP)

@@ -17,8 +17,8 @@ def free_runs(
 ) -> tuple[FreeRun, ...]:
     """Return the error of each record, all carts together, ordered by record id.
 
-    Of the values fitted to a record, only its encoder `zeros` (n,) are used. A record that was
-    interrupted by a hand is simulated piece by piece, and counts as one.
+    Of the values fitted to a record, only its encoder `zeros` (n,) are used. A record interrupted
+    by a hand is simulated piece by piece, but counts as one.
     """
     squares: dict[str, list[Array]] = {}
     for run in runs:

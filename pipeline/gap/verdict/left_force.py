@@ -2,7 +2,7 @@
 
 The model is restarted from the measurement again and again, and runs freely over a short stretch.
 In the later part of each stretch, the curvature of its error shows the missing force. Modulating
-functions average that force and suppress the effect of the start and of noise.
+functions average this force and suppress the effects of the start and of noise.
 """
 
 from collections.abc import Sequence
@@ -19,21 +19,21 @@ from pipeline.gap.fit.linearise import Nuisance, fresh_nuisance, simulate_run
 from pipeline.gap.fit.structure import GapModel
 from pipeline.gap.types import LeftForce
 
-_DEGREE = 4  # of the polynomial through the model's error in a window
+_DEGREE = 4  # degree of the polynomial through the model's error in a window
 
 
 def left_forces(
     model: GapModel, runs: Sequence[GapRun], nuisance: Sequence[Nuisance]
 ) -> tuple[LeftForce, ...]:
-    """Return the unexplained force on each cart of each run whose neighbours were measured."""
+    """Return the unexplained force on each cart of each run, if its neighbours were measured."""
     found = []
     for run, own in zip(runs, nuisance, strict=True):
         best: list[LeftForce] = []
-        # Lengths of the windows in s, for a bench of carts; the shortest with little noise is used.
+        # Lengths of the windows in s, for a bench of carts. The shortest with little noise is used.
         for length in (0.05, 0.07, 0.1, 0.15, 0.2):
             forces = _of_run(model, run, own, length=length * run.pace)
             best = [force for force, _ in forces] or best
-            # The noise must be less than a third of the force.
+            # The noise must be less than 0.3 of the force.
             if forces and all(noise < 0.3 * _rms(force.force) for force, noise in forces):
                 break
         found += best
@@ -43,7 +43,7 @@ def left_forces(
 def _of_run(
     model: GapModel, run: GapRun, own: Nuisance, *, length: float
 ) -> list[tuple[LeftForce, float]]:
-    """Return the unexplained force on each cart in windows of `length` s, and its noise."""
+    """Return the unexplained force on each cart in windows of `length` s, each with its noise."""
     width = round(length / run.record.sample_time) + 1
     if not 9 <= width <= run.t.size // 3:
         return []
@@ -57,7 +57,7 @@ def _of_run(
     n, chain = run.zero.size, model.structure.chain(model.theta)
     x, simulated = cut.by_cart(cut.y, own.zero), cut.by_cart(read, own.zero)
     speed = np.gradient(simulated, cut.t, axis=1)
-    # A restart is a jump, so the speed at both ends of a stretch is from the inside.
+    # A restart is a jump, so the speed at both ends of a stretch is computed from points inside it.
     bounds = np.array(cut.shots)
     for here, ahead in ((bounds[:-1], bounds[:-1] + 1), (bounds[1:] - 1, bounds[1:] - 2)):
         step = simulated[:, ahead] - simulated[:, here]

@@ -1,7 +1,7 @@
 """The force on each cart that masses, dampings and springs do not explain.
 
 The second derivative of measured positions is too noisy to use. Modulating functions instead give
-the exact mean of the force over a short window, together with mean velocity, position and input.
+the exact mean of the force over a short window, and the means of velocity, position and input.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,15 +25,15 @@ class ResidualForce:
 
     Attributes
     ----------
-    measured : this force for the measured motion.
-    model : this force for the motion of the model with effects. It agrees with `measured` if the
-        effects are right.
-    u : the logged input, on cart 1. Zero for other carts.
-    arriving : the input after the model's dead zone and saturation. It is subtracted from the
+    measured : the force according to the measured motion.
+    model : the force according to the motion of the model with effects. It agrees with `measured`
+        if the effects are right.
+    u : the logged input for cart 1; zero for other carts.
+    arriving : the input after the model's dead zone and saturation, which is subtracted from the
         forces.
-    velocity, position : of the cart, as measured. The encoder zero is subtracted.
-    neighbours : (2, n) positions of the carts before and after. Zero for a wall or a held cart.
-    neighbours_velocity : (2, n) velocities of these neighbours.
+    velocity, position : measured motion of the cart, without the encoder zero.
+    neighbours : positions (2, n) of the carts before and after; zero for a wall or a held cart.
+    neighbours_velocity : velocities (2, n) of the neighbours.
     """
 
     experiment: str
@@ -51,9 +51,9 @@ class ResidualForce:
 
 
 def residual_forces(gap: Gap, *, free: Mapping[str, Sequence[int]]) -> tuple[ResidualForce, ...]:
-    """Return the unexplained force on every cart in every run whose neighbours were measured.
+    """Return the unexplained force on every cart in every run, if its neighbours were measured.
 
-    A run sampled too slowly for the longest window is left out. `free` gives for each experiment
+    A run sampled too slowly for the longest window is left out. `free` lists, for each experiment,
     the carts that move.
     """
     runs: dict[tuple[str, bool, float], dict[int, Trace]] = {}
@@ -89,8 +89,8 @@ def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> Residu
         local = t[windows]
         s = (local - local[:, :1]) / (local[:, -1:] - local[:, :1])
         w, w1, w2 = window_weights(local)
-        # An input is held after its sample, so its weight is the exact share of the bump in that
-        # interval.
+        # An input is held after its sample, so its weight is the exact share of the bump function
+        # in that interval.
         held = np.diff(bump_integral(s), axis=1) / bump_integral(np.ones(1))
         pushes = [(held * push[windows[:, :-1]]).sum(1) for push in inputs]
         own = chain.m[i] * w2 - chain.c[i] * w1 + (before + after) * w

@@ -13,8 +13,7 @@ from pipeline.gap.types import GapWindow, Verdict
 from pipeline.plant.nonlinear.effects import find_effect
 from pipeline.words.phrases import phrases
 
-# For each behaviour of the cart: the key of the sentence that says which recording shows more of
-# it.
+# For each behaviour of the cart: the key of the sentence on the recording that shows more of it.
 _SHOWS = {
     "velocity near zero": "show_rest",
     "fast motion": "show_motion",
@@ -29,7 +28,7 @@ _SHOWS = {
 def find_windows(fit: GapFit, runs: Sequence[GapRun]) -> tuple[GapWindow, ...]:
     """Return the windows with most of the misfit, the worst first.
 
-    `share` is the window's part of the squared misfit of this cart in this run.
+    The `share` of a window is relative to the squared misfit of its cart in its run.
     """
     found: list[tuple[float, GapWindow]] = []
     for run, nuisance in zip(runs, fit.nuisance, strict=True):
@@ -96,7 +95,7 @@ def choose_experiment(
     *,
     repeated: bool,
 ) -> str:
-    """Return a sentence on the next recording, to decide, confirm, or show more of the gap.
+    """Return a sentence on the next recording: to decide, to confirm, or to show more of the gap.
 
     `left` are the windows in which the chosen model still departs, the worst first. `repeated` is
     true if some runs have the same input, so that their scatter is known.

@@ -23,18 +23,18 @@ from pipeline.json_files import result, written
 from pipeline.names import parameter_names
 
 if TYPE_CHECKING:
-    import control  # takes half a second, so it is imported on use
+    import control  # takes half a second, so it is imported only where needed
 
 
 @result(eq=False)
 class Chain:
-    """Masses, dampings and stiffnesses of a chain; all are in input units, as the gain is 1."""
+    """Masses, dampings and stiffnesses of a chain, in input units because the input gain is 1."""
 
     m: Array = written("masses (n), cart 1 first, input unit s² per position unit; all > 0")
     c: Array = written("viscous dampings (n), cart 1 first, input unit s per position unit")
     k: Array = written(
-        "stiffnesses (n + 1) wall-1, 1-2, …, n-wall, input unit per position unit; 0: no spring; "
-        "of one cart on two springs, of which only the sum can be identified, (sum, 0)"
+        "stiffnesses (n + 1) wall-1, 1-2, …, n-wall, input unit per position unit; 0 for no "
+        "spring; (sum, 0) for one cart on two springs, because only their sum can be identified"
     )
 
     def __post_init__(self) -> None:
@@ -91,8 +91,8 @@ class Chain:
     def to_control(self, *, free: Sequence[int] | None = None) -> "control.StateSpace":
         """Return the free carts as a python-control system, with the others held.
 
-        It has states `x1, v1, x2, v2, …`, input `u` and outputs `x1, x2, …`. The numbers are those
-        of the carts.
+        It has states `x1, v1, x2, v2, …`, input `u` and outputs `x1, x2, …`. The numbers are cart
+        numbers, so `x3` is always cart 3.
         """
         import control
 
@@ -123,7 +123,7 @@ class Chain:
 
         Raises
         ------
-        DataError : no spring holds the carts, so a constant force has no rest position. Or the
+        DataError : no spring holds the carts, so they never rest under a constant force; or the
             stiffnesses differ by too many orders of magnitude.
         """
         if not self.is_tied:
@@ -146,7 +146,7 @@ class Chain:
     def frequency_response(self, omega: Array) -> ComplexArray:
         """Return X_i/U (n, n_w) at `omega` (n_w,), rad/s, in position unit per input unit.
 
-        At a pole without damping the response is infinite.
+        At an undamped pole the response is infinite.
         """
         s = 1j * np.asarray(omega, dtype=np.float64)
         eye = np.eye(self.n)
@@ -166,12 +166,12 @@ class Chain:
 
     @property
     def omega_carts(self) -> Array:
-        """omega_i (n,), rad/s, of each cart with the others held."""
+        """Natural frequencies omega_i (n,), rad/s, of each cart with the others held."""
         return np.sqrt((self.k[:-1] + self.k[1:]) / self.m)
 
     @property
     def zeta_carts(self) -> Array:
-        """zeta_i (n,) of each cart with the others held; infinite if no spring holds the cart."""
+        """Damping ratios zeta_i (n,), each with the other carts held; infinite without a spring."""
         with np.errstate(divide="ignore"):
             return self.c / (2 * self.m * self.omega_carts)
 
@@ -205,11 +205,11 @@ class Chain:
         return reach * tails[cart], tails[0]
 
     def parameters(self) -> dict[str, float]:
-        """Return the named parameters of this chain, in the order of the paper's Tables 1-3.
+        """Return the named parameters of this chain, in the order of Tables 1-3 in Throne's paper.
 
         One cart has `K, omega_n, zeta` (`mass, damping` if it has no spring). Two and three carts
-        have the parameters of Tables 2 and 3, more carts those of Table 2 with further letters and
-        numbers.
+        have the parameters of Tables 2 and 3. More carts continue the names of Table 2 with further
+        letters and numbers.
 
         Raises
         ------
@@ -232,8 +232,8 @@ class Chain:
 def quadratic_factors(roots: ComplexArray) -> tuple[Array, Array]:
     """Return omega and zeta of s² + 2 zeta omega s + omega² for pairs of roots, omega ascending.
 
-    Complex roots are paired with their conjugates, real roots by size. So an overdamped factor has
-    zeta > 1.
+    Complex roots are paired with their conjugates, real roots in order of size. A pair of real
+    roots is an overdamped factor, with zeta > 1.
     """
     roots = np.asarray(roots, dtype=np.complex128)
     is_real = np.abs(roots.imag) <= 1e-9 * np.abs(roots)

@@ -10,15 +10,16 @@ from pipeline.errors import DataError
 from pipeline.plant.linear.chain import Chain, quadratic_factors
 from pipeline.plant.linear.simulate import simulate_linear
 
-SETTLED = 7.0  # time constants, after which a transient of 1 cm is half a count
-SETTLED_DWELL = 9.0  # after which it is a tenth; at a resonance it hides in the amplitude
+SETTLED = 7.0  # time constants until a transient of 1 cm is half an encoder count
+SETTLED_DWELL = 9.0  # until a tenth of a count, because dwells at a resonance hide a transient
 
 
 def dwell_frequencies(chain: Chain, *, n: int, among: Sequence[float] = ()) -> list[float]:
     """Return about `n` frequencies in Hz, ascending, with more of them at resonances and nulls.
 
-    Half of them are spread evenly over the range, as for a first look. The others are at each
-    resonance and null, and half a bandwidth to each side. Those in `among` are always included.
+    About half of them are spread evenly, on a logarithmic axis, over the range of the resonances.
+    The others lie at the resonances and nulls and within half a bandwidth of them. The frequencies
+    `among` are always included.
     """
     features = [quadratic_factors(chain.poles)]
     features += [quadratic_factors(chain.zeros(cart)) for cart in range(1, chain.n)]
@@ -30,7 +31,7 @@ def dwell_frequencies(chain: Chain, *, n: int, among: Sequence[float] = ()) -> l
     spread = np.geomspace(0.7 * resonances[0], 1.5 * resonances[-1], max(n - close.size, n // 2))
     hertz = list(among)
     for candidate in [*close, *spread]:
-        f = round(float(candidate) / (2 * np.pi), 2)  # as people type it
+        f = round(float(candidate) / (2 * np.pi), 2)  # rounded as people would type it
         if all(abs(f - other) > 0.015 * other for other in hertz):
             hertz.append(f)
     return sorted(hertz)
@@ -47,7 +48,7 @@ def settling_wait(chain: Chain, *, time_constants: float) -> float:
 
 def steady_time(hertz: float) -> float:
     """Return how long a dwell continues after the transient, s."""
-    # Long enough to see that the last cycles no longer change; at high frequencies, 1.4 s.
+    # Long enough to see that the last cycles no longer change, and at least 1.4 s.
     return max(6.5 / hertz, 1.4)
 
 
@@ -57,8 +58,8 @@ class Reach:
 
     Attributes
     ----------
-    steady : after the transient.
-    furthest : at any time.
+    steady : the largest motion after the transient.
+    furthest : the largest motion at any time.
     """
 
     steady: float
@@ -66,6 +67,9 @@ class Reach:
 
 
 def reach(chain: Chain, t: Array, *, shape: Array, wait: float) -> Reach:
-    """Return the motion from rest under an input of `shape` (n,); the transient lasts `wait` s."""
+    """Return the largest motions from rest under the input `shape` (n,).
+
+    The transient lasts `wait` s.
+    """
     unit = np.abs(simulate_linear(chain, t, shape))
     return Reach(steady=float(np.max(unit[:, t >= wait])), furthest=float(np.max(unit)))

@@ -1,7 +1,7 @@
 """The order of gains, resonances and nulls in a real chain of carts.
 
-Holding carts raises every frequency. So resonances and nulls interlace (Cauchy), exactly without
-damping. With heavy damping they may not.
+Holding a cart raises every frequency. So, without damping, resonances and nulls interlace (Cauchy).
+With heavy damping they may not.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ class Bracket(NamedTuple):
 
 
 def brackets(n: int) -> list[Bracket]:
-    """Return the brackets of a chain of n carts, two or more, with all springs present."""
+    """Return the brackets of a chain of two or more carts that has all its springs."""
     modes, alone = omega_names(MODES[:n]), omega_names(map(str, range(1, n + 1)))
     found = [Bracket(modes[0], name, modes[-1], _ALONE) for name in alone]
     if n == 3:

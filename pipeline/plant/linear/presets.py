@@ -1,4 +1,4 @@
-"""The plants of the paper's three tables, by name."""
+"""The plants of the three tables in Throne's paper, by name."""
 
 from collections.abc import Mapping
 
@@ -6,9 +6,10 @@ import numpy as np
 
 from pipeline.plant.linear.chain import Chain
 
-# In V, cm, s, from the paper's tables. throne-1dof is exactly Table 1. throne-2dof rounds to all
-# eight independent final values of Table 2. throne-3dof is the real chain nearest to Table 3. The
-# last two have no spring to the near wall, as their best fit needs none.
+# In V, cm and s, from the tables in Throne's paper. throne-1dof is exactly Table 1. throne-2dof
+# rounds to all eight independent final values of Table 2. throne-3dof is the real chain nearest to
+# Table 3. The last two have no spring to the near wall, because the best fit to the tables needs
+# none.
 PRESETS: Mapping[str, Chain] = {
     "throne-1dof": Chain(
         m=np.array([1.98587e-4]), c=np.array([5.24270e-4]), k=np.array([0.0346021, 0.0])

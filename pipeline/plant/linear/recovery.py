@@ -16,16 +16,16 @@ from pipeline.plant.linear.chain import Chain
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recovered:
-    """The chain implied by a set of transfer functions; arrays may have further axes.
+    """The chain implied by a set of transfer functions; extra axes of arrays hold further chains.
 
     Attributes
     ----------
-    m, c, k : (n,), (n,) and (n + 1,), as in `Chain`. A measured table may imply a negative spring,
-        which stays visible here.
-    damping_terms : (n,) 2 zeta_i omega_i of each cart. The others are held.
-    stiffness_terms : (n,) omega_i² of each cart. The others are held.
-    couplings : (n - 1,) for each spring between carts, k² over the product of both masses.
-    routes : the redundancies R1, R2, …. Each is one number computed in two ways.
+    m, c, k : masses (n,), dampings (n,) and stiffnesses (n + 1,). A measured table may imply a
+        negative stiffness, which is kept.
+    damping_terms : 2 zeta_i omega_i (n,) of each cart with the others held.
+    stiffness_terms : omega_i² (n,) of each cart with the others held.
+    couplings : for each spring between carts (n - 1,), k² over the product of the two masses.
+    routes : the redundancies R1, R2, …, each a pair of values for one number computed in two ways.
     """
 
     m: Array
@@ -49,9 +49,9 @@ class Recovered:
 def recover_chain(gains: Array, tails: Sequence[Array]) -> Recovered:
     """Compute masses, dampings and springs from static gains and the polynomials T_1 … T_n.
 
-    `gains` is (n,); `tails` are monic, in falling powers, T_i of degree 2 (n - i + 1). Further axes
+    `gains` is (n,); `tails` are monic, in falling powers, T_i of degree 2 (n - i + 1). Extra axes
     hold further chains. Each number is computed in the best-conditioned way. The s¹ coefficients
-    serve only as checks, because rounding grows some 15 times through them.
+    serve only as checks, because they amplify rounding some 15 times.
     """
     n, others = len(gains), tails[0].shape[1:]
     T = [*tails, np.ones((1, *others))]
@@ -67,7 +67,7 @@ def recover_chain(gains: Array, tails: Sequence[Array]) -> Recovered:
             kappa[i + 1] = (square[i] * rest[-1] - whole[-1]) / beyond[-1]
             rebuilt = _product([np.stack([np.ones(others), g[i], square[i]]), rest])
             rebuilt[-len(beyond) :] -= kappa[i + 1] * beyond
-            # Coefficients that no step above has used are the redundancies.
+            # Coefficients that were not used above give the redundancies.
             routes += [(rebuilt[j], whole[j]) for j in range(3, len(whole) - 1)]
         if i > 0:
             ratio[i] = gains[i] / gains[i - 1] * whole[-1] / rest[-1]
@@ -99,8 +99,8 @@ def _relative_difference(a: float, b: float) -> float:
 def transfer_functions(values: Mapping[str, float | Array]) -> tuple[Array, Sequence[Array]]:
     """Return the static gains (n,) and T_1 … T_n from named parameters of 1 to 3 carts.
 
-    `values` uses the names of `Chain.parameters`. The carts' own frequencies (omega_1, …) are not
-    used, except for that of the last cart, which is the zero of the cart before it.
+    `values` uses the names of `Chain.parameters`. The frequencies of single carts (omega_1, …) are
+    not used, except the last cart's, which is the zero of the cart before it.
     """
     if "omega_n" in values:
         return np.array([values["K"]]), [_quadratic(values, "n", zeta="zeta")]
@@ -132,7 +132,8 @@ def _quadratic(values: Mapping[str, float | Array], suffix: str, zeta: str | Non
 def recover_from_parameters(values: Mapping[str, float | Array]) -> Recovered:
     """Compute the chain from named parameters (1 to 3 carts), with the redundancies.
 
-    Two carts have 8 transfer-function parameters for 7 physical ones (R1); three have 15 for 10 (R1
-    to R5). For a table of a real chain the redundancies are zero.
+    Two carts have 8 transfer-function parameters for 7 physical ones, so one redundancy (R1). Three
+    carts have 15 for 10, so five (R1 to R5). In the table of a real chain, both values of each
+    redundancy agree.
     """
     return recover_chain(*transfer_functions(values))

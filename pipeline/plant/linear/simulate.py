@@ -9,7 +9,7 @@ from pipeline.arrays import Array
 from pipeline.plant.linear.chain import Chain
 
 OVERSAMPLING = 8  # points between samples for a band-limited input
-_LANCZOS_WIDTH = 12  # samples on each side of the interpolation kernel
+_LANCZOS_WIDTH = 12  # samples that the interpolation kernel spans on each side
 
 
 def simulate_linear(
@@ -25,14 +25,14 @@ def simulate_linear(
 
     Parameters
     ----------
-    t : (n,) s, strictly increasing. The intervals may differ.
-    u : (n,) input. With "zero_order" it is u[i] between t[i] and t[i + 1]. With "band_limited" it
+    t : times (n,), s, strictly increasing but not necessarily evenly spaced.
+    u : input (n,). With "zero_order" it is u[i] between t[i] and t[i + 1]. With "band_limited" it
         is the smooth signal through the samples (Lanczos interpolation).
-    x0 : (2f,) initial state (x1, v1, x2, v2, …) of the free carts. By default at rest.
+    x0 : initial state (2f,) of the free carts, (x1, v1, x2, v2, …); at rest by default.
 
     Returns
     -------
-    (f, n) positions at `t`.
+    positions (f, n) at `t`.
     """
     A, B, C, _ = chain.state_space(free=free)
     x0 = np.zeros(A.shape[0]) if x0 is None else np.asarray(x0, dtype=np.float64)
@@ -50,7 +50,7 @@ def propagate(A: Array, B: Array, t: Array, u: Array, *, x0: Array, linear: bool
     exact. It uses the matrix exponential of the augmented system (Van Loan, IEEE Trans. Automatic
     Control 23, 1978), one for each distinct interval.
     """
-    from scipy.linalg import expm  # a tenth of a second: imported where it is used
+    from scipy.linalg import expm  # takes a tenth of a second, so it is imported here
 
     n_states = A.shape[0]
     n_augmented = n_states + (2 if linear else 1)
@@ -59,7 +59,7 @@ def propagate(A: Array, B: Array, t: Array, u: Array, *, x0: Array, linear: bool
     augmented[:n_states, n_states] = B[:, 0]
     if linear:
         augmented[n_states, n_states + 1] = 1.0
-    # Sample times have relative rounding errors of 1e-16; intervals that agree to 1e-12 s are
+    # Sample times have relative rounding errors of 1e-16. Intervals that agree to 1e-12 s count as
     # equal.
     steps, which = np.unique(np.round(np.diff(t), 12), return_inverse=True)
     phi = expm(augmented * steps[:, None, None])
@@ -77,7 +77,7 @@ def propagate(A: Array, B: Array, t: Array, u: Array, *, x0: Array, linear: bool
 
 
 def _by_blocks(transition: Array, forced: Array, x: Array) -> Array:
-    """Return the states (n, n_states) after x; each next one is transition @ x + forced[i].
+    """Return the states (n, n_states) that follow x by the rule x → transition @ x + forced[i].
 
     Blocks are computed from rest, all at once, and then joined. That takes 2 √n steps of the Python
     interpreter instead of n.

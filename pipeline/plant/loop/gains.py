@@ -7,7 +7,7 @@ from pipeline.arrays import Array, ComplexArray
 
 
 def lqr_gains(phi: Array, gamma: Array, weights: Array) -> Array:
-    """Return the gains (…, n) that minimise the sum of x'Qx + u² for each Q of (…, n, n).
+    """Return the gains (…, n) that minimise the sum of x'Qx + u² for each Q in `weights` (…, n, n).
 
     This is the doubling algorithm: after i steps, H is the cost of the next 2^i samples. Many
     weights at once take little more time than one.
@@ -32,10 +32,11 @@ def lqr_gains(phi: Array, gamma: Array, weights: Array) -> Array:
 
 
 def place_poles(phi: Array, gamma: Array, poles: ComplexArray) -> Array:
-    """Return the gains (…, n) that give phi - gamma G the `poles` (…, n), in conjugate pairs.
+    """Return the gains G (…, n) with which phi - gamma G has the `poles` (…, n).
 
-    In Hessenberg form, the input reaches one state after the other. So the last row of the wanted
-    polynomial of phi gives the gains, and no controllability matrix must be inverted.
+    Complex poles must come in conjugate pairs. In Hessenberg form, the input reaches one state
+    after the other. So the last row of the wanted polynomial of phi gives the gains, and no
+    controllability matrix must be inverted.
 
     Reference: B. N. Datta, Linear Algebra Appl. 88 (1987) 207-226.
     """

@@ -16,10 +16,10 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.sampled_loop import StateFeedback, broken_loop, discretise
 
 if TYPE_CHECKING:
-    import control  # takes half a second, so it is imported on use
+    import control  # takes half a second, so it is imported only where needed
 
-_SLOWER = 1e-2  # times the slowest pole; the band begins there
-_NEAREST, _AROUND = 1e-6, 30  # least distance from a mode's frequency, relative; how many
+_SLOWER = 1e-2  # the band begins at this multiple of the slowest pole
+_NEAREST, _AROUND = 1e-6, 30  # near a mode: least relative distance; frequencies on each side
 
 
 @result()
@@ -30,18 +30,18 @@ class Margins:
     """
 
     gain: float | None = written(
-        "factor on the loop's gain that makes it unstable, the nearest to 1 (below 1: the least "
-        "gain it needs); null if there is no such factor"
+        "factor on the loop's gain, the nearest to 1, that makes the loop unstable; below 1, the "
+        "loop needs more gain than this; null if there is no such factor"
     )
     phase_deg: float | None = written(
-        "lag that makes the loop unstable, or lead if negative, the nearest to 0; null if the "
-        "loop's gain is never 1"
+        "phase lag (or lead, if negative), the nearest to 0, that makes the loop unstable; null if "
+        "the loop's gain is never 1"
     )
     modulus: Number = written(
-        "least distance of the Nyquist curve from -1, one over the peak of the sensitivity"
+        "least distance of the Nyquist curve from -1, which is one over the peak of the sensitivity"
     )
-    omega_gain: float | None = written("rad/s, where `gain` is met")
-    omega_phase: float | None = written("rad/s, where `phase_deg` is met")
+    omega_gain: float | None = written("frequency to which `gain` refers, rad/s")
+    omega_phase: float | None = written("frequency to which `phase_deg` refers, rad/s")
 
 
 def closed_loop(
@@ -94,7 +94,7 @@ def stability_margins(
         return (C @ np.linalg.solve(shifted, B[:, None]))[:, 0].astype(np.complex128)
 
     at_180 = _crossings(lambda omega: response(omega).imag, omega)
-    # At both ends of the band the response is real, and if negative, it crosses -180° there too.
+    # At both ends of the band the response is real. If it is negative there, the phase is -180°.
     # Without a spring to a wall, the band has no lower end.
     at_180 = np.append(at_180, [0.0, np.pi / sample_time] if chain.is_tied else np.pi / sample_time)
     real = response(at_180).real
@@ -113,7 +113,7 @@ def stability_margins(
 
 def _crossings(curve: Callable[[Array], Array], omega: Array) -> Array:
     """Return where a real curve crosses zero; `omega` must separate the crossings."""
-    from scipy.optimize import brentq  # a fifth of a second: imported where it is used
+    from scipy.optimize import brentq  # takes a fifth of a second, so it is imported here
 
     sign = np.sign(curve(omega))
     between = np.flatnonzero(sign[1:] * sign[:-1] < 0)
@@ -140,10 +140,10 @@ def _least(curve: Callable[[Array], Array], omega: Array) -> float:
 def _frequencies(z: ComplexArray, *, sample_time: float) -> Array:
     """Return frequencies up to the Nyquist frequency, rad/s, denser near a pole."""
     nyquist = np.pi / sample_time
-    s = np.log(z[np.abs(z) > np.exp(-np.pi)]) / sample_time  # other poles change nothing quickly
+    s = np.log(z[np.abs(z) > np.exp(-np.pi)]) / sample_time  # faster poles need no dense grid
     slowest = np.abs(s[np.abs(s) > _NEAREST * nyquist]).min(initial=nyquist)
     lowest = min(_SLOWER * slowest, _SLOWER * nyquist)
-    # 60 frequencies per decade, plus those of each mode.
+    # 60 frequencies per decade, plus some around each mode.
     count = int(60 * np.log10(nyquist / lowest))
     band = np.geomspace(lowest, nyquist, count, endpoint=False)
     modes = s[s.imag > 0]

@@ -32,21 +32,22 @@ def stays_stable(chain: Chain, controller: StateFeedback, *, sample_time: float)
 
 
 def level_error_percent(chain: Chain, gains: Array, *, cart: int) -> Array:
-    """Return how far errors in the springs move a cart's level, for gains (…, 2n).
+    """Return how far errors in the springs move a cart's steady position, for gains (…, 2n).
 
-    The result is in percent of the level, to first order, with the errors of all springs in the
-    worst direction.
+    The result is in percent of the steady position, to first order, with the errors of all springs
+    in the worst direction.
     """
     inverse = _compliance(chain, gains)
     x = inverse[..., :, 0]
-    # Spring j adds k_j (e_j - e_{j-1})(e_j - e_{j-1})' to the stiffness; e is zero for a wall.
+    # Spring j adds k_j (e_j - e_{j-1})(e_j - e_{j-1})' to the stiffness, where e_j is the unit
+    # vector of cart j, or zero for a wall.
     ends = np.diff(np.eye(chain.n + 2)[1:-1], axis=1)  # (n, n + 1), one column per spring
     moved = chain.k * (x @ ends) * (inverse[..., cart - 1, :] @ ends)
     return 100 * limits.MASS_SPRING_ERROR * np.abs(moved).sum(-1) / np.abs(x[..., cart - 1])
 
 
 def static_levels(chain: Chain, gains: Array) -> Array:
-    """Return the positions (…, n) of all carts under the gains (…, 2n), per unit of input."""
+    """Return the steady positions (…, n) of all carts under gains (…, 2n), per unit of input."""
     return _compliance(chain, gains)[..., :, 0]
 
 

@@ -4,9 +4,9 @@ The controller's clock ticks every `sample_time`. At tick k it does the followin
 
 1. Read every free cart's encoder: y = x + rest, rounded to `encoder_step`.
 2. Compute the effort from y and the reference (see below), then clip it to ± `input_limit`.
-3. Apply the effort. With `delay` 1 it acts from tick k + 1 to k + 2, as the computer needs its
-   sample to compute. With `delay` 0 it acts from tick k to k + 1. Before the first effort the input
-   is zero.
+3. Apply the effort. With `delay` 1 it acts from tick k + 1 to k + 2, because the computer needs
+   one sample to compute it. With `delay` 0 it acts from tick k to k + 1. Before the first effort
+   the input is zero.
 
 **State feedback.** The effort is prefilter r - gains · [x1, v1, x2, v2, …]. Positions are the
 readings. Velocities come from an alpha-beta observer with alpha 1. It uses the prediction that was
@@ -15,15 +15,15 @@ made at the last tick:
     v = v_predicted + (VELOCITY_CORRECTION / sample_time) (y - x_predicted).
 
 With a `model`, the prediction for the next tick is exact and includes the acting input. Without a
-model it is x + sample_time v at constant v, and v is the filtered difference of the readings. With
+model it is x + sample_time v with v unchanged, so v is a filtered difference of the readings. With
 `delay` 1 the gains multiply the prediction, which is the state at the moment when the effort begins
-to act. So the delay needs no further gain. The poles of the delayed loop are those of the loop
+to act. So the delay needs no gain of its own. The poles of the delayed loop are those of the loop
 without delay, and one more at z = 0. The observer starts at the first reading, at rest.
 
-**PID.** The effort is scale (kp e + ki ∫e + kd de/dt) with e = r - y of one cart. The error e is in
-the units of the readings. The integral is the sum of e sample_time up to this tick. The derivative
-is the difference from the last tick over sample_time. Before the first tick e is zero. So a
-reference that is on at the first tick causes a kick.
+**PID.** The effort is scale (kp e + ki ∫e + kd de/dt) with e = r - y of one cart, in the units of
+the readings. The integral is the sum of e · sample_time up to this tick. The derivative is the
+change of e since the last tick, divided by sample_time. Before the first tick e is zero, so a
+reference that is already on at the first tick causes a kick.
 """
 
 from collections.abc import Sequence
@@ -37,9 +37,9 @@ from pipeline.errors import DataError
 from pipeline.plant.linear.chain import Chain
 
 # Share of the prediction error that corrects the velocity at a tick. One half keeps three quarters
-# of the encoder's rounding noise out of v, and removes a wrong start in a few ticks.
+# of the encoder's rounding noise out of v, and corrects a wrong initial velocity in a few ticks.
 VELOCITY_CORRECTION = 0.5
-MOST_TICKS = 200_000  # ticks of a run. Over three minutes at 1 kHz, and some seconds to simulate
+MOST_TICKS = 200_000  # ticks per run: over three minutes at 1 kHz, simulated in some seconds
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,8 +48,9 @@ class StateFeedback:
 
     Attributes
     ----------
-    gains : (2f,) for the f free carts, input unit per position unit and per (position unit/s).
-    model : the plant that the observer predicts with. Without one it predicts at constant velocity.
+    gains : gains (2f,) of the f free carts, input unit per position unit and per (position unit/s).
+    model : the plant with which the observer predicts. Without a model, the observer
+        assumes constant velocity.
     """
 
     gains: Array
@@ -80,9 +81,9 @@ class LoopRun:
 
     Attributes
     ----------
-    t : (n,) s.
-    x : (f, n) readings of the free carts. They include the rest, but not the encoder's rounding.
-    u : (n,) effort that acts from each t on. Clipped, as a bench logs its input.
+    t : times (n,), s.
+    x : readings (f, n) of the free carts. They include the rest, but not the encoder's rounding.
+    u : effort (n,) that acts from each time on, clipped like the input in a bench's log.
     """
 
     t: Array
@@ -109,13 +110,14 @@ class LoopSetup:
 
     Attributes
     ----------
-    sample_time : s, of the controller. By default the mean interval of the run.
-    delay : ticks from reading to acting, 1 or 0.
+    sample_time : sample time of the controller, s. By default the mean interval of the run.
+    delay : number of ticks from a reading to the effort computed from it, 0 or 1.
     input_limit : the effort is clipped to ± this limit.
-    drive : force on cart 1 per effort. Different from 1 if a log has another sign or scale.
-    encoder_step : step to which the controller's readings are rounded. One number or (f,).
-    rest : readings of the carts at rest without input. One number or (f,).
-    free : the carts that move. By default all.
+    drive : force on cart 1 per unit of effort. It differs from 1 if a log has another sign or
+        scale.
+    encoder_step : step to which the controller's readings are rounded, one number or (f,).
+    rest : readings of the carts at rest without input, one number or (f,).
+    free : numbers of the carts that move; all by default.
     """
 
     sample_time: float | None = None
@@ -150,14 +152,14 @@ def simulate_loop(
 
     Parameters
     ----------
-    t : (n,) s, ascending. The times of the result; the run begins at t[0].
-    reference : set point, in the units of the readings. One number, or (n,) at `t`.
-    start : (2f,) state (x1, v1, x2, v2, …) at t[0], relative to the rest. By default at rest. It
-        may also be a plant in its present state, which replaces the chain.
+    t : times (n,) of the result, s, ascending. The run begins at t[0].
+    reference : set point, in the units of the readings; one number, or (n,) values at `t`.
+    start : initial state (2f,), (x1, v1, x2, v2, …), relative to the rest; at rest by default. A
+        plant in its present state may be given instead, and then replaces the chain.
 
     Raises
     ------
-    DataError : the controller does not fit the free carts, or ticks too often for such a run.
+    DataError : the controller does not fit the free carts, or the run has too many ticks.
     """
     t = np.asarray(t, dtype=np.float64)
     free = tuple(sorted(set(range(1, chain.n + 1) if setup.free is None else setup.free)))
@@ -212,7 +214,8 @@ def replay(
     """Return the effort (n,) that the controller computes at each reading of a recorded run.
 
     `y` (f, n) are the readings of the `free` carts. Nothing is clipped or predicted. The result is
-    the response of the stated law to the actual motion, for comparison with the logged input.
+    the response of the stated control law to the actual motion, for comparison with the logged
+    input.
     """
     T = float(t[-1] - t[0]) / (t.size - 1)
     law = _law(controller, free=tuple(free), sample_time=T, y0=y[:, 0])
@@ -228,7 +231,7 @@ def discretise(
     chain: Chain, sample_time: float, *, free: Sequence[int] | None = None
 ) -> tuple[Array, Array]:
     """Return Phi (2f, 2f) and Gamma (2f,) of the free carts for an input held over a sample."""
-    from scipy.linalg import expm  # a tenth of a second: imported where it is used
+    from scipy.linalg import expm  # takes a tenth of a second, so it is imported here
 
     A, B, _, _ = chain.state_space(free=free)
     size = A.shape[0]
@@ -241,11 +244,11 @@ def discretise(
 def broken_loop(
     chain: Chain, controller: StateFeedback, *, sample_time: float
 ) -> tuple[Array, Array, Array]:
-    """Return A (4n + 1)², B and C (4n + 1,) of the loop cut where the effort drives cart 1.
+    """Return A, B and C, of size 4n + 1, of the loop cut where the effort drives cart 1.
 
-    They describe the step from tick to tick, from a force on cart 1 to minus the effort. The state
-    is (x, prediction, acting effort). All carts are free, the delay is one tick, nothing is clipped
-    or rounded, and the reference is zero.
+    They describe the step from one tick to the next, from a force on cart 1 to minus the effort.
+    The state is (x, prediction, acting effort). All carts are free, the delay is one tick, nothing
+    is clipped or rounded, and the reference is zero.
     """
     free = tuple(range(1, chain.n + 1))
     size = 2 * chain.n
@@ -261,7 +264,7 @@ def broken_loop(
 
 
 def loop_matrix(chain: Chain, controller: StateFeedback, *, sample_time: float) -> Array:
-    """Return the map (4n + 1)² of (x, prediction, acting effort) from tick to tick.
+    """Return the matrix, of size 4n + 1, that maps (x, prediction, acting effort) to the next tick.
 
     The loop is stable if and only if all eigenvalues lie inside the unit circle.
     """
@@ -273,7 +276,7 @@ def loop_matrix(chain: Chain, controller: StateFeedback, *, sample_time: float) 
 
 
 class _Law(Protocol):
-    """The memory of a controller: it takes readings, returns efforts, and notes which acted."""
+    """A controller with its state: it takes readings, returns efforts, and predicts."""
 
     def measure(self, y: Array) -> None: ...
     def predict(self, applied: float) -> None: ...
@@ -322,7 +325,7 @@ class _PidLaw:
 def _law(controller: Controller, *, free: tuple[int, ...], sample_time: float, y0: Array) -> _Law:
     if isinstance(controller, Pid):
         if controller.cart not in free:
-            raise DataError(f"PID needs its cart {controller.cart} free, found {list(free)}")
+            raise DataError(f"PID needs cart {controller.cart} to be free, found free {list(free)}")
         return _PidLaw(controller, free.index(controller.cart), sample_time=sample_time)
     phi, gamma = _prediction(controller, free=free, sample_time=sample_time)
     return _StateFeedbackLaw(controller, phi, gamma, sample_time=sample_time, y0=y0)
@@ -345,7 +348,7 @@ def _prediction(
 
 
 def _hermite(at: Array, x: Array, slope: Array) -> Array:
-    """Interpolate values (f, n) with known slopes at 0, 1, 2, …; exact there, O(h⁴) between."""
+    """Interpolate values (f, n) with known slopes at 0, 1, 2, …; the error is O(h⁴)."""
     index = np.clip(np.floor(at).astype(int), 0, x.shape[1] - 2)
     s = at - index
     left, right = x[:, index], x[:, index + 1]

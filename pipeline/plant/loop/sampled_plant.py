@@ -9,7 +9,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.robustness import stays_stable
 from pipeline.plant.loop.sampled_loop import StateFeedback, discretise
 
-RADIANS_PER_SAMPLE = 0.5  # of the fastest mode, at most; about 12 samples in a period
+RADIANS_PER_SAMPLE = 0.5  # at most, for the fastest mode: about 12 samples per period
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,8 +32,8 @@ class SampledPlant:
         speeds = np.maximum(np.abs(chain.poles), 4 / settling)
         rate = float(np.exp(np.log(speeds).mean()))
         if sample_time is None:
-            # The laboratory controller's sample time, or shorter for 25 samples until the loop
-            # settles.
+            # The laboratory controller's sample time, or less if modes are fast, or if the loop
+            # would settle in less than 25 samples.
             sample_time = min(0.00884, RADIANS_PER_SAMPLE / speeds.max(), settling / 25)
         tied = chain.k[0] > 0 or chain.k[-1] > 0
         stiffness = 1 / chain.static_gains()[0] if tied else chain.m.sum() * rate**2
@@ -66,17 +66,20 @@ class SampledPlant:
         return self.stiffness * weights / np.outer(unit, unit)
 
     def stays_stable(self, gains: Array) -> bool:
-        """Whether the loop tolerates the usual errors of the chain; the gains have units."""
+        """Whether the loop with these unscaled gains tolerates the usual errors of the chain."""
         controller = StateFeedback(gains=gains, prefilter=1.0, model=self.chain)
         return stays_stable(self.chain, controller, sample_time=self.sample_time)
 
 
 def energy_weights(plant: SampledPlant, weights: Array) -> Array:
-    """Return Q (n_candidates, 2n, 2n) for a grid of weights of both energies, with R = 1."""
+    """Return Q (n_candidates, 2n, 2n) for all pairs of weights on potential and kinetic energy.
+
+    The input's square has the weight R = 1.
+    """
     chain, n = plant.chain, plant.chain.n
     stiffness = chain.stiffness / plant.stiffness
     if chain.k[0] == chain.k[-1] == 0:
-        # Without a spring to a wall, the mean displacement gets a weight as from a spring.
+        # Without a spring to a wall, the mean position is weighted as if a spring held it.
         stiffness = stiffness + np.ones((n, n)) / n**2
     potential, kinetic = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 * n))
     potential[0::2, 0::2] = stiffness

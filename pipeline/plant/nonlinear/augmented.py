@@ -37,13 +37,13 @@ def simulate_augmented(
 
     Parameters
     ----------
-    t, u : (n,) s and input, held from sample to sample.
-    free : the carts free to move. By default all; the others are held at zero.
-    x0 : (n_carts,) positions at the start. By default the rest positions.
+    t, u : times (n,) in s, and input (n,), held from sample to sample.
+    free : numbers of the carts that move; all by default. The others are held at zero.
+    x0 : positions (n_carts,) at the start. By default the rest positions.
 
     Returns
     -------
-    (n_carts, n) readings.
+    readings (n_carts, n).
 
     Raises
     ------
@@ -52,15 +52,15 @@ def simulate_augmented(
     n = model.chain.n
     free = _all(n) if free is None else free
     x0 = rest_positions(model, free=free) if x0 is None else np.asarray(x0, dtype=np.float64)
-    # The steps are smaller than usual, since other results are judged by this one.
+    # The steps are smaller than usual, because other results are judged by this one.
     return _simulate(model.tables(), t, u, free=free, x0=x0, refine=4.0)
 
 
 def rest_positions(model: AugmentedChain, *, free: Sequence[int] | None = None) -> Array:
     """Return the positions (n_carts,) at which the carts rest without input and dry friction.
 
-    The carts are released at zero, with such large dampings that they creep to their rest. Carts
-    without a spring to a wall can rest anywhere, so they stay at zero.
+    The carts are released at zero, with dampings so large that they creep to their rest. If no
+    spring connects the carts to a wall, they can rest anywhere, so they stay at zero.
     """
     tables, n = model.tables(), model.chain.n
     cart = tables.cart
@@ -94,7 +94,7 @@ def _all(n: int) -> tuple[int, ...]:
 
 
 def compile_simulator() -> None:
-    """Run the simulator once to compile it; this takes ten seconds, unless it is stored."""
+    """Run the simulator once to compile it, which takes ten seconds unless code is stored."""
     chain = Chain(m=np.ones(1), c=np.ones(1), k=np.array([1.0, 0.0]))
     simulate_augmented(AugmentedChain(chain=chain), np.array([0.0, 0.01]), np.zeros(2))
 
@@ -103,7 +103,7 @@ class SteppedBench:
     """A bench that advances by one interval at a time and keeps all of its state.
 
     Friction, contacts, hidden masses, the delay line and the drive's lag keep their state between
-    calls. A hand may move a cart, release it, or push it.
+    calls. A person's hand may move a cart, release it, or push it.
     """
 
     def __init__(
@@ -190,7 +190,7 @@ class SteppedBench:
     def carry(self, cart: int, *, to: float, interval: float) -> None:
         """Move one cart by hand to a position within `interval` s.
 
-        The other free carts are held.
+        The other free carts are held meanwhile.
         """
         # No force moves a carried cart, but its friction acts on the hand.
         self._state[kernel.INV, self._rows] = 1e-30
@@ -199,9 +199,9 @@ class SteppedBench:
         self.step(0.0, following=0.0, interval=interval)
 
     def let_go(self, cart: int, *, velocity: float) -> float:
-        """Free all carts again, this one with a velocity.
+        """Release all free carts, and give `cart` an initial velocity.
 
-        Return the force that held its springs.
+        Return the force that held this cart against its springs.
         """
         self._state[kernel.INV] = self._inverse_mass
         self._state[kernel.V, self._rows] = 0.0
@@ -209,13 +209,13 @@ class SteppedBench:
         return -float(self._static_forces()[cart - 1])
 
     def push(self, cart: int, force: float) -> None:
-        """Add a constant force on one cart, until it is removed."""
+        """Add a constant force on one cart; the same force with opposite sign removes it."""
         self._state[kernel.FIX, cart - 1] += force
 
     # ------------------------------------------------------------------ private parts
 
     def _force(self, start: float, end: float, upcoming: tuple[float, float]) -> float:
-        """Return the exact mean of the delayed and lagged input from start to end."""
+        """Return the exact mean, from `start` to `end`, of the input after delay and lag."""
         if self._lagged == 0.0 and upcoming[1] == 0.0 and not any(u for _, u in self._inputs):
             return 0.0
         delay = float(self._tables.drive[Drive.INPUT_DELAY_DELAY])
@@ -240,7 +240,7 @@ class SteppedBench:
         return s[kernel.FORCE] - self._bodies.K @ s[kernel.X]
 
     def _close_contacts(self) -> None:
-        """Add contacts that are closed from the start to the matrices."""
+        """Add the contacts that are closed at the start to the matrices."""
         bodies = self._bodies
         for e, which in enumerate(bodies.switches):
             if guard(which, False, self._tables, bodies.s, 0.0) > 0.0:

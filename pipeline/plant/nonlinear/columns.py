@@ -55,12 +55,12 @@ class Drive(IntEnum):
     COGGING_PHASE = 11
 
 
-# Dry friction, which may differ by a factor from run to run.
+# Columns of dry friction, which may differ by a factor from run to run.
 DRY = (
     Cart.COULOMB_FRICTION_FORCE,
     Cart.STICTION_STATIC_FORCE,
     Cart.PRESLIDING_FRICTION_FORCE,
     Cart.LOAD_FRICTION_COEFFICIENT,
 )
-# Values without effect, for columns in which 0 has an effect.
+# Values for no effect, in columns where 0 would have an effect.
 NEUTRAL = {"SENSOR_GAIN_GAIN": 1.0}

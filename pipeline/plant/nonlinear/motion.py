@@ -1,14 +1,14 @@
 """The chain with its effects as an ordinary differential equation, for python-control.
 
-It is written from the effects' own laws. The simulator switches at exact instants, whereas any
-solver may integrate the right-hand side given here. Two things are approximate:
+It is built from the laws of the effects. The simulator switches at exact instants, but the
+right-hand side given here suits any solver. Two things are approximate:
 
 - Dry friction is set-valued at rest. Here it brakes a slow cart like a damper that would stop it in
-  `stop` s, up to the friction's size. A held cart creeps at force / mass * stop.
+  `stop` s, up to the friction's size. So a cart held by friction creeps at force / mass * stop.
 - A delay is a Padé approximation of the fourth order, good up to a frequency of about 4 / delay
   (rad/s). See C. Moler, C. Van Loan, SIAM Review 45 (2003), 3-49, section 3, for the exponential.
 
-Without effects it is the linear chain.
+Without effects, the equation is that of the linear chain.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,7 +34,7 @@ from pipeline.plant.nonlinear.effects.law import (
 if TYPE_CHECKING:
     import control
 
-STOP_TIME = 1e-4  # s. Default of the parameter `stop`
+STOP_TIME = 1e-4  # in s; default of the parameter `stop`
 _PADE_ORDER = 4
 
 _FUNCTIONS: dict[str, Any] = {
@@ -73,9 +73,9 @@ class EquationsOfMotion:
 
     Attributes
     ----------
-    states : names. First x1, v1, x2, …, then those of the effects: `z1` of a bristle, `x1_hidden`
-        and `v1_hidden` of a hidden mass, `x_motor` and `v_motor` with a play, `u_lag`, `u_delay_1`,
-        ….
+    states : names of the states. First come x1, v1, x2, v2, …, then the states of the effects: `z1`
+        of a bristle, `x1_hidden` and `v1_hidden` of a hidden mass, `x_motor` and `v_motor` with
+        backlash, `u_lag`, `u_delay_1`, ….
     """
 
     def __init__(self, model: AugmentedChain) -> None:
@@ -140,16 +140,16 @@ class EquationsOfMotion:
                 own = [f"x{i}_hidden", f"v{i}_hidden"]
             case "play":
                 own = ["x_motor", "v_motor"]
-                # With a play, cart 1 keeps at least a fiftieth of its mass without the motor's
-                # mass.
+                # With backlash, cart 1 keeps at least a fiftieth of its mass when the motor's mass
+                # is separated.
                 self._m[0] = max(self._m[0] - term.values[1], 0.02 * self._m[0])
             case "lag":
                 own = ["u_lag"]
             case "delay":
                 if term.values[0] < 0.0:
                     raise DataError(
-                        "the drive leads its log (a negative delay): no system of states can; "
-                        "simulate the recordings instead"
+                        "the drive leads its log (a negative delay), which no state model can "
+                        "represent; simulate the recordings instead"
                     )
                 self._delay = _pade(term.values[0])
                 own = [f"u_delay_{q + 1}" for q in range(_PADE_ORDER)]
@@ -157,7 +157,7 @@ class EquationsOfMotion:
         self.states += own
 
     def start(self, x0: Sequence[float]) -> Array:
-        """Return the state of carts released at rest at `x0` (n_carts,), with their hidden masses.
+        """Return the state of carts (and hidden masses) released at rest at `x0` (n_carts,).
 
         Bristles are bent until they hold the carts.
         """
@@ -222,7 +222,7 @@ class EquationsOfMotion:
         return out
 
     def _arriving(self, state: Array, command: float, out: Array) -> float:
-        """Return the force of the drive on its body; fill the rates of the drive's states."""
+        """Return the force of the drive; fill in the rates of the drive's states."""
         u = command
         for law in self._inputs:
             u = law(u=u)
@@ -246,7 +246,7 @@ class EquationsOfMotion:
         x: float,
         v: float,
     ) -> float:
-        """Return the force that reaches cart 1 across the play; fill the motor's rates."""
+        """Return the force that reaches cart 1 across the backlash; fill in the motor's rates."""
         (gap, mass, stiffness, damping), at = play[0].values, play[1]
         apart, rate = state[at] - x, state[at + 1] - v
         side = 1.0 if apart > 0.0 else -1.0
@@ -283,7 +283,7 @@ class EquationsOfMotion:
 
 def _pade(delay: float) -> tuple[Array, Array, Array, float]:
     """Return A, b, c and d of the Padé approximation of exp(-s delay)."""
-    from scipy.signal import tf2ss  # takes half a second, so it is imported on use
+    from scipy.signal import tf2ss  # takes half a second, so it is imported here
 
     q = np.arange(_PADE_ORDER, -1, -1)
     order = _PADE_ORDER

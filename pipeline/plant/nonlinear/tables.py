@@ -1,6 +1,6 @@
 """The input of the simulator: three tables of numbers for carts, springs and drive.
 
-An effect fills columns of one row. With neutral values in all columns the model is the linear
+An effect fills columns of one row. With neutral values in all columns, the model is the linear
 chain.
 """
 
@@ -20,7 +20,7 @@ TABLES: dict[str, type[IntEnum]] = {"cart": Cart, "spring": Spring, "input": Dri
 
 
 class Tables(NamedTuple):
-    """The columns of the effects: cart (n, .), spring (n + 1, .) and drive (.,)."""
+    """The columns of the effects, in tables for carts (n, .), springs (n + 1, .) and drive (.,)."""
 
     cart: Array
     spring: Array

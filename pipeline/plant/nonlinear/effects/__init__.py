@@ -71,7 +71,7 @@ __all__ = [
 
 
 def find_effect(key: str) -> Effect:
-    """Return the effect with a given name.
+    """Return the effect with the given key.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def find_effect(key: str) -> Effect:
 
 
 def _with_words(typed: str) -> list[str]:
-    """Return the effects with all the typed words in their name, else in their title.
+    """Return the effects with all the typed words in their name, or else in their title.
 
     They are in the order of the catalogue, which begins with the most common.
     """

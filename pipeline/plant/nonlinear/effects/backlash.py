@@ -17,7 +17,7 @@ EFFECT = Effect(
     sentence="Pinion and rack have play: at each reversal the motor runs free through a gap.",
     place="input",
     law=BuiltLaw("play", _FORMULA),
-    growth=Growth(("g", "m_m", "e")),  # e: ratio of the speeds after and before an impact
+    growth=Growth(("g", "m_m", "e")),  # e: speed after an impact, divided by the speed before it
     parameters=(
         EffectParameter("gap", "g", "position", scale="position", typical=0.08, neutral=0.0),
         EffectParameter(
@@ -44,7 +44,7 @@ EFFECT = Effect(
             "contact_damping",
             "c_c",
             "input s/position",
-            # A third of critical damping, for the motor's share of the mass on the usual contact.
+            # A third of critical damping, for the usual motor mass and contact stiffness.
             scale="(stiffness * mass) ** 0.5",
             typical=1.0,
             lower=0.02,

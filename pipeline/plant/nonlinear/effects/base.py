@@ -31,15 +31,14 @@ Axis = Literal["velocity", "position", "stretch", "input", "time", "frequency"]
 
 @dataclass(frozen=True, kw_only=True)
 class PlaceScales:
-    """Typical sizes at one place of one bench, from its records and its linear model.
+    """Typical sizes at one place of a bench, from its recordings and its linear model.
 
     Attributes
     ----------
-    position, velocity : the largest of the cart, or of the spring's stretch. In position units and
-        seconds.
+    position, velocity : the largest values for the cart, or for the stretch of the spring.
     input : the largest input.
-    sample_time : s.
-    mass, damping, stiffness : of the cart (with all its springs), or of the spring and its carts.
+    mass, damping, stiffness : values for the cart with all its springs, or for the spring and a
+        cart at its end.
     """
 
     position: float
@@ -57,17 +56,17 @@ class EffectParameter:
 
     Attributes
     ----------
-    unit : in terms of "position", "input" and "s". Empty for a pure number.
-    scale : its typical size at a place, an expression in the fields of `PlaceScales`. Starts and
-        steps are multiples of it.
-    typical : the multiple of `scale` that makes the effect clearly visible. Used to hide it.
+    unit : unit in terms of "position", "input" and "s"; empty for a pure number.
+    scale : typical size at a place, as an expression in the fields of `PlaceScales`. Starting
+        values and steps of a fit are multiples of it.
+    typical : the multiple of `scale` that makes the effect clearly visible. It is used to hide
+        effects in a practice bench.
     signed : whether the parameter may change its sign in a fit.
-    side : whether its sign selects a side. Such a sign never changes.
-    neutral : the value that gives the base model. None if no value does.
+    side : whether the parameter's sign selects a side. Such a sign never changes.
+    neutral : the value without effect, or None.
     lower, upper : bounds of the magnitude, in multiples of `scale`.
-    reach : the largest step of its logarithm in a fit.
-    reported : False for a detail of a contact. The data need such a detail, but users do not ask
-        for it.
+    reach : the largest step of the parameter's logarithm in a fit.
+    reported : False for a detail of a contact, which the simulation needs but users do not ask for.
     """
 
     name: str
@@ -99,23 +98,26 @@ class Effect:
 
     Attributes
     ----------
-    key : its name in files.
-    sentence : its explanation for a student.
-    law : its law, in the symbols of the parameters.
-    growth : its coordinates in a fit from zero. None if these are its parameters.
-    fingerprint : its signs in the data.
-    deciding_run : the experiment that confirms it or rules it out.
-    axis : the quantity against which it shows. The force (or reading) depends on it.
-    between_carts : True if on a spring to a wall it would be part of the linear chain.
-    fewest_carts : with fewer carts it is part of the linear chain.
-    family : effects of one family exclude each other at one place. On several carts they count as
-        one.
-    grows_from : the simpler effect whose fit is the start of this one's.
-    only_rest : True if only rest positions show it, as for an encoder zero. It is found from them.
-    equivalent : effects that the data cannot distinguish from it, and why.
-    same_as, same_below : the key of an effect that provably cannot be distinguished from it. This
-        holds while its first parameter is below so many sample times.
-    genuine : a function of the values. It returns False if they amount to another law.
+    key : the effect's name in files.
+    sentence : an explanation for a student.
+    law : the law, in the symbols of the parameters.
+    growth : the coordinates in which a fit grows the effect from zero. None if the
+        parameters serve as coordinates.
+    fingerprint : how the effect shows in the data.
+    deciding_run : the experiment that confirms the effect or rules it out.
+    axis : the quantity on which the force (or reading) depends.
+    between_carts : whether the effect exists only on springs between carts. On a spring to a wall
+        it would be part of the linear chain.
+    fewest_carts : number of carts below which the effect is part of the linear chain.
+    family : name of a group of effects that exclude each other at one place. The same family on
+        several carts counts as one effect.
+    grows_from : key of the simpler effect whose fit is the start of this one's fit.
+    only_rest : whether only rest positions show the effect, as for an encoder zero. It is then
+        found from them.
+    equivalent : which other effects the data cannot distinguish from this one, and why.
+    same_as, same_below : key of an effect that provably cannot be distinguished from this one while
+        this one's first parameter is below `same_below` sample times.
+    genuine : a function of the parameter values that returns False if they amount to another law.
     """
 
     written_as: ClassVar[str] = "key"
@@ -148,7 +150,7 @@ class Effect:
 
     @property
     def contact(self) -> bool:
-        """Whether it has a contact, with details that users do not ask for."""
+        """Whether the effect has a contact, with details that users do not ask for."""
         return not all(p.reported for p in self.parameters)
 
     @property
@@ -159,7 +161,7 @@ class Effect:
 
     @property
     def dry(self) -> bool:
-        """Whether it is friction whose size differs between runs."""
+        """Whether the effect is dry friction, whose size may differ between runs."""
         return isinstance(self.law, FrictionLaw | HysteresisLaw)
 
     @property
@@ -180,13 +182,13 @@ class Effect:
 
     @property
     def needs_input(self) -> bool:
-        """Whether it changes nothing in a motion without an input."""
+        """Whether the effect changes nothing in a motion without input."""
         powered = isinstance(self.law, ForceLaw) and "on" in names_in(self.law.force)
         return powered or isinstance(self.law, InputLaw) or self.is_built("delay", "lag")
 
     @property
     def needs_drive(self) -> bool:
-        """Whether its law uses the input."""
+        """Whether the law uses the input."""
         law = self.law
         text = (
             law.force
@@ -198,12 +200,12 @@ class Effect:
         return bool({"u", "on"} & names_in(text)) or self.place == "input"
 
     def is_built(self, *kinds: str) -> bool:
-        """Whether its law is one of these kinds that are built into the simulators."""
+        """Whether the law is one of the given kinds, which are built into the simulators."""
         return isinstance(self.law, BuiltLaw) and self.law.kind in kinds
 
     @property
     def own(self) -> tuple[EffectParameter, ...]:
-        """The parameters, without those shared with the friction that it contains."""
+        """The parameters, without those shared with the friction that this effect contains."""
         if not (isinstance(self.law, FrictionLaw) and self.law.beyond):
             return self.parameters
         mine = {*self.grown.coordinates, *self.grown.parameters}
@@ -240,7 +242,7 @@ class Effect:
         return dict(zip(self.names, values, strict=True))
 
     def places(self, springs: Sequence[bool]) -> tuple[int, ...]:
-        """Return its possible places on a bench: cart or spring numbers, or 0 for the input.
+        """Return the possible places of the effect: cart or spring numbers, or 0 for the input.
 
         The two wall springs of a single cart act only through their sum, so one represents both.
         """
@@ -277,7 +279,7 @@ class Effect:
 class EffectTerm:
     """An effect at a place, with its parameter values in the effect's order."""
 
-    effect: Effect = written("its name in the catalogue")
+    effect: Effect = written("name of the effect in the catalogue")
     place: int
     values: tuple[float, ...]
 
@@ -297,7 +299,7 @@ class EffectTerm:
     def from_written(
         cls, *, effect: Effect, where: Mapping[str, int], parameters: Mapping[str, float]
     ) -> "EffectTerm":
-        """Return the effect stored in a file; a `KeyError` if it lacks a parameter."""
+        """Return the effect that a file states; raise `KeyError` if a parameter is missing."""
         values = tuple(parameters[name] for name in effect.names)
         return cls(effect=effect, place=next(iter(where.values()), 0), values=values)
 
@@ -344,14 +346,15 @@ def chain_scales(
 ) -> PlaceScales:
     """Return the typical sizes at a place.
 
-    `largest` are position and velocity (n + 1,) of each cart or spring stretch, by default 1.
+    `largest` are the largest positions and velocities, (n + 1,) each, of each cart or spring
+    stretch; by default 1.
     """
     position, velocity = np.ones((2, chain.n + 1)) if largest is None else largest
     i = max(at - 1, 0)
     near = min(i, chain.n - 1)
     stiffness = chain.k[i] if place == "spring" else float(np.diag(chain.stiffness)[near])
     if stiffness <= 0.0:
-        # For a cart without springs, its inertial force replaces the spring force.
+        # For a cart without springs, the inertial force replaces the spring force.
         stiffness = chain.m[near] * (velocity[i] / position[i]) ** 2
     return PlaceScales(
         position=float(position[i]),

@@ -22,8 +22,8 @@ EFFECT = Effect(
             scale="position",
             typical=0.2,
             lower=0.02,
-            upper=1.0,  # a longer period looks like a bent spring
-            reach=0.03,  # a quarter of a tooth, with eight teeth in the travel
+            upper=1.0,  # with a longer period, it looks like a bent spring
+            reach=0.03,  # a quarter of a tooth, if the travel has eight teeth
         ),
         EffectParameter("phase", "φ", "rad", scale="1", typical=3.142, signed=True),
     ),

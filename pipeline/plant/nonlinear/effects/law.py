@@ -34,9 +34,9 @@ class ForceLaw:
 
     Attributes
     ----------
-    step : the longest step in s over which the force may be held.
-    on_motor : for an input, whether the force acts on the motor if there is play. Otherwise it acts
-        on cart 1.
+    step : the longest time, in s, over which the force may be held constant.
+    on_motor : for an effect of the input with backlash, whether the force acts on the motor instead
+        of on cart 1.
     """
 
     force: str
@@ -47,12 +47,12 @@ class ForceLaw:
 
 @dataclass(frozen=True)
 class FrictionLaw:
-    """Dry friction: `size` while the cart slides; at rest it holds up to the same force.
+    """Dry friction: `size` is the force while sliding, and the largest force held at rest.
 
     Attributes
     ----------
-    at_rest : the largest force that it holds, if different.
-    beyond : key of the friction that it contains, whose parameters it shares.
+    at_rest : the largest force at rest, if it differs from `size`.
+    beyond : key of the friction that this effect contains, and with which it shares parameters.
     """
 
     size: str
@@ -74,9 +74,9 @@ class HysteresisLaw:
 
 @dataclass(frozen=True)
 class ContactLaw:
-    """A force past a position (or stretch) whose sign is the side; it may push, or also pull.
+    """A force beyond a position or stretch; it may only push, or also pull.
 
-    The simulators switch it on and off at the exact instant.
+    The sign of the position selects the side. The simulators switch the force at the exact instant.
     """
 
     force: str
@@ -108,14 +108,14 @@ Law = ForceLaw | FrictionLaw | HysteresisLaw | ContactLaw | InputLaw | BuiltLaw
 
 @dataclass(frozen=True)
 class Growth:
-    """Coordinates in which a law grows in proportion from zero, for a fit that starts there.
+    """Coordinates in which the force grows in proportion from zero, for a fit that starts at zero.
 
     Attributes
     ----------
-    coordinates : symbols. A parameter's symbol stands for that parameter.
-    parameters : the other parameters, by symbol. They are expressions in the coordinates, with
+    coordinates : symbols of the coordinates. The symbol of a parameter stands for that parameter.
+    parameters : expressions for the other parameters, by symbol. They may use the coordinates,
         `hypot` and `atan2`, the spring's stiffness `k` and the shared parameters.
-    signed : whether the first coordinate may have either sign.
+    signed : whether the first coordinate may be negative.
     """
 
     coordinates: tuple[str, ...]
@@ -135,7 +135,7 @@ def names_in(text: str) -> set[str]:
 
 
 def formula_of(law: Law, *, place: str, unseen: set[str]) -> Math:
-    """Return the law as mathematics, without the terms of `unseen` symbols."""
+    """Return the law as mathematics, without the terms in `unseen` symbols."""
     written = _Formula(place=place, unseen=unseen)
     before = ("k", "d", "+") if place == "spring" else ()
     match law:
@@ -163,7 +163,7 @@ _SUM, _PRODUCT, _POWER, _ATOM = range(4)  # precedence of an operation
 
 
 class _Formula:
-    """Turns expressions into terms in a row."""
+    """Turns expressions into lists of mathematical terms."""
 
     def __init__(self, *, place: str, unseen: set[str]) -> None:
         on_cart_1 = {"x": sub("x", "1"), "v": sub("v", "1")} if place == "input" else {}
@@ -178,7 +178,7 @@ class _Formula:
         return terms if binds >= least else [parens(*terms)]
 
     def _bound(self, node: ast.expr) -> tuple[list[Term], int]:
-        """Return an expression and its precedence."""
+        """Return the terms of an expression, and its precedence."""
         match node:
             case ast.Constant(value=value):
                 return [str(value)], _ATOM

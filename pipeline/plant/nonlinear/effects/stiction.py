@@ -26,6 +26,6 @@ EFFECT = Effect(
     axis="velocity",
     family="dry friction",
     grows_from="coulomb_friction",
-    # Without a drop it is Coulomb's law, and every dry surface has some sliding friction.
+    # Without a drop, this would be Coulomb's law. Every dry surface has some sliding friction.
     genuine=lambda p: LEAST_SLIDING * p["static_force"] < p["force"] < p["static_force"],
 )

@@ -1,8 +1,8 @@
 """Compile functions with numba, and choose the folder for the compiled code.
 
-numba looks only at a function's own file to see whether stored code is out of date. But a function
-also contains code and constants from other files. So the folder is named after the content of all
-files that may matter. After any change the folder is another one, and the old one is removed.
+numba looks only at a function's own file to see whether stored code is out of date. But compiled
+code also contains functions and constants from other files. So the folder is named after the
+content of all files that may matter. After any change to them, a new folder replaces the old one.
 """
 
 import hashlib
@@ -22,8 +22,8 @@ ROOM = Path(__file__).parent
 _PACKAGE = ROOM.parents[2]
 _settings: Any = config  # its attributes appear when it is loaded
 _OPTIONS: dict[str, Any] = {
-    # Without arrays made here, reference counts are not needed; they took a quarter of a search's
-    # time.
+    # Arrays are never made here, so reference counts are not needed. They took a quarter of a
+    # search's time.
     "_nrt": False,
     "nogil": True,
     "fastmath": {"contract", "reassoc", "arcp", "nsz"},
@@ -39,7 +39,8 @@ def jit(function: Callable[..., Any]) -> Any:
 def inlined(function: Callable[..., Any]) -> Any:
     """Compile a function into the functions that call it.
 
-    It is inlined in machine code. Inlining in Python would repeat the type analysis at every call.
+    Machine code is inlined, because inlining in Python would repeat the type analysis at every
+    call.
     """
     return _compiled(function, forceinline=True)
 
@@ -55,9 +56,9 @@ def _compiled(function: Callable[..., Any], **more: Any) -> Any:
 
 @cache
 def kept_in(room: Path) -> Path | None:
-    """Return the folder for the compiled functions of a room; None if no folder is writable.
+    """Return the folder for a package's compiled functions; None if no folder is writable.
 
-    It is in the package's own `__pycache__` or, if that is not writable, in the user's cache.
+    It is in cartlab's own `__pycache__` or, if that is not writable, in the user's cache.
     `NUMBA_CACHE_DIR` has priority.
     """
     name = f"{room.name}-{content_of(room)}"
@@ -80,7 +81,7 @@ def is_compiled() -> bool:
 
 
 def content_of(room: Path) -> str:
-    """Return a name for the content of all files that a room's compiled functions may contain."""
+    """Return a hash of all files that a package's compiled functions may contain."""
     digest = hashlib.sha256()
     for path in sorted({*shared_files(), *room.glob("*.py")}):
         digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
@@ -88,12 +89,12 @@ def content_of(room: Path) -> str:
 
 
 def shared_files() -> list[Path]:
-    """Return the files that any compiled function may contain: this room, and the columns."""
+    """Return the files that any compiled function may contain: this package, columns and tables."""
     return [*ROOM.glob("*.py"), ROOM.parent / "columns.py", ROOM.parent / "tables.py"]
 
 
 def _roots() -> Iterator[Callable[[], Path]]:
-    mine = hashlib.sha256(os.fsencode(_PACKAGE)).hexdigest()[:16]  # one of several installations
+    mine = hashlib.sha256(os.fsencode(_PACKAGE)).hexdigest()[:16]  # differs between installations
     if _settings.CACHE_DIR:
         yield lambda: Path(_settings.CACHE_DIR) / f"cartlab-{mine}"
     yield lambda: _PACKAGE / "__pycache__" / "compiled"
@@ -112,7 +113,7 @@ def _remove_others(folder: Path, room: Path) -> None:
 
 
 class _Word(event.Listener):
-    """Says once, on stderr, why the first simulation takes long."""
+    """Explains once, on stderr, why the first simulation takes long."""
 
     def __init__(self) -> None:
         self._said = False
@@ -121,7 +122,7 @@ class _Word(event.Listener):
         function = event.data["dispatcher"].py_func
         if not self._said and function.__module__.startswith("pipeline."):
             self._said = True
-            once = "once on this computer" if kept_in(ROOM) else "as no folder can keep it"
+            once = "once on this computer" if kept_in(ROOM) else "as it cannot be stored"
             sys.stderr.write(f"compiling the simulator, {once}: this takes about 20 s\n")
 
     def on_end(self, event: Any) -> None:

@@ -53,10 +53,10 @@ def contact(which, tables):
 
 @jit
 def guard(which, active, tables, s, h):
-    """Return how far a switch is past its switching point after a time h; it switches if > 0.
+    """Return how far past its switching point a switch is after a time h; it switches if > 0.
 
-    Switches n to 2n are springs past a stretch, the others contacts. A contact begins when the
-    bodies meet and push, and ends when the push ends.
+    Switches n to 2n are springs past a stretch, the others are contacts. A contact begins when the
+    bodies meet and push each other. It ends when the push ends.
     """
     n = tables.cart.shape[0]
     if n <= which <= 2 * n:

@@ -38,24 +38,24 @@ from pipeline.plant.nonlinear.simulator.state import (
     ACC, FIX, FORCE, INV, MID_V, MID_X, ROWS, V, X, Z, Bodies, Push, pair, tie,
 )  # fmt: skip
 
-_SERIES_REACH = 0.2  # omega h; the error of the sixth-order series is then 1e-8 after seconds
+_SERIES_REACH = 0.2  # omega h; with it, the sixth-order series has an error of 1e-8 after seconds
 _CONTACT_REACH = 0.4  # omega h inside a contact
 _INSTANT = 1e-9  # s; events closer than this count as simultaneous
 _BLOWN_UP = 1e9  # position at which the simulation has diverged
 
 
 class Excitation(NamedTuple):
-    """The input and the other given quantities of one run.
+    """The input of one run, and what else is prescribed.
 
     Attributes
     ----------
-    t : (samples,) times.
-    knots, command : (k,) the input, held from knot to knot.
-    held : (3, k) work array. It holds the input after the drive's laws, and its integrals.
-    free : (n,) which carts move.
-    guided : (n, samples) motion of the other carts. Zero by default.
-    shots : (shots + 1,) bounds of the pieces with their own start.
-    refine : divisor of the step.
+    t : times (samples,).
+    knots, command : times and values (k,) of the input, held from knot to knot.
+    held : work array (3, k) for the input after the drive's laws, and its two integrals.
+    free : whether each cart moves (n,).
+    guided : prescribed motion (n, samples) of the other carts; zero by default.
+    shots : bounds (shots + 1,) of the pieces of the run, each of which has its own start.
+    refine : number by which the step is divided.
     """
 
     t: Array
@@ -71,9 +71,9 @@ class Excitation(NamedTuple):
 class StartState(NamedTuple):
     """The start state of the bodies of one run.
 
-    `x` and `v` (shots, n) are those of the carts at the start of each shot. With (shots, 2 n),
-    hidden masses follow, relative to their carts; only the first shot uses these. `scatter` (n,) is
-    a factor on all dry friction of a cart.
+    `x` and `v` (shots, n) are those of the carts at the start of each shot. If their shape is
+    (shots, 2 n), the hidden masses follow, relative to their carts; only the first shot uses these.
+    `scatter` (n,) is a factor on all dry friction of a cart.
     """
 
     x: Array
@@ -90,7 +90,7 @@ def describe_run(
     shots: Any = None,
     guided: Array | None = None,
 ) -> Excitation:
-    """Return a run in the simulator's form, with arrays of any kind copied.
+    """Return a run in the simulator's form.
 
     `command` (k,) is held from knot to knot, by default from sample to sample. Without `guided` (n,
     samples), carts that are not `free` (n,) stand at zero. By default there is one shot.
@@ -121,7 +121,7 @@ def _plain(array: Any, dtype: Any) -> Any:
 
 @jit
 def _assemble(tables, free, s, K, C, parent, switches):
-    """Fill the linear matrices and switches; return numbers of bodies and switches, motor's row."""
+    """Fill in matrices and switches; return the number of bodies, motor's row, switch count."""
     cart, spring, drive = tables.cart, tables.spring, tables.drive
     n = cart.shape[0]
     for i in range(n):
@@ -176,7 +176,7 @@ def assemble(tables: Tables, free: NDArray[np.bool_]) -> Bodies:
 
 @jit
 def _integral(run, time, at):
-    """Integrate the held input up to `time`, once and twice; `at` is the interval found last."""
+    """Integrate the held input up to `time`, once and twice; the search starts at interval `at`."""
     knots, held = run.knots, run.held
     last = knots.size - 1
     while at < last and knots[at + 1] <= time:
@@ -201,11 +201,11 @@ def _edge(run, delay, now, end, at):
 
 @inlined
 def _steps(tables, bodies, refine):
-    """Return longest step, longest in a contact (s), friction (sliding, presliding), places.
+    """Return the longest step, the longest step in a contact (s), and which forces there are.
 
-    The places are those of smooth forces.
+    Positive sums mean sliding and presliding friction; flags name the places of smooth forces.
     """
-    # These are sums, later used as flags: numba would compile a function for every constant flag.
+    # Sums serve as flags here, because numba would compile a function for every constant flag.
     rubbing = presliding = fastest = contact = 0.0
     s, n, N, motor = bodies.s, bodies.n, bodies.N, bodies.motor
     for i in range(N):
@@ -221,7 +221,7 @@ def _steps(tables, bodies, refine):
     for j in range(n + 1):
         extra = slack_of(tables.spring, j)[0]
         if extra > 0.0:
-            # A spring that hardens past its gap is the faster one.
+            # A spring that gets stiffer beyond its gap has the higher frequency.
             heavier = max(s[INV, j] if j < n else 0.0, s[INV, j - 1] if j > 0 else 0.0)
             fastest += extra * heavier
     reach, smooth = reach_of(tables.cart, tables.spring, tables.drive)
@@ -244,7 +244,7 @@ def _start_shot(bodies, run, start, lanes, shot):
     restart(bodies, lanes, shot, run.free)
     for i in range(n):
         if run.free[i]:
-            # Hidden masses and the motor keep their position relative to their cart.
+            # Hidden masses and the motor keep their position relative to their carts.
             for j in range(n, N):
                 if (parent[j] == i) or (j == motor and i == 0):
                     s[X, j] += start.x[shot, i] - s[X, i]
@@ -333,8 +333,8 @@ def _simulate(tables, bodies, run, start, lanes, y, dy):
                 upon = t[sample] + (sub + 1) * whole
                 h = whole
                 if (dry and s[V, driven] == 0.0) or now > upon - whole + _INSTANT:
-                    # A cart held by friction feels the actual input, so the step ends at the next
-                    # jump of the input.
+                    # A cart that friction holds feels the actual input instead of its mean over the
+                    # step. So the step ends at the next jump of the input.
                     h = _edge(run, delay, now, upon, at) - now
                 upto, upto2, at = _integral(run, now + h - delay, at)
                 mean = (upto - past) / h
@@ -342,7 +342,7 @@ def _simulate(tables, bodies, run, start, lanes, y, dy):
                 early = upto2 - past2 - 0.5 * h * (past + upto)
                 past, past2 = upto, upto2
                 if tau > 0.0:
-                    # Exact for a straight line with the mean and the moment of the input.
+                    # Exact for a straight line that has the mean and the moment of the input.
                     slope = -12.0 * early / h**3
                     decay = exp(-h / tau)
                     fading = lagged - mean + slope * (0.5 * h + tau)
@@ -373,17 +373,17 @@ def simulate(
     *,
     of: NDArray[np.int64] = NO_LANES,
 ) -> tuple[Array, Array]:
-    """Simulate variants of one run, the first with derivatives.
+    """Simulate variants of one run, with derivatives for the first variant.
 
     Parameters
     ----------
-    variants : b of them, each with its tables and its start.
-    of : (2, lanes) the variable of each derivative, a kind of `sensitivity` and a place from 0.
+    variants : b variants, each with its tables and its start.
+    of : (2, lanes), the kind of variable of each derivative, and its cart or spring (from 0).
 
     Returns
     -------
-    (b, n, samples) readings without encoder zero, NaN if a variant diverged; (lanes, n, samples)
-    derivatives of the first variant's readings.
+    readings (b, n, samples) without encoder zero, NaN for a variant that diverged; derivatives
+    (lanes, n, samples) of the first variant's readings.
     """
     of = _plain(of, np.int64)
     run = run._replace(held=np.zeros_like(run.held))  # threads may share a run

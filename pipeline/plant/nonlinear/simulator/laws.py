@@ -140,7 +140,7 @@ def drop_slope(cart, i, v, u):
 
 @inlined
 def settling(cart, i, v):
-    """Return the largest force of hysteresis, the limit and rate (1/s) of its state."""
+    """Return the largest force of hysteresis; limit and rate (1/s) of its state."""
     if cart[i, Cart.PRESLIDING_FRICTION_FORCE] != 0.0:
         return (
             cart[i, Cart.PRESLIDING_FRICTION_FORCE],
@@ -152,7 +152,7 @@ def settling(cart, i, v):
 
 @inlined
 def settling_slopes(cart, i, v):
-    """Return the derivatives by the velocity of the limit and rate of the state."""
+    """Return the derivatives, by velocity, of the limit and rate of the state."""
     if cart[i, Cart.PRESLIDING_FRICTION_FORCE] != 0.0:
         return 0, (1.0 if v > 0.0 else -1.0) / cart[i, Cart.PRESLIDING_FRICTION_DISTANCE]
     return 0.0, 0.0
@@ -172,7 +172,7 @@ def stop_of(cart, i):
 
 @inlined
 def slack_of(spring, j):
-    """Return extra stiffness of spring j, its stretch, and the slope by k."""
+    """Return extra stiffness of spring j, where it begins, and its derivative by k."""
     if spring[j, Spring.SLACK_SPRING_STIFFNESS_CHANGE] != 0.0:
         return (
             spring[j, Spring.SLACK_SPRING_STIFFNESS_CHANGE] * spring[j, Spring.STIFFNESS],
@@ -192,12 +192,12 @@ def arriving(drive, u):
     return u
 
 
-ON_CARTS, ON_SPRINGS, ON_DRIVE = 1, 2, 4  # places of smooth forces, to be added
+ON_CARTS, ON_SPRINGS, ON_DRIVE = 1, 2, 4  # flags for the places of smooth forces
 
 
 @jit
 def reach_of(cart, spring, drive):
-    """Return the longest step for the laws, in s, and places of smooth forces."""
+    """Return the longest step for the laws, in s, and flags such as `ON_CARTS`."""
     longest, smooth = inf, 0
     for i in range(cart.shape[0]):
         if cart[i, Cart.STICTION_STATIC_FORCE] > cart[i, Cart.COULOMB_FRICTION_FORCE]:

@@ -2,12 +2,14 @@
 
 A small change of a parameter acts like a small force on the same linear system. Per unit of change,
 this force is -a for a mass, -v for a damping, the stretch for a spring, and the friction itself for
-friction. So each derivative is a motion of its own. In every step it is advanced by the matrix
-exponential of the carts' own equations. Half of the small force's impulse comes before, half after.
+a friction factor. So each derivative is a motion of its own. In every step, the matrix exponential
+of the carts' own equations advances it. Half of the small force's impulse is given before, half
+after.
 
-If dry friction stops a cart or a contact switches, the instant depends on the parameter. There the
-derivative of the velocity jumps with the acceleration (a saltation). Impulses are accurate to
-second order in the step. A derivative is then accurate to 1e-3, which is enough to guide a fit.
+If dry friction stops a cart or a contact switches, the instant depends on the parameter. At this
+instant, the derivative of the velocity jumps in proportion to the jump of the acceleration (a
+saltation). Impulses are accurate to second order in the step. A derivative is then accurate to
+1e-3, which is enough to guide a fit.
 
 Reference: I. A. Hiskens, M. A. Pai, IEEE Trans. Circuits and Systems I 47 (2000), 204-220.
 """
@@ -32,21 +34,21 @@ from pipeline.plant.nonlinear.simulator.state import (
 )  # fmt: skip
 
 # Kinds of variables for derivatives: an entry of the tables, for a cart or spring; the factor on a
-# cart's dry friction; or a cart's start. From n on, the start is that of the hidden mass on a cart.
+# cart's dry friction; or the start of a cart. Start numbers from n on are hidden masses.
 BY_MASS, BY_DAMPING, BY_STIFFNESS, BY_FRICTION, BY_POSITION, BY_VELOCITY = range(6)
 _BLOCK = 4  # lanes that a processor computes at once, along the last axis
 
 
 class Lanes(NamedTuple):
-    """Derivatives (lanes) of the state of N bodies, with work arrays.
+    """Derivatives of the state of N bodies, each in its own lane, with work arrays.
 
     Attributes
     ----------
-    of : (2, lanes) the kind of variable of each lane, and its cart or spring (from 0).
-    T : (5 N + 2, blocks, 4) rows. N positions, N velocities and N presliding states come first.
-        Then the time of the current event, a force, and 2 N rows of work space.
+    of : (2, lanes), the kind of variable of each lane, and its cart or spring (from 0).
+    T : (5 N + 2, blocks, 4) array. Its rows are N positions, N velocities, N presliding states, the
+        time of the current event, a force, and 2 N rows of work space.
     phi : (2 N + 1, 2 N) matrix that advances positions and velocities. Its last row holds the step
-        and the inverse masses that it is valid for.
+        and the inverse masses for which it is valid.
     work : (7, N) work space to compute `phi`.
     """
 
@@ -57,10 +59,10 @@ class Lanes(NamedTuple):
 
 
 def make_lanes(of: NDArray[np.int64], N: int) -> Lanes:
-    """Return the lanes `of` (2, lanes: kind and place) for N bodies, in whole blocks."""
+    """Return the lanes for the variables `of` (2, lanes) and N bodies, in whole blocks."""
     wanted = of.shape[1]
     blocks = (wanted + _BLOCK - 1) // _BLOCK
-    padded = np.full((2, blocks * _BLOCK), BY_VELOCITY + 1)  # no kind: fills the last block
+    padded = np.full((2, blocks * _BLOCK), BY_VELOCITY + 1)  # not a kind: fills up the last block
     padded[:, :wanted] = of
     T, phi = np.zeros((5 * N + 2, blocks, _BLOCK)), np.full((2 * N + 1, 2 * N), -1.0)
     return Lanes(padded, T, phi, np.empty((7, N)))
@@ -83,7 +85,7 @@ def carry(tables, bodies, push, lanes, whole, step):
     s, n, N, cart = bodies.s, bodies.n, bodies.N, tables.cart
     T, phi, of = lanes.T, lanes.phi, lanes.of
     moved = 3 * N + 2
-    # Steps that differ by less share their matrix.
+    # The matrix is computed again only if the step differs by more than this.
     changed = abs(step - phi[2 * N, 0]) > 1e-9 * step
     for i in range(N):
         if s[TURNED, i] != 0.0:
@@ -133,7 +135,7 @@ def carry(tables, bodies, push, lanes, whole, step):
 
 @jit
 def _exponential(bodies, lanes, step):
-    """Fill `phi`, column by column, by the series to sixth order."""
+    """Fill `phi` with the matrix exponential, column by column, by a series to sixth order."""
     s, K, C, N, phi, work = bodies.s, bodies.K, bodies.C, bodies.N, lanes.phi, lanes.work
     for column in range(2 * N):
         for i in range(N):
@@ -161,7 +163,7 @@ def _exponential(bodies, lanes, step):
 def _force(kind, at, s, n, spring):
     """Return the force that a unit change of a parameter adds, in the middle of the step.
 
-    It acts on the parameter's cart. For a spring, it draws both ends together.
+    It acts on the parameter's cart. For a spring, it pulls the two ends together.
     """
     if kind == BY_MASS:
         return -s[HALF_A, at]
@@ -178,7 +180,7 @@ def _force(kind, at, s, n, spring):
 
 @jit
 def _kick(tables, bodies, push, lanes, whole, span):
-    """Give the lanes the impulse of their forces and of the nonlinear slopes over `span` s."""
+    """Give the lanes the impulse of their own and the nonlinear forces over `span` s."""
     s, n, N, driven, T, of = bodies.s, bodies.n, bodies.N, bodies.driven, lanes.T, lanes.of
     cart, drive, scatter = tables.cart, tables.drive, push.scatter
     u, on, smooth = push.u, push.on, push.smooth
@@ -219,7 +221,7 @@ def _kick(tables, bodies, push, lanes, whole, span):
 
 @jit
 def _settled(cart, i, s, target, decay, span):
-    """Return the derivative by velocity of cart i's presliding state after `span` s."""
+    """Return the derivative, by velocity, of cart i's presliding state after `span` s."""
     by_target, by_pace = settling_slopes(cart, i, s[MID_V, i])
     return by_target * (1.0 - decay) - (s[Z, i] - target) * decay * span * by_pace
 
@@ -236,7 +238,7 @@ def _bend(T, bodies, body, by, span, by_x, by_v):
 
 @jit
 def stop(T, s, N, i):
-    """For each lane, note the time at which dry friction stops body i."""
+    """For each lane, store the derivative of the time at which dry friction stops body i."""
     before = s[ACC, i]
     _add(T, 3 * N, -1.0, 3 * N)
     if before != 0.0:
@@ -246,7 +248,7 @@ def stop(T, s, N, i):
 
 @jit
 def meet(T, bodies, body, other, stiffness, damping):
-    """For each lane, note the time at which a contact of a body begins or ends.
+    """For each lane, store the derivative of the time at which a contact begins or ends.
 
     `other` is the other body, or -1 for a wall. A contact ends when its push, given by stiffness
     and damping, ends. It begins (with damping 0) when the bodies touch.
@@ -288,7 +290,7 @@ def restart(bodies, lanes, shot, free):
 
 @jit
 def bend_presliding(bodies, lanes, i, most, scatter):
-    """Set the derivatives of cart i's presliding state at the start from those of the forces."""
+    """Set the start derivatives of cart i's presliding state from those of the forces."""
     s, n, N, T, of = bodies.s, bodies.n, bodies.N, lanes.T, lanes.of
     for lane in range(of.shape[1]):
         kind, at, block, q = of[0, lane], of[1, lane], lane // _BLOCK, lane % _BLOCK

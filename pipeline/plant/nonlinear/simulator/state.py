@@ -1,6 +1,6 @@
 """Structures that the compiled functions share.
 
-They are named tuples, which numba compiles to separate fields.
+They are named tuples, because numba compiles these to separate fields.
 """
 
 from typing import NamedTuple
@@ -11,15 +11,15 @@ from pipeline.arrays import Array
 from pipeline.plant.nonlinear.simulator.compiler import jit
 
 # Rows of the state table.
-# - X to INV. Position, velocity, presliding state, last acceleration and inverse mass.
-# - MID_X to FORCE. Position and velocity in the middle of the step, and the force.
-# - D2 to D6. Time derivatives 2 to 6 of the position.
-# - SIDE to FIX. Direction of dry friction, inverse mass with it (0 for a cart that sticks), decay
-# of the presliding state over half a step, constant forces of closed contacts.
-# - RUB to PAST. Dry friction force, acceleration before an event, whether an event has just changed
-# it, which springs are past their stretch.
-# - HALF_X to HALF_A. Position, velocity and acceleration in the middle of the step, which an event
-# may have shortened.
+# - X to INV: position, velocity, presliding state, last acceleration and inverse mass.
+# - MID_X to FORCE: position and velocity in the middle of the step, and the force.
+# - D2 to D6: time derivatives 2 to 6 of the position.
+# - SIDE to FIX: direction in which the cart slides, inverse mass (0 for a cart held by friction),
+# decay of the presliding state over half a step, constant forces of closed contacts.
+# - RUB to PAST: dry friction force, acceleration before an event, whether an event has just changed
+# the acceleration, whether a spring is stretched past its gap.
+# - HALF_X to HALF_A: position, velocity and acceleration halfway to the next event or to the end of
+# the step.
 X, V, Z, ACC, INV, MID_X, MID_V, FORCE, D2, D3, D4, D5, D6, SIDE, GRIP, DECAY, FIX = range(17)
 RUB, BEFORE, TURNED, PAST, HALF_X, HALF_V, HALF_A = range(17, 24)
 ROWS = 24
@@ -31,13 +31,13 @@ class Bodies(NamedTuple):
     Attributes
     ----------
     n, N : number of carts, and of all bodies.
-    motor : the motor's row, or -1.
+    motor : the motor's row, or -1 without a motor of its own.
     driven : row of the body on which the input acts.
-    parent : for each hidden mass, its cart. Otherwise -1.
-    s : the table of the state.
-    K, C : the linear matrices. Closed contacts are included.
-    switches : numbers of the existing contacts and slack springs. See `guard`.
-    active : which of them are closed.
+    parent : row of the cart that carries a hidden mass; -1 for other bodies.
+    s : the state table.
+    K, C : the stiffness and damping matrices. Closed contacts are included.
+    switches : numbers of the existing contacts and slack springs, as in `guard`.
+    active : whether each of the switches is closed.
     """
 
     n: int
@@ -53,15 +53,15 @@ class Bodies(NamedTuple):
 
 
 class Push(NamedTuple):
-    """The forces and options of a step of `h` s.
+    """The forces and options for a step of `h` s.
 
     Attributes
     ----------
     u : mean input that arrives during the step.
-    on : whether the drive is powered. 1 or 0.
-    scatter : (n,) factor on all dry friction of a cart.
+    on : 1 if the drive is powered, otherwise 0.
+    scatter : factor (n,) on all dry friction of each cart.
     dry : whether there is dry friction.
-    smooth : where there are smooth forces. See `reach_of`.
+    smooth : flags for the places of smooth forces, from `reach_of`.
     contact_step : longest step inside a contact.
     """
 

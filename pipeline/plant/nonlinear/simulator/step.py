@@ -1,4 +1,4 @@
-"""One step of the simulator: forces, the series of the linear flow, the events inside it."""
+"""One step of the simulator: forces, the series of the linear flow, and the events in the step."""
 
 from math import exp
 
@@ -18,7 +18,7 @@ from pipeline.plant.nonlinear.simulator.state import (
     stretch,
 )  # fmt: skip
 
-_MOST_EVENTS = 12  # in one substep; more would be chatter
+_MOST_EVENTS = 12  # per substep; more would be chatter
 
 
 @inlined
@@ -42,7 +42,7 @@ def smooth_forces(tables, bodies, u, on, smooth):
 
 @inlined
 def rub(cart, bodies, push, step):
-    """Add dry friction to the forces; a cart that it holds gets inverse mass 0."""
+    """Add dry friction to the forces; a cart held by friction gets the inverse mass 0."""
     s, n, scatter, u = bodies.s, bodies.n, push.scatter, push.u
     for i in range(n):
         s[RUB, i] = 0.0
@@ -51,7 +51,7 @@ def rub(cart, bodies, push, step):
             s[DECAY, i] = exp(-0.5 * pace * step)
             s[RUB, i] -= most * (target + (s[Z, i] - target) * s[DECAY, i])
     for i in range(n):
-        # The direction in which the cart slides; 0 without dry friction.
+        # direction in which the cart slides; 0 without dry friction
         s[SIDE, i] = 0.0
         if s[INV, i] == 0.0:
             continue
@@ -122,7 +122,7 @@ def first_stop(s, n, step, none):
 
 @inlined
 def first_switch(tables, bodies, step, none):
-    """Return when the first contact or slack switches within the step, and which (else `none`)."""
+    """Return when the first contact or slack spring switches in the step, and which (or `none`)."""
     switching, switches, active, s = none, bodies.switches, bodies.active, bodies.s
     for e in range(switches.size):
         end = guard(switches[e], active[e], tables, s, step)
@@ -130,7 +130,7 @@ def first_switch(tables, bodies, step, none):
             low, high = 0.0, step
             g_low = guard(switches[e], active[e], tables, s, 0.0)
             g_low, g_high = min(g_low, -1e-300), end
-            # Root by the Illinois method; the end after the root is taken.
+            # Root by the Illinois method; the later end of the final bracket is taken.
             for _ in range(8):
                 guess = low + (high - low) * g_low / (g_low - g_high)
                 value = guard(switches[e], active[e], tables, s, guess)
@@ -147,13 +147,13 @@ def first_switch(tables, bodies, step, none):
 def advance(tables, bodies, push, lanes):
     """Advance x, v and the presliding state z by a step, from event to event.
 
-    Derivatives are advanced too, see `make_lanes`.
+    Derivatives are advanced too; see `make_lanes`.
     """
     s, K, C, n, N = bodies.s, bodies.K, bodies.C, bodies.n, bodies.N
     switches, active = bodies.switches, bodies.active
     left = push.h
     events = 0
-    none = N + switches.size  # no body and no switch has this number
+    none = N + switches.size  # not the number of a body or switch
     while left > 1e-12:
         step = left
         for e in range(switches.size):
@@ -170,7 +170,7 @@ def advance(tables, bodies, push, lanes):
         s[FORCE, bodies.driven] += push.u
         if push.dry:
             rub(tables.cart, bodies, push, step)
-        # With the usual sizes as constants, the compiler unrolls the loops.
+        # Because the usual sizes are constants here, the compiler unrolls the loops.
         if N == 1:
             taylor(s, K, C, np.int64(1))
         elif N == 2:
@@ -212,7 +212,7 @@ def advance(tables, bodies, push, lanes):
                 meet(lanes.T, bodies, body, other, k, ends * c)
             active[switching] = not active[switching]
             sign = 1.0 if active[switching] else -1.0
-            lanes.phi[2 * N, 0] = -1.0  # the carts have other equations from here
+            lanes.phi[2 * N, 0] = -1.0  # the carts' equations change here
             switch(which, sign, tables, s, K, C)
             events += 1
         left -= step

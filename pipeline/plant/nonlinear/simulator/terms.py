@@ -33,7 +33,7 @@ class Kind(IntEnum):
     EXTRA_MODE = 18
 
 
-# By kind, the coordinates that vanish with the effect; the others are its shape.
+# For each kind, the coordinates that are zero without the effect.
 COEFFICIENTS = (
     (0,),
     (0,),
@@ -66,7 +66,7 @@ FRICTION = (
     Kind.LOAD_FRICTION,
 )
 HYSTERESIS = (Kind.PRESLIDING_FRICTION,)
-# Most numbers that `terms` or `settle` fill in.
+# Largest count of numbers that `terms` or `settle` write.
 TERMS = 11
 
 
@@ -75,7 +75,7 @@ def terms(kind, p, o, x, v, k, u, on, out):
     """Fill `out` with the law of a kind and derivatives; coordinates start at p[o].
 
     The derivatives are by position, velocity and input, then by each coordinate.
-    `x` and `v` are those of a cart or of a spring's stretch, `k` is its stiffness.
+    `x` and `v` are of a cart or a spring's stretch; `k` is the spring's stiffness.
     """
     if kind == Kind.COULOMB_FRICTION:
         out[0] = p[o]
@@ -176,7 +176,7 @@ def terms(kind, p, o, x, v, k, u, on, out):
 
 @jit
 def settle(kind, p, o, v, out):
-    """Fill `out` with `settling`, its slopes, and derivatives by coordinate."""
+    """Fill `out` with `settling`, its slopes, and its derivatives by coordinate."""
     if kind == Kind.PRESLIDING_FRICTION:
         out[0] = p[o]
         out[1] = 1.0 if v > 0.0 else -1.0
