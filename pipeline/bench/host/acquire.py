@@ -370,7 +370,7 @@ class _Run:
     Attributes
     ----------
     path : path of the raw file, which exists if the run began.
-    file : name of the data file of a run that ended early; "" if there is none.
+    file : name of the data file of a run that ended early; "" if it has no file.
     controller : controller of a closed loop, as written in submission.toml.
     """
 

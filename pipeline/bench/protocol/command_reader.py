@@ -30,11 +30,10 @@ _WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
 class CommandReader:
     """Split the bytes that arrive at a bench into commands; count and drop anything else.
 
-    A field that does not fit breaks off the current command, and may begin another one. So that a
-    lost byte never hides a stop, two kinds of field also count as a stop or reset:
-
-    - A field that ends in the letter of a stop or a reset, whatever noise precedes the letter.
-    - An `s` that was read as the wave of a start, if the next field of this start does not fit.
+    A field that does not fit breaks off the current command, and may begin another one. A lost byte
+    must never hide a stop. So a field that ends in the letter of a stop or a reset counts as one,
+    whatever noise precedes the letter. So does an `s` that was read as the wave of a start, if the
+    next field of this start does not fit.
 
     Parameters
     ----------

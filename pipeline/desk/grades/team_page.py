@@ -133,7 +133,7 @@ def _show_page(ask: Ask, *, wrong: str = "", status: int = 200) -> Response:
 def _find_chosen(ask: Ask, items: Sequence[Item], rubric: Rubric) -> Item:
     """Return the criterion or flag that the URL or the form names.
 
-    If none is named, return the first row that is in doubt or has a figure.
+    Without a name, return the first row that is in doubt or has a figure.
     """
     criterion = ask.text("criterion") or ask.query("criterion")
     for wanted, is_remark in ((criterion, False), (ask.query("remark"), True)):

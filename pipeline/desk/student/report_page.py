@@ -120,7 +120,7 @@ def _show_questions(
 
 
 def _list_signs(room: Room) -> str:
-    """Return the signs that one click writes, with their runs; "" if there are none."""
+    """Return the signs that one click writes, with their runs; "" without such signs."""
     document, signs = read_document(room.text), room.told["turned"]
     tables = list_experiments(document)
     open_: dict[str, list[str]] = {}
