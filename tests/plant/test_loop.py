@@ -219,5 +219,5 @@ def test_gains_that_do_not_fit_the_carts_are_refused():
 
 def test_a_pid_on_a_held_cart_is_refused():
     """A PID on a held cart is refused, as the cart cannot be controlled."""
-    with pytest.raises(DataError, match=r"its cart 2 free, found \[1\]"):
+    with pytest.raises(DataError, match=r"cart 2 to be free, found free \[1\]"):
         simulate_loop(TWO, Pid(kp=1.0, cart=2), t=CLOCK, reference=1.0, setup=LoopSetup(free=[1]))
