@@ -166,7 +166,8 @@ def test_one_number_changes_one_line(visitor, lab):
 def test_the_form_and_the_text_may_both_be_changed(visitor, lab):
     """If both the form and the text are changed, the number is inserted into the typed text."""
     page = editor(visitor, lab)
-    text = ONE_CART.replace("points are rounded to it", "quarters")
+    text = ONE_CART.replace("points are rounded to multiples of it", "quarters")
+    assert text != ONE_CART
     fields = sent(page, lab, **{"criteria.pieces.points": "1,5", "text": text})
     assert visitor.post("/rubric/save", **fields).status == 303
     written = lab.read_text(encoding="utf-8")

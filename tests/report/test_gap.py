@@ -280,7 +280,7 @@ def test_the_page_of_the_verdict_none_mentions_no_effects():
         "Where the linear model fails",
         "the residual of each model",
         "before (ring)",
-        "was then tried at every place",
+        "An observer then followed",
     ):
         assert wrong not in page.text
     assert "with the effects" not in html_of(gap)  # nor do the legends of the figures
