@@ -115,14 +115,15 @@ def test_a_stored_section_has_the_words_of_its_module(name):
     assert all(f"{tool} " in stored for tool in module.TOOLS)
 
 
-def test_an_unknown_name_is_refused(monkeypatch):
-    """An unknown name of a benchmark is refused with the known names, and nothing is written."""
+def test_an_unknown_name_is_refused(monkeypatch, capsys):
+    """An unknown name of a benchmark is refused with the known names."""
     monkeypatch.setattr(sys, "argv", ["benchmarks", "no-such-benchmark"])
 
     with pytest.raises(SystemExit) as refused:
         command.main()
 
     assert refused.value.code == 2
+    assert f"choose from {', '.join(command.BENCHMARKS)}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -47,8 +47,8 @@ def test_a_passed_limit_is_distinguished_from_other_ends():
     assert _cells(explorations.table(rows), "all")[-2:] == ["1", "2"]
 
 
-def test_a_recording_beyond_the_travel_limit_is_counted(tmp_path):
-    """A recording that passes the travel limit is counted as such in the study."""
+def test_a_recording_beyond_the_travel_limit_is_refused(tmp_path):
+    """A recording that passes the travel limit raises `LimitPassed`, which names the recording."""
     drawn = draw(71_001, effects=0)
     bench = VirtualBench(drawn.bench, seed=1)
     submission = load_submission(new_folder(tmp_path / "lab", bench, springs=drawn.springs))

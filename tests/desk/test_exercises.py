@@ -144,8 +144,8 @@ def test_a_picture_is_inert(visitor):
     assert visitor.get(f"/exercises/picture.svg?{forged}").status == 422
 
 
-def test_a_solution_equals_what_the_command_writes(tmp_path):
-    """The desk makes the same solution as the command, and gives the expected values as JSON."""
+def test_a_solution_is_made_and_shown(tmp_path):
+    """The desk makes a solution, shows its page, and gives the expected values as JSON."""
     folder = a_submission(tmp_path / "reference")
     with DeskServer(folder=folder) as server:
         visitor = Visitor.of(server.url)

@@ -779,7 +779,7 @@ def test_a_report_page_that_is_not_ours_runs_nothing(filled):
 
 
 def test_the_gap_is_found_as_a_job(filled):
-    """The desk finds the gap as a job and shows the same page as `cartlab gap`."""
+    """The desk finds the gap as a job, keeps `gap.json`, and shows the page in a sandbox."""
     visitor, folder = filled
     assert visitor.get(HERE + "gap/gap.html").status == 404
     assert visitor.post(HERE + "make-gap").status == 303
@@ -799,7 +799,7 @@ def test_a_failed_task_says_why(tmp_path, workers):
 
 
 def test_an_invalid_change_is_not_saved(tmp_path):
-    """A change that makes the file invalid is not saved, in whichever way it is made."""
+    """A change that makes the file invalid is refused, and the file stays as it was."""
     folder = a_submission(tmp_path / "team")
     before = (folder / NAME).read_bytes()
     with pytest.raises(SubmissionError):

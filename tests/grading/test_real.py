@@ -91,7 +91,7 @@ def test_damping_from_any_single_repeat_gets_no_flag(bench):
 
 
 def test_real_mistakes_are_still_named(bench):
-    """Frequencies in Hz and a gain from the peak are flagged on real recordings too."""
+    """Frequencies in Hz and a gain of the wrong sign are flagged on real recordings too."""
     first = first_estimates(bench)
     hertz = {n: typed(float(v) / (2 * math.pi)) for n, v in first.items() if n.startswith("omega")}
     (flag,) = bench.flags(initial={**first, **hertz}, final={})

@@ -276,7 +276,7 @@ def test_the_page_of_the_verdict_none_mentions_no_effects():
     page = page_of(gap)
 
     for wrong in (
-        "With no effect",
+        "With 0 effects",
         "Where the linear model fails",
         "the residual of each model",
         "before (ring)",
@@ -301,7 +301,7 @@ def test_an_unexplained_gap_is_drawn_without_effects():
     """
     alone = make_gap("unexplained", ())
     assert "with the effects" not in html_of(alone)
-    assert "With no effect" not in page_of(alone).text
+    assert "With 0 suspects" not in page_of(alone).text
     suspected = make_gap("unexplained")
     assert "With 1 suspect" in page_of(suspected).text
     assert "The model with the suspects" in page_of(suspected).text

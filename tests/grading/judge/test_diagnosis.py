@@ -315,6 +315,9 @@ def test_a_frequency_out_of_order_gets_one_flag():
     one = student(3)
     flag = only_flag(scaled(one, "final", ["omega_2"], 1.4))
     assert (flag.code, flag.parameters) == ("final_off", ("omega_2",))
+    recomputed = flag.evidence["recomputed"]
+    assert recomputed == pytest.approx(one.value("final", "omega_2"), rel=0.02)
+    assert f"your recordings give {recomputed:.4g}" in flag.message
 
 
 def test_impossible_numbers_are_flagged():
