@@ -93,9 +93,9 @@ def _report_outcome(done: "Summary", *, out: Path, rubric: Path) -> None:
             say(f"  and {more} more; see cartlab history")
     for submission, reason in done.failed:
         say(f"{submission}: {reason}")
-    if done.is_disk_full:
+    if done.disk_full:
         say(
-            f"the disk is full: {done.is_disk_full} of {done.total} submissions could not be "
+            f"the disk is full: {done.disk_full} of {done.total} submissions could not be "
             f"unpacked in {out}; free some space there and repeat the command"
         )
     if len(done.failed) == done.total > 1 and not done.unsettled:

@@ -151,7 +151,7 @@ class WorkerPool:
         self._closed = threading.Event()
         for _ in range(_SHORT_WORKERS):
             self._free.put(_worker())
-        self._lock = threading.Lock()
+        self._lock, self._starting = threading.Lock(), threading.Lock()
         self._folders: dict[str, tuple[threading.Semaphore, threading.Lock]] = {}
 
     def do(self, task: str, **given: Any) -> Any:
@@ -179,18 +179,19 @@ class WorkerPool:
 
         They start one after the other, so that the first is ready as early as possible.
         """
-        self._replace(*[self._free.get() for _ in range(_SHORT_WORKERS)])
+        for _ in range(_SHORT_WORKERS):
+            self._replace(self._free.get())
 
-    def _replace(self, *processes: Supervisor) -> None:
-        threading.Thread(target=self._start, args=processes, daemon=True).start()
+    def _replace(self, process: Supervisor) -> None:
+        threading.Thread(target=self._start, args=(process,), daemon=True).start()
 
-    def _start(self, *processes: Supervisor) -> None:
-        for process in processes:
-            try:
-                with suppress(Failed, OSError):  # the next task tries again, and reports an error
-                    process.start(self._closed)
-            finally:
-                self._free.put(process)
+    def _start(self, process: Supervisor) -> None:
+        try:
+            # The next task tries again, and reports an error.
+            with self._starting, suppress(Failed, OSError):
+                process.start(self._closed)
+        finally:
+            self._free.put(process)
 
     @contextmanager
     def _turn(self, folder: str | None) -> Iterator[None]:

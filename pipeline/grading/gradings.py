@@ -101,6 +101,7 @@ class Batch:
     shared : flag for recordings that another submission also contains, by submission.
     failed : name and reason for each submission that could not be graded.
     unsettled : failed submissions that the next run grades again.
+    disk_full : those of them that failed because the disk was full.
     kept, moved, taken_over : changes to the class list; see `so_far.SoFar`.
     """
 
@@ -108,7 +109,7 @@ class Batch:
     shared: Mapping[str, Flag]
     failed: tuple[tuple[str, str], ...] = ()
     unsettled: frozenset[str] = frozenset()
-    is_disk_full: frozenset[str] = frozenset()
+    disk_full: frozenset[str] = frozenset()
     kept: tuple[str, ...] = ()
     moved: Mapping[str, str] = field(default_factory=dict)
     taken_over: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...] = ()

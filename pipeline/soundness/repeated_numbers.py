@@ -254,7 +254,8 @@ def _check(
         )
     elif off:
         runs = ", ".join(f"{reading.run} ({reading.value:.4g})" for reading in off)
-        outcome, said = "fail", f"contradict each other ({apart}). {runs} is left out"
+        are = "is" if len(off) == 1 else "are"
+        outcome, said = "fail", f"contradict each other ({apart}). {runs} {are} left out"
     elif np.any(_contradictions(readings)):
         outcome, said = "fail", f"give values {apart} that depend on the step, as if a cart stuck"
     elif spread > readings[0].tolerance:

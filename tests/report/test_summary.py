@@ -102,6 +102,27 @@ def test_independent_initial_estimates_are_named():
     assert "ω_a, ω_b: initial and final estimates use the same recordings" in notes
 
 
+@pytest.mark.parametrize(
+    ("judged", "said"),
+    [
+        ((True,), "Estimates agree for the one parameter that was estimated in two ways."),
+        ((False,), "No other parameter was estimated in two ways."),
+        ((False, True), "The other parameter that was estimated in two ways agrees."),
+        ((False, False), "None of the 2 parameters that were estimated in two ways agrees."),
+        ((False, True, True), "The other 2 parameters that were estimated in two ways agree."),
+    ],
+)
+def test_one_parameter_is_singular(judged, said):
+    """The summary counts the parameters that agree, and one of them is in the singular."""
+    analysis = make_analysis(2)
+    flags = [*judged, *[None] * (len(analysis.rows) - len(judged))]
+    rows = tuple(
+        replace(row, consistent=flag, independent=None, change_percent=20.0)
+        for row, flag in zip(analysis.rows, flags, strict=True)
+    )
+    assert said in terminal_summary(replace(analysis, rows=rows))
+
+
 def plain_of(blocks) -> str:
     """Return the text of lists and paragraphs among blocks."""
     found = []

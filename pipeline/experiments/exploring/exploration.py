@@ -37,6 +37,7 @@ from pipeline.submission import System, load_submission
 from pipeline.submission.load import NAME
 from pipeline.submission.models import MOST_CARTS
 from pipeline.words.progress import Progress, silent
+from pipeline.words.text import capital
 from pipeline.workflow import analyse
 
 _FIRST = "sweep"  # the first recording that the plan proposes; nobody has to hold a cart for it
@@ -208,7 +209,7 @@ class Exploration:
         doubt = describe_doubt(gap) if gap else WORDS.text("no_look")
         if gap and not gap.complete:
             doubt += WORDS.text("search_ended", seconds=f"{_SEARCH:.0f}")
-        parts = [describe_accuracy(missing, errors), doubt, why or WORDS.text("the_end")]
+        parts = [describe_accuracy(missing, errors), doubt, capital(why) or WORDS.text("the_end")]
         but = ""
         if recording and not self._has_time_for([recording]):
             but = WORDS.text("time_up", time=time_words(self.seconds), name=recording.id)
@@ -227,7 +228,7 @@ class Exploration:
             left=gap.final if gap else None,
             floor=gap.noise_floor if gap else None,
             reached=not missing and not wanting and gap is not None and gap.verdict in SETTLED,
-            said=". ".join(filter(None, [self.lost, *parts, but])),
+            said=". ".join(filter(None, [self.lost, *parts, but])).replace("?. ", "? "),
             gap=gap,
         )
         if self.turns:

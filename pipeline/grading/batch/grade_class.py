@@ -43,7 +43,7 @@ class Summary:
     failed : name and reason for each submission that could not be graded.
     sharing : number of submissions that share recordings with another submission.
     unsettled : number of failed submissions that the next run grades again.
-    is_disk_full : number of submissions that failed because the disk was full.
+    disk_full : number of submissions that failed because the disk was full.
     changes : differences from the previous class list, one phrase each.
     """
 
@@ -51,7 +51,7 @@ class Summary:
     failed: tuple[tuple[str, str], ...]
     sharing: int
     unsettled: int = 0
-    is_disk_full: int = 0
+    disk_full: int = 0
     remarks: tuple[str, ...] = ()
     changes: tuple[str, ...] = ()
 
@@ -157,7 +157,7 @@ def grade_class(
         failed=tuple(sorted(failed)),  # sorted, so that their order does not reveal hidden names
         sharing=len(batch.shared),
         unsettled=len(batch.unsettled),
-        is_disk_full=len(batch.is_disk_full),
+        disk_full=len(batch.disk_full),
         remarks=(*remarks, *(f"{double}: see class.html" for double in doubles)),
         changes=tuple(changes),
     )

@@ -75,7 +75,7 @@ def grade_batch(
         shared=_shared(in_order, book, examples=examples),
         failed=tuple((row.submission, row.reason) for row in in_order if row.reason),
         unsettled=frozenset(unsettled),
-        is_disk_full=frozenset(no_room),
+        disk_full=frozenset(no_room),
         kept=tuple(before.kept),
         moved=before.moved,
         taken_over=before.taken_over,

@@ -242,6 +242,7 @@ def _birge_ratio(symbol: str, analysis: Analysis) -> float:
 
     Gains from steps and frequencies from decays do not use the fit. The ratio is the root mean
     square of their differences from the fit, in standard errors (Birge, Physical Review 40, 1932).
+    A reading that contradicts a fit which explains the data does not count: its recording is wrong.
 
     Parameters
     ----------
@@ -251,6 +252,8 @@ def _birge_ratio(symbol: str, analysis: Analysis) -> float:
     for row in analysis.rows:
         read, fitted = row.initial, row.final
         if read is None or fitted is None or read.source not in ("step", "log_decrement"):
+            continue
+        if is_explained(analysis) and not _agrees(read.value, fitted):
             continue
         std = np.hypot(read.std or 0.0, fitted.std or 0.0)
         if read_name(row.name).symbol == symbol and std > 0:

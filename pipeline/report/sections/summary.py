@@ -236,20 +236,15 @@ def _agreement(analysis: Analysis) -> tuple[bool, Spans] | None:
     judged = [row for row in analysis.rows if row.consistent is not None]
     if not judged:
         return None
-    parameters = count(len(judged), "parameter")
     off, same = [row for row in judged if not row.consistent], _same_recordings(judged)
-    if not off:
-        return True, _WORDS.spans("agree", parameters=parameters, same=same)
     rest = len(judged) - len(off)
+    key, n = ("rest", rest) if off and rest else ("no_rest" if off else "agree", len(judged))
+    key, parameters = key if n > 1 else f"{key}_one", count(n, "parameter")
+    if not off:
+        return True, _WORDS.spans(key, parameters=parameters, same=same)
     changes = [f"{row.name} ({percent(row.change_percent, signed=True)})" for row in off]
-    return False, _WORDS.spans(
-        "disagree",
-        changes=rich(listing(changes)),
-        rest=_WORDS.text("rest", parameters=count(rest, "parameter"))
-        if rest
-        else _WORDS.text("no_rest", parameters=parameters),
-        same=same,
-    )
+    said = _WORDS.text(key, parameters=parameters)
+    return False, _WORDS.spans("disagree", changes=rich(listing(changes)), rest=said, same=same)
 
 
 def _same_recordings(judged: Sequence[ParameterRow]) -> Spans:

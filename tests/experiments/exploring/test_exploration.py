@@ -207,7 +207,7 @@ def test_an_exploration_ends_after_three_failures(tmp_path):
 
     def record(ids):
         asked.extend(ids)
-        return Recorded(ids=(), seconds=20.0, why="the line is silent")
+        return Recorded(ids=(), seconds=20.0, why="the line is silent: is it plugged in?")
 
     turns = Exploration(
         folder=a_recorded_cart(tmp_path / "work"),
@@ -217,8 +217,8 @@ def test_an_exploration_ends_after_three_failures(tmp_path):
         tell=silent,
     ).run()
     assert len(set(asked)) == 3
-    assert [turn.said.split(". ")[0] for turn in turns[1:]] == [
-        f"{name} failed: the line is silent" for name in asked
+    assert [turn.said.split("? ")[0] for turn in turns[1:]] == [
+        f"{name} failed: the line is silent: is it plugged in" for name in asked
     ]
     assert not turns[-1].reached
 

@@ -43,3 +43,20 @@ def test_the_errors_grow_with_the_contradiction(sigmas):
     assert found["K_2"].std == pytest.approx(ratio * fitted.std)
     before = recompute(student(2).analysis).final
     assert found["omega_a"].std == before["omega_a"].std
+
+
+def test_a_wrong_recording_does_not_make_the_fit_doubtful():
+    """Steps 1.5 times too large contradict a fit that explains the data, and so do not count."""
+    analysis = student(2).analysis
+    before = recompute(analysis).final
+    rows = tuple(
+        replace(row, initial=replace(row.initial, value=1.5 * row.initial.value))
+        if row.initial and row.initial.source == "step"
+        else row
+        for row in analysis.rows
+    )
+    assert rows != analysis.rows
+    found = recompute(replace(analysis, rows=rows)).final
+    assert [found[name].std for name in ("K_1", "K_2")] == [
+        before[name].std for name in ("K_1", "K_2")
+    ]
