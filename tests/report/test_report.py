@@ -289,17 +289,21 @@ def test_the_same_analysis_gives_the_same_bytes(folders, tmp_path):
         assert path.read_bytes() == again.read_bytes(), path.name
 
 
-def test_an_interrupted_report_leaves_the_earlier_one_whole(tmp_path, monkeypatch):
-    """Ctrl-C while a report is made leaves every file of the earlier report as it was."""
+@pytest.mark.parametrize(
+    ("part", "files"),
+    [("render.write.print_pages", Files()), ("plots.page.compare_runs", Files(plots=True))],
+)
+def test_an_interrupted_report_leaves_the_earlier_one_whole(tmp_path, monkeypatch, part, files):
+    """Ctrl-C while a report or its plots are made leaves the earlier report as it was."""
 
-    def interrupt(*_: object) -> None:
+    def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     render_report(make_analysis(1), tmp_path)
     before = {path: path.read_bytes() for path in sorted(tmp_path.rglob("*.*"))}
-    monkeypatch.setattr("pipeline.report.render.write.print_pages", interrupt)
+    monkeypatch.setattr(f"pipeline.report.{part}", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        render_report(make_analysis(2), tmp_path)
+        render_report(make_analysis(2), tmp_path, files=files)
     assert {path: path.read_bytes() for path in sorted(tmp_path.rglob("*.*"))} == before
 
 

@@ -86,15 +86,17 @@ def render_report(
         analysis = replace(analysis, warnings=(*analysis.warnings, warning))
         progress(warning)
     document = build_document(analysis, gap=gap, changes=changes, progress=progress)
-    if files.plots:
-        document = replace(document, plots=PLOTS)
-    write_document(document, out, name="report", pdf=files.pdf)
-    clear_files(out, PLOTS)  # left by an earlier report
+    plots = ""
     if files.plots:
         # Imported late, because it loads the catalogue of effects.
-        from pipeline.report.plots.page import write_plots
+        from pipeline.report.plots.page import make_page
 
-        write_plots(analysis, out, gap=gap, progress=progress)
+        document = replace(document, plots=PLOTS)
+        plots = make_page(analysis, gap=gap, report=True, progress=progress)
+    write_document(document, out, name="report", pdf=files.pdf)
+    clear_files(out, PLOTS)  # left by an earlier report
+    if plots:
+        write_file(out / PLOTS, plots)
 
 
 def _students_text(analysis: Analysis) -> str:

@@ -47,9 +47,14 @@ _WORDS = phrases("plots")
 
 def write_plots(analysis: Analysis, out: Path, *, gap: Gap | None, progress: Progress) -> None:
     """Write the page of plots into a folder."""
-    runs = compare_runs(analysis, gap=gap, progress=progress)
     beside = (out / "report.html").is_file()
-    write_file(out / NAME, render_page(analysis, runs, gap=gap, report=beside))
+    write_file(out / NAME, make_page(analysis, gap=gap, report=beside, progress=progress))
+
+
+def make_page(analysis: Analysis, *, gap: Gap | None, report: bool, progress: Progress) -> str:
+    """Compare all recordings with their models and return the page; see `render_page`."""
+    runs = compare_runs(analysis, gap=gap, progress=progress)
+    return render_page(analysis, runs, gap=gap, report=report)
 
 
 def render_page(
