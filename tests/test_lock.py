@@ -9,6 +9,7 @@ import pytest
 from pipeline.errors import ConfigError
 from pipeline.grading.batch.grade_class import scratch_in
 from pipeline.lock import alone_in
+from tests.helpers.commandline import cartlab_here
 
 _HOLDER = """
 import sys
@@ -45,9 +46,7 @@ def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
     )
     with refused, alone_in(tmp_path):
         pass
-    command = [sys.executable, "-m", "pipeline", "grade", str(tmp_path / "none")]
-    typed = [*command, "--rubric", "throne-1dof", "--out", str(tmp_path)]
-    done = subprocess.run(typed, capture_output=True, text=True, check=False)
+    done = cartlab_here("grade", tmp_path / "none", "--rubric", "throne-1dof", "--out", tmp_path)
     assert done.returncode == 2
     assert f"(process {other.pid})" in done.stderr
     assert done.stderr.count("\n") == 1

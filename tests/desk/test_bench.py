@@ -103,7 +103,12 @@ def test_many_viewers_block_nobody(tmp_path, real):
     ("name", "room", "fields"),
     [
         ("long", "acquire", {"only": "long"}),
-        ("sweep", "explore", {"what": "all", "error": "1", "minutes": "20"}),
+        pytest.param(
+            "sweep",
+            "explore",
+            {"what": "all", "error": "1", "minutes": "20"},
+            marks=[pytest.mark.slow, pytest.mark.sample],
+        ),
     ],
 )
 def test_the_bench_is_stopped_when_the_desk_is_gone(tmp_path, real, name, room, fields):

@@ -18,6 +18,8 @@ from tests.helpers.waiting import PATIENCE, started
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no such signals")
 
+LONG = [pytest.mark.slow, pytest.mark.sample]  # each case starts a desk
+
 # A desk in which a line on stdin ends a thread or the whole process at any moment.
 DESK = """
 import ctypes, os, sys, threading
@@ -63,7 +65,7 @@ def a_desk(tmp_path: Path, *options: str) -> Iterator[tuple[subprocess.Popen, st
         yield desk, url, ended
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGHUP"])
+@pytest.mark.parametrize("name", ["SIGINT", pytest.param("SIGHUP", marks=LONG)])
 def test_a_signal_that_ends_the_desk_is_named(name, tmp_path):
     """A signal that ends the desk is named on stderr and in the log; neither shows the secret.
 
@@ -84,7 +86,7 @@ def test_a_signal_that_ends_the_desk_is_named(name, tmp_path):
 @pytest.mark.parametrize(
     ("number", "told"),
     [
-        (signal.SIGKILL, "was killed: by kill -9"),
+        pytest.param(signal.SIGKILL, "was killed: by kill -9", marks=LONG),
         (signal.SIGSEGV, "Fatal Python error: Segmentation fault"),
     ],
 )
@@ -106,10 +108,10 @@ def test_a_desk_killed_at_once_is_reported(number, told, tmp_path):
 @pytest.mark.parametrize(
     ("sent", "status", "told"),
     [
-        ("memory MainThread", 1, "the desk ends: MemoryError"),
+        pytest.param("memory MainThread", 1, "the desk ends: MemoryError", marks=LONG),
         ("memory server", 2, "the desk's server stopped unexpectedly"),
-        ("exit0 server", 2, "the desk's server stopped unexpectedly"),
-        ("exit now", 3, "was killed: by kill -9"),
+        pytest.param("exit0 server", 2, "the desk's server stopped unexpectedly", marks=LONG),
+        pytest.param("exit now", 3, "was killed: by kill -9", marks=LONG),
     ],
 )
 def test_an_exception_or_exit_in_the_desk_is_reported(sent, status, told, tmp_path):

@@ -104,6 +104,8 @@ def test_a_folder_has_one_task_at_a_time(tmp_path, jobs):
     assert jobs.start("make_solution", title="The solution", **given) is not job
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_job_survives_a_reload_and_can_be_stopped(tmp_path):
     """Every later page shows a running job and its stage.
 
@@ -143,6 +145,8 @@ def test_a_job_survives_a_reload_and_can_be_stopped(tmp_path):
         assert wrongs(page) == []
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_file_that_ends_the_process_fails_only_its_row(tmp_path):
     """If a file ends the process that reads it, only the row of this file fails.
 

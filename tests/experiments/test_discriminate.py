@@ -112,13 +112,12 @@ def test_the_proposal_separates_the_laws_within_the_limits(proposed):
     assert np.ptp(found.prediction.positions[:2], axis=0).max() > 0
 
 
-def test_a_difference_that_parameters_can_remove_does_not_count():
+def test_a_difference_that_parameters_can_remove_does_not_count(proposed):
     """A difference that other values of the parameters can remove does not count."""
     heavier = replace(DRY, chain=replace(CHAIN, m=CHAIN.m * 1.002, k=CHAIN.k * 0.999))
     gap = with_proposal(disputed(DRY, heavier), limits=LIMITS)
-    other = with_proposal(disputed(DRY, DRAG), limits=LIMITS)
-    assert other.proposal is not None
-    assert gap.proposal is None or gap.proposal.separation < 0.05 * other.proposal.separation
+    assert proposed.proposal is not None
+    assert gap.proposal is None or gap.proposal.separation < 0.05 * proposed.proposal.separation
     J = np.random.default_rng(0).standard_normal((3, 2, 50))
     difference = J[0].ravel() * 2 - J[2].ravel()
     assert _left(difference, J, np.full(2, np.inf)) == pytest.approx(0.0, abs=1e-20)
@@ -150,28 +149,27 @@ def test_another_dispute_gets_another_recording(proposed):
     assert with_proposal(disputed(DRY), limits=LIMITS).proposal is None
 
 
-def test_a_hopeless_contender_decides_nothing():
+def test_a_hopeless_contender_decides_nothing(proposed):
     """An explanation of almost no weight does not influence which recording is proposed."""
     gap = disputed(DRY, DRAG, STIFF)
     hopeless = replace(gap.contenders[2], weight=1e-12)
     two = with_proposal(replace(gap, contenders=(*gap.contenders[:2], hopeless)), limits=LIMITS)
-    alone = with_proposal(disputed(DRY, DRAG), limits=LIMITS)
     assert two.proposal is not None
-    assert alone.proposal is not None
-    assert two.proposal.recording == alone.proposal.recording
+    assert proposed.proposal is not None
+    assert two.proposal.recording == proposed.proposal.recording
     assert two.proposal.prediction is not None
     assert two.proposal.prediction.pair == (0, 1)
-    assert two.proposal.separation == pytest.approx(alone.proposal.separation)
+    assert two.proposal.separation == pytest.approx(proposed.proposal.separation)
     chosen = replace(gap.contenders[0], weight=1e-40)  # chosen by held-out runs against the BIC
     against = with_proposal(replace(gap, contenders=(chosen, gap.contenders[1])), limits=LIMITS)
     assert against.proposal is not None
-    assert against.proposal.recording == alone.proposal.recording
+    assert against.proposal.recording == proposed.proposal.recording
     swapped = (*gap.contenders[1:2], hopeless, gap.contenders[0])
     other = with_proposal(replace(gap, contenders=swapped), limits=LIMITS).proposal
     assert other is not None
     assert other.prediction is not None
     assert other.prediction.pair == (0, 2)
-    assert other.separation == pytest.approx(alone.proposal.separation)
+    assert other.separation == pytest.approx(proposed.proposal.separation)
 
 
 def test_nearly_decided_pairs_hardly_count():

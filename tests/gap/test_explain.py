@@ -69,6 +69,8 @@ def test_friction_that_varies_from_run_to_run_stays_one_effect():
     assert gap.effects[-1].nrmse_after == gap.final
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_an_effect_that_the_catalogue_lacks_is_not_misnamed():
     """If the catalogue lacks the true effect, no effect is named, and suspects are listed."""
     case = make_case(seed=10700, n=1, effects=["cubic_spring"], rate=113.1)
@@ -323,6 +325,8 @@ def test_friction_of_a_rigid_body_is_found_under_feedback(friction):
         assert gap.verdict == "none"
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_constant_force_without_springs_is_found():
     """If a cart without springs drifts on a tilted track, constant force and friction are named."""
     records = [

@@ -69,6 +69,8 @@ def test_a_change_in_another_file_is_noticed_and_the_old_folder_removed(package)
     assert len(list((package / "pipeline/__pycache__/compiled").iterdir())) == 1
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_in_a_read_only_package_the_users_cache_is_used(package):
     """If the package's folder is read-only, compiled code is stored in the user's cache."""
     (package / "pipeline" / "__pycache__").write_text("a file where the folder would be")

@@ -369,6 +369,8 @@ def test_correlated_residuals_widen_the_error():
     assert long_run_variance(fast[0]) == 1.0  # not below the mean square
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_long_rest_before_the_step_is_one_reading():
     """A long rest before the step does not make the gain more certain."""
     chain, rng, runs, rate = PRESETS["throne-1dof"], np.random.default_rng(18), 24, 500.0

@@ -78,6 +78,8 @@ def unfold(window) -> None:
         summary.click()
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
     """A student drops files, answers, corrects a mistake, reads the report, downloads the zip."""
     folder = tmp_path / "team"
@@ -281,6 +283,7 @@ def test_one_key_answers_for_several_recordings(show, tmp_path):
     assert [run.carts for run in runs] == [(1, 2), (1,), (1,)]
 
 
+@pytest.mark.usefixtures("work_here")
 def test_zip_and_report_wait_for_unsaved_text(show, tmp_path):
     """While typed text is not saved, no zip or report is made, and a message says why."""
     folder = a_submission(tmp_path / "team")
@@ -389,6 +392,7 @@ def test_the_command_prints_its_address_and_ends_on_a_signal(tmp_path):
         assert desk.stderr.read() == f"cartlab: the desk ends: {number.name}\n"
 
 
+@pytest.mark.usefixtures("work_here")
 def test_typing_goes_on_while_a_field_is_saved(show, tmp_path):
     """While one field is saved, a user can type in the next without losing letters or messages."""
     folder = a_submission(tmp_path / "team")

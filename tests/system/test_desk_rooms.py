@@ -83,6 +83,8 @@ def test_a_session_is_watched_and_steered(show, tmp_path, real, monkeypatch):
     assert [e.id for e in load_submission(work).experiments] == ["long", "next", "short"]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_an_exploration_is_watched_and_steered(show, tmp_path):
     """In an exploration you can veto an experiment, add your own, and end with Esc.
 

@@ -83,6 +83,8 @@ def explored(tmp_path_factory):
     return folder, turns, said, bench
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_an_exploration_names_the_effect_and_finds_the_carts(explored):
     """The exploration names the end stop on its cart, and finds every parameter correctly."""
     folder, turns, said, bench = explored
@@ -101,6 +103,8 @@ def test_an_exploration_names_the_effect_and_finds_the_carts(explored):
     assert said == [turn.said for turn in turns]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_an_exploration_writes_a_submission_and_a_diary(explored):
     """Every record is in submission.toml and plan.toml, and the diary shows each decision."""
     folder, turns, _, _ = explored
@@ -113,6 +117,8 @@ def test_an_exploration_writes_a_submission_and_a_diary(explored):
         assert f"{turn.seconds:.0f} s" in diary
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_an_exploration_keeps_only_runs_that_its_diary_shows(explored):
     """An earlier decision keeps only the run in its picture; the last one keeps all runs."""
     folder, turns, _, _ = explored
@@ -169,7 +175,7 @@ def test_too_little_time_for_the_sweep_moves_no_cart(tmp_path):
     assert virtual.seconds == 0.0
 
 
-def test_a_goal_for_an_unknown_parameter_is_refused(explored, tmp_path):
+def test_a_goal_for_an_unknown_parameter_is_refused(tmp_path):
     """A goal for a parameter that does not exist is refused with the nearest name."""
     asked: list[str] = []
 
@@ -178,7 +184,8 @@ def test_a_goal_for_an_unknown_parameter_is_refused(explored, tmp_path):
         return Recorded(ids=(), seconds=0.0)
 
     wish = read_error_goal("Zeta 1%")
-    for folder in (explored[0], tmp_path):  # with known carts, and with unknown ones
+    known = a_recorded_cart(tmp_path / "known")
+    for folder in (known, tmp_path / "unknown"):  # with known carts, and with unknown ones
         with pytest.raises(ConfigError, match="did you mean 'zeta'"):
             Exploration(folder=folder, record=record, goal=wish, seconds=900.0, tell=silent).run()
     assert not asked
@@ -223,6 +230,8 @@ def test_an_exploration_ends_after_three_failures(tmp_path):
     assert not turns[-1].reached
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
     """A recording that a person vetoes is replaced, and one that is added comes next.
 

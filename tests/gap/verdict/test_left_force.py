@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from pipeline.arrays import Array
 from pipeline.gap.data.sides import prepare, take_sides
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit.baseline import fit_baseline, fit_nuisance
@@ -16,7 +17,8 @@ from pipeline.plant.nonlinear.effects import CATALOGUE
 from pipeline.results import Kind, Record
 from pipeline.set_up import Bench
 
-Law = Callable[[float, float, float], float]  # arguments: position, velocity and input
+# Arguments: position, velocity and input of each run at one time; result: the force in each run.
+Law = Callable[[Array, Array, Array], Array]
 
 COUNT = 0.00227  # cm, one encoder step
 RATE, SUBSTEPS, DURATION = 250.0, 4, 8.0
@@ -26,60 +28,62 @@ CARTS = {
 }
 
 
-def record(chain: Chain, law: Law, *, cart: int, kind: Kind, size: float, seed: int) -> Record:
-    """Return one run of carts on springs, with an additional force on one cart.
+PLAN: tuple[tuple[Kind, float], ...] = (
+    ("sweep", 0.05), ("sweep", 0.03), ("step", 0.08), ("step", 0.05), ("decay", 2.0),
+    ("decay", 1.2),
+)  # fmt: skip
 
-    It is simulated by Heun's method with steps of 1 ms. Readings are whole encoder steps, with
-    noise of 0.3 steps.
+
+def recordings(law: Law, *, carts: int = 1, cart: int = 1) -> list[Record]:
+    """Return the recordings of a lab with sweeps, steps and decays.
+
+    One cart has an additional force. All runs are simulated at once by Heun's method with steps of
+    1 ms. Readings are whole encoder steps, with noise of 0.3 steps.
     """
-    n = chain.n
+    chain = CARTS[carts]
     t = np.arange(int(DURATION * RATE)) / RATE
-    u = np.zeros(t.size)
-    if kind == "sweep":
-        u = size * np.sin(2 * np.pi * (0.8 * t + 0.2 * t**2))
-    elif kind == "step":
-        u = size * ((t > 0.3) & (t < 4.0))
-    x, v = np.zeros(n), np.zeros(n)
-    if kind == "decay":
-        x[cart - 1] = size
+    shapes = {
+        "sweep": np.sin(2 * np.pi * (0.8 * t + 0.2 * t**2)),
+        "step": np.where((t > 0.3) & (t < 4.0), 1.0, 0.0),
+        "decay": np.zeros(t.size),
+    }
+    u = np.array([size * shapes[kind] for kind, size in PLAN])
+    x, v = np.zeros((carts, len(PLAN))), np.zeros((carts, len(PLAN)))
+    x[cart - 1] = [size if kind == "decay" else 0.0 for kind, size in PLAN]
 
     def acceleration(x, v, push):
-        force = -chain.stiffness @ x - chain.c * v
+        force = -chain.stiffness @ x - chain.c[:, None] * v
         force[0] += push
         force[cart - 1] += law(x[cart - 1], v[cart - 1], push)
-        return force / chain.m
+        return force / chain.m[:, None]
 
-    y, h = np.zeros((n, t.size)), 1.0 / RATE / SUBSTEPS
-    for sample, push in enumerate(u):
-        y[:, sample] = x
+    y, h = np.zeros((len(PLAN), carts, t.size)), 1.0 / RATE / SUBSTEPS
+    for sample, push in enumerate(u.T):
+        y[..., sample] = x.T
         for _ in range(SUBSTEPS):
             a = acceleration(x, v, push)
             b = acceleration(x + h * v, v + h * a, push)
             x, v = x + h * v + 0.5 * h * h * a, v + 0.5 * h * (a + b)
-    rng = np.random.default_rng(seed)
-    y = np.round((y + 0.3 * COUNT * rng.standard_normal(y.shape)) / COUNT) * COUNT
-    return Record(
-        id=f"{kind}-{seed}",
-        kind=kind,
-        t=t,
-        u=None if kind == "decay" else u.astype(np.float64),
-        y=y,
-        carts=tuple(range(1, n + 1)),
-        free=tuple(range(1, n + 1)),
-        resolution=np.full(n, COUNT),
-    )
-
-
-def recordings(law: Law, *, carts: int = 1, cart: int = 1) -> list[Record]:
-    """Return the recordings of a lab with sweeps, steps and decays."""
-    plan: tuple[tuple[Kind, float], ...] = (
-        ("sweep", 0.05), ("sweep", 0.03), ("step", 0.08), ("step", 0.05), ("decay", 2.0),
-        ("decay", 1.2),
-    )  # fmt: skip
+    free = tuple(range(1, carts + 1))
     return [
-        record(CARTS[carts], law, cart=cart, kind=kind, size=size, seed=seed)
-        for seed, (kind, size) in enumerate(plan)
+        Record(
+            id=f"{kind}-{seed}",
+            kind=kind,
+            t=t,
+            u=None if kind == "decay" else u[seed],
+            y=measured(y[seed], seed=seed),
+            carts=free,
+            free=free,
+            resolution=np.full(carts, COUNT),
+        )
+        for seed, (kind, _) in enumerate(PLAN)
     ]
+
+
+def measured(y: Array, *, seed: int) -> Array:
+    """Return positions as an encoder reads them."""
+    noise = 0.3 * COUNT * np.random.default_rng(seed).standard_normal(y.shape)
+    return np.round((y + noise) / COUNT) * COUNT
 
 
 def left_by_the_chain(records: list[Record], *, springs: tuple[bool, ...]) -> tuple[Residual, ...]:
@@ -119,7 +123,7 @@ def test_a_law_is_found_from_the_unexplained_force(law, terms):
 
 def test_noise_has_no_formula():
     """If the model is right, the residual gets no formula."""
-    (residual,) = left_by_the_chain(recordings(lambda x, v, u: 0.0), springs=(True, False))
+    (residual,) = left_by_the_chain(recordings(lambda x, v, u: 0.0 * x), springs=(True, False))
 
     assert residual.formula is None
     assert all(shown.formula is None for shown in residual.against)

@@ -74,6 +74,8 @@ def grade(zips: Path, out: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.skipif(sys.platform != "linux", reason="a small disk is made of memory")
 def test_a_full_disk_costs_nobody_a_grade(zips, tmp_path):
     """If the disk is full, the message says so, and the next run grades everybody."""
@@ -163,6 +165,8 @@ def test_a_limit_on_file_size_costs_nobody_a_grade(zips, teams, tmp_path):
         assert why == "cannot be read (File too large); the next run tries again"
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @POSIX
 @pytest.mark.parametrize("packed", [True, False])
 def test_a_limit_on_open_files_costs_nobody_a_point(zips, teams, tmp_path, packed):

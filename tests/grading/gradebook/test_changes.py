@@ -83,6 +83,8 @@ def test_changes_are_printed_and_kept_in_the_history(tmp_path):
 _LEFT = 4
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is a signal on POSIX")
 def test_ctrl_c_says_how_to_go_on(tmp_path):
     """After Ctrl-C one line says how to continue, and the same command then continues.

@@ -32,6 +32,13 @@ def judge(one: Team) -> JudgedNumbers:
     return judge_numbers(one.submission, one.analysis, rubric=one.rubric)
 
 
+@cache
+def judged(slip: str, seed: int) -> tuple[Team, JudgedNumbers]:
+    """Return the seed's team with a mistake, and what the check finds."""
+    one = slipped(slip, seed)
+    return one, judge(one)
+
+
 def asked_twice(found: JudgedNumbers) -> tuple[CheckAnswer, CheckAnswer]:
     first = next_answer(found, (), basis="0")
     return first, next_answer(found, (first,), basis="0")
@@ -51,8 +58,8 @@ def stripped(text: str, one: Team) -> str:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_no_answer_contains_digits_of_a_value(seed, slip):
     """In words and in JSON, the only digits of an answer are in names and counts."""
-    one = slipped(slip, seed)
-    for answer in asked_twice(judge(one)):
+    one, found = judged(slip, seed)
+    for answer in asked_twice(found):
         said = stripped("\n".join(answer_lines(answer)), one)
         assert re.findall(r".*\d.*", said) == []
         plain = json.loads(answer_line(answer))
@@ -90,8 +97,7 @@ def test_most_common_mistakes_are_recognised(slip):
     """At the second run, the check names the right mistake for most of the wrong numbers."""
     placed = []
     for seed in SEEDS:
-        one = slipped(slip, seed)
-        found = judge(one)
+        one, found = judged(slip, seed)
         if one is team(seed) or not found.disagree:
             continue
         _, where = asked_twice(found)
