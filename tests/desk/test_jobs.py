@@ -193,6 +193,8 @@ def test_a_failed_task_does_not_end_the_process(tmp_path):
     workers.close()
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_used_up_process_is_replaced_in_time(tmp_path, monkeypatch):
     """After its last allowed task, a process is replaced before the next task arrives."""
     monkeypatch.setattr("pipeline.processes._TASKS_EACH", 1)
@@ -202,6 +204,8 @@ def test_a_used_up_process_is_replaced_in_time(tmp_path, monkeypatch):
     workers.close()
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_lab_server_has_its_processes_before_students_ask(tmp_path):
     """A lab server starts all its worker processes before a student asks for anything."""
     workers = WorkerPool()
@@ -215,7 +219,11 @@ def test_a_lab_server_has_its_processes_before_students_ask(tmp_path):
     ("module", "line"),
     [
         ("pipeline.desk.tasks", b"no json\n"),
-        ("pipeline.desk.bench.process", b'{"folder": ".", "explore": [[], 7]}\n'),
+        pytest.param(
+            "pipeline.desk.bench.process",
+            b'{"folder": ".", "explore": [[], 7]}\n',
+            marks=[pytest.mark.slow, pytest.mark.sample],
+        ),
     ],
 )
 def test_an_exception_that_ends_a_process_is_reported(module, line):

@@ -155,7 +155,9 @@ def test_repeats_are_aligned_at_the_edge_of_their_input():
     assert repeatability([runs[0], replace(runs[1], id=runs[0].id)]) is None  # of one record
 
 
-@pytest.mark.parametrize("said", [(1,), (1, 2)])
+@pytest.mark.parametrize(
+    "said", [pytest.param((1,), marks=[pytest.mark.slow, pytest.mark.sample]), (1, 2)]
+)
 def test_a_cart_held_in_all_runs_is_a_wall(said):
     """If cart 2 is held in all runs of a two-cart folder, the result is that of one cart."""
     hidden = Hidden(effect="coulomb_friction", place=1, parameters={"force": 0.0025})

@@ -133,6 +133,8 @@ def tied(seed: int) -> tuple[Team, Grade]:
         return team, grade_submission(submission, rubric=rubric, name="team-07").grade
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_spring_that_the_rubric_lacks_flags_nobody():
     """If the recordings need a spring that the rubric lacks, it is used and nobody is flagged."""
     team, grade = tied(1)

@@ -130,7 +130,9 @@ def test_a_renamed_folder_is_the_same_submission(school, tmp_path):
     assert rows(out)["team-one"]["by_hand"] == ""
 
 
-@pytest.mark.parametrize("author", ["s0", "s1"])
+@pytest.mark.parametrize(
+    "author", [pytest.param("s0", marks=[pytest.mark.slow, pytest.mark.sample]), "s1"]
+)
 def test_a_strangers_folder_does_not_replace_a_team(school, tmp_path, author):
     """If a stranger's zip file contains a folder with a team's name, the team keeps its row.
 

@@ -221,6 +221,8 @@ def test_a_class_without_grades_asks_about_the_rubric(run, tmp_path):
     assert "is inside a submission; choose a folder outside it" in err
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_an_anonymous_grading_names_nobody_on_stderr(run, tmp_path, monkeypatch):
     """An anonymous grading prints no name on stderr, neither in progress lines nor in warnings."""
     monkeypatch.setattr("pipeline.cli.common.FIRST_WORD", 0.001)

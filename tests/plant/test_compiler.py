@@ -53,6 +53,8 @@ def _outer(package: Path, **environment: str) -> tuple[str, str]:
     return done.stdout.strip(), done.stderr
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_change_in_another_file_is_noticed_and_the_old_folder_removed(package):
     """If a called function's file changes, the caller is compiled again.
 

@@ -329,7 +329,12 @@ def test_expected_values_pass_and_mistakes_fail():
 
 
 @pytest.mark.parametrize(
-    ("carts", "hide"), [(1, ()), (3, ()), pytest.param(1, ("dead_zone",), id="not linear")]
+    ("carts", "hide"),
+    [
+        (1, ()),
+        pytest.param(3, (), marks=[pytest.mark.slow, pytest.mark.sample]),
+        pytest.param(1, ("dead_zone",), id="not linear"),
+    ],
 )
 def test_bounds_in_the_solution_earn_all_points(carts, hide):
     """A student's number at a bound of the solution earns all points, and one beyond it fewer."""

@@ -7,6 +7,8 @@ from pipeline.grading.gradebook.book import Gradebook
 from pipeline.simulated.classroom import PRESET, write_class
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_only_the_slip_and_the_copy_are_flagged(tmp_path):
     """Team 1 has all points, team 2 is flagged for Hz, and teams 2 and 3 for a shared recording."""
     write_class(tmp_path / "class")

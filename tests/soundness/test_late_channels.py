@@ -27,6 +27,7 @@ from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.ucsd import write_two_cart_submission
 
+LONG = [pytest.mark.slow, pytest.mark.sample]
 SAMPLE, COUNT = 0.00884, 0.00227  # s, cm
 LATE = 5  # samples
 
@@ -148,10 +149,8 @@ def motions(kinds: tuple[Kind, ...], *, late: int = 0) -> list[Record]:
     "hide",
     [
         (),
-        pytest.param(
-            ("coulomb_friction:cart=2,force=0.03",), marks=[pytest.mark.slow, pytest.mark.sample]
-        ),
-        ("input_delay:delay=0.03",),
+        pytest.param(("coulomb_friction:cart=2,force=0.03",), marks=LONG),
+        pytest.param(("input_delay:delay=0.03",), marks=LONG),
     ],
 )
 def test_friction_and_a_late_input_are_not_a_late_channel(tmp_path, hide):

@@ -24,9 +24,9 @@ LONG = [pytest.mark.slow, pytest.mark.sample]
         pytest.param("drive_damping", 1, marks=LONG),
         pytest.param("dead_zone", 1, marks=LONG),
         ("input_delay", 1),
-        ("extra_mode", 1),
+        pytest.param("extra_mode", 1, marks=LONG),
         pytest.param("end_stop", 1, marks=LONG),
-        ("force_offset", 2),
+        pytest.param("force_offset", 2, marks=LONG),
         pytest.param("cogging", 1, marks=LONG),
     ],
 )
@@ -79,7 +79,7 @@ def test_two_effects_are_found_together():
     ("effect", "hardness", "part"),
     [
         pytest.param("end_stop", 25.0, 0.6, marks=pytest.mark.slow),
-        ("slack_spring", 3.0, 0.6),
+        pytest.param("slack_spring", 3.0, 0.6, marks=LONG),
         pytest.param("end_stop", 5.0, 0.9, marks=LONG),
         pytest.param("end_stop", 5.0, 0.6, marks=pytest.mark.slow),
         pytest.param("slack_spring", 0.5, 0.9, marks=LONG),

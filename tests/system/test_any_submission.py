@@ -164,7 +164,7 @@ def check(case: Case) -> None:
     json.loads(json_text(analysis), parse_constant=refuse)
 
 
-quick = settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.data_too_large])
+quick = settings(max_examples=3, deadline=None, suppress_health_check=[HealthCheck.data_too_large])
 
 
 @quick

@@ -283,7 +283,8 @@ def test_one_key_answers_for_several_recordings(show, tmp_path):
     assert [run.carts for run in runs] == [(1, 2), (1,), (1,)]
 
 
-@pytest.mark.usefixtures("work_here")
+@pytest.mark.slow
+@pytest.mark.sample
 def test_zip_and_report_wait_for_unsaved_text(show, tmp_path):
     """While typed text is not saved, no zip or report is made, and a message says why."""
     folder = a_submission(tmp_path / "team")

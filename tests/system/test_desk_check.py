@@ -15,6 +15,8 @@ show, fits = test_desk.show, test_desk.fits
 pytestmark = pytest.mark.usefixtures("work_here")
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_student_finds_and_corrects_a_wrong_number(show, tmp_path):
     """The check shows which number is wrong and where to look; the corrected number agrees."""
     folder = a_submission(tmp_path / "team")

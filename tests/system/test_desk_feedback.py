@@ -65,6 +65,8 @@ def press(window, control, key: str = "Enter") -> None:
         window.keyboard.press(key)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.usefixtures("work_here")
 def test_from_the_request_to_the_answer_by_keyboard(show, lab, tmp_path: Path):
     """By keyboard, a student asks about a grade, the TA answers, and the student reads it."""

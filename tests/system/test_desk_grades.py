@@ -150,6 +150,8 @@ def test_a_class_is_graded_by_keys(show, tmp_path):
     assert (own.points, own.why, own.by) == (0.5, REASON, "Ada")
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_two_tas_see_each_others_changes(show):
     """If two TAs change one class, each sees the other's change, and no change is lost."""
     if why := postgres.missing():

@@ -9,6 +9,8 @@ from tests.helpers.places import ROOT
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no such signal")
 
+LONG = [pytest.mark.slow, pytest.mark.sample]
+
 # This program presses Ctrl-C at the N-th import, which is the same moment on any machine. The first
 # two imports are the package and its command line, before any of its code runs.
 _PRESS = """
@@ -38,7 +40,9 @@ def test_ctrl_c_while_the_commands_load_is_quiet(at):
     assert (done.returncode, done.stderr) == (130, "")
 
 
-@pytest.mark.parametrize("at", range(400, 1300, 200))
+@pytest.mark.parametrize(
+    "at", [400, 1000, *(pytest.param(at, marks=LONG) for at in (600, 800, 1200))]
+)
 def test_ctrl_c_while_a_command_loads_libraries_is_one_line(tmp_path, at):
     """Ctrl-C while a command loads its libraries for numbers, figures or pages gives one line."""
     out = tmp_path / "out"

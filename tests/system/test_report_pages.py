@@ -33,10 +33,10 @@ from tests.helpers.ucsd import write_one_cart_submission, write_two_cart_submiss
 from tests.helpers.waiting import PATIENCE
 from tests.report.test_gap import make_gap, two_cart_analysis
 
+LONG = [pytest.mark.slow, pytest.mark.sample]
 CASES = (
     "three", "gap", "solution", "effects", "class", "feedback",
-    *(pytest.param(case, marks=[pytest.mark.slow, pytest.mark.sample])
-      for case in ("real-one", "real-two")),
+    *(pytest.param(case, marks=LONG) for case in ("real-one", "real-two")),
 )  # fmt: skip
 # One effect for each kind of figure.
 PICTURED = tuple({effect.axis: effect for effect in reversed(CATALOGUE)}.values())
@@ -178,7 +178,7 @@ def test_no_word_of_the_pdf_is_cut_or_covered(made):
 
 # As a share of the height of a page's text. The last page may end early.
 MOST_WHITE = 1 / 3
-PRINTED = ("one", "two", "three", "gap", "solution")
+PRINTED = (*(pytest.param(case, marks=LONG) for case in ("one", "two")), "three", "gap", "solution")
 
 
 @pytest.mark.skipif(shutil.which("pdftoppm") is None, reason="no pdftoppm: poppler-utils")

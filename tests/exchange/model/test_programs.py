@@ -218,6 +218,8 @@ def test_octave_moves_as_c_does_with_every_effect(tmp_path):
         assert_allclose(found[name], y, atol=1e-9)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @no_octave
 def test_octave_moves_as_the_simulator_does(tmp_path):
     """With friction, play and delay, Octave's model agrees with the simulator step by step."""

@@ -57,6 +57,8 @@ def test_without_time_the_linear_model_is_the_answer():
     assert search.verdict == "unexplained"
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_overestimated_noise_is_measured_again():
     """If the assumed noise is three times too large, friction is still found."""
     fit, study = begun(FRICTION)

@@ -20,13 +20,16 @@ from pipeline.errors import ConfigError
 from pipeline.grading.autograder import run
 from pipeline.grading.autograder.pack import write_autograder
 from pipeline.grading.autograder.pins import pin_requirements
+from pipeline.grading.batch.runner import Grader
 from pipeline.grading.batch.task import Task
 from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.grade import Grade, read_grade
+from pipeline.grading.gradings import Grading
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.resources import RUBRICS
 from pipeline.simulated.submission import Students, write_submission
 from tests.helpers.commandline import cartlab_here
+from tests.helpers.grades import in_this_process
 from tests.helpers.hostile import SECRET, write_hostile
 from tests.helpers.waiting import PATIENCE
 
@@ -107,9 +110,15 @@ def upload(root: Path, submission: Path) -> dict[str, Any]:
 
 def upload_here(root: Path, submission: Path, *, rubric: str = "") -> dict[str, Any]:
     """Grade the upload in this process, because starting a new process takes a second."""
+
+    def grade(grader: Grader, task: Task) -> Grading:
+        return next(in_this_process([task], grader._setup))
+
     put(root, submission, rubric=rubric)
     (root / "results").mkdir()
-    assert run.grade_upload(root) == ""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Grader, "run", grade)
+        assert run.grade_upload(root) == ""
     return read_results(root)
 
 

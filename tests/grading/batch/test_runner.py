@@ -190,6 +190,8 @@ def test_a_fault_of_this_machine_is_tried_again(task, tmp_path):
     assert outcome.reason.startswith("cannot be read (")
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_memory_is_limited(school, setup, tmp_path):
     """A submission that needs more memory than the limit gets a row that says so.
 

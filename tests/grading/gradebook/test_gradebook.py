@@ -396,12 +396,6 @@ def test_rows_are_only_added(open_book, place):
     engine.dispose()
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
-def test_a_kill_leaves_every_outcome_whole_or_absent(tmp_path):
-    """If a process is killed while it writes, each outcome is stored either whole or not at all."""
-    assert_nothing_lost(str(tmp_path), kills=8)
-
-
 @pytest.mark.slow
 @pytest.mark.sample
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")

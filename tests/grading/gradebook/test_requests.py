@@ -325,9 +325,17 @@ def test_a_gradebook_without_requests_gets_them(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
-def test_a_kill_leaves_an_answer_with_its_points_or_neither(place):
+def test_a_kill_leaves_an_answer_with_its_points_or_neither(tmp_path):
     """If the answering process is killed, an answer is stored with its points or not at all."""
-    assert_whole(place, kills=8)
+    assert_whole(str(tmp_path), kills=8)
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
+def test_in_postgresql_a_kill_leaves_an_answer_with_its_points_or_neither(place_in_postgresql):
+    """If the answering process is killed, PostgreSQL too has the answer with its points or not."""
+    assert_whole(place_in_postgresql, kills=8)
 
 
 @pytest.mark.slow

@@ -68,7 +68,9 @@ def _changes(draw, rubric: Rubric) -> Rubric:
     return Rubric.model_validate(plain)
 
 
-@pytest.mark.parametrize("carts", [1, 2])
+@pytest.mark.parametrize(
+    "carts", [1, pytest.param(2, marks=[pytest.mark.slow, pytest.mark.sample])]
+)
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
 def test_reweighed_points_are_those_of_grading_again(carts, data):

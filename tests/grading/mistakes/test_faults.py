@@ -122,6 +122,13 @@ SEARCHED = (
     "a tenth of the input in every step",
     "a third of the input in every step",
     "every second dwell exchanged",
+    "four dwells exchanged",
+    "two of four steps exchanged",
+    "all dwells in millimetres",
+    "a step ten times too far",
+    "cart 2 frozen in a step",
+    "cart 1 dead in a step",
+    "cart 1 turned in four dwells",
 )
 LONG = [pytest.mark.slow, pytest.mark.sample]
 
@@ -132,7 +139,8 @@ def _cases() -> Iterator[Any]:
         yield pytest.param(case, "", marks=LONG if case in SEARCHED else ())
         if "turned" in case or "exchanged" in case:
             short = case in ("cart 1 turned in four dwells", "a step exchanged")
-            yield pytest.param(case, ", sign = 1", marks=() if short else pytest.mark.slow)
+            marks = LONG if case == "a step exchanged" else ()
+            yield pytest.param(case, ", sign = 1", marks=marks if short else pytest.mark.slow)
 
 
 @pytest.mark.parametrize(("case", "sign"), [*_cases()])

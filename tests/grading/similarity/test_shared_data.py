@@ -19,6 +19,8 @@ from pipeline.submission import load_submission
 from tests.helpers.bench_classes import move_class, read_class
 from tests.helpers.ucsd import write_two_cart_submission
 
+LONG = [pytest.mark.slow, pytest.mark.sample]
+
 
 @pytest.fixture(scope="module")
 def teams(tmp_path_factory):
@@ -98,7 +100,9 @@ def test_honest_teams_on_one_bench_share_nothing(teams):
     assert find_shared([prints(str(i), records) for i, records in enumerate(teams)]) == {}
 
 
-@pytest.mark.parametrize("per_cm", [5, 20, 37, 100, 500])
+@pytest.mark.parametrize(
+    "per_cm", [5, 100, *(pytest.param(per_cm, marks=LONG) for per_cm in (20, 37, 500))]
+)
 def test_agreement_by_rounding_is_not_flagged(quiet_teams, per_cm):
     """If two noise-free recordings agree only because of rounding, nobody is flagged."""
     honest = [
@@ -112,7 +116,7 @@ def test_agreement_by_rounding_is_not_flagged(quiet_teams, per_cm):
         assert set(find_shared([*batch, prints("copy", copied)])) == {"0", "copy"}
 
 
-@pytest.mark.parametrize("per_cm", [5, 20])
+@pytest.mark.parametrize("per_cm", [5, pytest.param(20, marks=LONG)])
 def test_honest_teams_with_coarse_encoders_share_nothing(tmp_path, per_cm):
     """Honest teams with coarse encoders are not flagged, even if a cart moves by one or two counts.
 
@@ -268,9 +272,9 @@ def test_the_cost_grows_with_the_recordings_not_their_square(teams, alike, compa
     else:
         hum = np.resize(3 * COUNT * rng.standard_normal(37), record.t.size)
         made = lambda: disguised(replace(record, y=record.y + hum), rng, noise=1.0)  # noqa: E731
-    batch = [prints(name, [replace(made(), id=str(k)) for k in range(100)]) for name in "ab"]
+    batch = [prints(name, [replace(made(), id=str(k)) for k in range(50)]) for name in "ab"]
     find_shared(batch)
-    assert 0 < len(compared) <= 10 * 200  # there would be 10,000 pairs, each with many time shifts
+    assert 0 < len(compared) <= 10 * 100  # there would be 2,500 pairs, each with many time shifts
 
 
 @pytest.mark.parametrize("kind", ["step", "decay"])
@@ -292,6 +296,8 @@ def knocking():
     return read_class(moved, seed=3)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_impacts_of_a_bench_are_not_flagged(knocking):
     """Teams that share only a bench's impacts are not flagged; a noisy copy is still found."""
     honest = [prints(str(number), records) for number, records in enumerate(knocking)]
