@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import pytest
+
 from pipeline.grading.batch.grade_class import Options, grade_class
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.simulated.classroom import PRESET, write_class
