@@ -236,6 +236,8 @@ def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
     assert (added.amplitude, added.frequency_end) == (0.01, 5.0)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_ports_are_listed_and_the_one_used_is_remembered(tmp_path, real):
     """The list of ports has each virtual bench that runs on this computer.
 

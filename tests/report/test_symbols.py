@@ -24,7 +24,9 @@ def raw(html: str) -> list[str]:
     return _AS_IN_FILES.findall(unescape(_HIDDEN.sub(" ", html)))
 
 
-@pytest.mark.parametrize("carts", [1, 2, 3])
+@pytest.mark.parametrize(
+    "carts", [1, 2, pytest.param(3, marks=[pytest.mark.slow, pytest.mark.sample])]
+)
 def test_reports_show_symbols(carts):
     """Report, solution and terminal show parameters as symbols, not by their names in files."""
     analysis = make_analysis(carts)

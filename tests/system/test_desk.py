@@ -373,6 +373,8 @@ def test_the_desk_works_without_scripts(show, tmp_path):
     assert load_submission(folder).title == "Plain"
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_command_prints_its_address_and_ends_on_a_signal(tmp_path):
     """`cartlab desk` prints its address in one line, and a signal ends it with status 0."""
     command = [sys.executable, "-m", "pipeline", "desk", str(tmp_path / "team"), "--no-browser"]

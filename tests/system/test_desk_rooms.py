@@ -129,6 +129,8 @@ def test_an_exploration_is_watched_and_steered(show, tmp_path):
     assert chosen[1] not in {e.id for e in load_submission(work).experiments}
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_an_exercise_has_the_chosen_effect(show, tmp_path):
     """An instructor ticks an effect, moves its slider, and makes an exercise from it."""
     out = tmp_path / "exercise"
@@ -162,6 +164,8 @@ def test_an_exercise_has_the_chosen_effect(show, tmp_path):
     assert len(load_submission(out).experiments) > 10
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_rubric_is_edited_by_keyboard(show, tmp_path, monkeypatch):
     """A rubric is copied from a shipped one, changed, checked and saved by keyboard."""
     monkeypatch.chdir(tmp_path)

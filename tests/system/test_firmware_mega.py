@@ -96,6 +96,8 @@ def test_every_edge_at_the_pins_counts(mega):
     assert _readings(mega)[-1].counts == tuple(turns.sum(axis=0))
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_third_encoder_needs_one_changed_line(tmp_path):
     """If it is built for three encoders, the sketch also counts at pins 20 and 21, and says so."""
     mega = Mega(build_sketch(tmp_path, encoders=3), tmp_path)

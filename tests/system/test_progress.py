@@ -96,6 +96,8 @@ def test_a_terminal_shows_stage_and_time(tmp_path):
     assert seen.rstrip().endswith(f"wrote {tmp_path / 'report.html'}")
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo terminals")
 def test_ctrl_c_is_answered(tmp_path):
     """After Ctrl-C a message says that the report was stopped, and the exit status is 130."""

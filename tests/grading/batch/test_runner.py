@@ -155,6 +155,8 @@ def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup, kill_next
         assert worker.run(task).status == "graded"
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_worker_killed_while_it_starts_is_started_again(task, setup, kill_next):
     """If a worker process is killed while it starts, another one grades its submission."""
     kill_next()
