@@ -150,7 +150,7 @@ def _recurs(one: Intervention, found: Sequence[Intervention], driven: Mapping[st
 
 
 def _share(force: ForceLeft, size: float) -> Array:
-    """Return the unexplained share of the force on the cart around each time."""
+    """Return which share of the force on the cart is unexplained, near each sample."""
     acting = most_around(force.acting, 2 * round(_AROUND / force.hop) + 1)
     return np.abs(force.left) / (acting + size)
 

@@ -63,7 +63,7 @@ def fit_carts(
     bench: Bench,
     log: Log,
 ) -> Fitted:
-    """Return the Bode fit if the records follow it, or else the joint fit in time."""
+    """Return the Bode fit if the records follow it, or else the joint time-domain fit."""
     if not _is_seen(bench.n, runs.used, responses):
         log.skip(Stage.FINAL_ESTIMATES, _WORDS.text("unseen_cart", cart=bench.n))
         return Fitted()

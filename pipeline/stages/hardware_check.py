@@ -258,9 +258,11 @@ def _logged_per_stated(
 
 
 def _median_ratio(logged: Array, stated: Array) -> float:
-    """Return the factor with the least sum of absolute differences, a weighted median; or 1.
+    """Return the factor by which the logged input is larger than the stated one.
 
-    Samples with a saturated input, or with a velocity that is mostly rounding, do not affect it.
+    It minimises the sum of absolute differences, and so is a weighted median. Samples with a
+    saturated input, or with a velocity that is mostly rounding, do not affect it. If the stated
+    input is always zero, it is 1.
     """
     asked = np.flatnonzero(stated)
     if asked.size == 0:

@@ -43,8 +43,8 @@ class InputScale(TomlTable):
     sign: Literal[1, -1] | None = Field(
         default=None,
         title="Sign of the input",
-        description="-1 if a positive input drives cart 1 towards negative x; if left out, found "
-        "from the data",
+        description="-1 if a positive input drives cart 1 towards negative x; if empty, it is "
+        "found from the data",
     )
     per_count: Positive | None = Field(
         default=None,
@@ -169,22 +169,24 @@ class Experiment(TomlTable):
     file: str
     # On loading, a missing value becomes all carts.
     carts: tuple[int, ...] = Field(
-        default=(), title="Free carts", description="1, 2; if left out, all"
+        default=(), title="Free carts", description="such as 1, 2; if empty, all"
     )
     frequency: Positive | None = Field(
         default=None,
         title="Frequency",
-        description="Hz, of a sine; if left out, found from the data",
+        description="of the sine, in Hz; if empty, it is found from the data",
     )
     window: tuple[Finite, Finite] | None = Field(
-        default=None, title="Use only", description="start and end, in s"
+        default=None,
+        title="Part to use",
+        description="from, to, in s; if empty, all of it",
     )
     note: str = Field(default="", max_length=2_000, title="Note")
     input: InputOverride | None = None
     columns: dict[str, str | int] | None = Field(
         default=None,
         title="Columns",
-        description="of this file, one per line: x1 = Encoder 1 Pos, or x1 = 3",
+        description="of this file, one per line: x1 = Encoder 1 Pos (heading) or x1 = 3 (number)",
     )
     sample_rate: Positive | None = Field(
         default=None, title="Sample rate", description="Hz, for a file without a time column"

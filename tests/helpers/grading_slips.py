@@ -66,7 +66,7 @@ def hz(team: Team) -> Team:
 
 
 def hz_of_one(team: Team) -> Team:
-    """Divide one frequency by 2π, as if only this one was not converted."""
+    """Divide one frequency by 2π, as if the team had left only this one in Hz."""
     names = [n for n in team.reported.final if n.startswith("omega")]
     return scaled(team, [str(team.rng.choice(names))], 1 / TURN, some_tables(team))
 

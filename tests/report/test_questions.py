@@ -76,7 +76,7 @@ def test_a_damping_that_changed_asks_for_the_amplitudes():
     (question,) = ask(off("zeta_b", 65.0))
     assert (question.id, question.section) == ("zeta_b", "parameters")
     assert question.text.startswith(
-        "zeta_b changed by 65.0 % from the decay to the Bode fit. Which"
+        "The decay and the Bode fit give values of zeta_b that differ by 65.0 %. Which"
     )
     assert "saw the larger amplitude" in question.text
 

@@ -520,7 +520,7 @@ def test_unusual_chains_are_shown(name, tmp_path):
     )  # fmt: skip
     springs = tuple(bool(k != 0) for k in chain.k)
     page, pdf = render(bare(analysis, bench=Bench(springs=springs), fit=fit, rows=(row,)), tmp_path)
-    assert "to the recordings in time" in page.text
+    assert "time-domain fit of the recordings" in page.text
     assert "The identified chain" in pdf
 
 

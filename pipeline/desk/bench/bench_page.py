@@ -78,7 +78,7 @@ def add(ask: Ask) -> Response:
 
 
 def weigh(ask: Ask) -> Response:
-    """Show what a recording would improve, beside what the program's own choice would improve."""
+    """Show how much the typed recording would improve, next to the best one that cartlab finds."""
     from pipeline.experiments.goal import WORST
 
     folder, typed = ask.folder(), {name: ask.text(name) for name in _TYPED}

@@ -18,7 +18,7 @@ _KEPT = 200  # folders whose port is remembered
 
 @dataclass(frozen=True, kw_only=True)
 class Port:
-    """A port to choose.
+    """A port that the user can choose.
 
     Attributes
     ----------

@@ -386,7 +386,7 @@ def write_fields(document: tomlkit.TOMLDocument, changed: Iterable[Field]) -> No
 
 
 def _settle(document: tomlkit.TOMLDocument, path: str) -> None:
-    """Remove the mark of a doubt from a key of `[system]`, because a person has now set the key."""
+    """Remove the "doubtful" mark from a key of `[system]` that a person has just set."""
     table, key, *_ = [*path.split("."), ""]
     item: Any = document.get("system", {}).get(key) if table == "system" else None
     if item is not None and item.trivia.comment.startswith(f"# {UNSURE}"):

@@ -281,7 +281,7 @@ def _differences(
 ) -> tuple[Array, Array, Array]:
     """Return the same as `_derivatives`, but from finite differences alone.
 
-    With contacts the misfit has many narrow valleys, and a finite difference averages over them.
+    With contacts the misfit has many narrow minima, and a finite difference averages over them.
     """
     position, velocity = usual_sizes(model, run)
     steps = model.structure.steps() if layout.shared else np.zeros(0)

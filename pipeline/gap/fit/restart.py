@@ -20,8 +20,8 @@ def restart_runs(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper) -> GapFit:
     """Restart the worst runs' nuisance parameters at other rest positions of the carts.
 
     A cart may rest anywhere inside the band of friction or cogging, and its encoder is zeroed at
-    this rest. So the misfit of a run has several valleys in encoder zero and friction. The shared
-    parameters stay the same.
+    this rest. So the misfit of a run has several local minima over encoder zero and friction. The
+    shared parameters stay the same.
     """
     if not fit.structure.many_rests:
         return fit

@@ -19,7 +19,7 @@ _LENGTHS = (0.3, 0.6, 1.2, 2.4)  # s; with a contact, pieces grow to whole runs
 # rigid, but the simulator's contact is slightly soft.
 _VARIED = ((1.0, 1.0), (1.2, 1.0), (1.0, 0.65), (1.2, 0.65))
 _NEAR = 8  # iterations of a fit that starts near its end
-# Options without springs: the cost of a whole run has many valleys, and small improvements add up.
+# Options without springs: the cost of a whole run has many minima, and small gains add up.
 _FINISHED: dict[str, Any] = {"iterations": 60, "tolerance": 1e-6}
 
 

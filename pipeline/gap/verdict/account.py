@@ -44,7 +44,7 @@ def list_effects(
             for key, h in same_size.items()
             if key != chosen.key and (rest < key or not key & chosen.key)
         ]
-        # If the cost has many narrow valleys, its curvature does not give the standard error.
+        # If the cost has many narrow minima, its curvature does not give the standard error.
         rugged = term.effect.contact and final.chi > AT_FLOOR
         known = None if std is None or rugged else std[structure.span(index)]
         values = _named_values(term, known, units)

@@ -56,8 +56,8 @@ def export(
 
     Raises
     ------
-    ConfigError : the roster is not the platform's table, or has another maximum grade; or the name
-        of `out` is that of another kind of file.
+    ConfigError : the roster is not a table of this platform, its maximum grade differs from the
+        rubric's, or `out` has the name of a file of another kind.
     """
     table = out if out.suffix.lower() == ".csv" and not out.is_dir() else None
     folder = table.parent if table else named_folder(out)

@@ -58,11 +58,11 @@ class Roster:
         return cls(file=path.name, table=table)
 
     def check_maximum(self, out_of: float, *, title: str) -> None:
-        """Refuse a table with another maximum grade, because an import would not change it.
+        """Refuse a table whose maximum grade differs, because an import would not change it.
 
         Raises
         ------
-        ConfigError : Moodle's column or Canvas' row of possible points has another maximum.
+        ConfigError : Moodle's column or Canvas' row of possible points has a different maximum.
         """
         column = self._title(title)
         said = [*self.table[_MAXIMUM].unique()] if _MAXIMUM in self.table else []

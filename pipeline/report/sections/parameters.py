@@ -104,7 +104,7 @@ def source_text(estimate: Estimate | None, *, steps: Collection[str]) -> str:
         "step": "step",
         "log_decrement": "decay",
         "bode_fit": "Bode fit",
-        "time_fit": "fit in time",
+        "time_fit": "time-domain fit",
         "assumed": "assumed",
         "frequency_response": "response",
     }

@@ -220,7 +220,7 @@ def test_a_moodle_worksheet_is_filled_in(tmp_path):
 
 
 def test_a_worksheet_with_another_maximum_is_refused(tmp_path):
-    """A Moodle worksheet with another maximum is refused, since Moodle would keep its own."""
+    """A Moodle worksheet with a different maximum is refused, since Moodle would keep its own."""
     roster = "Identifier,Full name,Grade,Maximum Grade\nParticipant 1024,Jane Doe,,{}\n"
     write(tmp_path, HALF, platform="moodle", roster=roster.format('"20,00"'))
     with pytest.raises(ConfigError, match=r"maximum grade 18\.00, the rubric 20"):
@@ -228,7 +228,7 @@ def test_a_worksheet_with_another_maximum_is_refused(tmp_path):
 
 
 def test_a_canvas_gradebook_with_another_maximum_is_refused(tmp_path):
-    """A Canvas gradebook with another maximum is refused, since Canvas would keep its own."""
+    """A Canvas gradebook with a different maximum is refused, since Canvas would keep its own."""
     roster = (
         "Student,ID,Section,Lab 3 (77),Lab 4 (78)\n"
         "    Points Possible,,,{},40\n"
