@@ -12,7 +12,6 @@ from pipeline.checks.carts import physical_values
 from pipeline.ingest.columns import is_count
 from pipeline.ingest.read import DUTY_COUNT, Ingested
 from pipeline.results import Assumption, ChainFit, Check, Record
-from pipeline.stages.compare import SIGMA_LIMIT
 from pipeline.submission import Submission, System
 from pipeline.submission.load import spring_names
 from pipeline.words.numbers import abridge
@@ -59,7 +58,7 @@ def _springs(
         elif name in vanishing:
             support = "contradicted"
             reason = f"{_number(name, value, std, unit)}: it may not exist"
-        elif fit.explains_data or _beyond_misfit(value, std, fit=fit):
+        elif fit.explains_data or std:  # a standard error includes the misfit of the carts
             support, reason = "supported", _number(name, value, std, unit)
         else:
             number = _number(name, value, std, unit)
@@ -74,17 +73,6 @@ def _springs(
             found_std=std,
             reason=reason,
         )
-
-
-def _beyond_misfit(value: float | None, std: float | None, *, fit: ChainFit) -> bool:
-    """Return whether a spring differs from zero by more than the misfit of the model allows.
-
-    Standard errors assume that the model is right. Where chi-square is too large, they are enlarged
-    by its square root, the Birge ratio.
-    """
-    if value is None or not std:
-        return False
-    return value > SIGMA_LIMIT * std * np.sqrt(fit.chi_square_per_dof)
 
 
 def _number(name: str, value: float | None, std: float | None, unit: str) -> str:

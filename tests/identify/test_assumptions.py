@@ -134,17 +134,23 @@ def test_a_held_cart_that_was_not_measured_is_open(tmp_path):
 
 
 @pytest.mark.skipif(not (REAL_DATA / "ecp210-ucsd").is_dir(), reason="no real recordings here")
-def test_a_fit_with_a_large_misfit_supports_only_springs_far_beyond_it(tmp_path):
-    """If the carts do not explain the data, the misfit enlarges the error of each spring."""
+def test_a_large_misfit_leaves_a_certain_spring_supported(tmp_path):
+    """The springs of carts that do not explain the data are supported by their standard errors.
+
+    These include the misfit: five recordings, each on its own, give the spring between the carts
+    within three of them.
+    """
     folder = write_two_cart_submission(tmp_path / "s", REAL_DATA, steps=(1, 2, 3, 4, 5))
     analysis = analyse(load_submission(folder), design=False)
     assert analysis.fit is not None
-    enlarged = 3 * analysis.fit.chi_square_per_dof**0.5
+    assert not analysis.fit.explains_data
     springs = [a for a in analysis.assumptions if a.key == "system.springs"]
-    by_error = {
-        a.about: a.found / (a.found_std * enlarged) for a in springs if a.found and a.found_std
-    }
-    assert by_error["wall-1"] > 1 > by_error["1-2"]
     assert {a.about: a.support for a in springs} == {
-        "wall-1": "supported", "1-2": "open", "2-wall": "open",
+        "wall-1": "supported", "1-2": "supported", "2-wall": "open",
     }  # fmt: skip
+    for step in range(1, 6):
+        folder = write_two_cart_submission(tmp_path / str(step), REAL_DATA, steps=(step,))
+        alone = analyse(load_submission(folder), design=False).fit
+        assert alone is not None
+        apart = alone.chain.k[1] - analysis.fit.chain.k[1]
+        assert abs(apart) < 3 * alone.std["k_2"]
