@@ -2,8 +2,7 @@
 
 There are two simulations of each cart. In "closed", the controller that ran on the hardware closes
 the loop around the chain, with its delay and saturation. In "open", the measured input drives the
-chain. This also tests the sign and scale of the logged input, because some benches change both when
-the loop is closed.
+chain. This also tests the logged input, whose sign and scale some benches change in closed loop.
 """
 
 from dataclasses import dataclass, replace

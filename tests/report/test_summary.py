@@ -211,4 +211,4 @@ def test_a_question_about_one_recording_does_not_mention_two():
         for row in analysis.rows
     )
     (question,) = (q for q in ask(replace(analysis, rows=rows)) if q.id == "zeta")
-    assert "although both use the same recordings" in question.text
+    assert "use the same recordings" in question.text
