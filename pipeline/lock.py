@@ -15,7 +15,7 @@ _AGAIN = 0.02  # s between attempts
 
 
 @contextmanager
-def alone_in(out: Path, *, private: bool = False) -> Iterator[None]:
+def lock_or_refuse(out: Path, *, private: bool = False) -> Iterator[None]:
     """Create a folder if needed, and keep other cartlab programs out of it.
 
     The operating system holds the lock and releases it when the process ends, however it ends. A
@@ -41,11 +41,11 @@ def alone_in(out: Path, *, private: bool = False) -> Iterator[None]:
 
 
 @contextmanager
-def turn_in(folder: Path) -> Iterator[None]:
+def lock_when_free(folder: Path) -> Iterator[None]:
     """Wait until no other program is changing files of this folder, then keep others out.
 
-    This lock is separate from that of `alone_in`, which a bench session may hold for an hour while
-    `submission.toml` changes.
+    This lock is separate from that of `lock_or_refuse`, which a bench session may hold for an hour
+    while `submission.toml` changes.
 
     Raises
     ------

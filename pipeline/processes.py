@@ -51,7 +51,7 @@ class Ended(Failed):
     how : why the process ended: `start` if it failed before it was ready, `crash` if it failed
         later.
     status : exit status or signal of the process, in words.
-    said : the last part of what the process wrote to stderr.
+    stderr_end : the last part of what the process wrote to stderr.
     """
 
     def __init__(
@@ -60,10 +60,10 @@ class Ended(Failed):
         *,
         how: Literal["stopped", "time", "memory", "crash", "start"],
         status: str = "",
-        said: str = "",
+        stderr_end: str = "",
     ) -> None:
         super().__init__(why)
-        self.how, self.status, self.said = how, status, said
+        self.how, self.status, self.stderr_end = how, status, stderr_end
 
 
 class Supervisor:
@@ -81,7 +81,7 @@ class Supervisor:
         *,
         limit: float,
         stop: threading.Event | None = None,
-        tell: Progress = silent,
+        progress: Progress = silent,
     ) -> Any:
         """Do a task in the worker and return its answer; both are plain data.
 
@@ -89,7 +89,7 @@ class Supervisor:
         ----------
         limit : time limit in s, not counting the start of the process.
         stop : event that cancels the task when it is set.
-        tell : function that is called with the name of each stage of the task.
+        progress : function that is called with the name of each stage of the task.
 
         Raises
         ------
@@ -110,7 +110,7 @@ class Supervisor:
             if answer is None:
                 raise self._ended(process, f"stopped after {limit:g} s", "time")
             if "stage" in answer:
-                tell(answer["stage"])
+                progress(answer["stage"])
                 continue
             self._done += 1
             if self._done >= _TASKS_EACH:
@@ -142,7 +142,7 @@ class Supervisor:
     def _ready(self, stop: threading.Event) -> "LineProcess":
         if self._process is not None and self._process.runs:
             return self._process
-        said = why = ""
+        stderr_end = why = ""
         for _ in range(_STARTS):
             self.close()
             process = self._process = LineProcess(self._module)
@@ -159,9 +159,9 @@ class Supervisor:
                 why = str(error)
             except OSError as error:  # the process has ended
                 why = f"the process ended ({error.strerror})"
-            said = process.said()
+            stderr_end = process.stderr_end()
         self.close()
-        raise Ended(why, how="start", said=said)
+        raise Ended(why, how="start", stderr_end=stderr_end)
 
     def _line(
         self, process: "LineProcess", *, end: float, most: float, stop: threading.Event
@@ -189,9 +189,9 @@ class Supervisor:
         how: Literal["stopped", "time", "memory", "crash"],
         status: str = "",
     ) -> Ended:
-        said = process.said()
+        stderr_end = process.stderr_end()
         self.close()
-        return Ended(why, how=how, status=status, said=said)
+        return Ended(why, how=how, status=status, stderr_end=stderr_end)
 
 
 class LineProcess:
@@ -255,7 +255,7 @@ class LineProcess:
         code = self._process.wait()
         return f"signal {-code}" if code < 0 else f"exit status {code}"
 
-    def said(self) -> str:
+    def stderr_end(self) -> str:
         """Return the end of what the process wrote to stderr; "" after `close`."""
         if self._stderr.closed:
             return ""
@@ -264,7 +264,7 @@ class LineProcess:
 
     def last_words(self) -> str:
         """Return how the process ended and the last line that it wrote to stderr."""
-        words = self.said().strip().rpartition("\n")[2][-_LAST_WORDS:]
+        words = self.stderr_end().strip().rpartition("\n")[2][-_LAST_WORDS:]
         return f"the process ended ({self.ending()}) {words}".rstrip()
 
     def close(self) -> None:
@@ -328,8 +328,8 @@ def attempt(work: Callable[[], Any]) -> Any:
     except MemoryError:
         raise Failed("needs more memory than allowed") from None
     except OSError as error:
-        said = f"{error.filename or ''}: {error.strerror or error}".lstrip(": ")
-        raise Failed(said) from error
+        message = f"{error.filename or ''}: {error.strerror or error}".lstrip(": ")
+        raise Failed(message) from error
     except Exception as error:
         traceback.print_exc()
         what = f"{type(error).__name__}: {error}"[:_LAST_WORDS]

@@ -8,16 +8,16 @@ import pytest
 
 from pipeline.errors import ConfigError
 from pipeline.grading.batch.grade_class import scratch_in
-from pipeline.lock import alone_in
+from pipeline.lock import lock_or_refuse
 from tests.helpers.commandline import cartlab_here
 
 _HOLDER = """
 import sys
 from pathlib import Path
 from pipeline.grading.batch.grade_class import scratch_in
-from pipeline.lock import alone_in
+from pipeline.lock import lock_or_refuse
 out = Path(sys.argv[1])
-with alone_in(out), scratch_in(out) as scratch:
+with lock_or_refuse(out), scratch_in(out) as scratch:
     (scratch / "copy").touch()
     print("held", flush=True)
     sys.stdin.read()
@@ -44,7 +44,7 @@ def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
     refused = pytest.raises(
         ConfigError, match=rf"another cartlab \(process {other.pid}\) is writing"
     )
-    with refused, alone_in(tmp_path):
+    with refused, lock_or_refuse(tmp_path):
         pass
     done = cartlab_here("grade", tmp_path / "none", "--rubric", "throne-1dof", "--out", tmp_path)
     assert done.returncode == 2
@@ -53,7 +53,7 @@ def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
     assert (tmp_path / f".scratch-{other.pid}" / "copy").is_file()
     other.kill()
     other.wait()
-    with alone_in(tmp_path), scratch_in(tmp_path) as scratch:
+    with lock_or_refuse(tmp_path), scratch_in(tmp_path) as scratch:
         assert [path.name for path in tmp_path.glob(".scratch*")] == [scratch.name]
     assert [path.name for path in tmp_path.iterdir()] == [".lock"]
 
@@ -61,7 +61,7 @@ def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
 def test_a_foreign_file_with_the_locks_name_is_refused(tmp_path):
     """If a file has the lock's name but is not a lock, the run stops with a message."""
     (tmp_path / ".lock").write_bytes(b"something else" * 100)
-    with pytest.raises(ConfigError, match="not a lock of cartlab"), alone_in(tmp_path):
+    with pytest.raises(ConfigError, match="not a lock of cartlab"), lock_or_refuse(tmp_path):
         pass
 
 
@@ -71,6 +71,6 @@ def test_a_new_folder_is_removed_if_the_run_fails(tmp_path):
     A folder that existed before the run stays.
     """
     for out in (tmp_path / "new" / "out", tmp_path):
-        with pytest.raises(ZeroDivisionError), alone_in(out), scratch_in(out):
+        with pytest.raises(ZeroDivisionError), lock_or_refuse(out), scratch_in(out):
             raise ZeroDivisionError
     assert list((tmp_path / "new").iterdir()) == []

@@ -125,13 +125,13 @@ def _record(
 
 def _import(folder: Path, source: Path, terminal: "Terminal", *, once: bool) -> None:
     from pipeline.bench.host.importing import Importer
-    from pipeline.lock import alone_in
+    from pipeline.lock import lock_or_refuse
 
     if not folder.exists():  # the imported files do not state the number of carts
         raise ConfigError(f"{folder}: no such folder; run `cartlab new {folder} --carts N`")
     taken = 0
     try:
-        with alone_in(folder):
+        with lock_or_refuse(folder):
             for imported in Importer(folder, source, observer=terminal).watch(once=once):
                 taken += 1
                 as_what = f"{imported.file}: {imported.experiment}, a {imported.kind}"

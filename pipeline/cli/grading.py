@@ -239,14 +239,14 @@ def _changing(grades: str, assignment: str | None) -> Iterator["Gradebook"]:
     """Open a gradebook to change it; if it is in a folder, update the pages there afterwards."""
     from pipeline.grading.gradebook.book import Gradebook
     from pipeline.grading.publish.outputs import write_outputs
-    from pipeline.lock import alone_in
+    from pipeline.lock import lock_or_refuse
 
     folder = Path(grades)
     with Gradebook(grades, assignment=assignment) as book:
         if not folder.is_dir():
             yield book
             return
-        with alone_in(folder):
+        with lock_or_refuse(folder):
             yield book
             write_outputs(book, folder)
 

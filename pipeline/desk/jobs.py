@@ -122,7 +122,7 @@ class Jobs:
                 job.asked,
                 limit=1800.0,
                 stop=job.stop,
-                tell=lambda stage: job.tell("running", stage),
+                progress=lambda stage: job.tell("running", stage),
             )
             job.tell("done", answer if isinstance(answer, str) else "done")
         except Failed as error:

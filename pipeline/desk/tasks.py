@@ -38,7 +38,7 @@ from pipeline.ingest.fill import (
 )
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.read import read_data
-from pipeline.lock import alone_in
+from pipeline.lock import lock_or_refuse
 from pipeline.output import own_folder, write_file
 from pipeline.processes import serve
 from pipeline.results import Analysis, Assumption
@@ -129,7 +129,7 @@ def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
         except ConfigError:  # there is no previous report, or it is of another bench
             return None
 
-    with alone_in(out):
+    with lock_or_refuse(out):
         analysis, changes = write_report(submission, out, compared=compared, progress=progress)
         asked = [
             {"id": one.id, "section": one.section, "text": with_symbols(one.text)}
@@ -164,7 +164,7 @@ def make_gap(folder: str, *, progress: Progress) -> None:
 
     submission = load_submission(Path(folder))
     out = own_folder(submission.folder, "gap")
-    with alone_in(out):
+    with lock_or_refuse(out):
         analysis = analyse(submission, design=False, progress=progress)
         found = investigate(analysis, progress=progress)
         found = propose_for(found, submission)
@@ -183,7 +183,7 @@ def make_plots(folder: str, *, progress: Progress) -> None:
     made_of = stat_sources(Path(folder))
     submission = load_submission(Path(folder))
     out = own_folder(submission.folder, "report")
-    with alone_in(out):
+    with lock_or_refuse(out):
         analysis, gap = with_gap(
             analyse(submission, design=False, progress=progress), submission.folder
         )
@@ -262,11 +262,11 @@ def publish_grades(folder: str, *, progress: Progress) -> None:
     """Write the output files of the gradebook in a folder."""
     from pipeline.grading.gradebook.book import Gradebook
     from pipeline.grading.publish.outputs import write_outputs
-    from pipeline.lock import alone_in
+    from pipeline.lock import lock_or_refuse
 
     out = Path(folder)
     progress("pages and feedback")
-    with Gradebook(out) as book, alone_in(out):
+    with Gradebook(out) as book, lock_or_refuse(out):
         write_outputs(book, out)
 
 

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from pipeline.bench.protocol.messages import FREQUENCIES, MOST_TONES
 from pipeline.errors import ConfigError
 from pipeline.experiments.plan import Plan, PlanLimits, Recording, StateLoop
-from pipeline.lock import turn_in
+from pipeline.lock import lock_when_free
 from pipeline.output import write_file
 from pipeline.submission import Submission, System, load_submission
 from pipeline.submission.complaints import (
@@ -114,7 +114,7 @@ def add_recordings(folder: Path, proposed: Sequence[Recording], *, otherwise: Pl
     ------
     ConfigError : the plan is broken, or would be afterwards; nothing is written.
     """
-    with turn_in(folder):
+    with lock_when_free(folder):
         submission = load_submission(folder)
         plan = load_plan(submission) if plan_path(submission).exists() else otherwise
         taken = [one.id for one in (*submission.experiments, *plan.recordings)]

@@ -11,7 +11,7 @@ from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Array
 
 from pipeline.errors import SubmissionError
-from pipeline.lock import turn_in
+from pipeline.lock import lock_when_free
 from pipeline.output import write_file
 from pipeline.submission.load import MAX_TOML_BYTES, NAME, outside, parse_submission
 from pipeline.submission.models import Submission
@@ -62,7 +62,7 @@ def edit_submission(
         changed in this way.
     Outdated : the file's text is not the one for which the change was prepared.
     """
-    with turn_in(folder):
+    with lock_when_free(folder):
         text = submission_text(folder)
         if seen and seen != text_digest(text):
             raise Outdated(text)

@@ -186,7 +186,7 @@ def test_a_failed_task_does_not_end_the_process(tmp_path):
     worker = workers._free.get()
     process = worker._process
     assert process is not None
-    assert "Traceback" in process.said()
+    assert "Traceback" in process.stderr_end()
     workers._free.put(worker)
     assert workers.do("list_files", folder=str(tmp_path)) == []
     assert process.runs

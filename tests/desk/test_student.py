@@ -26,7 +26,7 @@ from pipeline.desk.tasks import make_report
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.ingest.formats.recognise import parse_table
-from pipeline.lock import turn_in
+from pipeline.lock import lock_when_free
 from pipeline.processes import Failed
 from pipeline.submission import load_submission
 from pipeline.submission.edit import edit_submission
@@ -281,7 +281,7 @@ def test_moving_aside_waits_for_other_changes(filled, named):
     recording.write_bytes(b"nothing in it")
     assert "data/late.csv" in visitor.get(HERE).text
     with ThreadPoolExecutor(1) as pool:
-        with turn_in(folder):
+        with lock_when_free(folder):
             moved = pool.submit(visitor.post, HERE + "aside", file="data/late.csv")
             time.sleep(1.0)
             assert not moved.done()

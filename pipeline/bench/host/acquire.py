@@ -24,7 +24,7 @@ from pipeline.errors import ConfigError, DataError, HardwareError, PipelineError
 from pipeline.experiments.plan import Plan, Recording
 from pipeline.experiments.plan_file import add_recordings, load_plan, plan_path, save_plan
 from pipeline.experiments.propose import extend_plan, propose_plan
-from pipeline.lock import alone_in
+from pipeline.lock import lock_or_refuse
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME
 from pipeline.submission.toml_file import Value
@@ -63,7 +63,7 @@ def acquire(
     ConfigError : another session writes to the folder, or the plan or submission does not fit the
         bench. If only one recording does not fit, its outcome says why, and the session continues.
     """
-    with stopping_on_signals(), alone_in(folder):
+    with stopping_on_signals(), lock_or_refuse(folder):
         work = _Acquisition(
             folder,
             port=port,
@@ -83,7 +83,7 @@ def ensure_plan(folder: Path, *, port: str) -> None:
     """
     submission = load_submission(folder)
     if not plan_path(submission).exists():
-        with alone_in(folder), open_line(port, baud=_USUAL_BAUD) as line:
+        with lock_or_refuse(folder), open_line(port, baud=_USUAL_BAUD) as line:
             save_plan(propose_plan(submission, bench=line.bench), submission)
 
 

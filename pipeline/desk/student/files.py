@@ -15,7 +15,7 @@ from pipeline.desk.student.handin import BESIDE
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.unpack import HAND_IN, is_debris
 from pipeline.ingest.formats.recognise import ENDINGS
-from pipeline.lock import turn_in
+from pipeline.lock import lock_when_free
 from pipeline.output import own_folder, write_file
 from pipeline.processes import Failed
 from pipeline.submission.complaints import quote
@@ -52,7 +52,7 @@ def take_uploads(
                 files += _unpack(content, scratch / str(number), workers=workers)
             except (SubmissionError, Failed) as error:
                 said.append(_refuse(name, error))
-        with turn_in(folder):
+        with lock_when_free(folder):
             room = _Room(folder)
             for name, given in files:
                 try:

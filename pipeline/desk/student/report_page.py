@@ -10,7 +10,7 @@ from pipeline.desk.last_report import NOTES, read_notes, read_told
 from pipeline.desk.student.form import read_document, sign_fields, write_fields
 from pipeline.desk.student.room import Room, look_around
 from pipeline.errors import SubmissionError
-from pipeline.lock import turn_in
+from pipeline.lock import lock_when_free
 from pipeline.output import write_file
 from pipeline.report.sections.answers import with_answer, written_answer
 from pipeline.submission.edit import Outdated, edit_submission, text_digest
@@ -38,7 +38,7 @@ def answer(ask: Ask) -> Response:
     """Write the answer to a question into `notes.md`; if it is refused, show it again as typed."""
     folder, id_, words = ask.folder(), ask.text("id"), ask.text("answer")
     try:
-        with turn_in(folder):
+        with lock_when_free(folder):
             notes = read_notes(folder)
             if ask.text("seen") != text_digest(notes):
                 return ask.page(

@@ -32,7 +32,7 @@ from pipeline.desk.student.room import Room, look_around
 from pipeline.desk.student.rows import gather_remarks, group_rows, look_at_all
 from pipeline.desk.typed import read_whole_number
 from pipeline.errors import SubmissionError
-from pipeline.lock import turn_in
+from pipeline.lock import lock_when_free
 from pipeline.processes import Failed
 from pipeline.submission.edit import Outdated, edit_submission, submission_text
 from pipeline.submission.load import NAME, list_experiments, outside, posix
@@ -59,7 +59,7 @@ def set_aside(ask: Ask) -> Response:
     folder, file = ask.folder(), ask.text("file")
     if file not in ask.desk.workers.do("list_files", folder=str(folder)):
         raise HTTPException(404, "there is no such recording")
-    with turn_in(folder):
+    with lock_when_free(folder):
         document = read_document(submission_text(folder) if (folder / NAME).exists() else "")
         if any(posix(str(table.get("file", ""))) == file for table in list_experiments(document)):
             raise SubmissionError(f"{file}: {NAME} uses it; remove it there first")

@@ -22,7 +22,7 @@ from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.similarity.prints import fingerprint
-from pipeline.lock import alone_in
+from pipeline.lock import lock_or_refuse
 from pipeline.output import OWNERS_FOLDER, named_folder, own_folder
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
@@ -124,7 +124,7 @@ def grade_class(
     _refuse_submission(named_folder(out))
     if options.gradebook is None:
         _refuse_another_class(out, assignment=rubric_file.stem)
-    with alone_in(out, private=True), scratch_in(out) as scratch:
+    with lock_or_refuse(out, private=True), scratch_in(out) as scratch:
         known = _listed_names(place, assignment=rubric_file.stem)
         passed: list[str] = []
         found = find_hand_ins(paths, scratch=scratch, skip=[out], known=known, say=passed.append)

@@ -160,10 +160,10 @@ class Grader:
             plain = self._process.do(asdict(task), limit=self._setup.time_limit, stop=stop)
         except Ended as end:
             if end.how == "start":
-                last = end.said.strip().splitlines() or ["they gave no reason"]
+                last = end.stderr_end.strip().splitlines() or ["they gave no reason"]
                 raise ConfigError(f"the grading processes do not start: {last[-1]}") from None
             reasons = {"memory": too_large, "crash": f"the grader crashed ({end.status})"}
-            return self._failed(task, reasons.get(end.how, str(end)), detail=end.said)
+            return self._failed(task, reasons.get(end.how, str(end)), detail=end.stderr_end)
         except Failed as error:
             self.close()  # after a failure, a new process is safer
             return self._failed(task, str(error))

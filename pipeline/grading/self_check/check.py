@@ -24,7 +24,7 @@ from pipeline.grading.self_check.log import (
     read_answers,
     write_answer,
 )
-from pipeline.lock import turn_in
+from pipeline.lock import lock_when_free
 from pipeline.results import Analysis
 from pipeline.submission import Reported, Submission
 from pipeline.words.progress import Progress, silent
@@ -71,7 +71,7 @@ def check_numbers(
     read_answers(folder)  # report a bad file before the long analysis
     judged = analyse_under(submission, rubric=rubric, progress=progress)
     found = judge_numbers(judged.submission, judged.analysis, rubric=rubric)
-    with turn_in(folder):
+    with lock_when_free(folder):
         before = read_answers(folder)
         answer = next_answer(found, before, basis=find_basis(submission), where=where)
         write_answer(folder, answer)
