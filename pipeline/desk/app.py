@@ -73,20 +73,20 @@ def _stop(ask: Ask) -> Response:
     return ask.back(ask.here + ("#work" if ask.here.startswith("/grades/") else "#report"))
 
 
-async def _tell_news(ask: Ask) -> Response:
+async def _stream_events(ask: Ask) -> Response:
     """Return a stream of events that report the work in the place that the URL names."""
-    return StreamingResponse(_news(ask, ask.place_or_404()), media_type="text/event-stream")
+    return StreamingResponse(_events(ask, ask.place_or_404()), media_type="text/event-stream")
 
 
-async def _news(ask: Ask, place: Any) -> AsyncIterator[str]:
+async def _events(ask: Ask, place: Any) -> AsyncIterator[str]:
     """Yield an event for every new stage of the work; a slow reader gets only the latest stage."""
-    seen, quiet, frame = -1, 0.0, 0.2  # `frame` is the time in s between two checks for changes
+    version, quiet, frame = -1, 0.0, 0.2  # `frame` is the time in s between two checks for changes
     while (job := ask.desk.jobs.of(place)) is not None:
-        if job.news != seen:
-            seen, quiet = job.news, 0.0
+        if job.version != version:
+            version, quiet = job.version, 0.0
             shown = ask.job or job
-            said = " ".join(ask.user.without_folders(shown.said).split())
-            yield f"event: {'end' if job.over else 'stage'}\ndata: {said}\n\n"
+            message = " ".join(ask.user.without_folders(shown.message).split())
+            yield f"event: {'end' if job.over else 'stage'}\ndata: {message}\n\n"
         elif quiet > 5.0:  # s without an event; the line sent then keeps the connection open
             quiet = 0.0
             yield ": still here\n\n"
@@ -116,7 +116,7 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/student/{n:int}/make-gap", "POST", _start("make_gap", "The gap", then="#report")),
     ("/student/{n:int}/gap/{name:path}", "GET", _serve("gap")),
     ("/student/{n:int}/stop", "POST", _stop),
-    ("/student/{n:int}/events", "GET", _tell_news),
+    ("/student/{n:int}/events", "GET", _stream_events),
     ("/student/{n:int}/report", "GET", report_page.show),
     ("/student/{n:int}/report/{name:path}", "GET", _serve("report")),
     ("/student/{n:int}/questions", "GET", report_page.show_questions),
@@ -153,7 +153,7 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/solution/{n:int}/make", "POST", _start("make_solution", "The solution")),
     ("/solution/{n:int}/{name:path}", "GET", _serve("solution")),
     ("/grades/{n:int}/", "GET", class_table.show),
-    ("/grades/{n:int}/events", "GET", _tell_news),
+    ("/grades/{n:int}/events", "GET", _stream_events),
     ("/grades/{n:int}/news", "GET", class_table.show_news),
     ("/grades/{n:int}/distribution.svg", "GET", class_table.draw_distribution),
     ("/grades/{n:int}/class.html", "GET", class_table.show_class_page),

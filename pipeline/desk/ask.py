@@ -37,7 +37,7 @@ Stamp = tuple[int, int, dict[str, str | int]]
 
 
 @dataclass(frozen=True)
-class Said:
+class Message:
     """A message that a page shows once.
 
     Attributes
@@ -59,7 +59,7 @@ class Desk:
     Attributes
     ----------
     root : the top folder of the list in which the person at this computer chooses a folder.
-    said : messages still to be shown, by person and address.
+    messages : messages still to be shown, by person and address.
     """
 
     root: Path = field(default_factory=find_root)
@@ -67,13 +67,13 @@ class Desk:
     workers: WorkerPool = field(default_factory=WorkerPool)
     benches: Benches = field(default_factory=Benches)
     books: Books = field(default_factory=Books)
-    said: dict[tuple[str, str], list[Said]] = field(default_factory=dict)
+    messages: dict[tuple[str, str], list[Message]] = field(default_factory=dict)
     # By folder: the files that the last downloaded zip contained, with their time and size.
     handed: dict[Path, dict[str, list[int]]] = field(default_factory=dict)
     _shown: dict[str, OrderedDict[str, str]] = field(default_factory=dict)
-    _looks: OrderedDict[Path, tuple[Stamp, dict[str, Any]]] = field(default_factory=OrderedDict)
+    _inspected: OrderedDict[Path, tuple[Stamp, dict[str, Any]]] = field(default_factory=OrderedDict)
 
-    def looks(
+    def inspect_files(
         self, folder: Path, stated: Callable[[str], dict[str, str | int]]
     ) -> dict[str, dict[str, Any]]:
         """Return what each data file of a submission contains, by name; reread only changed files.
@@ -87,12 +87,12 @@ class Desk:
             path, columns = folder / file, stated(file)
             info = path.stat()
             stamp = info.st_mtime_ns, info.st_size, columns
-            kept = self._looks.get(path)
-            if kept is None or kept[0] != stamp:
-                kept = self._looks[path] = stamp, self._look(folder, file, columns)
-                while len(self._looks) > 5_000:
-                    self._looks.popitem(last=False)
-            found[file] = kept[1]
+            cached = self._inspected.get(path)
+            if cached is None or cached[0] != stamp:
+                cached = self._inspected[path] = stamp, self._inspect_file(folder, file, columns)
+                while len(self._inspected) > 5_000:
+                    self._inspected.popitem(last=False)
+            found[file] = cached[1]
         return found
 
     def keep_shown(self, text: str, *, digest: str, to: str) -> None:
@@ -115,9 +115,11 @@ class Desk:
         """Return a text that a page showed; None if it is no longer kept."""
         return self._shown.get(to, {}).get(digest)
 
-    def _look(self, folder: Path, file: str, columns: dict[str, str | int]) -> dict[str, Any]:
+    def _inspect_file(
+        self, folder: Path, file: str, columns: dict[str, str | int]
+    ) -> dict[str, Any]:
         try:
-            return self.workers.do("look_at_file", folder=str(folder), file=file, columns=columns)
+            return self.workers.do("inspect_file", folder=str(folder), file=file, columns=columns)
         except Failed as error:  # the file stopped its process; only its own row is affected
             return {**NOTHING_KNOWN, "remarks": [str(error)]}
 
@@ -196,15 +198,15 @@ class Ask:
             return None
         return show_job(self.desk.jobs.of(place), self.user, place)
 
-    def start(self, task: str, *, title: str, **given: Any) -> None:
+    def start(self, task: str, *, title: str, **arguments: Any) -> None:
         """Start a long task in the folder that the URL names.
 
         Parameters
         ----------
-        given : further arguments of the task.
+        arguments : further arguments of the task.
         """
         folder = self.folder()
-        self.desk.jobs.start(task, title=title, place=folder, folder=str(folder), **given)
+        self.desk.jobs.start(task, title=title, place=folder, folder=str(folder), **arguments)
 
     def stop(self, folder: Path) -> None:
         """Stop the job in a folder; what is already done stays."""
@@ -246,7 +248,7 @@ class Ask:
             "folder": folder,
             "job": self.job,
             # Reading the messages removes them, so that they are shown only once.
-            "said": lambda place="": self.desk.said.pop(self._room(place), []),
+            "messages": lambda place="": self.desk.messages.pop(self._room(place), []),
         }
         text = _environment().get_template(f"{template}.html.j2").render(everywhere | context)
         if prefix := self.request.scope.get("prefix"):
@@ -260,11 +262,11 @@ class Ask:
         """
         return Response(headers={"HX-Redirect": self.request.scope.get("prefix", "") + to})
 
-    def back(self, to: str, *said: str | Said, place: str = "") -> Response:
+    def back(self, to: str, *messages: str | Message, place: str = "") -> Response:
         """Return to a page that shows messages once, at its top or at its part `place`."""
-        if said:
-            lines = [Said(one) if isinstance(one, str) else one for one in said]
-            self.desk.said.setdefault(self._room(place), []).extend(lines)
+        if messages:
+            lines = [Message(one) if isinstance(one, str) else one for one in messages]
+            self.desk.messages.setdefault(self._room(place), []).extend(lines)
         return RedirectResponse(to, status_code=303)
 
 

@@ -21,19 +21,19 @@ class BenchSession(ShownSession):
 
     Attributes
     ----------
-    said : how the session ended; "" while it runs.
+    outcome : how the session ended; "" while it runs.
     """
 
-    def __init__(self, given: Mapping[str, Any]) -> None:
+    def __init__(self, request: Mapping[str, Any]) -> None:
         super().__init__()
-        self.port: str = given["port"]
-        self.explores = any(given["explore"])
-        self.said, self.failed = "", False
+        self.port: str = request["port"]
+        self.explores = any(request["explore"])
+        self.outcome, self.failed = "", False
         self.ended = threading.Event()
         self._state: dict[str, Any] = {}
         self._process = LineProcess("pipeline.desk.bench.process")
         with suppress(OSError):
-            self._process.send(json.dumps(given).encode() + b"\n")
+            self._process.send(json.dumps(request).encode() + b"\n")
         threading.Thread(target=self._listen, daemon=True).start()
 
     # ------------------------------------------------------------------ by the desk's pages
@@ -100,8 +100,8 @@ class BenchSession(ShownSession):
         try:
             while line := self._line():
                 self._take(**json.loads(line))
-            if not self.said:
-                self.said, self.failed = self._process.last_words(), True
+            if not self.outcome:
+                self.outcome, self.failed = self._process.last_words(), True
         finally:
             self._process.close()
             self.ended.set()
@@ -121,7 +121,7 @@ class BenchSession(ShownSession):
         failed: bool = False,
     ) -> None:
         """Store one report of the process: a state, points, or the end."""
-        self.said, self.failed = over, failed
+        self.outcome, self.failed = over, failed
         if state is not None:
             self._state = state
             self.version += 1
@@ -166,8 +166,8 @@ class Benches:
         with self._lock:
             before = self._sessions.get(folder)
             if before is None or before.ended.is_set():
-                given = {"folder": str(folder), "port": port, "only": only, "explore": explore}
-                self._sessions[folder] = BenchSession(given)
+                request = {"folder": str(folder), "port": port, "only": only, "explore": explore}
+                self._sessions[folder] = BenchSession(request)
             return self._sessions[folder]
 
     def close(self) -> None:

@@ -67,7 +67,7 @@ class Ending:
         if not isinstance(error, PipelineError | OSError):
             self._say(f"cartlab: the desk ends: {self._why}")
         faulthandler.disable()
-        self.note(f"{watch.SAID}{self._why}")
+        self.note(f"{watch.REASON}{self._why}")
         with suppress(OSError):
             if self._watch.stdin is not None:
                 self._watch.stdin.close()

@@ -24,20 +24,20 @@ SLIDE = 1.0  # decades from the usual size to each end of a slider
 _OWN = "custom chain"
 
 
-def look_at_exercise(
+def check_exercise(
     bench: Mapping[str, str], chosen: Sequence[Mapping[str, Any]], *, progress: Progress
 ) -> dict[str, Any]:
     """Return the chosen effects on a bench as a form shows them, or what is wrong with them."""
     try:
         plain = _prepare(bench)
     except ConfigError as error:
-        return {"wrong": str(error), "effects": [], "told": []}
+        return {"wrong": str(error), "effects": [], "sentences": []}
     effects = [_describe_effect(plain, entry) for entry in chosen]
     try:
-        told, wrong = _prepare(bench, [one["hide"] for one in effects]).effect_sentences, ""
+        sentences, wrong = _prepare(bench, [one["hide"] for one in effects]).effect_sentences, ""
     except ConfigError as error:
-        told, wrong = (), str(error)
-    return {"wrong": wrong, "effects": effects, "told": list(told)}
+        sentences, wrong = (), str(error)
+    return {"wrong": wrong, "effects": effects, "sentences": list(sentences)}
 
 
 def draw_effect(bench: Mapping[str, str], hide: str, *, progress: Progress) -> str:
@@ -77,7 +77,7 @@ def make_exercises(
     return [str(folder) for folder in made]
 
 
-def tell_hidden(bench: Mapping[str, str], hide: Sequence[str]) -> list[str]:
+def describe_hidden(bench: Mapping[str, str], hide: Sequence[str]) -> list[str]:
     """Return what is hidden in a bench, one sentence for each effect."""
     return list(_prepare(bench, hide).effect_sentences)
 

@@ -30,17 +30,17 @@ class Job:
 
     Attributes
     ----------
-    asked : name and arguments of the task.
-    said : the current stage; at the end the error, or the answer of the task if it is a text.
-    news : number that grows with every change of state or stage.
+    task : name and arguments of the task.
+    message : the current stage; at the end the error, or the answer of the task if it is a text.
+    version : number that grows with every change of state or stage.
     """
 
     title: str
     place: Path
-    asked: tuple[str, dict[str, Any]]
+    task: tuple[str, dict[str, Any]]
     state: State = "waiting"
-    said: str = "waiting for its turn"
-    news: int = 0
+    message: str = "waiting for its turn"
+    version: int = 0
     stop: threading.Event = field(default_factory=threading.Event)
     lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
@@ -49,16 +49,18 @@ class Job:
         """Whether the job has ended."""
         return self.state in ("done", "failed", "stopped")
 
-    def without_talk(self) -> "Job":
+    def without_message(self) -> "Job":
         """Return a copy that hides the stages, for a person who may not read them."""
-        return replace(self, title="Work in this folder", said="done" if self.over else "under way")
+        return replace(
+            self, title="Work in this folder", message="done" if self.over else "under way"
+        )
 
-    def tell(self, state: State, said: str) -> None:
+    def update(self, state: State, message: str) -> None:
         """Set the state and the stage."""
         with self.lock:
-            self.state, self.said, self.news = state, said, self.news + 1
+            self.state, self.message, self.version = state, message, self.version + 1
 
-    def at_this_moment(self) -> "Job":
+    def snapshot(self) -> "Job":
         """Return a copy whose state and stage belong together and no longer change."""
         with self.lock:
             return replace(self)
@@ -72,37 +74,37 @@ class Jobs:
         self._lock = threading.Lock()
         self._turns = threading.Semaphore(os.cpu_count() or 1)
 
-    def start(self, task: str, *, title: str, place: Path, **given: Any) -> Job:
+    def start(self, task: str, *, title: str, place: Path, **arguments: Any) -> Job:
         """Start a task; if the same task is running already, do nothing.
 
         Raises
         ------
         Busy : another job is running in the folder.
         """
-        asked = task, given
+        call = task, arguments
         with self._lock:
             before = self._jobs.get(place)
             if before and not before.over:
-                if before.asked != asked:
+                if before.task != call:
                     raise Busy(
                         f"{before.title} is running in this folder: wait until it ends, or stop "
                         "it first"
                     )
                 return before
-            job = self._jobs[place] = Job(title=title, place=place, asked=asked)
+            job = self._jobs[place] = Job(title=title, place=place, task=call)
         threading.Thread(target=self._run, args=(job,), daemon=True).start()
         return job
 
     def of(self, place: Path) -> Job | None:
         """Return the last job in a folder, as a copy that does not change."""
         job = self._jobs.get(place)
-        return job and job.at_this_moment()
+        return job and job.snapshot()
 
     def list_of(self, task: str) -> list[Job]:
         """Return the jobs of one task, the newest first."""
         with self._lock:
-            jobs = [job for job in reversed(self._jobs.values()) if job.asked[0] == task]
-        return [job.at_this_moment() for job in jobs]
+            jobs = [job for job in reversed(self._jobs.values()) if job.task[0] == task]
+        return [job.snapshot() for job in jobs]
 
     def close(self) -> None:
         """Stop all jobs, and wait until their processes have ended."""
@@ -114,23 +116,23 @@ class Jobs:
     def _run(self, job: Job) -> None:
         while not self._turns.acquire(timeout=_GLANCE):
             if job.stop.is_set():
-                return job.tell("stopped", "stopped before it began")
-        job.tell("running", "starting")
+                return job.update("stopped", "stopped before it began")
+        job.update("running", "starting")
         process = _worker()
         try:
             answer = process.do(
-                job.asked,
+                job.task,
                 limit=1800.0,
                 stop=job.stop,
-                progress=lambda stage: job.tell("running", stage),
+                progress=lambda stage: job.update("running", stage),
             )
-            job.tell("done", answer if isinstance(answer, str) else "done")
+            job.update("done", answer if isinstance(answer, str) else "done")
         except Failed as error:
-            job.tell("stopped" if job.stop.is_set() else "failed", str(error))
+            job.update("stopped" if job.stop.is_set() else "failed", str(error))
         except OSError as error:
-            job.tell("failed", f"its process could not be started ({error.strerror or error})")
+            job.update("failed", f"its process could not be started ({error.strerror or error})")
         except BaseException as error:  # shown on the waiting page; the log has the traceback
-            job.tell("failed", f"the desk itself failed ({type(error).__name__}: {error})")
+            job.update("failed", f"the desk itself failed ({type(error).__name__}: {error})")
             raise
         finally:
             process.close()
@@ -154,7 +156,7 @@ class WorkerPool:
         self._lock, self._starting = threading.Lock(), threading.Lock()
         self._folders: dict[str, tuple[threading.Semaphore, threading.Lock]] = {}
 
-    def do(self, task: str, **given: Any) -> Any:
+    def do(self, task: str, **arguments: Any) -> Any:
         """Run a task and return its answer.
 
         Raises
@@ -162,12 +164,12 @@ class WorkerPool:
         Failed : the task failed; the text says why. The next task is not affected.
         Busy : too many requests already wait for the folder.
         """
-        with self._turn(given.get("folder")):
+        with self._turn(arguments.get("folder")):
             process = self._free.get()
             try:
                 if self._closed.is_set():
                     raise Failed("the desk is ending")
-                return process.do((task, given), limit=180.0, stop=self._closed)
+                return process.do((task, arguments), limit=180.0, stop=self._closed)
             finally:
                 if process.runs or self._closed.is_set():
                     self._free.put(process)

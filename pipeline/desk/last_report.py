@@ -13,9 +13,9 @@ from pipeline.submission.load import MAX_NOTES_BYTES, NAME, list_experiments, ou
 from pipeline.submission.toml_file import read_text
 
 # A file next to the report: its questions, assumptions, findings, and state of its sources.
-ASKED = "questions.json"
+FINDINGS = "questions.json"
 NOTES = "notes.md"
-NOTHING_TOLD: Mapping[str, Any] = {
+NO_FINDINGS: Mapping[str, Any] = {
     "questions": [], "assumed": [], "contradicted": [], "failed": [], "changes": "", "turned": {},
 }  # fmt: skip
 PLOTS = "report/compare.html"
@@ -30,8 +30,8 @@ def stat_sources(folder: Path) -> dict[str, list[int]]:
     data = (path.relative_to(folder).as_posix() for path in (folder / "data").rglob("*"))
     named = (str(table.get("file", "")) for table in list_experiments(_read_document(folder)))
     names = sorted({NAME, NOTES, "gap/gap.json", *data, *named})
-    there = [name for name in names if outside(folder, name) is None]
-    infos = {name: (folder / name).stat() for name in there}
+    present = [name for name in names if outside(folder, name) is None]
+    infos = {name: (folder / name).stat() for name in present}
     return {name: [info.st_mtime_ns, info.st_size] for name, info in infos.items()}
 
 
@@ -43,7 +43,7 @@ def find_state(folder: Path) -> str:
     """
     if outside(folder, "report/report.html") is not None:
         return "none"
-    made_of, now = _read_asked(folder).get("made_of"), stat_sources(folder)
+    made_of, now = _read_findings_file(folder).get("made_of"), stat_sources(folder)
     if made_of == now:
         return "current"
     if not isinstance(made_of, dict):
@@ -58,9 +58,9 @@ def plots_are_current(folder: Path) -> bool:
     return _read_small(folder, PLOTS_OF).get("made_of") == stat_sources(folder)
 
 
-def read_told(folder: Path) -> dict[str, Any]:
+def read_findings(folder: Path) -> dict[str, Any]:
     """Return what the last report assumed, asked and found wrong, if its file can be read."""
-    read = _read_asked(folder)
+    read = _read_findings_file(folder)
     try:
         return {
             "questions": _pick_texts(read["questions"], ("id", "section", "text")),
@@ -71,7 +71,7 @@ def read_told(folder: Path) -> dict[str, Any]:
             "turned": {str(run): int(sign) for run, sign in read.get("turned", {}).items()},
         }
     except (KeyError, TypeError, ValueError, AttributeError):
-        return dict(NOTHING_TOLD)
+        return dict(NO_FINDINGS)
 
 
 def _pick_assumptions(found: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -92,7 +92,7 @@ def list_unanswered(folder: Path) -> list[dict[str, str]]:
         notes = ""
     return [
         one
-        for one in read_told(folder)["questions"]
+        for one in read_findings(folder)["questions"]
         if not written_answer(notes, one["id"]).strip()
     ]
 
@@ -112,8 +112,8 @@ def read_notes(folder: Path) -> str:
     return read_text(folder / NOTES, where=where, limit=MAX_NOTES_BYTES, error=SubmissionError)
 
 
-def _read_asked(folder: Path) -> dict[str, Any]:
-    return _read_small(folder, f"report/{ASKED}")
+def _read_findings_file(folder: Path) -> dict[str, Any]:
+    return _read_small(folder, f"report/{FINDINGS}")
 
 
 def _read_small(folder: Path, name: str) -> dict[str, Any]:

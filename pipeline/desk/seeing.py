@@ -59,6 +59,6 @@ def show_job(job: Job | None, user: User, folder: Path) -> Job | None:
     The job's stages are hidden if they could show numbers, because others may make a report in the
     folder.
     """
-    if job is None or job.asked[0] in _TELLS_NONE or not sees_check(user, folder):
+    if job is None or job.task[0] in _TELLS_NONE or not sees_check(user, folder):
         return job
-    return job.without_talk()
+    return job.without_message()

@@ -12,13 +12,13 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.desk.exercises import (
+    check_exercise,
+    describe_hidden,
     draw_effect,
-    look_at_exercise,
     make_exercises,
     make_solution,
-    tell_hidden,
 )
-from pipeline.desk.last_report import ASKED, PLOTS_OF, stat_sources
+from pipeline.desk.last_report import FINDINGS, PLOTS_OF, stat_sources
 from pipeline.desk.typed import read_path
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.identify.springs import fill as fill_folder
@@ -49,7 +49,7 @@ from pipeline.words.progress import Progress
 _ACROSS, _HIGH = 120, 32  # width and height of a thumbnail
 
 
-def look_at_file(
+def inspect_file(
     folder: str, file: str, columns: dict[str, str | int], *, progress: Progress
 ) -> dict[str, Any]:
     """Return what a data file contains, with a thumbnail.
@@ -89,7 +89,7 @@ def list_doubts(folder: str, *, progress: Progress) -> dict[str, Any]:
     system = system_doubts(Path(folder))
     asked = "springs" in system
     return {
-        "system": {key: said.removeprefix(UNSURE) for key, said in system.items()},
+        "system": {key: doubt.removeprefix(UNSURE) for key, doubt in system.items()},
         "springs": find_springs(load_submission(Path(folder))).open if asked else (),
         "experiments": experiment_doubts(Path(folder)),
     }
@@ -108,7 +108,7 @@ def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
     from pipeline.report.sections.questions import ask
     from pipeline.words.text import with_symbols
 
-    def tell(one: Assumption) -> dict[str, Any]:
+    def describe(one: Assumption) -> dict[str, Any]:
         return {
             "key": one.key,
             "about": one.about,
@@ -135,11 +135,11 @@ def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
             {"id": one.id, "section": one.section, "text": with_symbols(one.text)}
             for one in ask(analysis)
         ]
-        told = {
+        findings = {
             "questions": asked,
-            "assumed": [tell(one) for one in analysis.assumptions if one.origin != "stated"],
+            "assumed": [describe(one) for one in analysis.assumptions if one.origin != "stated"],
             "contradicted": [
-                tell(one) for one in analysis.assumptions if one.support == "contradicted"
+                describe(one) for one in analysis.assumptions if one.support == "contradicted"
             ],
             "changes": with_symbols(changes_line(changes)) if changes else "",
             "failed": [with_symbols(check.message) for check in analysis.failed_checks],
@@ -149,8 +149,8 @@ def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
             "unreadable": dict(analysis.unreadable),
             "made_of": made_of,
         }
-        write_file(out / ASKED, json.dumps(told, ensure_ascii=False))
-    return told
+        write_file(out / FINDINGS, json.dumps(findings, ensure_ascii=False))
+    return findings
 
 
 def make_gap(folder: str, *, progress: Progress) -> None:
@@ -249,7 +249,7 @@ def describe_exercise(
     submission = load_submission(Path(folder))
     first = {record.kind: record for record in reversed(read_data(submission).records)}
     return {
-        "told": tell_hidden(bench, hide),
+        "sentences": describe_hidden(bench, hide),
         "files": data_files(Path(folder)),
         "records": [
             {"id": record.id, "kind": record.kind, "lines": _draw_lines(list(record.y))}
@@ -317,23 +317,23 @@ def preview_rubric(folder: str, text: str, *, progress: Progress) -> dict[str, A
 TASKS: Mapping[str, Callable[..., Any]] = {
     task.__name__: task
     for task in (
-        look_at_file, list_files, list_not_read, list_doubts, fill_tables, make_report, make_gap,
+        inspect_file, list_files, list_not_read, list_doubts, fill_tables, make_report, make_gap,
         check_numbers, unpack_upload, propose_recordings, weigh_recording, publish_grades,
-        regrade_class, preview_rubric, look_at_exercise, draw_effect, make_exercises,
+        regrade_class, preview_rubric, check_exercise, draw_effect, make_exercises,
         make_solution, describe_exercise, make_plots,
     )
 }  # fmt: skip
 
 
-def do(asked: tuple[str, Mapping[str, Any]], tell: Progress) -> Any:
+def do(task: tuple[str, Mapping[str, Any]], progress: Progress) -> Any:
     """Run a task and return its answer.
 
     Parameters
     ----------
     asked : name and arguments of the task.
     """
-    name, given = asked
-    return TASKS[name](**given, progress=tell)
+    name, arguments = task
+    return TASKS[name](**arguments, progress=progress)
 
 
 def _describe(found: Found) -> dict[str, Any]:

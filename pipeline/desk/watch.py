@@ -10,7 +10,7 @@ import signal
 import sys
 from datetime import UTC, datetime
 
-SAID = "ends: "  # precedes the reason when the desk itself reports its end
+REASON = "ends: "  # precedes the reason when the desk itself reports its end
 
 
 def main() -> None:
@@ -20,16 +20,16 @@ def main() -> None:
         if (number := getattr(signal, name, None)) is not None:
             signal.signal(number, signal.SIG_IGN)
     path, process = sys.argv[1:]
-    said = crashed = False
+    explained = crashed = False
     for raw in sys.stdin.buffer:
         line = raw.decode(errors="replace").rstrip("\n")
         own = line.startswith("\t")
-        said = said or line.startswith(f"\t{SAID}")
+        explained = explained or line.startswith(f"\t{REASON}")
         _log(path, process, line.lstrip("\t"))
         if not own:
             _say(line)
             crashed = True
-    if not said:
+    if not explained:
         why = "was killed: by kill -9, by the system for lack of memory, or by a library"
         if crashed:
             why = "crashed: the lines above say where"

@@ -3,19 +3,19 @@
 "use strict";
 htmx.onLoad(() => {
   const shown = document.querySelector("[data-events]");
-  if (shown && !shown.dataset.heard) {
-    shown.dataset.heard = "yes";
-    const news = new EventSource(shown.dataset.events);
+  if (shown && !shown.dataset.followed) {
+    shown.dataset.followed = "yes";
+    const events = new EventSource(shown.dataset.events);
     const end = () => {
-      news.close();
+      events.close();
       if (shown.isConnected)
         htmx.ajax("GET", location.pathname, { target: "#main", select: "#main > *", swap: "innerHTML show:none" });
     };
-    news.addEventListener("stage", (event) => {
-      if (!shown.isConnected) return news.close();
+    events.addEventListener("stage", (event) => {
+      if (!shown.isConnected) return events.close();
       shown.querySelector("span").textContent = event.data;
     });
-    news.addEventListener("end", end);
+    events.addEventListener("end", end);
   }
   for (const place of document.querySelectorAll(".drop:not([data-open])")) {
     place.dataset.open = "yes";
@@ -35,8 +35,8 @@ htmx.onLoad(() => {
   }
 });
 document.addEventListener("htmx:sendError", () => {
-  const said = document.querySelector("[role=status]");
-  said.textContent = "No answer: the desk has stopped, or the upload is too large.";
+  const status = document.querySelector("[role=status]");
+  status.textContent = "No answer: the desk has stopped, or the upload is too large.";
 });
 
 // An answer replaces all of #main. Of each page, by its heading, is kept what was typed and not sent with the request; it goes

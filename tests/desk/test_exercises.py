@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.desk.app import DeskServer
-from pipeline.desk.exercises import look_at_exercise
+from pipeline.desk.exercises import check_exercise
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.nonlinear.effects import CATALOGUE
 from tests.helpers.desks import Visitor, a_submission
@@ -50,12 +50,12 @@ def test_every_effect_has_valid_sizes_on_its_slider():
         for effect in CATALOGUE:
             if chain.n < effect.fewest_carts or (effect.between_carts and chain.n < 2):
                 continue
-            found = look_at_exercise(
+            found = check_exercise(
                 {"preset": preset},
                 [{"key": effect.key, "place": "", "sizes": {}}],
                 progress=print,
             )
-            assert (found["wrong"], len(found["told"])) == ("", 1)
+            assert (found["wrong"], len(found["sentences"])) == ("", 1)
             assert all(p["slide"] == "0" for p in found["effects"][0]["parameters"])
 
 
@@ -64,7 +64,7 @@ def test_a_moved_slider_or_a_typed_number_counts():
 
     def force(preset: str, **size: str) -> dict[str, str]:
         chosen = [{"key": "coulomb_friction", "place": "1", "sizes": {"force": size}}]
-        found = look_at_exercise({"preset": preset}, chosen, progress=print)
+        found = check_exercise({"preset": preset}, chosen, progress=print)
         return found["effects"][0]["parameters"][0]
 
     usual = force("throne-2dof")["value"]

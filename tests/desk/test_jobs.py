@@ -78,7 +78,7 @@ def test_a_process_that_does_not_start_ends_its_job(tmp_path, jobs, monkeypatch)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "nothing"))
     job = jobs.start("make_report", title="The report", place=tmp_path, folder=str(tmp_path))
     until(lambda: job.over)
-    assert (job.state, "its process could not be started" in job.said) == ("failed", True)
+    assert (job.state, "its process could not be started" in job.message) == ("failed", True)
 
 
 def test_a_failed_task_shows_its_last_lines(tmp_path, jobs):
@@ -86,7 +86,7 @@ def test_a_failed_task_shows_its_last_lines(tmp_path, jobs):
     job = jobs.start("nonsense", title="Nonsense", place=tmp_path)
     until(lambda: job.over)
     assert job.state == "failed"
-    assert "KeyError: 'nonsense'" in job.said
+    assert "KeyError: 'nonsense'" in job.message
 
 
 def test_a_folder_has_one_task_at_a_time(tmp_path, jobs):
@@ -250,7 +250,7 @@ def test_a_job_whose_thread_fails_is_over(jobs, monkeypatch, tmp_path):
     monkeypatch.setattr("pipeline.processes.LineProcess", no_more)
     job = jobs.start("make_report", title="The report", place=tmp_path, folder=str(tmp_path))
     until(lambda: job.over and raised)
-    assert (job.state, job.said) == ("failed", "the desk itself failed (MemoryError: no more)")
+    assert (job.state, job.message) == ("failed", "the desk itself failed (MemoryError: no more)")
 
 
 def test_workers_end_with_a_killed_desk(tmp_path):

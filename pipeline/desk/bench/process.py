@@ -21,16 +21,16 @@ def main() -> None:
     """Acquire or explore as stdin says, and write the events to stdout."""
     say = answering()
     sent = lines_sent()
-    given = json.loads(next(sent))
-    folder = Path(given["folder"])
+    request = json.loads(next(sent))
+    folder = Path(request["folder"])
     state, is_over = LiveState(folder), threading.Event()
     threading.Thread(target=_press_buttons, args=(sent, state), daemon=True).start()
-    telling = threading.Thread(target=_tell_news, args=(state, say, is_over))
-    telling.start()
+    writer = threading.Thread(target=_write_events, args=(state, say, is_over))
+    writer.start()
     end: dict[str, Any] = {}
     try:
-        work = _explore if any(given["explore"]) else _acquire
-        end = {"over": work(folder, given, state)}
+        work = _explore if any(request["explore"]) else _acquire
+        end = {"over": work(folder, request, state)}
     except KeyboardInterrupt:
         end = {"over": "Stopped. Start again to continue."}
     except (PipelineError, OSError) as error:
@@ -38,31 +38,31 @@ def main() -> None:
     finally:
         state.end()
         is_over.set()
-        telling.join()
+        writer.join()
     say(**end)
 
 
-def _acquire(folder: Path, given: dict[str, Any], state: LiveState) -> str:
+def _acquire(folder: Path, request: dict[str, Any], state: LiveState) -> str:
     """Acquire recordings; return a sentence on what was recorded."""
     outcomes = acquire(
-        folder, port=given["port"], observers=[state], only=given["only"], buttons=state.buttons
+        folder, port=request["port"], observers=[state], only=request["only"], buttons=state.buttons
     )
     whole = {outcome.recording.id for outcome in outcomes if not outcome.partial}
     left = sorted({outcome.recording.id for outcome in outcomes} - whole)
-    told = [f"{len(whole)} recorded", *([f"not recorded: {', '.join(left)}"] if left else [])]
-    return "; ".join(told)
+    parts = [f"{len(whole)} recorded", *([f"not recorded: {', '.join(left)}"] if left else [])]
+    return "; ".join(parts)
 
 
-def _explore(folder: Path, given: dict[str, Any], state: LiveState) -> str:
+def _explore(folder: Path, request: dict[str, Any], state: LiveState) -> str:
     """Explore; return a sentence on what is known at the end."""
     from pipeline.experiments.exploring.at_bench import explore_bench
     from pipeline.experiments.exploring.error_goal import read_error_goal, read_time
     from pipeline.words.text import with_symbols
 
-    until, limit = given["explore"]
+    until, limit = request["explore"]
     turns = explore_bench(
         folder,
-        port=given["port"],
+        port=request["port"],
         observers=[state],
         buttons=state.buttons,
         goal=read_error_goal(until),
@@ -72,7 +72,7 @@ def _explore(folder: Path, given: dict[str, Any], state: LiveState) -> str:
     return f"{reached}: {with_symbols(turns[-1].said)}."
 
 
-def _tell_news(state: LiveState, say: Callable[..., None], is_over: threading.Event) -> None:
+def _write_events(state: LiveState, say: Callable[..., None], is_over: threading.Event) -> None:
     """Write the state of the session whenever it changes; nothing if the session never began.
 
     Parameters
@@ -80,8 +80,8 @@ def _tell_news(state: LiveState, say: Callable[..., None], is_over: threading.Ev
     is_over : set when the session has ended.
     """
     begun = last = False
-    for news in state.follow(version=1):
-        for kind, data in news:
+    for events in state.follow(version=1):
+        for kind, data in events:
             begun = begun or data.get("phase") != "over"
             if begun:
                 say(**{kind: data})

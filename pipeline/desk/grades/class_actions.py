@@ -37,10 +37,10 @@ def take_table(ask: Ask) -> Response:
             raise ConfigError(f"line {wish.line}: no submission of this class has this name")
         meant.append(replace(wish, submission=teams[wish.submission]))
     done = open_book(ask).change_all(meant, by=by)
-    said = f"{count(done.teams, 'change')} imported"
+    message = f"{count(done.teams, 'change')} imported"
     if unchanged := len(meant) - done.teams:
-        said += f"; {count(unchanged, 'row')} changed nothing"
-    return ask.back(ask.here, f"{said}.")
+        message += f"; {count(unchanged, 'row')} changed nothing"
+    return ask.back(ask.here, f"{message}.")
 
 
 def release(ask: Ask) -> Response:
@@ -51,8 +51,8 @@ def release(ask: Ask) -> Response:
         )
     released = ask.text("do") == "release"
     open_book(ask).release(released, by=sign(ask))
-    said = "Students can read their feedback." if released else "Students can no longer read it."
-    return ask.back(f"{ask.here}#work", said)
+    message = "Students can read their feedback." if released else "Students can no longer read it."
+    return ask.back(f"{ask.here}#work", message)
 
 
 def export_class(ask: Ask) -> Response:

@@ -130,9 +130,9 @@ def count_lost(shown: Class, titles: Mapping[str, str]) -> list[Counted]:
 def show_news(ask: Ask) -> Response:
     """Show which points were changed since a page was loaded; empty if none were."""
     shown = read_class(ask)
-    since, told = (_read_number(ask, name) for name in ("since", "told"))
+    since, latest = (_read_number(ask, name) for name in ("since", "told"))
     answer = ask.page("news", title="", news=list_news(ask, shown, since=since))
-    if shown.state[1] == told:
+    if shown.state[1] == latest:
         answer.headers["HX-Reswap"] = "none"
     return answer
 
@@ -144,21 +144,21 @@ def list_news(ask: Ask, shown: Class, *, since: int) -> dict[str, Any]:
     ----------
     since : number of the last change that the page knows.
     """
-    changes, told = [], shown.state[1]
+    changes, latest = [], shown.state[1]
     about = ask.query("of")
-    if told != since:
+    if latest != since:
         of_name = {team.submission: name for name, team in shown.teams.items()}
         titles = {asked.id: asked.title for asked in shown.rubric.criteria}
         for submission, override in open_book(ask).changes_since(since):
             name = of_name.get(submission, STRANGER)
-            given = "as graded" if override.points is None else points_text(override.points)
-            given = "a comment" if override.comment else given
+            points = "as graded" if override.points is None else points_text(override.points)
+            points = "a comment" if override.comment else points
             what = titles.get(override.criterion) or override.criterion
             at = to_the_second(override.at)
-            text = f"{what}: {given}, by {override.by}: {override.why} ({at})"
+            text = f"{what}: {points}, by {override.by}: {override.why} ({at})"
             changes.append({"name": name, "text": text, "mine": name == about})
     more = len(changes) - _MOST_NEWS
-    return {"since": since, "told": told, "changes": changes[::-1][:_MOST_NEWS],
+    return {"since": since, "told": latest, "changes": changes[::-1][:_MOST_NEWS],
             "more": max(more, 0), "of": about}  # fmt: skip
 
 

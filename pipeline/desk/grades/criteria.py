@@ -109,7 +109,7 @@ def describe_criterion(
     typed : refused fields of the criterion's form (points, other, why), and the reason (wrong).
     """
     own = next((c for c in grade.criteria if c.id == asked.id), None)
-    given = now.entry.overrides.get(asked.id) or now.entry.comments.get(asked.id)
+    by_hand = now.entry.overrides.get(asked.id) or now.entry.comments.get(asked.id)
     points = points_text(own.points) if own else ""
     steps = list_steps(asked.points, now.rubric)
     chosen = typed.get("points") or points
@@ -131,15 +131,15 @@ def describe_criterion(
         "wrong": typed.get("wrong", ""),
         "version": now.versions[asked.id],
         "changed": asked.id in now.changed,
-        "by_hand": _say_given(given) if given else "",
-        "is_comment": given is not None and given.comment,
-        "own_reason": given.why if given else "",
+        "by_hand": _describe_by_hand(by_hand) if by_hand else "",
+        "is_comment": by_hand is not None and by_hand.comment,
+        "own_reason": by_hand.why if by_hand else "",
     }
 
 
-def _say_given(given: HandPoints) -> str:
-    what = "Comment by" if given.comment else "Points by hand,"
-    return f"{what} {given.by}: {given.why}"
+def _describe_by_hand(by_hand: HandPoints) -> str:
+    what = "Comment by" if by_hand.comment else "Points by hand,"
+    return f"{what} {by_hand.by}: {by_hand.why}"
 
 
 def describe_flag(flag: Flag, units: Units | None) -> dict[str, Any]:

@@ -38,18 +38,18 @@ def act(ask: Ask) -> Response:
     try:
         if what == "reopen":
             book.reopen(name, criterion, by=by, seen=seen)
-            said = "Reopened: the team may ask once more."
+            message = "Reopened: the team may ask once more."
         elif what == "answer":
             points = _read_points(ask.text("points"))
             book.answer(name, criterion, points, text=ask.text("text"), by=by, seen=seen)
-            said = f"Answered: {team.line.submission}, {_find_title(shown.rubric, criterion)}."
+            message = f"Answered: {team.line.submission}, {_find_title(shown.rubric, criterion)}."
         else:
             raise HTTPException(400, "there is no such button")
     except Conflict as conflict:
         return _show_conflict(ask, shown, conflict)
     except ConfigError as error:
         return _show_page(ask, wrong=str(error), status=422)
-    return ask.back(_write_address(ask, ask.query("of")), said)
+    return ask.back(_write_address(ask, ask.query("of")), message)
 
 
 def _read_points(typed: str) -> float | None:
@@ -106,7 +106,7 @@ def _describe(ask: Ask, queued: Queued, shown: Class, name: str, *, wrong: str) 
         "title": _find_title(rubric, request.criterion),
         "points": points_text(own.points) if own else NOTHING,
         "out_of": points_text(asked.points) if asked else NOTHING,
-        "said": with_symbols(sentence(own.message)) if own else "",
+        "message": with_symbols(sentence(own.message)) if own else "",
         "address": f"{ask.here}team?{urlencode(place)}#chosen",
         "steps": describe_steps(request.events, **hidden),
         "state": request.state,

@@ -38,7 +38,7 @@ class Row:
     moved : whether somebody has changed the points since the list was shown.
     now, after : points of the criterion before and after the change.
     total_now, total_after : points of the submission before and after the change.
-    said : the current message of the criterion.
+    message : the current message of the criterion.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Row:
     after: str
     total_now: str
     total_after: str
-    said: str
+    message: str
 
 
 def show(ask: Ask) -> Response:
@@ -77,10 +77,10 @@ def apply(ask: Ask) -> Response:
     except ConfigError as error:
         text = capital(str(error).replace(" (--why)", "").replace(" (--by)", ""))
         return _show_page(ask, wrong=f"{text}. Nothing was changed.", status=422)
-    said = f"{count(done.teams, 'team')} changed in “{capital(asked.title or asked.id)}”."
+    message = f"{count(done.teams, 'team')} changed in “{capital(asked.title or asked.id)}”."
     if unchanged := len(wishes) - done.teams:
-        said += f" {unchanged} had these points already."
-    return ask.back(_address(ask, done=done.at if done.teams else ""), said, place=_DONE)
+        message += f" {unchanged} had these points already."
+    return ask.back(_address(ask, done=done.at if done.teams else ""), message, place=_DONE)
 
 
 def _undo(ask: Ask) -> Response:
@@ -89,14 +89,14 @@ def _undo(ask: Ask) -> Response:
     if ask.text("set") not in [one.at for one in book.changed_together(least=1)]:
         raise HTTPException(404, "there is no such change in this class")
     undone = book.undo_all(ask.text("set"), by=sign(ask))
-    said = f"{count(undone.back, 'team')} undone."
+    message = f"{count(undone.back, 'team')} undone."
     if undone.kept:
         names = {team.submission: name for name, team in shown.teams.items()}
         kept = ", ".join(sorted(names.get(one, STRANGER) for one in undone.kept))
-        said += f" Kept, because they changed since: {kept}."
+        message += f" Kept, because they changed since: {kept}."
     if not ask.query("criterion"):  # the button was in the list on the class page
-        return ask.back(f"{ask.here}#sets", said, place=_DONE)
-    return ask.back(_address(ask, done=undone.at if undone.back else ""), said, place=_DONE)
+        return ask.back(f"{ask.here}#sets", message, place=_DONE)
+    return ask.back(_address(ask, done=undone.at if undone.back else ""), message, place=_DONE)
 
 
 def _address(ask: Ask, *, done: str) -> str:
@@ -248,5 +248,5 @@ def _row(ask: Ask, name: str, one: Tried, *, asked: Criterion, ticked: bool) -> 
         after=own(one.after),
         total_now=points_text(one.now.points),
         total_after=points_text(one.after.points),
-        said=with_symbols(next(messages, "")),
+        message=with_symbols(next(messages, "")),
     )

@@ -26,7 +26,7 @@ _SHOWN_ON = "throne-2dof"  # the smallest bench with a spring between two carts
 def show(ask: Ask) -> Response:
     """Show the form as filled in, with a picture of every chosen effect."""
     sent = ask.request.query_params
-    bench, found = _look_at_exercise(ask)
+    bench, found = _check_exercise(ask)
     pictures = [_write_picture_url(bench, one["hide"]) for one in found["effects"]]
     return ask.page(
         "exercises",
@@ -53,7 +53,7 @@ def draw(ask: Ask) -> Response:
 
 def make(ask: Ask) -> Response:
     """Start the task that makes an exercise, or one for each team of a class."""
-    bench, found = _look_at_exercise(ask)
+    bench, found = _check_exercise(ask)
     if found["wrong"]:
         raise ConfigError(found["wrong"])
     out = _read_folder(ask)
@@ -78,19 +78,19 @@ def show_made(ask: Ask) -> Response:
     """Show the progress of an exercise, or the exercise when it is finished."""
     out = _read_folder(ask)
     job = ask.desk.jobs.of(out)
-    if job is None or job.asked[0] != "make_exercises":
+    if job is None or job.task[0] != "make_exercises":
         raise HTTPException(404, "no exercise was made there")
-    given = job.asked[1]
+    arguments = job.task[1]
     # The job numbers its folders in this order; a stopped job has made only the first ones.
-    folders = [out] if len(given["seeds"]) == 1 else sorted(out.glob("*/"))
+    folders = [out] if len(arguments["seeds"]) == 1 else sorted(out.glob("*/"))
     made = [
         (folder, seed)
-        for folder, seed in zip(folders, given["seeds"], strict=False)
+        for folder, seed in zip(folders, arguments["seeds"], strict=False)
         if (folder / NAME).is_file()
     ]
-    what: dict[str, Any] = {"told": [], "files": [], "records": []}
+    what: dict[str, Any] = {"sentences": [], "files": [], "records": []}
     if job.over and made:
-        bench, hide = given["bench"], given["hide"]
+        bench, hide = arguments["bench"], arguments["hide"]
         what = ask.desk.workers.do(
             "describe_exercise", bench=bench, hide=hide, folder=str(made[0][0])
         )
@@ -100,7 +100,7 @@ def show_made(ask: Ask) -> Response:
         out=out,
         job=job,
         made=made,
-        bench=given["bench"],
+        bench=arguments["bench"],
         **what,
     )
 
@@ -142,7 +142,7 @@ def _free_folder(root: Path) -> Path:
     return next(root / name for name in names if not (root / name).exists())
 
 
-def _look_at_exercise(ask: Ask) -> tuple[dict[str, str], dict[str, Any]]:
+def _check_exercise(ask: Ask) -> tuple[dict[str, str], dict[str, Any]]:
     """Return the bench of the form, and what the worker process finds about it and its effects."""
     bench = _read_bench(ask)
     known = {effect.key: effect for effect in CATALOGUE}
@@ -161,7 +161,7 @@ def _look_at_exercise(ask: Ask) -> tuple[dict[str, str], dict[str, Any]]:
         for key in dict.fromkeys(ask.sent.getlist("effect"))
         if isinstance(key, str) and key in known
     ]
-    return bench, ask.desk.workers.do("look_at_exercise", bench=bench, chosen=chosen)
+    return bench, ask.desk.workers.do("check_exercise", bench=bench, chosen=chosen)
 
 
 def _read_bench(ask: Ask) -> dict[str, str]:

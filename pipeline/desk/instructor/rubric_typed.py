@@ -98,11 +98,11 @@ def typed_rubric(edited: str, typed: Mapping[str, str]) -> TypedRubric:
         text = with_values(edited, changed_fields(form, typed))
     except ConfigError as error:
         problems = error.problems if isinstance(error, WrongFields) else {"": str(error)}
-        told = [
+        mistakes = [
             Mistake(line=0, what=f"{name}: {what}" if name else what)
             for name, what in problems.items()
         ]
-        return TypedRubric(text=edited, edited=edited, rubric=None, mistakes=told, form=form,
+        return TypedRubric(text=edited, edited=edited, rubric=None, mistakes=mistakes, form=form,
                            typed=typed, wrong=problems)  # fmt: skip
     rubric, mistakes = _parsed(text)
     if rubric is None:

@@ -7,7 +7,7 @@ from starlette.responses import Response
 
 from pipeline.desk.ask import Ask
 from pipeline.desk.student.check_state import load_if_sound
-from pipeline.desk.student.room import look_around
+from pipeline.desk.student.room import read_room
 from pipeline.errors import SubmissionError
 from pipeline.grading.self_check.log import CheckAnswer, find_basis, read_answers
 from pipeline.grading.self_check.words import (
@@ -37,7 +37,7 @@ def show(ask: Ask) -> Response:
     return ask.page(
         "check",
         title=f"Check of {folder.name}",
-        room=look_around(ask),
+        room=read_room(ask),
         busy=busy,
         problems=problems,
         ready=submission is not None and submission.reported is not None,
@@ -67,7 +67,7 @@ def _describe_rows(
     current: CheckAnswer, answers: Sequence[CheckAnswer], submission: Submission
 ) -> list[dict[str, Any]]:
     """Return a row for each number that disagrees, with its hint if there is one."""
-    told = {
+    hints = {
         hint.number: hint_words(hint)
         for answer in answers
         if answer.basis == current.basis
@@ -78,7 +78,7 @@ def _describe_rows(
             "number": number,
             "name": number_words(number),
             "typed": _find_typed(number, submission),
-            "hint": told.get(number),
+            "hint": hints.get(number),
         }
         for number in current.disagree
     ]

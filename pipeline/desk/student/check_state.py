@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-from pipeline.desk.student.way import Stands
+from pipeline.desk.student.way import Status
 from pipeline.errors import SubmissionError
 from pipeline.grading.self_check.log import find_basis, read_answers
 from pipeline.submission import Submission, load_submission
 
 
-def tell_state(folder: Path) -> Stands:
+def find_check_state(folder: Path) -> Status:
     """Return the state of the check (done, needs, old or none), and a word for it."""
     submission, problems = load_if_sound(folder)
     try:

@@ -17,7 +17,7 @@ def ask_doubts(
     *,
     fractions: Sequence[str],
     doubts: Mapping[str, Any],
-    told: Mapping[str, Any],
+    findings: Mapping[str, Any],
 ) -> tuple[Field, ...]:
     """Return the fields of the set-up; each doubtful one has a question and possible answers.
 
@@ -25,17 +25,21 @@ def ask_doubts(
     ----------
     fractions : files whose positions are not whole numbers.
     doubts : what `submission.toml` marks as unsure; see `tasks.list_doubts`.
-    told : assumptions and contradictions of the current report.
+    findings : assumptions and contradictions of the current report.
     """
     return tuple(
         replace(field, asked=asked, answers=answers) if asked else field
         for field in fields
-        for asked, answers in [_ask(field, fractions=fractions, doubts=doubts, told=told)]
+        for asked, answers in [_ask(field, fractions=fractions, doubts=doubts, findings=findings)]
     )
 
 
 def _ask(
-    field: Field, *, fractions: Sequence[str], doubts: Mapping[str, Any], told: Mapping[str, Any]
+    field: Field,
+    *,
+    fractions: Sequence[str],
+    doubts: Mapping[str, Any],
+    findings: Mapping[str, Any],
 ) -> tuple[str, tuple[Answer, ...]]:
     if field.path == "system.position.unit" and (
         doubt := unit_doubt(field.value or "count", fractions=fractions)
@@ -44,18 +48,20 @@ def _ask(
         return doubt, (Answer(label="Use cm", value="cm"),) if known else ()
     if field.path == "system.springs" and "springs" in doubts["system"]:
         return doubts["system"]["springs"], _list_springs(field, doubts["springs"])
-    wrong = [one for one in told["contradicted"] if one["key"] == field.path]
+    wrong = [one for one in findings["contradicted"] if one["key"] == field.path]
     if wrong and (answers := _contradict(field, wrong)):
         return "; ".join(_name(one, one["why"]) for one in wrong), answers
-    taken = [one for one in told["assumed"] if one["key"] == field.path]
-    if any(one["support"] == "open" for one in taken) and (answers := _confirm(field, taken)):
-        said = listing(list(dict.fromkeys(_name(one, one["taken"]) for one in taken)))
-        return f"not stated, and the data do not show it; assumed: {said}", answers
+    assumptions = [one for one in findings["assumed"] if one["key"] == field.path]
+    if any(one["support"] == "open" for one in assumptions) and (
+        answers := _confirm(field, assumptions)
+    ):
+        assumed = listing(list(dict.fromkeys(_name(one, one["taken"]) for one in assumptions)))
+        return f"not stated, and the data do not show it; assumed: {assumed}", answers
     return "", ()
 
 
-def _name(one: Mapping[str, str], said: str) -> str:
-    return f"{one['about']}: {said}" if one["about"] else said
+def _name(one: Mapping[str, str], value: str) -> str:
+    return f"{one['about']}: {value}" if one["about"] else value
 
 
 def _list_springs(field: Field, unknown: Sequence[int]) -> tuple[Answer, ...]:

@@ -8,7 +8,7 @@ from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
-from pipeline.desk.ask import Said
+from pipeline.desk.ask import Message
 from pipeline.desk.jobs import WorkerPool
 from pipeline.desk.scratch import scratch_folder
 from pipeline.desk.student.handin import BESIDE
@@ -36,12 +36,12 @@ _ASIDE = "set-aside"  # folder for recordings that are not part of the submissio
 
 def take_uploads(
     sent: Iterable[tuple[str, BinaryIO]], folder: Path, *, workers: WorkerPool
-) -> list[Said]:
+) -> list[Message]:
     """Store uploaded files and the content of zip files.
 
     Return messages about unexpected results.
     """
-    said: list[Said | None] = []
+    messages: list[Message | None] = []
     with scratch_folder() as scratch:
         files: list[tuple[str, BinaryIO | Path]] = []
         for number, (name, content) in enumerate(sent):
@@ -51,24 +51,26 @@ def take_uploads(
             try:
                 files += _unpack(content, scratch / str(number), workers=workers)
             except (SubmissionError, Failed) as error:
-                said.append(_refuse(name, error))
+                messages.append(_refuse(name, error))
         with lock_when_free(folder):
             room = _Room(folder)
-            for name, given in files:
+            for name, source in files:
                 try:
-                    with _open(given) as file:
-                        said.append(_take(name, file.read(MAX_DATA_BYTES + 1), folder, room=room))
+                    with _open(source) as file:
+                        messages.append(
+                            _take(name, file.read(MAX_DATA_BYTES + 1), folder, room=room)
+                        )
                 except SubmissionError as error:
-                    said.append(_refuse(name, error))
-    return [line for line in said if line]
+                    messages.append(_refuse(name, error))
+    return [line for line in messages if line]
 
 
-def _refuse(name: str, error: Exception) -> Said:
-    return Said(f"{quote(name)}: not uploaded: {error}", "refused")
+def _refuse(name: str, error: Exception) -> Message:
+    return Message(f"{quote(name)}: not uploaded: {error}", "refused")
 
 
-def _open(given: BinaryIO | Path) -> AbstractContextManager[BinaryIO]:
-    return given.open("rb") if isinstance(given, Path) else nullcontext(given)
+def _open(source: BinaryIO | Path) -> AbstractContextManager[BinaryIO]:
+    return source.open("rb") if isinstance(source, Path) else nullcontext(source)
 
 
 def _unpack(content: BinaryIO, scratch: Path, *, workers: WorkerPool) -> list[tuple[str, Path]]:
@@ -88,9 +90,9 @@ class _Room:
     """
 
     def __init__(self, folder: Path) -> None:
-        there = [folder / name for name in (NAME, *BESIDE)]
-        there += own_folder(folder, "data").rglob("*")
-        sizes = [path.stat().st_size for path in there if path.is_file()]
+        present = [folder / name for name in (NAME, *BESIDE)]
+        present += own_folder(folder, "data").rglob("*")
+        sizes = [path.stat().st_size for path in present if path.is_file()]
         self._files, self._bytes = len(sizes), sum(sizes)
 
     def check(self, raw: bytes) -> None:
@@ -104,9 +106,9 @@ class _Room:
         self._files, self._bytes = self._files + 1, self._bytes + len(raw)
 
 
-def _take(given: str, raw: bytes, folder: Path, *, room: _Room) -> Said | None:
+def _take(sent_name: str, raw: bytes, folder: Path, *, room: _Room) -> Message | None:
     """Store a file. If its name is taken or not valid, use another name and return a message."""
-    last = PurePosixPath(given.replace("\\", "/")).name
+    last = PurePosixPath(sent_name.replace("\\", "/")).name
     if last in _TEXTS:
         _check_text(raw, last)
         if _is_sound(folder, last):
@@ -117,9 +119,9 @@ def _take(given: str, raw: bytes, folder: Path, *, room: _Room) -> Said | None:
     if PurePosixPath(last).suffix.casefold() not in ENDINGS:
         raise SubmissionError(f"the name of a recording ends in {', '.join(ENDINGS)}")
     # Replace invisible marks and unusual spaces.
-    seen = "".join(c if c.isprintable() else "-" for c in last)
+    printable = "".join(c if c.isprintable() else "-" for c in last)
     # Bytes count, not characters: most systems allow 255, some fewer.
-    name = seen.encode(errors="ignore")[-120:].decode(errors="ignore")
+    name = printable.encode(errors="ignore")[-120:].decode(errors="ignore")
     # Replace characters that some systems refuse, and names that Windows reserves.
     name = re.sub(r'[<>:"/\\|?*\x00-\x1f\x7f]|^[. ~]+|[. ]+$', "-", name)
     if re.fullmatch(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?", name):
@@ -127,14 +129,14 @@ def _take(given: str, raw: bytes, folder: Path, *, room: _Room) -> Said | None:
     names = _list_names(own_folder(folder, "data") / name)
     target = next(path for path in names if not _is_there(path) or _holds(path, raw))
     if _is_there(target):
-        return Said(f"{quote(last)}: already exists", "changed")
+        return Message(f"{quote(last)}: already exists", "changed")
     room.check(raw)
     target.parent.mkdir(exist_ok=True)
     write_file(target, raw)
-    why = "" if seen == last else "; names may not contain invisible characters"
+    why = "" if printable == last else "; names may not contain invisible characters"
     if target.name == last:
         return None
-    return Said(f"{quote(last)}: saved as {target.name}{why}", "changed")
+    return Message(f"{quote(last)}: saved as {target.name}{why}", "changed")
 
 
 def _is_there(path: Path) -> bool:

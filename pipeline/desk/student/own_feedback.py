@@ -176,7 +176,7 @@ def _show_why(asked: Asked, grade: Grade, found: OwnFeedback, *, hidden: bool) -
     if own is None or not hidden:
         return show_evidence(own, asked.check, grade.units) if own else ""
     remarks = find_remarks(grade, asked, found.rubric)
-    said = [capital(WORDS.text(f"title_{flag.code}")) for flag in remarks]
-    given = found.entry.overrides.get(asked.id) or found.entry.comments.get(asked.id)
-    said += [given.why] if given else []
-    return render_blocks([paragraph(rich(sentence(one))) for one in dict.fromkeys(said)])
+    sentences = [capital(WORDS.text(f"title_{flag.code}")) for flag in remarks]
+    by_hand = found.entry.overrides.get(asked.id) or found.entry.comments.get(asked.id)
+    sentences += [by_hand.why] if by_hand else []
+    return render_blocks([paragraph(rich(sentence(one))) for one in dict.fromkeys(sentences)])

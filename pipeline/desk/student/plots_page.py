@@ -13,7 +13,7 @@ def show(ask: Ask) -> Response:
     if not _is_busy(ask) and plots_are_current(ask.folder()):
         return _lead_to(ask, f"{ask.here}{PLOTS}")
     job = ask.desk.jobs.of(ask.folder())
-    failed = job is not None and job.asked[0] == TASK and job.state in ("failed", "stopped")
+    failed = job is not None and job.task[0] == TASK and job.state in ("failed", "stopped")
     return ask.page("plots", title=f"Plots of {ask.folder().name}", failed=failed)
 
 

@@ -6,9 +6,9 @@ import tomlkit
 from starlette.responses import Response
 
 from pipeline.desk.ask import Ask
-from pipeline.desk.last_report import NOTES, read_notes, read_told
+from pipeline.desk.last_report import NOTES, read_findings, read_notes
 from pipeline.desk.student.form import read_document, sign_fields, write_fields
-from pipeline.desk.student.room import Room, look_around
+from pipeline.desk.student.room import Room, read_room
 from pipeline.errors import SubmissionError
 from pipeline.lock import lock_when_free
 from pipeline.output import write_file
@@ -24,7 +24,7 @@ def show(ask: Ask) -> Response:
     return ask.page(
         "report",
         title=f"Report of {folder.name}",
-        room=look_around(ask),
+        room=read_room(ask),
         there=outside(folder, "report/report.html") is None,
     )
 
@@ -51,7 +51,7 @@ def answer(ask: Ask) -> Response:
                     had="You typed",
                     back=f"{ask.here}questions",
                 )
-            if id_ not in [one["id"] for one in read_told(folder)["questions"]]:
+            if id_ not in [one["id"] for one in read_findings(folder)["questions"]]:
                 raise SubmissionError(f"the report has no question {id_!r}")
             new = with_answer(notes, id_, words)
             if len(new.encode()) > MAX_NOTES_BYTES:
@@ -65,7 +65,7 @@ def answer(ask: Ask) -> Response:
 
 def state_signs(ask: Ask) -> Response:
     """Write the sign of the input into the tables of runs whose sign the report reversed."""
-    signs = read_told(ask.folder())["turned"]
+    signs = read_findings(ask.folder())["turned"]
 
     def change(document: tomlkit.TOMLDocument) -> None:
         write_fields(document, sign_fields(document, signs))
@@ -73,7 +73,9 @@ def state_signs(ask: Ask) -> Response:
     try:
         edit_submission(ask.folder(), change, seen=ask.text("seen") or "nothing")
     except SubmissionError as error:
-        return _show_questions(ask, status=409 if isinstance(error, Outdated) else 422, said=error)
+        return _show_questions(
+            ask, status=409 if isinstance(error, Outdated) else 422, sign_error=error
+        )
     return ask.back(f"{ask.here}questions#question-sign", "Saved.", place="question-sign")
 
 
@@ -82,29 +84,31 @@ def _show_questions(
     *,
     status: int = 200,
     refused: Mapping[str, tuple[str, str]] = {},
-    said: SubmissionError | None = None,
+    sign_error: SubmissionError | None = None,
 ) -> Response:
     """Show the questions.
 
     Parameters
     ----------
     refused : by question, an answer as typed and why it was refused.
-    said : why a sign was not written.
+    sign_error : why a sign was not written.
     """
-    folder, room = ask.folder(), look_around(ask)
-    told = read_told(folder)
-    problems, notes = [*(why for _, why in refused.values()), *([str(said)] if said else [])], ""
+    folder, room = ask.folder(), read_room(ask)
+    findings = read_findings(folder)
+    problems, notes = [why for _, why in refused.values()], ""
+    if sign_error:
+        problems.append(str(sign_error))
     try:
         notes = read_notes(folder)
     except SubmissionError as error:
         problems = [str(error)]
-    questions, known = [], [one["id"] for one in told["questions"]]
+    questions, known = [], [one["id"] for one in findings["questions"]]
     others = [
         {"id": id_, "section": "", "text": f"Answer to {id_}"}
         for id_ in refused
         if id_ not in known
     ]
-    for one in [*told["questions"], *others]:
+    for one in [*findings["questions"], *others]:
         words, why = refused.get(one["id"]) or (written_answer(notes, one["id"]), "")
         questions.append({**one, "answer": words, "wrong": why})
     return ask.page(
@@ -121,7 +125,7 @@ def _show_questions(
 
 def _list_signs(room: Room) -> str:
     """Return the signs that one click writes, with their runs; "" without such signs."""
-    document, signs = read_document(room.text), room.told["turned"]
+    document, signs = read_document(room.text), room.findings["turned"]
     tables = list_experiments(document)
     open_: dict[str, list[str]] = {}
     for field in sign_fields(document, signs):

@@ -8,7 +8,7 @@ from typing import Any
 from pipeline.desk import last_report
 from pipeline.desk.ask import Ask
 from pipeline.desk.seeing import sees_check
-from pipeline.desk.student.check_state import tell_state
+from pipeline.desk.student.check_state import find_check_state
 from pipeline.desk.student.doubts import NO_DOUBTS, ask_doubts
 from pipeline.desk.student.form import Field, Group, fill_form, mark_errors, read_document
 from pipeline.desk.student.rows import Row, list_rows
@@ -31,7 +31,7 @@ class Room:
     rows : one row for each recording.
     groups : groups of the set-up; empty if the file cannot be read.
     wrong : problems of the file that belong to no field.
-    told : what the last report asked, assumed and found.
+    findings : what the last report asked, assumed and found.
     facts : what decides the state of the steps.
     """
 
@@ -39,11 +39,11 @@ class Room:
     rows: tuple[Row, ...]
     groups: tuple[Group, ...]
     wrong: tuple[str, ...]
-    told: Mapping[str, Any]
+    findings: Mapping[str, Any]
     facts: Facts
 
     @property
-    def seen(self) -> str:
+    def digest(self) -> str:
         """The digest of the text, which identifies this version."""
         return text_digest(self.text)
 
@@ -58,7 +58,7 @@ class Room:
         return next_step(self.steps)
 
 
-def look_around(
+def read_room(
     ask: Ask, *, changed: Sequence[Field] = (), error: SubmissionError | None = None
 ) -> Room:
     """Return the data of the room that the URL names.
@@ -82,14 +82,14 @@ def look_around(
     form = fill_form(document)
     every = [f for group in form for f in group.fields] + [f for row in rows for f in row.fields]
     shown, left = mark_errors(every, changed, error)
-    check = tell_state(folder) if sees_check(ask.user, ask.folder()) else None
+    check = find_check_state(folder) if sees_check(ask.user, ask.folder()) else None
     report = "none" if check else last_report.find_state(folder)
-    told = last_report.NOTHING_TOLD if check else last_report.read_told(folder)
+    findings = last_report.NO_FINDINGS if check else last_report.read_findings(folder)
     asked = ask_doubts(
         shown,
         fractions=[row.file for row in rows if row.look["fractions"]],
         doubts=doubts,
-        told=told if report in ("current", "answered") else last_report.NOTHING_TOLD,
+        findings=findings if report in ("current", "answered") else last_report.NO_FINDINGS,
     )
     by_path = {field.path: field for field in asked}
     rows = [replace(row, fields=tuple(by_path[f.path] for f in row.fields)) for row in rows]
@@ -101,15 +101,15 @@ def look_around(
         rows=tuple(rows),
         groups=tuple(groups),
         wrong=tuple(left),
-        told=told,
+        findings=findings,
         facts=Facts(
             recordings=sum(row.is_recording for row in rows),
             to_look_at=sum(row.needs_a_person for row in rows),
             missing=tuple(group.title for group in groups if group.missing),
             sound=bool(text) and error is None,
             report=report,
-            making=bool(job and not job.over and job.asked[0] == "make_report"),
-            questions=len(told["questions"]),
+            making=bool(job and not job.over and job.task[0] == "make_report"),
+            questions=len(findings["questions"]),
             unanswered=0 if check else len(last_report.list_unanswered(folder)),
             handed=ask.desk.handed.get(folder) == last_report.stat_sources(folder),
             check=check,

@@ -43,7 +43,7 @@ class Row:
 
     Attributes
     ----------
-    look : what the file contains; see `tasks.look_at_file`.
+    look : what the file contains; see `tasks.inspect_file`.
     index : index of the table in the file; None without a table.
     problems : why the row needs a person.
     """
@@ -139,7 +139,7 @@ def list_rows(
     for index, table in enumerate(listed):
         places.setdefault(posix(str(table.get("file", ""))), []).append(index)
     rows = []
-    for file, look in look_at_all(ask, folder, document).items():
+    for file, look in inspect_all(ask, folder, document).items():
         for index in places.pop(file, []) or [None]:
             if index is None:
                 rows.append(_describe_unknown(file, look))
@@ -153,10 +153,10 @@ def list_rows(
     return rows
 
 
-def look_at_all(ask: Ask, folder: Path, document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def inspect_all(ask: Ask, folder: Path, document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return what each data file contains, by name."""
     known = {**document, "experiments": list_experiments(document)[:MOST_EXPERIMENTS]}
-    return ask.desk.looks(folder, lambda file: stated_columns(known, file))
+    return ask.desk.inspect_files(folder, lambda file: stated_columns(known, file))
 
 
 def _describe_unknown(file: str, look: Mapping[str, Any]) -> Row:
@@ -188,7 +188,7 @@ def _describe(
     problems += [f"state {need} below" for need in look["needs"] if need not in table]
     if _lacks_controller(fields):
         problems.append("state the controller that ran")
-    known = {said for cart, said in look["still"].items() if int(cart) not in carts}
+    known = {remark for cart, remark in look["still"].items() if int(cart) not in carts}
     known.update(problems)
     if "sample_rate" in table:
         known.add(NO_CLOCK)
@@ -229,7 +229,7 @@ def _question(
     """
     if not field.path.endswith(".carts"):
         return field
-    open_ = "carts" not in table or any(is_marked(said, marked) for said in look["unsure"])
+    open_ = "carts" not in table or any(is_marked(remark, marked) for remark in look["unsure"])
     hardly = [cart for cart in look["hardly"] if cart in carts]
     return ask_held(field, hardly, carts) if open_ and hardly else field
 
@@ -240,20 +240,22 @@ def gather_remarks(rows: Sequence[Row]) -> dict[str, str]:
     Remarks that differ only in numbers of ms or pieces share a sentence with the range of these
     numbers.
     """
-    told = [(row.file.removeprefix("data/"), said) for row in rows for said in row.remarks]
-    times = Counter(_MEASURED.sub("#", said) for _, said in told)
+    remarks = [(row.file.removeprefix("data/"), remark) for row in rows for remark in row.remarks]
+    times = Counter(_MEASURED.sub("#", remark) for _, remark in remarks)
     sentences = {}
     for pattern in (one for one, number in times.items() if number >= 3):
-        alike = [(file, said) for file, said in told if _MEASURED.sub("#", said) == pattern]
-        whole = _span_numbers([said for _, said in alike])
+        alike = [
+            (file, remark) for file, remark in remarks if _MEASURED.sub("#", remark) == pattern
+        ]
+        whole = _span_numbers([remark for _, remark in alike])
         (sentence,) = by_note((file, whole) for file, _ in alike)
-        sentences |= {said: sentence for _, said in alike}
+        sentences |= {remark: sentence for _, remark in alike}
     return sentences
 
 
-def _span_numbers(said: Sequence[str]) -> str:
+def _span_numbers(remarks: Sequence[str]) -> str:
     """Return remarks that differ only in numbers as one, with the range of each number."""
-    columns = zip(*(_MEASURED.findall(one) for one in said), strict=True)
+    columns = zip(*(_MEASURED.findall(one) for one in remarks), strict=True)
     ends = [(min(column, key=float), max(column, key=float)) for column in columns]
     spans = iter([low if low == high else f"{low} to {high}" for low, high in ends])
-    return _MEASURED.sub(lambda _: next(spans), said[0])
+    return _MEASURED.sub(lambda _: next(spans), remarks[0])

@@ -13,7 +13,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from pipeline.desk import last_report
-from pipeline.desk.ask import Ask, Said
+from pipeline.desk.ask import Ask, Message
 from pipeline.desk.seeing import sees_check
 from pipeline.desk.student.files import put_aside, take_uploads
 from pipeline.desk.student.form import (
@@ -28,8 +28,8 @@ from pipeline.desk.student.form import (
     write_fields,
 )
 from pipeline.desk.student.handin import list_held, list_missing, pack
-from pipeline.desk.student.room import Room, look_around
-from pipeline.desk.student.rows import gather_remarks, group_rows, look_at_all
+from pipeline.desk.student.room import Room, read_room
+from pipeline.desk.student.rows import gather_remarks, group_rows, inspect_all
 from pipeline.desk.typed import read_whole_number
 from pipeline.errors import SubmissionError
 from pipeline.lock import lock_when_free
@@ -50,8 +50,8 @@ def upload(ask: Ask) -> Response:
     """Store uploaded files, and add tables for them to `submission.toml`."""
     folder, items = ask.folder(), ask.form.getlist("files")
     sent = [(i.filename, i.file) for i in items if isinstance(i, UploadFile) and i.filename]
-    said = take_uploads(sent, folder, workers=ask.desk.workers)
-    return _go_back(ask, [*said, *_fill_tables(ask, folder)], _FILES)
+    messages = take_uploads(sent, folder, workers=ask.desk.workers)
+    return _go_back(ask, [*messages, *_fill_tables(ask, folder)], _FILES)
 
 
 def set_aside(ask: Ask) -> Response:
@@ -63,8 +63,8 @@ def set_aside(ask: Ask) -> Response:
         document = read_document(submission_text(folder) if (folder / NAME).exists() else "")
         if any(posix(str(table.get("file", ""))) == file for table in list_experiments(document)):
             raise SubmissionError(f"{file}: {NAME} uses it; remove it there first")
-        said = put_aside(file, folder)
-    return _go_back(ask, [Said(said)], _FILES)
+        message = put_aside(file, folder)
+    return _go_back(ask, [Message(message)], _FILES)
 
 
 def fill(ask: Ask) -> Response:
@@ -129,7 +129,7 @@ def start_hand_in(ask: Ask) -> Response:
 
 def show_hand_in(ask: Ask) -> Response:
     """Show what is done, what is missing, what was assumed, and the content of the zip."""
-    folder, room = ask.folder(), look_around(ask)
+    folder, room = ask.folder(), read_room(ask)
     keeps = list_missing(folder)
     names = [] if keeps else list_held(folder, report=not sees_check(ask.user, ask.folder()))
     return ask.page(
@@ -174,26 +174,26 @@ def _list_authors(room: Room) -> list[str]:
 def _list_doubts(ask: Ask, document: Mapping[str, Any], index: int) -> Sequence[str]:
     """Return the doubts about the carts of an experiment."""
     files = [posix(str(table.get("file", ""))) for table in list_experiments(document)]
-    looks = look_at_all(ask, ask.folder(), document)
+    looks = inspect_all(ask, ask.folder(), document)
     return looks[files[index]]["unsure"] if index < len(files) and files[index] in looks else ()
 
 
-def _fill_tables(ask: Ask, folder: Path) -> list[Said]:
+def _fill_tables(ask: Ask, folder: Path) -> list[Message]:
     """Add tables for new files; return messages."""
     try:
         rows = ask.desk.workers.do("fill_tables", folder=str(folder))
     except Failed as error:
-        return [Said(str(error), "refused")]
+        return [Message(str(error), "refused")]
     new = [row["file"] for row in rows if row["state"] in ("new", "completed")]
-    said = [Said(f"{count(len(new), 'file')} written into {NAME}.")] if new else []
+    messages = [Message(f"{count(len(new), 'file')} written into {NAME}.")] if new else []
     without = [row for row in rows if row["state"] in ("copy", "refused")]
     notes = by_note((row["file"], note) for row in without for note in row["remarks"])
-    return said + [Said(note, "refused") for note in notes]
+    return messages + [Message(note, "refused") for note in notes]
 
 
-def _go_back(ask: Ask, said: Iterable[Said], place: str) -> Response:
+def _go_back(ask: Ask, messages: Iterable[Message], place: str) -> Response:
     """Return to the page from which the request came, and show messages at the same part of it."""
-    return ask.back(f"{ask.here}#{place}", *said, place=place)
+    return ask.back(f"{ask.here}#{place}", *messages, place=place)
 
 
 def _show_page(
@@ -204,7 +204,7 @@ def _show_page(
     error: SubmissionError | None = None,
 ) -> Response:
     """Show the room; fields with errors show what was typed."""
-    folder, room = ask.folder(), look_around(ask, changed=changed, error=error)
+    folder, room = ask.folder(), read_room(ask, changed=changed, error=error)
     named = [row.file for row in room.rows if row.index is not None]
     return ask.page(
         "student",
@@ -240,7 +240,7 @@ def _edit(
         return _show_outdated(ask, error.text, changed)
     except SubmissionError as error:
         return _show_page(ask, status=422, changed=changed, error=error)
-    return _go_back(ask, [Said("Saved.")], place)
+    return _go_back(ask, [Message("Saved.")], place)
 
 
 def _show_outdated(ask: Ask, text: str, changed: Sequence[Field]) -> Response:

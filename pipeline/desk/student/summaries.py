@@ -10,8 +10,8 @@ from pipeline.words.numbers import count
 def summarise(group: Group) -> Group:
     """Return the group with its summary and with what is missing."""
     values = {field.path: field.value for field in group.fields}
-    said, missing = _SAY[group.key](group, values)
-    return replace(group, summary=", ".join(filter(None, said)), missing=missing)
+    parts, missing = _SAY[group.key](group, values)
+    return replace(group, summary=", ".join(filter(None, parts)), missing=missing)
 
 
 _Said = tuple[list[str], str]
@@ -29,19 +29,19 @@ def _say_bench(group: Group, values: Mapping[str, str]) -> _Said:
     springs = next(field for field in group.fields if field.kind == "flags")
     names = [name for name, on in zip(springs.names, springs.on, strict=False) if on]
     asked = [field for field in group.fields if field.answers]
-    said = [
+    parts = [
         f"{carts} cart{'' if carts == '1' else 's'}",
         f"springs {', '.join(names)}" if names else "no springs",
         values["system.position.unit"] or "count",
         values["system.input.unit"] or "V",
     ]
-    return said, count(len(asked), "answer") if asked else ""
+    return parts, count(len(asked), "answer") if asked else ""
 
 
 def _say_design(group: Group, values: Mapping[str, str]) -> _Said:
     cart, step = values["design.cart"], values["design.reference"]
-    said = [cart and f"cart {cart}", step and f"step {step}", values["design.method"]]
-    return said if any(said) else ["none"], ""
+    parts = [cart and f"cart {cart}", step and f"step {step}", values["design.method"]]
+    return parts if any(parts) else ["none"], ""
 
 
 def _say_numbers(group: Group, values: Mapping[str, str]) -> _Said:

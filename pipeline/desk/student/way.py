@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 State = Literal["done", "needs", "old", "none"]  # as the page shows them; "none" means not yet
-Stands = tuple[State, str]  # a state, and the word shown for it
+Status = tuple[State, str]  # a state, and the word shown for it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +32,7 @@ class Facts:
     questions: int = 0
     unanswered: int = 0
     handed: bool = False
-    check: Stands | None = None
+    check: Status | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,19 +52,19 @@ class Step:
     word: str
 
 
-def _files(facts: Facts) -> Stands:
+def _files(facts: Facts) -> Status:
     if not facts.recordings:
         return "needs", "drop them"
     return ("needs", f"{facts.to_look_at} to look at") if facts.to_look_at else ("done", "done")
 
 
-def _set_up(facts: Facts) -> Stands:
+def _set_up(facts: Facts) -> Status:
     if not facts.recordings:
         return "none", "not yet"
     return ("done", "done") if facts.sound and not facts.missing else ("needs", "needs you")
 
 
-def _report(facts: Facts) -> Stands:
+def _report(facts: Facts) -> Status:
     if facts.making:
         return "none", "being made"
     if facts.report == "current":
@@ -77,7 +77,7 @@ def _report(facts: Facts) -> Stands:
     return ("needs", "make it") if ready else ("none", "not yet")
 
 
-def _questions(facts: Facts) -> Stands:
+def _questions(facts: Facts) -> Status:
     if facts.report == "none":
         return "none", "not yet"
     if facts.unanswered:
@@ -85,7 +85,7 @@ def _questions(facts: Facts) -> Stands:
     return "done", "done" if facts.questions else "none asked"
 
 
-def _check(facts: Facts) -> Stands:
+def _check(facts: Facts) -> Status:
     return facts.check or ("none", "not yet")
 
 
@@ -97,7 +97,7 @@ def _has_result(facts: Facts) -> bool:
     return (_check if facts.check else _report)(facts)[0] == "done"
 
 
-def _hand_in(facts: Facts) -> Stands:
+def _hand_in(facts: Facts) -> Status:
     steps = (_set_up,) if facts.check else (_set_up, _questions)
     if not _has_result(facts) or any(find(facts)[0] != "done" for find in steps):
         return "none", "not yet"
@@ -105,7 +105,7 @@ def _hand_in(facts: Facts) -> Stands:
 
 
 # Key, title, address relative to the room, and a function that returns the state.
-_STEPS: tuple[tuple[str, str, str, Callable[[Facts], Stands]], ...] = (
+_STEPS: tuple[tuple[str, str, str, Callable[[Facts], Status]], ...] = (
     ("files", "Files", "#files", _files),
     ("set-up", "Set-up", "#details", _set_up),
     ("report", "Report", "report", _report),
