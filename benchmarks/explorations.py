@@ -51,7 +51,7 @@ def run(seed: int) -> dict:
                 record=session,
                 goal=ErrorGoal(),
                 seconds=ALLOWED,
-                tell=lambda text: None,
+                announce=lambda text: None,
             ).run()
         except (PipelineError, AssertionError) as error:
             return row | {"ended": f"{type(error).__name__}: {error}"[:200]}
@@ -76,7 +76,7 @@ def run(seed: int) -> dict:
         "worst": max(e or np.inf for e in turns[-1].errors.values()),
         "seconds": turns[-1].seconds,
         "fixed": fixed,
-        "said": turns[-1].said[:300],
+        "said": turns[-1].summary[:300],
         "cpu": round(time.process_time() - began, 1),
     }
 

@@ -82,7 +82,8 @@ class Record:
     hold : how the input behaves between samples.
     source : path of the data file inside the submission.
     notes : corrections made while reading.
-    turned : whether the input's sign was reversed, so that it agrees with the other recordings.
+    sign_reversed : whether the input's sign was reversed, so that it agrees with the other
+        recordings.
     position_scale, input_scale : signed factors from the file's own numbers to y and u. A
         controller's gains may be in the file's units.
     heading_units : the units that the headings of the position and input columns state.
@@ -101,7 +102,7 @@ class Record:
     hold: Hold = "zero_order"
     source: str = ""
     notes: tuple[str, ...] = ()
-    turned: bool = False
+    sign_reversed: bool = False
     position_scale: float = 1.0
     input_scale: float = 1.0
     heading_units: tuple[HeadingUnit, ...] = ()

@@ -20,7 +20,7 @@ READERS = {
     "removesuffix",
 }
 # Attributes and variables that hold messages or ids.
-SAID = {"message", "reason", "stage", "id", "about", "note", "parameter", "warning",
+MESSAGES = {"message", "reason", "stage", "id", "about", "note", "parameter", "warning",
         "partial"}  # fmt: skip
 # In these packages the variables in PARAMETERS hold names of parameters, never names of files.
 ROOMS = ("checks", "identify", "soundness", "report/equations", "grading/mistakes", "grading/judge",
@@ -32,7 +32,7 @@ ALLOWED = {'grade.reason.split("\\n")', 'reason.split("\\n")'}
 
 def read_back(source: str, *, of_parameters: bool = False) -> list[str]:
     """Return the expressions in a module that extract a fact from a sentence, an id or a name."""
-    names = SAID - {"id"} | (PARAMETERS if of_parameters else set())
+    names = MESSAGES - {"id"} | (PARAMETERS if of_parameters else set())
     found = (ast.unparse(node) for node in _readings(ast.parse(source), names))
     return [text for text in found if text.replace("'", '"') not in ALLOWED]
 
@@ -40,21 +40,21 @@ def read_back(source: str, *, of_parameters: bool = False) -> list[str]:
 def _readings(tree: ast.Module, names: set[str]) -> Iterator[ast.expr]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-            if node.func.attr in READERS and _is_said(node.func.value, names):
+            if node.func.attr in READERS and _is_message(node.func.value, names):
                 yield node
         elif isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load):
-            if _is_part(node.slice) and _is_said(node.value, names):
+            if _is_part(node.slice) and _is_message(node.value, names):
                 yield node
         elif isinstance(node, ast.Compare) and isinstance(node.ops[0], (ast.In, ast.NotIn)):
             text = isinstance(node.left, (ast.Constant, ast.JoinedStr))
             where = node.comparators[0]
-            if text and isinstance(where, ast.Attribute) and where.attr in SAID - {"id"}:
+            if text and isinstance(where, ast.Attribute) and where.attr in MESSAGES - {"id"}:
                 yield node
 
 
-def _is_said(node: ast.expr, names: set[str]) -> bool:
+def _is_message(node: ast.expr, names: set[str]) -> bool:
     if isinstance(node, ast.Attribute):
-        return node.attr in SAID
+        return node.attr in MESSAGES
     return isinstance(node, ast.Name) and node.id in names
 
 

@@ -96,20 +96,20 @@ def say(text: str) -> None:
 @contextmanager
 def progress_line() -> Iterator[Progress]:
     """Show progress; print a message if Ctrl-C ends the work."""
-    with ctrl_c_says(lambda: say("stopped; repeat the command to start again")) as look:
+    with ctrl_c_says(lambda: say("stopped; repeat the command to start again")) as check_stop:
         with _shown_line() as show:
 
-            def look_and_show(text: str) -> None:
-                look()
+            def check_and_show(text: str) -> None:
+                check_stop()
                 show(text)
 
-            yield look_and_show
+            yield check_and_show
 
 
 @contextmanager
 def _shown_line() -> Iterator[Progress]:
     if not sys.stderr.isatty():
-        with said_now_and_then() as show:
+        with log_progress() as show:
             yield show
         return
     from rich import progress
@@ -124,7 +124,7 @@ def _shown_line() -> Iterator[Progress]:
 
 
 @contextmanager
-def said_now_and_then() -> Iterator[Progress]:
+def log_progress() -> Iterator[Progress]:
     """Print progress after 2 s, then at doubling intervals of at most a minute.
 
     This is for a log, whose lines cannot be overwritten: short work prints nothing, long work

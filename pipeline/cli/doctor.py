@@ -121,7 +121,7 @@ def _packages() -> tuple[list[Package], dict[str, list[Package]]]:
     try:
         asked = [Requirement(text) for text in installed.requires("cartlab") or ()]
     except installed.PackageNotFoundError:  # the code is on the path, but pip did not install it
-        return [_look("cartlab", "")], {}
+        return [_find_package("cartlab", "")], {}
     offered = installed.metadata("cartlab").get_all("Provides-Extra") or ()
     applies = {
         extra: [one for one in asked if one.marker is None or one.marker.evaluate({"extra": extra})]
@@ -129,7 +129,9 @@ def _packages() -> tuple[list[Package], dict[str, list[Package]]]:
         if extra in ("", *offered)
     }
     looked = {
-        one.name: _look(one.name, str(one.specifier)) for all_ in applies.values() for one in all_
+        one.name: _find_package(one.name, str(one.specifier))
+        for all_ in applies.values()
+        for one in all_
     }
     needed = [looked[one.name] for one in applies.pop("")]
     return needed, {
@@ -138,7 +140,7 @@ def _packages() -> tuple[list[Package], dict[str, list[Package]]]:
     }
 
 
-def _look(name: str, wanted: str) -> Package:
+def _find_package(name: str, wanted: str) -> Package:
     """Return a package with its problem, if it is missing, too old, or does not load."""
     from packaging.specifiers import SpecifierSet
 

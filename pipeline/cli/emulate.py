@@ -56,7 +56,7 @@ def emulate(
         faults=fault or (),
         seed=seed,
     )
-    server = Server(bench, options, tell=lambda event: say(json.dumps(event)))
+    server = Server(bench, options, on_event=lambda event: say(json.dumps(event)))
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())

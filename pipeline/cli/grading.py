@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.cli.common import AsJson, app, said_now_and_then, say
+from pipeline.cli.common import AsJson, app, log_progress, say
 from pipeline.cli.stopping import ctrl_c_says
 
 if TYPE_CHECKING:
@@ -70,10 +70,10 @@ def grade(
         lateness=lateness,
     )
     kept = f"stopped; finished grades are kept in {out}; repeat the command to continue"
-    with ctrl_c_says(lambda: say(kept)) as look, _batch_progress() as show:
+    with ctrl_c_says(lambda: say(kept)) as check_stop, _batch_progress() as show:
 
         def progress(done: int, total: int, last: str) -> None:
-            look()
+            check_stop()
             show(done, total, last)
 
         done = grade_class(paths, rubric_file=rubric, out=out, options=options, progress=progress)
@@ -107,7 +107,7 @@ def _report_outcome(done: "Summary", *, out: Path, rubric: Path) -> None:
 def _batch_progress() -> Iterator[Callable[[int, int, str], None]]:
     """Show how many submissions are graded and, on a terminal, the remaining time."""
     if not sys.stderr.isatty():
-        with said_now_and_then() as show:
+        with log_progress() as show:
             yield lambda done, total, last: show(f"{done} of {total}: {last}".rstrip(": "))
         return
     from rich.console import Console

@@ -45,7 +45,7 @@ def plan(
     with progress_line() as progress:
         if number is None:
             made = make_plan(submission, stock=stock, progress=progress)
-            words, further = [made.trouble, made.said], {}
+            words, further = [made.trouble, made.message], {}
         else:
             commands = frozenset[str]() if stock else known_commands(folder)
             made = plan_next(

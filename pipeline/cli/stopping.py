@@ -24,7 +24,7 @@ def ctrl_c_says(say: Callable[[], None]) -> Iterator[Callable[[], None]]:
         pressed = True
         raise KeyboardInterrupt
 
-    def look() -> None:
+    def check() -> None:
         if pressed:
             raise KeyboardInterrupt
 
@@ -32,8 +32,8 @@ def ctrl_c_says(say: Callable[[], None]) -> Iterator[Callable[[], None]]:
     if before is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, stop)
     try:
-        yield look
-        look()
+        yield check
+        check()
     except BaseException:
         if not pressed:
             raise

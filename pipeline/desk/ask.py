@@ -71,9 +71,9 @@ class Desk:
     # By folder: the files that the last downloaded zip contained, with their time and size.
     handed: dict[Path, dict[str, list[int]]] = field(default_factory=dict)
     _shown: dict[str, OrderedDict[str, str]] = field(default_factory=dict)
-    _inspected: OrderedDict[Path, tuple[Stamp, dict[str, Any]]] = field(default_factory=OrderedDict)
+    _described: OrderedDict[Path, tuple[Stamp, dict[str, Any]]] = field(default_factory=OrderedDict)
 
-    def inspect_files(
+    def describe_files(
         self, folder: Path, stated: Callable[[str], dict[str, str | int]]
     ) -> dict[str, dict[str, Any]]:
         """Return what each data file of a submission contains, by name; reread only changed files.
@@ -87,11 +87,11 @@ class Desk:
             path, columns = folder / file, stated(file)
             info = path.stat()
             stamp = info.st_mtime_ns, info.st_size, columns
-            cached = self._inspected.get(path)
+            cached = self._described.get(path)
             if cached is None or cached[0] != stamp:
-                cached = self._inspected[path] = stamp, self._inspect_file(folder, file, columns)
-                while len(self._inspected) > 5_000:
-                    self._inspected.popitem(last=False)
+                cached = self._described[path] = stamp, self._describe_file(folder, file, columns)
+                while len(self._described) > 5_000:
+                    self._described.popitem(last=False)
             found[file] = cached[1]
         return found
 
@@ -115,11 +115,11 @@ class Desk:
         """Return a text that a page showed; None if it is no longer kept."""
         return self._shown.get(to, {}).get(digest)
 
-    def _inspect_file(
+    def _describe_file(
         self, folder: Path, file: str, columns: dict[str, str | int]
     ) -> dict[str, Any]:
         try:
-            return self.workers.do("inspect_file", folder=str(folder), file=file, columns=columns)
+            return self.workers.do("describe_file", folder=str(folder), file=file, columns=columns)
         except Failed as error:  # the file stopped its process; only its own row is affected
             return {**NOTHING_KNOWN, "remarks": [str(error)]}
 

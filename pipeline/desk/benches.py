@@ -11,7 +11,7 @@ from typing import Any
 
 from starlette.responses import Response
 
-from pipeline.bench.live.live_page import press_button, stream_news
+from pipeline.bench.live.live_page import press_button, stream_events
 from pipeline.bench.live.live_state import ShownSession
 from pipeline.processes import LineProcess
 
@@ -81,7 +81,7 @@ class BenchSession(ShownSession):
         ended = "event: ended\ndata:\n\n"
         if self.ended.is_set():
             return Response(ended, media_type="text/event-stream")
-        return stream_news(self, is_over=self.ended.is_set, last_words=ended)
+        return stream_events(self, is_over=self.ended.is_set, last_words=ended)
 
     def close(self, *, by: float) -> None:
         """Wait for the end of the session, then end its process.

@@ -15,7 +15,7 @@ from pipeline.desk.users import Place, User, name_place
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.experiments.plan_file import NAME as PLAN
 from pipeline.grading.gradebook.schema import FILE
-from pipeline.submission.load import outside
+from pipeline.submission.load import file_problem
 
 _MADE = 3  # exercises listed on the first page
 # The rooms for which a folder can be chosen.
@@ -122,8 +122,8 @@ def _describe_submission(ask: Ask, n: int, folder: Path) -> dict[str, Any]:
         "files": files,
         "report": report,
         "is_recording": session is not None and not session.ended.is_set(),
-        "has_plan": outside(folder, PLAN) is None,
-        "has_solution": outside(folder, "solution/solution.html") is None,
+        "has_plan": file_problem(folder, PLAN) is None,
+        "has_solution": file_problem(folder, "solution/solution.html") is None,
     }
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from pipeline.errors import SubmissionError
 from pipeline.report.sections.answers import written_answer
-from pipeline.submission.load import MAX_NOTES_BYTES, NAME, list_experiments, outside
+from pipeline.submission.load import MAX_NOTES_BYTES, NAME, file_problem, list_experiments
 from pipeline.submission.toml_file import read_text
 
 # A file next to the report: its questions, assumptions, findings, and state of its sources.
@@ -30,7 +30,7 @@ def stat_sources(folder: Path) -> dict[str, list[int]]:
     data = (path.relative_to(folder).as_posix() for path in (folder / "data").rglob("*"))
     named = (str(table.get("file", "")) for table in list_experiments(_read_document(folder)))
     names = sorted({NAME, NOTES, "gap/gap.json", *data, *named})
-    present = [name for name in names if outside(folder, name) is None]
+    present = [name for name in names if file_problem(folder, name) is None]
     infos = {name: (folder / name).stat() for name in present}
     return {name: [info.st_mtime_ns, info.st_size] for name, info in infos.items()}
 
@@ -41,7 +41,7 @@ def find_state(folder: Path) -> str:
     "answered" means that only the answers in `notes.md` have changed; no number depends on them.
     "older" means that other sources have changed.
     """
-    if outside(folder, "report/report.html") is not None:
+    if file_problem(folder, "report/report.html") is not None:
         return "none"
     made_of, now = _read_findings_file(folder).get("made_of"), stat_sources(folder)
     if made_of == now:
@@ -53,7 +53,7 @@ def find_state(folder: Path) -> str:
 
 def plots_are_current(folder: Path) -> bool:
     """Return whether there are plots and their sources have not changed."""
-    if outside(folder, PLOTS) is not None:
+    if file_problem(folder, PLOTS) is not None:
         return False
     return _read_small(folder, PLOTS_OF).get("made_of") == stat_sources(folder)
 
@@ -106,7 +106,7 @@ def read_notes(folder: Path) -> str:
     """
     if not (folder / NOTES).exists():
         return ""
-    if problem := outside(folder, NOTES):
+    if problem := file_problem(folder, NOTES):
         raise SubmissionError(problem)
     where = f"{folder.name}/{NOTES}"
     return read_text(folder / NOTES, where=where, limit=MAX_NOTES_BYTES, error=SubmissionError)
@@ -118,7 +118,7 @@ def _read_findings_file(folder: Path) -> dict[str, Any]:
 
 def _read_small(folder: Path, name: str) -> dict[str, Any]:
     """Return the content of a small JSON file that cartlab wrote; {} if it cannot be read."""
-    if outside(folder, name) is None and (folder / name).stat().st_size <= 1_000_000:
+    if file_problem(folder, name) is None and (folder / name).stat().st_size <= 1_000_000:
         with suppress(ValueError, RecursionError):
             read = json.loads((folder / name).read_bytes())
             return read if isinstance(read, dict) else {}
@@ -126,7 +126,7 @@ def _read_small(folder: Path, name: str) -> dict[str, Any]:
 
 
 def _read_document(folder: Path) -> dict[str, Any]:
-    if outside(folder, NAME) is None:
+    if file_problem(folder, NAME) is None:
         with suppress(ValueError, RecursionError):  # the page shows what is wrong
             return tomllib.loads((folder / NAME).read_bytes().decode())
     return {}

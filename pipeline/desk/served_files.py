@@ -8,7 +8,7 @@ from starlette.responses import FileResponse, Response
 from pipeline.desk.ask import Ask
 from pipeline.report.render.html import every_hash
 from pipeline.resources import TEMPLATES
-from pipeline.submission.load import outside
+from pipeline.submission.load import file_problem
 
 # The policy for a page from a submission's folder, which may come from a stranger. The page gets an
 # origin of its own, so that it sees no cookie and sends nothing to the desk. It may run only the
@@ -45,7 +45,7 @@ _STATIC = {
 def serve_file(folder: Path, name: str) -> Response:
     """Return a file in a folder; a link in the folder that leads out of it is refused."""
     kind = _KINDS.get(PurePosixPath(name).suffix)
-    if kind is None or outside(folder, name) is not None:
+    if kind is None or file_problem(folder, name) is not None:
         raise HTTPException(404, "there is no such file")
     policy = _allow_own_scripts(_STRANGE_PAGE) if kind == "text/html" else _INERT
     headers = {} if kind == "application/pdf" else {"Content-Security-Policy": policy}

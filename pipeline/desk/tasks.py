@@ -29,10 +29,10 @@ from pipeline.ingest.fill import (
     UNSURE,
     Found,
     data_files,
+    examine_file,
     experiment_doubts,
     hardly_moving,
     has_fractions,
-    look_at,
     passed_over,
     system_doubts,
 )
@@ -43,13 +43,13 @@ from pipeline.output import own_folder, write_file
 from pipeline.processes import serve
 from pipeline.results import Analysis, Assumption
 from pipeline.submission import load_submission
-from pipeline.submission.load import leaves
+from pipeline.submission.load import path_problem
 from pipeline.words.progress import Progress
 
 _ACROSS, _HIGH = 120, 32  # width and height of a thumbnail
 
 
-def inspect_file(
+def describe_file(
     folder: str, file: str, columns: dict[str, str | int], *, progress: Progress
 ) -> dict[str, Any]:
     """Return what a data file contains, with a thumbnail.
@@ -58,9 +58,9 @@ def inspect_file(
     ----------
     columns : columns of the file, as `submission.toml` states them.
     """
-    if leaves(Path(folder), file):
+    if path_problem(Path(folder), file):
         raise SubmissionError(f"{file}: is outside the folder")
-    found = look_at(Path(folder), file, columns=columns)
+    found = examine_file(Path(folder), file, columns=columns)
     return {**_describe(found), "lines": draw_thumbnail(Path(folder), found, columns=columns)}
 
 
@@ -144,7 +144,9 @@ def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
             "changes": with_symbols(changes_line(changes)) if changes else "",
             "failed": [with_symbols(check.message) for check in analysis.failed_checks],
             "turned": {
-                one.id: 1 if one.input_scale > 0 else -1 for one in analysis.records if one.turned
+                one.id: 1 if one.input_scale > 0 else -1
+                for one in analysis.records
+                if one.sign_reversed
             },
             "unreadable": dict(analysis.unreadable),
             "made_of": made_of,
@@ -317,7 +319,7 @@ def preview_rubric(folder: str, text: str, *, progress: Progress) -> dict[str, A
 TASKS: Mapping[str, Callable[..., Any]] = {
     task.__name__: task
     for task in (
-        inspect_file, list_files, list_not_read, list_doubts, fill_tables, make_report, make_gap,
+        describe_file, list_files, list_not_read, list_doubts, fill_tables, make_report, make_gap,
         check_numbers, unpack_upload, propose_recordings, weigh_recording, publish_grades,
         regrade_class, preview_rubric, check_exercise, draw_effect, make_exercises,
         make_solution, describe_exercise, make_plots,

@@ -64,7 +64,7 @@ class NextPlan:
     doubt: str = ""
 
     @property
-    def said(self) -> str:
+    def summary(self) -> str:
         """The benefit of the experiments in one sentence."""
         return "; ".join(self.sentences)
 

@@ -59,13 +59,13 @@ class MadePlan:
 
     Attributes
     ----------
-    said : the message, in one sentence.
+    message : the message, in one sentence.
     trouble : why the data could not be used; empty if they were used, or if there are no data.
     """
 
     plan: Plan
     path: Path
-    said: str
+    message: str
     trouble: str
 
 
@@ -92,9 +92,9 @@ def make_plan(submission: Submission, *, stock: bool = False, progress: Progress
         new, trouble = old, str(error)
     added = new.recordings[len(old.recordings) :]
     new, path = add_recordings(submission.folder, added, otherwise=old), plan_path(submission)
-    told = f"{path}: {count(len(added), 'recording')} added"
-    said = told if there else f"wrote {path}: check its [limits]"
-    return MadePlan(plan=new, path=path, said=said, trouble=trouble)
+    added_words = f"{path}: {count(len(added), 'recording')} added"
+    message = added_words if there else f"wrote {path}: check its [limits]"
+    return MadePlan(plan=new, path=path, message=message, trouble=trouble)
 
 
 def propose_plan(submission: Submission, *, bench: Description | None = None) -> Plan:

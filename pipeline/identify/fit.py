@@ -217,9 +217,9 @@ def _conflict(
         return {}
     example, misread = next(iter(found.items()))
     of_mine, of_theirs = (" and ".join(sorted(kinds)) for kinds in (mine - theirs, theirs - mine))
-    said = {"mine": of_mine, "theirs": of_theirs, "example": example, "look": misread.words}
+    details = {"mine": of_mine, "theirs": of_theirs, "example": example, "look": misread.words}
     return {
-        name: RecordingFault(code="contradicting_kinds", run=name, said=said)
+        name: RecordingFault(code="contradicting_kinds", run=name, details=details)
         for kind in mine ^ theirs
         for name in ids[kind]
     }

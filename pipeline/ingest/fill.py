@@ -35,7 +35,7 @@ from pipeline.submission.edit import (
     submission_text,
     toml_item,
 )
-from pipeline.submission.load import NAME, leaves, outside, posix, stated_columns
+from pipeline.submission.load import NAME, file_problem, path_problem, posix, stated_columns
 from pipeline.submission.models import MOST_CARTS, MOST_EXPERIMENTS
 from pipeline.submission.template import write_templates
 from pipeline.submission.toml_file import Value, parse_toml
@@ -89,7 +89,7 @@ def data_files(folder: Path) -> list[str]:
     """Return the recordings in `data/`, as paths for `submission.toml`."""
     found = data_files_in(folder / "data")
     names = [path.relative_to(folder).as_posix() for path in found]
-    return [name for name in names if outside(folder, name) is None]
+    return [name for name in names if file_problem(folder, name) is None]
 
 
 def passed_over(folder: Path, *, named: Collection[str] = ()) -> list[Found]:
@@ -97,7 +97,7 @@ def passed_over(folder: Path, *, named: Collection[str] = ()) -> list[Found]:
 
     The files in `named` are left out, because they have a table.
     """
-    if problem := leaves(folder, "data"):  # `data` is a link that leads out of the submission
+    if problem := path_problem(folder, "data"):  # `data` is a link that leads out of the submission
         return [Found(file="data", state="refused", remarks=(problem,))]
     names = [path.relative_to(folder).as_posix() for path in data_files_in(folder / "data")]
     closed = [one for name in names if name not in named and (one := refused(folder, name))]
@@ -113,7 +113,7 @@ def passed_over(folder: Path, *, named: Collection[str] = ()) -> list[Found]:
     ]
 
 
-def look_at(folder: Path, file: str, *, columns: Mapping[str, str | int] = {}) -> Found:
+def examine_file(folder: Path, file: str, *, columns: Mapping[str, str | int] = {}) -> Found:
     """Return what a file of a submission contains; its `state` is "broken" or, so far, "unknown".
 
     Parameters
@@ -212,7 +212,8 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
     text = "" if new else submission_text(folder)
     document = parse_toml(text, where=f"{folder.resolve().name}/{NAME}", error=SubmissionError)
     looked = [
-        look_at(folder, file, columns=stated_columns(document, file)) for file in data_files(folder)
+        examine_file(folder, file, columns=stated_columns(document, file))
+        for file in data_files(folder)
     ]
     if not looked:
         what = "; ".join(_not_looked_into(passed_over(folder)))
@@ -315,7 +316,7 @@ class _Filling:
         """Yield the files that have a table but are missing, with likely alternatives."""
         files = {posix(str(table["file"])): table for table in self._tables}
         for file, table in files.items():
-            wrong = outside(self._folder, file, taken=files)
+            wrong = file_problem(self._folder, file, taken=files)
             if wrong is not None:
                 name, kind = str(table.get("id", "")), table.get("kind")
                 yield Found(

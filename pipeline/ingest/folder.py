@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.formats.recognise import ENDINGS, is_recording, read_table
-from pipeline.submission.load import outside
+from pipeline.submission.load import file_problem
 from pipeline.words.numbers import first_few
 
 # files of operating systems whose names do not begin with a dot
@@ -58,7 +58,7 @@ def files_not_read(folder: Path, *, root: Path) -> list[NotRead]:
 
 def refused(root: Path, name: str) -> NotRead | None:
     """Return why a file below `root` must not be opened; None if it may be opened."""
-    problem = outside(root, name)
+    problem = file_problem(root, name)
     if problem is None:
         return None
     link = (root / name).is_symlink()
@@ -75,7 +75,7 @@ def recordings_beside(folder: Path, *, named: Iterable[str]) -> list[NotRead]:
         name = path.name
         if _is_hidden(name) or name in known or not _is_recording(path):
             continue
-        if outside(folder, name) is None and _is_table(folder, name):
+        if file_problem(folder, name) is None and _is_table(folder, name):
             reason = "it is outside data/, and only files in data/ are read"
             found.append(NotRead(file=name, reason=reason, advice="move it into data/"))
     return found

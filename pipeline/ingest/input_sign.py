@@ -76,7 +76,7 @@ def with_signs(
             record,
             u=record.u if signs[record.id] == 1 else 0.0 - record.u,
             input_scale=signs[record.id] * record.input_scale,
-            turned=record.id not in stated and found.get(record.id) == -bench,
+            sign_reversed=record.id not in stated and found.get(record.id) == -bench,
         )
         if record.u is not None
         else record
@@ -148,13 +148,13 @@ def find_signs(records: Sequence[Record], *, stated: Mapping[str, int]) -> dict[
     weighed = {record.id: found for record in records if (found := _weigh(record)) is not None}
     if not weighed:
         return {}
-    said = {name: stated.get(name, 1) for name in weighed}
+    stated_signs = {name: stated.get(name, 1) for name in weighed}
     rule = [name for name, w in weighed.items() if w.complete] or list(weighed)
     rule = [name for name in rule if not weighed[name].closed] or rule
     # If equally many records have each sign, the sign of each record by itself is the better start.
-    alone = {n for n, w in weighed.items() if w.decisive and _bench([w], [said[n]])[0] < 0}
-    for turned in (set[str](), alone):
-        found = _settle(weighed, said, turned, rule=rule)
+    alone = {n for n, w in weighed.items() if w.decisive and _bench([w], [stated_signs[n]])[0] < 0}
+    for reversed_ in (set[str](), alone):
+        found = _settle(weighed, stated_signs, reversed_, rule=rule)
         if found:
             return found
     return {}
@@ -162,8 +162,8 @@ def find_signs(records: Sequence[Record], *, stated: Mapping[str, int]) -> dict[
 
 def _settle(
     weighed: Mapping[str, _Weighed],
-    said: Mapping[str, int],
-    turned: set[str],
+    stated: Mapping[str, int],
+    reversed_: set[str],
     *,
     rule: Sequence[str],
 ) -> dict[str, int]:
@@ -173,21 +173,21 @@ def _settle(
     """
     # At most five rounds of reversing records and fitting again.
     for _ in range(5):
-        signs = {name: -said[name] if name in turned else said[name] for name in weighed}
+        signs = {name: -stated[name] if name in reversed_ else stated[name] for name in weighed}
         sign, weights = _bench([weighed[name] for name in rule], [signs[name] for name in rule])
         if sign == 0:
             return {}
-        cosines = {name: sign * said[name] * _cosine(w, weights) for name, w in weighed.items()}
+        cosines = {name: sign * stated[name] * _cosine(w, weights) for name, w in weighed.items()}
         contrary = {n for n, w in weighed.items() if w.decisive and cosines[n] < -0.7}
-        if contrary == turned:
+        if contrary == reversed_:
             # The cosine is between an input and the force that the bench's equation gives. It stays
             # positive with a lag (at most 90°) and any likely delay. For a log with the opposite
             # sign it is near -1.
             return {
-                name: sign * signs[name] if name in turned or cosines[name] > 0.3 else 0
+                name: sign * signs[name] if name in reversed_ or cosines[name] > 0.3 else 0
                 for name in weighed
             }
-        turned = contrary
+        reversed_ = contrary
     return {}
 
 

@@ -317,7 +317,9 @@ def format_inspections(inspections: Sequence[Inspection]) -> str:
         duration, rate = (
             "" if number is None else f"{number:.4g}" for number in (one.duration, one.rate)
         )
-        rows.append((one.file, one.format, str(one.samples), duration, rate, _looks(one), roles))
+        rows.append(
+            (one.file, one.format, str(one.samples), duration, rate, _describe_kind(one), roles)
+        )
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
         "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -331,7 +333,7 @@ def format_inspections(inspections: Sequence[Inspection]) -> str:
     return "\n".join([*lines, *(f"! {problem}" for problem in problems)])
 
 
-def _looks(inspection: Inspection) -> str:
+def _describe_kind(inspection: Inspection) -> str:
     at = "" if inspection.frequency is None else f" at {inspection.frequency:.4g} Hz"
     return f"{inspection.kind or 'unknown'}{at}"
 
@@ -349,7 +351,7 @@ def format_inspection(inspection: Inspection) -> str:
             f"jitter {1e3 * jitter:.3g} ms rms" if jitter > 1e-9 else "even"
         )
     lines.append(f"  samples   {samples}")
-    lines.append(f"  looks like {_looks(inspection)}")
+    lines.append(f"  looks like {_describe_kind(inspection)}")
     width = max(len(column.name) for column in inspection.columns)
     for column in inspection.columns:
         step = f", step {column.step:.4g}" if column.step else ""

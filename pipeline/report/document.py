@@ -116,7 +116,7 @@ class Table:
     kind: str = field(default="table", init=False)
 
     @property
-    def told(self) -> bool:
+    def has_long_text(self) -> bool:
         """Return whether cells contain long text.
 
         If they do, a phone shows each row as lines instead of columns.

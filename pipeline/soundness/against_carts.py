@@ -114,8 +114,8 @@ def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, RecordingFault
         least = abs(gain.gain) - SIGMAS * gain.gain_std
         # The difference must exceed the amount by which friction may hold the carts off.
         if least > 1.3 * (abs(before.gain) + SIGMAS * before.gain_std):
-            said = {"times": f"{abs(gain.gain / before.gain):.3g}", "before": str(cart - 1)}
-            found[run] = RecordingFault(code="too_far", run=run, cart=cart, said=said)
+            details = {"times": f"{abs(gain.gain / before.gain):.3g}", "before": str(cart - 1)}
+            found[run] = RecordingFault(code="too_far", run=run, cart=cart, details=details)
     return found
 
 
@@ -160,7 +160,9 @@ def _dead_channels(
         if np.ptp(y) == 0 and (record.kind == "decay" or never):
             others = [free for free in record.free if free != cart]
             code = "never_changes_held" if others else "never_changes"
-            yield RecordingFault(code=code, run=record.id, cart=cart, said={"others": str(others)})
+            yield RecordingFault(
+                code=code, run=record.id, cart=cart, details={"others": str(others)}
+            )
         if chain is None or record.u is None or not is_driven(record):
             continue
         force = force_on(record, chain, cart=cart)
@@ -171,7 +173,7 @@ def _dead_channels(
             if not _must_move(record, chain, still, cart=cart, step=steps[cart]):
                 continue
             code = "dead" if np.ptp(y) == 0 else "froze_at_input"
-            yield RecordingFault(code=code, run=record.id, cart=cart, said=_span(record, still))
+            yield RecordingFault(code=code, run=record.id, cart=cart, details=_span(record, still))
 
 
 def _frozen(
@@ -210,8 +212,10 @@ def _frozen(
             # The reading follows the carts if its error elsewhere is below a quarter of the missed
             # motion.
             if follows and np.sqrt(elsewhere) < 0.25 * moved:
-                said = _span(record, part)
-                yield RecordingFault(code="froze_in_motion", run=record.id, cart=cart, said=said)
+                details = _span(record, part)
+                yield RecordingFault(
+                    code="froze_in_motion", run=record.id, cart=cart, details=details
+                )
 
 
 def _span(record: Record, part: slice) -> dict[str, str]:
@@ -238,8 +242,10 @@ def _copies(records: Sequence[Record]) -> dict[str, RecordingFault]:
     for record in records:
         what = (record.kind, record.free, record.t.tobytes(), record.y.tobytes())
         if first.setdefault(what, record.id) != record.id:
-            said = {"original": first[what]}
-            copies[record.id] = RecordingFault(code="copied_samples", run=record.id, said=said)
+            details = {"original": first[what]}
+            copies[record.id] = RecordingFault(
+                code="copied_samples", run=record.id, details=details
+            )
     return copies
 
 
@@ -248,8 +254,8 @@ def _short_dwell(record: Record) -> Iterator[RecordingFault]:
         duration = float(record.t[-1] - record.t[0]) + record.sample_time
         cycles = record.omega * duration / (2 * np.pi)
         if cycles < _FEWEST_CYCLES:
-            said = {"cycles": f"{_FEWEST_CYCLES:g}"}
-            yield RecordingFault(code="short_dwell", run=record.id, said=said)
+            details = {"cycles": f"{_FEWEST_CYCLES:g}"}
+            yield RecordingFault(code="short_dwell", run=record.id, details=details)
 
 
 def _wrong_clock(record: Record, *, usual: float) -> Iterator[RecordingFault]:
@@ -261,8 +267,8 @@ def _wrong_clock(record: Record, *, usual: float) -> Iterator[RecordingFault]:
         # A factor of 100 or more is another unit of time; a factor of 2 may be another setting.
         is_unit = max(factor, 1 / factor) >= 100.0
         if is_unit and abs(record.sample_time - factor * usual) < SAME * factor * usual:
-            said = {"apart": f"{record.sample_time:.3g}", "usual": f"{usual:.3g}", "look": words}
-            yield RecordingFault(code="other_clock", run=record.id, said=said)
+            details = {"apart": f"{record.sample_time:.3g}", "usual": f"{usual:.3g}", "look": words}
+            yield RecordingFault(code="other_clock", run=record.id, details=details)
 
 
 # ------------------------------------------------------- records that follow no carts
@@ -270,8 +276,8 @@ def _wrong_clock(record: Record, *, usual: float) -> Iterator[RecordingFault]:
 
 def _misread(record: Record, misread: Misread, everywhere: bool) -> RecordingFault:
     code = "misread_everywhere" if everywhere else "misread"
-    said = {"look": misread.words, "remedy": misread.remedy}
-    return RecordingFault(code=code, run=record.id, said=said)
+    details = {"look": misread.words, "remedy": misread.remedy}
+    return RecordingFault(code=code, run=record.id, details=details)
 
 
 def _strays(
@@ -291,5 +297,5 @@ def _strays(
             continue
         # More than half of the power of every cart must be unexplained.
         if all(min(near_by.lost.values()) > 0.5 for near_by in near(record, chain)):
-            said = {"percent": f"{100 * min(fit.share, 1.0):.0f}"}
-            yield RecordingFault(code="stray", run=record.id, said=said, is_wrong=False)
+            details = {"percent": f"{100 * min(fit.share, 1.0):.0f}"}
+            yield RecordingFault(code="stray", run=record.id, details=details, is_wrong=False)

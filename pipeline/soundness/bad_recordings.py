@@ -36,8 +36,8 @@ def find_bad_recordings(analysis: Analysis) -> dict[str, str]:
             found[record.id] = setups[record.id]
             continue
         here = [late[record.id]] if record.id in late else []
-        told = (fault.reason for fault in _channels_at_fault(record, sticky=sticky))
-        for problem in (*told, *here):
+        reasons = (fault.reason for fault in _channels_at_fault(record, sticky=sticky))
+        for problem in (*reasons, *here):
             found.setdefault(record.id, problem)
     return found
 
@@ -48,17 +48,17 @@ def _channels_at_fault(record: Record, *, sticky: bool) -> Iterator[RecordingFau
         if cart not in record.free or sticky or record.kind not in ("sine", "sweep"):
             continue
         if (limit := saturation(record.position(cart))) is not None:
-            said = {"limit": f"{limit:.4g}"}
-            yield RecordingFault(code="clipped_position", run=record.id, cart=cart, said=said)
+            details = {"limit": f"{limit:.4g}"}
+            yield RecordingFault(code="clipped_position", run=record.id, cart=cart, details=details)
     u = record.u
     if u is None or record.kind == "closed_loop":
         return
     if (limit := saturation(u)) is not None:
-        yield RecordingFault(code="clipped_input", run=record.id, said={"limit": f"{limit:.4g}"})
+        yield RecordingFault(code="clipped_input", run=record.id, details={"limit": f"{limit:.4g}"})
     if record.kind == "sine" and record.omega is not None and np.ptp(u) > 0:
         hertz, stated = line_frequency(record.t, u), record.omega / (2 * np.pi)
         resolution = 1.0 / float(record.t[-1] - record.t[0])
         if hertz is not None and abs(hertz - stated) > max(_OTHER_RUN * stated, resolution):
             look = why_other_frequency(stated / hertz) or say("frequency_of_another")
-            said = {"found": f"{hertz:.3g}", "stated": f"{stated:.3g}", "look": look}
-            yield RecordingFault(code="other_frequency", run=record.id, said=said)
+            details = {"found": f"{hertz:.3g}", "stated": f"{stated:.3g}", "look": look}
+            yield RecordingFault(code="other_frequency", run=record.id, details=details)

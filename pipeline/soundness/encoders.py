@@ -38,8 +38,8 @@ def find_other_units(
             if _is_decimal(step) and _is_decimal(usual):
                 continue
             for scale in [s for s in scales if _alike(step, s * usual)]:
-                said = {"scale": f"{scale:.3g}"}
-                fault = RecordingFault(code="other_unit", run=record.id, cart=cart, said=said)
+                details = {"scale": f"{scale:.3g}"}
+                fault = RecordingFault(code="other_unit", run=record.id, cart=cart, details=details)
                 found.setdefault(record.id, fault)
     return found
 
@@ -69,7 +69,7 @@ def find_stuck(records: Sequence[Record]) -> dict[str, RecordingFault]:
                 fastest = float(np.quantile(moves, 0.98))
                 away = last < moves.size and moves[last] >= 1.5 * fastest
                 if away or moves[first - 1] >= 0.6 * fastest:
-                    said = {"first": f"{record.t[first]:.4g}", "last": f"{record.t[last]:.4g}"}
-                    fault = RecordingFault(code="stuck", run=record.id, cart=cart, said=said)
+                    details = {"first": f"{record.t[first]:.4g}", "last": f"{record.t[last]:.4g}"}
+                    fault = RecordingFault(code="stuck", run=record.id, cart=cart, details=details)
                     found.setdefault(record.id, fault)
     return found

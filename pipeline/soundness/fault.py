@@ -30,7 +30,7 @@ class RecordingFault:
     ----------
     code : kind of the fault, which is also the key of its sentence.
     run, cart : the recording and the cart. Without a cart, the fault concerns the whole recording.
-    said : values for the sentence, as text.
+    details : values for the sentence, as text.
     value, limit : the number that shows the fault, and its largest allowed value. None if there is
         no such number.
     is_wrong : whether the recording does not show what happened. Otherwise it only differs from
@@ -40,7 +40,7 @@ class RecordingFault:
     code: str
     run: str
     cart: int | None = None
-    said: Mapping[str, str] = field(default_factory=dict)
+    details: Mapping[str, str] = field(default_factory=dict)
     value: float | None = None
     limit: float | None = None
     is_wrong: bool = True
@@ -48,7 +48,7 @@ class RecordingFault:
     @property
     def reason(self) -> str:
         """The fault in words that follow the recording's name."""
-        return _WORDS.text(self.code, cart=self.cart, **self.said)
+        return _WORDS.text(self.code, cart=self.cart, **self.details)
 
     @property
     def left_out(self) -> LeftOut:

@@ -73,8 +73,10 @@ def _shows(link: ChannelDelay, *, sample: float) -> bool:
 def late_fault(late: LateChannel) -> RecordingFault:
     """Return the delay of a cart's channel, as a fault of the first of its recordings."""
     when = "later" if late.delay > 0 else "earlier"
-    said = {"delay": f"{1e3 * abs(late.delay):.3g}", "when": when, "than": str(late.than)}
-    return RecordingFault(code="late_channel", run=late.experiments[0], cart=late.cart, said=said)
+    details = {"delay": f"{1e3 * abs(late.delay):.3g}", "when": when, "than": str(late.than)}
+    return RecordingFault(
+        code="late_channel", run=late.experiments[0], cart=late.cart, details=details
+    )
 
 
 def late_experiments(late: Sequence[LateChannel]) -> Mapping[str, str]:

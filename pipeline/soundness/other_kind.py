@@ -23,8 +23,8 @@ def find_other_kinds(
     for record in records:
         original = first.setdefault(files.get(record.source, record.source), record.source)
         if original != record.source:
-            said = {"source": record.source, "original": original}
-            found[record.id] = RecordingFault(code="copied_file", run=record.id, said=said)
+            details = {"source": record.source, "original": original}
+            found[record.id] = RecordingFault(code="copied_file", run=record.id, details=details)
         for fault in (*_another_input(record, largest=largest), *_cut(record, records)):
             found.setdefault(record.id, fault)
     return found
@@ -67,5 +67,5 @@ def _cut(record: Record, records: Sequence[Record]) -> Iterator[RecordingFault]:
     if alike.sum() < max(WITNESSES, len(others) / 2):
         return
     if length < 0.5 * usual and record.t.size < 0.5 * samples:
-        said = {"length": f"{length:.3g}", "usual": f"{usual:.3g}"}
-        yield RecordingFault(code="cut", run=record.id, said=said)
+        details = {"length": f"{length:.3g}", "usual": f"{usual:.3g}"}
+        yield RecordingFault(code="cut", run=record.id, details=details)

@@ -127,4 +127,4 @@ def _is_sampled_so(record: Record, records: Sequence[Record], *, factor: float) 
 
 def _odd(name: str, *, scale: float) -> RecordingFault:
     code = "moves_too_little" if scale < 1 else "moves_too_far"
-    return RecordingFault(code=code, run=name, said={"scale": f"{scale:.3g}"}, is_wrong=False)
+    return RecordingFault(code=code, run=name, details={"scale": f"{scale:.3g}"}, is_wrong=False)

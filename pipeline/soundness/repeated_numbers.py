@@ -71,8 +71,8 @@ def compare_repeats(
     """
     readings = _readings(decays, steps, carts=carts)
     # Dampings of a fit are not used, because they may come from the decays.
-    told = {name: one for name, one in fitted.items() if not read_name(name).is_ratio}
-    right = {name: _right_ones(all_, told.get(name)) for name, all_ in readings.items()}
+    estimates = {name: one for name, one in fitted.items() if not read_name(name).is_ratio}
+    right = {name: _right_ones(all_, estimates.get(name)) for name, all_ in readings.items()}
     usual = {n: float(np.median([r.value for r in ones])) for n, ones in right.items() if ones}
     for name in [name for name in usual if name in dwells and not read_name(name).is_ratio]:
         if all(_is_far(reading, dwells[name], name=name) for reading in right[name]):
@@ -86,17 +86,17 @@ def compare_repeats(
     for name, value in usual.items():
         belong = {reading.run for reading in right[name]}
         for run in [r.run for r in readings[name] if r.run not in belong and r.run not in odd]:
-            said = _wrong_clock(of_run[run], usual)
-            if said or name not in by_size:
-                wrong = said or (not right[name] and _differ_in_size(readings[name]))
+            clock_error = _wrong_clock(of_run[run], usual)
+            if clock_error or name not in by_size:
+                wrong = clock_error or (not right[name] and _differ_in_size(readings[name]))
                 odd[run] = RecordingFault(
                     code="odd_number" if right[name] else "odd_beside_dwells",
                     run=run,
-                    said={
+                    details={
                         "parameter": name,
                         "found": f"{of_run[run][name]:.3g}",
                         "usual": f"{value:.3g}",
-                        "look": f": {said}" if said else "",
+                        "look": f": {clock_error}" if clock_error else "",
                     },
                     is_wrong=bool(wrong) and not _is_reversed(of_run[run], usual),
                 )
@@ -198,12 +198,16 @@ def _right_ones(readings: Sequence[_Reading], fitted: Estimate | None) -> list[_
     return largest if 2 * len(largest) > len(readings) else []
 
 
-def _is_far(reading: _Reading, told: Estimate, *, name: str) -> bool:
+def _is_far(reading: _Reading, estimate: Estimate, *, name: str) -> bool:
     """Whether the whole interval of a reading is far from a number that is known well."""
-    if told.std is None or told.value <= 0 or SIGMAS * told.std > _LIKE_THE_FIT * told.value:
+    if (
+        estimate.std is None
+        or estimate.value <= 0
+        or SIGMAS * estimate.std > _LIKE_THE_FIT * estimate.value
+    ):
         return False
     factor = _BY_THE_BENCH[read_name(name).symbol]
-    return reading.high < told.value / factor or reading.low > told.value * factor
+    return reading.high < estimate.value / factor or reading.low > estimate.value * factor
 
 
 def _wrong_clock(values: Mapping[str, float], usual: Mapping[str, float]) -> str:
@@ -213,12 +217,12 @@ def _wrong_clock(values: Mapping[str, float], usual: Mapping[str, float]) -> str
         for name, value in values.items()
         if read_name(name).is_frequency and usual.get(name)
     ]
-    looks = (
+    explanations = (
         words
         for factor, words in TIME_FACTORS.items()
         if ratios and all(_near(ratio, factor) for ratio in ratios)
     )
-    return next(looks, "")
+    return next(explanations, "")
 
 
 def _is_reversed(values: Mapping[str, float], usual: Mapping[str, float]) -> bool:
@@ -248,25 +252,25 @@ def _check(
     apart = f"from {min(values):.4g} to {max(values):.4g}"
     count = f"{len(readings)} runs"
     if undecided:
-        outcome, said = (
+        outcome, text = (
             "fail",
-            (f"contradict each other ({apart}), and nothing shows which is right: no run is used"),
+            f"contradict each other ({apart}), and nothing shows which is right: no run is used",
         )
     elif off:
         runs = ", ".join(f"{reading.run} ({reading.value:.4g})" for reading in off)
         are = "is" if len(off) == 1 else "are"
-        outcome, said = "fail", f"contradict each other ({apart}). {runs} {are} left out"
+        outcome, text = "fail", f"contradict each other ({apart}). {runs} {are} left out"
     elif np.any(_contradictions(readings)):
-        outcome, said = "fail", f"give values {apart} that depend on the step, as if a cart stuck"
+        outcome, text = "fail", f"give values {apart} that depend on the step, as if a cart stuck"
     elif spread > readings[0].tolerance:
-        outcome, said = "skip", f"give values {apart}; their standard errors allow this difference"
+        outcome, text = "skip", f"give values {apart}; their standard errors allow this difference"
     else:
-        outcome, said = "pass", f"agree within {spread:.2g} %"
+        outcome, text = "pass", f"agree within {spread:.2g} %"
     return Check(
         kind="repeats",
         parameter=name,
         outcome=outcome,
         value=spread,
         limit=readings[0].tolerance,
-        message=f"{name}: {count} {said}.",
+        message=f"{name}: {count} {text}.",
     )

@@ -38,9 +38,11 @@ def find_outlier_repeats(records: Sequence[Record], *, unit: str) -> dict[str, R
             index, distance, spread = found
             left.remove(index)
             name, others = group[index].id, ", ".join(group[i].id for i in left)
-            said = {"others": others, "unit": unit}
-            said |= {"distance": f"{distance:.3g}", "spread": f"{spread:.3g}"}
-            outliers[name] = RecordingFault(code="odd_repeat", run=name, said=said, is_wrong=False)
+            details = {"others": others, "unit": unit}
+            details |= {"distance": f"{distance:.3g}", "spread": f"{spread:.3g}"}
+            outliers[name] = RecordingFault(
+                code="odd_repeat", run=name, details=details, is_wrong=False
+            )
     return outliers
 
 

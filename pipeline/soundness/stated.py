@@ -41,7 +41,7 @@ def find_wrong_setups(records: Sequence[Record]) -> list[RecordingFault]:
                 code="wrong_setup",
                 run=record.id,
                 cart=mover,
-                said={"free": ", ".join(map(str, record.free))},
+                details={"free": ", ".join(map(str, record.free))},
                 value=held[mover] / free if free > 0 else None,
                 limit=1 / LEAST_SHARE,
             )
@@ -61,7 +61,7 @@ def find_loose_holds(records: Sequence[Record]) -> list[RecordingFault]:
                     code="moves_though_held",
                     run=record.id,
                     cart=cart,
-                    said={"percent": f"{100 * share:.0f}"},
+                    details={"percent": f"{100 * share:.0f}"},
                     value=share,
                     limit=_HELD_FIRMLY,
                 )
@@ -81,19 +81,21 @@ def find_other_scales(records: Sequence[Record], *, bench: Bench) -> list[Record
     whole = all(np.array_equal(record.y, np.round(record.y)) for record in records)
     if metres and travel > (limit := (_LONGEST_WHOLE if whole else _LONGEST) / metres):
         why = say("position_scale_whole" if whole else "position_scale_long")
-        said = {"reach": f"{travel:.4g}", "unit": unit, "quoted": repr(unit), "why": why}
+        details = {"reach": f"{travel:.4g}", "unit": unit, "quoted": repr(unit), "why": why}
         found.append(
-            RecordingFault(code="position_scale", run=run, said=said, value=travel, limit=limit)
+            RecordingFault(
+                code="position_scale", run=run, details=details, value=travel, limit=limit
+            )
         )
     unit, volts = bench.units.input, conversion(bench.units.input, "V")
     # Under feedback, a bench may log another signal as its input.
     driven = [(r, r.u) for r in records if r.u is not None and r.kind != "closed_loop"]
     largest, run = _reached((r, float(np.abs(u).max())) for r, u in driven)
     if volts and largest * volts > _LARGEST:
-        said = {"reach": f"{largest:.4g}", "unit": unit, "quoted": repr(unit)}
+        details = {"reach": f"{largest:.4g}", "unit": unit, "quoted": repr(unit)}
         limit = _LARGEST / volts
         found.append(
-            RecordingFault(code="input_scale", run=run, said=said, value=largest, limit=limit)
+            RecordingFault(code="input_scale", run=run, details=details, value=largest, limit=limit)
         )
     return found
 

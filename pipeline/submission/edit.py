@@ -13,7 +13,7 @@ from tomlkit.items import Array
 from pipeline.errors import SubmissionError
 from pipeline.lock import lock_when_free
 from pipeline.output import write_file
-from pipeline.submission.load import MAX_TOML_BYTES, NAME, outside, parse_submission
+from pipeline.submission.load import MAX_TOML_BYTES, NAME, file_problem, parse_submission
 from pipeline.submission.models import Submission
 from pipeline.submission.toml_file import Value, read_text
 
@@ -36,7 +36,7 @@ def submission_text(folder: Path) -> str:
     SubmissionError : the file cannot be read.
     """
     where = f"{folder.resolve().name}/{NAME}"
-    if (problem := outside(folder, NAME)) is not None:
+    if (problem := file_problem(folder, NAME)) is not None:
         raise SubmissionError(f"{where}: {problem}")
     return read_text(folder / NAME, where=where, limit=MAX_TOML_BYTES, error=SubmissionError)
 

@@ -63,7 +63,7 @@ def load_submission(path: Path) -> Submission:
     if toml != path and not toml.exists() and not toml.is_symlink():
         hint = _near_file(folder, NAME, ()) or "; cartlab fill writes one for the files in data/"
         raise SubmissionError(f"{quote(str(path))}: contains no {NAME}{hint}")
-    if (problem := outside(folder, toml.name)) is not None:
+    if (problem := file_problem(folder, toml.name)) is not None:
         raise SubmissionError(f"{where}: {problem}")
     return parse_submission(
         read_text(toml, where=where, limit=MAX_TOML_BYTES, error=SubmissionError),
@@ -205,7 +205,7 @@ def _notes(folder: Path) -> str | None:
     path, where = folder / "notes.md", f"{folder.resolve().name}/notes.md"
     if not path.exists() and not path.is_symlink():
         return None
-    if (problem := outside(folder, "notes.md")) is not None:
+    if (problem := file_problem(folder, "notes.md")) is not None:
         raise SubmissionError(f"{where}: {problem}")
     typed = read_text(path, where=where, limit=MAX_NOTES_BYTES, error=SubmissionError)
     text = COMMENT.sub("", typed)
@@ -279,7 +279,7 @@ def _experiment_problems(
 ) -> Iterator[tuple[Location, str]]:
     if not experiment.id.strip() or not experiment.id.isprintable() or len(experiment.id) > 100:
         yield ("id",), "expected 1 to 100 printable characters"
-    if (problem := leaves(folder, experiment.file)) is not None:
+    if (problem := path_problem(folder, experiment.file)) is not None:
         yield ("file",), problem
     for j, cart in enumerate(experiment.carts):
         yield from _in_range(("carts", j), cart, n)
@@ -362,7 +362,7 @@ def stated_columns(document: Mapping[str, Any], file: str) -> dict[str, str | in
     return stated
 
 
-def leaves(folder: Path, name: str) -> str | None:
+def path_problem(folder: Path, name: str) -> str | None:
     """Return why `name` cannot be a file inside `folder`, or None; the file need not exist."""
     shown = quote(name)
     if not name.strip() or not name.isprintable():
@@ -373,7 +373,7 @@ def leaves(folder: Path, name: str) -> str | None:
     if windows.drive or windows.root or relative.is_absolute() or ".." in windows.parts:
         return f"{shown} is outside the submission folder"
     steps = [folder / part for part in (relative, *relative.parents)[:-1]]
-    with suppress(OSError, RuntimeError):  # `outside` reports links that cannot be followed
+    with suppress(OSError, RuntimeError):  # `file_problem` reports links that cannot be followed
         linked = any(map(_may_be_link, steps))
         if linked and not steps[0].resolve().is_relative_to(folder.resolve()):
             return f"{shown} is outside the submission folder, through a link"
@@ -393,12 +393,12 @@ def _may_be_link(path: Path) -> bool:
     return False
 
 
-def outside(folder: Path, name: str, *, taken: Collection[str] = ()) -> str | None:
+def file_problem(folder: Path, name: str, *, taken: Collection[str] = ()) -> str | None:
     """Return why `name` is not a readable regular file inside `folder`, or None if it is one.
 
     The files in `taken` belong to other entries, so messages do not suggest them.
     """
-    if (problem := leaves(folder, name)) is not None:
+    if (problem := path_problem(folder, name)) is not None:
         return problem
     shown = quote(name)
     try:

@@ -794,7 +794,7 @@ def test_a_failed_task_says_why(tmp_path, workers):
     with pytest.raises(Failed, match="contains no recordings"):
         workers.do("fill_tables", folder=str(tmp_path))
     with pytest.raises(Failed, match="outside"):
-        workers.do("inspect_file", folder=str(tmp_path), file="../x.csv", columns={})
+        workers.do("describe_file", folder=str(tmp_path), file="../x.csv", columns={})
     assert workers.do("list_files", folder=str(tmp_path)) == []
 
 

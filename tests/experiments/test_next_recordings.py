@@ -302,7 +302,7 @@ def test_carts_that_hardly_settle_get_no_dwells():
 def test_a_predicted_error_below_calibration_is_reported(analysis):
     """If the predicted error is below what any calibration allows, the message says so."""
     found = choose_next(analysis, Plan(limits=LIMITS), n=1, goal="worst", commands=COMMANDS)
-    assert (STATISTICAL in found.said) == (found.errors[-1] < CALIBRATION)
+    assert (STATISTICAL in found.summary) == (found.errors[-1] < CALIBRATION)
     assert (STATISTICAL in found.recordings[0].note) == (found.errors[-1] < CALIBRATION)
     known = Knowledge.of(analysis)
     worst, names = find_goal("worst", known, feedback=None), list(known.chain.parameters())

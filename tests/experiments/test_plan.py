@@ -337,7 +337,7 @@ def test_a_recording_added_meanwhile_is_kept(tmp_path):
     n = len(old.recordings)
     assert made.plan == load_plan(submission)
     assert made.plan.recordings[: n + 1] == (*old.recordings, mine)
-    assert f" {len(made.plan.recordings) - n - 1} recording" in made.said
+    assert f" {len(made.plan.recordings) - n - 1} recording" in made.message
     assert of_kind(made.plan, "sine")
 
 

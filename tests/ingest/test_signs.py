@@ -184,7 +184,7 @@ def test_the_report_asks_why_a_record_was_inverted(tmp_path):
 
     analysis = analyse(load_submission(folder))
 
-    assert [record.id for record in analysis.records if record.turned] == ["step-1"]
+    assert [record.id for record in analysis.records if record.sign_reversed] == ["step-1"]
     (question, *_) = ask(analysis)
     assert (question.id, question.section) == ("sign", "steps")
     assert "step-1" in question.text

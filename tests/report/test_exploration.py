@@ -31,7 +31,7 @@ def make_turn(*weights: float) -> Turn:
         left=0.1,
         floor=0.01,
         reached=False,
-        said="K_1 is known to ± 1 % only",
+        summary="K_1 is known to ± 1 % only",
     )
 
 

@@ -40,7 +40,7 @@ def modules() -> list[tuple[str, set[str]]]:
 @pytest.mark.parametrize("subject", SUBJECTS)
 def test_every_sentence_is_used(subject, modules):
     """Every sentence of a catalogue is used by some module."""
-    asking = (f'"{subject}"', "WORDS", "words: Phrases", "said=(")
+    asking = (f'"{subject}"', "WORDS", "words: Phrases", "advice_keys=(")
     strings: set[str] = set()
     parts: set[str] = set()  # keys that are put together, as in f"title_{verdict}"
     for text, found in modules:
@@ -49,8 +49,8 @@ def test_every_sentence_is_used(subject, modules):
     built = tuple(s for s in parts if s.endswith("_"))
     built_ends = tuple(s for s in parts if s.startswith("_"))
     for key in phrases(subject).by_key:
-        said = key in strings or key.startswith(built) or key.endswith(built_ends)
-        assert said or key in ("bode_fit", "time_fit"), key  # names of fit methods
+        is_used = key in strings or key.startswith(built) or key.endswith(built_ends)
+        assert is_used or key in ("bode_fit", "time_fit"), key  # names of fit methods
 
 
 def test_values_in_a_sentence_are_never_markup(tmp_path):

@@ -61,8 +61,8 @@ class Importer:
         self._plan: Plan | None = (
             load_plan(self._submission) if plan_path(self._submission).exists() else None
         )
-        self._seen: dict[Path, tuple[int, int]] = {}  # size and time at the last scan
-        self._looks: dict[Path, int] = {}
+        self._last_state: dict[Path, tuple[int, int]] = {}  # size and time at the last scan
+        self._unchanged: dict[Path, int] = {}
         self._over: set[Path] = set()  # imported, refused, or already in the submission
         self._locked: set[Path] = set()  # locked files that were reported
         if self._plan:
@@ -115,11 +115,13 @@ class Importer:
             except OSError:  # removed in the meantime
                 continue
             state = info.st_size, info.st_mtime_ns
-            self._looks[path] = self._looks.get(path, 0) + 1 if self._seen.get(path) == state else 0
-            self._seen[path] = state
-            if info.st_size and (at_once or self._looks[path] >= 2):  # it no longer changes
+            self._unchanged[path] = (
+                self._unchanged.get(path, 0) + 1 if self._last_state.get(path) == state else 0
+            )
+            self._last_state[path] = state
+            if info.st_size and (at_once or self._unchanged[path] >= 2):  # it no longer changes
                 ready.append(path)
-        return sorted(ready, key=lambda path: (self._seen[path][1], path.name))
+        return sorted(ready, key=lambda path: (self._last_state[path][1], path.name))
 
     def _is_other(self, path: Path) -> bool:
         """Return whether a path cannot be a data file; if so, report it."""
@@ -152,7 +154,7 @@ class Importer:
             if path.exists() and self._opens(path):
                 raise  # the file can be read, so writing to the submission failed
             self._over.discard(path)
-            self._looks[path] = 0
+            self._unchanged[path] = 0
             return None
 
     def _take(self, path: Path, *, final: bool) -> Imported | None:
@@ -178,7 +180,7 @@ class Importer:
             self._observer.remark(f"not imported: {error}")
             return None
         if inspection.cut_short:
-            if not final and self._looks[path] < 20:  # its last line may still be written
+            if not final and self._unchanged[path] < 20:  # its last line may still be written
                 self._over.discard(path)
             else:
                 self._observer.remark(f"{path.name}: not imported: {inspection.problems[0]}")

@@ -149,7 +149,7 @@ class SerialLine:
         raise self._runaway
 
     @contextmanager
-    def watched(self, tell: Callable[[str], None]) -> Iterator[None]:
+    def watched(self, report: Callable[[str], None]) -> Iterator[None]:
         """Watch the line in a thread between runs, while a person or the program is busy.
 
         The thread sends no heartbeat. So if a run hangs, the bench still cuts the motor. At the end
@@ -157,21 +157,21 @@ class SerialLine:
 
         Parameters
         ----------
-        tell : called once from the thread, with a message, if the bench acts without an order.
+        report : called once from the thread, with a message, if the bench acts without an order.
         """
         over = threading.Event()
 
         def watch() -> None:
-            told = False
+            reported = False
             while not over.wait(_LOOK):
                 try:
                     with self._lock:
                         if not self._in_run:
                             self.overhear()
                 except Runaway as runaway:
-                    if not told:
-                        tell(str(runaway))
-                    told = True
+                    if not reported:
+                        report(str(runaway))
+                    reported = True
                 except HardwareError:  # the next use of the line reports the error
                     return
 
@@ -215,16 +215,16 @@ class SerialLine:
         ----------
         longest : longest time to wait, in s.
         """
-        heard, end = bytearray(), time.monotonic() + longest
+        received, end = bytearray(), time.monotonic() + longest
         quiet_at = time.monotonic() + _QUIET
         while True:
             data, now = self.overhear(), time.monotonic()
             if data:
-                heard += data
+                received += data
                 quiet_at = now + _QUIET
             # `now` was read before the port, because this computer may pause between the two.
             if now > min(end, quiet_at):
-                return bytes(heard)
+                return bytes(received)
             time.sleep(_LOOK)
 
     def clear(self, *, queries: int = _QUERIES) -> None:
@@ -297,11 +297,11 @@ class SerialLine:
         """
         self.send(Signal.QUERY)
         self._asked += 1
-        heard, answers, end = b"", [], time.monotonic() + _ANSWER
+        received, answers, end = b"", [], time.monotonic() + _ANSWER
         while len(answers) < self._asked:
             now = time.monotonic()
-            heard += self.overhear()
-            lines = [line for line in heard.split(b"\n")[:-1] if line.startswith(beginning)]
+            received += self.overhear()
+            lines = [line for line in received.split(b"\n")[:-1] if line.startswith(beginning)]
             if len(lines) > len(answers):
                 answers, end = lines, now + _ANSWER
             # `now` was read before the port, because this computer may pause between the two.
@@ -319,16 +319,16 @@ class SerialLine:
         # A run of 0.1 s without motion makes a stock bench send lines.
         self.send(Start(wave=Wave.DELTA, frequency=1 / 0.1, amplitude=0))
         self._in_run, self._is_cleared = False, True  # the motor must stay off in this run
-        heard, end = b"", time.monotonic() + FIRST_LINE
-        while not heard and time.monotonic() < end:
+        received, end = b"", time.monotonic() + FIRST_LINE
+        while not received and time.monotonic() < end:
             time.sleep(_LOOK)
-            heard = self.overhear()
-        heard += self.drain()
+            received = self.overhear()
+        received += self.drain()
         self.send(Signal.RESET)
-        readings = [parse_reading(line) for line in heard.split(b"\n")]
+        readings = [parse_reading(line) for line in received.split(b"\n")]
         encoders = [len(reading.counts) for reading in readings if reading is not None]
         if not encoders:
-            what = f"{heard[:40]!r}, which is not a line of a bench" if heard else "nothing"
+            what = f"{received[:40]!r}, which is not a line of a bench" if received else "nothing"
             raise HardwareError(
                 f"{self._name}: answers {what}. Check that this is the bench's port, the bench is "
                 "on, its baud rate is that in plan.toml, and no other program uses the port"

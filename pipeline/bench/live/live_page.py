@@ -37,7 +37,7 @@ _FILES = {
 }
 
 
-def stream_news(
+def stream_events(
     session: ShownSession, *, is_over: Callable[[], bool], last_words: str = ""
 ) -> Response:
     """Return the changes of a session as a stream of events.
@@ -50,20 +50,20 @@ def stream_news(
     if session.viewers >= 8:  # each open page costs a little computing time
         return PlainTextResponse("too many pages show this session", status_code=503)
 
-    async def news() -> AsyncIterator[str]:
+    async def events() -> AsyncIterator[str]:
         """Yield changes as they happen; a slow page gets fewer events, not late ones."""
         session.viewers += 1
         try:
-            said, over = time.monotonic(), is_over()
+            last_sent, over = time.monotonic(), is_over()
             for changed in session.follow():
                 for kind, data in changed:
-                    said = time.monotonic()
+                    last_sent = time.monotonic()
                     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
                     yield f"event: {kind}\ndata: {text}\n\n"
                 if over:
                     break
-                if time.monotonic() - said > 5.0:  # s
-                    said = time.monotonic()
+                if time.monotonic() - last_sent > 5.0:  # s
+                    last_sent = time.monotonic()
                     yield ": still here\n\n"
                 await asyncio.sleep(FRAME)
                 over = is_over()
@@ -72,7 +72,7 @@ def stream_news(
         finally:
             session.viewers -= 1
 
-    return StreamingResponse(news(), media_type="text/event-stream")
+    return StreamingResponse(events(), media_type="text/event-stream")
 
 
 def press_button(session: ShownSession, wish: str, number: str) -> int:
@@ -155,7 +155,7 @@ class LivePage(LiveState):
         return Response(status_code=status)
 
     async def _stream(self, request: Request) -> Response:
-        return stream_news(self, is_over=lambda: self._closing)
+        return stream_events(self, is_over=lambda: self._closing)
 
 
 class _SecretPath:

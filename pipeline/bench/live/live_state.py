@@ -90,15 +90,15 @@ class ShownSession(ABC):
         """
         run = start = 0
         while True:
-            news: list[tuple[str, Mapping[str, Any]]] = []
+            events: list[tuple[str, Mapping[str, Any]]] = []
             if version != self.version:
                 version = self.version
-                news.append(("state", self.snapshot()))
+                events.append(("state", self.snapshot()))
             points = self.points(run=run, start=start)
             if (points["run"], points["end"]) != (run, start):
                 run, start = points["run"], points["end"]
-                news.append(("points", points))
-            yield news
+                events.append(("points", points))
+            yield events
 
     def _keep(
         self, run: int, points: Sequence[Sequence[float]], counters: Mapping[str, int]

@@ -23,7 +23,7 @@ from pipeline.experiments.plan import Recording
 from pipeline.names import read_name
 from pipeline.report.exploration import NAME as DIARY
 from pipeline.submission import Submission, load_submission
-from pipeline.submission.load import outside
+from pipeline.submission.load import file_problem
 from pipeline.words.text import with_symbols
 
 _KINDS = (("step", "Step"), ("sweep", "Sweep"), ("sine", "Dwell"), ("decay", "Decay"))
@@ -144,11 +144,11 @@ def _show_page(
         asks=running and not running.is_shown,
         live=Markup(live_view()) if running and running.is_shown else "",
         ports=list_ports(ask),
-        has_report=outside(folder, "report/report.html") is None,
+        has_report=file_problem(folder, "report/report.html") is None,
         kinds=_KINDS,
         kind=kind if kind in dict(_KINDS) else _KINDS[0][0],
         kind_asked=bool(ask.query("kind")),
-        diary=outside(folder, DIARY) is None,
+        diary=file_problem(folder, DIARY) is None,
         typed={name: typed.get(name, "") for name in _TYPED},
         refused=refused,
         weighed=weighed,

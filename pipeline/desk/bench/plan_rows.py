@@ -11,7 +11,7 @@ from pipeline.experiments.plan_file import load_plan, plan_path
 from pipeline.experiments.plan_words import session_time, time_words, what_words
 from pipeline.names import parameter_names, read_name
 from pipeline.submission import Submission, load_submission
-from pipeline.submission.load import NAME, outside
+from pipeline.submission.load import NAME, file_problem
 
 
 def plan_ids(folder: Path) -> frozenset[str] | None:
@@ -93,5 +93,5 @@ def _why_again(session: BenchSession | None) -> dict[str, str]:
 def _find_partial(submission: Submission, name: str) -> str:
     """Return a note if an earlier run of this recording ended early, else ""."""
     file = f"data/{name}.partial.txt"
-    is_there = outside(submission.folder, file) is None
+    is_there = file_problem(submission.folder, file) is None
     return f"An earlier run ended early; what it recorded is in {file}." if is_there else ""

@@ -69,7 +69,7 @@ def _explore(folder: Path, request: dict[str, Any], state: LiveState) -> str:
         seconds=read_time(limit),
     )
     reached = "The goal is reached" if turns[-1].reached else "The goal was not reached"
-    return f"{reached}: {with_symbols(turns[-1].said)}."
+    return f"{reached}: {with_symbols(turns[-1].summary)}."
 
 
 def _write_events(state: LiveState, say: Callable[..., None], is_over: threading.Event) -> None:

@@ -17,7 +17,7 @@ from pipeline.output import new_folder
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.nonlinear.effects import CATALOGUE
 from pipeline.report.effects.catalogue import catalogue_data
-from pipeline.submission.load import NAME, outside
+from pipeline.submission.load import NAME, file_problem
 from pipeline.words.math import to_text
 
 _SHOWN_ON = "throne-2dof"  # the smallest bench with a spring between two carts
@@ -118,7 +118,7 @@ def show_solution(ask: Ask) -> Response:
     return ask.page(
         "solution",
         title=f"Solution of {folder.name}",
-        there=outside(folder, "solution/solution.html") is None,
+        there=file_problem(folder, "solution/solution.html") is None,
     )
 
 

@@ -24,7 +24,7 @@ from pipeline.submission.load import (
     MAX_NOTES_BYTES,
     MAX_TOML_BYTES,
     NAME,
-    outside,
+    file_problem,
 )
 from pipeline.submission.toml_file import decoded, parse_toml
 
@@ -183,7 +183,7 @@ def _check_text(raw: bytes, name: str) -> None:
 
 def _is_sound(folder: Path, name: str) -> bool:
     """Return whether the folder has a text file of this name that can be read."""
-    if outside(folder, name) is not None:
+    if file_problem(folder, name) is not None:
         return False
     try:
         _check_text((folder / name).read_bytes(), name)

@@ -9,7 +9,7 @@ from pipeline.desk.last_report import NOTES, find_state
 from pipeline.errors import SubmissionError
 from pipeline.grading.self_check.log import FILE as CHECKS
 from pipeline.submission import load_submission
-from pipeline.submission.load import NAME, outside
+from pipeline.submission.load import NAME, file_problem
 
 _REPORT = "report/report.pdf"
 BESIDE = (NOTES, CHECKS, _REPORT)
@@ -51,7 +51,7 @@ def list_held(folder: Path, *, report: bool = True) -> list[str]:
 def list_beside(folder: Path, *, report: bool = True) -> list[str]:
     """Return the existing files of `BESIDE` for the zip, without a report that is out of date."""
     left_out = "" if report and find_state(folder) == "current" else _REPORT
-    return [name for name in BESIDE if name != left_out and outside(folder, name) is None]
+    return [name for name in BESIDE if name != left_out and file_problem(folder, name) is None]
 
 
 def list_missing(folder: Path) -> list[str]:
@@ -61,7 +61,7 @@ def list_missing(folder: Path) -> list[str]:
     except SubmissionError as error:
         return [str(error)]
     files = dict.fromkeys(experiment.file for experiment in submission.experiments)
-    found = [problem for file in files if (problem := outside(folder, file)) is not None]
+    found = [problem for file in files if (problem := file_problem(folder, file)) is not None]
     found += [
         f"{file} is computed from recordings; use the recording itself"
         for file in files

@@ -14,7 +14,7 @@ from pipeline.lock import lock_when_free
 from pipeline.output import write_file
 from pipeline.report.sections.answers import with_answer, written_answer
 from pipeline.submission.edit import Outdated, edit_submission, text_digest
-from pipeline.submission.load import MAX_NOTES_BYTES, list_experiments, outside
+from pipeline.submission.load import MAX_NOTES_BYTES, file_problem, list_experiments
 from pipeline.words.numbers import abridge
 
 
@@ -25,7 +25,7 @@ def show(ask: Ask) -> Response:
         "report",
         title=f"Report of {folder.name}",
         room=read_room(ask),
-        there=outside(folder, "report/report.html") is None,
+        there=file_problem(folder, "report/report.html") is None,
     )
 
 

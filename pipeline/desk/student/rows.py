@@ -43,7 +43,7 @@ class Row:
 
     Attributes
     ----------
-    look : what the file contains; see `tasks.inspect_file`.
+    look : what the file contains; see `tasks.describe_file`.
     index : index of the table in the file; None without a table.
     problems : why the row needs a person.
     """
@@ -139,7 +139,7 @@ def list_rows(
     for index, table in enumerate(listed):
         places.setdefault(posix(str(table.get("file", ""))), []).append(index)
     rows = []
-    for file, look in inspect_all(ask, folder, document).items():
+    for file, look in describe_all(ask, folder, document).items():
         for index in places.pop(file, []) or [None]:
             if index is None:
                 rows.append(_describe_unknown(file, look))
@@ -153,10 +153,10 @@ def list_rows(
     return rows
 
 
-def inspect_all(ask: Ask, folder: Path, document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def describe_all(ask: Ask, folder: Path, document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return what each data file contains, by name."""
     known = {**document, "experiments": list_experiments(document)[:MOST_EXPERIMENTS]}
-    return ask.desk.inspect_files(folder, lambda file: stated_columns(known, file))
+    return ask.desk.describe_files(folder, lambda file: stated_columns(known, file))
 
 
 def _describe_unknown(file: str, look: Mapping[str, Any]) -> Row:

@@ -29,13 +29,13 @@ from pipeline.desk.student.form import (
 )
 from pipeline.desk.student.handin import list_held, list_missing, pack
 from pipeline.desk.student.room import Room, read_room
-from pipeline.desk.student.rows import gather_remarks, group_rows, inspect_all
+from pipeline.desk.student.rows import describe_all, gather_remarks, group_rows
 from pipeline.desk.typed import read_whole_number
 from pipeline.errors import SubmissionError
 from pipeline.lock import lock_when_free
 from pipeline.processes import Failed
 from pipeline.submission.edit import Outdated, edit_submission, submission_text
-from pipeline.submission.load import NAME, list_experiments, outside, posix
+from pipeline.submission.load import NAME, file_problem, list_experiments, posix
 from pipeline.words.numbers import by_note, count
 
 _FILES, _SET_UP = "files", "details"  # parts of pages, by their HTML ids
@@ -174,7 +174,7 @@ def _list_authors(room: Room) -> list[str]:
 def _list_doubts(ask: Ask, document: Mapping[str, Any], index: int) -> Sequence[str]:
     """Return the doubts about the carts of an experiment."""
     files = [posix(str(table.get("file", ""))) for table in list_experiments(document)]
-    looks = inspect_all(ask, ask.folder(), document)
+    looks = describe_all(ask, ask.folder(), document)
     return looks[files[index]]["unsure"] if index < len(files) and files[index] in looks else ()
 
 
@@ -215,7 +215,7 @@ def _show_page(
         often=gather_remarks(room.rows),
         not_read=ask.desk.workers.do("list_not_read", folder=str(folder), named=named),
         keeps=list_missing(folder) if room.facts.sound else [],
-        gap=outside(folder, "gap/gap.html") is None,
+        gap=file_problem(folder, "gap/gap.html") is None,
     )
 
 

@@ -123,7 +123,11 @@ def find_misread(
     if better > 1 and fit.share < 0.005:
         return None
     # Use the sign convention of the bench: this record's own sign was found from its data.
-    record = replace(record, u=0.0 - record.u) if record.turned and record.u is not None else record
+    record = (
+        replace(record, u=0.0 - record.u)
+        if record.sign_reversed and record.u is not None
+        else record
+    )
     modes = _modes(chain)
     for misread, other in _readings(record, modes):
         held = _hold_against(other, chain, modes)

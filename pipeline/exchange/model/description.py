@@ -152,7 +152,7 @@ class Description:
     links : each hidden mass, with the force on its cart. The opposite force acts on the mass.
     inputs : title and law of each step from the input to the force `u`.
     rest : (n_carts,) rest positions, computed without dry friction.
-    turned : whether the input has the opposite sign in the recordings.
+    sign_reversed : whether the input has the opposite sign in the recordings.
     """
 
     units: Units
@@ -171,7 +171,7 @@ class Description:
     readings: tuple[str, ...]
     rest: tuple[str, ...]
     titles: tuple[str, ...]
-    turned: bool
+    sign_reversed: bool
 
     @property
     def driven(self) -> str:
@@ -203,14 +203,14 @@ def describe(
     *,
     units: Units,
     free: Collection[int] | None = None,
-    turned: bool = False,
+    sign_reversed: bool = False,
 ) -> Description:
     """Return the content of a model for export.
 
     Parameters
     ----------
     free : the carts that may move, by default all. The parameters of other carts are unknown.
-    turned : whether the input has the opposite sign in the recordings.
+    sign_reversed : whether the input has the opposite sign in the recordings.
 
     Raises
     ------
@@ -267,7 +267,7 @@ def describe(
         readings=tuple(f"{gains.get(i, '')}x.cart_{i}" for i in range(1, chain.n + 1)),
         rest=tuple(f"{x + 0.0:.{_DIGITS}g}" for x in rest_positions(model, free=free)),
         titles=tuple(_title(term) for term in terms),
-        turned=turned,
+        sign_reversed=sign_reversed,
     )
 
 

@@ -78,8 +78,8 @@ def _variables(description: Description) -> list[Variable]:
 
     fixed = {"causality": "parameter", "variability": "fixed"}
     tunable = {"causality": "parameter", "variability": "tunable"}
-    turned = "; the recordings count it the other way" if description.turned else ""
-    add("u", "u", f"input, constant during a step{turned}", units.input, "input", start="0")
+    sign_note = "; the recordings count it the other way" if description.sign_reversed else ""
+    add("u", "u", f"input, constant during a step{sign_note}", units.input, "input", start="0")
     for i, start in enumerate(description.rest, start=1):
         meaning = f"start position of cart {i}"
         add(f"x{i}_start", f"start[{i - 1}]", meaning, units.position, start=start, **fixed)

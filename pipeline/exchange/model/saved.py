@@ -22,9 +22,11 @@ def save_model(
     A model that would need future inputs is not written; the sentence then says why.
     """
     driven = [record.input_scale for record in analysis.records if record.u is not None]
-    turned = sum(scale > 0 for scale in driven) < sum(scale < 0 for scale in driven)
+    sign_reversed = sum(scale > 0 for scale in driven) < sum(scale < 0 for scale in driven)
     try:
-        description = describe(model, units=analysis.bench.units, free=free, turned=turned)
+        description = describe(
+            model, units=analysis.bench.units, free=free, sign_reversed=sign_reversed
+        )
     except DataError as error:
         return f"no model was written: {error}"
     whole, compiled = fmu(description)

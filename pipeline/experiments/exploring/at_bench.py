@@ -68,7 +68,7 @@ def explore_bench(
         record=record,
         goal=goal,
         seconds=seconds,
-        tell=lambda sentence: everyone.thought(with_symbols(sentence)),
+        announce=lambda sentence: everyone.thought(with_symbols(sentence)),
         progress=think,
         vetoes=vetoes,
     )

@@ -63,7 +63,7 @@ def choose_recording(
         except DataError as error:  # a large step is still possible
             end = str(error)
         else:
-            return found.recordings[0], found.said
+            return found.recordings[0], found.summary
     # Record each of these only once: carts that were held back would go no further the second time.
     recorded = {record.id for record in analysis.records}
     tried = [*refused, *(r for r in plan.recordings if r.id in recorded)]

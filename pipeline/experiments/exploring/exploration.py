@@ -79,7 +79,7 @@ class Exploration:
     goal : the errors to reach.
     seconds : time allowed at the bench, including rests. No recording begins that would exceed it.
         An interrupted recording counts each time.
-    tell : function that is called with a sentence in each turn.
+    announce : function that is called with a sentence in each turn.
     progress : function that is called often with a few words during computations. An exception that
         it raises ends the exploration.
     vetoes : function that returns whether a person refuses the chosen recording; if so, another one
@@ -99,7 +99,7 @@ class Exploration:
     record: Callable[[Sequence[str]], Recorded]
     goal: ErrorGoal
     seconds: float
-    tell: Progress
+    announce: Progress
     progress: Progress = silent
     vetoes: Callable[[Recording], bool] = lambda recording: False
     turns: list[Turn] = field(default_factory=list)
@@ -121,7 +121,7 @@ class Exploration:
             too long.
         """
         self._begin()
-        self._look()
+        self._analyse()
         while (recording := self._take_turn()) is not None:
             gc.collect()  # figures and searches are reference cycles with large arrays
             self._try_out(recording)
@@ -170,22 +170,22 @@ class Exploration:
         self.goal.missing(dict.fromkeys(names))
 
     def _record(self, ids: Sequence[str]) -> Recorded:
-        came = self.record(ids)
-        self.made += came.ids
-        self.spent += came.seconds
-        return came
+        recorded = self.record(ids)
+        self.made += recorded.ids
+        self.spent += recorded.seconds
+        return recorded
 
     def _has_time_for(self, recordings: Sequence[Recording]) -> bool:
         return self.spent + session_time(recordings) <= self.seconds
 
-    def _look(self) -> None:
+    def _analyse(self) -> None:
         """Identify the carts and look for the gap with all data so far."""
         analysis = analyse(load_submission(self.folder), progress=self.progress)
         self.gap: Gap | None = None
         try:
             self.gap = investigate(analysis, progress=self.progress, budget=_SEARCH)
         except DataError as error:
-            self.tell(f"the search for the gap is not possible: {error}")
+            self.announce(f"the search for the gap is not possible: {error}")
         self._propose(analysis)
         self.analysis = _identify_beside(analysis, self.gap)
 
@@ -210,15 +210,16 @@ class Exploration:
         if gap and not gap.complete:
             doubt += WORDS.text("search_ended", seconds=f"{_SEARCH:.0f}")
         parts = [describe_accuracy(missing, errors), doubt, capital(why) or WORDS.text("the_end")]
-        but = ""
+        why_ended = ""
         if recording and not self._has_time_for([recording]):
-            but = WORDS.text("time_up", time=time_words(self.seconds), name=recording.id)
+            why_ended = WORDS.text("time_up", time=time_words(self.seconds), name=recording.id)
         # after three failures in a row, another choice does not help
         elif recording and self.failures >= 3:
-            but = WORDS.text("none_came", count=self.failures)
-        if but:
+            why_ended = WORDS.text("none_came", count=self.failures)
+        if why_ended:
             recording = None
-        wanting = bool(but or (self.failures and not recording))  # something useful was left undone
+        # whether something useful was left undone
+        is_cut_short = bool(why_ended or (self.failures and not recording))
         turn = Turn(
             seconds=self.spent,
             recorded=self.made,
@@ -227,8 +228,8 @@ class Exploration:
             explanations=list_explanations(gap) if gap else (),
             left=gap.final if gap else None,
             floor=gap.noise_floor if gap else None,
-            reached=not missing and not wanting and gap is not None and gap.verdict in SETTLED,
-            said=". ".join(filter(None, [self.lost, *parts, but])).replace("?. ", "? "),
+            reached=not missing and not is_cut_short and gap is not None and gap.verdict in SETTLED,
+            summary=". ".join(filter(None, [self.lost, *parts, why_ended])).replace("?. ", "? "),
             gap=gap,
         )
         if self.turns:
@@ -236,7 +237,7 @@ class Exploration:
         self.turns.append(turn)
         self.made = ()
         write_diary(self.turns, self.analysis, self.folder, wanted=self.goal.error)
-        self.tell(turn.said)
+        self.announce(turn.summary)
         return recording
 
     def _choose(self, missing: dict[str, float]) -> tuple[Recording | None, str]:
@@ -278,7 +279,7 @@ class Exploration:
             self.lost, self.failures = "", 0
             if recording.aim == GAP:
                 self.asked.append(recording)
-            self._look()
+            self._analyse()
             return
         self.refused.append(recording)
         self.failures = 0 if came.vetoed else self.failures + 1

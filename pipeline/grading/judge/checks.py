@@ -100,7 +100,7 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
         deviations.append(_deviation(error, name))
         if earned_by(criterion, deviations[-1]) < 1:
             wrong.add(name)
-            there = f", but your recordings give {known[name].said}" if name in known else ""
+            there = f", but your recordings give {known[name].text}" if name in known else ""
             off.append(f"{name}: you report {as_typed(table[name])}{there}")
     left = (
         f" Not judged: {first_few(guessed, _NAMED)}."

@@ -31,7 +31,7 @@ class Mistake:
 
     Attributes
     ----------
-    said : keys of the advice in `templates/words/grading.toml`.
+    advice_keys : keys of the advice in `templates/words/grading.toml`.
     predicted : for each parameter, the bounds of the number that the mistake gives.
     tolerance : relative distance from these bounds within which a number still matches.
     periods : the number of periods counted, and the true number.
@@ -45,7 +45,7 @@ class Mistake:
     """
 
     codes: tuple[Code, ...]
-    said: tuple[str, ...]
+    advice_keys: tuple[str, ...]
     predicted: dict[str, Reference]
     tolerance: float
     periods: tuple[int, int] = (0, 0)
@@ -61,12 +61,16 @@ class Mistake:
         counted, there = self.periods
         recomputed = f"{reference.value:.4g}"
         values = {"reported": as_typed(typed), "recomputed": recomputed}
-        return "".join(WORDS.text(key, counted=counted, there=there, **values) for key in self.said)
+        return "".join(
+            WORDS.text(key, counted=counted, there=there, **values) for key in self.advice_keys
+        )
 
-    def together_with(self, code: Code, said: str, predicted: dict[str, Reference]) -> "Mistake":
+    def together_with(
+        self, code: Code, advice_key: str, predicted: dict[str, Reference]
+    ) -> "Mistake":
         """Return this mistake combined with a second one."""
-        codes, sentences = (*self.codes, code), (*self.said, said)
-        return replace(self, codes=codes, said=sentences, predicted=predicted)
+        codes, advice_keys = (*self.codes, code), (*self.advice_keys, advice_key)
+        return replace(self, codes=codes, advice_keys=advice_keys, predicted=predicted)
 
 
 def _may_be_log10(name: str, reference: Reference, reported: Reported) -> bool:
@@ -119,13 +123,13 @@ def _groups(references: Numbers, reported: Reported) -> dict[str, dict[str, Refe
         if read[n].is_ratio and not read[n].is_by_eye and r.low > 0
     }
     gains = {n: r for n, r in references.items() if n in sure and read[n].is_gain}
-    told = {n: r for n, r in frequencies.items() if n in sure}
+    certain = {n: r for n, r in frequencies.items() if n in sure}
     own = {n: r for n, r in dampings.items() if n in sure}
     shows_log10 = any(_may_be_log10(n, r, reported) for n, r in dampings.items())
     return {
-        "frequencies": told,
-        "all frequencies": frequencies if frequencies.keys() > told.keys() else {},
-        "own frequencies": {n: r for n, r in told.items() if not read[n].is_by_eye},
+        "frequencies": certain,
+        "all frequencies": frequencies if frequencies.keys() > certain.keys() else {},
+        "own frequencies": {n: r for n, r in certain.items() if not read[n].is_by_eye},
         "gains": gains,
         "sharp gains": {n: r for n, r in gains.items() if r.within(limits.SHARP)},
         "all dampings": dampings,
@@ -152,7 +156,7 @@ def _by_factor(of: Mapping[str, Numbers], *groups: Of) -> list[Mistake]:
 def _mistake(row: Factor, numbers: Numbers, *, beside: frozenset[str]) -> Mistake:
     return Mistake(
         codes=(row.code,),
-        said=(row.said,),
+        advice_keys=(row.advice_key,),
         predicted=_times(numbers, row.factor),
         tolerance=row.tolerance,
         whole=row.whole,
@@ -182,7 +186,7 @@ def _miscounts(omegas: Numbers, zetas: Numbers, every_zeta: Numbers) -> Iterator
         damped = {n: r for n, r in damped.items() if n in map(_damping, omegas)}
         both = Mistake(
             codes=("peak_count",),
-            said=("miscount",),
+            advice_keys=("miscount",),
             periods=(counted, there),
             predicted={**fast, **damped},
             tolerance=limits.COUNTED,
@@ -247,7 +251,7 @@ def _gain_mistakes(gains: Numbers, analysis: Analysis) -> Iterator[Mistake]:
         far = all(abs(math.log(count)) > math.log(limits.FAR) for count in counts.values())
         yield Mistake(
             codes=("counts_for_length",),
-            said=("counts",),
+            advice_keys=("counts",),
             predicted={n: r.times(1 / counts[n]) for n, r in gains.items()},
             tolerance=limits.UNMISTAKABLE if far else limits.READ,
         )
@@ -265,7 +269,7 @@ def _peaks(turns: Mapping[str, StepTurns]) -> Iterator[Mistake]:
     for predicted in peaks:
         yield Mistake(
             codes=("peak_for_steady_state",),
-            said=("step_peak",),
+            advice_keys=("step_peak",),
             predicted=predicted,
             tolerance=limits.TURN_READ,
             whole=True,
@@ -281,7 +285,7 @@ def _swinging(turns: Mapping[str, StepTurns], gains: Numbers) -> Iterator[Mistak
         later = {n: e for n, t in turns.items() if (e := t.turn(edge, turn)) is not None}
         yield Mistake(
             codes=("transient_used",),
-            said=("swinging",),
+            advice_keys=("swinging",),
             predicted={n: e for n, e in later.items() if _is_off(e, gains[n])},
             tolerance=limits.TURN_READ,
             whole=True,
@@ -340,7 +344,7 @@ def _swaps(references: Numbers, dampings: Numbers | None = None) -> Iterator[Mis
             predicted |= {_damping(n): dampings[_damping(other)] for n, other in moved.items()}
         yield Mistake(
             codes=("carts_swapped",),
-            said=("swapped",),
+            advice_keys=("swapped",),
             predicted=predicted,
             tolerance=limits.DAMPING if read_name(next(iter(moved))).is_damping else limits.READ,
             whole=True,

@@ -197,7 +197,7 @@ def _by_way(tried: Sequence[_Tried]) -> list[list[_Tried]]:
     """Group the variants of each mistake; they concern different numbers."""
     ways: dict[tuple, list[_Tried]] = {}
     for one in tried:
-        ways.setdefault((one.mistake.said, one.mistake.periods), []).append(one)
+        ways.setdefault((one.mistake.advice_keys, one.mistake.periods), []).append(one)
     return [*ways.values()]
 
 

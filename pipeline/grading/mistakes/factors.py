@@ -35,13 +35,13 @@ class Factor:
 
     Attributes
     ----------
-    said : key of the advice in `templates/words/grading.toml`.
+    advice_key : key of the advice in `templates/words/grading.toml`.
     of : the group of numbers that the mistake can affect.
     whole, least, tries, from_time_records : see `Mistake`.
     """
 
     code: Code
-    said: str
+    advice_key: str
     of: Of
     factor: float
     tolerance: float
@@ -51,23 +51,33 @@ class Factor:
     from_time_records: bool = False
 
 
-def _frequency(said: str, factor: float, *, of: Of = "frequencies", least: int = 1) -> Factor:
+def _frequency(advice_key: str, factor: float, *, of: Of = "frequencies", least: int = 1) -> Factor:
     tolerance = limits.UNMISTAKABLE
     return Factor(
-        code="hz_for_rad_s", said=said, of=of, factor=factor, tolerance=tolerance, least=least
+        code="hz_for_rad_s",
+        advice_key=advice_key,
+        of=of,
+        factor=factor,
+        tolerance=tolerance,
+        least=least,
     )
 
 
-def _peaks(said: str, factor: float, *, of: Of, whole: bool = False) -> Factor:
+def _peaks(advice_key: str, factor: float, *, of: Of, whole: bool = False) -> Factor:
     return Factor(
-        code="peak_to_peak", said=said, of=of, factor=factor, tolerance=limits.READ, whole=whole
+        code="peak_to_peak",
+        advice_key=advice_key,
+        of=of,
+        factor=factor,
+        tolerance=limits.READ,
+        whole=whole,
     )
 
 
-def _decrement(said: str, factor: float) -> Factor:
+def _decrement(advice_key: str, factor: float) -> Factor:
     return Factor(
         code="peak_count",
-        said=said,
+        advice_key=advice_key,
         of="sharp dampings",
         factor=factor,
         tolerance=limits.READ,
@@ -76,8 +86,8 @@ def _decrement(said: str, factor: float) -> Factor:
     )
 
 
-def _reduced(code: Code, said: str, factor: float, *, of: Of) -> Factor:
-    return Factor(code=code, said=said, of=of, factor=factor, tolerance=MISREAD_RATIO)
+def _reduced(code: Code, advice_key: str, factor: float, *, of: Of) -> Factor:
+    return Factor(code=code, advice_key=advice_key, of=of, factor=factor, tolerance=MISREAD_RATIO)
 
 
 FACTORS = (
@@ -93,7 +103,7 @@ FACTORS = (
     _peaks("input_peak_to_peak", 0.5, of="sharp gains"),
     Factor(
         code="log10_for_ln",
-        said="log10",
+        advice_key="log10",
         of="dampings",
         factor=LOG10,
         tolerance=limits.LOG10_DAMPING,

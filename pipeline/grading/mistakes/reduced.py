@@ -40,7 +40,7 @@ def diagnose_reduced(analysis: Analysis) -> list[Flag]:
     slips = [(_share(slip.rows.reported, slip.predicted), slip) for slip in _slips(analysis, rows)]
     share, best = max(slips, key=lambda one: one[0], default=(0.0, None))
     if best is not None and share >= limits.MOST_ROWS:
-        return [_flag(best.code, best.said, best.rows)]
+        return [_flag(best.code, best.advice_key, best.rows)]
     if rows is None:
         return []
     ratio = float(np.median(np.abs(np.log(rows.reported / rows.measured))))
@@ -90,7 +90,7 @@ class _Slip:
     """A known mistake, the key of its sentence, and the ratios that it predicts for rows."""
 
     code: Code
-    said: str
+    advice_key: str
     predicted: Array
     rows: _Rows
 
@@ -100,20 +100,24 @@ def _slips(analysis: Analysis, rows: _Rows | None) -> Iterator[_Slip]:
     for row in [row for row in FACTORS if row.of == "frequencies of rows"]:
         moved = _rows(analysis, stretch=row.factor)
         if moved is not None:
-            yield _Slip(code=row.code, said=row.said, predicted=moved.measured, rows=moved)
+            yield _Slip(
+                code=row.code, advice_key=row.advice_key, predicted=moved.measured, rows=moved
+            )
     if rows is None:
         return
     for row in [row for row in FACTORS if row.of == "ratios of rows"]:
         predicted = row.factor * rows.measured
-        yield _Slip(code=row.code, said=row.said, predicted=predicted, rows=rows)
+        yield _Slip(code=row.code, advice_key=row.advice_key, predicted=predicted, rows=rows)
     counts = [r.encoder_step(int(c)) for r in analysis.records for c in r.carts]
     count = float(np.median(counts)) if counts else 0.0
     if count not in (0.0, 1.0):
         predicted = rows.measured / count
-        yield _Slip(code="counts_for_length", said="reduced_counts", predicted=predicted, rows=rows)
+        yield _Slip(
+            code="counts_for_length", advice_key="reduced_counts", predicted=predicted, rows=rows
+        )
 
 
-def _flag(code: Code, said: str, rows: _Rows) -> Flag:
+def _flag(code: Code, advice_key: str, rows: _Rows) -> Flag:
     worst = int(np.argmax(np.abs(np.log(rows.reported / rows.measured))))
     carts = sorted(set(rows.cart.tolist()))
     return Flag(
@@ -121,7 +125,7 @@ def _flag(code: Code, said: str, rows: _Rows) -> Flag:
         parameters=tuple(f"bode.x{cart}" for cart in carts),
         message=WORDS.text(
             "reduced",
-            slip=WORDS.text(said),
+            slip=WORDS.text(advice_key),
             cart=rows.cart[worst],
             reported=f"{rows.reported[worst]:.4g}",
             recomputed=f"{rows.measured[worst]:.4g}",
@@ -156,7 +160,7 @@ def _against_time_records(analysis: Analysis) -> list[Flag]:
                 Flag(
                     code=slip.code,
                     parameters=tuple(f"bode.x{table.cart}" for table in analysis.tables),
-                    message=WORDS.text("reduced_fitted", slip=WORDS.text(slip.said)),
+                    message=WORDS.text("reduced_fitted", slip=WORDS.text(slip.advice_key)),
                     evidence={"ratio": float(values[0])},
                 )
             ]

@@ -80,7 +80,7 @@ def off_flag(
         message=WORDS.text(
             "off",
             name=worst,
-            recomputed=reference.said,
+            recomputed=reference.text,
             reported=as_typed(typed),
             look=WORDS.text(look),
         ),

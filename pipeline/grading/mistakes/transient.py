@@ -39,7 +39,7 @@ def transient_fits(
                     codes=("transient_used",),
                     predicted=moved,
                     tolerance=0.06,  # relative; a student's fit may weigh the points differently
-                    said=("early",),
+                    advice_keys=("early",),
                     # No parameters fit such amplitudes exactly, so not every number of the table
                     # matches.
                     least=max(2, round(0.65 * len(asked))),

@@ -45,7 +45,7 @@ def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) ->
     folder = own_folder(out, FEEDBACK)
     folder.mkdir(parents=True, exist_ok=True)
     made_of = _read_made(folder)
-    look = _look(rubric)
+    layout = _digest_layout(rubric)
     lines: list[Line] = []
     now_of: dict[str, str] = {}
     gradings: dict[str, int] = {}
@@ -58,7 +58,7 @@ def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) ->
         grade = anonymise(entry.grade, names) if names is not None else entry.grade
         lines.append(Line.of(grade))
         gradings[entry.submission], authors[entry.submission] = entry.grading, entry.grade.authors
-        now_of[grade.submission] = _digest(look, entry.key, repr(grade))
+        now_of[grade.submission] = _digest(layout, entry.key, repr(grade))
         own = own_folder(folder, _checked(grade.submission))
         there = (own / _PAGE).is_file() and (own / _JSON).is_file()
         if there and made_of.get(grade.submission) == now_of[grade.submission]:
@@ -83,7 +83,7 @@ def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) ->
     clusters = find_clusters(shared)
     if names is not None:
         clusters = renamed(clusters, names, other=STRANGER)
-    now_of[_WHOLE] = _digest(look, repr((lines, doubles, clusters)), *now_of.values())
+    now_of[_WHOLE] = _digest(layout, repr((lines, doubles, clusters)), *now_of.values())
     if made_of.get(_WHOLE) != now_of[_WHOLE] or not (out / _CLASS).is_file():
         page = class_page(lines, rubric=rubric, doubles=doubles, clusters=clusters)
         write_file(out / _CLASS, page)
@@ -162,7 +162,7 @@ def _names(book: Gradebook, out: Path) -> dict[str, str]:
     return names
 
 
-def _look(rubric: Rubric) -> str:
+def _digest_layout(rubric: Rubric) -> str:
     """Return a hash of everything that affects all pages, such as templates and the rubric."""
     names = ("report.html.j2", "blocks.html.j2", "report.css", "page.js", "explore.js")
     parts = [(TEMPLATES / name).read_text(encoding="utf-8") for name in names]

@@ -40,7 +40,7 @@ class Reference:
         return cls(value=value, low=value, high=value, std=std, source=source)
 
     @property
-    def said(self) -> str:
+    def text(self) -> str:
         """The reference as text: a number if the bounds are close, otherwise a range."""
         if self.low > 0 and self.within(limits.ONE_NUMBER):
             return f"{self.value:.4g}"

@@ -15,7 +15,7 @@ from pipeline.grading.grade import Code, GradeTable
 from pipeline.output import write_file
 from pipeline.results import Kind
 from pipeline.submission import Submission
-from pipeline.submission.load import outside
+from pipeline.submission.load import file_problem
 
 FILE = "checks.jsonl"
 MAX_BYTES = 5_000_000  # bytes; enough for several thousand requests
@@ -78,7 +78,7 @@ def read_answers(folder: Path) -> tuple[CheckAnswer, ...]:
         return ()
     if path.is_symlink():
         raise SubmissionError(f"{FILE}: is a link; put the file itself there")
-    if problem := outside(folder, FILE):
+    if problem := file_problem(folder, FILE):
         raise SubmissionError(problem)
     if path.stat().st_size > MAX_BYTES:
         raise SubmissionError(f"{FILE}: has more than {MAX_BYTES:,} bytes; ask your instructor")

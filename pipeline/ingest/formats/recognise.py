@@ -12,7 +12,7 @@ from pipeline.ingest.formats.table import FileTable
 from pipeline.ingest.formats.tdms import is_tdms, read_tdms
 from pipeline.ingest.formats.text import read_text
 from pipeline.ingest.formats.workbook import is_workbook, read_workbook
-from pipeline.submission.load import outside
+from pipeline.submission.load import file_problem
 
 # Endings of data files.
 ENDINGS = (
@@ -63,7 +63,7 @@ def read_table(
         message names the line.
     OSError : the computer cannot read the file now, whatever its content.
     """
-    if (problem := outside(folder, name, taken=taken)) is not None:
+    if (problem := file_problem(folder, name, taken=taken)) is not None:
         raise SubmissionError(problem if shown is None else f"{shown}: {problem}")
     source = shown or name
     try:

@@ -159,7 +159,7 @@ def _read_channels(raw: bytes, *, source: str) -> list[_Channel]:
     from nptdms import TdmsFile
 
     channels: list[_Channel] = []
-    with _complaints() as said:
+    with _complaints() as messages:
         try:
             with TdmsFile.open(BytesIO(raw)) as file:
                 values = sum(len(one) for group in file.groups() for one in group.channels())
@@ -175,8 +175,8 @@ def _read_channels(raw: bytes, *, source: str) -> list[_Channel]:
             f"{source}: holds more than {_MOST_VALUES:,} numbers, or {_MOST_CHUNKS:,} pieces; "
             "keep one recording"
         )
-    if said:
-        raise SubmissionError(f"{source}: the .tdms file is damaged ({said[0][:100]})")
+    if messages:
+        raise SubmissionError(f"{source}: the .tdms file is damaged ({messages[0][:100]})")
     return channels
 
 
@@ -204,10 +204,10 @@ def _printable(text: str) -> str:
     return text if text.isprintable() else repr(text)[1:-1]
 
 
-def _number(said: object) -> float:
+def _number(value: object) -> float:
     """Return a property if it is a finite number; 0 otherwise."""
-    known = isinstance(said, float | int | np.number) and bool(np.isfinite(said))
-    return float(said) if known else 0.0  # type: ignore[arg-type]
+    known = isinstance(value, float | int | np.number) and bool(np.isfinite(value))
+    return float(value) if known else 0.0  # type: ignore[arg-type]
 
 
 @contextmanager
@@ -216,13 +216,13 @@ def _complaints() -> Iterator[list[str]]:
     from nptdms.log import log_manager
 
     log_manager.console_handler.setLevel(logging.CRITICAL)
-    heard = _Listener()
+    listener = _Listener()
     logger = logging.getLogger("nptdms")
-    logger.addHandler(heard)
+    logger.addHandler(listener)
     try:
-        yield heard.said
+        yield listener.messages
     finally:
-        logger.removeHandler(heard)
+        logger.removeHandler(listener)
 
 
 class _Listener(logging.Handler):
@@ -230,12 +230,12 @@ class _Listener(logging.Handler):
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
-        self.said: list[str] = []
+        self.messages: list[str] = []
         self._thread = threading.get_ident()
 
     def emit(self, record: logging.LogRecord) -> None:
         if record.thread == self._thread:
-            self.said.append(record.getMessage())
+            self.messages.append(record.getMessage())
 
 
 # --------------------------------------------------------------------- choice of the recording

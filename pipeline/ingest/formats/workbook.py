@@ -40,7 +40,7 @@ def read_workbook(raw: bytes, *, source: str) -> FileTable:
     """
     book = Book(raw, source=source)
     for name in book.sheets:
-        sheet = _Sheet(book.cells(name), book.looks, source=source, name=name)
+        sheet = _Sheet(book.cells(name), book.formats, source=source, name=name)
         if (block := sheet.longest_block()) is not None:
             others = [other for other in book.sheets if other != name and book.has_cells(other)]
             return sheet.read(block, notes=_not_read(others))
@@ -79,7 +79,7 @@ class _Block:
 class _Sheet:
     """The cells of a sheet, sorted into numbers (also those typed as text), texts, and others."""
 
-    def __init__(self, cells: Cells, looks: Sequence[str], *, source: str, name: str) -> None:
+    def __init__(self, cells: Cells, formats: Sequence[str], *, source: str, name: str) -> None:
         self._source, self._where = source, f"{source} sheet {name!r}"
         self._merged, self._wrong = cells.merged, cells.wrong
         self._typed = {at: text for at, text in cells.texts.items() if _NUMBER.fullmatch(text)}
@@ -89,14 +89,14 @@ class _Sheet:
         self._rows = np.r_[np.array(cells.rows, dtype=np.int64), places[:, 0]]
         self._columns = np.r_[np.array(cells.columns, dtype=np.int64), places[:, 1]]
         self._values = np.r_[np.array(cells.values), numbers]
-        known = np.array([*looks, ""])  # the last entry is for a format that is not listed
-        numbered = np.array(cells.looks, dtype=np.int64)
-        numbered[(numbered < 0) | (numbered >= len(looks))] = len(looks)
-        self._looks = np.r_[known[numbered], np.full(len(numbers), "")]
+        known = np.array([*formats, ""])  # the last entry is for a format that is not listed
+        numbered = np.array(cells.formats, dtype=np.int64)
+        numbered[(numbered < 0) | (numbered >= len(formats))] = len(formats)
+        self._formats = np.r_[known[numbered], np.full(len(numbers), "")]
         self._is_typed = np.arange(self._rows.size) >= numbered.size
         order = np.lexsort((self._columns, self._rows))
         self._rows, self._columns = self._rows[order], self._columns[order]
-        self._values, self._looks = self._values[order], self._looks[order]
+        self._values, self._formats = self._values[order], self._formats[order]
         self._is_typed = self._is_typed[order]
 
     # ---------------------------------------------------------------- finding the table
@@ -240,11 +240,11 @@ class _Sheet:
         A spreadsheet stores them in days. A single date among numbers is an error: the spreadsheet
         has turned a number such as 1.5 into a date.
         """
-        looks, values = self._looks[cells], self._values[cells]
-        is_time = (looks == "date") | (looks == "time")
+        formats, values = self._formats[cells], self._values[cells]
+        is_time = (formats == "date") | (formats == "time")
         if not is_time.any():
             said = f"{name!r} is shown in percent, but its stored value is used: 0.5 for 50 %"
-            return None, said if (looks == "percent").any() else ""
+            return None, said if (formats == "percent").any() else ""
         if not is_time.all():
             at = int(self._rows[cells[np.argmax(is_time)]]), column
             raise SubmissionError(
@@ -252,7 +252,7 @@ class _Sheet:
                 "spreadsheet programs turn numbers such as 1.5 into dates: import the recording "
                 "again with its columns as text, or with the other decimal mark"
             )
-        start = values[0] if (looks == "date").any() else 0.0
+        start = values[0] if (formats == "date").any() else 0.0
         what = "dates" if start else "times of day"
         # Rounded to 1e-5 s, because doubles and files keep a date to 1e-11 days.
         times = np.round(_DAY * (values - start), 5)

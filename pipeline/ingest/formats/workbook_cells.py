@@ -50,7 +50,7 @@ class Cells:
     Attributes
     ----------
     rows, columns : row and column (from 1) of each number in `values`.
-    looks : number format of each number; see `Book.looks`.
+    formats : number format of each number; see `Book.formats`.
     texts : texts, by (row, column).
     wrong : contents that cannot be a measurement, by (row, column).
     merged : for each cell of a merged range, the first cell of the range.
@@ -59,7 +59,7 @@ class Cells:
     rows: array = field(default_factory=lambda: array("l"))
     columns: array = field(default_factory=lambda: array("l"))
     values: array = field(default_factory=lambda: array("d"))
-    looks: array = field(default_factory=lambda: array("l"))
+    formats: array = field(default_factory=lambda: array("l"))
     texts: dict[tuple[int, int], str] = field(default_factory=dict)
     wrong: dict[tuple[int, int], str] = field(default_factory=dict)
     merged: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
@@ -71,7 +71,7 @@ class Book:
     Attributes
     ----------
     sheets : the file part of each worksheet, by name, in order.
-    looks : "", "percent", "time" or "date", by the number of a format.
+    formats : "", "percent", "time" or "date", by the number of a format.
 
     Raises
     ------
@@ -111,7 +111,7 @@ class Book:
         self.sheets = {name: part for name, kind, part in parts if kind == "worksheet"}
         one_of = {kind: part for kind, part in related.values()}
         self._shared = one_of.get("sharedStrings", "")
-        self.looks = self._read_looks(one_of["styles"]) if "styles" in one_of else [""]
+        self.formats = self._read_formats(one_of["styles"]) if "styles" in one_of else [""]
 
     def _related(self, part: str) -> dict[str, tuple[str, str]]:
         """Return (kind, part) of each part that a part refers to, by the reference's id."""
@@ -130,9 +130,9 @@ class Book:
             self._parse(listed, start=relation)
         return found
 
-    def _read_looks(self, part: str) -> list[str]:
+    def _read_formats(self, part: str) -> list[str]:
         codes: dict[int, str] = {}
-        looks: list[str] = []
+        formats: list[str] = []
         within: list[str] = []
 
         def start(name: str, attributes: dict[str, str]) -> None:
@@ -141,17 +141,22 @@ class Book:
                 codes[int(attributes["numFmtId"])] = attributes.get("formatCode", "")
             elif name == "xf" and "cellXfs" in within:
                 number = int(attributes.get("numFmtId", 0))
-                looks.append(_look(number, codes.get(number, "")))
+                formats.append(_classify_format(number, codes.get(number, "")))
 
         self._parse(part, start=start, end=lambda _: within.pop())
-        return looks or [""]
+        return formats or [""]
 
     def _shared_texts(self) -> list[str]:
         """Return the texts that cells refer to by number; they are read on first use."""
         if self._texts is None:
             reading = _Texts()
             if self._shared:
-                self._parse(self._shared, start=reading.start, end=reading.end, said=reading.said)
+                self._parse(
+                    self._shared,
+                    start=reading.start,
+                    end=reading.end,
+                    characters=reading.characters,
+                )
             self._texts = reading.texts
         return self._texts
 
@@ -183,7 +188,12 @@ class Book:
 
     def _read_sheet(self, sheet: str, reading: "_Sheet") -> None:
         with _reported(self._source):
-            self._parse(self.sheets[sheet], start=reading.start, end=reading.end, said=reading.said)
+            self._parse(
+                self.sheets[sheet],
+                start=reading.start,
+                end=reading.end,
+                characters=reading.characters,
+            )
 
     def _parse(
         self,
@@ -191,7 +201,7 @@ class Book:
         *,
         start: Callable[[str, dict[str, str]], object],
         end: Callable[[str], object] = lambda _: None,
-        said: Callable[[str], object] | None = None,
+        characters: Callable[[str], object] | None = None,
     ) -> None:
         """Parse a part; the handlers get names without namespace prefixes."""
         if part not in self._members:
@@ -218,7 +228,7 @@ class Book:
         parser.buffer_text = True
         parser.StartDoctypeDeclHandler = refuse
         parser.StartElementHandler, parser.EndElementHandler = opened, closed
-        parser.CharacterDataHandler = said
+        parser.CharacterDataHandler = characters
         fed = 0
         for chunk in self._inflated(part):
             parser.Parse(chunk)
@@ -280,7 +290,7 @@ class _Texts:
             self._in_sound = True
         self._in_text = name == "t" and not self._in_sound
 
-    def said(self, text: str) -> None:
+    def characters(self, text: str) -> None:
         if self._in_text and len(self._pieces) < _LONGEST_TEXT:
             self._pieces.append(text[:_LONGEST_TEXT])
 
@@ -301,7 +311,7 @@ class _Sheet:
         self.cells = Cells()
         self._shared, self._left = shared, most
         self._row = self._column = 0
-        self._kind, self._look, self._formula = "n", 0, False
+        self._kind, self._format, self._formula = "n", 0, False
         self._pieces: list[str] | None = None  # None while no value is being read
         self._value: str | None = None
         self._in_sound = False
@@ -311,7 +321,7 @@ class _Sheet:
         if name == "c":
             self._place(attributes.get("r"))
             self._kind = attributes.get("t", "n")
-            self._look = int(attributes.get("s", 0))
+            self._format = int(attributes.get("s", 0))
             self._formula, self._value, self._in_sound = False, None, False
         elif name == "v" or (name == "t" and not self._in_sound):
             self._pieces = []
@@ -325,7 +335,7 @@ class _Sheet:
         elif name == "mergeCell":
             self._merge(attributes.get("ref", ""))
 
-    def said(self, text: str) -> None:
+    def characters(self, text: str) -> None:
         if self._pieces is not None and len(self._pieces) < _LONGEST_TEXT:
             self._pieces.append(text[:_LONGEST_TEXT])
 
@@ -373,7 +383,7 @@ class _Sheet:
             self.cells.rows.append(at[0])
             self.cells.columns.append(at[1])
             self.cells.values.append(float(value))
-            self.cells.looks.append(self._look)
+            self.cells.formats.append(self._format)
         elif self._kind == "s":
             if text := self._shared()[int(value)].strip():
                 self.cells.texts[at] = text
@@ -395,7 +405,7 @@ class _Sheet:
             raise _Broken("too many merged cells")
 
 
-def _look(number: int, code: str) -> str:
+def _classify_format(number: int, code: str) -> str:
     """Return what a number format stands for: "percent", "time", "date" or ""."""
     bare = _NO_CODE.sub("", code).casefold()
     if number in _PERCENTS or "%" in bare:

@@ -64,7 +64,7 @@ class Turn:
     left: float | None
     floor: float | None
     reached: bool
-    said: str
+    summary: str
     gap: Gap | None = None
 
     def without_other_traces(self) -> "Turn":
@@ -126,7 +126,7 @@ def _board(turns: Sequence[Turn], wanted: float) -> Tiles:
     last = turns[-1]
     worst = max((error for error in last.errors.values() if error is not None), default=None)
     known = worst is not None and worst <= wanted
-    told = {"wanted": _known(wanted), "turns": count(len(turns), "turn")}
+    values = {"wanted": _known(wanted), "turns": count(len(turns), "turn")}
     values: dict[str, tuple[str, Tone]] = {
         "tile_worst": (_known(worst), "good" if known else "bad"),
         "tile_verdict": (verdict_title(last.gap) if last.gap else NOTHING, _tone(last.gap)),
@@ -134,7 +134,7 @@ def _board(turns: Sequence[Turn], wanted: float) -> Tiles:
     }
     return Tiles(
         tuple(
-            Tile(_WORDS.spans(key), spans(value), _WORDS.spans(f"{key}_note", **told), tone)
+            Tile(_WORDS.spans(key), spans(value), _WORDS.spans(f"{key}_note", **values), tone)
             for key, (value, tone) in values.items()
         )
     )
@@ -153,7 +153,7 @@ def _story(page: Page, turns: Sequence[Turn]) -> list[Block]:
         recorded = listing(turn.recorded) or _WORDS.text("nothing_new")
         head = {"number": str(number), "seconds": f"{turn.seconds:.0f}", "recorded": recorded}
         blocks.append(Heading(_WORDS.spans("turn", **head)))
-        blocks.append(paragraph(rich(clean(turn.said + "."))))
+        blocks.append(paragraph(rich(clean(turn.summary + "."))))
         trace = deciding_trace(turn.gap, turn.recorded) if turn.gap else None
         if turn.gap and trace:
             blocks.append(before_after_picture(page, turn.gap, trace, number=number))

@@ -13,7 +13,7 @@ from pipeline.names import mode_suffixes
 from pipeline.plant.linear.chain import Chain
 from pipeline.report.figures.colours import CARTS, MEASURED, MODEL, QUIET
 from pipeline.report.figures.style import legend_above, log_frequency_axis, panels, plot_line
-from pipeline.report.figures.svg import tell
+from pipeline.report.figures.svg import attach_data
 from pipeline.results import FrequencyResponse
 from pipeline.set_up import Units
 from pipeline.words.numbers import subscript
@@ -63,7 +63,7 @@ def overview_figure(
         colour, ls, *_ = CARTS[(response.cart - 1) % len(CARTS)]
         decibel = _decibel(response.magnitude)
         (points,) = ax.plot(response.omega, decibel, "D", ms=3.2, mew=0.8, mfc="white", mec=colour)
-        tell(points, response.omega, decibel, name=f"{name}, measured")
+        attach_data(points, response.omega, decibel, name=f"{name}, measured")
         if chain:
             omega, line = _fitted(response, chain)
             look = {"color": colour, "ls": ls}
@@ -109,7 +109,7 @@ def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) ->
         line = np.unwrap(np.angle(chain.frequency_response(omega)[response.cart - 1]))
         line -= 2 * np.pi * np.round(line[0] / (2 * np.pi))
         (drawn,) = ax.plot(omega, np.degrees(line), color=MODEL)
-        tell(drawn, omega, np.degrees(line), name="fit")
+        attach_data(drawn, omega, np.degrees(line), name="fit")
         near = np.interp(response.omega, omega, line)
         phase = near + (phase - near + np.pi) % (2 * np.pi) - np.pi
     error = (
@@ -162,7 +162,7 @@ def _points(ax: Axes, x: Array, y: Array, error: Array | None, *, label: str = "
     (drawn,) = ax.plot(
         x, y, "D", ms=3.2, mew=0.8, mfc="white", color=MEASURED, label=label or None, zorder=3
     )
-    tell(drawn, x, y, name="measured")
+    attach_data(drawn, x, y, name="measured")
     if error is not None:
         below, above = np.broadcast_to(error, (2, x.size))
         ends = np.column_stack([y - below, y + above, np.full(x.size, np.nan)])

@@ -12,7 +12,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.report.figures.bode import bode_panels
 from pipeline.report.figures.colours import MEASURED, MODEL, SECOND, SECOND_LINE, SHADE, THIRD
 from pipeline.report.figures.style import legend_above, panels, plot_line, shorten
-from pipeline.report.figures.svg import tell
+from pipeline.report.figures.svg import attach_data
 from pipeline.report.figures.time import decay_figure, step_figure
 from pipeline.results import FrequencyResponse, LogDecrement, Record, StepGain
 from pipeline.set_up import Units
@@ -27,7 +27,7 @@ def distribution_figure(points: Sequence[float], *, out_of: float) -> Figure:
     ax.bar(centres, counts, width=0.94 * np.diff(edges), color=MODEL)
     # Invisible points that show values when a reader points at a bar.
     (tops,) = ax.plot(centres, counts, ls="none", marker="none")
-    tell(tops, centres, counts.astype(float), name="submissions")
+    attach_data(tops, centres, counts.astype(float), name="submissions")
     ax.set_xlim(0.0, out_of)
     ax.set_ylim(0.0, 1.08 * max(1, counts.max()))
     ax.yaxis.set_major_locator(MaxNLocator(nbins=4, integer=True))

@@ -20,7 +20,7 @@ from matplotlib.path import Path
 
 from pipeline.arrays import Array
 from pipeline.report.figures.colours import MEASURED, MODEL, QUIET, SECOND_LINE, Look
-from pipeline.report.figures.svg import tell
+from pipeline.report.figures.svg import attach_data
 from pipeline.words.numbers import subscript
 from pipeline.words.text import clean
 
@@ -233,7 +233,7 @@ def plot_points(
     strokes[1::2, 0] += 1e-4 * (points[-1, 0] - points[0, 0])
     path = Path(strokes, np.tile([Path.MOVETO, Path.LINETO], shown.size))
     dots = PathPatch(path, fill=False, color=color, lw=2.2, capstyle="round", zorder=1.9)
-    tell(dots, t, y, name=name)
+    attach_data(dots, t, y, name=name)
     ax.add_artist(dots)
     ax.update_datalim(points)
     ax.autoscale_view()  # A patch does not do this by itself, and it may be the only artist.
@@ -244,7 +244,7 @@ def plot_line(
 ) -> None:
     """Draw a line, thinned to what the eye can resolve; zooming in shows every sample."""
     (line,) = ax.plot(*thin(t, y), label=name if in_legend else None, **look)
-    tell(line, t, y, name=name)
+    attach_data(line, t, y, name=name)
 
 
 def plot_model(ax: Axes, t: Array, y: Array, *, label: str = "model") -> None:

@@ -23,10 +23,10 @@ _SAME = 1e-6  # positions that differ by less than this share of the figure's si
 # several figures.
 _GROUP_ID = re.compile(r' id="[a-zA-Z0-9.]+_\d+"')
 _TAG = re.compile(rf' id="({"|".join(TAGS)})"')
-_TOLD = re.compile(r""" id=(["'])(\{.*?\})\1""")
+_ATTACHED = re.compile(r""" id=(["'])(\{.*?\})\1""")
 
 
-def tell(artist: Artist, x: Array, y: Array, *, name: str) -> None:
+def attach_data(artist: Artist, x: Array, y: Array, *, name: str) -> None:
     """Give a drawn series a name and its complete data; the drawing may be thinned out."""
     artist.set_gid(json.dumps({"name": name, "x": packed_time(x), "y": _packed(y)}))
 
@@ -57,14 +57,14 @@ def to_svg(figure: Figure, *, name: str, alt: str) -> str:
             label = str(line.get_label())
             x, y = (np.asarray(v, dtype=float) for v in line.get_data())
             if x.size and line.get_gid() is None and not label.startswith("_"):
-                tell(line, x, y, name=label)
+                attach_data(line, x, y, name=label)
     buffer = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": name}):
         FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
     svg = "<svg " + buffer.getvalue().partition("<svg ")[2]
     svg = re.sub(r"\s*<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     svg = _GROUP_ID.sub("", svg).replace("'DejaVu Sans'", "'DejaVu Sans', sans-serif")
-    svg = _TOLD.sub(_attributes, _TAG.sub(r' class="\1"', svg))
+    svg = _ATTACHED.sub(_attributes, _TAG.sub(r' class="\1"', svg))
     title = f"<title>{escape(alt, quote=False)}</title>"
     return svg.replace("<svg ", '<svg role="img" ', 1).replace(">", f">{title}", 1)
 
@@ -118,7 +118,7 @@ def packed_time(values: Array) -> str:
 
 
 def _attributes(match: re.Match[str]) -> str:
-    told = json.loads(unescape(match[2]))
-    if "box" in told:
-        return f' class="panel" data-panel="{escape(json.dumps(told, ensure_ascii=False))}"'
-    return f' data-name="{escape(told["name"])}" data-x="{told["x"]}" data-y="{told["y"]}"'
+    data = json.loads(unescape(match[2]))
+    if "box" in data:
+        return f' class="panel" data-panel="{escape(json.dumps(data, ensure_ascii=False))}"'
+    return f' data-name="{escape(data["name"])}" data-x="{data["x"]}" data-y="{data["y"]}"'

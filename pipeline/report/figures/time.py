@@ -22,7 +22,7 @@ from pipeline.report.figures.style import (
     position_label,
     small_multiples,
 )
-from pipeline.report.figures.svg import tell
+from pipeline.report.figures.svg import attach_data
 from pipeline.results import (
     FeedbackDesign,
     HardwareCheck,
@@ -97,7 +97,7 @@ def plot_damping(ax: Axes, decay: LogDecrement, *, marker: str) -> None:
     amplitude, zeta = decay.zeta_at_amplitude
     (line,) = ax.plot(amplitude, zeta, marker, ms=3.2, mfc="white", mec=MEASURED, mew=0.8, ls="-",
                       lw=0.6, color=QUIET)  # fmt: skip
-    tell(line, amplitude, zeta, name=clean(decay.name))
+    attach_data(line, amplitude, zeta, name=clean(decay.name))
 
 
 # ---------------------------------------------------------------------- steps

@@ -68,7 +68,7 @@ def ask(analysis: Analysis) -> tuple[Asked, ...]:
 
 
 def _turned(analysis: Analysis) -> Iterator[Asked]:
-    turned = [record for record in analysis.records if record.turned]
+    turned = [record for record in analysis.records if record.sign_reversed]
     if not turned:
         return
     names = [record.id for record in turned]

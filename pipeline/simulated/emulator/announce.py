@@ -26,12 +26,12 @@ def announced(bench: RunningBench) -> Iterator[None]:
     """Announce a running bench to this user's desks; remove the file at the end."""
     folder, pid = _find_folder(), os.getpid()
     path = folder / f"{pid}.json"
-    told = {"name": bench.name, "address": bench.address, "began": _began(pid)}
+    entry = {"name": bench.name, "address": bench.address, "began": _began(pid)}
     with suppress(OSError):  # without a folder, the bench's address can still be typed
         folder.mkdir(OWNERS_FOLDER, exist_ok=True)
         if _is_own(folder):
             _clear_stale(folder)
-            path.write_text(json.dumps(told), encoding="utf-8")
+            path.write_text(json.dumps(entry), encoding="utf-8")
     try:
         yield
     finally:
@@ -66,10 +66,10 @@ def _is_own(folder: Path) -> bool:
 def _read(path: Path) -> RunningBench | None:
     """Return the bench of a file; None if its process has ended."""
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        if told["began"] != _began(int(path.stem)):
+        entry = json.loads(path.read_text(encoding="utf-8"))
+        if entry["began"] != _began(int(path.stem)):
             return None
-        return RunningBench(name=str(told["name"]), address=str(told["address"]))
+        return RunningBench(name=str(entry["name"]), address=str(entry["address"]))
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

@@ -56,7 +56,7 @@ class Server:
     Parameters
     ----------
     core : function that makes the controller for a description.
-    tell : function that is called with each event as it happens.
+    on_event : function that is called with each event as it happens.
 
     Attributes
     ----------
@@ -76,10 +76,10 @@ class Server:
         options: EmulatorOptions,
         *,
         core: Callable[[Description], Core] = ReferenceCore,
-        tell: Callable[[dict], None] = lambda event: None,
+        on_event: Callable[[dict], None] = lambda event: None,
     ) -> None:
         bench.refuse_endless()
-        self._period, self._speed, self._tell = options.period, options.speed, tell
+        self._period, self._speed, self._on_event = options.period, options.speed, on_event
         struck = [read_fault(text) for text in options.faults]
         self._faults = Faults(struck, seed=options.seed, period=options.period)
         if options.port == "pty" and any(fault.kind == "disconnect" for fault in struck):
@@ -191,9 +191,9 @@ class Server:
         """Advance the bench by one tick; return the bytes to send."""
         now = int(1e3 * time.monotonic())
         duty = self._core.tick(self._carts.counts(), stamp=int(1e3 * self._clock), now=now)
-        said = self._core.take().splitlines(keepends=True)
-        readings = [line for line in said if not line.startswith(b"?")]
-        answers = b"".join(line for line in said if line.startswith(b"?"))
+        output = self._core.take().splitlines(keepends=True)
+        readings = [line for line in output if not line.startswith(b"?")]
+        answers = b"".join(line for line in output if line.startswith(b"?"))
         out = self._faults.behind(answers, clock=self._clock)
         for line in readings if self._connected else ():
             struck, kind = self._faults.strike(line, clock=self._clock)
@@ -226,4 +226,4 @@ class Server:
 
     def _log(self, **event: object) -> None:
         self.events.append(event)
-        self._tell(event)
+        self._on_event(event)

@@ -299,7 +299,7 @@ def test_fmpy_finds_no_fault_in_the_fmu(hard_fmu, tmp_path):
     assert validate_fmu(str(hard_fmu)) == []
     everything = model_of(*(effect.key for effect in CATALOGUE))
     for name, model in (("all", everything), ("none", model_of())):
-        whole, compiled_too = fmu(describe(model, units=PAPER_UNITS, turned=True))
+        whole, compiled_too = fmu(describe(model, units=PAPER_UNITS, sign_reversed=True))
         (tmp_path / f"{name}.fmu").write_bytes(whole)
         assert compiled_too
         assert validate_fmu(str(tmp_path / f"{name}.fmu")) == []

@@ -78,7 +78,7 @@ def explored(tmp_path_factory):
         record=session,
         goal=read_error_goal("all 1%"),
         seconds=400.0,
-        tell=said.append,
+        announce=said.append,
     ).run()
     return folder, turns, said, bench
 
@@ -92,7 +92,7 @@ def test_an_exploration_names_the_effect_and_finds_the_carts(explored):
     assert last.verdict == "named"
     assert last.reached
     assert last.recorded == ("sweep-2",)  # the second sweep reaches the end stop
-    assert "the worst to ±" in last.said
+    assert "the worst to ±" in last.summary
     (explanation,) = last.explanations
     assert "cart 1" in explanation.name
     assert all(error is not None and error < 0.01 for error in last.errors.values())
@@ -100,7 +100,7 @@ def test_an_exploration_names_the_effect_and_finds_the_carts(explored):
     assert [one["effect"] for one in gap["effects"]] == ["end_stop"]
     m = gap["chain"]["m"][0]
     assert m == pytest.approx(bench.chain.m[0], rel=0.01)
-    assert said == [turn.said for turn in turns]
+    assert said == [turn.summary for turn in turns]
 
 
 @pytest.mark.slow
@@ -151,12 +151,12 @@ def test_an_exploration_ends_before_it_exceeds_its_time(tmp_path):
         record=session,
         goal=ErrorGoal(error=1e-7),
         seconds=90.0,
-        tell=silent,
+        announce=silent,
     ).run()
     assert turn.seconds <= 90.0
     assert (turn.verdict, turn.reached) == ("", False)
     assert turn.errors
-    assert "would run out before" in turn.said
+    assert "would run out before" in turn.summary
 
 
 def test_too_little_time_for_the_sweep_moves_no_cart(tmp_path):
@@ -170,7 +170,7 @@ def test_too_little_time_for_the_sweep_moves_no_cart(tmp_path):
             record=session,
             goal=ErrorGoal(),
             seconds=10.0,
-            tell=silent,
+            announce=silent,
         ).run()
     assert virtual.seconds == 0.0
 
@@ -187,7 +187,9 @@ def test_a_goal_for_an_unknown_parameter_is_refused(tmp_path):
     known = a_recorded_cart(tmp_path / "known")
     for folder in (known, tmp_path / "unknown"):  # with known carts, and with unknown ones
         with pytest.raises(ConfigError, match="did you mean 'zeta'"):
-            Exploration(folder=folder, record=record, goal=wish, seconds=900.0, tell=silent).run()
+            Exploration(
+                folder=folder, record=record, goal=wish, seconds=900.0, announce=silent
+            ).run()
     assert not asked
     with pytest.raises(ConfigError, match="no such parameter"):
         ErrorGoal(prefix="zeta_7").missing({"zeta_1": 0.1, "zeta_2": None})
@@ -203,7 +205,7 @@ def test_a_goal_for_a_rigid_cart_is_accepted(tmp_path):
             record=session,
             goal=ErrorGoal(prefix="mass"),
             seconds=10.0,
-            tell=silent,
+            announce=silent,
         ).run()
 
 
@@ -221,10 +223,10 @@ def test_an_exploration_ends_after_three_failures(tmp_path):
         record=record,
         goal=ErrorGoal(error=1e-7),
         seconds=900.0,
-        tell=silent,
+        announce=silent,
     ).run()
     assert len(set(asked)) == 3
-    assert [turn.said.split("? ")[0] for turn in turns[1:]] == [
+    assert [turn.summary.split("? ")[0] for turn in turns[1:]] == [
         f"{name} failed: the line is silent: is it plugged in" for name in asked
     ]
     assert not turns[-1].reached
@@ -264,7 +266,7 @@ def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
             record=session,
             goal=ErrorGoal(error=1e-7),
             seconds=400.0,
-            tell=said.append,
+            announce=said.append,
             vetoes=vetoes,
         ).run()
     first, mine, other = offered
@@ -304,7 +306,7 @@ def test_an_added_recording_comes_next_whatever_its_id(tmp_path):
             record=session,
             goal=ErrorGoal(error=1e-7),
             seconds=400.0,
-            tell=silent,
+            announce=silent,
             progress=add,
             vetoes=enough,
         ).run()
@@ -341,7 +343,7 @@ def test_thinking_can_be_ended(tmp_path):
             record=session,
             goal=ErrorGoal(),
             seconds=90.0,
-            tell=silent,
+            announce=silent,
             progress=enough,
         ).run()
     assert len(load_submission(tmp_path / "work").experiments) == 3
@@ -373,7 +375,7 @@ def test_the_large_step_is_made_only_once(tmp_path):
         record=session,
         goal=ErrorGoal(),
         seconds=300.0,
-        tell=silent,
+        announce=silent,
     ).run()
     assert [turn.verdict for turn in turns] == ["named"] * 2
     assert turns[-1].recorded == ("step-3",)

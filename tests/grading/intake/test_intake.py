@@ -14,7 +14,7 @@ from pipeline.grading.intake.files import digest, open_submission, packed, unpac
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.grading.intake.lms_names import parse_name
 from pipeline.grading.intake.unpack import HAND_IN
-from pipeline.submission.load import MAX_DATA_BYTES, NAME, outside
+from pipeline.submission.load import MAX_DATA_BYTES, NAME, file_problem
 
 TOML = "version = 1\n"
 
@@ -442,7 +442,9 @@ def test_a_recording_that_is_too_large_is_refused_and_not_missed(tmp_path):
     team = tree(tmp_path / "team-01", {"submission.toml": TOML, "data/long.csv": ""})
     os.truncate(team / "data" / "long.csv", MAX_DATA_BYTES + 1)
     folder = open_submission([team], tmp_path / "opened")
-    assert "100,000,001 bytes, the limit is 100,000,000" in str(outside(folder, "data/long.csv"))
+    assert "100,000,001 bytes, the limit is 100,000,000" in str(
+        file_problem(folder, "data/long.csv")
+    )
 
 
 def test_too_many_files_are_refused_with_one_reason(tmp_path):
