@@ -126,7 +126,7 @@ def _board(turns: Sequence[Turn], wanted: float) -> Tiles:
     last = turns[-1]
     worst = max((error for error in last.errors.values() if error is not None), default=None)
     known = worst is not None and worst <= wanted
-    values = {"wanted": _known(wanted), "turns": count(len(turns), "turn")}
+    notes = {"wanted": _known(wanted), "turns": count(len(turns), "turn")}
     values: dict[str, tuple[str, Tone]] = {
         "tile_worst": (_known(worst), "good" if known else "bad"),
         "tile_verdict": (verdict_title(last.gap) if last.gap else NOTHING, _tone(last.gap)),
@@ -134,7 +134,7 @@ def _board(turns: Sequence[Turn], wanted: float) -> Tiles:
     }
     return Tiles(
         tuple(
-            Tile(_WORDS.spans(key), spans(value), _WORDS.spans(f"{key}_note", **values), tone)
+            Tile(_WORDS.spans(key), spans(value), _WORDS.spans(f"{key}_note", **notes), tone)
             for key, (value, tone) in values.items()
         )
     )
