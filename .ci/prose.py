@@ -40,7 +40,7 @@ RULES = {
 }
 FOUND = [(re.compile(pattern), advice) for pattern, advice in RULES.items()]
 # Starts of a new paragraph, or of the next entry in a numpydoc section.
-ENTRY = re.compile(r"\n\s*\n|\n\s*-{4,}\s*\n|\n(?=\s*[\w`][^:\n]{0,60} : )")
+ENTRY = re.compile(r"\n\s*\n|\n\s*-{4,}\s*\n|\n(?=\s*[\w`][^:\n]{0,60} : |\s*- )")
 INLINE = "a|abbr|b|code|em|i|kbd|label|mark|small|span|strong|sub|sup|time|var"
 
 

@@ -271,9 +271,9 @@ class Gap:
         default=True,
     )
     effects: tuple[FoundEffect, ...] = written(
-        "if the verdict is `ambiguous`, the rivals of the last effect explain as much; if it is "
-        "`partial`, each effect lowers the error by a tenth or more, but a gap remains; if it is "
-        "`unexplained`, they are only suspects"
+        "verdict `ambiguous`: the rivals of the last effect explain as much. Verdict `partial`: "
+        "each effect lowers the error by a tenth or more, but a gap remains. Verdict "
+        "`unexplained`: they are only suspects"
     )
     suspects: tuple[Rival, ...] = written(
         "if the verdict is `unexplained`, the single effects that help most, the best first",

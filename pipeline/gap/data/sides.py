@@ -146,7 +146,7 @@ def _with_still_carts_held(records: list[Record], *, notes: list[str]) -> list[R
 
 
 def take_sides(runs: list[GapRun], *, notes: list[str]) -> tuple[list[GapRun], list[GapRun]]:
-    """Return training and held-out runs; if no run can be spared, cut the longest one in time."""
+    """Return training and held-out runs; if no run can be spared, cut the longest one in two."""
     teach, judge_by = split(runs)
     if judge_by:
         return [runs[i] for i in teach], [runs[i] for i in judge_by]
@@ -211,7 +211,7 @@ def split(runs: Sequence[GapRun]) -> tuple[list[int], list[int]]:
     - Of three or more sizes of a kind, the middle one is held out, so the extremes are trained on.
     - Of two free decays, the smaller one is held out.
     - At least one run of each kind is trained on.
-    - From a single run, or only two sweeps, none is held out. The caller then cuts a run in time.
+    - A single run, or two sweeps alone, are all trained on. The caller then cuts a run in two.
     """
     groups: dict[tuple, list[int]] = defaultdict(list)
     for index, run in enumerate(runs):

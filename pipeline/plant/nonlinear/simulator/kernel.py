@@ -93,7 +93,7 @@ def describe_run(
     """Return a run in the simulator's form.
 
     `command` (k,) is held from knot to knot, by default from sample to sample. Without `guided` (n,
-    samples), carts that are not `free` (n,) stand at zero. By default there is one shot.
+    samples), carts that are not `free` (n,) stay at zero. By default there is one shot.
     """
     t, free = _plain(t, np.float64), _plain(free, np.bool_)
     command = _plain(command, np.float64)
