@@ -360,5 +360,5 @@ def _notes(
             "oscillation"
         )
     if any(p.level is None for p in found):
-        notes.append("edges after which the cart never settles are left out")
+        notes.append("edges before or after which the cart never settles are left out")
     return notes
