@@ -129,6 +129,8 @@ def test_an_exception_or_exit_in_the_desk_is_reported(sent, status, told, tmp_pa
         assert "Traceback" in kept
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_desk_outlives_its_terminal_and_an_exception_in_another_thread(tmp_path):
     """A desk started with nohup survives the end of its terminal.
 

@@ -209,6 +209,8 @@ WEAK_ZONE = replace(
 )
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_new_effect_needs_only_its_own_file(tmp_path, monkeypatch):
     """For a new law, the columns, force, derivatives and terms of the fit are all generated."""
     catalogue = (*CATALOGUE, CUBIC_DRAG, WEAK_ZONE)

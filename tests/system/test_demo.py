@@ -10,6 +10,8 @@ from pipeline.cli.demo import found_beside, search_beside
 from pipeline.errors import SubmissionError
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_an_error_of_the_second_process_is_shown(tmp_path, capsys):
     """If the demo's second process fails, the demo shows its error and its exit status."""
     (tmp_path / "bench").mkdir()

@@ -30,7 +30,6 @@ from tests.helpers.desks import Visitor, a_submission, some_files
 from tests.helpers.grades import make_grade, make_outcome, two_cart_rubric, write_class
 from tests.helpers.waiting import PATIENCE, started, until
 
-LONG = [pytest.mark.slow, pytest.mark.sample]
 _RECORD = some_files(most=1)[0][1]
 
 
@@ -208,9 +207,9 @@ def _act_until_killed(work: _Save, desk: subprocess.Popen, *, after: float) -> N
     assert psutil.wait_procs(started_by_it, timeout=PATIENCE)[1] == []
 
 
-@pytest.mark.parametrize(
-    "work", [_Override, pytest.param(_Upload, marks=LONG), pytest.param(_Regrade, marks=LONG)]
-)
+@pytest.mark.slow
+@pytest.mark.sample
+@pytest.mark.parametrize("work", [_Override, _Upload, _Regrade])
 def test_a_kill_loses_nothing(work, tmp_path):
     """A confirmed override, upload or regrade is not lost if the server is killed."""
     kill_again_and_again(work(folder=tmp_path / "it"), kills=1, seed=1)

@@ -30,7 +30,12 @@ def searched(*hidden: Hidden, seconds: float | None = None) -> Search:
     [
         ((), "none", set()),
         ((FRICTION,), "named", {COULOMB}),
-        ((LATE, FRICTION), "named", {COULOMB, DELAY}),
+        pytest.param(
+            (LATE, FRICTION),
+            "named",
+            {COULOMB, DELAY},
+            marks=[pytest.mark.slow, pytest.mark.sample],
+        ),
     ],
 )
 def test_hidden_effects_are_named(hidden, verdict, found):
