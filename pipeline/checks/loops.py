@@ -64,8 +64,8 @@ def check_loops(hardware: Sequence[HardwareCheck]) -> list[Check]:
         if check.contradicted:
             notes.setdefault(check.experiment, []).extend([check.note] if check.note else [])
     return [
-        Check(kind="hardware", run=run, outcome="fail", message=f"{run}: {'; '.join(said)}.")
-        for run, said in notes.items()
+        Check(kind="hardware", run=run, outcome="fail", message=f"{run}: {'; '.join(texts)}.")
+        for run, texts in notes.items()
     ]
 
 

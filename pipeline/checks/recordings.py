@@ -137,20 +137,22 @@ def check_signs(signs: Signs, *, without: Container[str]) -> list[Check]:
     """
     says, wrong = [], 0
     for sign in (1, -1):
-        told = [
+        determined = [
             name
             for name, found in signs.found.items()
             if signs.stated.get(name) == sign and found and name not in without
         ]
-        contrary = [name for name in told if signs.found[name] == -sign]
-        if contrary and 2 * len(contrary) >= len(told):
+        contrary = [name for name in determined if signs.found[name] == -sign]
+        if contrary and 2 * len(contrary) >= len(determined):
             message = _WORDS.text(
                 "sign",
                 stated=sign,
                 found=f"{-sign:+d}",
                 found_plain=-sign,
                 runs=abridge(contrary, most=FEW_NAMES),
-                those="all" if contrary == told else f"{len(contrary)} of the {len(told)}",
+                those="all"
+                if contrary == determined
+                else f"{len(contrary)} of the {len(determined)}",
             )
             says.append(message)
             wrong += len(contrary)
@@ -188,13 +190,13 @@ def check_left_out(left_out: Sequence[LeftOut], *, records: Sequence[Record]) ->
 
 def _named(names: Sequence[str], records: Sequence[Record]) -> str:
     """Return the names of records in words, or the whole kind: "all 29 dwells, step-2"."""
-    said: list[str] = []
+    parts: list[str] = []
     for kind in dict.fromkeys(record.kind for record in records):
         alike = [record.id for record in records if record.kind == kind]
         of_kind = [name for name in alike if name in names]
         whole = len(of_kind) == len(alike) > _SPELT_OUT
-        said += [f"all {len(alike)} {_PLURAL.get(kind, kind)}"] if whole else of_kind
-    return ", ".join(said)
+        parts += [f"all {len(alike)} {_PLURAL.get(kind, kind)}"] if whole else of_kind
+    return ", ".join(parts)
 
 
 def check_setup(records: Sequence[Record]) -> list[Check]:
@@ -237,14 +239,14 @@ def check_channels(late: Sequence[LateChannel]) -> list[Check]:
     for cart, of_cart in groupby(sorted(late, key=lambda one: one.cart), key=lambda one: one.cart):
         alike = list(of_cart)
         surest = min(alike, key=lambda one: (one.than, one.limit))
-        said = abridge([kinds[one.kind] for one in alike])
+        kinds_text = abridge([kinds[one.kind] for one in alike])
         check = Check(
             kind="late_channel",
             cart=cart,
             outcome="fail",
             value=surest.delay,
             limit=surest.limit,
-            message=_WORDS.text("late_channel", late=late_fault(surest).reason, kinds=said),
+            message=_WORDS.text("late_channel", late=late_fault(surest).reason, kinds=kinds_text),
         )
         checks.append(check)
     return checks

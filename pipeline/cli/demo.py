@@ -60,9 +60,9 @@ def found_beside(beside: subprocess.Popen[str], out: Path) -> list[str]:
     with progress_line() as progress:
         progress("looking for the hidden effect")
         assert beside.stdout is not None
-        told = beside.stdout.read()  # the process ends when its stdin is closed
+        output = beside.stdout.read()  # the process ends when its stdin is closed
         if beside.wait() == 0:
-            return json.loads(told)
+            return json.loads(output)
         say(f"the second process failed (status {beside.returncode}): searching again here")
         from pipeline.cli.hidden_bench import find_hidden
 

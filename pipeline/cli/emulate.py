@@ -62,10 +62,10 @@ def emulate(
         signal.signal(number, lambda *_: stop.set())
     for sentence in bench.effect_sentences:
         say(f"hidden: {sentence}")
-    said = server.description
+    description = server.description
     say(
-        f"a duty count is {said.input_per_count:.4g} {said.input_unit}, "
-        f"an encoder count {said.position_per_count:.4g} {said.position_unit}"
+        f"a duty count is {description.input_per_count:.4g} {description.input_unit}, "
+        f"an encoder count {description.position_per_count:.4g} {description.position_unit}"
     )
     try:
         with announced(RunningBench(name=bench.name, address=server.address)):

@@ -173,8 +173,8 @@ def run_report(
         analysis, changes = make_report(
             submission, out, compared=compared, files=files, progress=progress
         )
-    said = (changes and with_symbols(changes_line(changes)), open_line(analysis))
-    for line in (terminal_summary(analysis), *_unreadable(analysis), *filter(None, said)):
+    lines = (changes and with_symbols(changes_line(changes)), open_line(analysis))
+    for line in (terminal_summary(analysis), *_unreadable(analysis), *filter(None, lines)):
         say(line)
     say(_wrote(out, "report", pdf=files.pdf))
     if files.plots:

@@ -298,8 +298,8 @@ def _contradictions(
         if points != round(points, 2):
             yield ("criteria", i, "points"), f"{points:g}: points have at most two decimals"
         elif Decimal(str(points)) % Decimal(str(found.step)):
-            said = f"{points:g} is not a multiple of step = {found.step:g}"
-            yield ("criteria", i, "points"), said
+            message = f"{points:g} is not a multiple of step = {found.step:g}"
+            yield ("criteria", i, "points"), message
         if isinstance(criterion, Parameters | InitialFinal):
             for pattern in criterion.parameters:
                 if not matching((pattern,), names):

@@ -136,23 +136,23 @@ def _sign(system: System, data: Ingested, *, failed: Sequence[Check]) -> Iterato
     stated = system.input.sign
     usual = 1 if sum(1 if r.input_scale > 0 else -1 for r in driven) >= 0 else -1
     sign = stated or usual
-    told = [name for name, found in data.signs.found.items() if found == sign]
+    shown_by = [name for name, found in data.signs.found.items() if found == sign]
     others = [name for name, found in data.signs.found.items() if found == -sign]
     wrong = next((check.message for check in failed if check.kind == "input"), "")
     support: Support = "open"
     if wrong:
         support, reason = "contradicted", wrong
-    elif told:
+    elif shown_by:
         but = f"; the opposite sign is shown by {abridge(others)}"
-        support, reason = "supported", f"shown by {abridge(told)}{but if others else ''}"
+        support, reason = "supported", f"shown by {abridge(shown_by)}{but if others else ''}"
     else:
         reason = "no recording shows it"
     yield Assumption(
         key="system.input.sign",
         value=float(sign),
-        origin="stated" if stated else "data" if told else "default",
+        origin="stated" if stated else "data" if shown_by else "default",
         support=support,
-        experiments=tuple(told),
+        experiments=tuple(shown_by),
         reason=reason,
     )
 

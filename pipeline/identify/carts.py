@@ -282,8 +282,8 @@ def _frequency_response(
     if responses:
         used = {run for response in responses for run in response.experiments}
         kinds = {record.kind for record in runs.driven if record.id in used}
-        said = " and ".join(f"{kind} records" for kind in ("step", "sweep") if kind in kinds)
-        log.warn([_WORDS.text("response_from", runs=said)])
+        kinds_text = " and ".join(f"{kind} records" for kind in ("step", "sweep") if kind in kinds)
+        log.warn([_WORDS.text("response_from", runs=kinds_text)])
     return responses or ()
 
 

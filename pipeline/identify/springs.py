@@ -63,10 +63,10 @@ def fill(folder: Path) -> Filled:
         _state_springs(submission)
         if doubt:
             mark_system(folder, "position", doubt=unsure(doubt))
-    said = system_doubts(folder)
+    doubts = system_doubts(folder)
     if doubt:
-        said.setdefault("position", doubt)
-    return Filled(files=files, doubts=tuple(f"{key}: {one}" for key, one in said.items()))
+        doubts.setdefault("position", doubt)
+    return Filled(files=files, doubts=tuple(f"{key}: {one}" for key, one in doubts.items()))
 
 
 def find_springs(submission: Submission) -> Springs:

@@ -259,8 +259,8 @@ class _Filling:
             if posix(str(table["file"])) == found.file:
                 return self._complete(table, found, found.inspection)
         if (same := self._same(found.file)) is not None:
-            told = f"is a copy of {same}; one entry is enough"
-            return replace(found, state="copy", remarks=(told,))
+            remark = f"is a copy of {same}; one entry is enough"
+            return replace(found, state="copy", remarks=(remark,))
         if found.kind is None:
             self._say_unknown(found)
             return found
@@ -395,7 +395,7 @@ def system_doubts(folder: Path) -> dict[str, str]:
     """Return the doubts marked next to the keys of `[system]`, by key."""
     system: Any = _read(folder).get("system", {})
     comments = {key: item.trivia.comment.removeprefix("# ") for key, item in system.value.items()}
-    return {key: said for key, said in comments.items() if said.startswith(UNSURE)}
+    return {key: doubt for key, doubt in comments.items() if doubt.startswith(UNSURE)}
 
 
 def experiment_doubts(folder: Path) -> list[tuple[str, ...]]:
@@ -483,7 +483,7 @@ def format_found(found: Sequence[Found]) -> str:
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in rows
     ]
-    said = by_note(
+    remarks = by_note(
         (one.file, remark)
         for one in found
         for remark in (
@@ -492,7 +492,7 @@ def format_found(found: Sequence[Found]) -> str:
             *(UNSURE + unsure for unsure in one.unsure),
         )
     )
-    return "\n".join([*lines, *(f"! {remark}" for remark in said)])
+    return "\n".join([*lines, *(f"! {remark}" for remark in remarks)])
 
 
 def format_passed_over(found: Iterable[Found]) -> list[str]:

@@ -87,8 +87,8 @@ class Inspection:
         """The range of each column if the columns have no names; "" if they have names."""
         if "columns" not in self.needs:
             return ""
-        said = [f"{one.name} ({one.low:.4g} to {one.high:.4g})" for one in self.columns]
-        return f"the columns and their ranges: {first_few(said, _MOST_COLUMNS)}"
+        ranges = [f"{one.name} ({one.low:.4g} to {one.high:.4g})" for one in self.columns]
+        return f"the columns and their ranges: {first_few(ranges, _MOST_COLUMNS)}"
 
     def to_dict(self) -> dict:
         """Return the inspection as plain values for JSON."""
@@ -121,11 +121,11 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
         problems.append(unusable[-1])
     unnamed = all(name.isdigit() for name in table.names)
     bare = not assigned and unnamed
-    told = find_roles(table) if bare else Roles()
-    guessed = dict(told.columns)
+    roles = find_roles(table) if bare else Roles()
+    guessed = dict(roles.columns)
     if bare:
         assigned, _ = assign_columns(table, explicit=guessed, free=(1,))
-        problems.append(_name_them(told))
+        problems.append(_name_them(roles))
     elif unused and not unnamed:
         problems.append(f"not used: {', '.join(unused)}; name them in `columns` to use them")
     # If the columns have no names, the other problems follow from this.
@@ -159,7 +159,7 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
         needs=tuple(needs),
         variables=table.variables,
         guessed=guessed,
-        doubts=told.doubts,
+        doubts=roles.doubts,
         cut_short=bool(table.cut_short),
     )
 
@@ -189,22 +189,22 @@ def unread_entry(file: Path, state: str, problem: str, *, advice: str = "") -> d
     """
     nothing: dict[str, Any] = dict.fromkeys(field.name for field in fields(Inspection))
     lists = {name: [] for name in ("columns", "unusable", "needs", "variables", "doubts")}
-    told = {"file": str(file), "problems": [problem], "advice": advice}
-    return {"state": state, **nothing, **lists, "samples": 0, "guessed": {}, **told}
+    entry = {"file": str(file), "problems": [problem], "advice": advice}
+    return {"state": state, **nothing, **lists, "samples": 0, "guessed": {}, **entry}
 
 
-def _name_them(told: Roles) -> str:
+def _name_them(roles: Roles) -> str:
     """Return how to name columns without headings, as far as the signals show it."""
-    said = "the columns have no names: state their roles in submission.toml"
-    line = ", ".join(f"{role} = {number}" for role, number in told.columns.items())
-    if line and not told.doubts:
+    text = "the columns have no names: state their roles in submission.toml"
+    line = ", ".join(f"{role} = {number}" for role, number in roles.columns.items())
+    if line and not roles.doubts:
         return f"the columns have no names; their signals suggest columns = {{ {line} }}"
     if line:
-        return f"{said}, perhaps columns = {{ {line} }}: {'; '.join(told.doubts)}"
+        return f"{text}, perhaps columns = {{ {line} }}: {'; '.join(roles.doubts)}"
     return (
-        f"{said}, by their numbers from 1: columns = {{ time = …, input = …, x1 = … }}; none looks "
+        f"{text}, by their numbers from 1: columns = {{ time = …, input = …, x1 = … }}; none looks "
         "like time: if there is none, state sample_rate = … (Hz) instead"
-        + "".join(f"; {doubt}" for doubt in told.doubts)
+        + "".join(f"; {doubt}" for doubt in roles.doubts)
     )
 
 

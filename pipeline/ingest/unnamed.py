@@ -75,9 +75,9 @@ def _find_roles(table: FileTable) -> Roles:
         for i, j in combinations(signals, 2)
         if np.std(values[i] - values[j]) < _EQUAL * np.std(values[i])
     ][:1]
-    told = {"time": time, "input": drive, "reference": reference}
-    told |= {f"x{cart}": i for cart, i in enumerate(positions, start=1)}
-    columns = {role: i + 1 for role, i in told.items() if i is not None}
+    roles = {"time": time, "input": drive, "reference": reference}
+    roles |= {f"x{cart}": i for cart, i in enumerate(positions, start=1)}
+    columns = {role: i + 1 for role, i in roles.items() if i is not None}
     return Roles(columns=columns, doubts=tuple(doubts))
 
 
@@ -156,9 +156,9 @@ def _find_input(table: FileTable, signals: Sequence[int]) -> tuple[int | None, i
     values = table.values
     left = _left_unexplained(values, signals)
     stepped = [i for i in signals if _is_stepped(values[i])]
-    told = _by_jumps(values, signals, stepped, left) if stepped else _by_law(values, signals, left)
-    if told is not None:
-        drive, reference = told
+    found = _by_jumps(values, signals, stepped, left) if stepped else _by_law(values, signals, left)
+    if found is not None:
+        drive, reference = found
         return drive, reference, ""
     guess = _as_exported(table, signals)
     return guess, None, "which column is the input is not clear from the signals"

@@ -287,16 +287,16 @@ def _hold_vanished(
         return fitted, data
     needed = {cart: zeta for cart, zeta in decays.items() if f"c_{cart}" in vanished}
     k = chain.k[:-1] + chain.k[1:]  # not positive if k_1 is below zero; then decays are not used
-    for told in (decays, needed) if needed and np.all(k > 0) else ():
+    for dampings in (decays, needed) if needed and np.all(k > 0) else ():
         c = chain.c.copy()
-        for cart, zeta in told.items():
+        for cart, zeta in dampings.items():
             c[cart - 1] = 2 * zeta.value * np.sqrt(chain.m[cart - 1] * k[cart - 1])
-        names = {f"c_{cart}" for cart in told}
+        names = {f"c_{cart}" for cart in dampings}
         held = P.holding_at_zero(*(name for name in vanished if name not in names))
-        along = replace(data, decays=told)
+        along = replace(data, decays=dampings)
         both = _solve(held, along, held.pack(replace(chain, c=c)), fitted.scale)
         # Each decay may add up to 9 to χ², which is three standard errors.
-        if both.chi_square < fitted.chi_square + 9.0 * len(told):
+        if both.chi_square < fitted.chi_square + 9.0 * len(dampings):
             return _hold_vanished(both, along, {})
     held = P.holding_at_zero(*vanished)
     return _hold_vanished(_solve(held, data, held.pack(chain), fitted.scale), data, {})
@@ -338,11 +338,11 @@ def _result(
     G, _ = response_at(P, data, P.physical(chain))
     standardised = (data.magnitude - np.abs(G)) / data.std
     remarks = [remark, *(f"{name} is held at zero" for name in P.zero)]
-    told = [f"c_{cart}" for cart in data.decays]
-    if told:
+    dampers = [f"c_{cart}" for cart in data.decays]
+    if dampers:
         remarks.append(
             "the frequency response alone puts a damping at zero, so the fit also uses the damping "
-            f"ratios of decays ({', '.join(told)})"
+            f"ratios of decays ({', '.join(dampers)})"
         )
     parameters = named_estimates(chain, names=names, covariance=covariance, source="bode_fit")
     for cart in data.decays:
@@ -360,7 +360,7 @@ def _result(
         chain=chain,
         names=names,
         covariance=covariance,
-        at_bound=(*P.zero, *told),
+        at_bound=(*P.zero, *dampers),
         parameters=parameters,
         staged=staged.parameters if staged else {},
         chi_square_per_dof=chi_square_per_dof,

@@ -317,30 +317,30 @@ def _finish(
 
 def _message(plant: SampledPlant, goal: _Goal, design: FeedbackDesign) -> str:
     """Return what can be reached if the goal cannot, and the effect of model errors; often ""."""
-    said = []
+    parts = []
     tied = plant.chain.k[0] > 0 or plant.chain.k[-1] > 0
     held = abs(plant.chain.static_gains()[plant.cart - 1]) * goal.limit if tied else np.inf
     if not design.reachable and abs(goal.reference) > held:
-        said.append(
+        parts.append(
             f"an input of ±{goal.limit:.3g} cannot hold cart {plant.cart} at "
             f"{goal.reference:.3g}; it reaches at most {held:.3g}"
         )
     elif not design.reachable:
         settling = design.settling_time
         settles = "does not settle" if settling is None else f"settles in {settling:.3g} s"
-        said.append(
+        parts.append(
             f"{goal} cannot be met: the best design overshoots by {design.overshoot_percent:.2g} % "
             f"and {settles}, with an input of {design.peak_input:.3g}"
         )
     if not plant.stays_stable(design.gains):
-        said.append(
+        parts.append(
             f"the loop may be unstable if masses or springs are off by {100 * MASS_SPRING_ERROR:g} "
             f"%, or dampings by {100 * DAMPING_ERROR:g} %"
         )
     error = float(level_error_percent(plant.chain, design.gains, cart=plant.cart))
     if error > 5.0:
-        said.append(
+        parts.append(
             f"these gains cancel much of the plant's own stiffness: errors of "
             f"{100 * MASS_SPRING_ERROR:g} % in the springs move the level by up to {error:.0f} %"
         )
-    return "; ".join(said)
+    return "; ".join(parts)

@@ -230,14 +230,14 @@ def _result(
 def _message(attempt: Attempt, remarks: Sequence[str]) -> str:
     """Describe how the fit went."""
     count = len(attempt.windows)
-    said = [
+    parts = [
         f"{count} time record{'s' * (count > 1)}, "
         f"{100 * (1 - attempt.lost):.1f} % of the motion explained",
         *remarks,
     ]
     if attempt.parametrisation.zero:
-        said.append(f"held at zero: {', '.join(attempt.parametrisation.zero)}")
+        parts.append(f"held at zero: {', '.join(attempt.parametrisation.zero)}")
     moving = [w.id for w in attempt.windows if w.kind != "decay" and not w.at_rest]
     if moving:
-        said.append(f"in motion at the start: {', '.join(moving)}")
-    return "; ".join(said)
+        parts.append(f"in motion at the start: {', '.join(moving)}")
+    return "; ".join(parts)

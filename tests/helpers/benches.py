@@ -27,7 +27,7 @@ class Emulator:
     """
 
     address: str
-    said: list[str]
+    output: list[str]
     pid: int = 0
     runs: int = 0
     _events: "queue.Queue[dict[str, Any]]" = field(default_factory=queue.Queue)
@@ -56,7 +56,7 @@ def emulator(
     words = ["cartlab", "emulate", *options]
     if "--model" not in options:
         words += ["--preset", preset]
-    running = Emulator(address="", said=[])
+    running = Emulator(address="", output=[])
     ready = threading.Event()
     with socket.create_server(("127.0.0.1", 0)) as door:
         door.settimeout(PATIENCE)
@@ -68,7 +68,7 @@ def emulator(
         listener.start()
         try:
             assert ready.wait(PATIENCE), "no bench became ready"
-            assert running.address, "\n".join(running.said)
+            assert running.address, "\n".join(running.output)
             yield running
         finally:
             with suppress(ProcessLookupError):
@@ -84,7 +84,7 @@ def _listen(running: Emulator, said: IO[str], ready: threading.Event) -> None:
             running.runs += event["event"] == "run"
             running._events.put(event)
         else:
-            running.said.append(line.rstrip())
+            running.output.append(line.rstrip())
         if line.startswith("ready: "):
             running.address = line.removeprefix("ready: ").strip()
             ready.set()

@@ -90,7 +90,7 @@ class RunawayBench(threading.Thread):
         self.resets = self.lines = 0
         self.is_stopped = self.is_pulled = False
         self.offence: int | None = None
-        self.told: int | None = None
+        self.stopped_at: int | None = None
         self.started_after: list[Start] = []
 
     def __enter__(self) -> "RunawayBench":
@@ -137,8 +137,8 @@ class RunawayBench(threading.Thread):
 
     def _hear(self, command: Command) -> None:
         is_stop = command in (Signal.STOP, Signal.RESET)
-        if is_stop and self.offence is not None and self.told is None:
-            self.told = self.ms
+        if is_stop and self.offence is not None and self.stopped_at is None:
+            self.stopped_at = self.ms
         self.resets += command is Signal.RESET
         self.is_stopped = is_stop or (self.is_stopped and not isinstance(command, Start))
         self.is_pulled |= isinstance(command, Hands) and command.released > 0

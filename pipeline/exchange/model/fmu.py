@@ -50,10 +50,10 @@ def fmu(description: Description) -> tuple[bytes, bool]:
     # The GUID in binary and description must be the same, because tools compare them.
     known = "".join([*sources.values(), *map(repr, variables), __version__])
     guid = f"{{{hashlib.sha256(known.encode()).hexdigest()[:32]}}}"
-    said = {"guid": guid, "variables": variables, "settable": settable, "version": __version__}
-    sources |= {name: render(name, description, **said) for name in ("fmi2.h", "fmi2.c")}
+    values = {"guid": guid, "variables": variables, "settable": settable, "version": __version__}
+    sources |= {name: render(name, description, **values) for name in ("fmi2.h", "fmi2.c")}
     files: dict[str, str | bytes] = {
-        "modelDescription.xml": render("modelDescription.xml", description, **said),
+        "modelDescription.xml": render("modelDescription.xml", description, **values),
         **{f"sources/{name}": text for name, text in sources.items()},
     }
     binary = compile_library(sources)

@@ -200,10 +200,10 @@ class Gradebook:
             add_list(connection, listed, assignment=mine, at=self._at(), rubric=text)
             if last is None:
                 return []
-            told = [f"rubric: {change}" for change in rubric_changes(last.rubric, text)]
+            changes = [f"rubric: {change}" for change in rubric_changes(last.rubric, text)]
             before = points_of(connection, last)
             before = {batch.moved.get(name, name): had for name, had in before.items()}
-        return told + points_changes(before, points, by_hand=by_hand, shown=shown)
+        return changes + points_changes(before, points, by_hand=by_hand, shown=shown)
 
     # ---------------------------------------------------------------- current class list
 

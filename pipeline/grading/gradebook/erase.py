@@ -37,6 +37,6 @@ def erase_rows(connection: Connection, gone: Mapping[int, str]) -> None:
     any_name = re.compile(rf"(?<![\w-])(?:{names})(?![\w-])")
     for row in connection.execute(flagged.where(entries.c.shared != "")).all():
         where = (entries.c.batch_id == row.batch_id) & (entries.c.position == row.position)
-        told = any_name.sub(NOBODY, row.shared)
-        if told != row.shared:
-            connection.execute(update(entries).where(where).values(shared=told))
+        erased = any_name.sub(NOBODY, row.shared)
+        if erased != row.shared:
+            connection.execute(update(entries).where(where).values(shared=erased))

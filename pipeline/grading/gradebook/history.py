@@ -128,15 +128,15 @@ def _listed(connection: Connection, submission: int, *, named: bool) -> Iterator
                 yield Event(at=at, what="removed", points=None, text=text)
             before = None
             continue
-        said = ["shared_data"] if shared else []
+        notes = ["shared_data"] if shared else []
         if before is None and (
             then := _other_name(connection, submission, of=batch, among=previous)
         ):
-            said.append(f"was {then} before" if named else "was renamed")
+            notes.append(f"was {then} before" if named else "was renamed")
         if judged_by and rubric != judged_by:
-            said += [f"rubric: {change}" for change in rubric_changes(judged_by, rubric)]
+            notes += [f"rubric: {change}" for change in rubric_changes(judged_by, rubric)]
         if ((points, out_of, shared), rubric) != (before, judged_by):
-            yield Event(at=at, what="listed", points=points, out_of=out_of, text="; ".join(said))
+            yield Event(at=at, what="listed", points=points, out_of=out_of, text="; ".join(notes))
         before, judged_by = (points, out_of, shared), rubric
 
 
@@ -203,5 +203,5 @@ def _request_words(event: Event) -> str:
     """Return an event of a request as one line of text."""
     by = f"by {event.by}" if event.by else "by the team"
     points = "" if event.points is None else f"{event.points:g} by hand, "
-    said = " ".join(event.text.split())
-    return f"{event.what:8}  {event.criterion}: {points}{by}" + (f": {said}" if said else "")
+    text = " ".join(event.text.split())
+    return f"{event.what:8}  {event.criterion}: {points}{by}" + (f": {text}" if text else "")

@@ -277,12 +277,12 @@ class RequestBook(OpenBook):
             raise Conflict(f"{criterion}: was changed after this page was shown", now=given)
         return last, row, request
 
-    def _add(self, connection: Connection, row: Row, said: RequestEvent) -> None:
+    def _add(self, connection: Connection, row: Row, draft: RequestEvent) -> None:
         """Store an event of a request, with the current time and authors."""
-        if not said.by.strip():
+        if not draft.by.strip():
             raise RequestRefused("enter your name: requests and answers are signed")
         authors = last_named(connection, row.submission_id)
-        event = replace(said, at=self._at(), authors=authors)
+        event = replace(draft, at=self._at(), authors=authors)
         add_row(connection, request_events, {**asdict(event), "submission_id": row.submission_id})
 
 

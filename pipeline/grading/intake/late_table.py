@@ -32,10 +32,10 @@ def read_late_table(path: Path) -> dict[str, float]:
         raise ConfigError(f"{path.name}: expected columns {' and '.join(_HEADS)}")
     days: dict[str, float] = {}
     for line, *cells in table.loc[:, _HEADS].itertuples():
-        who, said = (str(cell).strip() for cell in cells[:2])
-        late = _number(said)
+        who, typed = (str(cell).strip() for cell in cells[:2])
+        late = _number(typed)
         if late is None or not 0 <= late <= _LONGEST:
-            raise ConfigError(f"{path.name} line {line}: days_late: cannot read {quote(said)}")
+            raise ConfigError(f"{path.name} line {line}: days_late: cannot read {quote(typed)}")
         if days.get(who.casefold(), late) != late:
             raise ConfigError(
                 f"{path.name} line {line}: {late:g} days late here, and "

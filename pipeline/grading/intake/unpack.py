@@ -190,11 +190,11 @@ def _why(error: Exception) -> str:
     if isinstance(error, NotImplementedError):
         return "its compression is not supported"
     if isinstance(error, OSError | RuntimeError):  # from the disk or from a decoder
-        said = getattr(error, "strerror", None) or _line(error)
-        return f"cannot be unpacked ({said})"
-    said = _line(error)
+        message = getattr(error, "strerror", None) or _line(error)
+        return f"cannot be unpacked ({message})"
+    message = _line(error)
     # Details in brackets would only repeat this error.
-    more = "" if said == "File is not a zip file" else f" ({said})"
+    more = "" if message == "File is not a zip file" else f" ({message})"
     return f"not a complete zip archive{more}"
 
 

@@ -40,12 +40,12 @@ def charge(
     kept: Fraction = ALL - exact(cost)
     if verdict.share <= kept:
         return verdict
-    said = WORDS.text(
+    sentence = WORDS.text(
         "costs",
         title=WORDS.text(f"title_{dearest.code}"),
         percent=f"{100 * cost:g}",
     )
-    return replace(verdict, share=kept, message=f"{verdict.message} {said}")
+    return replace(verdict, share=kept, message=f"{verdict.message} {sentence}")
 
 
 def concerns(flag: Flag, criterion: asked.Criterion, *, names: list[str]) -> bool:

@@ -171,8 +171,8 @@ def prepare_work(
     """
     reported, signed = turned_round(submission.reported or Reported(), analysis.records)
     submission = submission.model_copy(update={"reported": reported})
-    work, told = _prepare(submission, analysis, rubric=rubric)
-    flags = sorted([*told, *_flags(work)], key=lambda flag: CODES.index(flag.code))
+    work, flags_so_far = _prepare(submission, analysis, rubric=rubric)
+    flags = sorted([*flags_so_far, *_flags(work)], key=lambda flag: CODES.index(flag.code))
     return work, tuple(flags), signed
 
 

@@ -263,8 +263,8 @@ def diagnose_controller(controller: Controller) -> list[Flag]:
     meets = any(controller.meets(one) for one in numbers)
     claimed = any(controller.is_claimed(one) for one in numbers)
     # Gains that meet the goal and match the claims are those that the student meant.
-    told = controller.overshoot is not None or controller.settling is not None
-    slip, intended = ("", None) if meets and told and claimed else _slip(controller)
+    is_stated = controller.overshoot is not None or controller.settling is not None
+    slip, intended = ("", None) if meets and is_stated and claimed else _slip(controller)
     ran = controller.ran
     # If the bench ran with other gains, they show which of the reported numbers is wrong.
     other_ran = ran is not None and not same_gains(ran, controller.gains)
@@ -440,7 +440,7 @@ def _prefilter_slips(controller: Controller, right: float) -> Iterator[tuple[str
                 sample_time=goal.sample_time,
             )
             if other is not None:
-                said = WORDS.text("prefilter_of_other", cart=cart, goal=goal.cart)
-                yield said, other.prefilter
+                sentence = WORDS.text("prefilter_of_other", cart=cart, goal=goal.cart)
+                yield sentence, other.prefilter
     if right != 1.0:
         yield WORDS.text("prefilter_none"), 1.0

@@ -152,11 +152,11 @@ def _put_dampings(
     n = right.shape[0] // 2
     for i in range(n):
         omega, zeta = _own_names(i, n)
-        at, told = 2 * i + 1, known.get(zeta)
-        if told is None:
+        at, damping = 2 * i + 1, known.get(zeta)
+        if damping is None:
             right[at, at] = np.nan
             continue
-        middle, half = (told.high + told.low) / 2, (told.high - told.low) / 2
+        middle, half = (damping.high + damping.low) / 2, (damping.high - damping.low) / 2
         right[at, at] = -2 * middle * values[omega]
         slack[at, at] = (
             2 * (half + limits.HONEST_SIGMAS * limits.HONEST_DAMPING * middle) * values[omega]

@@ -128,14 +128,14 @@ def _by_hand(line: Line) -> str:
 def _points(page: PageBuilder, points: "pd.Series", rubric: Rubric) -> list[Block]:
     if points.empty:
         return []
-    told = {
+    values = {
         "low": points_text(points.min()),
         "high": points_text(points.max()),
         "out_of": points_text(rubric.out_of),
         "submissions": counted(len(points), "submission"),
     }
     figure = distribution_figure(points.to_list(), out_of=rubric.out_of)
-    return [page.picture("distribution", figure, WORDS, "distribution", **told)]
+    return [page.picture("distribution", figure, WORDS, "distribution", **values)]
 
 
 def _criteria(page: PageBuilder, graded: "pd.DataFrame", rubric: Rubric) -> list[Block]:

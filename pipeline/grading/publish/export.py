@@ -162,8 +162,8 @@ def _comment(student: Student) -> str:
     """Return short feedback as HTML, which Moodle expects."""
     if student.undecided:
         return ""
-    said = _comment_lines(student.grade, by_hand=student.by_hand)
-    return "<br>".join(html.escape(line, quote=False) for line in said)
+    lines = _comment_lines(student.grade, by_hand=student.by_hand)
+    return "<br>".join(html.escape(line, quote=False) for line in lines)
 
 
 def _comment_lines(grade: Grade, *, by_hand: Collection[str]) -> list[str]:

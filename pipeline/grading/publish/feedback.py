@@ -89,11 +89,11 @@ def _summary(grade: Grade) -> list[Block]:
         key = "failed_by_hand" if overrides else "failed"
         then = WORDS.text(f"{key}_then")
         first, *others = map(sentence, grade.reason.split("\n"))
-        told: list[Block] = [paragraph(WORDS.spans(key, why=f"{first} {then}"))]
+        blocks: list[Block] = [paragraph(WORDS.spans(key, why=f"{first} {then}"))]
         if others:
             why = paragraph(WORDS.spans(key, why=WORDS.text("failed_reasons")))
-            told = [why, bullet_list(map(spans, (first, *others))), paragraph(then)]
-        return [Tiles((tile, by_hand) if overrides else (tile,)), *told, *_notes(grade)]
+            blocks = [why, bullet_list(map(spans, (first, *others))), paragraph(then)]
+        return [Tiles((tile, by_hand) if overrides else (tile,)), *blocks, *_notes(grade)]
     passed = sum(c.outcome == "pass" for c in grade.criteria)
     tiles = [
         Tile(spans("Points"), spans(points)),
@@ -197,11 +197,11 @@ def _criteria(grade: Grade, rubric: Rubric, numbers: count) -> list[Block]:
     blocks: list[Block] = [make_table(next(numbers), WORDS.text("points"), head, rows, "lrl")]
     for criterion in grade.criteria:
         title = _capital(clean(criterion.title or criterion.id))
-        said = paragraph(rich(sentence(criterion.message)))
+        message = paragraph(rich(sentence(criterion.message)))
         table = numbers_table(
             criterion, check=checks.get(criterion.id, ""), units=grade.units, numbers=numbers
         )
-        inside: list[Block] = [said, *([table] if table else [])]
+        inside: list[Block] = [message, *([table] if table else [])]
         head = spans(f"{title}: {WORDS.text(f'outcome_{criterion.outcome}')}")
         passed = criterion.outcome == "pass"
         blocks += [Details(head, tuple(inside))] if passed else [Heading(head), *inside]

@@ -44,8 +44,10 @@ def draw_figures(analysis: Analysis, reported: Reported | None) -> tuple[tuple[s
                 units=Page(analysis).units,
             )
             computed = "the response computed from the reported final table"
-            told = computed if curve else "no complete final table"
-            alt = f"Measured frequency response of cart {response.cart}, its fit, and {told}."
+            drawn_curve = computed if curve else "no complete final table"
+            alt = (
+                f"Measured frequency response of cart {response.cart}, its fit, and {drawn_curve}."
+            )
             name = f"{_RESPONSE}-{response.cart}"
             drawn.append((f"{name}.svg", to_svg(figure, name=name, alt=alt)))
     return tuple(drawn)
@@ -74,10 +76,12 @@ def draw_records(analysis: Analysis, criteria: Iterable[Criterion]) -> tuple[tup
     def keep(draw: Callable[..., Any], names: Sequence[str], *, record: Record, **how) -> None:
         reported = ", ".join(f"{name_span(name).text} {pairs[name][0]:.4g}" for name in names)
         recomputed = ", ".join(f"{pairs[name][1]:.4g}" for name in names)
-        told = f"reported {reported}; recomputed {recomputed}"
-        figure = draw(record=record, title=told, position_unit=unit, **how)
+        title = f"reported {reported}; recomputed {recomputed}"
+        figure = draw(record=record, title=title, position_unit=unit, **how)
         file = "-".join(("record", *names))
-        drawn.append((f"{file}.svg", to_svg(figure, name=file, alt=f"{clean(record.id)}: {told}.")))
+        drawn.append(
+            (f"{file}.svg", to_svg(figure, name=file, alt=f"{clean(record.id)}: {title}."))
+        )
 
     with drawing():
         for cart in range(1, analysis.bench.n + 1):

@@ -63,13 +63,13 @@ def _grade_lines(grade: Grade, *, by_hand: bool, hidden: bool) -> list[str]:
     """
     how = " automatically, so points were given by hand" if by_hand else ""
     failed = grade.status == "failed"
-    said = [f"Could not be graded{how}: {grade.reason}"] if failed else []
+    lines = [f"Could not be graded{how}: {grade.reason}"] if failed else []
     if hidden:
-        said += [] if failed else [WORDS.text("gradescope_hidden")]
-    said += flag_messages(grade, codes=_WITHOUT_NUMBERS if hidden else CODES)
+        lines += [] if failed else [WORDS.text("gradescope_hidden")]
+    lines += flag_messages(grade, codes=_WITHOUT_NUMBERS if hidden else CODES)
     if grade.deducted:
-        said.append(f"Late: {points_text(grade.deducted)} points off.")
-    return said
+        lines.append(f"Late: {points_text(grade.deducted)} points off.")
+    return lines
 
 
 def _criterion_text(judged: Criterion, grade: Grade, rubric: Rubric, *, hidden: bool) -> str:
@@ -83,11 +83,11 @@ def _criterion_text(judged: Criterion, grade: Grade, rubric: Rubric, *, hidden: 
     outcome = WORDS.text(f"outcome_{judged.outcome}")
     if not hidden:
         return f"{outcome}: {with_symbols(judged.message)}"
-    said = [
+    lines = [
         WORDS.text(f"title_{flag.code}")
         for criterion in rubric.criteria
         if criterion.id == judged.id
         for flag in find_remarks(grade, criterion, rubric)
     ]
-    said += [given.why for given in grade.overrides if given.criterion == judged.id]
-    return ": ".join([outcome, "; ".join(said)] if said else [outcome])
+    lines += [given.why for given in grade.overrides if given.criterion == judged.id]
+    return ": ".join([outcome, "; ".join(lines)] if lines else [outcome])

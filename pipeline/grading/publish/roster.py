@@ -65,10 +65,10 @@ class Roster:
         ConfigError : Moodle's column or Canvas' row of possible points has a different maximum.
         """
         column = self._title(title)
-        said = [*self.table[_MAXIMUM].unique()] if _MAXIMUM in self.table else []
+        stated = [*self.table[_MAXIMUM].unique()] if _MAXIMUM in self.table else []
         if column in self.table:
-            said += [*self.table.loc[self._of_all(), column]]
-        for text in said:
+            stated += [*self.table.loc[self._of_all(), column]]
+        for text in stated:
             if (most := _number(text)) is not None and most != out_of:
                 raise ConfigError(
                     f"{self.file}: has the maximum grade {text}, the rubric {out_of:g}: "

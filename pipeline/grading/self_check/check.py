@@ -137,16 +137,16 @@ def next_answer(
     known: Collection[str] = ()
     if before and before[-1].basis == basis:
         known = before[-1].disagree
-    told = [n for n in found.disagree if n in known and (where is None or n in where)]
+    hinted = [n for n in found.disagree if n in known and (where is None or n in where)]
     return CheckAnswer(
         ask=len(before) + 1,
-        stage="where" if told else "which",
+        stage="where" if hinted else "which",
         basis=basis,
         disagree=found.disagree,
         agree=found.agree,
         not_checked=found.not_checked,
         doubtful=tuple(found.work.bad),
-        hints=tuple(find_hint(number, found.work, found.flags) for number in told),
+        hints=tuple(find_hint(number, found.work, found.flags) for number in hinted),
     )
 
 

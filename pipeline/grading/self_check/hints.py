@@ -130,10 +130,10 @@ def _name_part(run: str, window: tuple[float, float], analysis: Analysis) -> Par
     return "middle" if start >= 0.2 and end <= 0.8 else "whole"
 
 
-def _gather(told: Sequence[tuple[str, Kind, Part]]) -> Iterator[Stretch]:
+def _gather(parts: Sequence[tuple[str, Kind, Part]]) -> Iterator[Stretch]:
     """Yield the parts; recordings of the same kind and part are named together."""
     order = [(kind, part) for kind in get_args(Kind) for part in get_args(Part)]
     for kind, part in order:
-        runs = tuple(dict.fromkeys(run for run, k, p in told if (k, p) == (kind, part)))
+        runs = tuple(dict.fromkeys(run for run, k, p in parts if (k, p) == (kind, part)))
         if runs:
             yield Stretch(kind=kind, recordings=runs, part=part)

@@ -89,8 +89,8 @@ def answer_lines(answer: CheckAnswer) -> Iterator[str]:
         words = hint_words(hints[0])
         yield f"  {', '.join(hint.number for hint in hints)}: {words.title}"
         yield from (f"      {line}" for line in words.look)
-    told = {hint.number for hint in answer.hints}
-    left = [number for number in answer.disagree if number not in told]
+    with_hint = {hint.number for hint in answer.hints}
+    left = [number for number in answer.disagree if number not in with_hint]
     yield from (f"  {number}" for number in left)
     if answer.not_checked:
         yield WORDS.text("not_checked", numbers=", ".join(answer.not_checked))

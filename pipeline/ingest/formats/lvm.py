@@ -137,8 +137,8 @@ def _segments(lines: Sequence[str], at: int, dialect: _Dialect) -> tuple[list[_S
 
 def _is_row(line: str, dialect: _Dialect) -> bool:
     """Return whether a line is a row of numbers, rather than the first tag of a header."""
-    said = [field for field in dialect.fields(line) if field]
-    return bool(said) and is_number(said[0].replace(dialect.decimal, "."))
+    cells = [field for field in dialect.fields(line) if field]
+    return bool(cells) and is_number(cells[0].replace(dialect.decimal, "."))
 
 
 def _read(segment: _Segment, dialect: _Dialect) -> FileTable:
@@ -178,8 +178,8 @@ def _read(segment: _Segment, dialect: _Dialect) -> FileTable:
 
 def _missing(segment: _Segment, found: int) -> str | None:
     """Return a note if a segment has fewer rows than its header states; otherwise None."""
-    said = max((int(n) for n in segment.header.get("Samples", []) if n.isdecimal()), default=0)
-    return f"line {segment.lines[-1]}: {found:,} of {said:,} samples" if found < said else None
+    stated = max((int(n) for n in segment.header.get("Samples", []) if n.isdecimal()), default=0)
+    return f"line {segment.lines[-1]}: {found:,} of {stated:,} samples" if found < stated else None
 
 
 def _headings(segment: _Segment, names: Sequence[str], dialect: _Dialect) -> list[str]:
@@ -228,13 +228,13 @@ def _stated(tag: str, segment: _Segment, dialect: _Dialect) -> float | None:
     SubmissionError : the entry is not a number, or differs between channels.
     """
     place = f"{dialect.source} line {segment.line}: the header above states {tag}"
-    said = [value for value in segment.header.get(tag, []) if value]
-    numbers = [value.replace(dialect.decimal, ".") for value in said]
+    values = [value for value in segment.header.get(tag, []) if value]
+    numbers = [value.replace(dialect.decimal, ".") for value in values]
     if not all(map(is_number, numbers)):
-        raise SubmissionError(f"{place} {first_few(said, 3)[:60]!r}, which is not a number")
+        raise SubmissionError(f"{place} {first_few(values, 3)[:60]!r}, which is not a number")
     found = set(map(float, numbers))
     if len(found) > 1 or not all(map(np.isfinite, found)):
-        raise SubmissionError(f"{place} differently for each channel: {first_few(said, 3)[:60]}")
+        raise SubmissionError(f"{place} differently for each channel: {first_few(values, 3)[:60]}")
     return found.pop() if found else None
 
 

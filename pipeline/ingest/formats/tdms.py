@@ -187,16 +187,16 @@ def _channel(one: "TdmsChannel") -> _Channel:
         values = (values - start) / np.timedelta64(1, "s") if values.size else values
         kind = "times"
     is_number = values.dtype.kind in "biuf" and values.ndim == 1
-    said = one.properties
+    properties = one.properties
     return _Channel(
         group=_printable(one.group_name),
         name=_printable(one.name),
         kind=kind if is_number else "no numbers",
         samples=values.size,
         values=values.astype(np.float64) if is_number else None,
-        unit="s" if kind == "times" else _printable(str(said.get("unit_string", ""))),
-        interval=_number(said.get("wf_increment")),
-        start=_number(said.get("wf_start_offset")),
+        unit="s" if kind == "times" else _printable(str(properties.get("unit_string", ""))),
+        interval=_number(properties.get("wf_increment")),
+        start=_number(properties.get("wf_start_offset")),
     )
 
 

@@ -191,13 +191,13 @@ class _Sheet:
             self._refuse_gaps(rows, self._rows[cells], column=column, name=name)
         values, whole = np.empty((len(used), rows.size)), []
         for i, (column, cells) in enumerate(zip(used, mine, strict=True)):
-            times, said = self._times(cells, column=column, name=names[i])
-            if said and times is None:
-                notes.append(said)
+            times, note = self._times(cells, column=column, name=names[i])
+            if note and times is None:
+                notes.append(note)
             values[i] = self._values[cells] if times is None else times
             whole.append(times is None and bool((values[i] == np.round(values[i])).all()))
             if times is not None:
-                notes.append(said)
+                notes.append(note)
                 names[i] = f"{_UNIT_OF_HEADING.sub('', names[i])} [s]"
         refuse_unusable(values, names=names, place=lambda row: f"{self._where} row {rows[row]}")
         return FileTable(
@@ -243,8 +243,8 @@ class _Sheet:
         formats, values = self._formats[cells], self._values[cells]
         is_time = (formats == "date") | (formats == "time")
         if not is_time.any():
-            said = f"{name!r} is shown in percent, but its stored value is used: 0.5 for 50 %"
-            return None, said if (formats == "percent").any() else ""
+            note = f"{name!r} is shown in percent, but its stored value is used: 0.5 for 50 %"
+            return None, note if (formats == "percent").any() else ""
         if not is_time.all():
             at = int(self._rows[cells[np.argmax(is_time)]]), column
             raise SubmissionError(

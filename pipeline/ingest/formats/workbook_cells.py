@@ -258,8 +258,8 @@ def _reported(source: str) -> Iterator[None]:
         yield
     except (_Broken, zipfile.BadZipFile, zlib.error, struct.error, expat.ExpatError, EOFError,
             LookupError, OSError, OverflowError, RuntimeError, ValueError):  # fmt: skip
-        said = f"{source}: the workbook is broken, cut short or larger than any recording"
-        raise SubmissionError(said) from None
+        message = f"{source}: the workbook is broken, cut short or larger than any recording"
+        raise SubmissionError(message) from None
 
 
 class _Bounded(BytesIO):

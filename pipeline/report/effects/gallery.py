@@ -79,7 +79,7 @@ def effect_picture(page: PageBuilder, term: EffectTerm, chain: Chain, *, bench: 
         for p, value in zip(effect.parameters, term.values, strict=True)
         if p.reported
     )
-    said = {
+    values = {
         "title": effect.title,
         "place": f" on {effect.place} {term.place}" if term.place else "",
         "bench": bench,
@@ -88,7 +88,7 @@ def effect_picture(page: PageBuilder, term: EffectTerm, chain: Chain, *, bench: 
         "axis": effect.axis,
         "fingerprint": effect.fingerprint,
     }
-    return page.picture(effect.key, effect_figure(term, chain), _WORDS, "effect", **said)
+    return page.picture(effect.key, effect_figure(term, chain), _WORDS, "effect", **values)
 
 
 def hiding_command(term: EffectTerm) -> str:

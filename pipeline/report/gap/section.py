@@ -44,12 +44,12 @@ def gap_in_short(gap: Gap) -> list[Block]:
     """Return the verdict as one paragraph with a link to its section."""
     name = listing([effect_name(found.effect, found.where) for found in gap.effects])
     names = f" ({name})" if name and gap.verdict in ("named", "partial") else ""
-    said = WORDS.spans(
+    sentence = WORDS.spans(
         "in_short" if gap.effects else "in_short_linear",
         verdict=f"{verdict_title(gap)}{names}",
         **shares(gap),
     )
-    return [paragraph(said)]
+    return [paragraph(sentence)]
 
 
 def gap_blocks(page: Page, gap: Gap) -> list[Block]:
@@ -92,8 +92,10 @@ def augmented_hardware_blocks(page: Page, gap: Gap) -> list[Block]:
     for i, (run, found) in enumerate(drawn, start=1):
         worst = max(found, key=lambda replay: replay.nrmse)
         figure = _replay_figure(found, position_unit=page.position, added=added)
-        said = {"run": run, "error": share(worst.nrmse), "cart": worst.check.cart, "added": added}
-        blocks.append(page.picture(f"hardware-effects-{i}", figure, WORDS, "replay_figure", **said))
+        values = {"run": run, "error": share(worst.nrmse), "cart": worst.check.cart, "added": added}
+        blocks.append(
+            page.picture(f"hardware-effects-{i}", figure, WORDS, "replay_figure", **values)
+        )
     return blocks
 
 

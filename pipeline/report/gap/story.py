@@ -134,9 +134,14 @@ def _where(page: Page, gap: Gap) -> list[Block]:
     shown = rows[:_MOST_ROWS]
     top, more = shown[0], left_out(len(rows) - len(shown))
     alone = "" if gap.effects else "_linear"
-    said = {"more": more, "runs": count(len(shown), "run"), "run": top.experiment, "cart": top.cart}
+    values = {
+        "more": more,
+        "runs": count(len(shown), "run"),
+        "run": top.experiment,
+        "cart": top.cart,
+    }
     figure = by_record_figure(shown, added=added_name(gap))
-    picture = page.picture("by-record", figure, WORDS, f"by_record{alone}", **said, **shares(top))
+    picture = page.picture("by-record", figure, WORDS, f"by_record{alone}", **values, **shares(top))
     blocks: list[Block] = [picture]
     if gap.where:
         blocks.append(window_table(page, gap.where, model=WORDS.text("linear_model")))
@@ -267,9 +272,9 @@ def _force_left(page: Page, gap: Gap) -> list[Block]:
     for residual in gap.residual:
         cart = str(residual.cart)
         if residual.formula is None:
-            said = WORDS.spans("force_left_no_formula", cart=cart)
+            sentence = WORDS.spans("force_left_no_formula", cart=cart)
         else:
-            said = WORDS.spans(
+            sentence = WORDS.spans(
                 "force_left_formula",
                 formula=residual.formula.text,
                 unit=residual.unit,
@@ -281,10 +286,13 @@ def _force_left(page: Page, gap: Gap) -> list[Block]:
             "cart": cart,
             "line": WORDS.text("force_left_formula_line") if residual.formula else "",
             "quantities": listing([shown.quantity for shown in residual.against]),
-            "formula": plain(said),
+            "formula": plain(sentence),
         }
         figure, key = force_left_figure(residual), "force_left_figure"
-        blocks += [page.picture(f"force-left-{cart}", figure, WORDS, key, **shown), paragraph(said)]
+        blocks += [
+            page.picture(f"force-left-{cart}", figure, WORDS, key, **shown),
+            paragraph(sentence),
+        ]
     return blocks
 
 
@@ -328,9 +336,9 @@ def _predicted(page: Page, gap: Gap) -> list[Block]:
         return []
     table = proposal.recording
     if "release" in table:
-        said = WORDS.text("predicted_release", cart=str(table["release"]))
+        values = WORDS.text("predicted_release", cart=str(table["release"]))
     else:
-        said = WORDS.text(
+        values = WORDS.text(
             "predicted_driven",
             drive=page.drive,
             **{key: str(table[key]) for key in ("wave", "amplitude", "frequency")},
@@ -349,15 +357,15 @@ def _predicted(page: Page, gap: Gap) -> list[Block]:
     figure = predicted_figure(prediction, names=names, position_unit=page.position)
     paragraph_ = WORDS.spans(
         "predicted",
-        recording=said,
+        recording=values,
         separation=f"{proposal.separation:.2g}",
         one=one,
         other=other,
         hand=WORDS.text("predicted_hand", note=table["note"]) if "note" in table else "",
     )
     short = "; ".join(_apart_names(first, second, most=_MOST_NAMES))
-    said = {"cart": prediction.cart, "names": short}
-    picture = page.picture("predicted", figure, WORDS, "predicted_figure", **said)
+    values = {"cart": prediction.cart, "names": short}
+    picture = page.picture("predicted", figure, WORDS, "predicted_figure", **values)
     return [paragraph(paragraph_), picture]
 
 

@@ -63,16 +63,16 @@ def verdict_blocks(gap: Gap) -> list[Block]:
     so_far = [] if gap.complete else [paragraph(WORDS.spans("so_far"))]
     match gap.verdict:
         case "none":
-            said: list[Block] = [
+            blocks: list[Block] = [
                 paragraph(WORDS.spans("none", noise=_noise(gap), baseline=share(gap.baseline)))
             ]
         case "named" | "partial":
-            said = [_named(gap)]
+            blocks = [_named(gap)]
         case "ambiguous":
-            said = _ambiguous(gap)
+            blocks = _ambiguous(gap)
         case "unexplained":
-            said = [_unexplained(gap)]
-    return [*so_far, *said]
+            blocks = [_unexplained(gap)]
+    return [*so_far, *blocks]
 
 
 def scope_blocks(gap: Gap, *, position: str, drive: str) -> list[Block]:
@@ -138,17 +138,17 @@ def _named(gap: Gap) -> Block:
 def _ambiguous(gap: Gap) -> list[Block]:
     last, rival = contenders(gap)
     others = [effect_name(f.effect, f.where) for f in gap.effects if f is not last]
-    said = {
+    values = {
         "name": capital(effect_name(last.effect, last.where)),
         "beside": f", beside {listing(others)}" if others else "",
         "errors": _errors(gap),
     }
     both = [_explanation(last.effect, last.where, gap.final, sizes_text(last.parameters))]
     if rival is None:
-        return [paragraph(WORDS.spans("ambiguous_alone", **said)), bullet_list(both)]
+        return [paragraph(WORDS.spans("ambiguous_alone", **values)), bullet_list(both)]
     both.append(_explanation(rival.effect, rival.where, rival.nrmse_after, ""))
     named = effect_name(rival.effect, rival.where)
-    return [paragraph(WORDS.spans("ambiguous", rival=named, **said)), bullet_list(both)]
+    return [paragraph(WORDS.spans("ambiguous", rival=named, **values)), bullet_list(both)]
 
 
 def _explanation(effect: Effect, where: Mapping[str, int], error: float, sizes: str) -> Spans:
@@ -163,16 +163,16 @@ def _explanation(effect: Effect, where: Mapping[str, int], error: float, sizes: 
 
 
 def _unexplained(gap: Gap) -> Block:
-    said = {"noise": _noise(gap), "suspicion": _suspicion(gap), **shares(gap)}
+    values = {"noise": _noise(gap), "suspicion": _suspicion(gap), **shares(gap)}
     if not gap.effects:
         key = "unexplained" if gap.complete else "undecided"
         if gap.final < NOTHING * gap.noise_floor:
             key = f"{key}_taught"
-        return paragraph(WORDS.spans(key, **said))
+        return paragraph(WORDS.spans(key, **values))
     suspects = listing([effect_name(found.effect, found.where) for found in gap.effects])
     are = "suspect is" if len(gap.effects) == 1 else "suspects, together, are"
     key = "suspected" if gap.complete else "suspected_so_far"
-    return paragraph(WORDS.spans(key, are=are, suspects=suspects, **said))
+    return paragraph(WORDS.spans(key, are=are, suspects=suspects, **values))
 
 
 def _suspicion(gap: Gap) -> str:

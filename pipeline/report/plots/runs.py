@@ -91,8 +91,8 @@ def compare_runs(
         progress(f"simulating {record.id}")
         run = _compare(record, analysis, gap)
         if reason := left_out.get(record.id):
-            said = _WORDS.text("left_out", reason=reason)
-            run = replace(run, note="; ".join(filter(None, (said, run.note))))
+            text = _WORDS.text("left_out", reason=reason)
+            run = replace(run, note="; ".join(filter(None, (text, run.note))))
         found.append(run)
     return tuple(found)
 

@@ -46,7 +46,7 @@ class PageBuilder:
         rows: Iterable[Sequence[Cell | str | Spans]],
         align: str,
         /,
-        **said: object,
+        **values: object,
     ) -> Table:
         """Return a table with the next number; see `make_table`.
 
@@ -56,8 +56,8 @@ class PageBuilder:
         key : key of the caption; the headings have the key `{key}_head`.
         said : values that are inserted into the caption and the headings.
         """
-        head = [rich(text) for text in words.cells(f"{key}_head", **said)]
-        return self.headed_table(words.text(key, **said), head[: len(align)], rows, align)
+        head = [rich(text) for text in words.cells(f"{key}_head", **values)]
+        return self.headed_table(words.text(key, **values), head[: len(align)], rows, align)
 
     def headed_table(
         self,

@@ -56,9 +56,9 @@ def _failed(analysis: Analysis) -> Iterator[Spans]:
         groups.setdefault(_group(check), []).append(check)
     for group in sorted(groups, key=_place):
         checks = sorted(groups[group], key=_excess, reverse=True)
-        told = checks[: 1 if group in _ALIKE else _MOST_TOLD]
-        told = () if group in _TOLD_ELSEWHERE else told
-        messages = dict.fromkeys(_sentence(clean(check.message)) for check in told)
+        shown = checks[: 1 if group in _ALIKE else _MOST_TOLD]
+        shown = () if group in _TOLD_ELSEWHERE else shown
+        messages = dict.fromkeys(_sentence(clean(check.message)) for check in shown)
         yield _WORDS.spans(
             "failed",
             action=_action(group, checks, analysis),
@@ -180,5 +180,7 @@ def set_up_in_doubt(analysis: Analysis) -> tuple[bool, Spans] | None:
     wrong = [check for check in analysis.failed_checks if _group(check) in _AT_THE_TOP]
     if not wrong:
         return None
-    said = (_WORDS.spans(f"top_{_group(c)}", message=_sentence(clean(c.message))) for c in wrong)
-    return False, tuple(span for one in said for span in (*one, Span(" ")))[:-1]
+    sentences = (
+        _WORDS.spans(f"top_{_group(c)}", message=_sentence(clean(c.message))) for c in wrong
+    )
+    return False, tuple(span for one in sentences for span in (*one, Span(" ")))[:-1]

@@ -82,11 +82,11 @@ def taken_text(one: Assumption) -> str:
 
 def skipped_blocks(page: Page) -> list[Block]:
     """Return the skipped stages and the reasons."""
-    told = [
+    items = [
         spans(Span(f"{clean(skip.name)}: ", "strong"), rich(clean(skip.reason)))
         for skip in page.analysis.skipped
     ]
-    return [bullet_list(told)] if told else []
+    return [bullet_list(items)] if items else []
 
 
 def provenance_blocks(page: Page, made: str) -> list[Block]:

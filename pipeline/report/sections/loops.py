@@ -23,7 +23,7 @@ def feedback_blocks(page: Page) -> list[Block]:
     if design is None:
         return []
     settling = design.settling_time
-    said = {
+    values = {
         "cart": design.cart,
         "goal": f"{significant(design.reference)} {page.position}",
         "overshoot": percent(design.overshoot_percent),
@@ -39,7 +39,7 @@ def feedback_blocks(page: Page) -> list[Block]:
         paragraph(_WORDS.text("feedback", method=method, message=clean(design.message))),
         _feedback_table(page, design),
         _pole_table(page, design),
-        page.picture("feedback", figure, _WORDS, "design", **said),
+        page.picture("feedback", figure, _WORDS, "design", **values),
     ]
 
 

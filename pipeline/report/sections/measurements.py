@@ -28,8 +28,8 @@ def response_blocks(page: Page) -> list[Block]:
     for response in sorted(responses, key=lambda r: -r.cart):
         if np.any(response.magnitude > 0):
             figure = bode_figure(response, chain=chain, units=page.units)
-            name, said = f"bode-cart-{response.cart}", _bode_words(page, response)
-            pictures.append(page.picture(name, figure, _WORDS, key, alt="bode_alt", **said))
+            name, values = f"bode-cart-{response.cart}", _bode_words(page, response)
+            pictures.append(page.picture(name, figure, _WORDS, key, alt="bode_alt", **values))
     if not pictures:
         return []
     found = {response.source for response in responses}
@@ -55,8 +55,10 @@ def overview_blocks(page: Page) -> list[Block]:
         return []
     chain, marks = page.analysis.chain, listing(omega_names(mode_suffixes(page.analysis.bench.n)))
     figure = overview_figure(shown, chain=chain, units=page.units)
-    key, said = "overview" if chain else "overview_points", {"carts": count(len(shown), "cart")}
-    return [page.picture("overview", figure, _WORDS, key, alt="overview_alt", marks=marks, **said)]
+    key, values = "overview" if chain else "overview_points", {"carts": count(len(shown), "cart")}
+    return [
+        page.picture("overview", figure, _WORDS, key, alt="overview_alt", marks=marks, **values)
+    ]
 
 
 def _bode_words(page: Page, response: FrequencyResponse) -> dict[str, object]:
@@ -67,7 +69,7 @@ def _bode_words(page: Page, response: FrequencyResponse) -> dict[str, object]:
     numbers = {"first": omega[0], "last": omega[-1], "peak": omega[peak]}
     numbers["magnitude"] = magnitude[peak]
     ordinal = {1: "first", 2: "second", 3: "third"}.get(cart, f"{cart}th")
-    said: dict[str, object] = {
+    values: dict[str, object] = {
         **{name: significant(float(value), digits=3) for name, value in numbers.items()},
         "cart": _WORDS.text("of_carts" if n > 1 else "one_cart", cart=cart, ordinal=ordinal),
         "number": cart,
@@ -77,13 +79,13 @@ def _bode_words(page: Page, response: FrequencyResponse) -> dict[str, object]:
         "marks": listing(omega_names(mode_suffixes(n))),
     }
     if chain is None:
-        return said
+        return values
     off = 100 * (magnitude / np.abs(chain.frequency_response(omega)[cart - 1]) - 1)
     middle = percent(float(np.median(np.abs(off))))
     shown = magnitude > 0
     omega, off = omega[shown], off[shown]
     worst = int(np.argmax(np.abs(off)))
-    return said | {
+    return values | {
         "fitted": _WORDS.text("bode_alt_fitted", middle=middle),
         "half": significant(float(np.median(np.abs(off))), digits=2),
         "omega": significant(float(omega[worst]), digits=3),

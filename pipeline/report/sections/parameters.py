@@ -68,8 +68,8 @@ def parameter_table(page: Page) -> Table:
     # Without a fit, only the first four columns are filled.
     columns = None if any(row.final for row in rows) else 4
     shown = [_parameter_row(row, steps=steps)[:columns] for row in rows]
-    align, told = "lldlddrl"[:columns], words.get(carts, carts)
-    return page.table(_WORDS, "parameter_table", shown, align, carts=told)
+    align, carts_text = "lldlddrl"[:columns], words.get(carts, carts)
+    return page.table(_WORDS, "parameter_table", shown, align, carts=carts_text)
 
 
 def _parameter_row(row: ParameterRow, *, steps: Collection[str]) -> list[Cell]:

@@ -154,9 +154,9 @@ def _friction(analysis: Analysis) -> Iterator[Asked]:
             (small, large), (at_small, at_large) = seen[:, order[[0, -1]]]
             if at_small > at_large > 0:
                 sizes = {"small": small, "large": large, "at_small": at_small, "at_large": at_large}
-                told = {name: significant(value, digits=2) for name, value in sizes.items()}
+                values = {name: significant(value, digits=2) for name, value in sizes.items()}
                 unit = clean(analysis.bench.units.position)
-                rise = _WORDS.text("friction_rises", unit=unit, **told)
+                rise = _WORDS.text("friction_rises", unit=unit, **values)
         text = _WORDS.text("friction", run=decay.experiment, cart=cart, rise=rise)
         yield Asked(kind="friction", id=f"friction-{cart}", section="decays", text=text)
 

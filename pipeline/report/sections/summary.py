@@ -65,9 +65,9 @@ def terminal_summary(analysis: Analysis) -> str:
     failed = analysis.fit is not None and not analysis.fit.converged
     has = "The failed fit ended at" if failed else "It has"
     it_has = [paragraph(f"{has} {'; '.join(numbers)}.{only}")] if numbers else []
-    told = bullet_list(text for _, text in _findings(analysis))
+    findings = bullet_list(text for _, text in _findings(analysis))
     next_ = [paragraph(f"{_WORDS.text('next')}."), next_steps(analysis)]
-    return plain_lines([_identified(analysis), *it_has, told, *next_])
+    return plain_lines([_identified(analysis), *it_has, findings, *next_])
 
 
 def _findings(analysis: Analysis) -> list[tuple[bool, Spans]]:
@@ -169,8 +169,8 @@ def _number_tile(name: str, final: Estimate, *, unit: str, is_sure: bool, error:
         value = significant(final.value, digits=3)
     elif 0 < share < CALIBRATION:
         value = significant(final.value)
-        told = _WORDS.text(error, share=f"{significant(100 * share, digits=1)} %")
-        unit = f"{unit}, {told}" if unit else told
+        accuracy = _WORDS.text(error, share=f"{significant(100 * share, digits=1)} %")
+        unit = f"{unit}, {accuracy}" if unit else accuracy
     else:
         # If the error is 1 % or more, the value has about four digits when the error has two.
         value = with_error(final.value, final.std, digits=2 if share >= 0.01 else 1)
@@ -228,8 +228,8 @@ def _assumed(analysis: Analysis) -> tuple[bool, Spans] | None:
     taken = [a for a in analysis.assumptions if a.origin == "default" and a.support == "open"]
     if not taken:
         return None
-    said = [clean(f"{f'{one.key} {one.about}'.strip()} ({taken_text(one)})") for one in taken]
-    return False, _WORDS.spans("assumed", taken=listing(said))
+    items = [clean(f"{f'{one.key} {one.about}'.strip()} ({taken_text(one)})") for one in taken]
+    return False, _WORDS.spans("assumed", taken=listing(items))
 
 
 def _agreement(analysis: Analysis) -> tuple[bool, Spans] | None:
@@ -243,8 +243,8 @@ def _agreement(analysis: Analysis) -> tuple[bool, Spans] | None:
     if not off:
         return True, _WORDS.spans(key, parameters=parameters, same=same)
     changes = [f"{row.name} ({percent(row.change_percent, signed=True)})" for row in off]
-    said = _WORDS.text(key, parameters=parameters)
-    return False, _WORDS.spans("disagree", changes=rich(listing(changes)), rest=said, same=same)
+    text = _WORDS.text(key, parameters=parameters)
+    return False, _WORDS.spans("disagree", changes=rich(listing(changes)), rest=text, same=same)
 
 
 def _same_recordings(judged: Sequence[ParameterRow]) -> Spans:
@@ -262,7 +262,7 @@ def _undecided(analysis: Analysis) -> tuple[bool, Spans] | None:
 
     Without this finding, the number on the board would look certain.
     """
-    told = [
+    names = [
         _WORDS.text(
             "undecided_one",
             name=row.name,
@@ -272,9 +272,9 @@ def _undecided(analysis: Analysis) -> tuple[bool, Spans] | None:
         for row in analysis.rows
         if row.consistent is None and row.change_sigmas is not None and row.initial and row.final
     ]
-    if not told:
+    if not names:
         return None
-    return False, _WORDS.spans("undecided", parameters=rich(listing(told)))
+    return False, _WORDS.spans("undecided", parameters=rich(listing(names)))
 
 
 def _checks(analysis: Analysis) -> tuple[bool, Spans] | None:
@@ -293,14 +293,14 @@ def _friction(analysis: Analysis) -> tuple[bool, Spans] | None:
     shown = [d for d in analysis.log_decrements if d.friction and d.friction.present]
     if not shown:
         return None
-    said = []
+    places = []
     for key in ("decays_of", "ringing_of"):
         of_kind = [d for d in shown if (d.experiment in analysis.steps) == (key == "ringing_of")]
         if of_kind:
             carts = _carts(sorted({d.cart for d in of_kind}))
             runs = listing(list(dict.fromkeys(d.experiment for d in of_kind)), most=_MOST_TOLD)
-            said.append(_WORDS.text(key, carts=carts, runs=clean(runs)))
-    return False, _WORDS.spans("friction", where=listing(said))
+            places.append(_WORDS.text(key, carts=carts, runs=clean(runs)))
+    return False, _WORDS.spans("friction", where=listing(places))
 
 
 def _design(analysis: Analysis) -> tuple[bool, Spans] | None:

@@ -50,9 +50,9 @@ def transfer_blocks(page: Page) -> list[Block]:
     if not all(springs[1:-1]) or n > derivation.MOST_CARTS:
         return []
     if n == 1:
-        said = rich(_WORDS.text("one_cart" if symbolic else "one_cart_no_spring"))
+        text = rich(_WORDS.text("one_cart" if symbolic else "one_cart_no_spring"))
         return [
-            Paragraph(said),
+            Paragraph(text),
             symbolic or _written([Equation("X_1/U", "1/(m*s**2+c*s)")]),
         ]
     last = "Neighbouring carts" if n > 2 else "The two carts"

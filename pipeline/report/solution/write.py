@@ -100,10 +100,10 @@ def build_solution(
     document = build_document(
         analysis, gap=gap, worked=worked, answer=model_answer, progress=progress
     )
-    told = ["Worked solution for instructors", count(analysis.bench.n, "cart")]
+    parts = ["Worked solution for instructors", count(analysis.bench.n, "cart")]
     if analysis.failed_checks:
-        told.append(f"doubtful: {count(len(analysis.failed_checks), 'check')} failed")
-    return replace(document, subtitle=" · ".join(told))
+        parts.append(f"doubtful: {count(len(analysis.failed_checks), 'check')} failed")
+    return replace(document, subtitle=" · ".join(parts))
 
 
 def model_answer(question: Asked) -> Paragraph:

@@ -91,8 +91,8 @@ def at_the_end(bench: RunawayBench) -> bool:
 def assert_over(bench: RunawayBench) -> None:
     """Check that the bench misbehaved, was stopped at once, and was not started again."""
     assert bench.offence is not None
-    assert bench.told is not None
-    assert bench.told - bench.offence <= AT_ONCE
+    assert bench.stopped_at is not None
+    assert bench.stopped_at - bench.offence <= AT_ONCE
     assert bench.started_after == []
 
 
@@ -228,7 +228,7 @@ class Pulling(Notes):
         if instruction.startswith("Pull"):
             bench = self.bench
             assert bench is not None
-            until(lambda: bench.told is not None, "a stop")
+            until(lambda: bench.stopped_at is not None, "a stop")
 
     def is_pulling(self, bench: RunawayBench) -> bool:
         """Return whether the cart is being pulled out."""

@@ -103,7 +103,7 @@ def test_hosts_talk_to_a_pseudo_terminal_one_after_the_other():
             assert readings[-1].counts[0] > readings[-1].counts[1] > 100
             assert took > 1.9
             assert [bench.event("client")["connected"] for _ in "io"] == [True, False]
-        assert "hidden: coulomb_friction on cart 1: force 0.004 V" in bench.said
+        assert "hidden: coulomb_friction on cart 1: force 0.004 V" in bench.output
     assert bench.event("exit")["status"] == 0
 
 
