@@ -241,7 +241,7 @@ def _score(
     # table.
     wide = any(m.table_wide for m, _ in cover.fits)
     unexplained = -math.log(limits.ANYWHERE) - (0.0 if wide else _SLIP)
-    likelihood = sum(
+    log_likelihood = sum(
         unexplained
         if name in off and name not in cover.explained
         else _log_density(table[name], predicted[name], name)
@@ -249,7 +249,7 @@ def _score(
         if table[name].value > 0
     )
     tries = max((mistake.tries for mistake, _ in cover.fits), default=1)
-    return likelihood - math.log(tries) - _KNOWN_SLIP * len(cover.codes - set(free))
+    return log_likelihood - math.log(tries) - _KNOWN_SLIP * len(cover.codes - set(free))
 
 
 def _log_density(typed: Typed, reference: Reference, name: str) -> float:
