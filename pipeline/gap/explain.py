@@ -1,7 +1,6 @@
 """The gap workflow: split the runs, fit the chain, search for effects, judge, describe the rest."""
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -30,6 +29,7 @@ from pipeline.gap.verdict.free_run import free_runs
 from pipeline.gap.verdict.left_force import left_forces
 from pipeline.gap.verdict.residual_map import map_residual
 from pipeline.gap.verdict.where import choose_experiment, find_windows
+from pipeline.gap.workers import two_workers
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.augmented import compile_simulator
 from pipeline.plant.nonlinear.effects import CATALOGUE
@@ -97,18 +97,16 @@ def explain_gap(
     # If the longest run was cut in time, there is one run more than before.
     whole = runs if len(training) + len(held_out) > len(runs) and not any(bench.springs) else []
     # The matrices are small, so threads inside BLAS would only slow the workers down.
-    with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(max_workers=2) as pool:
-        deadline = Deadline(pool.map, seconds=budget)
+    with threadpool_limits(1, user_api="blas"), two_workers() as mapper:
+        deadline = Deadline(mapper, seconds=budget)
         progress("fitting the linear chain")
-        linear, training = fit_baseline(
-            training, springs=bench.springs, start=chain, mapper=pool.map
-        )
+        linear, training = fit_baseline(training, springs=bench.springs, start=chain, mapper=mapper)
         study = Study(
             training=(),
             held_out=tuple(held_out),
             springs=bench.springs,
             catalogue=tuple(catalogue),
-            fitting=Fitting(mapper=pool.map),
+            fitting=Fitting(mapper=mapper),
             progress=progress,
             whole=tuple(whole),
         ).with_noise(training)

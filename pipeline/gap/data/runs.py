@@ -86,7 +86,7 @@ class GapRun:
             known[list(self.rows)] = self.sigma
         return known, 2.0 * known / (_SMOOTHING * self.pace)
 
-    @property
+    @cached_property
     def swing(self) -> Array:
         """Root mean square (rows,) of the readings about their rest."""
         return np.sqrt(np.mean((self.y - self.rest[list(self.rows)][:, None]) ** 2, axis=1))
@@ -122,6 +122,29 @@ class GapRun:
     def thin(self) -> "GapRun":
         """The run as the fits use it, with blocks of fast samples averaged, in the same pieces."""
         return _thin(self) if self.block > 1 else self
+
+    def thinned(self, y: Array) -> Array:
+        """Return readings (…, samples) averaged in blocks of samples, see `thin`.
+
+        The mean of a smooth motion exceeds its value in the middle by half the curvature times the
+        variance of the times. This excess is subtracted, so the model need not be simulated at
+        every sample.
+        """
+        q, out = self.block, []
+        if q == 1:
+            return y
+        for first, end in pairwise(self.shots):
+            last = first + (end - first) // q * q
+            times = self.t[first:last].reshape(-1, q)
+            middle = times.mean(axis=1)
+            mean = y[..., first:last].reshape(*y.shape[:-1], -1, q).mean(axis=-1)
+            if middle.size >= 3:  # a curvature needs three blocks
+                slope = np.diff(mean) / np.diff(middle)
+                curvature = np.diff(slope) / (0.5 * (middle[2:] - middle[:-2]))
+                nearest = np.clip(np.arange(middle.size) - 1, 0, middle.size - 3)
+                mean = mean - 0.5 * times.var(axis=1) * curvature[..., nearest]
+            out += [y[..., first : first + 1], mean]
+        return np.concatenate(out, axis=-1)
 
     @cached_property
     def excitation(self) -> Excitation:
@@ -168,8 +191,11 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
     span = np.ptp(y, axis=1)
     off = np.where(ended | balanced, 0.02, 0.2) * span
     zero_std[own] = np.maximum(np.maximum(off, resolution), 1e-12)
-    moving = [_smooth_state(t, row, 0, window=_SMOOTHING * pace) for row in y]
-    start[own], slope[own] = (y[:, 0], 0.0) if at_rest else np.transpose(moving)
+    if at_rest:
+        start[own] = y[:, 0]
+    else:
+        moving = _smooth_states(t, y, np.zeros(1, dtype=np.int64), window=_SMOOTHING * pace)
+        start[own], slope[own] = moving[0][:, 0], moving[1][:, 0]
     knots, command = _held_input(t, u) if record.hold == "band_limited" else (t, u)
     rate = 1.0 / float(np.median(np.diff(t)))
     length = max(2, round(_ONE_READING * pace * rate))
@@ -235,31 +261,22 @@ def _guided(record: Record, *, n: int) -> Array:
 def _thin(run: GapRun) -> GapRun:
     """Return the run with one reading for each block of samples, at the middle of its times.
 
-    The mean of a smooth motion exceeds its value in the middle by half the curvature times the
-    variance of the times. This excess is subtracted, so the model need not be simulated at every
-    sample. The first sample of each piece defines its state and has no weight.
+    The first sample of each piece defines its state and has no weight.
     """
     q = run.block
-    t, y, weight, shots = [], [], [], [0]
+    t, weight, shots = [], [], [0]
     for first, end in pairwise(run.shots):
         last = first + (end - first) // q * q
-        times = run.t[first:last].reshape(-1, q)
-        middle = times.mean(axis=1)
-        mean = run.y[:, first:last].reshape(len(run.y), -1, q).mean(axis=2)
-        if middle.size >= 3:  # a curvature needs three blocks
-            slope = np.diff(mean, axis=1) / np.diff(middle)
-            curvature = np.diff(slope, axis=1) / (0.5 * (middle[2:] - middle[:-2]))
-            mean = mean - 0.5 * times.var(axis=1) * np.pad(curvature, ((0, 0), (1, 1)), mode="edge")
+        middle = run.t[first:last].reshape(-1, q).mean(axis=1)
         share = (run.weight[:, first:last] ** 2).reshape(len(run.y), -1, q).mean(axis=2)
         t += [run.t[first : first + 1], middle]
-        y += [run.y[:, first : first + 1], mean]
         weight += [np.zeros((len(run.y), 1)), np.sqrt(share)]
         shots.append(shots[-1] + 1 + middle.size)
     side = (1.0 - q**-2) / 24.0  # share of each neighbour's mean in the corrected mean
     return replace(
         run,
         t=np.concatenate(t),
-        y=np.concatenate(y, axis=1),
+        y=run.thinned(run.y),
         guided=np.array([np.interp(np.concatenate(t), run.t, x) for x in run.guided]),
         weight=np.concatenate(weight, axis=1),
         sigma=run.sigma * np.sqrt(((1.0 + 2.0 * side) ** 2 + 2.0 * side**2) / q),
@@ -296,11 +313,8 @@ def cut_shots(run: GapRun, *, length: float) -> GapRun:
     bounds = np.linspace(0, run.t.size, count + 1).astype(int)
     n = run.start.size
     shot_x, shot_v = np.zeros((count, n)), np.zeros((count, n))
-    for s, first in enumerate(bounds[:-1]):
-        for j, row in enumerate(run.rows):
-            shot_x[s, row], shot_v[s, row] = _smooth_state(
-                run.t, run.y[j], first, window=_SMOOTHING * run.pace
-            )
+    x, v = _smooth_states(run.t, run.y, bounds[:-1], window=_SMOOTHING * run.pace)
+    shot_x[:, run.rows], shot_v[:, run.rows] = x.T, v.T
     shot_x[0], shot_v[0] = run.start, run.slope
     return replace(run, shots=tuple(int(b) for b in bounds), shot_x=shot_x, shot_v=shot_v)
 
@@ -345,14 +359,19 @@ def _free_from(offset: Array, still: Array, *, radians: float | None) -> int:
     return last + int(np.argmin(side * offset[leader, last:]))
 
 
-def _smooth_state(t: Array, y: Array, at: int, *, window: float) -> tuple[float, float]:
-    """Return position and velocity at one sample, from a local cubic."""
+def _smooth_states(t: Array, y: Array, at: np.ndarray, *, window: float) -> tuple[Array, Array]:
+    """Return positions and velocities (rows, states) at some samples, each from a local cubic."""
     half = max(3, round(window / float(t[1] - t[0])))
-    low, high = max(0, at - half), min(t.size, at + half + 1)
-    if high - low < 2 * half + 1:
-        low, high = (
-            (0, min(t.size, 2 * half + 1)) if low == 0 else (max(0, high - 2 * half - 1), high)
-        )
-    local = (t[low:high] - t[at]) / window
-    coefficients = np.polyfit(local, y[low:high], min(3, local.size - 1))
-    return float(coefficients[-1]), float(coefficients[-2] / window)
+    width = min(2 * half + 1, t.size)
+    around = np.clip(at - half, 0, t.size - width)[:, None] + np.arange(width)
+    local = (t[around] - t[at, None]) / window
+    powers = np.vander(local.ravel(), min(4, width)).reshape(*local.shape, -1)
+    size = np.sqrt((powers * powers).sum(axis=1))
+    bases, smallest = powers / size[:, None], width * np.finfo(np.float64).eps
+    # The cubics of np.polyfit, with its checks made once for all states.
+    states = [
+        [np.linalg.lstsq(basis, row, rcond=smallest)[0][-2:] for row in readings]
+        for basis, readings in zip(bases, np.moveaxis(y[:, around], 1, 0), strict=True)
+    ]
+    slope, position = np.moveaxis(np.array(states) / size[:, None, -2:], (0, 1, 2), (2, 1, 0))
+    return position, slope / window

@@ -18,6 +18,7 @@ from pipeline.gap.fit.linearise import (
     layout_of,
     linearise,
     move_nuisance,
+    nuisance_step,
     residual_points,
     run_cost,
 )
@@ -235,10 +236,10 @@ def _follow(
 
     def move(job: tuple[Linear, GapRun, Nuisance, float]) -> tuple[Nuisance, tuple[float, float]]:
         part, run, nuisance, before = job
-        tried = []
+        tried, step = [], nuisance_step(part, delta[: part.reduced.shape[1] - 1])
         # Shares of the run's own step, tried until its cost does not rise.
         for scale in (1.0, 0.3, 0.05):
-            moved = move_nuisance(part, nuisance, delta[: part.reduced.shape[1] - 1], scale)
+            moved = move_nuisance(part.layout, nuisance, step, scale)
             cost = run_cost(model, run, moved, spread=fit.spread)
             tried.append((cost[0] + inflate**2 * cost[1], moved, cost))
             if tried[-1][0] <= before:

@@ -146,6 +146,8 @@ def _by_shot(residual: Array, run: GapRun) -> Array:
     Shorter shots are padded with zeros.
     """
     residual = residual * run.weight
+    if len(run.shots) == 2:
+        return residual.reshape(*residual.shape[:-2], 1, -1)
     counts = np.diff(run.shots)
     longest = int(counts.max())
     out = np.zeros((*residual.shape[:-2], len(counts), residual.shape[-2], longest))
@@ -259,7 +261,7 @@ def _derivatives(
         (sensitivity.BY_VELOCITY, i) for i in layout.v0
     ]
     lanes += [(sensitivity.BY_FRICTION, i) for i in layout.scatter]
-    local, steps = len(lanes), np.zeros(0)
+    local, steps, models = len(lanes), np.zeros(0), [model]
     if layout.shared:
         lanes += [
             (kind, i)
@@ -268,7 +270,7 @@ def _derivatives(
         ]
         lanes += [(sensitivity.BY_STIFFNESS, j) for j in structure.rows]
         steps = structure.steps()[structure.base_size :]
-    models = [model, *_varied(model, steps)]
+        models += model.varied[structure.base_size :]
     y, by = _simulate_variants(models, run, [nuisance.start] * len(models), lanes=lanes)
     # The derivative by the logarithm of p is p times the derivative by p.
     by[local:] *= np.exp(theta[: len(lanes) - local])[:, None, None]
@@ -301,17 +303,10 @@ def _differences(
         for i, size in zip(places, sizes, strict=True):
             values[lane, i] += size
             lane += 1
-    models = [*[model] * lane, *_varied(model, steps)]
+    models = [*[model] * lane, *(model.varied if layout.shared else ())]
     y, _ = _simulate_variants(models, run, list(map(StartState, x0, v0, scatter)))
     by = (y[1:] - y[0]) / divisors[:, None, None]
     return y[0], by[: lane - 1], by[lane - 1 :]
-
-
-def _varied(model: GapModel, steps: Array) -> list[GapModel]:
-    """Return models, each with one of the last parameters changed by its step."""
-    thetas = np.repeat(model.theta[None], steps.size, axis=0)
-    thetas[:, model.theta.size - steps.size :] += np.diag(steps)
-    return [GapModel(structure=model.structure, theta=theta) for theta in thetas]
 
 
 def usual_sizes(model: GapModel, run: GapRun) -> tuple[Array, Array]:
@@ -345,9 +340,11 @@ def start_prior(
     return prior
 
 
-def move_nuisance(linear: Linear, nuisance: Nuisance, delta: Array, scale: float = 1.0) -> Nuisance:
-    """Return the nuisance parameters after a step of the shared parameters."""
-    layout = linear.layout
+def nuisance_step(linear: Linear, delta: Array) -> tuple[Array, Array]:
+    """Return the step of the nuisance parameters that belongs to one of the shared parameters.
+
+    It has two parts: starts (shots, starts), then friction factors and zeros.
+    """
     n_wide, n_starts = linear.run_wide.shape[0], linear.shots.shape[1]
     tail = np.concatenate([-delta, [1.0]])
     wide = np.zeros(0)
@@ -355,6 +352,14 @@ def move_nuisance(linear: Linear, nuisance: Nuisance, delta: Array, scale: float
         wide = np.linalg.solve(linear.run_wide[:, :n_wide], linear.run_wide[:, n_wide:] @ tail)
     right = linear.shots[:, :, n_starts:] @ np.concatenate([-wide, tail])
     starts = np.linalg.solve(linear.shots[:, :, :n_starts], right[..., None])[..., 0]
+    return np.asarray(starts, dtype=np.float64), np.asarray(wide, dtype=np.float64)
+
+
+def move_nuisance(
+    layout: Layout, nuisance: Nuisance, step: tuple[Array, Array], scale: float
+) -> Nuisance:
+    """Return the nuisance parameters after a share `scale` of their step."""
+    starts, wide = step
     x0, v0 = nuisance.x0.copy(), nuisance.v0.copy()
     zero, scatter = nuisance.zero.copy(), nuisance.scatter.copy()
     x0[:, list(layout.x0)] += scale * starts[:, : len(layout.x0)]

@@ -219,6 +219,12 @@ class GapModel:
         return self.structure.model(self.theta).tables()
 
     @cached_property
+    def varied(self) -> "tuple[GapModel, ...]":
+        """The models with one parameter changed by its step for finite differences."""
+        thetas = self.theta + np.diag(self.structure.steps())
+        return tuple(GapModel(structure=self.structure, theta=theta) for theta in thetas)
+
+    @cached_property
     def visible(self) -> bool:
         """Whether all hidden masses swing slowly enough to differ from the carts."""
         cart = self.tables.cart

@@ -96,8 +96,8 @@ def _weigh(fit: GapFit, run: GapRun, nuisance: Nuisance, *, rng: np.random.Gener
     H = J.T @ (J - N @ taken)
     J = (J - N @ taken).T.reshape(columns[local:-1].shape)
     weight = J * thin.weight / thin.sigma[:, None]
-    errors = _errors(fit, run, nuisance, rng=rng)
-    scores = np.array([np.sum(weight * off, axis=(1, 2)) for off in errors])
+    errors = np.array(list(_errors(fit, run, nuisance, rng=rng)))
+    scores = np.tensordot(errors, weight, axes=((1, 2), (1, 2)))
     return np.stack([H, scores.T @ scores / _DRAWS, score_covariance(columns[-1], J)])
 
 
@@ -122,4 +122,4 @@ def _errors(
             if step > 0:
                 phase = rng.uniform(-0.5, 0.5)
                 row[:] = step * (np.round(row / step + phase) - phase)
-        yield replace(run, y=read - x).thin.y
+        yield run.thinned(read - x)

@@ -4,6 +4,7 @@ The method is Levenberg-Marquardt.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,9 +24,9 @@ _RIDGE = 1e-12  # share of the diagonal of each run that is added to it
 class Follow:
     """A model that follows the records: its laws, its vector, the runs' own parameters, its errors.
 
-    `cost` is the sum of squared errors in units of the noise. `points` is the number of errors,
-    `n_independent` the number of independent ones. `gain` is the share of each error that corrects
-    the state.
+    `cost` is the sum of squared errors in units of the noise. `points` is the number of errors.
+    `errors` (rows, samples) of each run are in units of the noise. `gain` is the share of each
+    error that corrects the state.
     """
 
     laws: LawSet
@@ -34,13 +35,22 @@ class Follow:
     gain: float
     cost: float
     points: float
-    n_independent: float = 1.0
+    errors: tuple[Array, ...] = ()
     prior: float = 0.0
 
     @property
     def chi(self) -> float:
         """Mean squared error per reading, in units of the noise."""
         return self.cost / self.points
+
+    @cached_property
+    def n_independent(self) -> float:
+        """The number of independent errors, at most a quarter of the readings."""
+        if any(self.laws.bench.springs):
+            alone = sum(sum(map(independent, run)) for run in self.errors)
+        else:
+            alone = sum(run.size for run in self.errors)
+        return min(alone, self.points / 4.0)
 
     @property
     def inflate(self) -> float:
@@ -90,25 +100,22 @@ class Records:
     def weigh(self, follow: Follow) -> Follow:
         """Return the model with its cost, which is infinite if the simulation diverges."""
         laws, dry = follow.laws, follow.laws.dry
-        on_springs = any(laws.bench.springs)
 
-        def one(pair: tuple[Track, Own]) -> tuple[float, float, float]:
+        def one(pair: tuple[Track, Own]) -> tuple[tuple[float, float], Array]:
             track, own = pair
             run = errors_of(laws, follow.p, track, own, gain=follow.gain, derive=False)
             if run is None:
-                return np.inf, np.inf, 1.0
+                return (np.inf, np.inf), np.zeros((1, 1))  # counts as one reading
             left = run[0] * track.weight
             prior = track.prior(own, dry)[1]
-            rows = left[:, track.seen].T
-            n_independent = sum(independent(row) for row in rows) if on_springs else rows.size
-            return float((left**2).sum()), float((prior**2).sum()), n_independent
+            cost = float((left**2).sum()), float((prior**2).sum())
+            return cost, left[:, track.seen].T
 
-        costs = np.array(list(self.mapper(one, zip(self.tracks, follow.own, strict=True))))
+        told = self.mapper(one, zip(self.tracks, follow.own, strict=True))
+        costs, errors = zip(*told, strict=True)
         points = sum(track.points for track in self.tracks)
-        cost, prior, n_independent = costs.sum(axis=0).tolist()
-        # At most a quarter of the readings count as independent.
-        n_independent = min(n_independent, points / 4.0)
-        return replace(follow, cost=cost, points=points, prior=prior, n_independent=n_independent)
+        cost, prior = np.sum(costs, axis=0).tolist()
+        return replace(follow, cost=cost, points=points, prior=prior, errors=errors)
 
     def slope(self, follow: Follow, *, factors: bool = True) -> Slope:
         """Return the normal equations; without `factors`, dry friction is the same in all runs."""
@@ -119,7 +126,7 @@ class Records:
             track, own = pair
             run = errors_of(laws, follow.p, track, own, gain=follow.gain, derive=True)
             # An almost infinite slope has no finite square.
-            if run is None or not np.all(np.abs(run[1]) < 1e100):
+            if run is None or not (run[1].min() > -1e100 and run[1].max() < 1e100):
                 nothing = np.full((size, size), np.nan)
                 return nothing, nothing[0], nothing
             E, J = run
