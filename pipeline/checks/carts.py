@@ -135,7 +135,10 @@ def check_vanishing(fit: ChainFit, *, bench: Bench) -> list[Check]:
 
 
 def _larger_neighbour(name: str, values: Mapping[str, float]) -> str:
-    """Return the name of the larger positive neighbour of a parameter, of the same kind; or ""."""
+    """Return the larger of the two neighbouring parameters of the same kind, by name.
+
+    Only positive neighbours count. Without one the result is "".
+    """
     read = read_name(name)
     assert read.cart is not None
     beside = [f"{read.symbol}_{read.cart + step}" for step in (-1, 1)]

@@ -37,7 +37,7 @@ def check_recordings(
     late: Sequence[LateChannel],
     bench: Bench,
 ) -> list[Check]:
-    """Return all checks of the recordings, first those whose failure spoils most numbers."""
+    """Return all checks of the recordings, those whose failure affects most numbers first."""
     return [
         *check_signs(data.signs, without={one.experiment for one in left_out if one.is_wrong}),
         *check_files(data.unreadable),
@@ -131,9 +131,8 @@ def check_scales(records: Sequence[Record], *, bench: Bench) -> list[Check]:
 def check_signs(signs: Signs, *, without: Container[str]) -> list[Check]:
     """Return a failed check if records contradict the stated sign of the input.
 
-    `without` are records that do not show what happened, so their sign means nothing. A bench has
-    only one sign. So if just a few dwells contradict it, the cause is a long delay, and the check
-    does not fail.
+    Records in `without` are ignored, because they do not show what happened. A bench has only one
+    sign. If just a few dwells contradict it, the cause is a long delay, so the check does not fail.
     """
     says, wrong = [], 0
     for sign in (1, -1):

@@ -24,7 +24,7 @@ def _parzen(x: Array) -> Array:
 
 
 def colour(residual: Array, *, angle: float) -> float:
-    """Return the residual's spectral density at `angle` (rad per sample) over its mean.
+    """Return the residual's spectral density at `angle` (rad per sample), relative to white noise.
 
     The factor multiplies the variance that a fitted sinusoid's coefficients have in white noise. It
     is at least 1, because the fit itself removes power at `angle`.
@@ -61,7 +61,8 @@ def long_run_variance(residual: Array) -> float:
 def score_covariance(residual: Array, jacobian: Array) -> Array:
     """Return the covariance (n_p, n_p) of sum(jacobian * residual) over carts and samples.
 
-    `residual` (p, n) is assumed stationary, with correlated carts; `jacobian` (n_p, p, n).
+    The `residual` (p, n) is assumed to be stationary, and the carts may be correlated. `jacobian`
+    is (n_p, p, n).
     """
     n = residual.shape[1]
     correlation = _tapered_correlation(residual)

@@ -136,9 +136,9 @@ def _bursts(cart: int, seen: Sequence[Seen]) -> list[Intervention]:
 
 
 def _recurs(one: Intervention, found: Sequence[Intervention], driven: Mapping[str, float]) -> bool:
-    """Return whether a burst occurs at the same instant in another driven run, unlike a hand.
+    """Return whether a burst occurs at the same instant in another driven run.
 
-    `driven` gives, for each driven run, the time of its first sample.
+    Such a burst is not due to a hand. `driven` gives the time of each driven run's first sample.
     """
     if one.start == driven.get(one.experiment, one.start):
         return False

@@ -36,7 +36,7 @@ class ForceLeft:
     ----------
     left : unexplained acceleration (n,). For a cart at rest, only the part that static friction
         cannot hold.
-    acting : size (n,) of the acceleration, or of the acceleration due to springs and input if that
+    acting : size (n,) of the acceleration, either in total or due to springs and input, whichever
         is larger.
     state : variables (5, n) of the law: position about the rest, stretches of both springs,
         velocity, input.
@@ -108,7 +108,8 @@ class _Windows:
     def columns(self, *, driven: bool) -> Array:
         """Return the columns (n, unknowns) of the law: those of `_SPRINGS`, `_DAMPERS` and `_DRY`.
 
-        Each record has its own rest and gain, because a drive may treat levels differently.
+        Each record gets a separate rest and input gain, because a drive's gain may depend on the
+        level of the input.
         """
         v, u = self.v[1], driven * self.u
         # In a window in which the cart reverses, this is its main direction.
@@ -257,7 +258,7 @@ def _fit(parts: Sequence[tuple[Array, Array]], *, least: float) -> tuple[list[Ar
     Parameters
     ----------
     parts : columns (windows, unknowns) and accelerations (windows,) of each record. The first
-        columns are for the record's own unknowns.
+        columns are for the unknowns that differ from record to record.
     least : a lower limit for the usual residual.
     """
     shared = parts[0][0].shape[1] - _OWN

@@ -101,7 +101,10 @@ class MeasuredRun:
         return replace(self, x0=fitted[1 : 1 + len(states)], rest=fitted[1 + len(states) :])
 
     def step_window(self, signal: Array | None) -> slice | None:
-        """Return the samples from the first step of `signal` (n,) to the next, or None."""
+        """Return the samples from the first step of `signal` (n,) to its next step or its end.
+
+        The result is None if there is no step, or if too few samples follow it.
+        """
         if signal is None or not np.any(signal):
             return None
         # Before the record the signal was zero, so a signal that is on at the first sample steps
@@ -135,7 +138,7 @@ class MeasuredRun:
 
 
 def measured_run(record: Record, chain: Chain) -> MeasuredRun:
-    """Return the run; its rest is read at the start or, if it begins in motion, fitted.
+    """Return the run. Its rest is read at the start, or fitted if the run begins in motion.
 
     Raises
     ------

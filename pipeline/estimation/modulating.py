@@ -30,7 +30,7 @@ def bump_integral(s: Array) -> Array:
 
 
 def window_weights(t: Array) -> tuple[Array, Array, Array]:
-    """Return weights (windows, samples) that give mean, minus mean slope, and mean curvature.
+    """Return weights (windows, samples) for the mean, the negative mean slope, and the curvature.
 
     With few samples the bump's derivatives are integrated badly. So the weights are corrected to be
     exact for parabolas.

@@ -60,7 +60,7 @@ def difference_gain(order: int) -> float:
 
 
 def high_frequency_noise(residual: Array, *, half_width: int = 4) -> float:
-    """Return the standard deviation of a residual about a quadratic that moves along with it."""
+    """Return the noise of a residual, as its deviation from a local quadratic fit."""
     width = 2 * half_width + 1
     if residual.size < 2 * width:
         return float(residual.std())
@@ -76,8 +76,8 @@ def high_frequency_noise(residual: Array, *, half_width: int = 4) -> float:
 def grain(t: Array, y: Array, *, step: float) -> float:
     """Return the smallest significant change: the encoder step, or the noise if that is larger.
 
-    Noise sigma counts as the step with the same rounding error, sqrt(12) sigma. `step` is the
-    encoder step, 0 if unknown.
+    To compare the two, noise sigma is converted to sqrt(12) sigma, the step whose rounding error is
+    sigma. `step` is the encoder step, 0 if unknown.
     """
     arithmetic = 1e-6 * float(np.ptp(y))  # for a simulation, which has neither noise nor steps
     return max(step, float(np.sqrt(12) * local_noise(t, y)), arithmetic)

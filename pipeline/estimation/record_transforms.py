@@ -1,7 +1,7 @@
-"""The transfer ratio of one step or sweep record, with any motion at its ends.
+"""The frequency response from one step or sweep record, whether or not the carts rest at its ends.
 
 If a record begins and ends at rest, even displaced, the ratio FT(y')/FT(u') of the derivatives'
-transforms is exact, without a window. Any other record is evaluated by local polynomials. The
+transforms is exact, without a data window. Any other record is evaluated by local polynomials. The
 unknown motion before and after the record adds a smooth term in frequency, which is fitted too.
 
 Reference: Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2nd ed.,
@@ -116,7 +116,7 @@ def _ratio(Y: ComplexArray, U: ComplexArray, *, std: Array) -> TransferRatio:
 
 
 def _noise(run: Record) -> Array:
-    """Return the standard deviation (n_carts,) of the noise, or of encoder rounding."""
+    """Return the standard deviation (n_carts,) of noise or encoder rounding, the larger one."""
     white = np.std(np.diff(run.y, n=3, axis=1), axis=1) / difference_gain(3)
     return np.maximum(white, run.resolution / np.sqrt(12.0))
 
@@ -156,7 +156,10 @@ def _line_transforms(
 def _local_polynomials(
     U: ComplexArray, Y: ComplexArray, *, place: Array, half: int
 ) -> TransferRatio:
-    """Fit the lines (1, 2, …) around each `place` (n_w,), up to `half` lines to each side."""
+    """Fit local polynomials to the spectral lines near each `place` (n_w,), in line numbers.
+
+    Line numbers begin at 1. A fit uses up to `half` lines on each side of the nearest one.
+    """
     width = 2 * half + 1
     first = np.clip(np.rint(place).astype(int) - 1 - half, 0, U.size - width)
     window = first[:, None] + np.arange(width)  # (n_w, width)

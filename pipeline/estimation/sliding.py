@@ -13,6 +13,6 @@ T = TypeVar("T", bound=np.generic)
 
 
 def most_around(values: NDArray[T], width: int) -> NDArray[T]:
-    """Return, for each value, the largest of the `width` values around it (an odd number)."""
+    """Return, for each value, the largest of the `width` values centred on it; `width` is odd."""
     padded = np.pad(values, width // 2, mode="edge")
     return sliding_window_view(padded, width).max(axis=-1)

@@ -1,4 +1,4 @@
-"""The gap workflow: split the runs, fit the chain, search for effects, judge, describe the rest."""
+"""The gap workflow: split the runs, fit the chain, search for effects, describe the remaining error."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -44,7 +44,7 @@ def investigate(analysis: Analysis, *, progress: Progress, budget: float | None 
     """Explain the gap of a submission's time records, starting from the identified chain.
 
     Recordings that the identification left out are not used here either. `budget` is a time limit
-    in s, without compilation; if it is reached, the result is the best answer so far.
+    in s, not counting compilation; if it is reached, the result is the best answer so far.
 
     Raises
     ------
@@ -186,7 +186,7 @@ def _notes(search: Search, budget: float | None) -> list[str]:
 
 
 def _learnt_spread(fit: GapFit) -> dict[int, float]:
-    """Return how much each cart's dry friction varies from run to run, if it varies."""
+    """Return, by cart, how much its dry friction varies from run to run; none if it is fixed."""
     moved = np.any([nuisance.scatter != 1.0 for nuisance in fit.nuisance], axis=0)
     dry = fit.structure.dry
     return {i + 1: float(fit.spread[i]) for i in range(len(dry)) if dry[i] and moved[i]}

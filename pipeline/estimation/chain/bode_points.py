@@ -124,7 +124,7 @@ def response_at(
 def weighted_residuals(
     P: Parametrisation, data: Points, scale: Scale, physical: Array
 ) -> tuple[Array, Array]:
-    """Return the weighted residuals (model minus measured) and their Jacobian by p."""
+    """Return the weighted residuals (model minus measured) and their Jacobian with respect to p."""
     G, dG = response_at(P, data, physical)
     r, J = _response_residuals(data, scale, G, dG)
     if not data.decays:
@@ -136,9 +136,9 @@ def weighted_residuals(
 def _decay_residuals(
     P: Parametrisation, decays: Mapping[int, Estimate], physical: Array
 ) -> tuple[Array, Array]:
-    """Return ln ζ_i minus its value from each decay, in standard errors; also its derivatives.
+    """Return the residuals of ln ζ_i from decays, in standard errors, and their Jacobian.
 
-    ζ² = c² / 4mk.
+    A residual is model minus measurement. The model is ζ² = c² / 4mk.
     """
     chain = P.chain(physical)
     residuals, jacobian = [], []

@@ -48,7 +48,8 @@ class ChannelDelay:
 def find_channel_delays(records: Sequence[Record], *, n: int) -> dict[int, ChannelDelay]:
     """Return, by cart, the delay of its channel against the channel before it, if significant.
 
-    The last cart comes first, because the law of the cart before it needs its true times.
+    The search begins at the last cart, because the law of each cart uses the corrected times of the
+    cart after it.
     """
     found: dict[int, ChannelDelay] = {}
     for cart in range(n, 1, -1):

@@ -61,7 +61,7 @@ class Misread:
     ----------
     words : a description of the mistake.
     legal : whether the record may be right as it is.
-    remedy : the correction to make, if all records of a bench need it.
+    remedy : what the student must do if all records of a bench contain the mistake.
     scale : the ratio of the motion's unit to the input's, given if nothing else is wrong.
     clock : the ratio of the record's time to the true time, given if nothing else is wrong.
     """
@@ -85,7 +85,10 @@ def measured(record: Record) -> list[int]:
 
 
 def follow(records: Sequence[Record], chain: Chain) -> dict[str, Followed]:
-    """Return, by id, how every driven record in which measured carts move follows the chain."""
+    """Return, by id, how well each driven record follows the chain.
+
+    Records in which no measured cart moves are skipped.
+    """
     modes = _modes(chain)
     found = {r.id: _hold_against(r, chain, modes) for r in records if is_driven(r)}
     return {name: fit for name, fit in found.items() if fit}
@@ -250,7 +253,7 @@ def _hold_against(record: Record, chain: Chain, modes: _ModesOf) -> Followed | N
 
 
 def force_on(record: Record, chain: Chain, *, cart: int) -> Array | None:
-    """Return the force (n,) of input and neighbours on a cart; None if one of them is unknown."""
+    """Return the force (n,) on a cart from the input and its neighbours; None if unknown."""
     assert record.u is not None
     force = record.u if cart == 1 else np.zeros_like(record.u)
     for neighbour, k in ((cart - 1, chain.k[cart - 1]), (cart + 1, chain.k[cart])):

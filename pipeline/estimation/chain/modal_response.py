@@ -1,8 +1,8 @@
-"""Exact response of a chain to a measured input, and its Jacobian by the fit vector, by modes.
+"""The exact response of a chain to a measured input, computed mode by mode, with derivatives.
 
 In modal coordinates the states are uncoupled: z' = lambda z + b u. So a held input gives an exact
-scalar recursion at any sample times. The derivatives by all parameters need only one more recursion
-for each mode (the derivative by lambda) and constant matrices.
+scalar recursion at any sample times. All derivatives need only one more recursion for each mode
+(the derivative with respect to lambda) and constant matrices.
 """
 
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ _PARTING = 1e-5
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Modes:
-    """The modes of the free carts, one of each conjugate pair, with their derivatives by theta.
+    """The modes of the free carts, one of each conjugate pair, with derivatives.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Modes:
     entry : (n_m, 2f), with z(0) = entry @ x(0). The state is (x1, v1, x2, v2, …).
     drive : (n_m,) with z' = poles z + drive u.
     d_poles (n_p, n_m), d_shapes (n_p, f, n_m), d_entry (n_p, n_m, 2f), d_drive (n_p, n_m) :
-        derivatives by theta.
+        derivatives with respect to theta.
     """
 
     poles: ComplexArray
@@ -54,9 +54,9 @@ def find_modes(
 ) -> Modes:
     """Decompose the free part of a chain into modes.
 
-    `dp_dtheta` (n_p,) is that of `Parametrisation`. If two poles meet (a critically damped cart),
-    there are no separate modes, and rounding near such a point spoils the derivatives. So these
-    poles are moved apart first.
+    `dp_dtheta` (n_p,) comes from `Parametrisation.dp_dtheta`. If two poles meet (a critically
+    damped cart), there are no separate modes, and rounding near such a point spoils the
+    derivatives. So these poles are moved apart first.
     """
     A, B, _, _ = chain.state_space(free=free)
     if _poles_meet(A):
@@ -101,7 +101,7 @@ def _poles_meet(A: Array) -> bool:
 def _state_space_derivatives(
     chain: Chain, free: Sequence[int], parametrisation: Parametrisation
 ) -> tuple[Array, Array]:
-    """Return dA/dp (n_p, 2f, 2f) and dB/dp (n_p, 2f) by the physical parameters."""
+    """Return dA/dp (n_p, 2f, 2f) and dB/dp (n_p, 2f) for the physical parameters p."""
     rows = [cart - 1 for cart in free]
     mass, damping, stiffness, force = chain.matrices(free=free)
     dM, dC, dK = (d[:, rows][:, :, rows] for d in parametrisation.matrix_derivatives)

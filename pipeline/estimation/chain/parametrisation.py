@@ -200,13 +200,13 @@ def parameter_jacobian(chain: Chain, names: Sequence[str]) -> Array:
 
 
 def critical_damping(chain: Chain) -> float:
-    """Return the order of magnitude of a damping that stops a mode's swing at once."""
+    """Return roughly the damping from which a mode no longer swings."""
     m, k = float(np.max(chain.m)), float(np.max(chain.k))
     return float(np.sqrt(m * k)) or m  # without a spring, the damping that stops it within a second
 
 
 def physical_start(found: Chain, *, bench: Bench, zeta: float = START_ZETA) -> Chain:
-    """Return a possible chain near the one that a measured table implies.
+    """Return a physically possible chain near the one that a measured table implies.
 
     `found` may hold impossible values (a negative spring, a mass far too small); these are clipped.
     Dampings are set from `zeta`, because dampings from a table are too uncertain. But a cart

@@ -82,7 +82,7 @@ def _start(known: Mapping[str, float], i: int, *, n: int, like: Chain) -> Array:
 
 
 def _suffixes(i: int, *, n: int) -> list[str]:
-    """Return the suffixes of T_{i+1}'s quadratic factors, empty if the tables do not name them."""
+    """Return the suffixes that Throne's tables give to T_{i+1}'s quadratic factors, if any."""
     if i == 0:
         return mode_suffixes(n)
     if i == n - 1:
@@ -119,7 +119,7 @@ def _fit(
 
 
 def _log_factors(omega: Array, factors: Array) -> tuple[Array, Array]:
-    """Return Σ ln|Q_j| (n_w,) and its Jacobian (n_w, 2 n_j) by ln omega_j, then by ln zeta_j."""
+    """Return Σ ln|Q_j| (n_w,) and its derivatives by ln omega_j, then ln zeta_j (n_w, 2 n_j)."""
     size, zeta = np.exp(np.clip(factors, -_FARTHEST, _FARTHEST))
     r = omega[:, None] / size
     damping = 2j * zeta * r

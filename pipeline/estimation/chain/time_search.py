@@ -40,8 +40,8 @@ class Attempt:
     ----------
     theta : the fit vector (n_p,) of `Parametrisation`.
     misfits : the misfit of each window.
-    converged : whether a search ended at this chain by itself.
-    n_evaluations : number of chains that the search compared before it came to this one.
+    converged : whether the search that led to this chain converged.
+    n_evaluations : number of chains that this search compared with the windows.
     """
 
     parametrisation: Parametrisation

@@ -32,8 +32,8 @@ class FitWindow:
     sigma : standard error (p,) used for the weights, at least `stated_sigma`.
     step : encoder steps (p,), position units; zero if unknown.
     at_rest : whether the carts start at rest. Otherwise position and speed at t = 0 are unknown.
-    shared : variance (p,) of the common error of the readings before the input begins, over sigma².
-        While nothing moves, the encoder's rounding is one common error.
+    shared : variance (p,), over sigma², of the error that all readings before the input share.
+        While nothing moves, the encoder always rounds in the same way.
     """
 
     id: str
@@ -97,8 +97,8 @@ class Misfit:
     Attributes
     ----------
     residual : (p, n), model minus measured, over sigma.
-    jacobian : derivatives (n_p, p, n) of the residual by theta, with the nuisance parameters (start
-        and encoder zeros) adjusted.
+    jacobian : derivatives (n_p, p, n) of the residual with respect to theta. The nuisance
+        parameters (start and encoder zeros) are adjusted along with theta.
     n_nuisance : number of eliminated nuisance parameters.
     """
 
@@ -243,10 +243,10 @@ def compare(window: FitWindow, modes: Modes) -> Misfit:
 
 
 def weighed(values: Array, window: FitWindow) -> Array:
-    """Return values (…, p, n) over sigma, with less weight on the mean of the first rest.
+    """Return values (…, p, n) over sigma, whitened before the input begins.
 
-    This whitens n readings with a common error. Their covariance is 1 + shared; its eigenvalue is 1
-    + n shared along the vector of ones, and 1 in all other directions.
+    The n readings until then have a common error. Their covariance matrix has the eigenvalue
+    1 + n shared along the vector of ones, and 1 in all other directions.
     """
     scaled = values / window.sigma[:, None]
     if np.any(window.shared) and (n := window.n_resting):

@@ -53,7 +53,7 @@ def fit_friction(
 
     Returns
     -------
-    None if the samples do not determine the further unknowns, or if the fit does not converge.
+    None if there are too few samples, or if the fit does not converge.
     """
     pole = complex(viscous.poles[0])
     if t.size <= _UNKNOWNS + 1 or pole.imag <= 0:
@@ -104,10 +104,10 @@ def _inverse_normal(fitted: "_Swings", linear: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Swings:
-    """A decay cut into half cycles at its turning points, also before the fit's turning point.
+    """A decay cut into half cycles at its turning points.
 
     In each half cycle, y = rest + drift + (amplitude kept + friction pushed) swing - friction side.
-    Friction is the friction band d, on the side towards which the cart moves.
+    Here friction means the friction band d.
 
     Attributes
     ----------
@@ -168,7 +168,7 @@ class _Swings:
         return np.array([one, self.since, kept * self.swing, pushed * self.swing - side]).T
 
     def derivatives(self, linear: Array) -> Array:
-        """Return the derivatives of y by turning point, decay rate and frequency, (n, 3)."""
+        """Return dy/dp (n, 3); p is turning point, decay rate and frequency."""
         _, drift, amplitude, band = linear
         _, decay, omega_d = self.p
         tau, swing, sine, ratio = self.tau, self.swing, self.sine, decay / omega_d

@@ -56,7 +56,7 @@ class FreeDecay:
         return self.friction.model if self.friction and self.friction.test.present else self.fit
 
     def rms(self, t: Array, y: Array) -> float:
-        """Return the root-mean-square residual over the decay; `t` and `y` are the record's."""
+        """Return the root-mean-square residual over the decay; `t` and `y` cover the record."""
         window = slice(self.first, self.stop)
         return float(np.sqrt(np.mean((y[window] - self.model(t[window])) ** 2)))
 
@@ -140,8 +140,8 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
     """Fit the free decay from its release to its last turning point.
 
     The later swings are fitted first. The fit is then extended back over the earlier ones as long
-    as they agree. This separates the hand from the cart. If not even the later swings fit down to
-    the noise (real friction is not ideal), all swings are used.
+    as they agree. This finds where the hand lets go. If not even the later swings fit down to the
+    noise (real friction is not ideal), all swings are used.
 
     Parameters
     ----------
@@ -208,6 +208,6 @@ def _carried_back(
 
 
 def _ratio(y: Array, run: list[int]) -> float:
-    """Return the mean ratio of a swing to the one before, or a guess for two turning points."""
+    """Return the mean ratio of each swing to the one before, or a guess if there is only one."""
     swings = np.abs(np.diff(y[run]))
     return float((swings[-1] / swings[0]) ** (1 / (swings.size - 1))) if swings.size > 1 else 0.3

@@ -26,7 +26,7 @@ class SeparableModel(Protocol):
         ...
 
     def derivatives(self, linear: Array) -> Array:
-        """Return the derivatives of columns @ linear by the nonlinear unknowns, (n, n_p)."""
+        """Return d(columns @ linear)/dp (n, n_p) for the nonlinear unknowns p."""
         ...
 
 

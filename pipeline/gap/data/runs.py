@@ -37,13 +37,13 @@ class GapRun:
     guided : motion (n, samples) of held carts that still move; zero for all other carts.
     knots, command : times and values of the input, held from knot to knot.
     at_rest : whether the carts are at rest at the first sample.
-    start_known : whether the first readings determine the start. Otherwise it is fitted, because
-        springs make the carts forget their start.
+    start_known : whether the start is taken from the first readings, as on a bench without springs.
+        Otherwise it is fitted.
     start, slope : first reading and velocity (n,) of each cart.
     rest : rest positions (n,), as readings.
     zero, zero_std : expected encoder zeros (n,) and their uncertainty; see `with_zeros`.
     sigma : noise (rows,) of one sample.
-    weight : square root (rows, samples) of the weight of each sample; at most 1.
+    weight : factor (rows, samples), at most 1, on each sample's residual.
     block : number of samples that `thin` averages to one residual.
     pace : 1 for a bench of carts, and smaller in proportion for faster systems.
     shots : bounds (shots + 1,) of pieces that have their own start. (0, samples) is the whole run.
@@ -108,19 +108,19 @@ class GapRun:
         return x
 
     def with_noise(self, sigma: Mapping[int, float]) -> "GapRun":
-        """Return the run with another noise for some carts, given by cart index."""
+        """Return the run with the noise of some carts replaced; `sigma` is by cart index."""
         own = [sigma.get(row, old) for row, old in zip(self.rows, self.sigma, strict=True)]
         return replace(self, sigma=np.array(own))
 
     def with_zeros(self, *, width: float) -> "GapRun":
-        """Return the run whose encoder zeros are the file's, known to `width` times the noise."""
+        """Return the run with expected encoder zeros of 0, known to `width` times the noise."""
         std = np.full(self.zero.size, 1.0)
         std[list(self.rows)] = width * self.sigma
         return replace(self, zero=np.zeros(self.zero.size), zero_std=std)
 
     @cached_property
     def thin(self) -> "GapRun":
-        """The run as the fits use it, with blocks of fast samples averaged, in the same pieces."""
+        """The run as the fits use it: blocks of fast samples are averaged, the pieces are kept."""
         return _thin(self) if self.block > 1 else self
 
     def thinned(self, y: Array) -> Array:
@@ -239,7 +239,7 @@ def _begins_at_rest(y: Array, u: Array, still: Array, sample_time: float) -> tup
 
 
 def _held_input(t: Array, u: Array) -> tuple[Array, Array]:
-    """Return knots, and a held input with the same mean between knots as the smooth input."""
+    """Return knots, and a held input with the band-limited input's mean between knots."""
     knots, smooth = interpolate_band_limited(t, u)
     return knots, np.append(0.5 * (smooth[1:] + smooth[:-1]), smooth[-1])
 

@@ -211,7 +211,8 @@ def split(runs: Sequence[GapRun]) -> tuple[list[int], list[int]]:
     - Of three or more sizes of a kind, the middle one is held out, so the extremes are trained on.
     - Of two free decays, the smaller one is held out.
     - At least one run of each kind is trained on.
-    - A single run, or two sweeps alone, are all trained on. The caller then cuts a run in two.
+    - If nothing is held out so far, the smaller of two runs of a kind is, unless both are sweeps.
+    - If still nothing is held out, the caller cuts a run in two.
     """
     groups: dict[tuple, list[int]] = defaultdict(list)
     for index, run in enumerate(runs):
@@ -246,8 +247,7 @@ def split(runs: Sequence[GapRun]) -> tuple[list[int], list[int]]:
 def _size(run: GapRun) -> float:
     """Return how hard a run was driven: its extreme input, or the start of a free decay.
 
-    Under feedback it is the range of the reference, because the controller's input only follows
-    from it.
+    Under feedback it is the range of the reference, because the reference determines the input.
     """
     if run.record.reference is not None and np.ptp(run.record.reference) > 0.0:
         return float(np.ptp(run.record.reference))

@@ -90,8 +90,8 @@ def fit_baseline(
 ) -> tuple[GapFit, list[GapRun]]:
     """Fit the linear chain; return the fit and the runs with their measured noise.
 
-    The fit uses short pieces with their own start states first, then whole runs. It is done from
-    the identified chain and from an independent estimate. The better result is kept.
+    Short pieces, each with a start state, are fitted first, from two initial chains: the identified
+    one and an independent estimate. From the better result, whole runs are then fitted.
     """
     structure = Structure(springs=tuple(springs))
     # In pieces of 0.6 s, a missing effect does little harm.
@@ -106,7 +106,10 @@ def fit_baseline(
 
 
 def measure_noise(fit: GapFit, shots: Sequence[GapRun], runs: Sequence[GapRun]) -> list[GapRun]:
-    """Return the runs with each cart's noise, from its encoder step or high-frequency residual."""
+    """Return the runs with measured noise: encoder rounding or high-frequency residual.
+
+    The larger of the two counts for each cart.
+    """
     found: dict[int, list[float]] = {}
     resting: dict[int, list[float]] = {}
     for shot, nuisance in zip(shots, fit.nuisance, strict=True):
