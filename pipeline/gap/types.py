@@ -40,7 +40,7 @@ class Rival:
 
 @result()
 class FoundEffect:
-    """One effect, in the order in which effects were found; errors are on held-out runs."""
+    """One effect that was found; its errors are those on held-out runs."""
 
     effect: Effect = written("name of the effect in the catalogue")
     where: dict[str, int] = written(_WHERE)
@@ -221,8 +221,8 @@ class Proposal:
     ----------
     recording : the recording as a table of plan.toml.
     limits : the limits of the plan for which the recording was chosen, by name.
-    separation : root mean square difference between the two contenders, in units of the noise,
-        without the part that a refit of the other contender absorbs.
+    separation : root mean square difference, in units of the noise, that remains between the two
+        contenders if one is refitted to the other.
     prediction : the contenders' predictions; None if the proposal was read from a file.
     """
 

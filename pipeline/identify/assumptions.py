@@ -109,7 +109,7 @@ def _units(
 
 
 def _scales(submission: Submission, records: Sequence[Record]) -> Iterator[Assumption]:
-    """Yield the size of a count, if the counts of any recording were converted."""
+    """Yield how much one count is worth, if the counts of any recording were converted."""
     system = submission.system
     own = {e.id: e.input.per_count for e in submission.experiments if e.input}
     for role, stated, scales in (
@@ -160,7 +160,7 @@ def _sign(system: System, data: Ingested, *, failed: Sequence[Check]) -> Iterato
 def _free_carts(
     records: Sequence[Record], *, n: int, failed: Sequence[Check]
 ) -> Iterator[Assumption]:
-    """Yield the free carts, one entry for all recordings with the same free carts."""
+    """Yield one assumption for each set of free carts, with the recordings that have this set."""
     if n == 1:
         return
     wrong = {check.run for check in failed if check.kind == "setup"}

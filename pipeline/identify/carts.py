@@ -47,7 +47,7 @@ _WORDS = phrases("skipped")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Identified:
-    """The results of the stages up to the fit, from some of the records."""
+    """The results of all stages up to the fit, for one choice of records."""
 
     decays: Sequence[LogDecrement]
     gains: Sequence[StepGain]
@@ -73,10 +73,10 @@ def identify(
     progress: Progress,
     measured: dict[str, Any],
 ) -> Identified:
-    """Take the records, except those in `without`, through the stages up to the fit.
+    """Run all stages up to the fit on the records, except those in `without`.
 
-    `measured` keeps the results of single records for the next call, which leaves out other
-    records.
+    `measured` is a cache of results that depend on a single record. It is filled here and can be
+    passed to the next call.
     """
     log = Log(measured=measured)
     used = [record for record in data.records if record.id not in without]
@@ -168,7 +168,7 @@ def _driven(records: Sequence[Record], *, n: int, log: Log) -> list[Record]:
 def _log_decrements(
     runs: Runs, *, bench: Bench, interventions: Sequence[Intervention], log: Log
 ) -> list[LogDecrement]:
-    """Return each single cart's decays, or without a decay the ringing after its steps."""
+    """Return the decays of each cart alone; a cart without one is judged by its step ringing."""
     decays: list[LogDecrement] = []
     for cart, (before, after) in enumerate(pairwise(bench.springs), start=1):
         if not (before or after):

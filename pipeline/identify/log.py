@@ -30,7 +30,7 @@ class Log:
             return None
 
     def attempt_once(self, stage: Stage, run: Callable[[], T], *, of: str, cart: int) -> T | None:
-        """Run a stage of one record only once; its result does not depend on other records."""
+        """Run a stage of one record as `attempt` does, but only once; then reuse its result."""
         key = stage, of, cart
         if key not in self.measured:
             try:

@@ -20,9 +20,10 @@ _FASTEST = 10.0
 
 
 def reading_remarks(data: Ingested, *, unit: str) -> list[str]:
-    """Return notes from reading the files, on decays in another unit, and if `unit` is wrong.
+    """Return the notes from reading the files, with warnings about units.
 
-    The unit of a decay does not matter for its result.
+    There is one if `unit` seems wrong, and one for decays in other units. Their unit does not
+    affect their results.
     """
     units = find_other_units(data.records, decays=True)
     return [

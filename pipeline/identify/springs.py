@@ -140,7 +140,7 @@ def _gains(step: Record) -> list[StepGain]:
 
 
 def _ratio(before: StepGain, last: StepGain) -> tuple[float, float]:
-    """Return the range of ratios of the last spring to the one before that the steps allow."""
+    """Return the smallest and largest ratio of the last two springs that the steps allow."""
     (near, far), (low, high) = _bounds(before), _bounds(last)
     return near / high - 1, far / low - 1 if low > 0 else np.inf
 

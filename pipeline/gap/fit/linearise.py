@@ -252,9 +252,9 @@ def _derivatives(
 ) -> tuple[Array, Array, Array]:
     """Return the readings (rows, samples), and two sets of derivatives (., rows, samples).
 
-    The first set is by the run's starts and friction factors, the second by the shared parameters.
-    Derivatives by the chain's parameters are integrated with the state. Derivatives by the effects'
-    parameters are finite differences.
+    The first set belongs to the run's starts and friction factors, the second to the shared
+    parameters. For the chain's parameters, derivatives are integrated with the state. For the
+    effects' parameters they are finite differences.
     """
     structure, theta = model.structure, model.theta
     lanes = [(sensitivity.BY_POSITION, i) for i in layout.x0] + [

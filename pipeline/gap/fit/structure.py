@@ -1,4 +1,4 @@
-"""The parameters of a model as one vector: logarithms, or multiples if they may change sign."""
+"""The parameters of a model as one vector: logarithms, or scaled values if the sign may change."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ _SMALLEST = 1e-7  # share of a parameter's scale; a smaller effect counts as abs
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """An effect at a place, with the signs of its sided parameters and its typical sizes."""
+    """An effect at a place, with the signs and typical sizes of its parameters."""
 
     effect: Effect
     place: int
@@ -184,7 +184,7 @@ class Structure:
         return np.concatenate(reach)
 
     def physical_derivative(self, theta: Array) -> Array:
-        """Return d(parameter)/d(coordinate) of the effects; the entries of the chain are 1."""
+        """Return d(parameter)/d(coordinate) for the effects' parameters; 1 for the chain's."""
         out = [np.ones(self.base_size)]
         for index, c in enumerate(self.effects):
             values = c.values(theta[self.span(index)])
@@ -226,7 +226,7 @@ class GapModel:
 
     @cached_property
     def visible(self) -> bool:
-        """Whether all hidden masses swing slowly enough to differ from the carts."""
+        """Whether all hidden masses are slow enough not to move rigidly with their carts."""
         cart = self.tables.cart
         hidden = cart[:, Cart.EXTRA_MODE_MASS] > 0.0
         if not hidden.any():

@@ -3,8 +3,8 @@
 While a cart rests, its encoder repeats one reading, and friction lets it rest anywhere. All these
 readings share one rounding error, which limits how well friction is known. So the covariance is H⁻¹
 S H⁻¹, where H is the information of the fit. S is the covariance caused by such encoder errors,
-computed from many random draws. A variance is at least that of white noise, and at least what the
-residual's own correlation implies.
+computed from many random draws. Variances are
+raised, if necessary, to those of white noise and to those that the residual's correlation implies.
 
 Reference: L. Ljung, System Identification, 2nd ed., section 9.5, for this formula; B. Efron, R. J.
 Tibshirani, An Introduction to the Bootstrap, 1993, section 6.5, for the random draws.

@@ -52,7 +52,7 @@ def choose_laws(
     chains: Sequence[Chain],
     progress: Progress = silent,
 ) -> Follow:
-    """Return the model with the laws that are needed, fitted to free simulations if possible."""
+    """Return the model with only the needed laws, fitted to free simulations if possible."""
     full = start_all(records, springs=springs, chains=chains)
     lean = let_go(full, records)
     progress(f"all laws fitted together: {len(lean.laws.groups())} remain")

@@ -17,10 +17,10 @@ def is_rough(follow: Follow) -> bool:
 
 
 def criterion(follow: Follow, n_independent: float) -> float:
-    """Return the Bayesian criterion for `n_independent` readings, with a price for every effect.
+    """Return the Bayesian criterion for `n_independent` readings, with a penalty for every effect.
 
-    When two models are compared, the independent residuals of the fuller model count for both,
-    because only its residual is due to chance.
+    Two models are compared with the fuller model's `n_independent`, because only its residual is
+    due to chance.
     """
     low, high, _ = follow.laws.bounds()
     size = int(np.sum(low < high))
@@ -53,7 +53,7 @@ def drop_needless(follow: Follow, records: Records) -> Follow:
 
 
 def _needless(follow: Follow, records: Records) -> list[int]:
-    """Return the groups that may be dropped, least needed first, by the cost's quadratic form."""
+    """Return the groups that may be dropped, least needed first, by the quadratic cost model."""
     slope = records.slope(follow, factors=False)
     if not slope.sound:
         return []

@@ -22,11 +22,12 @@ _RIDGE = 1e-12  # share of the diagonal of each run that is added to it
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Follow:
-    """A model that follows the records: its laws, its vector, the runs' own parameters, its errors.
+    """A model that follows the records.
 
-    `cost` is the sum of squared errors in units of the noise. `points` is the number of errors.
-    `errors` (rows, samples) of each run are in units of the noise. `gain` is the share of each
-    error that corrects the state.
+    `p` is the vector of shared parameters; `own` holds the parameters of each run. `cost` is the
+    sum of squared errors in units of the noise. `points` is the number of errors. `errors` (rows,
+    samples) of each run are in units of the noise. `gain` is the share of each error that corrects
+    the state.
     """
 
     laws: LawSet
@@ -67,7 +68,8 @@ class Follow:
 class Slope:
     """The normal equations H and b of a step of the vector.
 
-    The runs' own parameters are eliminated; `back` gives their steps for a step of the vector.
+    The parameters of single runs are eliminated. Their steps follow from a step of the vector
+    through `back`.
     """
 
     H: Array
@@ -150,7 +152,7 @@ class Records:
         return self.fit(replace(follow, laws=laws, p=p), **options)
 
     def fit(self, start: Follow, *, gain: float | None = None, iterations: int = 12) -> Follow:
-        """Fit a model from its present values, with its own gain or another one."""
+        """Fit a model from its present values, with its present gain or the given `gain`."""
         best = self.weigh(start if gain is None else replace(start, gain=gain))
         bounds = best.laws.steps_of_shape(best.p)
         damp = _DAMP

@@ -48,8 +48,8 @@ class FollowedRun(NamedTuple):
     seen, free : whether each cart is compared, and whether it moves (n,).
     guided : motion (samples, n) of held carts.
     knots, command : times and values of the input, held from knot to knot.
-    held : input after dead zone and limit, its derivatives by these two, and the integrals of all
-        three, (3, 2, knots).
+    held : input after dead zone and limit, its derivatives with respect to these two, and the
+        integrals of all three, (3, 2, knots).
     zero, factor : this run's encoder zeros and factors on dry friction (n,).
     gain : share of the error that corrects the state.
     longest : longest step, s.
@@ -92,9 +92,9 @@ class Room(NamedTuple):
     ----------
     xm : positions (n,) at mid-step.
     f, R : forces and sliding friction (n,).
-    K, C : slopes (n, n) of the forces by position and velocity.
-    du : derivatives (4,) of the input by the drive's parameters.
-    dlag : derivatives (4,) of the lag's state by the drive's parameters.
+    K, C : derivatives (n, n) of the forces with respect to positions and velocities.
+    du : derivatives (4,) of the input with respect to the drive's parameters.
+    dlag : the same derivatives (4,) of the lag's state.
     DF, DR : derivatives (n, lanes) of forces and friction.
     """
 
@@ -143,7 +143,7 @@ def reach(x, j, n):
 
 @inlined
 def add_forces(laws, run, state, work, step):
-    """Add the laws' forces at mid-step, and their slopes by position and velocity."""
+    """Add the laws' forces at mid-step, and their slopes against position and velocity."""
     p, factor, aux, v, xm, h = laws.p, run.factor, state.aux, state.v, work.xm, step.h
     n, f, K, C = v.size, work.f, work.K, work.C
     for law in range(laws.kinds.size):

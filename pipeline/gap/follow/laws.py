@@ -271,7 +271,10 @@ class LawSet:
         return out
 
     def _shared(self, kind: int, place: int, p: Array) -> dict[str, float]:
-        """Return, by symbol, the parameters of a law's friction; 0 if the friction does not act."""
+        """Return, by symbol, the parameters of the friction that a law extends, at the same place.
+
+        They are 0 if that friction does not act, and missing if the law extends none.
+        """
         law = CATALOGUE[kind].law
         if not (isinstance(law, FrictionLaw) and law.beyond):
             return {}

@@ -113,7 +113,7 @@ def shaped_laws(follow: Follow, records: Records) -> list[TrialLaw]:
 
 
 def _to_both_sides(most: Array, parts: Sequence[float]) -> list[float]:
-    """Return `parts` of the largest positions on both sides, unless a side is hardly reached."""
+    """Return fractions (`parts`) of the largest excursion on each side that is really reached."""
     sides = [(side, most[k]) for k, side in enumerate((1.0, -1.0)) if most[k] > 0.1 * most.max()]
     return [side * part * size for side, size in sides for part in parts]
 

@@ -173,7 +173,7 @@ def errors_of(
 
 
 def _shaped(track: Track, dead: float, limit: float) -> Array:
-    """Return the input after dead zone and limit, and its derivatives by both, (3, 2, knots).
+    """Return the input after dead zone and limit, and its derivatives by the two, (3, 2, knots).
 
     The second axis holds the values and their integrals over time.
     """

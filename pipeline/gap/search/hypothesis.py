@@ -79,8 +79,8 @@ class Study:
     """The context of the search: runs, springs, catalogue, and options of fits.
 
     `repeatability` is the relative difference of runs with the same input, 0 without repeats.
-    `whole` is filled for benches without springs. It holds the training runs, among them at full
-    length the run that was cut in time, so that slowly growing errors show.
+    `whole` is filled for benches without springs. It holds the training runs, with the run that was
+    cut in two at its full length, so that slowly growing errors show.
     """
 
     training: tuple[GapRun, ...]
@@ -102,7 +102,7 @@ class Study:
         return fit_model(start, self.training, replace(self.fitting, **how))
 
     def with_noise(self, training: Sequence[GapRun]) -> "Study":
-        """Return the study with these training runs, and with their noise in all other runs."""
+        """Return the study with these training runs; the other runs get the same noise."""
         sigma = {row: s for run in training for row, s in zip(run.rows, run.sigma, strict=True)}
         held_out = tuple(run.with_noise(sigma) for run in self.held_out)
         whole = tuple(run.with_noise(sigma) for run in self.whole)
@@ -116,7 +116,7 @@ class Study:
         return float(np.sqrt(noise / motion))
 
     def explains(self, hypothesis: Hypothesis) -> bool:
-        """Return whether the remaining error is small enough to call the gap named."""
+        """Return whether the remaining error is small enough for the verdict `named`."""
         enough = max(limits.ENOUGH_NOISE * self.floor, limits.ENOUGH_REPEATS * self.repeatability)
         return hypothesis.error <= enough
 
@@ -130,7 +130,7 @@ class Study:
         return hypothesis.error > enough and not hypothesis.has_contact
 
     def is_noise(self, hypothesis: Hypothesis) -> bool:
-        """Return whether only noise is left, or in held-out runs only the difference of repeats."""
+        """Return whether the remaining error is only noise or the difference between repeats."""
         quiet = hypothesis.error < limits.NOTHING * self.floor
         quiet = quiet and hypothesis.fit.chi < limits.AT_FLOOR
         as_repeats = hypothesis.error < limits.AS_REPEATS * self.repeatability
@@ -180,8 +180,8 @@ def _count_independent(fit: GapFit, runs: Sequence[GapRun]) -> float:
 def evidence(fuller: Hypothesis, other: Hypothesis) -> float:
     """Return by how much the fuller of two hypotheses is more likely, in units of the criterion.
 
-    Independent readings are counted in the residual of the fuller hypothesis, because only its
-    residual is due to chance. Held-out runs, to which neither hypothesis was fitted, count equally.
+    The number of independent readings comes from the residual of the fuller hypothesis, because
+    only this one is due to chance. Training and held-out runs count equally.
     """
     share = fuller.n_independent / (fuller.fit.n_points / limits.THINNING)
     taught = (other.bic - fuller.bic) * share
@@ -191,7 +191,7 @@ def evidence(fuller: Hypothesis, other: Hypothesis) -> float:
 def lowers_error(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
     """Return whether the held-out error falls enough.
 
-    It must fall by a tenth if the remaining error is too large to call the gap named.
+    It must fall by a tenth if the remaining error is too large for the verdict `named`.
     """
     gain = 1.0 if study.explains(child) else limits.PARTIAL_GAIN
     return child.error < gain * parent.error

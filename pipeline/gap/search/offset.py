@@ -18,7 +18,7 @@ from pipeline.plant.linear.chain import Chain
 
 @dataclass(frozen=True, kw_only=True)
 class Offset:
-    """A constant force on a cart, with its standard error over the runs."""
+    """A constant force on a cart; its standard error comes from the scatter between runs."""
 
     cart: int
     force: float
@@ -28,7 +28,7 @@ class Offset:
 def find_offset(
     chain: Chain, runs: Sequence[GapRun], nuisance: Sequence[Nuisance]
 ) -> Offset | None:
-    """Return the constant force implied by the fitted encoder zeros, or None."""
+    """Return the constant force that explains the fitted encoder zeros, if any is certain."""
     if not np.any(chain.k > 0):
         return None
     if len({run.free for run in runs}) == 1 and not any(run.at_rest for run in runs):

@@ -75,7 +75,10 @@ def _as_good(without: Hypothesis, chosen: Hypothesis, study: Study) -> bool:
 
 
 def significance(fit: GapFit) -> list[float]:
-    """Return how many standard errors each effect's least certain parameter is from no effect."""
+    """Return how far each effect's least certain parameter is from its neutral value.
+
+    The distance is in standard errors. At its neutral value, a parameter has no effect.
+    """
     structure = fit.structure
     if fit.covariance is None:
         return [np.inf] * len(structure.effects)
@@ -102,7 +105,7 @@ def _without(hypothesis: Hypothesis, effect: Candidate, study: Study) -> Hypothe
 
 
 def _plainer(hypothesis: Hypothesis, rich: Candidate, study: Study) -> Hypothesis | None:
-    """Return the hypothesis with the simpler law from which a richer law grew, or None."""
+    """Return the hypothesis with a rich law replaced by its simpler form, if that form exists."""
     if rich.effect.grows_from is None:
         return None
     index = hypothesis.fit.structure.effects.index(rich)

@@ -22,12 +22,12 @@ from pipeline.words.phrases import phrases
 
 
 class Search:
-    """A search; each step continues from the state after the last step.
+    """A search. Each step continues from the results of the previous one.
 
     Attributes
     ----------
-    study : runs and options of fits. It is replaced if another noise or another split of the runs
-        is better.
+    study : runs and options of fits. It is replaced if a new noise level or a different split of
+        the runs is better.
     linear : the linear chain that fits the training runs.
     chosen : the best hypothesis so far.
     found : all hypotheses judged so far, the linear one first.
@@ -66,7 +66,7 @@ class Search:
             self._try(self.study.with_noise(measure_noise(self.chosen.fit, training, training)))
 
     def change_sides(self) -> None:
-        """Exchange training and held-out runs and search again, if only the held-out ones misfit.
+        """Exchange training and held-out runs and search again, if only held-out runs fit badly.
 
         An effect that acts only in the held-out runs cannot be found from the training runs.
         """

@@ -15,8 +15,8 @@ def reach_verdict(
     """Return the verdict, the accepted steps, and the rivals if the verdict is `ambiguous`.
 
     `steps` lead from the linear model to the chosen one; `found` are all hypotheses judged. If a
-    large error remains, the last step is withdrawn if its effect is disputed. An effect is dropped
-    if a hypothesis without it does about as well.
+    large error remains, two more rules apply. An effect is dropped if a hypothesis without it does
+    about as well. Otherwise the last step is withdrawn if rivals dispute its effect.
     """
     baseline, chosen = steps[0], steps[-1]
     if not chosen.key:

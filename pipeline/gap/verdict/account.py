@@ -73,7 +73,7 @@ def _stand_in(effect: tuple[str, int], others: frozenset[tuple[str, int]]) -> tu
 
 
 def list_suspects(found: Sequence[Hypothesis], effects: Sequence[FoundEffect]) -> tuple[Rival, ...]:
-    """Return the single effects beyond `effects` that would help most, the best first."""
+    """Return the effects that help most when used alone, the best first, except for `effects`."""
     baseline = next(h for h in found if not h.key)
     listed = {(f.effect.key, next(iter(f.where.values()), 0)) for f in effects}
     singles = sorted(

@@ -122,7 +122,7 @@ def find_formula(
 
 
 def _criterion(rest: Array, terms: int) -> float:
-    """Return the Bayesian criterion, with an extra price because many terms are tried."""
+    """Return the Bayesian criterion, with an extra penalty because many terms are tried."""
     count = rest.size
     cost = count * float(np.log(max(float(rest @ rest), 1e-300) / count))
     return cost + terms * (float(np.log(count)) + BIC_DROP)

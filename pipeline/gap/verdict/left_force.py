@@ -96,7 +96,7 @@ def _of_run(
 
 
 def _smooth(t: Array, values: Array) -> tuple[Array, Array]:
-    """Return a polynomial through each row of values (windows, samples), and its derivative."""
+    """Fit a polynomial to each row of values (windows, samples); return it and its derivative."""
     span = t[:, -1:] - t[:, :1]
     # The samples are evenly spaced, or nearly so, and all windows share one basis.
     s = np.linspace(-1.0, 1.0, t.shape[1])

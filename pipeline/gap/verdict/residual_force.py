@@ -127,7 +127,7 @@ def _arriving(u: Array, model: AugmentedChain) -> Array:
 
 
 def _cut(t: Array, *, length: float) -> np.ndarray | None:
-    """Return the sample numbers (windows, samples) of overlapping windows, None if too short."""
+    """Return the sample numbers (windows, samples) of overlapping windows; None for a short run."""
     width = round(length * (t.size - 1) / float(t[-1] - t[0])) + 1
     if width < 9 or width > t.size:
         return None

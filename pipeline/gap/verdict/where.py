@@ -95,9 +95,9 @@ def choose_experiment(
     *,
     repeated: bool,
 ) -> str:
-    """Return a sentence on the next recording: to decide, to confirm, or to show more of the gap.
+    """Return advice on the next recording, for example how to decide between two effects.
 
-    `left` are the windows in which the chosen model still departs, the worst first. `repeated` is
+    `left` are the windows in which the chosen model still misfits, the worst first. `repeated` is
     true if some runs have the same input, so that their scatter is known.
     """
     if verdict == "ambiguous":

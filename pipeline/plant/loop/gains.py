@@ -35,8 +35,8 @@ def place_poles(phi: Array, gamma: Array, poles: ComplexArray) -> Array:
     """Return the gains G (…, n) with which phi - gamma G has the `poles` (…, n).
 
     Complex poles must come in conjugate pairs. In Hessenberg form, the input reaches one state
-    after the other. So the last row of the wanted polynomial of phi gives the gains, and no
-    controllability matrix must be inverted.
+    after the other. So the gains follow from the last row of the desired characteristic polynomial,
+    evaluated at phi. No controllability matrix has to be inverted.
 
     Reference: B. N. Datta, Linear Algebra Appl. 88 (1987) 207-226.
     """
