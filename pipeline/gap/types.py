@@ -40,7 +40,7 @@ class Rival:
 
 @result()
 class FoundEffect:
-    """One effect that was found; its errors are those on held-out runs."""
+    """One effect, listed in the order of discovery; its errors are those on held-out runs."""
 
     effect: Effect = written("name of the effect in the catalogue")
     where: dict[str, int] = written(_WHERE)
