@@ -44,7 +44,7 @@ class HardwareError(PipelineError):
 def is_name_fault(error: OSError) -> bool:
     """Return whether the file's name caused the error, rather than the computer.
 
-    An error without a number comes from a text decoder, so it is about the file too.
+    An error without an `errno` comes from a text decoder, so the file is at fault too.
     """
     return error.errno is None or error.errno in _NAME_FAULTS
 

@@ -41,7 +41,7 @@ _SIGNIFICANT = 10  # significant digits; further ones depend on processor and li
 
 
 class InFile(NamedTuple):
-    """Part of an annotation that gives the type of the value in the file."""
+    """An annotation with the type that a value has in the file."""
 
     type: Any
 
@@ -53,7 +53,7 @@ Matrix = Annotated[Array, InFile(tuple[tuple[float, ...], ...])]
 
 
 class _Mark(NamedTuple):
-    """How a member is written; `order` is its place in the class body."""
+    """How a member is written to the file; `order` is its position in the class body."""
 
     order: int
     description: str
@@ -88,7 +88,7 @@ def written(
 def computed(
     *, key: str = "", part: tuple[str, ...] = (), older: Any = MISSING
 ) -> Callable[[F], F]:
-    """Mark a property's function as written to the file; its docstring is the description."""
+    """Mark a property as written to the file; its docstring is the description."""
 
     def mark(function: F) -> F:
         description = (getdoc(function) or "").removesuffix(".")

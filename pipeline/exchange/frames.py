@@ -92,14 +92,14 @@ def record_frame(record: Record, *, analysis: Analysis) -> "pd.DataFrame":
 
 
 def record_series(record: Record) -> dict[str, Array]:
-    """Return arrays (n,): `time`, `u` and `reference` if the record has them, and `x1`, …."""
+    """Return arrays (n,): `time`, the positions `x1`, …, and, if recorded, `u` and `reference`."""
     series = {"time": record.t, "u": record.u, "reference": record.reference}
     positions = {f"x{cart}": record.position(cart) for cart in record.carts}
     return {name: values for name, values in series.items() if values is not None} | positions
 
 
 def _rows(results: Sequence[object]) -> list[dict[str, Any]]:
-    """Return the fields of each result that are written to `results.json`, with all digits."""
+    """Return the fields of each result as in `results.json`, but with all digits."""
     return [plain(one, digits=17) for one in results]
 
 

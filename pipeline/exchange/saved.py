@@ -112,7 +112,7 @@ def _responses(responses: Sequence[FrequencyResponse]) -> Any:
 
 
 def _named(records: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the records under unique names that MATLAB allows: `step-1` as `step_1`."""
+    """Return the records by names that are unique and valid in MATLAB: `step-1` is `step_1`."""
     named: dict[str, Any] = {}
     for id_, record in records.items():
         plain = re.sub(r"\W", "_", id_, flags=re.ASCII)

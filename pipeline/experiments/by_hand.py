@@ -36,15 +36,15 @@ TYPED = {"frequency_end": "to"}
 
 @dataclass(frozen=True, kw_only=True)
 class WantedRecording:
-    """The few numbers in which a person describes a recording.
+    """The few numbers with which a person describes a recording.
 
     Attributes
     ----------
-    seconds : duration in s, 1 to 120; rounded to whole periods of a dwell or sweep.
+    seconds : duration in s, 1 to 120. For a dwell or sweep it is rounded to whole periods.
     amplitude : amplitude in input units.
     frequency : frequency in Hz of a dwell, or at the start of a sweep.
     frequency_end : frequency in Hz at the end of a sweep.
-    cart : the released cart of a decay.
+    cart : the cart that is released for a decay.
     """
 
     kind: RecordingKind
@@ -58,7 +58,7 @@ class WantedRecording:
 def make_recording(wanted: WantedRecording, *, plan: Plan, submission: Submission) -> Recording:
     """Return the recording; all carts are free unless one is released by hand.
 
-    The rest before the recording is as long as before the plan's other driven recordings.
+    A driven recording waits beforehand as long as the last driven recording of the plan.
 
     Raises
     ------

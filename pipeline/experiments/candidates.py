@@ -28,7 +28,7 @@ def propose_candidates(
 
     Raises
     ------
-    DataError : no candidate has an input within the limits, or no candidate settles.
+    DataError : the limits allow no candidate, or dwells would take too long to settle.
     """
     made = list(_dwells(known) if known.dwells else _broadband(known, limits, commands, goal))
     settle = rounded(settling_wait(known.chain, time_constants=SETTLED))
@@ -49,10 +49,10 @@ def propose_candidates(
 
 
 def _dwells(known: Knowledge) -> Iterator[Recording]:
-    """Yield dwells, each twice as long as the wait for the steady state.
+    """Yield dwells; each lasts twice as long as the carts need to reach the steady state.
 
-    No dwell is yielded if the wait is too long, because a transient would be mistaken for a steady
-    state.
+    If the steady state takes too long to reach, no dwell is yielded. A transient would be mistaken
+    for a steady state.
     """
     wait = settling_wait(known.chain, time_constants=SETTLED_DWELL)
     if wait * np.min(-known.chain.poles.real) < SETTLED:

@@ -1,9 +1,9 @@
 """Choose the experiment that distinguishes two explanations even after they are refitted.
 
-This is a T-optimal design: the difference of two predictions counts only as far as the other model
-cannot absorb it. That model may adjust its start, the encoder zeros and, as far as all earlier
-records allow, its parameters. With several models, each pair is weighted by the product of its
-probabilities. This bounds the expected decrease of entropy.
+This is a T-optimal design: only that part of a difference counts which neither model can absorb. A
+model may adjust its initial state, the encoder zeros and, as far as all earlier records allow, its
+parameters. With several models, each pair is weighted by the product of its probabilities. The
+weighted sum bounds the expected decrease in entropy.
 
 References: A. C. Atkinson, V. V. Fedorov, Biometrika 62 (1975), 57-70 and 289-303; G. E. P. Box, W.
 J. Hill, Technometrics 9 (1967), 57-71.
@@ -164,7 +164,7 @@ def _noise(gap: Gap) -> Array:
 
 
 def _pinned(gap: Gap) -> Array:
-    """Return how far the records allow each parameter of the chain to vary."""
+    """Return how far the records allow each parameter of the chain to be from its estimate."""
     chain = gap.model.chain
     return np.array(
         [
@@ -180,9 +180,10 @@ def _pinned(gap: Gap) -> Array:
 
 
 def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, float]]:
-    """Yield steps to both sides, triangles, chirps, and releases of each cart, in several sizes.
+    """Yield steps in both directions, triangles, chirps and releases, in several sizes.
 
-    Each recording comes with the position from which its cart is released (position units), or 0.
+    With each recording comes the position from which a cart is released, in position units. It is
+    zero if no cart is released.
     """
     resonances = np.sort(np.abs(chain.poles)) / (2 * np.pi)
     settle = rounded(settling_wait(chain, time_constants=SETTLED))
@@ -284,7 +285,8 @@ def _separate(
 def _need_input(one: AugmentedChain, other: AugmentedChain) -> bool:
     """Return whether two models differ only in effects on an input, such as a lag and a delay.
 
-    Their free motions should then agree; bounces at a contact may make accidental differences.
+    Without an input, the motions of both models should then agree. Only bounces at a contact may
+    make them differ by accident.
     """
     mine, others = ({(t.effect.key, t.place): t for t in m.terms} for m in (one, other))
     lone = [(mine | others)[key] for key in mine.keys() ^ others.keys()]
@@ -292,10 +294,10 @@ def _need_input(one: AugmentedChain, other: AugmentedChain) -> bool:
 
 
 def _left(difference: Array, by: Array, pinned: Array) -> float:
-    """Return the sum of squares of a difference (n,) that no change of parameters absorbs.
+    """Return what remains of a difference (n,), as a sum of squares, after the best refit.
 
-    `by` has the derivatives of the difference by the parameters, those of the chain first. Earlier
-    records hold the chain's parameters within `pinned` (n_p,): a change by this much adds one to
+    `by` has the derivatives of the difference with respect to the parameters; the chain's
+    parameters come first. Earlier records confine these: a change by `pinned` (n_p,) adds one to
     the sum.
     """
     columns = by.reshape(len(by), -1).T
@@ -313,10 +315,10 @@ def _left(difference: Array, by: Array, pinned: Array) -> float:
 def _predict(
     model: AugmentedChain, t: Array, u: Array, recording: Recording, x0: Array | None
 ) -> tuple[Array, Array]:
-    """Return the readings (n, samples) and their derivatives (., n, samples) by free parameters.
+    """Return the readings (n, samples) and their derivatives (n_free, n, samples).
 
-    The free parameters are those of the chain and its effects, the start of a released cart, and
-    the encoder zeros.
+    The derivatives are with respect to the parameters of the chain and its effects, the position
+    from which a cart is released, and the encoder zeros.
     """
     n, k = model.chain.n, model.chain.k
     variants = [model, *_changed(model)]

@@ -1,9 +1,9 @@
-"""The controller of a recording in the bench's own numbers, checked for safety.
+"""The controller of a recording, in the units that the bench uses, checked for safety.
 
 The bench computes in duty counts and encoder counts, once per period, by the laws in
 `plant.loop.sampled_loop`. State feedback assumes constant velocity between samples and one period
-of delay; PID has no delay. A design may have another sample time and predict with a model. So the
-loop is simulated as the bench will run it, before any gain is sent.
+of delay; PID has no delay. A design may assume a different sample time and predict with a model. So
+the loop is simulated as the bench will run it, before any gain is sent.
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ _PID_SHARES = (1.0, 0.5, 0.25, 0.1)  # shares of the carts' own stiffness that a
 
 @dataclass(frozen=True, kw_only=True)
 class CountScales:
-    """The size of a count in the submission's units.
+    """How much one count is worth in the submission's units.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ def propose_pid(
 
     Raises
     ------
-    DataError : the carts are not identified, or no gains keep within the limits.
+    DataError : the carts are not identified, or all gains tried are unstable or pass a limit.
     """
     trial = _Trial.of(
         recording, submission=submission, analysis=analysis, bench=bench, limits=limits
@@ -160,7 +160,7 @@ def controller_table(
 ) -> Table:
     """Return the `controller` entry of submission.toml for a recording with these gains.
 
-    The `scale` of a PID applies to a data file in encoder counts.
+    For a PID, `scale` is correct if the data file records positions in encoder counts.
     """
     if isinstance(gains, PidGains):
         table = {"kp": gains.kp, "ki": gains.ki, "kd": gains.kd}
@@ -312,9 +312,9 @@ class _Trial:
 
 
 def _pid_matrix(chain: Chain, pid: Pid, *, period: float) -> Array:
-    """Return the map of (x, ∫e, last e) from one sample to the next, without reference or delay.
+    """Return the matrix that takes (state, ∫e, last e) to the next sample, without reference.
 
-    Without ki the integral has no effect and is left out; it would be an eigenvalue of one.
+    If ki is zero, the integral is left out: it has no effect, but would add an eigenvalue of 1.
     """
     phi, gamma = discretise(chain, period)
     row = np.zeros(gamma.size)

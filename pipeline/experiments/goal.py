@@ -21,14 +21,14 @@ _STEP = 1e-4  # relative change of a parameter for a numerical derivative
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Goal:
-    """An error to reduce: the error of one number, or the largest or mean of several errors.
+    """The error to reduce: of one number, or the largest or mean error of several numbers.
 
     Attributes
     ----------
     name : the goal's name, as given to `--for`.
-    words : the number in words, "the error of zeta_2".
-    rows : (k, n_p) derivatives of the wanted numbers by relative changes of the parameters. An
-        overshoot is a share of the step. With one row, the design is c-optimal.
+    words : the error in words, such as "the error of zeta_2".
+    rows : (k, n_p) derivatives of the numbers with respect to relative changes of the parameters.
+        An overshoot is a share of the step. With one row, the design is c-optimal.
     mean : how several errors become one number. The "largest" gives an E-optimal design in the
         named parameters, the "root mean square" an A-optimal design, and the "volume" of the
         confidence region (as its mean radius) a D-optimal design.
@@ -40,7 +40,7 @@ class Goal:
     mean: Literal["largest", "root mean square", "volume"] = "largest"
 
     def of(self, information: Array) -> Array:
-        """Return the error (…,) for information H and S (…, 2, n_p, n_p); inf if unbounded."""
+        """Return the error (…,) for the matrices H and S (…, 2, n_p, n_p); inf if unbounded."""
         H, S = information[..., 0, :, :], information[..., 1, :, :]
         if self.mean == "volume":
             (sign, of_h), (_, of_s) = np.linalg.slogdet(H), np.linalg.slogdet(S)
@@ -107,9 +107,10 @@ def find_goal(name: str, known: Knowledge, *, feedback: FeedbackDesign | None) -
 
 
 def _by_overshoot(known: Knowledge, feedback: FeedbackDesign) -> Array:
-    """Return the derivative (1, n_p) of the loop's peak by the parameters, as a share of the step.
+    """Return the derivatives (1, n_p) of the loop's peak with respect to the parameters.
 
-    The controller stays the same while the carts vary.
+    The parameters change by shares of their values, and the peak is a share of the step. The
+    controller stays the same.
     """
     P, chain = known.parametrisation, known.chain
     controller = feedback.controller(chain)

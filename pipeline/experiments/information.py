@@ -1,10 +1,10 @@
 """The Fisher information that a record will give on the carts, predicted before it is made.
 
 The prediction follows from the fit that will use the record. H is the information: the squared
-derivatives of the motion by the parameters, relative to the noise, with the start and the encoder
-zeros eliminated. S is the covariance that the noise causes in the gradient of the fit. It equals H
-for white noise and is larger if rounding leaves lasting errors. H and S add up over records, and
-the covariance of the parameters is H⁻¹ S H⁻¹.
+derivatives of the motion with respect to the parameters, relative to the noise, with the initial
+state and the encoder zeros eliminated. S is the covariance that the noise causes in the gradient of
+the fit. It equals H for white noise and is larger if rounding errors persist over many samples. H
+and S add up over records, and the covariance of the parameters is H⁻¹ S H⁻¹.
 
 References: E. Walter, L. Pronzato, Identification of Parametric Models from Experimental Data,
 1997, chapter 6; G. C. Goodwin, R. L. Payne, Dynamic System Identification: Experiment Design and
@@ -56,8 +56,8 @@ class Knowledge:
     beyond : ratio of the measured variances to those that encoder errors alone would cause.
         Friction, for example, increases it.
     dwells : the dwells so far. If there are any, only they are used to identify the carts.
-    misfit : how far a dwell is from the carts beyond its standard error, as a share of the dwell's
-        magnitude.
+    misfit : deviation of a dwell from the identified carts beyond its standard error, as a share of
+        the dwell's magnitude.
     """
 
     chain: Chain
@@ -120,10 +120,10 @@ class Knowledge:
         return replace(known, noise=np.array(shaken))._compared(windows, covariance)
 
     def _compared(self, windows: Sequence[FitWindow], covariance: Array) -> Self:
-        """Return this knowledge with H of the windows, and with the S that gives the `covariance`.
+        """Return a copy with H from the windows, and with S such that H⁻¹ S H⁻¹ is `covariance`.
 
-        `beyond` becomes the ratio of the measured variances to those from encoder errors, at least
-        1.
+        `beyond` becomes the ratio of the measured variances to those from encoder errors alone; it
+        is at least 1.
         """
         H, S = np.sum([self._of_window(window) for window in windows], axis=0)
         J, inverse = self.by_parameters(), np.linalg.inv(H)
@@ -132,9 +132,10 @@ class Knowledge:
         return replace(self, information=np.stack([H, H @ covariance @ H]), beyond=beyond)
 
     def by_parameters(self) -> Array:
-        """Return how the named parameters (in table order) change with the physical ones.
+        """Return the derivatives (n_named, n_p) of the named parameters.
 
-        The result (n_named, n_p) has relative changes of both.
+        They are relative changes per relative change of the physical parameters. The named
+        parameters are in table order.
         """
         J = parameter_jacobian(self.chain, self.parametrisation.names) * self.size
         return J / np.array(list(self.chain.parameters().values()))[:, None]
@@ -182,7 +183,7 @@ class Knowledge:
         return np.stack([flat @ flat.T, S])
 
     def _errors(self, exact: Array, rows: list[int]) -> Iterator[Array]:
-        """Yield several samples of random encoder errors on exact positions (p, n)."""
+        """Yield several random draws of the encoder errors (p, n) for exact positions (p, n)."""
         rng, step = np.random.default_rng(0), self.step[rows, None]
         for _ in range(3):  # a single sample would be too random
             # An encoder starts anywhere between two counts.
@@ -210,7 +211,7 @@ class Knowledge:
         return np.tile(J.T @ J, (2, 1, 1))
 
     def of_lines(self, omega: Array, *, amplitude: Array, seconds: float) -> Array:
-        """Return H and S (n, 2, n_p, n_p) of single steady sines; `omega` (n,) is in rad/s.
+        """Return H and S (n, 2, n_p, n_p), one pair for each steady sine; `omega` is in rad/s.
 
         The sines move the carts by many counts, so rounding errors are white.
         """
@@ -244,7 +245,7 @@ class Knowledge:
         return sampled_input(recording, period=self.sample_time)
 
     def at_its_limits(self, recording: Recording, *, limits: PlanLimits, share: float) -> float:
-        """Return the amplitude at which the largest cart motion is this `share` of the travel."""
+        """Return the largest amplitude within the input limit and this `share` of the travel."""
         t, u = self.input(recording)
         x = simulate_linear(self.chain, t, u, free=recording.carts)
         return min(share * limits.travel / float(np.max(np.abs(x))), limits.input)

@@ -61,8 +61,8 @@ def schroeder_phases(size: Array) -> Array:
 def low_peak_phases(lines: Lines, size: Array, G: ComplexArray) -> Array:
     """Return phases (n,) for which the largest swing of the carts is small.
 
-    The motion is clipped and the new phases are kept, again and again. `G` (carts, n) is the
-    frequency response at the lines.
+    Repeatedly, the motion is clipped and the phases of the clipped motion are used for the next
+    round. `G` (carts, n) is the frequency response at the lines.
     """
     motion = size * G
     phase = schroeder_phases(np.max(np.abs(motion), axis=0))

@@ -46,8 +46,8 @@ class NextPlan:
     errors : (n + 1,) relative error after the open recordings of the plan, then after each chosen
         experiment.
     planned : relative error after each open recording of the plan alone, by the recording's id.
-    separation : only for "gap": separation of the best separated pair of explanations, in standard
-        deviations of the noise.
+    separation : only for "gap": distance between the two explanations that the recording separates
+        best, in standard deviations of the noise.
     wrote : the change of plan.toml, in words.
     doubt : why the errors are not reliable, whatever is recorded; empty if they are reliable.
     """
@@ -147,7 +147,7 @@ def plan_next(
 
 
 def _doubt(analysis: Analysis, folder: Path) -> str:
-    """Return a note if the fit leaves more than noise; the predicted errors count only noise."""
+    """Return a warning if the residual exceeds the noise, which predicted errors do not count."""
     fit = analysis.fit
     if fit is None or fit.explains_data:
         return ""
@@ -236,7 +236,7 @@ def why_useless(recording: Recording, known: Knowledge, *, limits: PlanLimits) -
 
 
 def _decisive(submission: Submission, limits: PlanLimits) -> tuple[Recording, float]:
-    """Return the recording that `cartlab gap` proposes, and the separation it promises.
+    """Return the recording that `cartlab gap` proposes, and its predicted separation.
 
     Raises
     ------

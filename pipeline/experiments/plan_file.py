@@ -103,8 +103,8 @@ def save_plan(plan: Plan, submission: Submission) -> Path:
 def add_recordings(folder: Path, proposed: Sequence[Recording], *, otherwise: Plan) -> Plan:
     """Append recordings to the current plan of a submission; return the new plan.
 
-    Computing the proposal may have taken minutes, in which others may have added recordings. An id
-    that is already taken is changed.
+    The plan is read again, because someone may have added recordings while the proposal was
+    computed. An id that is already taken is changed.
 
     Parameters
     ----------

@@ -288,7 +288,7 @@ def _reason(analysis: Analysis, *stages: Stage) -> str:
 
 
 def large_steps(chain: Chain, limits: PlanLimits) -> list[Recording]:
-    """Return a step to each side that ends as far out as intended."""
+    """Return steps in both directions, as large as intended or as the input limit allows."""
     settle = rounded(settling_wait(chain, time_constants=SETTLED))
     hold = AIM * limits.travel / float(np.max(np.abs(chain.static_gains())))
     size = min(_STEP * hold, limits.input)
@@ -324,13 +324,13 @@ def _driven(chain: Chain, limits: PlanLimits) -> list[Recording]:
 def _loop(
     analysis: Analysis, submission: Submission, limits: PlanLimits, bench: Description | None
 ) -> Recording:
-    """Return a recording in which the set point of a loop steps on and off.
+    """Return a closed-loop recording in which the set point steps on and off.
 
-    The loop is the designed one, or a PID on a stock bench.
+    It uses the designed controller or, on a stock bench, a PID.
 
     Raises
     ------
-    DataError : there is no design or no PID; the message gives the reason.
+    DataError : no controller was designed, or no PID is possible; the message gives the reason.
     """
     feedback = analysis.feedback
     if feedback is None:

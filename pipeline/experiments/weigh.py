@@ -22,7 +22,7 @@ class Weighed:
 
     Attributes
     ----------
-    words : the parameter to improve, such as "zeta_2".
+    words : the error to reduce, such as "the error of zeta_2".
     why : why the proposed recording does not help, or even does harm; empty if it helps.
     """
 

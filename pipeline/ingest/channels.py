@@ -85,12 +85,12 @@ def _runs(still: np.ndarray, *, least: int) -> list[list[int]]:
 
 
 def saturation(u: Array) -> float | None:
-    """Return the level at which the input was clipped, or None.
+    """Return the level at which the input was clipped; None if it was not clipped.
 
-    A clipped input reaches its extreme with a jump, stays there and leaves it with a jump. Far more
-    samples have the extreme value than the next one. This does not hold for the crest of a sine,
-    even if it is rounded to a few digits. Nor does it hold for a controller that slowly approaches
-    its last value. An input with few levels, such as a step, is never called clipped.
+    A clipped input jumps to its extreme, stays there and jumps back. Far more samples are at the
+    extreme than at the next level. This does not hold for the crest of a sine, even if it is
+    rounded to a few digits. Nor does it hold for a controller that slowly approaches its final
+    value. An input with few levels, such as a step, is never called clipped.
     """
     levels, counts = np.unique(u, return_counts=True)
     # An input with few levels, such as a step, has its extremes by design.
@@ -121,7 +121,10 @@ def never_changes(name: str) -> str:
 
 
 def channel_problems(t: Array, u: Array | None, positions: dict[str, Array]) -> list[str]:
-    """Return the faults of the input and of the positions (by heading), in words."""
+    """Return the faults of the input and of the positions in words.
+
+    The positions are given by heading.
+    """
     problems = []
     moving = any(np.ptp(x) > 0 for x in positions.values())
     for name, x in positions.items():

@@ -1,7 +1,7 @@
 """Check sample times, and straighten them if the file has rounded them.
 
-Near 1 kHz, the stamps of a millisecond clock hardly show its true period: a short record looks
-perfectly even. The records of a session share one clock, so together they do show it.
+Near 1 kHz, stamps in whole milliseconds hardly show the clock's true period: a short record looks
+perfectly even. The records of a session share one clock, so together they reveal its period.
 """
 
 from collections.abc import Sequence
@@ -196,7 +196,7 @@ def decimal_step(values: Array) -> float:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Rounded:
-    """The stamps of a record, and the stretches (start, end) that a straight line explains.
+    """The stamps of a record, and its stretches (start, end) that are straight but for rounding.
 
     `even` means that the stamps already are on a line. They are then straightened only if other
     records give a better period.
@@ -296,10 +296,9 @@ def _line(stamps: Array, *, slope: float | None = None) -> Array:
 def _periods(records: Sequence[_Rounded]) -> list[float | None]:
     """Return the period of each record's clock; records that allow the same period share it.
 
-    Each record confines the period to an interval, which is wider for a shorter record. The records
-    are taken in order of certainty. Each joins the first group whose period it allows, in the
-    narrowest possible band. None means that the stamps are kept or no single period explains the
-    record.
+    Each record confines the period to an interval, which is wider for a shorter record. Records
+    with narrow intervals come first. Each joins the first group whose period it allows, or starts a
+    new group. None means that the stamps are kept or no single period explains the record.
     """
     groups: list[tuple[float, float, list[int]]] = []
     told = {

@@ -1,4 +1,4 @@
-"""Find out what the files of a submission are, and describe them in its `submission.toml`.
+"""Find out what the files of a submission contain, and describe them in its `submission.toml`.
 
 Every recording in `data/` without a table gets one, and an incomplete table is completed from its
 file. Existing entries are never changed. Doubts become comments.
@@ -60,8 +60,8 @@ class Found:
     Attributes
     ----------
     file : path below the submission's folder.
-    state : whether the table is new, was completed, or was there; or why the file is not used. It
-        may be a copy, unknown, broken, missing, refused because of its name, or not read.
+    state : whether the table is new, was completed or was already complete; or why the file is not
+        used. It may be a copy, unknown, broken, missing, refused because of its name, or not read.
     experiment : id of the file's table; empty if there is no table.
     carts : the free carts, as far as the file shows; () means all.
     inspection : result of the inspection; None if the file cannot be read.
@@ -114,7 +114,7 @@ def passed_over(folder: Path, *, named: Collection[str] = ()) -> list[Found]:
 
 
 def examine_file(folder: Path, file: str, *, columns: Mapping[str, str | int] = {}) -> Found:
-    """Return what a file of a submission contains; its `state` is "broken" or, so far, "unknown".
+    """Return what a file of a submission contains; `state` is "broken" or, for now, "unknown".
 
     Parameters
     ----------
@@ -140,8 +140,8 @@ def examine_file(folder: Path, file: str, *, columns: Mapping[str, str | int] = 
 def free_carts(inspection: Inspection) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Return the carts that move in a file, and questions about them.
 
-    () means all carts. It is returned for a table of ratios, and if no cart moves, because that
-    proves nothing.
+    () means all carts. It is also returned for a table of ratios, and if no cart moves: that does
+    not prove that any cart was held.
     """
     carts = _moving(inspection)
     little = hardly_moving(inspection)
@@ -237,7 +237,7 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
 
 
 class _Filling:
-    """A document to which the tables of files are added one by one."""
+    """A document to which tables are added, file by file."""
 
     def __init__(
         self, document: tomlkit.TOMLDocument, folder: Path, looked: Sequence[Found]
@@ -313,7 +313,7 @@ class _Filling:
         )
 
     def missing(self) -> Iterator[Found]:
-        """Yield the files that have a table but are missing, with likely alternatives."""
+        """Yield the files that have a table but do not exist, with files of similar names."""
         files = {posix(str(table["file"])): table for table in self._tables}
         for file, table in files.items():
             wrong = file_problem(self._folder, file, taken=files)
@@ -348,7 +348,7 @@ class _Filling:
         return {c.role: table.values[i].tobytes() for i, c in enumerate(columns) if c.role}
 
     def _say_unknown(self, found: Found) -> None:
-        """Write a table as a comment, once; a person who knows the file can complete it."""
+        """Add a table as a comment, unless it is there; a person can complete it."""
         line = f"file = {json.dumps(found.file, ensure_ascii=False)}"
         if f"# {line}" in tomlkit.dumps(self._document).splitlines():
             return
@@ -450,7 +450,10 @@ def _unsure(found: Found, n: int) -> Iterator[str]:
 
 
 def _carts_seen(looked: Sequence[Found]) -> int:
-    """Return the number of the last cart that moves in any file; exports may have more columns."""
+    """Return the highest number of a cart that moves in any file.
+
+    Exports may also have columns for carts that the bench lacks.
+    """
     carts = [
         cart for one in looked if one.inspection for cart in one.carts or one.inspection.positions
     ]
@@ -458,7 +461,7 @@ def _carts_seen(looked: Sequence[Found]) -> int:
 
 
 def _state_units(document: tomlkit.TOMLDocument, looked: Sequence[Found]) -> None:
-    """Write the units stated by headings into a new document; counts need no statement."""
+    """Write the units stated by headings into a new document; counts are its default."""
     system: Any = document["system"]
     for inspection in (one.inspection for one in looked if one.inspection):
         for column in inspection.columns:

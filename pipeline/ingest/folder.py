@@ -42,12 +42,12 @@ class NotRead:
 
 
 def data_files_in(folder: Path) -> list[Path]:
-    """Return the files that may hold data, in a folder and its subfolders; "2" is before "10"."""
+    """Return the files that may hold data, in a folder and its subfolders; "2" precedes "10"."""
     return [path for path in _entries(folder) if _is_recording(path)]
 
 
 def files_not_read(folder: Path, *, root: Path) -> list[NotRead]:
-    """Return all other files of a folder and its subfolders, with advice.
+    """Return the files of a folder and its subfolders that are no data files, with advice.
 
     Names are relative to `root`; links that lead out of `root` are not followed. Hidden files are
     skipped.
@@ -91,7 +91,7 @@ def not_read_notes(found: Iterable[tuple[str, str, str]]) -> list[str]:
 
 
 def _not_read(root: Path, name: str) -> NotRead:
-    """Return why a file is not a recording, judged by its ending or else by its content."""
+    """Return why a file is not read: because of its ending or, if unknown, its content."""
     ending = Path(name).suffix.casefold()
     if ending in _FORM_OF:
         reason, advice = _FORM_OF[ending]

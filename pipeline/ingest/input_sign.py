@@ -115,7 +115,7 @@ def _say_signs(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Weighed:
-    """Both sides of the equation under the sliding bump, divided by the norm of the input's side.
+    """Both sides of the equation, averaged with the sliding bump, relative to the input's norm.
 
     Attributes
     ----------
@@ -167,9 +167,10 @@ def _settle(
     *,
     rule: Sequence[str],
 ) -> dict[str, int]:
-    """Reverse records that contradict the equation fitted to `rule`, until no record does.
+    """Return the sign of each record, as in `find_signs`; empty if no solution is found.
 
-    Return the sign of each record, as in `find_signs`; empty if no solution is found.
+    The equation is fitted to the records in `rule`. Records that contradict it are reversed, and
+    the fit is repeated until the reversed records stay the same.
     """
     # At most five rounds of reversing records and fitting again.
     for _ in range(5):
@@ -195,7 +196,7 @@ def _bench(weighed: Sequence[_Weighed], signs: Sequence[int]) -> tuple[int, Arra
     """Return the sign (relative to `signs`) and m, c, k, k' of the equation of all records.
 
     The sign is 0 if the opposite sign explains the records nearly as well, or if a shift of the
-    inputs by one sample would change it. Under feedback, an early log is not tried.
+    inputs by one sample would change it. Under feedback, the input is not shifted to earlier times.
     """
     motion = np.vstack([w.motion for w in weighed])
     size = np.linalg.norm(motion, axis=0)
@@ -216,7 +217,7 @@ def _bench(weighed: Sequence[_Weighed], signs: Sequence[int]) -> tuple[int, Arra
 
 
 def _explain(motion: Array, drive: Array) -> tuple[Array, float]:
-    """Return the weights (4,), never negative, and the norm of the unexplained drive."""
+    """Return the non-negative weights (4,), and the norm of the drive that they do not explain."""
     try:
         return nnls(motion, drive)
     except RuntimeError:  # no solution, so nothing is explained

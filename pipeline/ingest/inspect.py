@@ -194,7 +194,7 @@ def unread_entry(file: Path, state: str, problem: str, *, advice: str = "") -> d
 
 
 def _name_them(roles: Roles) -> str:
-    """Return how to name columns without headings, as far as the signals show it."""
+    """Return advice on naming columns without headings, with the roles that signals suggest."""
     text = "the columns have no names: state their roles in submission.toml"
     line = ", ".join(f"{role} = {number}" for role, number in roles.columns.items())
     if line and not roles.doubts:
@@ -209,7 +209,7 @@ def _name_them(roles: Roles) -> str:
 
 
 def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str]) -> Clock | None:
-    """Return the clock of the file, or None; notes on the clock are added to `problems`.
+    """Return the clock of the file, None without a time column; add its notes to `problems`.
 
     Raises
     ------
@@ -267,7 +267,7 @@ def _guess(
 def _follows(u: Array, reference: Array) -> bool:
     """Return whether the reference is the commanded input itself, as in open loop.
 
-    The reference may be rounded to counts, and logged up to one sample apart from the input.
+    The reference may be rounded to counts, and logged up to one sample before or after the input.
     """
     if np.ptp(reference) == 0.0:
         return False
@@ -295,7 +295,7 @@ def is_stepped(u: Array) -> bool:
 
 
 def line_frequency(t: Array, u: Array) -> float | None:
-    """Return the frequency (Hz) of an input that is a single sine; otherwise None."""
+    """Return the frequency (Hz) of an input; None if it is not a single sine."""
     even = np.linspace(t[0], t[-1], t.size)
     signal = np.interp(even, t, u)
     power = np.abs(np.fft.rfft((signal - signal.mean()) * np.hanning(t.size))) ** 2

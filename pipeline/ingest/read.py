@@ -361,7 +361,7 @@ def _input(opened: _Opened) -> tuple[Array | None, float]:
 
 
 def _beyond_volts(values: Array) -> bool:
-    """Return whether values are counts, not volts: large whole numbers, even written as "512.0"."""
+    """Return whether values are counts, not volts: large whole numbers, such as "512.0"."""
     return bool(np.all(values == np.round(values)) and np.abs(values).max() > _FEW_COUNTS)
 
 

@@ -117,7 +117,7 @@ def _other_clock(values: Array) -> tuple[str, ...]:
 
 
 def _without_copies(table: FileTable, signals: Sequence[int]) -> list[int]:
-    """Return the columns, but not a commanded position that repeats a later encoder column."""
+    """Return the columns except commanded positions that only repeat a later encoder column."""
     values, whole = table.values, table.whole
     return [
         i for i in signals
@@ -150,7 +150,7 @@ def _without_rates(values: Array, signals: Sequence[int], *, interval: float) ->
 
 
 def _find_input(table: FileTable, signals: Sequence[int]) -> tuple[int | None, int | None, str]:
-    """Return the columns of input and reference (or None), and a note on what is in doubt."""
+    """Return the columns of input and reference, each None if not found, and a note on doubts."""
     if len(signals) < 2:
         return None, None, ""
     values = table.values
@@ -194,7 +194,11 @@ def _by_jumps(
 def _by_law(
     values: Array, signals: Sequence[int], left: Mapping[int | None, float]
 ) -> tuple[int | None, None] | None:
-    """Return the input if one column clearly explains the motion of the others, or None."""
+    """Return the column that clearly explains the motion of the others, and None as reference.
+
+    The column is None if the motion dies away without an input. The result is None if the input is
+    not clear.
+    """
     if not left:
         return None
     if left[None] < _FREE:  # no input is needed, or all columns are sines
@@ -248,8 +252,8 @@ def _averages(values: Array, signals: Sequence[int]) -> tuple[Array, Array, Arra
 def _left_unexplained(values: Array, signals: Sequence[int]) -> dict[int | None, float]:
     """Return, for each trial input, the share of accelerations that no linear law explains.
 
-    The key None stands for no input. The law is linear in all other columns and their slopes. The
-    share is the mean over these columns.
+    The key None stands for no input. The law is linear in all columns, and in the slopes of those
+    that are not the trial input. The share is the mean over the latter columns.
     """
     parts = _averages(values, signals)
     if parts is None:
@@ -268,7 +272,7 @@ def _left_unexplained(values: Array, signals: Sequence[int]) -> dict[int | None,
 
 
 def _purest(values: Array, signals: Sequence[int]) -> int | None:
-    """Return the column that is a computed sine; no measured signal is so pure."""
+    """Return the column that is a much purer sine than all others: a computed one; else None."""
     parts = _averages(values, signals)
     if parts is None:
         return None
@@ -283,7 +287,7 @@ def _purest(values: Array, signals: Sequence[int]) -> int | None:
 
 
 def _dies_away(rows: Array) -> bool:
-    """Return whether a motion dies away: little of it is left at the end."""
+    """Return whether every column moves less than half as much at the end as at the start."""
     parts = np.array_split(rows, 3, axis=1)
     first, last = (
         np.sqrt(((part - part.mean(1, keepdims=True)) ** 2).mean(1))

@@ -1,6 +1,6 @@
 """The content of an exported model, for all languages: its parameters, bodies and laws.
 
-Laws are expressions for `syntax`, with the names of the model: `p.m1`, `x.cart_1`, `v.motor`,
+Laws are expressions as described in `syntax`, with names such as `p.m1`, `x.cart_1`, `v.motor` and
 `z.z1`. `u` is the force of the drive on its body, and `on` is 1 while the drive is powered. In a
 spring's law, `d` is the stretch and `rate` its velocity.
 """
@@ -54,7 +54,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Body:
-    """A cart, the motor in front of its play, or a hidden mass.
+    """A cart, the motor if its coupling has play, or a hidden mass.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Force:
     ----------
     side, depth, rate : expressions that describe a contact, which acts while `depth` has the sign
         of `side`. `rate` is the velocity of `depth`.
-    pulls : whether a contact may also pull.
+    pulls : whether a contact can also pull, not only push.
     """
 
     title: str
@@ -424,10 +424,10 @@ def _link(term: EffectTerm) -> tuple[str, Force]:
 
 
 def _longest_step(model: AugmentedChain, free: Sequence[int]) -> float:
-    """Return the longest time step in s: a twentieth of a radian of the fastest oscillation.
+    """Return the longest time step in s.
 
-    For oscillations in a contact, it is a tenth of a radian. cartlab's own simulator has a higher
-    order and takes steps four times as long.
+    In one step, the fastest oscillation advances by a twentieth of a radian; in a contact, by a
+    tenth. cartlab's own simulator is of higher order and takes steps four times as long.
     """
     step = 0.25 * SteppedBench(model, free=free).shortest_step
     cart = model.tables().cart

@@ -17,7 +17,7 @@ FILES = ("model.fmu", "model.c", "model.h", "model.m")
 def save_model(
     model: AugmentedChain, analysis: Analysis, out: Path, *, free: Collection[int]
 ) -> str:
-    """Write a model with its free carts into the folder `out`; return a sentence on the result.
+    """Write a model of the `free` carts into the folder `out`; return a sentence on the result.
 
     A model that would need future inputs is not written; the sentence then says why.
     """

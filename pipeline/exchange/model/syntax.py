@@ -47,7 +47,7 @@ class _Substitution(ast.NodeTransformer):
         return ast.Call(node.func, [self.visit(one) for one in node.args], [])
 
     def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
-        """Simplify products and sums with 0 and 1; substituted symbols may leave these."""
+        """Simplify operations with 0 and 1, which the substitution may have introduced."""
         left, right = self.visit(node.left), self.visit(node.right)
         match node.op, _value(left), _value(right):
             case (ast.Mult(), 0, _) | (ast.Mult(), _, 0):
@@ -72,7 +72,7 @@ def _not_known(node: ast.AST) -> ValueError:
 
 
 class _Printer(ast.NodeTransformer):
-    """The part common to both languages; it refuses anything that laws do not contain."""
+    """The rules for both languages. They refuse any syntax that laws do not use."""
 
     def __init__(self, functions: Mapping[str, str], constants: Mapping[str, str]) -> None:
         self._functions, self._constants = functions, constants

@@ -26,7 +26,7 @@ def explore_bench(
     seconds: float,
     vetoes: Callable[[Recording], bool] = lambda recording: False,
 ) -> tuple[Turn, ...]:
-    """Explore the bench at a port; return what was known in each turn.
+    """Explore the bench at a port; return the turns.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def explore_bench(
 
     Raises
     ------
-    Stopped : a signal or a button ended it.
+    Stopped : a signal or a button ended the exploration.
     HardwareError, ConfigError, DataError : see `acquire` and `Exploration`.
     """
     everyone, buttons = Observers(observers), buttons or Buttons()

@@ -32,10 +32,11 @@ def choose_recording(
     refused: Sequence[Recording],
     commands: frozenset[str],
 ) -> tuple[Recording | None, str]:
-    """Return the next recording and its reason; None if everything is known or nothing helps.
+    """Return the next recording and why it was chosen.
 
-    A recording that distinguishes explanations comes first, then one that improves the worst
-    parameter, then one that shows effects at large motion.
+    The recording is None if everything is known or nothing would help. A recording that
+    distinguishes explanations comes first, then one that improves the least known parameter, then
+    one that shows effects at large motion.
 
     Parameters
     ----------
@@ -79,10 +80,10 @@ def choose_recording(
 
 
 def _reach_far_out(analysis: Analysis, limits: PlanLimits) -> Iterator[tuple[Recording, str]]:
-    """Yield recordings that show effects at large motion, each with the range that it adds.
+    """Yield two recordings that show effects at large motion, each with a reason in words.
 
-    The recordings are a step that moves the carts as far as they may rest, and a sweep that swings
-    them to both sides. The range is in words; it is empty if the recording adds no range.
+    The first is a step to the furthest intended rest position; the second is a sweep with large
+    swings to both sides. The reason is empty if earlier records already go about as far.
     """
     chain = identified_chain(analysis)
     driven = [record for record in analysis.records if record.kind in ("step", "sweep")]

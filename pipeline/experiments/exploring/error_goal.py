@@ -1,4 +1,4 @@
-"""The goal of an exploration: which errors to reach, and within what time."""
+"""The goal of an exploration: the errors to reach, and the time allowed."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ class ErrorGoal:
     error: float = 0.01
 
     def missing(self, errors: dict[str, float | None]) -> dict[str, float]:
-        """Return the parameters whose errors are still too large, with these errors.
+        """Return the errors that are still too large, by parameter; inf if unknown.
 
         Raises
         ------

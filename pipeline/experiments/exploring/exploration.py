@@ -1,4 +1,4 @@
-"""Record, identify, look for the gap and choose, until everything is known or time is up."""
+"""Record, identify, look for the gap and choose again, until all is known or time is up."""
 
 import gc
 from collections.abc import Callable, Sequence
@@ -55,7 +55,7 @@ class Recorded:
     ids : ids of the recordings that were made.
     seconds : total time of all attempts, in s.
     vetoed : whether recordings are missing because a person at the bench refused them.
-    why : the reason, if known, why other recordings are missing.
+    why : why requested recordings are missing; empty if none are, or if the reason is unknown.
     """
 
     ids: tuple[str, ...]
@@ -66,10 +66,10 @@ class Recorded:
 
 @dataclass(kw_only=True)
 class Exploration:
-    """An exploration of a bench, turn by turn, into a submission.
+    """An exploration of a bench, turn by turn; a submission collects its recordings.
 
-    After each turn the folder holds the submission, gap/gap.json and the diary, however the
-    exploration ends. A recording that a person adds to plan.toml comes before cartlab's own choice.
+    After each turn, the folder holds the submission, gap/gap.json and the diary. A recording that a
+    person adds to plan.toml takes precedence over cartlab's choice.
 
     Attributes
     ----------
@@ -77,8 +77,8 @@ class Exploration:
     record : function that makes recordings of the plan, given by their ids. Its first call also
         makes submission and plan if they are missing.
     goal : the errors to reach.
-    seconds : time allowed at the bench, including rests. No recording begins that would exceed it.
-        An interrupted recording counts each time.
+    seconds : time allowed at the bench, including rests. A recording that would exceed it is not
+        begun. Each interrupted attempt counts in full.
     announce : function that is called with a sentence in each turn.
     progress : function that is called often with a few words during computations. An exception that
         it raises ends the exploration.
@@ -90,7 +90,7 @@ class Exploration:
     ours : ids in the plan that cartlab added. All other recordings without data were added by a
         person.
     refused : recordings that were vetoed or failed.
-    asked : recordings made to decide between explanations.
+    asked : recordings that were made to decide between explanations.
     lost : the reason why the last chosen recording is missing; empty if it was made.
     failures : number of failures in a row.
     """
@@ -117,8 +117,8 @@ class Exploration:
         Raises
         ------
         DataError : the first recordings do not identify the carts.
-        ConfigError : these carts do not have the goal's parameter, or the first sweep alone takes
-            too long.
+        ConfigError : the carts have no parameter that the goal names, or the first sweep alone
+            takes too long.
         """
         self._begin()
         self._analyse()
@@ -190,7 +190,7 @@ class Exploration:
         self.analysis = _identify_beside(analysis, self.gap)
 
     def _propose(self, analysis: Analysis) -> None:
-        """Find the recording that decides between the explanations, and save it in gap.json."""
+        """Find the recording that best distinguishes the explanations; save it in gap.json."""
         if self.gap is None:
             return
         often = [r for r in self.asked if sum(map(r.resembles, self.asked)) >= _OFTEN]
@@ -269,7 +269,7 @@ class Exploration:
         return recording, WORDS.text("therefore", name=recording.id, why=why)
 
     def _try_out(self, recording: Recording) -> None:
-        """Make the chosen recording and look again, or remember that it failed."""
+        """Make the chosen recording and analyse all data again, or remember that it failed."""
         self.ours.add(recording.id)
         if self.vetoes(recording):
             came = Recorded(ids=(), seconds=0.0, vetoed=True)
@@ -290,11 +290,11 @@ class Exploration:
 
 
 def _identify_beside(analysis: Analysis, gap: Gap | None) -> Analysis:
-    """Return the analysis with the carts identified together with their effects.
+    """Return the analysis with the carts as identified together with the effects of the gap.
 
     Raises
     ------
-    DataError : the carts are identified neither with effects nor without them.
+    DataError : the carts could be identified neither with effects nor without.
     """
     fit, acting = analysis.fit, gap is not None and bool(gap.model.terms)
     if fit is None or not (fit.converged or acting):

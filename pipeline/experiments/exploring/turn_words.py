@@ -56,7 +56,7 @@ def describe_doubt(gap: Gap) -> str:
 
 
 def list_explanations(gap: Gap) -> tuple[WeighedExplanation, ...]:
-    """Return the models that may be true, the chosen one first; for a named gap only that one."""
+    """Return the models that may be true, the chosen one first; it is alone if the gap is named."""
     contenders = [(one, one.weight) for one in gap.contenders]
     if gap.verdict == "named":
         contenders = [(gap.model, 1.0)]

@@ -29,13 +29,13 @@ _MOST_SEGMENTS = 10_000
 
 
 def is_lvm(raw: bytes) -> bool:
-    """Return whether a file is a LabVIEW measurement file, from its first line."""
+    """Return whether the first line is that of a LabVIEW measurement file."""
     return _START.match(raw) is not None
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Segment:
-    """The tags of a header, the column names and their line, and the rows with their lines."""
+    """A segment: its header's tags, its column names and their line, its rows and their lines."""
 
     header: dict[str, list[str]]
     names: list[str]
@@ -196,7 +196,7 @@ def _headings(segment: _Segment, names: Sequence[str], dialect: _Dialect) -> lis
 
 
 def _with_one_clock(rows: Rows, names: Sequence[str], *, place: str) -> Rows:
-    """Return the rows with only the first of their time columns, which must be equal."""
+    """Return the rows with only the first time column; all time columns must be equal."""
     clocks = [i for i in range(len(rows.names)) if names[i] == "X_Value"]
     if any((rows.values[:, i] != rows.values[:, clocks[0]]).any() for i in clocks[1:]):
         raise SubmissionError(
@@ -221,7 +221,7 @@ def _with_times(table: FileTable, segment: _Segment, dialect: _Dialect) -> FileT
 
 
 def _stated(tag: str, segment: _Segment, dialect: _Dialect) -> float | None:
-    """Return the number that a header states for all channels, or None.
+    """Return the number that a header states for all channels; None if it states none.
 
     Raises
     ------

@@ -72,7 +72,7 @@ def read_mat(raw: bytes, *, source: str) -> FileTable:
 
 
 def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariable]:
-    """Return the variables that form the recording: all that have as many samples as the longest.
+    """Return the variables that form the recording; all of them have the same number of samples.
 
     Raises
     ------

@@ -79,7 +79,7 @@ class MatVariable:
 
 
 def is_mat(raw: bytes) -> bool:
-    """Return whether a file is a `.mat` file, from its first bytes."""
+    """Return whether the first bytes are those of a `.mat` file."""
     return raw.startswith(b"MATLAB") or _v4_heading(raw, 0) is not None
 
 
@@ -150,7 +150,10 @@ def _version_5(raw: bytes) -> Iterator[MatVariable]:
 
 
 def _content(raw: bytes, at: int, order: str) -> tuple[int, bytes]:
-    """Return (type, bytes) of the long element at `at`, which must be complete."""
+    """Return (type, bytes) of the element at `at`, whose tag has eight bytes.
+
+    The element must be complete.
+    """
     kind, size = struct.unpack_from(order + "II", raw, at)
     content = raw[at + 8 : at + 8 + size]
     if len(content) < size:
@@ -304,7 +307,7 @@ def _holds_numbers(dtype: np.dtype) -> bool:
 
 
 def _class_of(item: Any) -> str:
-    """Return MATLAB's class of a data set or, if it is not stated, the class of the numbers."""
+    """Return MATLAB's class of a data set; numbers without a stated class are "double"."""
     if "MATLAB_empty" in item.attrs:
         return "empty"
     of = item.attrs.get("MATLAB_class", b"double" if item.dtype.kind in "fiu" else b"unknown")

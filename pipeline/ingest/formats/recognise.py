@@ -76,7 +76,7 @@ def read_table(
 
 
 def is_recording(head: bytes) -> bool:
-    """Return whether a file that is not text may hold a recording, from its first bytes."""
+    """Return whether a binary file with these first bytes may hold a recording."""
     return any(is_theirs(head) for is_theirs, _ in _READERS)
 
 

@@ -20,7 +20,7 @@ _SMALLEST_MEASURED, _LARGEST_MEASURED = 1e-12, 1e12
 
 @dataclass(frozen=True, kw_only=True)
 class Variable:
-    """A variable of a binary file, and its use.
+    """A variable of a binary file, and whether it is read.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class FileTable:
 
     @property
     def cut_short(self) -> str:
-        """The fault of a truncated file with what to do; "" for a complete file."""
+        """The message about a truncated file, with advice; "" for a complete file."""
         if self.cut is None:
             return ""
         return f"{self.cut}; the file is truncated: export it again, or delete its last line"
@@ -132,7 +132,7 @@ def refuse_unusable(values: Array, *, names: Sequence[str], place: Callable[[int
 
     Raises
     ------
-    SubmissionError : the message names the column and, by `place`, the row.
+    SubmissionError : there is such a number; the message names its column and `place(row)`.
     """
     # This limit applies to everything in a file, also to times and unused columns.
     usable = np.abs(values) < 1e50  # NaN compares as false
@@ -143,11 +143,11 @@ def refuse_unusable(values: Array, *, names: Sequence[str], place: Callable[[int
 
 
 def refuse_extreme(values: Array, *, what: str) -> None:
-    """Refuse numbers if the largest or smallest, except zeros, is impossible on a bench.
+    """Refuse numbers whose largest magnitude is impossible on a bench; all zeros are allowed.
 
     Raises
     ------
-    SubmissionError : there is such a number; the message begins with `what`.
+    SubmissionError : the numbers are refused; the message begins with `what`.
     """
     largest = float(np.abs(values).max(initial=0.0))
     if largest != 0 and not _SMALLEST_MEASURED <= largest <= _LARGEST_MEASURED:

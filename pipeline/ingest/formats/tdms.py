@@ -1,8 +1,8 @@
 """Read National Instruments' binary format (.tdms): find the group of channels with the recording.
 
-The file is read by npTDMS, which a hostile file could keep busy for hours. So the work is estimated
-first, from the lengths in front of the segments: objects times segments, and bytes of metadata.
-Layout: "TDMS File Format Internal Structure", National Instruments.
+npTDMS reads the file, and a hostile file could keep it busy for hours. So the work is estimated
+first, from the lead-ins of the segments: objects times segments, and bytes of metadata. Layout:
+"TDMS File Format Internal Structure", National Instruments.
 """
 
 import logging
@@ -40,7 +40,7 @@ _TIME = re.compile(r"\s*(elapsed[ _])?(t|times?|time[ _]?stamps?)\s*([\[(].*)?",
 
 
 def is_tdms(raw: bytes) -> bool:
-    """Return whether a file is a .tdms file, from the tag of its first segment."""
+    """Return whether a file begins with the tag of a .tdms segment."""
     return raw.startswith(b"TDSm")
 
 
@@ -89,7 +89,7 @@ def read_tdms(raw: bytes, *, source: str) -> FileTable:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Channel:
-    """A channel with its unit and clock if stated; `values` is None if it holds no numbers."""
+    """A channel with its stated unit and clock; `values` is None if it holds no numbers."""
 
     group: str
     name: str
@@ -116,7 +116,7 @@ class _Channel:
 
 
 def _refuse_endless(raw: bytes, *, source: str) -> None:
-    """Refuse a file that is truncated, or that npTDMS would read for longer than any recording.
+    """Refuse a file that is truncated, or on which npTDMS would work longer than on any recording.
 
     Raises
     ------
@@ -242,7 +242,9 @@ class _Listener(logging.Handler):
 
 
 def _recording(channels: Sequence[_Channel], *, source: str) -> tuple[str, list[_Channel]]:
-    """Return the group that is the recording, and its channels; short channels are only settings.
+    """Return the name and channels of the group that is the recording, without short channels.
+
+    A short channel holds settings.
 
     Raises
     ------
@@ -272,7 +274,7 @@ def _advice(channel: _Channel, *, longest: int) -> str:
 
 
 def _clock(channels: Sequence[_Channel], *, source: str) -> tuple[float, float]:
-    """Return the interval and the first time (s) that channels state; 0 if they state nothing.
+    """Return the sample interval and the first time (s) of the channels; zeros if not stated.
 
     Raises
     ------

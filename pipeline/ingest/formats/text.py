@@ -103,9 +103,9 @@ def parse_rows(
 
 
 def _numbers(rows: Iterable[Sequence[str]], *, width: int) -> Array | None:
-    """Return the rows as numbers (n, width), or None if any field is not a number.
+    """Return the rows as numbers (n, width); None if a field is not a number or a row does not fit.
 
-    The rows are not checked one by one, which saves time.
+    To save time, the rows are not checked one by one.
     """
     fields = chain.from_iterable(row if len(row) == width else ("",) for row in rows)
     try:
@@ -149,7 +149,7 @@ def make_table(
     cut: str | None,
     notes: Sequence[str] = (),
 ) -> FileTable:
-    """Return rows as the columns of a file; `typed` is the first row as written."""
+    """Return a table made of rows; `typed` is the first row as written in the file."""
     values = np.ascontiguousarray(rows.values.T)
     whole = tuple(
         "." not in field and "," not in field and bool((column == np.round(column)).all())
@@ -271,7 +271,7 @@ class _Layout:
 
     @property
     def split(self) -> Callable[[str], list[str]]:
-        """The function that splits a row of numbers and writes decimal points."""
+        """The function that splits a row of numbers and replaces decimal commas by points."""
         if self.decimal_comma:
             return lambda row: [field.replace(",", ".") for field in self.fields(row)]
         if self.delimiter is None or self.trailing:
@@ -324,7 +324,7 @@ def _delimited(text: str, source: str) -> FileTable:
 def _heading(
     lines: Sequence[tuple[int, str]], start: int, layout: _Layout
 ) -> tuple[list[str] | None, int]:
-    """Return the headings, or None, and the index of the first row of numbers.
+    """Return the headings, None if missing, and the index of the first row of numbers.
 
     The last comment before a table without headings may be its heading. A row of units below the
     heading ("ms", "V") is added to the names: "time [ms]".
@@ -343,7 +343,7 @@ def _heading(
 
 
 def with_units(names: Sequence[str], units: Sequence[str]) -> list[str] | None:
-    """Return headings with the units below them, "time [ms]"; None if there are no such units."""
+    """Return headings joined with units, "time [ms]"; None if `units` are not units."""
     bare = [unit.strip(' ()[]"') for unit in units]
     words = all(re.fullmatch(rf"[^\d]{{1,{_LONGEST_UNIT}}}", unit) for unit in bare)
     if not words or len(bare) != len(names) or bare == list(names):
@@ -365,10 +365,10 @@ def is_bench_log(names: Sequence[str]) -> bool:
 
 
 def _sniff(sample: Sequence[str]) -> _Layout | None:
-    """Return the layout in which most lines are rows of numbers of one width, or None.
+    """Return the layout in which the most lines are rows of equally many numbers; None if none are.
 
-    Of equally good layouts the first one is used. So "0,5;1,2" is two numbers with decimal commas,
-    and "0,5" is two integers.
+    Among equally good layouts, the first one is used. So "0,5;1,2" is two numbers with decimal
+    commas, and "0,5" is two integers.
     """
     best, best_score = None, 0.0
     for delimiter in ("\t", ";", ",", None):

@@ -77,7 +77,7 @@ class _Block:
 
 
 class _Sheet:
-    """The cells of a sheet, sorted into numbers (also those typed as text), texts, and others."""
+    """The cells of a sheet, sorted into numbers (even if stored as text), texts, and others."""
 
     def __init__(self, cells: Cells, formats: Sequence[str], *, source: str, name: str) -> None:
         self._source, self._where = source, f"{source} sheet {name!r}"
@@ -121,7 +121,7 @@ class _Sheet:
         return longest
 
     def _blocks(self) -> list[_Block]:
-        """Return the tables: a row of texts only, perhaps a row of units, a row of numbers."""
+        """Return the tables: each has a row of headings, perhaps a row of units, then numbers."""
         texts: dict[int, set[int]] = {}
         for row, column in self._texts:
             texts.setdefault(row, set()).add(column)
@@ -221,7 +221,7 @@ class _Sheet:
     def _refuse_gaps(
         self, rows: NDArray[np.int64], own: NDArray[np.int64], *, column: int, name: str
     ) -> None:
-        """Refuse a column if a cell holds no number, or if the file has a cell twice."""
+        """Refuse a column if a cell holds no number, or is in the file twice."""
         if (doubled := np.flatnonzero(np.diff(own) == 0)).size:
             cell = _cell(int(own[doubled[0]]), column)
             raise SubmissionError(f"{self._where} cell {cell}: the file has it twice")
@@ -237,8 +237,8 @@ class _Sheet:
     ) -> tuple[Array | None, str]:
         """Return dates or times of day in seconds, with a note; None for other numbers.
 
-        A spreadsheet stores them in days. A single date among numbers is an error: the spreadsheet
-        has turned a number such as 1.5 into a date.
+        A spreadsheet stores dates and times in days. A single date among numbers is an error: the
+        spreadsheet has turned a number such as 1.5 into a date.
         """
         formats, values = self._formats[cells], self._values[cells]
         is_time = (formats == "date") | (formats == "time")

@@ -71,7 +71,7 @@ class Book:
     Attributes
     ----------
     sheets : the file part of each worksheet, by name, in order.
-    formats : "", "percent", "time" or "date", by the number of a format.
+    formats : what each number format shows: "percent", "time", "date" or "".
 
     Raises
     ------
@@ -114,7 +114,7 @@ class Book:
         self.formats = self._read_formats(one_of["styles"]) if "styles" in one_of else [""]
 
     def _related(self, part: str) -> dict[str, tuple[str, str]]:
-        """Return (kind, part) of each part that a part refers to, by the reference's id."""
+        """Return the references of a part: kind and target of each, by id."""
         folder, name = posixpath.split(part)
         listed = posixpath.join(folder, "_rels", f"{name}.rels")
         found: dict[str, tuple[str, str]] = {}
@@ -263,7 +263,7 @@ def _reported(source: str) -> Iterator[None]:
 
 
 class _Bounded(BytesIO):
-    """Bytes of which `zipfile` may read only a limited amount at once (the table of contents)."""
+    """Bytes of which `zipfile` may read only a limited number at once, to bound the directory."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         if size is not None and size > max(_MOST_DIRECTORY, _CHUNK):
@@ -276,7 +276,7 @@ class _Full(Exception):
 
 
 class _Texts:
-    """The list of texts, each perhaps in pieces; Japanese pronunciation hints are ignored."""
+    """The list of texts, joined from their pieces; Japanese pronunciation hints are ignored."""
 
     def __init__(self) -> None:
         self.texts: list[str] = []
