@@ -312,7 +312,7 @@ class CheckedNumbers:
         return self.answer.agree
 
     def share(self, *numbers: str) -> float:
-        """Return the share of these numbers that agree; a missing number counts as not agreeing."""
+        """Return the share of these numbers that agree; a missing number counts as wrong."""
         if not numbers:
             raise TypeError('name the numbers that count: share("final.K", "final.zeta")')
         return sum(number in self.agree for number in numbers) / len(numbers)

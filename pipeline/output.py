@@ -42,8 +42,8 @@ def named_folder(out: Path) -> Path:
 
     Raises
     ------
-    ConfigError : the path is taken by something that is not a folder, or looks like that of a file
-        although several files are written.
+    ConfigError : the path is taken by something that is not a folder, or its ending is that of a
+        file.
     """
     files = (".html", ".pdf", ".json", ".csv", ".xlsx", ".zip", ".db", ".sqlite")
     if not out.is_dir() and out.suffix.lower() in files:
@@ -133,10 +133,10 @@ def _cell(value: object) -> str:
 
 
 def harmless(text: str) -> str:
-    """Return text without control characters, with an apostrophe before any start of a formula.
+    """Return text that no spreadsheet runs: an apostrophe comes before any start of a formula.
 
-    Special blanks and invisible characters become plain blanks. So they cannot end a row, and they
-    cannot hide a formula from this function.
+    Control characters, special blanks and invisible characters become plain blanks. So they cannot
+    end a row or hide a formula from this function.
     """
     text = "".join(c if c.isprintable() else " " for c in text)
     return text if _PLAIN.fullmatch(text) else _FORMULA.sub(r"\1'", text)

@@ -166,7 +166,7 @@ class Supervisor:
     def _line(
         self, process: "LineProcess", *, end: float, most: float, stop: threading.Event
     ) -> dict[str, Any] | None:
-        """Return the next message of the process, or None if it sends none before `end`."""
+        """Return the next message of the process; None if it sends none before `end`."""
         while True:
             if stop.is_set():
                 raise self._ended(process, "stopped", "stopped")
@@ -197,8 +197,8 @@ class Supervisor:
 class LineProcess:
     """A worker process that exchanges lines with this one.
 
-    It is a plain subprocess, because a daemonic process such as a Dask worker may not have children
-    of `multiprocessing`.
+    It is a plain subprocess, because a daemonic process, such as a Dask worker, may not start
+    children with `multiprocessing`.
     """
 
     def __init__(self, module: str) -> None:

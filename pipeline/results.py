@@ -71,13 +71,13 @@ class Record:
     ----------
     id : the experiment's id, used in every message.
     t : (n,) measured times in s; they increase strictly, but need not be evenly spaced.
-    u : (n,) input, or None if the file has no input. A positive input pushes cart 1 towards
-        positive x.
+    u : (n,) input; None if the file has no input. A positive input pushes cart 1 towards positive
+        x.
     y : (len(carts), n) positions. Row j belongs to cart `carts[j]`.
     carts : the carts that were measured.
     free : the carts free to move. The others are held.
-    reference : (n,) set point of a closed-loop run, in position units, or None.
-    omega : frequency of a sine dwell, rad/s, or None.
+    reference : (n,) set point of a closed-loop run, in position units; otherwise None.
+    omega : frequency of a sine dwell in rad/s; otherwise None.
     resolution : (len(carts),) encoder step in position units; 0 if no step is visible.
     hold : how the input behaves between samples.
     source : path of the data file inside the submission.
@@ -330,12 +330,12 @@ class ChainFit:
     chain : the fitted plant.
     names : physical parameters that have a standard error, such as "m_1", "c_1", "k_2".
     covariance : (n_p, n_p) covariance of these parameters.
-    at_bound : physical parameters that the fitted data cannot distinguish from zero, their bound.
-        They are held at zero or, where possible, taken from the decays.
+    at_bound : physical parameters whose fitted values cannot be distinguished from zero, their
+        bound. They are held at zero or, where possible, taken from the decays.
     parameters : the named parameters of the chain with standard errors, in table order. A parameter
         that ended at its bound has a true `Estimate.at_bound`, and no table shows it.
     staged : the named parameters from the stage-by-stage fit (last cart first), for the report.
-    misfit : for a "bode_fit", how far the magnitude points are from the fit beyond their standard
+    misfit : for a "bode_fit", deviation of the magnitude points from the fit beyond their standard
         errors, as a share of the magnitude.
     standardised : residuals divided by their standard errors: one array (n_w,) per cart, or (n,)
         per record.
@@ -551,7 +551,7 @@ class MeasuredInput:
 
 @result(eq=False)
 class HardwareCheck:
-    """Model against measurement for one cart of one run, as Figures 15-17.
+    """Model against measurement for one cart of one run, as in Figures 15-17.
 
     Attributes
     ----------
@@ -665,10 +665,10 @@ class Assumption:
 
 @dataclass(frozen=True, kw_only=True)
 class LateChannel:
-    """A cart whose position is read later than another cart's, in the experiments of one kind.
+    """The delay between the readings of two carts, in the experiments of one kind.
 
-    `delay` is in s, negative if this cart is read earlier; `limit` is the largest allowed delay.
-    `than` is the other cart.
+    `cart` is read `delay` (s) later than the cart `than`, or earlier if the delay is negative.
+    `limit` is the largest allowed delay.
     """
 
     cart: int

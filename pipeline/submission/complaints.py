@@ -59,7 +59,7 @@ def _summary(value: dict | tuple | list) -> str:
 
 
 def nearest(name: object, candidates: Sequence[str]) -> str:
-    """Return "; did you mean …?", or all valid values if nothing is near and they are few."""
+    """Return "; did you mean …?" or, if no candidate is similar, the first few candidates."""
     close = get_close_matches(str(name)[:_LONGEST_QUOTE], candidates, n=1, cutoff=0.5)
     if close:
         return f"; did you mean {close[0]!r}?"
@@ -135,7 +135,7 @@ def dotted(location: Location, document: object) -> str:
 
 
 def explain(error: ErrorDetails, document: dict, *, root: type[BaseModel] = Submission) -> str:
-    """Return one pydantic error as `key: what was expected, what was found, what is near`.
+    """Return one pydantic error as `key: what was expected, what was found, what was meant`.
 
     `root` is the model of the format.
     """
@@ -179,7 +179,10 @@ def refusal(error: ErrorDetails) -> str:
 
 
 def relevant_errors(errors: Sequence[ErrorDetails]) -> list[ErrorDetails]:
-    """Return the errors, unknown keys first, without missing keys that are only misspelt."""
+    """Return the errors, unknown keys first.
+
+    A missing key is left out if an unknown key is likely the same key, misspelt.
+    """
     unknown = [error for error in errors if error["type"] == "extra_forbidden"]
 
     def is_misspelt(error: ErrorDetails) -> bool:

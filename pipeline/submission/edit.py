@@ -1,4 +1,4 @@
-"""Change `submission.toml` in place; the comments, order and digits of the rest are kept."""
+"""Change `submission.toml` in place; comments, order and all other digits are kept."""
 
 import hashlib
 import re
@@ -19,7 +19,7 @@ from pipeline.submission.toml_file import Value, read_text
 
 
 class Outdated(SubmissionError):
-    """The file has changed since the change was prepared; `text` is its present content."""
+    """The file was changed by others after an edit was prepared; `text` is its present content."""
 
     def __init__(self, text: str) -> None:
         super().__init__(

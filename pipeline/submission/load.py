@@ -52,7 +52,8 @@ def load_submission(path: Path) -> Submission:
 
     Raises
     ------
-    SubmissionError : each line has file, key, what was expected, what was found.
+    SubmissionError : the submission is invalid. Each line names the file and the key, and says what
+        was expected and found.
     """
     path = Path(path)
     toml = path if path.is_file() or path.suffix == ".toml" else path / NAME
@@ -201,7 +202,7 @@ def _plain(value: object, at: tuple[int | str, ...]) -> object:
 
 
 def _notes(folder: Path) -> str | None:
-    """Return the text of `notes.md` without comments, or None if no text is left."""
+    """Return the text of `notes.md`, shortened and without comments; None if nothing is left."""
     path, where = folder / "notes.md", f"{folder.resolve().name}/notes.md"
     if not path.exists() and not path.is_symlink():
         return None
@@ -245,7 +246,7 @@ def _problems(submission: Submission, folder: Path) -> Iterator[tuple[Location, 
 
 
 def _another_count(submission: Submission) -> Iterator[tuple[Location, str]]:
-    """Yield a problem if at least two other statements imply another number of carts."""
+    """Yield a problem if `carts` is contradicted by at least two statements that agree."""
     reported = submission.reported or Reported()
     controllers = {e.id: e.controller for e in submission.experiments}
     lengths = {
@@ -363,7 +364,7 @@ def stated_columns(document: Mapping[str, Any], file: str) -> dict[str, str | in
 
 
 def path_problem(folder: Path, name: str) -> str | None:
-    """Return why `name` cannot be a file inside `folder`, or None; the file need not exist."""
+    """Return why `name` cannot be a file inside `folder`; None if it can, even if it is missing."""
     shown = quote(name)
     if not name.strip() or not name.isprintable():
         hidden = "it contains an invisible character: rename the file"
@@ -381,7 +382,7 @@ def path_problem(folder: Path, name: str) -> str | None:
 
 
 def _typed(name: str) -> bool:
-    """Whether all invisible characters in a name may come from a backslash in quotes."""
+    """Whether all invisible characters of a name may be escapes, typed as a backslash in quotes."""
     return all(c.isprintable() or unicodedata.category(c) == "Cc" for c in name)
 
 
@@ -394,7 +395,7 @@ def _may_be_link(path: Path) -> bool:
 
 
 def file_problem(folder: Path, name: str, *, taken: Collection[str] = ()) -> str | None:
-    """Return why `name` is not a readable regular file inside `folder`, or None if it is one.
+    """Return why `name` is not a readable regular file inside `folder`; None if it is one.
 
     The files in `taken` belong to other entries, so messages do not suggest them.
     """

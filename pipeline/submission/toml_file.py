@@ -111,8 +111,8 @@ def parse_toml(
 
     Raises
     ------
-    PipelineError : of class `error`. Each mistake has a line with its line number or key, and with
-        what to write instead.
+    PipelineError : of class `error`. Each line of the message names the place of a mistake, and
+        says what to write instead.
     """
     read = read_toml(text, as_typed=as_typed, root=root)
     if read.slips:
@@ -121,7 +121,7 @@ def parse_toml(
 
 
 def at_line(where: str, line: int, what: str) -> str:
-    """Return a fault with its place in a file: a line, or for line 0 the whole file."""
+    """Return a fault with its place: a line of the file, or the whole file if `line` is 0."""
     return f"{where} line {line}: {what}" if line else f"{where}: {what}"
 
 
@@ -207,7 +207,7 @@ def check_number(value: float | Decimal, at: Location) -> None:
 
 
 def _decimal(text: str) -> Decimal:
-    """Return a number as typed; a number with a huge exponent becomes one that is refused."""
+    """Return a number as typed; if its exponent is too large, one that `check_number` refuses."""
     try:
         return Decimal(text)
     except InvalidOperation:

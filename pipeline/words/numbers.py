@@ -35,7 +35,7 @@ def significant(value: float | None, *, digits: int = 4, power: bool = False) ->
 
 
 def with_errors(column: Sequence[tuple[float, float | None]]) -> list[str]:
-    """Return "value ± std" for each pair; if one needs a power of ten, all have one."""
+    """Return "value ± std" for each pair; if one text needs a power of ten, all have one."""
     texts = [with_error(value, std) for value, std in column]
     if not any(_TIMES in text for text in texts):
         return texts
@@ -119,7 +119,7 @@ def abridge(ids: Sequence[str], *, most: int = 4) -> str:
 
 
 def by_note(notes: Iterable[tuple[str, str]]) -> list[str]:
-    """Return one sentence per note, beginning with the names of all items that have the note."""
+    """Return a sentence for each different note, beginning with the names of its items."""
     about: dict[str, list[str]] = {}
     for name, note in notes:
         if note:

@@ -90,7 +90,7 @@ def _spans(template: str, values: Mapping[str, str | Spans]) -> Iterator[Span]:
 
 
 def _filled(text: str, like: Span, values: Mapping[str, str | Spans]) -> Iterator[Span]:
-    """Yield a text with its values, in the style of `like`; values with marks keep their own."""
+    """Yield a text with its values, in the style of `like`; values with marks keep theirs."""
     said = ""
     for i, part in enumerate(_VALUE.split(text)):
         value = values[part] if i % 2 else part

@@ -118,7 +118,7 @@ def check_comparable(before: Draft, *, bench: Bench) -> None:
 
     Raises
     ------
-    ConfigError : the earlier draft has another number of carts or other units.
+    ConfigError : the numbers of carts or the units of the two drafts differ.
     """
     then, units = before["submission"], Units(**before["submission"]["units"])
     if (then["carts"], units) != (bench.n, bench.units):
@@ -227,7 +227,10 @@ def _number_row(change: Change) -> list[Cell]:
 
 
 def _moved(change: Change, *, between: str = " (") -> str:
-    """Return a change as text, such as "+2.0 % (1.4 σ)"; `between` replaces " ("."""
+    """Return a change as text, such as "+2.0 % (1.4 σ)".
+
+    If `between` is given, it separates the two numbers instead of the brackets.
+    """
     text = percent(change.percent, signed=True)
     if change.sigmas is None:
         return text

@@ -78,8 +78,8 @@ def render_report(
 ) -> None:
     """Write `report.html`, `figures/*.svg` and the other requested files into the folder `out`.
 
-    The same analysis gives the same bytes. Both the report and `progress` name the characters that
-    the PDF's fonts lack. `progress` also receives the name of each section.
+    The same analysis gives the same bytes. If the PDF's fonts lack some characters, the report and
+    `progress` name them. `progress` also receives the name of each section.
     """
     if files.pdf and (lost := missing_characters(_students_text(analysis))):
         warning = f"report.pdf: its fonts lack {lost}; report.html shows them"

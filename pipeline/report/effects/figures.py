@@ -95,9 +95,9 @@ def _difference(run: _Run, cart: int) -> float:
 
 
 def _runs(term: EffectTerm, chain: Chain, *, cart: int) -> list[_Run]:
-    """Return a run in which the input is switched on and off and, if useful, a decay.
+    """Return a run in which the input is switched on and off, and a decay of one cart.
 
-    The decay of a single cart is added unless the effect is in the drive.
+    The decay is left out for an effect on the input.
     """
     t = np.arange(0.0, _DURATION, 1 / _RATE)
     # Slightly less than the input that holds a cart at the end of its travel.

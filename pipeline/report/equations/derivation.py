@@ -4,8 +4,8 @@ All equations are text that `algebra` shows and computes. The tests check each o
 impedance matrix with a computer algebra system.
 
 Delta(s) is the monic characteristic polynomial of the whole chain. N(s) is the characteristic
-polynomial of carts 2 to n while cart 1 is held. R(s) is that of carts 3 to n while carts 1 and 2
-are held. P_i(s) is that of cart i while all other carts are held. The paper's common denominator is
+polynomial of carts 2 to n while cart 1 is held. R(s) belongs to carts 3 to n while carts 1 and 2
+are held, and P_i(s) to cart i while all other carts are held. The paper's common denominator is
 Delta(s) divided by its constant term. With three carts, the paper's numerator of cart 1 is N(s)
 divided by its constant term. Coefficients are d_0, d_1, … for Delta, n_0, … for N, and r_0, … for
 R.
@@ -116,7 +116,7 @@ def tail(i: int, n: int) -> str:
 def elimination(n: int) -> list[Equation]:
     """Return the steps that eliminate the carts, from the last to the first.
 
-    Each step expresses the position of a cart by that of the cart before it.
+    Each step expresses the position of a cart by the position of the previous cart.
     """
     equations = []
     for i in range(n, 1, -1):

@@ -57,10 +57,10 @@ def augmented_equations(springs: Sequence[bool], terms: Sequence[EffectTerm]) ->
 
 
 def law(terms: Sequence[EffectTerm], index: int) -> Formula:
-    """Return the law of one effect, with its letter in the equations of motion.
+    """Return the law of one effect, marked with the effect's letter.
 
-    An effect on the input starts from the output of the previous effect on the input. A force that
-    depends on the input uses the input after all these effects.
+    Effects on the input form a sequence: each one changes the output of the previous one. A force
+    that depends on the input uses the last output.
     """
     term, letter = terms[index], _letters(terms)[index]
     effect, parts = term.effect, term.effect.formula.parts
@@ -90,7 +90,7 @@ def law(terms: Sequence[EffectTerm], index: int) -> Formula:
 
 
 def _across(terms: Sequence[EffectTerm], index: int) -> list[Term]:
-    """Return the force across the play, and Newton's law of the motor."""
+    """Return the contact force between motor and cart 1, and Newton's law of the motor."""
     letters = _letters(terms)
     force = sub("f", letters[index])
     motor: list[Term] = [_arriving(terms), "−", force]
@@ -107,19 +107,19 @@ def _letters(terms: Sequence[EffectTerm]) -> dict[int, str]:
 
 
 def _arriving(terms: Sequence[EffectTerm], *, before: EffectTerm | None = None) -> Term:
-    """Return the symbol of the input after all effects on it, or just before one of them."""
+    """Return the symbol of the input after all effects on it, or only those before `before`."""
     steps = input_steps(terms)
     done = steps if before is None else steps[: steps.index(before)]
     return sub("u", _letters(terms)[terms.index(done[-1])]) if done else "u"
 
 
 def _play(terms: Sequence[EffectTerm]) -> int | None:
-    """Return the index of the effect that is a play between motor and cart 1, or None."""
+    """Return the index of the play between motor and cart 1; None if there is no play."""
     return next((i for i, term in enumerate(terms) if term.effect.has_play), None)
 
 
 def _on_motor(term: EffectTerm) -> bool:
-    """Return whether the force acts on the motor when there is play between motor and cart 1."""
+    """Return whether the force acts on the motor, rather than on cart 1, if there is play."""
     return isinstance(term.effect.law, ForceLaw) and term.effect.law.on_motor
 
 

@@ -129,7 +129,7 @@ def _side_by_side(terms: Sequence[Math]) -> Math:
 
 
 def symbolic_transfer_functions(springs: Sequence[bool]) -> Formula | None:
-    """Return X_i/U as in the paper, or None if the parameters have no names.
+    """Return X_i/U as in the paper; None if the parameters have no names.
 
     Parameters have names if the chain has one to three carts and is tied to a wall by a spring.
     """

@@ -46,14 +46,14 @@ class Turn:
     recorded : ids of the recordings made in this turn.
     errors : relative standard error of each parameter, by name; None if unknown.
     verdict : verdict of the gap analysis; "" if the analysis was not possible.
-    explanations : the competing explanations, the one in the model first; if nothing competes, only
-        the named explanation; empty if the linear chain is enough.
+    explanations : the competing explanations, the one in the model first. If none compete, only the
+        named explanation; empty if the linear chain is enough.
     left : the model's error as a share of the motion; None if unknown.
     floor : the noise floor as a share of the motion; None if unknown.
     reached : whether all requested parameters are known and the gap is named or absent.
-    said : results, doubts and the reason for the next recording, as sentences.
-    gap : the gap analysis of this turn, or None. For an earlier turn, it keeps only the trace that
-        the diary shows.
+    summary : results, doubts and the reason for the next recording, as sentences.
+    gap : the gap analysis of this turn; None if it was not possible. For an earlier turn, it keeps
+        only the trace that the diary shows.
     """
 
     seconds: float

@@ -1,4 +1,4 @@
-"""The colours and line styles of figures and pages, readable without matplotlib."""
+"""The colours and line styles of figures and pages; importing them does not load matplotlib."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Figures of the gap: motion before and after, errors run by run, and force over its cause."""
+"""Figures of the gap: motion, errors of each run, and force against its cause."""
 
 from collections.abc import Sequence
 
@@ -42,7 +42,7 @@ def before_after_figure(
     added: str = ADDED,
     touched: Sequence[tuple[Array, Array]] = (),
 ) -> Figure:
-    """Return one cart in one run: measured and both models above, the residuals below.
+    """Return a figure of one cart in one run: measurement and models above, residuals below.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def predicted_figure(
 
 
 def by_record_figure(rows: Sequence[RecordGap], *, added: str = ADDED) -> Figure:
-    """Return a figure of the error before and after in every run, cart by cart, next to the noise.
+    """Return a figure of each run's and cart's error, without and with effects, and the noise.
 
     Parameters
     ----------
@@ -116,7 +116,10 @@ def by_record_figure(rows: Sequence[RecordGap], *, added: str = ADDED) -> Figure
 
 
 def plot_by_record(ax: Axes, rows: Sequence[RecordGap], *, added: str = ADDED) -> None:
-    """Plot a bar from the error before to the error after for each run and cart, and the noise."""
+    """Plot, for each run and cart, a bar between the errors without and with effects.
+
+    The noise is plotted as well.
+    """
     y = -np.arange(len(rows), dtype=float)
     before, after, noise = (
         100 * np.array([getattr(row, name) for row in rows])

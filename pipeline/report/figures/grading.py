@@ -37,7 +37,7 @@ def distribution_figure(points: Sequence[float], *, out_of: float) -> Figure:
 
 
 def two_distributions_figure(before: Sequence[int], after: Sequence[int]) -> Figure:
-    """Return histograms of points, under the current rubric and under another one.
+    """Return histograms of points under the current rubric and under a changed one.
 
     Parameters
     ----------

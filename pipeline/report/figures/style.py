@@ -1,7 +1,7 @@
 """The style of all figures.
 
 Measured data are dark points, and single values are diamonds. Models are blue lines. So figures are
-clear in grey and to colour-blind readers. Text stays text that can be searched and selected.
+clear in greyscale and for colour-blind readers. Text can be searched and selected.
 """
 
 import warnings

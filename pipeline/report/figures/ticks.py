@@ -1,4 +1,4 @@
-"""Draw ticks as one grid line and a few texts for each axis.
+"""Draw the ticks of each axis as a single line for the whole grid and a few texts.
 
 matplotlib makes seven objects for every tick, which takes half the time of drawing a figure.
 """

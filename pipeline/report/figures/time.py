@@ -145,7 +145,7 @@ def plot_step(ax: Axes, gains: Sequence[StepGain], *, record: Record) -> None:
 def _plot_cart_points(ax: Axes, t: Array, y: Array, *, cart: int) -> None:
     """Plot a cart's measured points in a panel that it shares with other carts.
 
-    Some points have the cart's marker.
+    A few of them have the cart's marker, to distinguish the carts.
     """
     style, name = (cart - 1) % len(CARTS), f"x{subscript(cart)}"
     colour, _, mark, _ = CARTS[style]
@@ -243,7 +243,7 @@ def plot_effort(ax: Axes, record: Record, *, model: Array | None) -> None:
 
 
 def plot_hardware(ax: Axes, checks: Sequence[HardwareCheck]) -> None:
-    """Plot the measurement, the simulated closed loop, and the model on the measured input."""
+    """Plot the measurement, and one or two models with which it is compared."""
     plot_measured(ax, checks[0].t, checks[0].measured)
     for check, plot in zip(checks, (plot_model, plot_second), strict=False):
         plot(ax, check.t, check.model, label=_LOOPS[check.loop])

@@ -1,4 +1,4 @@
-"""Read the gap analysis that is stored beside the data of a report."""
+"""Read the gap analysis that is stored next to the data of a report."""
 
 from dataclasses import replace
 from pathlib import Path

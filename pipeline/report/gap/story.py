@@ -225,7 +225,7 @@ def _step(gap: Gap, found: FoundEffect) -> Spans:
 def _evidence(
     page: Page, gap: Gap, found: FoundEffect, *, forces: Sequence[ResidualForce], number: int
 ) -> list[Block]:
-    """Return the figure that shows an effect: force over its cause, timing, or spectrum."""
+    """Return the figure that shows an effect: force against its cause, timing, or spectrum."""
     axis, added = found.effect.axis, added_name(gap)
     if axis == "frequency":
         held_out = [trace for trace in gap.traces if trace.held_out]
@@ -436,9 +436,10 @@ def _method(gap: Gap) -> list[Block]:
 
 
 def deciding_trace(gap: Gap, recorded: Collection[str]) -> Trace | None:
-    """Return the trace of the new runs that the linear model describes worst.
+    """Return the trace that the linear model describes worst, from the `recorded` runs.
 
-    If there are no new runs, all runs are considered. Returns None if there are no traces.
+    If the gap has no traces of these runs, all traces are considered. Returns None if it has no
+    traces at all.
     """
 
     def size(trace: Trace) -> float:
@@ -450,7 +451,10 @@ def deciding_trace(gap: Gap, recorded: Collection[str]) -> Trace | None:
 
 
 def _worst_first(gap: Gap) -> list[Trace]:
-    """Return one trace of each held-out run; the linear model's largest error comes first."""
+    """Return the worst trace of each held-out run; the worst of all comes first.
+
+    The worst trace is the one with the linear model's largest error.
+    """
 
     def size(trace: Trace) -> float:
         row = _row(gap, trace)

@@ -29,7 +29,7 @@ def error_table(page: Page, gap: Gap) -> Table:
 
 
 def window_table(page: Page, windows: Sequence[GapWindow], *, model: str) -> Table:
-    """Return the stretches of time in which a model is wrong most.
+    """Return the stretches of time in which a model's error is largest.
 
     Parameters
     ----------

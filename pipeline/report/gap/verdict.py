@@ -238,9 +238,9 @@ def contenders(gap: Gap) -> tuple[FoundEffect, Rival | None]:
 
 
 def kept_together(effects: Sequence[FoundEffect]) -> list[tuple[FoundEffect, ...]]:
-    """Return the effects in their order, in groups such that each group lowers the held-out error.
+    """Return the effects in groups, each of which lowers the held-out error; the order is kept.
 
-    A group has several effects only if the first of them do not lower the error without the others.
+    A group has several effects if they lower the error only together.
     """
     groups: list[tuple[FoundEffect, ...]] = []
     group: tuple[FoundEffect, ...] = ()
@@ -297,6 +297,6 @@ def phase(what: str) -> str:
 
 
 def share(value: float) -> str:
-    """Return a share of the motion in percent, with the digits that matter."""
+    """Return a share of the motion in percent, with two digits, or three from 10 % on."""
     digits = 3 if value >= 0.0995 else 2
     return f"{significant(100 * value, digits=digits)} %"

@@ -61,7 +61,7 @@ def pack_run(run: ComparedRun) -> dict[str, Any]:
 
 
 def keep_extremes(signals: Sequence[Array]) -> NDArray[np.intp]:
-    """Return the samples (k,) of signals (n,) that show the ends and extremes of every stretch."""
+    """Return the indices (k,) of the samples at the ends and extremes of every stretch."""
     bounds = np.linspace(0, signals[0].size, _STRETCHES + 1).astype(int)
     kept = [bounds[:-1], bounds[1:] - 1]
     for signal in signals:

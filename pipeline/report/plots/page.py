@@ -111,7 +111,7 @@ def _write_address(run: str, cart: int, model: str) -> str:
 
 
 def _find_worst(runs: Sequence[ComparedRun]) -> tuple[str, int, float] | None:
-    """Return the run and cart that the linear model describes worst, and the error there."""
+    """Return the run and cart that the linear model describes worst, and the model's error."""
     found = [
         (clean(run.id), cart.cart, one.nrmse)
         for run in runs

@@ -34,8 +34,8 @@ class Simulated:
     Attributes
     ----------
     y : readings (n,), NaN where nothing is simulated.
-    nrmse : root mean square of measured minus simulated position, divided by that of measured minus
-        rest position, over the simulated samples.
+    nrmse : rms of measured minus simulated position, divided by the rms of measured minus rest
+        position, over the simulated samples.
     """
 
     model: ModelName
@@ -45,7 +45,7 @@ class Simulated:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ComparedCart:
-    """One cart of a run: measured (n,), and simulated by each model."""
+    """One cart of a run: its measured positions (n,), and its simulation by each model."""
 
     cart: int
     measured: Array
@@ -130,9 +130,9 @@ def _compare(record: Record, analysis: Analysis, gap: Gap | None) -> ComparedRun
 def _driven(
     record: Record, analysis: Analysis, chain: Chain, gap: Gap | None
 ) -> tuple[dict[int, list[Simulated]], str]:
-    """Return the simulations of each cart: on the measured input, and in the loop if one ran.
+    """Return the simulations of each cart, and a note for the reader of the plot.
 
-    The text is a note for the reader of the plot.
+    Models are driven by the measured input. If a loop ran, it is simulated as well.
     """
     checks = [check for check in analysis.hardware if check.experiment == record.id]
     checks = checks or list(check_hardware(record, chain))
@@ -214,7 +214,7 @@ def _released(
 
 
 def _motion_alone(run: GapRun) -> Record:
-    """Return the record of a run from the run's first sample on."""
+    """Return the record without the samples before the run."""
     record, n = run.record, run.t.size
     return replace(
         record,

@@ -166,7 +166,7 @@ def _heads(table: Table) -> list[str]:
 
 
 def _board(board: Tiles) -> str:
-    """Return the style of a board: length of its longest value, and tiles in a row."""
+    """Return the style of a board: the length of its longest value, and the tiles per row."""
     return f"--least:{board.longest}ch;--across:{board.across}"
 
 

@@ -36,8 +36,8 @@ class End:
     ----------
     page : number of the page on which the block ends.
     y : distance from the top of the page, in points.
-    picture, table : number of the figure or table, or 0. A table has a second `End` for its
-        caption.
+    picture, table : number of the figure or table, 0 for any other block. A table has a second
+        `End` for its caption.
     share : scale of a figure, 1 by default.
     height : height of a figure, in points.
     """
@@ -70,7 +70,10 @@ class Pages:
         return max((end.page for end in self.ends), default=0)
 
     def white_under(self, page: int) -> float:
-        """Return the share of a page that is empty at the bottom; 0 for the last page."""
+        """Return the share of a page that is empty at the bottom.
+
+        It counts as 0 for the last page, and where a table continues on the next page.
+        """
         lowest = max((end.y for end in self.ends if end.page == page), default=self.bottom)
         if page >= self.count or page in self.broken.values():
             return 0.0
@@ -86,7 +89,7 @@ class Pages:
     def white(self, last: int) -> float:
         """Return a penalty for white space on pages 1 to `last`.
 
-        One half-empty page is worse than two.
+        It is quadratic: one page with much white space counts more than two with half as much.
         """
         pages = range(1, last + 1)
         return sum(max(self.white_under(page) - _WHITE, 0.0) ** 2 for page in pages)

@@ -173,7 +173,7 @@ def _nothing_left(analysis: Analysis) -> Spans:
 
 
 def set_up_in_doubt(analysis: Analysis) -> tuple[bool, Spans] | None:
-    """Return the problems that make every number wrong, as one finding, or None.
+    """Return the problems that make every number wrong, as one finding, None without problems.
 
     The summary shows this finding first.
     """

@@ -274,7 +274,7 @@ def split_notes(
 def placed(
     sections: Sequence[Section], asked: Sequence[Asked], answers: Mapping[str, tuple[Block, ...]]
 ) -> tuple[Section, ...]:
-    """Return the sections with each question at the end of its own section.
+    """Return the sections with each question at the end of the section that it is about.
 
     If the report lacks that section, the question is placed in the discussion.
     """
@@ -329,7 +329,7 @@ def open_questions(
 
 
 def open_line(analysis: Analysis) -> str:
-    """Return a line for the terminal on questions that are still open, or ""."""
+    """Return a line for the terminal on questions that are still open; "" if none are."""
     asked = ask(analysis)
     answers, _ = split_notes(discussion_blocks(analysis.discussion or ""), asked)
     missing = [question.id for question in asked if question.id not in answers]

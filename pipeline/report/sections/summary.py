@@ -38,7 +38,7 @@ _MOST_TOLD = 3  # most findings of one kind; a summary is short
 
 
 def summary(page: Page) -> list[Block]:
-    """Return what was identified, what agrees or not, what is missing, and what to do next.
+    """Return what was identified, what agrees, what does not, what is missing, and what to do next.
 
     Results are shown on boards of tiles. Problems are also described in sentences. One picture
     shows all carts.
@@ -71,7 +71,7 @@ def terminal_summary(analysis: Analysis) -> str:
 
 
 def _findings(analysis: Analysis) -> list[tuple[bool, Spans]]:
-    """Return the findings: for each, whether it is good, and a sentence."""
+    """Return the findings; each is a sentence, with whether it is good news."""
     found = (
         set_up_in_doubt,
         _assumed,
@@ -157,12 +157,15 @@ def _numbers_board(analysis: Analysis, *, error: str = "statistical") -> tuple[T
 
 
 def _is_explained(analysis: Analysis) -> bool:
-    """Return whether the standard errors are valid, because the fit leaves only noise."""
+    """Return whether the standard errors are valid, because the residual is only noise."""
     return analysis.fit is not None and analysis.fit.explains_data
 
 
 def _number_tile(name: str, final: Estimate, *, unit: str, is_sure: bool, error: str) -> Tile:
-    """Return a tile for a number; an error below the accuracy of a calibration is only a note."""
+    """Return a tile for a number, with its standard error.
+
+    An error below the accuracy of a calibration is stated in a note instead.
+    """
     share = (final.std or 0.0) / abs(final.value) if final.value else 1.0
     if not is_sure:
         # The true error is unknown, so the value has only three digits.

@@ -85,7 +85,7 @@ class Solution:
 
 
 def default_rubric(analysis: Analysis) -> Rubric:
-    """Return the shipped rubric for this number of carts, or one with the checks' limits."""
+    """Return the shipped rubric for this number of carts; if none, one with the default limits."""
     if shipped := shipped_rubric(analysis.bench.n):
         return shipped
     checks = (
