@@ -230,7 +230,7 @@ def _forces(
     yield from force
     yield "    return f\n"
     yield f"\n@inlined\ndef {name}_slopes({arguments}):"
-    yield f'    """Return the derivatives of `{name}_force` by position and velocity."""'
+    yield f'    """Return the derivatives of `{name}_force` with respect to position and velocity."""'
     yield "    by_x = by_v = 0.0"
     yield from slopes
     yield "    return by_x, by_v\n"
@@ -274,7 +274,7 @@ def _friction(catalogue: Iterable[Effect]) -> Iterator[str]:
     yield from dropping
     yield "    return size\n"
     yield "\n@inlined\ndef drop_slope(cart, i, v, u):"
-    yield '    """Return the derivative of `dropping` by the velocity."""\n    slope = 0.0'
+    yield '    """Return the derivative of `dropping`, d/dv."""\n    slope = 0.0'
     yield from slope
     yield "    return slope\n"
 
@@ -303,13 +303,13 @@ def settling(effect: Effect) -> tuple[Expr, Expr, Expr]:
 def _hysteresis(catalogue: Iterable[Effect]) -> Iterator[str]:
     mine = [effect for effect in catalogue if isinstance(effect.law, HysteresisLaw)]
     yield "\n@inlined\ndef settling(cart, i, v):"
-    yield '    """Return the largest force of hysteresis; limit and rate (1/s) of its state."""'
+    yield '    """Return the largest force of hysteresis, and limit and rate (1/s) of its state."""'
     for effect in mine:
         values = ", ".join(code(in_table(one, effect)) for one in settling(effect))
         yield f"    if {_gate(effect)}:\n        return {values}"
     yield "    return 0.0, 0.0, 0.0\n"
     yield "\n@inlined\ndef settling_slopes(cart, i, v):"
-    yield '    """Return the derivatives, by velocity, of the limit and rate of the state."""'
+    yield '    """Return the derivatives d/dv of the limit and rate of the state."""'
     for effect in mine:
         slopes = (derivative(one, v) for one in settling(effect)[1:])
         values = ", ".join(code(in_table(one, effect)) for one in slopes)
@@ -336,7 +336,7 @@ def _contacts(catalogue: Iterable[Effect]) -> Iterator[str]:
     yield from stops
     yield "    return 0.0, 0.0, 0.0\n"
     yield "\n@inlined\ndef slack_of(spring, j):"
-    yield '    """Return extra stiffness of spring j, where it begins, and its derivative by k."""'
+    yield '    """Return extra stiffness of spring j, where it begins, and its d/dk."""'
     yield from slacks
     yield "    return 0.0, 0.0, 0.0\n"
 
@@ -407,8 +407,8 @@ def _followed(catalogue: Sequence[Effect]) -> Iterator[str]:
     yield f"TERMS = {max(5 + 3 * size if bristle else 4 + size for bristle, size in sizes)}\n"
     yield "\n@jit\ndef terms(kind, p, o, x, v, k, u, on, out):"
     yield '    """Fill `out` with the law of a kind and derivatives; coordinates start at p[o].\n'
-    yield "    The derivatives are by position, velocity and input, then by each coordinate."
-    yield "    `x` and `v` are of a cart or a spring's stretch; `k` is the spring's stiffness."
+    yield "    The derivatives are d/dx, d/dv and d/du, then d/d(coordinate) for each coordinate."
+    yield "    `x` and `v` belong to a cart or a spring's stretch; `k` is the spring's stiffness."
     yield '    """'
     branch = "if"
     for effect in catalogue:

@@ -186,9 +186,9 @@ def _frozen(
 ) -> Iterator[RecordingFault]:
     """Yield a fault for each reading that is constant for a while although the carts moved it far.
 
-    The reading is constant for ten samples or more, while the identified carts move by at least a
-    fifth of their motion and the force on the cart exceeds any friction. Before and after that, the
-    reading follows the carts.
+    The reading is constant for ten samples or more. Meanwhile the identified cart moves by at least
+    a fifth of the recorded range, and the force on it exceeds any friction. At other times the
+    reading follows the identified cart.
     """
     for cart, missed in fit.missed.items():
         y = record.position(cart)
@@ -224,7 +224,10 @@ def _span(record: Record, part: slice) -> dict[str, str]:
 
 
 def _must_move(record: Record, chain: Chain, still: slice, *, cart: int, step: float) -> bool:
-    """Whether the input moves a cart far meanwhile, both from rest and in steady state."""
+    """Whether the cart moves far in a simulation while its reading stands `still`.
+
+    In a dwell, it must also move far in steady state.
+    """
     assert record.u is not None
     free = tuple(sorted(record.free))
     y = simulate_linear(chain, record.t, record.u, free=free, hold=record.hold)[free.index(cart)]
@@ -259,9 +262,9 @@ def _short_dwell(record: Record) -> Iterator[RecordingFault]:
 
 
 def _wrong_clock(record: Record, *, usual: float) -> Iterator[RecordingFault]:
-    """Yield a fault if the time column of a record is in another unit than usual.
+    """Yield a fault if the time column of a record is in an unusual unit.
 
-    That is so if its sample interval, in another unit of time, is the usual one.
+    That is so if its sample interval, converted from this unit, is the usual one.
     """
     for factor, words in TIME_FACTORS.items():
         # A factor of 100 or more is another unit of time; a factor of 2 may be another setting.
@@ -283,7 +286,7 @@ def _misread(record: Record, misread: Misread, everywhere: bool) -> RecordingFau
 def _strays(
     records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, Followed]
 ) -> Iterator[RecordingFault]:
-    """Yield the records that follow neither the carts of most records nor similar ones.
+    """Yield the records that follow neither the chain nor a slightly slower or faster one.
 
     It is enough if one cart follows, because another one may be near its null and hardly move. A
     cart that moves less than it should proves nothing, because friction may hold it.

@@ -14,12 +14,12 @@ from pipeline.soundness.fault import SAME, WITNESSES, RecordingFault
 def find_other_units(
     records: Sequence[Record], *, decays: bool = False
 ) -> dict[str, RecordingFault]:
-    """Find the records whose encoder step is the usual one in another unit, by id.
+    """Find, by id, the records whose encoder step is the usual one converted to another unit.
 
     The usual step is that of most kinds of experiment, not of most records. A dozen dwells may have
     been exported together, and so may all be wrong. Steps of 0.01 and 0.001 differ only in the
-    number of decimals. For a decay, any unit of length will do; so decays are searched separately,
-    with `decays`.
+    number of decimals. The unit of a decay does not matter, so decays are searched only if
+    `decays` is true, and then nothing else.
     """
     found: dict[str, RecordingFault] = {}
     for cart in sorted({cart for record in records for cart in record.carts}):

@@ -71,7 +71,7 @@ def _shows(link: ChannelDelay, *, sample: float) -> bool:
 
 
 def late_fault(late: LateChannel) -> RecordingFault:
-    """Return the delay of a cart's channel, as a fault of the first of its recordings."""
+    """Return the delay of a cart's channel as a fault of the first recording that shows it."""
     when = "later" if late.delay > 0 else "earlier"
     details = {"delay": f"{1e3 * abs(late.delay):.3g}", "when": when, "than": str(late.than)}
     return RecordingFault(

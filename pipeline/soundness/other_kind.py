@@ -1,4 +1,4 @@
-"""Find recordings of another experiment: another kind of input, a truncated file or a copy."""
+"""Find recordings that are not what they should be: a wrong input, a truncated file or a copy."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -47,10 +47,10 @@ def _is_sine(t: Array, u: Array) -> bool:
 
 
 def _cut(record: Record, records: Sequence[Record]) -> Iterator[RecordingFault]:
-    """Yield a fault if a file looks truncated: most repeats are equally long, over twice as long.
+    """Yield a fault if most similar records have one length, and this one less than half of it.
 
-    Recordings that a person stops by hand differ in duration, so they are not compared. If the
-    clock is in another unit, the repeat is longer without having more samples.
+    Recordings that a person stops by hand differ in duration, so they are not compared. A
+    truncated file must also have fewer samples; otherwise its clock may just be in another unit.
     """
     if record.kind not in ("decay", "step"):
         return

@@ -67,7 +67,10 @@ def find_other_readings(
 def without_lone_factors(
     found: Mapping[str, Misread], records: Sequence[Record], *, fits: Mapping[str, Followed]
 ) -> dict[str, Misread]:
-    """Return the corrections, without the factors that only some records of a kind need.
+    """Return the corrections without unconfirmed factors on the unit or the clock.
+
+    Several records of a kind must share a factor, and none may contradict it. A clock factor may
+    instead be confirmed by the sample interval.
 
     Parameters
     ----------
@@ -105,7 +108,7 @@ def _may_be_a_limit(
 ) -> bool:
     """Whether these records may be due to an amplifier at its limit.
 
-    Their inputs must have one size, because only then does a limit give the same factor. And no
+    Their inputs must be equally large, because only then does a limit give the same factor. And no
     record with such a large input may follow the chain.
     """
     sizes = [_size(record) for record in sharing]
@@ -119,7 +122,7 @@ def _size(record: Record) -> float:
 
 
 def _is_sampled_so(record: Record, records: Sequence[Record], *, factor: float) -> bool:
-    """Whether a record's sample interval is this many times that of the others."""
+    """Whether a record's sample interval is `factor` times the usual one."""
     others = [other.sample_time for other in records if other is not record]
     usual = factor * float(np.median(others)) if others else 0.0
     return abs(record.sample_time - usual) <= SAME * usual

@@ -166,7 +166,7 @@ def _contradictions(readings: Sequence[_Reading]) -> NDArray[np.bool_]:
 
 
 def _only_by_size(readings: Sequence[_Reading]) -> bool:
-    """Whether readings contradict only between steps of different sizes, as with dry friction."""
+    """Whether only steps of different sizes contradict each other, as with dry friction."""
     size = np.array([reading.size for reading in readings])
     alike = np.abs(size[:, None] - size) <= SAME_SIZE * np.maximum(size[:, None], size)
     return not np.any(_contradictions(readings) & alike)

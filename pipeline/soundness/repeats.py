@@ -24,7 +24,7 @@ def find_outlier_repeats(records: Sequence[Record], *, unit: str) -> dict[str, R
 
     Repeats have the same kind, free and measured carts, and nearly the same input (in closed loop,
     the same set point). Decays are not compared, because a hand never releases a cart twice from
-    the same place. Fewer than half of the repeats can be flagged, and none of two. `unit` is the
+    the same place. Fewer than half of a group can be flagged, so none of two. `unit` is the
     unit of positions.
     """
     outliers: dict[str, RecordingFault] = {}

@@ -101,9 +101,9 @@ def find_other_scales(records: Sequence[Record], *, bench: Bench) -> list[Record
 
 
 def _reached(reaches: Iterable[tuple[Record, float]]) -> tuple[float, str]:
-    """Return the second largest reach of all kinds of experiment, and its record.
+    """Return the second largest reach among the kinds of experiment, and its record.
 
-    The largest one may be an accident, so two kinds must reach this far.
+    The largest one may be an accident. If there is only one kind, its reach is returned.
     """
     by_kind: dict[str, tuple[float, str]] = {}
     for record, reach in reaches:
@@ -112,7 +112,7 @@ def _reached(reaches: Iterable[tuple[Record, float]]) -> tuple[float, str]:
 
 
 def why_other_frequency(ratio: float) -> str:
-    """Return a likely reason why a dwell is stated at this multiple of its frequency, or ""."""
+    """Return why the stated frequency may be `ratio` times the true one; "" if unknown."""
     turns = {2 * np.pi: "frequency_in_radians", 1 / (2 * np.pi): "frequency_divided"}
     for factor, key in turns.items():
         if abs(ratio / factor - 1) < OTHER_DWELL:

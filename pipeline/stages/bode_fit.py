@@ -204,7 +204,7 @@ def _solve(P: Parametrisation, data: Points, theta: Array, scale: Scale) -> _Fit
 def _fit_from_starts(
     P: Parametrisation, data: Points, starts: Iterable[Chain]
 ) -> tuple[_Fitted, int]:
-    """Return the best fit and the number of starts, tried until one explains the data."""
+    """Try starts until one explains the data; return the best fit and the number of starts."""
     fits: list[_Fitted] = []
     failed: list[DataError] = []
     for start in starts:
@@ -382,7 +382,7 @@ def _covariance(
     """Return the covariance (n_p, n_p) of the physical parameters, and their names.
 
     A damping that is held at zero is included if the data give its standard error, because every
-    cart has some damping. Numbers that depend on it must not look more certain than it is. A far
+    cart has some damping. Numbers that depend on it must not look more certain than it is. A
     spring, however, may really be missing.
     """
     springs = tuple(name for name in P.zero if read_name(name).symbol == "k")

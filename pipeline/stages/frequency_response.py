@@ -41,7 +41,7 @@ _LOW_SHARE = 0.7
 
 
 def dwell_fault(point: SinePoint) -> str:
-    """Return why a dwell gives no point of a frequency response, or ""."""
+    """Return why a dwell gives no point of a frequency response; "" if it does."""
     if not point.input_amplitude > 0:
         return "a frequency response needs a sinusoidal input, found none"
     if not all(np.isfinite(x) and x > 0 for x in (point.omega, point.gain, point.gain_std)):
@@ -165,7 +165,7 @@ def response_from_records(records: Sequence[Record]) -> tuple[FrequencyResponse,
 
 
 def _grid(runs: Sequence[Record]) -> Array:
-    """Return harmonics of the (median) record length, thinned to a constant ratio."""
+    """Return harmonics of the median record length, thinned to a logarithmic spacing."""
     base = 2 * np.pi / float(np.median([run.t[-1] - run.t[0] for run in runs]))
     top = max(int(max(visible_band(run) for run in runs) / base), 2)
     # This gives some five lines within the half-power width 2ζω of a mode with ζ = 0.05.

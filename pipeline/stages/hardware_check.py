@@ -198,7 +198,7 @@ def _close(
 def _run_loop(
     run: MeasuredRun, law: Controller, *, reference: Array, drive: float, limit: float
 ) -> tuple[LoopRun | None, float]:
-    """Return the simulated run and its misfit; None and the largest misfit if it is unstable.
+    """Return the simulated run and its misfit; the run is None if it is unstable.
 
     The controller's sample time, delay and prediction are not logged. So the usual combinations are
     tried, and the one nearest to the measurement is returned.
@@ -222,7 +222,7 @@ def _run_loop(
 def _ways(
     run: MeasuredRun, law: Controller, *, drive: float
 ) -> list[tuple[Controller, float | None, int]]:
-    """Return controllers to try, with sample time (None for the log's) and delay in ticks."""
+    """Return controllers to try, each with its sample time (None: as logged) and delay in ticks."""
     ways: list[tuple[Controller, float | None, int]] = [(law, None, 1), (law, None, 0)]
     if isinstance(law, StateFeedback):
         # In units of the effort, masses, dampings and stiffnesses are divided by `drive`.
@@ -290,7 +290,7 @@ def _not_as_stated(run: MeasuredRun, closed: _Simulated, opened: _Simulated) -> 
 def _another_cart(
     run: MeasuredRun, controller: submission.Controller | None, cart: int | None
 ) -> str:
-    """Return a note that another cart than the stated one comes to rest at the reference."""
+    """Return a note if the cart that comes to rest at the reference is not the stated one."""
     reference = run.record.reference
     if not isinstance(controller, submission.StateFeedbackController) or reference is None:
         return ""
@@ -312,7 +312,7 @@ def _another_cart(
 
 
 def _plateau(u: Array | None) -> float:
-    """Return the largest input if the log stays at it for more than a sample, or else infinity."""
+    """Return the largest input if more than one sample reaches it, otherwise infinity."""
     if u is None:
         return np.inf
     size = np.abs(u)

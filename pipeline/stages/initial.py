@@ -11,9 +11,9 @@ from pipeline.results import Estimate, LogDecrement, StepGain
 def combine_repeats(
     values: Sequence[float], *, std: Sequence[float], source: str, experiments: Sequence[str] = ()
 ) -> Estimate:
-    """Combine repeats of one number to their mean.
+    """Combine repeats of one number into their mean.
 
-    Its standard error is that of the spread or of the single errors, whichever is larger.
+    Its standard error follows from their spread or from their errors, whichever gives more.
     """
     v = np.array(values, dtype=float)
     within = float(np.sqrt(np.sum(np.square(std))) / v.size)

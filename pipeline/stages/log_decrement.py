@@ -167,13 +167,13 @@ def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
 
 
 def _slope(weight: Array) -> Array:
-    """Return factors (n,) that turn values into the slope per step of their weighted line."""
+    """Return weights (n,) that give, from values, the slope per step of a fitted weighted line."""
     line = np.vander(np.arange(float(weight.size)), 2)
     return (np.linalg.pinv(line * weight[:, None]) * weight)[0]
 
 
 def _half_swing(n: int) -> Array:
-    """Return the map (n - 2, n) from turning points to half swings about the moving middle."""
+    """Return the matrix (n - 2, n) from turning points to amplitudes about a moving middle."""
     if n < 3:
         return np.empty((0, n))
     return 0.5 * np.eye(n - 2, n, 1) - 0.25 * (np.eye(n - 2, n) + np.eye(n - 2, n, 2))

@@ -22,7 +22,7 @@ _ITERATIONS = 20
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Part:
-    """Some samples and the columns fitted to them, solved once for all signals.
+    """A range of samples with the columns to fit, prepared once for all signals.
 
     `columns` (n, p) are those of `_columns`, and `inverse` (p, n) is their pseudo-inverse. The
     phase of the sine advances by `angle` (rad) per sample.
@@ -241,7 +241,9 @@ class Dwell:
     def _drop_drifting(
         self, y: Array, start: int, *, latest: int, floor: float
     ) -> tuple[int, float]:
-        """Return a start, at most `latest`, from which two halves agree, and the remaining error.
+        """Move the start until both halves of the steady part agree, at most to `latest`.
+
+        Return the start and the remaining error.
 
         At a resonance, the transient has the frequency of the dwell and is hidden in its amplitude.
         If the difference between the halves exceeds the noise, half of it is still in the mean.
@@ -309,7 +311,7 @@ def _rounding_std(fit: _Sine, *, step: float) -> float:
 
 
 def _held(t: Array, *, omega: float) -> complex:
-    """Return the factor from a sampled sine to the first harmonic of its held staircase."""
+    """Return the first harmonic of a held (staircase) sine, relative to the sampled sine."""
     dt = np.diff(t)
     # Intervals of more than three samples are gaps in the log.
     dt = dt[dt < 3.0 * np.median(dt)]  # the input during a gap is unknown

@@ -316,7 +316,7 @@ def _finish(
 
 
 def _message(plant: SampledPlant, goal: _Goal, design: FeedbackDesign) -> str:
-    """Return what can be reached if the goal cannot, and the effect of model errors; often ""."""
+    """Return a warning if the goal cannot be met or model errors matter; otherwise ""."""
     parts = []
     tied = plant.chain.k[0] > 0 or plant.chain.k[-1] > 0
     held = abs(plant.chain.static_gains()[plant.cart - 1]) * goal.limit if tied else np.inf

@@ -30,7 +30,7 @@ _SAME_INPUT = 0.02  # share of the input's range
 
 @dataclass(frozen=True, kw_only=True)
 class _Level:
-    """The rest of a cart at one input: value, standard error, and samples."""
+    """The level at which a cart rests under one input, with its standard error and samples."""
 
     first: int
     stop: int
@@ -240,7 +240,7 @@ def _extrapolated(t: Array, y: Array, *, n_modes: int, floor: float) -> _Level |
 def _with_unseen_start(
     t: Array, y: Array, found: list[_Plateau], *, size: float, step: float
 ) -> tuple[list[_Plateau], list[str]]:
-    """Add a rest in front, if the input is on at the start and the cart only begins to move."""
+    """Add a rest before the record if the input is on, and motion begins, at its first sample."""
     head = found[0]
     if head.u == 0 or not head.level or abs(head.level.value - y[0]) <= _MOVED * size:
         return found, []
@@ -257,7 +257,7 @@ def _with_unseen_start(
 
 
 def _drift(t: Array, y: Array, levels: Sequence[_Level], *, size: float) -> float:
-    """Return the slope that every settled window shares, per second, or 0."""
+    """Return the slope, per second, that all settled windows share; 0 if they do not."""
     slopes, errors = [], []
     for level in levels:
         if level.extrapolated or level.stop - level.first < _MIN_SAMPLES:
@@ -319,7 +319,10 @@ def _combine(edges: Sequence[StepEdge]) -> tuple[float, float]:
 
 
 def _rest_shift(found: Sequence[_Plateau]) -> tuple[float | None, float]:
-    """Return how far a later rest is from the first at the same input, with standard error."""
+    """Return how far the last rest at the first input is from the first rest, and its error.
+
+    The distance is None if the first input does not occur again.
+    """
     span = max(p.u for p in found) - min(p.u for p in found)
     settled = [p for p in found if p.level]
     for last in reversed(settled[1:]):
@@ -330,7 +333,10 @@ def _rest_shift(found: Sequence[_Plateau]) -> tuple[float | None, float]:
 
 
 def _interval(edges: Sequence[StepEdge], *, shift: float) -> tuple[float, float]:
-    """Return the gains that friction allows: each rest point may be off by half the shift."""
+    """Return the range of gains that friction allows.
+
+    Each rest point may be off by half the shift.
+    """
     gains = [edge.gain for edge in edges]
     slack = abs(shift) / (2 * min(abs(edge.u_after - edge.u_before) for edge in edges))
     slack = max(slack, max(edge.gain_std for edge in edges))

@@ -94,18 +94,18 @@ def _open(records: Sequence[Record]) -> tuple[list[FitWindow], list[str]]:
 
 
 def _informed(attempt: Attempt, index: int) -> FitWindow:
-    """Return a window that has standard errors and a start according to its residuals."""
+    """Return a window with the standard errors and the start condition that its residuals show."""
     window, misfit = attempt.windows[index], attempt.misfits[index]
     at_rest = window.kind != "decay" and _starts_at_rest(attempt, index)
     return window.informed(misfit.residual * window.sigma[:, None], at_rest=at_rest)
 
 
 def _starts_at_rest(attempt: Attempt, index: int) -> bool:
-    """Return whether a window starts at rest: a free start improves the fit only by chance.
+    """Return whether a free start would improve the fit only by chance.
 
-    The improvement is that of the whole fit, to first order, with all parameters adjusted.
-    Residuals beyond the stated noise are an error of the chain itself, of which a record has few
-    independent values.
+    The window then counts as starting at rest. The improvement is that of the fit to all windows,
+    to first order. Residuals beyond the stated noise are an error of the chain, of which a record
+    has few independent values.
     """
     resting = replace(attempt.windows[index], at_rest=True)
     (held,) = look([resting], attempt.parametrisation, attempt.theta).misfits

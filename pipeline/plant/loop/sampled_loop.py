@@ -113,8 +113,8 @@ class LoopSetup:
     sample_time : sample time of the controller, s. By default the mean interval of the run.
     delay : number of ticks from a reading to the effort computed from it, 0 or 1.
     input_limit : the effort is clipped to ± this limit.
-    drive : force on cart 1 per unit of effort. It differs from 1 if a log has another sign or
-        scale.
+    drive : force on cart 1 per unit of effort. It differs from 1 if the
+        log has a wrong sign or scale.
     encoder_step : step to which the controller's readings are rounded, one number or (f,).
     rest : readings of the carts at rest without input, one number or (f,).
     free : numbers of the carts that move; all by default.
@@ -213,9 +213,9 @@ def replay(
 ) -> Array:
     """Return the effort (n,) that the controller computes at each reading of a recorded run.
 
-    `y` (f, n) are the readings of the `free` carts. Nothing is clipped or predicted. The result is
-    the response of the stated control law to the actual motion, for comparison with the logged
-    input.
+    `y` (f, n) are the readings of the `free` carts. Efforts are neither delayed nor clipped, and
+    the observer predicts without an input. The result is the response of the stated control law to
+    the actual motion, for comparison with the logged input.
     """
     T = float(t[-1] - t[0]) / (t.size - 1)
     law = _law(controller, free=tuple(free), sample_time=T, y0=y[:, 0])

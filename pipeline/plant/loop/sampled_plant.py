@@ -1,4 +1,4 @@
-"""A chain as its controller sees it: sampled, without units, with its energies."""
+"""A chain as its controller sees it: sampled, in scaled units, with its energies."""
 
 from dataclasses import dataclass
 

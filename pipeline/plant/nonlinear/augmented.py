@@ -94,7 +94,7 @@ def _all(n: int) -> tuple[int, ...]:
 
 
 def compile_simulator() -> None:
-    """Run the simulator once to compile it, which takes ten seconds unless code is stored."""
+    """Run the simulator once, which compiles it in ten seconds unless compiled code is stored."""
     chain = Chain(m=np.ones(1), c=np.ones(1), k=np.array([1.0, 0.0]))
     simulate_augmented(AugmentedChain(chain=chain), np.array([0.0, 0.01]), np.zeros(2))
 
@@ -248,7 +248,7 @@ class SteppedBench:
                 switch(which, 1.0, self._tables, bodies.s, bodies.K, bodies.C)
 
     def _bend_presliding(self) -> None:
-        """Bend the presliding friction until it balances the forces on the carts at rest."""
+        """Set the presliding states so that friction balances the forces at rest, if it can."""
         net = self._static_forces()
         most = np.array([settling(self._tables.cart, i, 0.0)[0] for i in range(self._n)])
         for i in np.flatnonzero(most):

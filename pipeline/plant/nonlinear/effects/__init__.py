@@ -89,7 +89,7 @@ def find_effect(key: str) -> Effect:
 
 
 def _with_words(typed: str) -> list[str]:
-    """Return the effects with all the typed words in their name, or else in their title.
+    """Return the effects whose names contain all typed words, or else those whose titles do.
 
     They are in the order of the catalogue, which begins with the most common.
     """

@@ -150,7 +150,7 @@ class Effect:
 
     @property
     def contact(self) -> bool:
-        """Whether the effect has a contact, with details that users do not ask for."""
+        """Whether the effect has a contact, some of whose parameters are not reported."""
         return not all(p.reported for p in self.parameters)
 
     @property
@@ -346,8 +346,8 @@ def chain_scales(
 ) -> PlaceScales:
     """Return the typical sizes at a place.
 
-    `largest` are the largest positions and velocities, (n + 1,) each, of each cart or spring
-    stretch; by default 1.
+    `largest` holds the largest positions and velocities, (n + 1,) each, of the carts or of the
+    spring stretches. By default they are 1.
     """
     position, velocity = np.ones((2, chain.n + 1)) if largest is None else largest
     i = max(at - 1, 0)

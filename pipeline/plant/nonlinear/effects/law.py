@@ -1,9 +1,9 @@
 """The law of an effect, written once as expressions in Python's syntax.
 
-On a cart (cart 1, for the input) the symbols are `x` and `v`. On a spring they are its stretch `d`,
-`rate` and stiffness `k`. Everywhere, `u` is the force of the drive on its body, `on` is 1 while the
-drive is powered and 0 otherwise, and `z` is a state of the law's own. All other names are symbols
-of parameters. The functions are abs, sign, exp, sin, cos, min, max, clip.
+On a cart (cart 1, for the input) the symbols are `x` and `v`. On a spring they are the stretch `d`,
+its `rate` of change, and the stiffness `k`. Everywhere, `u` is the force of the drive on its body.
+`on` is 1 while the drive is powered, otherwise 0. `z` is an internal state of the law. All other
+names are symbols of parameters. The functions are abs, sign, exp, sin, cos, min, max, clip.
 
 `python -m docs.codegen` generates compiled code from the laws, with all derivatives.
 """

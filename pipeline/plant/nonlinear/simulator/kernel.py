@@ -1,4 +1,4 @@
-"""Simulate carts with dry friction, contact, slack and an imperfect drive: compiled, by events.
+"""Simulate carts with dry friction, contact, slack and an imperfect drive: compiled, event-driven.
 
 Every substep integrates the linear part (springs, dampers, hidden masses) by a Taylor series of
 sixth order. So the linear chain is exact to rounding. Nonlinear forces are held at their value in
@@ -45,7 +45,7 @@ _BLOWN_UP = 1e9  # position at which the simulation has diverged
 
 
 class Excitation(NamedTuple):
-    """The input of one run, and what else is prescribed.
+    """The input of one run, and the prescribed motion of its carts.
 
     Attributes
     ----------
@@ -190,7 +190,7 @@ def _integral(run, time, at):
 
 @jit
 def _edge(run, delay, now, end, at):
-    """Return when the delayed input first jumps between `now` and `end`; else `end`."""
+    """Return when the delayed input first jumps after `now`, at the latest `end`."""
     knots, held = run.knots, run.held
     while at < knots.size - 1 and knots[at + 1] + delay < end - _INSTANT:
         at += 1
@@ -201,9 +201,10 @@ def _edge(run, delay, now, end, at):
 
 @inlined
 def _steps(tables, bodies, refine):
-    """Return the longest step, the longest step in a contact (s), and which forces there are.
+    """Return the longest step, the longest step in a contact (s), and the kinds of forces.
 
-    Positive sums mean sliding and presliding friction; flags name the places of smooth forces.
+    The kinds are two numbers, positive if there is sliding or presliding friction, and flags for
+    the places of smooth forces.
     """
     # Sums serve as flags here, because numba would compile a function for every constant flag.
     rubbing = presliding = fastest = contact = 0.0
@@ -260,7 +261,7 @@ def _start_shot(bodies, run, start, lanes, shot):
 
 @inlined
 def _bend(tables, bodies, lanes, scatter, u, smooth):
-    """Bend the presliding friction as far as it balances the forces on the carts at the start."""
+    """Set the presliding states so that friction balances the forces at the start, if it can."""
     s, n, N = bodies.s, bodies.n, bodies.N
     for i in range(N):
         s[MID_X, i], s[MID_V, i], s[FORCE, i] = s[X, i], s[V, i], s[FIX, i]

@@ -22,7 +22,7 @@ def cart_force(cart, i, x, v, u):
 
 @inlined
 def cart_slopes(cart, i, x, v, u):
-    """Return the derivatives of `cart_force` by position and velocity."""
+    """Return the derivatives of `cart_force` with respect to position and velocity."""
     by_x = by_v = 0.0
     if cart[i, Cart.QUADRATIC_DRAG_COEFFICIENT] != 0.0:
         by_v += -2 * cart[i, Cart.QUADRATIC_DRAG_COEFFICIENT] * abs(v)
@@ -40,7 +40,7 @@ def spring_force(spring, j, d, rate):
 
 @inlined
 def spring_slopes(spring, j, d, rate):
-    """Return the derivatives of `spring_force` by position and velocity."""
+    """Return the derivatives of `spring_force` with respect to position and velocity."""
     by_x = by_v = 0.0
     if spring[j, Spring.CUBIC_SPRING_COEFFICIENT] != 0.0:
         by_x += 3 * d**2 * spring[j, Spring.CUBIC_SPRING_COEFFICIENT]
@@ -58,7 +58,7 @@ def drive_force(drive, x, v, u, on):
 
 @inlined
 def drive_slopes(drive, x, v, u, on):
-    """Return the derivatives of `drive_force` by position and velocity."""
+    """Return the derivatives of `drive_force` with respect to position and velocity."""
     by_x = by_v = 0.0
     if drive[Drive.DRIVE_DAMPING_COEFFICIENT] != 0.0:
         by_v += -drive[Drive.DRIVE_DAMPING_COEFFICIENT] * on
@@ -78,7 +78,7 @@ def motor_force(drive, x, v, u, on):
 
 @inlined
 def motor_slopes(drive, x, v, u, on):
-    """Return the derivatives of `motor_force` by position and velocity."""
+    """Return the derivatives of `motor_force` with respect to position and velocity."""
     by_x = by_v = 0.0
     if drive[Drive.COGGING_FORCE] != 0.0:
         by_x += (
@@ -125,7 +125,7 @@ def dropping(cart, i, v, u):
 
 @inlined
 def drop_slope(cart, i, v, u):
-    """Return the derivative of `dropping` by the velocity."""
+    """Return the derivative of `dropping`, d/dv."""
     slope = 0.0
     if cart[i, Cart.STICTION_STATIC_FORCE] > cart[i, Cart.COULOMB_FRICTION_FORCE]:
         slope += (
@@ -140,7 +140,7 @@ def drop_slope(cart, i, v, u):
 
 @inlined
 def settling(cart, i, v):
-    """Return the largest force of hysteresis; limit and rate (1/s) of its state."""
+    """Return the largest force of hysteresis, and limit and rate (1/s) of its state."""
     if cart[i, Cart.PRESLIDING_FRICTION_FORCE] != 0.0:
         return (
             cart[i, Cart.PRESLIDING_FRICTION_FORCE],
@@ -152,7 +152,7 @@ def settling(cart, i, v):
 
 @inlined
 def settling_slopes(cart, i, v):
-    """Return the derivatives, by velocity, of the limit and rate of the state."""
+    """Return the derivatives d/dv of the limit and rate of the state."""
     if cart[i, Cart.PRESLIDING_FRICTION_FORCE] != 0.0:
         return 0, (1.0 if v > 0.0 else -1.0) / cart[i, Cart.PRESLIDING_FRICTION_DISTANCE]
     return 0.0, 0.0
@@ -172,7 +172,7 @@ def stop_of(cart, i):
 
 @inlined
 def slack_of(spring, j):
-    """Return extra stiffness of spring j, where it begins, and its derivative by k."""
+    """Return extra stiffness of spring j, where it begins, and its d/dk."""
     if spring[j, Spring.SLACK_SPRING_STIFFNESS_CHANGE] != 0.0:
         return (
             spring[j, Spring.SLACK_SPRING_STIFFNESS_CHANGE] * spring[j, Spring.STIFFNESS],

@@ -1,10 +1,10 @@
-"""Derivatives of the motion by parameters and start, integrated with the state.
+"""The motion's derivatives with respect to parameters and start, integrated with the state.
 
 A small change of a parameter acts like a small force on the same linear system. Per unit of change,
 this force is -a for a mass, -v for a damping, the stretch for a spring, and the friction itself for
-a friction factor. So each derivative is a motion of its own. In every step, the matrix exponential
-of the carts' own equations advances it. Half of the small force's impulse is given before, half
-after.
+a friction factor. So each derivative is itself a motion. In every step it is advanced by the
+matrix exponential of the carts' equations. Half of the small force's impulse is added before this,
+half after.
 
 If dry friction stops a cart or a contact switches, the instant depends on the parameter. At this
 instant, the derivative of the velocity jumps in proportion to the jump of the acceleration (a
@@ -180,7 +180,7 @@ def _force(kind, at, s, n, spring):
 
 @jit
 def _kick(tables, bodies, push, lanes, whole, span):
-    """Give the lanes the impulse of their own and the nonlinear forces over `span` s."""
+    """Add to each lane the impulse, over `span` s, of its small force and of nonlinear forces."""
     s, n, N, driven, T, of = bodies.s, bodies.n, bodies.N, bodies.driven, lanes.T, lanes.of
     cart, drive, scatter = tables.cart, tables.drive, push.scatter
     u, on, smooth = push.u, push.on, push.smooth
@@ -221,14 +221,14 @@ def _kick(tables, bodies, push, lanes, whole, span):
 
 @jit
 def _settled(cart, i, s, target, decay, span):
-    """Return the derivative, by velocity, of cart i's presliding state after `span` s."""
+    """Return d/dv of cart i's presliding state after `span` s at constant velocity v."""
     by_target, by_pace = settling_slopes(cart, i, s[MID_V, i])
     return by_target * (1.0 - decay) - (s[Z, i] - target) * decay * span * by_pace
 
 
 @jit
 def _bend(T, bodies, body, by, span, by_x, by_v):
-    """Give the lanes of a body the impulse of a force that depends on another body's state."""
+    """Add to a body's lanes the impulse of a force that depends on the state of body `by`."""
     s, N = bodies.s, bodies.N
     if by_x != 0.0:
         _add(T, N + body, s[GRIP, body] * span * by_x, by)
@@ -290,7 +290,7 @@ def restart(bodies, lanes, shot, free):
 
 @jit
 def bend_presliding(bodies, lanes, i, most, scatter):
-    """Set the start derivatives of cart i's presliding state from those of the forces."""
+    """Set the derivatives of cart i's presliding state at the start, given those of the forces."""
     s, n, N, T, of = bodies.s, bodies.n, bodies.N, lanes.T, lanes.of
     for lane in range(of.shape[1]):
         kind, at, block, q = of[0, lane], of[1, lane], lane // _BLOCK, lane % _BLOCK

@@ -31,7 +31,7 @@ class Bodies(NamedTuple):
     Attributes
     ----------
     n, N : number of carts, and of all bodies.
-    motor : the motor's row, or -1 without a motor of its own.
+    motor : the motor's row, or -1 if the motor is not a separate body.
     driven : row of the body on which the input acts.
     parent : row of the cart that carries a hidden mass; -1 for other bodies.
     s : the state table.

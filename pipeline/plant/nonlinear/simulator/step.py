@@ -99,7 +99,7 @@ def taylor(s, K, C, N):
 
 @inlined
 def first_stop(s, n, step, none):
-    """Return when the first sliding cart stops within the step, and which one (else `none`)."""
+    """Return when the first sliding cart stops within the step, and its index (or `none`)."""
     stopping = none
     for i in range(n):
         if s[SIDE, i] == 0.0:
@@ -122,7 +122,7 @@ def first_stop(s, n, step, none):
 
 @inlined
 def first_switch(tables, bodies, step, none):
-    """Return when the first contact or slack spring switches in the step, and which (or `none`)."""
+    """Return when the first contact or slack spring switches, and its index (or `none`)."""
     switching, switches, active, s = none, bodies.switches, bodies.active, bodies.s
     for e in range(switches.size):
         end = guard(switches[e], active[e], tables, s, step)

@@ -74,8 +74,8 @@ TERMS = 11
 def terms(kind, p, o, x, v, k, u, on, out):
     """Fill `out` with the law of a kind and derivatives; coordinates start at p[o].
 
-    The derivatives are by position, velocity and input, then by each coordinate.
-    `x` and `v` are of a cart or a spring's stretch; `k` is the spring's stiffness.
+    The derivatives are d/dx, d/dv and d/du, then d/d(coordinate) for each coordinate.
+    `x` and `v` belong to a cart or a spring's stretch; `k` is the spring's stiffness.
     """
     if kind == Kind.COULOMB_FRICTION:
         out[0] = p[o]
