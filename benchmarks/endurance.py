@@ -595,8 +595,8 @@ def exploration_words(made: Mapping[str, Any]) -> str:
     return "\n".join(
         [
             f"- {made['bench_seconds'] / 60:.0f} minutes at the bench of "
-            f"{60 * made['hours']:.0f} allowed, {made['recordings']} recordings, "
-            f"{made['turns']} turns, in {made['seconds'] / 60:.0f} minutes.",
+            f"{60 * made['hours']:.0f} allowed, {made['recordings']} recordings, in "
+            f"{made['seconds'] / 60:.0f} minutes.",
             f"- Memory: {memory_words(made['memory'])}.",
             f"- {load_words(made)}",
         ]
