@@ -230,7 +230,7 @@ def _forces(
     yield from force
     yield "    return f\n"
     yield f"\n@inlined\ndef {name}_slopes({arguments}):"
-    yield f'    """Return the derivatives of `{name}_force` with respect to position and velocity."""'
+    yield f'    """Return the slopes of `{name}_force` against position and velocity."""'
     yield "    by_x = by_v = 0.0"
     yield from slopes
     yield "    return by_x, by_v\n"

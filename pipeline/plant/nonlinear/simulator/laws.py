@@ -22,7 +22,7 @@ def cart_force(cart, i, x, v, u):
 
 @inlined
 def cart_slopes(cart, i, x, v, u):
-    """Return the derivatives of `cart_force` with respect to position and velocity."""
+    """Return the slopes of `cart_force` against position and velocity."""
     by_x = by_v = 0.0
     if cart[i, Cart.QUADRATIC_DRAG_COEFFICIENT] != 0.0:
         by_v += -2 * cart[i, Cart.QUADRATIC_DRAG_COEFFICIENT] * abs(v)
@@ -40,7 +40,7 @@ def spring_force(spring, j, d, rate):
 
 @inlined
 def spring_slopes(spring, j, d, rate):
-    """Return the derivatives of `spring_force` with respect to position and velocity."""
+    """Return the slopes of `spring_force` against position and velocity."""
     by_x = by_v = 0.0
     if spring[j, Spring.CUBIC_SPRING_COEFFICIENT] != 0.0:
         by_x += 3 * d**2 * spring[j, Spring.CUBIC_SPRING_COEFFICIENT]
@@ -58,7 +58,7 @@ def drive_force(drive, x, v, u, on):
 
 @inlined
 def drive_slopes(drive, x, v, u, on):
-    """Return the derivatives of `drive_force` with respect to position and velocity."""
+    """Return the slopes of `drive_force` against position and velocity."""
     by_x = by_v = 0.0
     if drive[Drive.DRIVE_DAMPING_COEFFICIENT] != 0.0:
         by_v += -drive[Drive.DRIVE_DAMPING_COEFFICIENT] * on
@@ -78,7 +78,7 @@ def motor_force(drive, x, v, u, on):
 
 @inlined
 def motor_slopes(drive, x, v, u, on):
-    """Return the derivatives of `motor_force` with respect to position and velocity."""
+    """Return the slopes of `motor_force` against position and velocity."""
     by_x = by_v = 0.0
     if drive[Drive.COGGING_FORCE] != 0.0:
         by_x += (
