@@ -82,9 +82,10 @@ def person(author: str) -> str:
 
 
 def go_with(given: tuple[str, ...], authors: tuple[str, ...]) -> bool:
-    """Return whether points given to the people `given` apply to a submission of `authors`.
+    """Return whether points given to some people apply to a submission by some authors.
 
-    A submission that cannot be read has no authors. Points given under its name then apply.
+    They do if at least one author is among those people. If the authors or the people are
+    unknown, the points apply to the submission of the same name.
     """
     if not authors or not given:
         return True
@@ -101,7 +102,7 @@ class Batch:
     shared : flag for recordings that another submission also contains, by submission.
     failed : name and reason for each submission that could not be graded.
     unsettled : failed submissions that the next run grades again.
-    disk_full : those of them that failed because the disk was full.
+    disk_full : submissions that failed because the disk was full.
     kept, moved, taken_over : changes to the class list; see `so_far.SoFar`.
     """
 

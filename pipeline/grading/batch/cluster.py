@@ -130,7 +130,7 @@ def _grade_all(
 ) -> Iterator[Grading]:
     """Yield each outcome when it is ready.
 
-    Dask repeats the tasks of a lost worker on another one.
+    If a worker is lost, Dask runs its tasks again on another worker.
     """
     waiting = list(reversed(tasks))
     under_way: dict[str, Task] = {}

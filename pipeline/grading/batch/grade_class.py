@@ -73,7 +73,7 @@ class Options:
     Attributes
     ----------
     jobs : number of grading processes on this machine.
-    cluster : address of a Dask scheduler, whose cluster then grades instead of this machine.
+    cluster : address of a Dask scheduler; if given, grading runs on its cluster, not on this machine.
     time_limit : time limit for one submission, in s.
     memory_limit : memory limit for one submission, in bytes.
     anonymous : whether to leave names out of all files; a rubric may also require this.
@@ -216,7 +216,7 @@ def _skip_messages(
 
 
 def _class_messages(batch: Batch, book: Gradebook, *, shown: Callable[[str], str]) -> Iterator[str]:
-    """Yield messages about springs that the rubric lacks and about changes of the class list."""
+    """Yield messages about springs missing from the rubric and about changes to the class list."""
     grades = (entry.grade for entry in book.entries())
     if asked := wrong_springs(grade.springs for grade in grades if grade.status == "graded"):
         yield asked
@@ -270,7 +270,7 @@ def _executor(options: Options) -> Executor:
 def _example_prints(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:
     """Yield the fingerprints of example recordings, which several teams may submit.
 
-    The examples are those of the rubric, and those of cartlab that have as many carts.
+    These are the rubric's examples, and cartlab's examples with the same number of carts.
 
     Raises
     ------

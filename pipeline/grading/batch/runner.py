@@ -270,8 +270,8 @@ def _shared(
 def _is_earlier_version(earlier: Member, now: Member | None) -> bool:
     """Return whether `earlier` is an earlier version of the submission `now`.
 
-    This is so if the teams are the same. Within one assignment, the same recordings are enough,
-    because authors may have corrected their ids. Shared recordings are then not a sign of copying.
+    This is true if both are from the same team. Within one assignment, equal recordings are enough,
+    because authors may have corrected their ids. An earlier version is not a copy.
     """
     if now is None:
         return False

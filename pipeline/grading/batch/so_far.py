@@ -1,8 +1,8 @@
 """Compare a run with the current class list: which submissions are missing, renamed or replaced?
 
-A name alone does not identify a submission, because whoever packs a folder chooses its name, and
-cartlab extends equal names. A submission is also recognised by its account number on the learning
-platform, its files, its authors and their recordings.
+A name alone does not identify a submission: students name their folders as they like, and cartlab
+adds to a name that occurs twice. A submission is also recognised by its account number on the
+learning platform, its files, its authors and their recordings.
 """
 
 from collections.abc import Mapping

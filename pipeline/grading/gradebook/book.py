@@ -162,7 +162,7 @@ class Gradebook:
     ) -> list[str]:
         """Store a complete batch as the new class list, unless nothing has changed.
 
-        Returns the differences from the previous class list, one phrase each; those of the rubric
+        Returns the differences from the previous class list, one phrase each; changes to the rubric
         come first.
 
         Parameters
@@ -331,7 +331,7 @@ class Gradebook:
     def override(
         self, team: str, criterion: str, points: float | None, *, why: str, by: str
     ) -> HandPoints:
-        """Set the points of a criterion by hand, also for later gradings; None removes such points.
+        """Set a criterion's points by hand, also for later gradings; None: the automatic points.
 
         Raises
         ------
@@ -431,6 +431,6 @@ class Gradebook:
 
 
 def _named(team: str, rows: Sequence[Row]) -> list[Row]:
-    """Return the rows with the name `team`; if no row has it, those with the author `team`."""
+    """Return the rows named `team`; if no row is, those with `team` among the authors."""
     exact = [row for row in rows if row.name == team]
     return exact or [row for row in rows if person(team) in map(person, row.authors)]

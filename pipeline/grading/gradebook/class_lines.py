@@ -84,13 +84,13 @@ class Line(GradeTable):
 
 
 def wrong_springs(graded: Iterable[tuple[str, ...]]) -> str:
-    """Return a question to the instructor if recordings need springs that the rubric lacks.
+    """Return a question for the instructor if recordings need springs missing from the rubric.
 
     Returns "" if there is nothing to ask.
 
     Parameters
     ----------
-    graded : the springs that the rubric lacks, for each graded submission.
+    graded : for each graded submission, the springs missing from the rubric.
     """
     every = list(graded)
     asking = [springs for springs in every if springs]

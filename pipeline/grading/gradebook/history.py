@@ -143,7 +143,9 @@ def _listed(connection: Connection, submission: int, *, named: bool) -> Iterator
 def _other_name(
     connection: Connection, submission: int, *, of: int | None, among: int | None
 ) -> str:
-    """Return the name under which the same authors continue in another class list, or "".
+    """Return the name that a submission's authors have in another class list.
+
+    Returns "" unless exactly one submission that is new in that list has the same authors.
 
     Parameters
     ----------

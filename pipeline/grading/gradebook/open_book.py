@@ -86,7 +86,7 @@ class TeamNow:
     ----------
     versions : version of the points, by criterion; a change must name the version on which it is
         based.
-    changed : criteria to which points or a comment were ever given by hand.
+    changed : criteria that have ever had points or a comment given by hand.
     seen : name of the person who marked the grading as reviewed, or "".
     """
 
@@ -124,7 +124,7 @@ class Undone:
     ----------
     at : time at which the changes were undone; `undo_all` with this time restores them.
     back : number of changes undone.
-    kept : submissions that stay as they are, because somebody has changed them since.
+    kept : submissions left unchanged, because somebody has changed them since.
     """
 
     at: str
@@ -134,7 +134,7 @@ class Undone:
 
 @dataclass(frozen=True, kw_only=True)
 class Tried:
-    """The grade of a submission without and with points that are tried but not stored.
+    """The grade of a submission without and with some points that have not been stored.
 
     Attributes
     ----------
@@ -318,7 +318,7 @@ class OpenBook(Gradebook):
         return Together(at=at, by=by, teams=new)
 
     def try_all(self, wishes: Sequence[WantedPoints]) -> list[Tried]:
-        """Return each submission's grade without and with the points of `wishes`; store nothing.
+        """Return each submission's grade without and with the requested points; store nothing.
 
         Submissions that are not in the class are left out.
         """
@@ -413,7 +413,8 @@ class OpenBook(Gradebook):
 def _line(row: Row, given: Mapping[int, HandPoints] | None, *, rubric: Rubric) -> Line:
     """Return a line of the class list with its current grade.
 
-    Only a line with overrides needs the whole grade; without overrides, `given` is None.
+    `given` holds the overrides, or is None without any. Only overrides make it necessary to read the
+    whole grade.
     """
     shared = read_flag(row.shared)
     if given:
@@ -483,7 +484,7 @@ def _changed_at(batch: Row, at: str) -> Select:
 
 
 def _try(connection: Connection, row: Row, wish: WantedPoints, *, rubric: Rubric) -> Tried:
-    """Return the grade of a submission without and with the points of a wish."""
+    """Return the grade of a submission without and with the requested points."""
     shared, own = read_flag(row.shared), overrides.c.submission_id == row.submission_id
     rows = connection.execute(_overrides().where(own)).all()
     ever = [_read_override(one) for one in rows]

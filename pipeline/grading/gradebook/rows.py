@@ -330,7 +330,7 @@ def last_named(connection: Connection, submission: int) -> tuple[str, ...]:
 def carry_over(connection: Connection, moved: Mapping[str, str], *, assignment: str) -> None:
     """Copy overrides and requests of renamed submissions to their new names.
 
-    Rows that the new name already has are not copied, so nothing is doubled if a name changes back.
+    Rows that already exist under the new name are not copied again if a name changes back.
     """
     named = select(submissions.c.name, submissions.c.id).where(
         submissions.c.assignment == assignment,

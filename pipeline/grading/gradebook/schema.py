@@ -429,9 +429,10 @@ def _engine(place: str | Path, *, create: bool) -> Engine:
 
 
 def _keep_private(file: Path) -> None:
-    """Let only the owner read a new gradebook file; SQLite gives its side files the same rights.
+    """Let only the owner read a new gradebook file.
 
-    An existing file keeps the rights of its group and is closed to everybody else.
+    An existing file keeps its group permissions, but all other users lose access. SQLite gives the
+    same permissions to the temporary files next to it.
     """
     with suppress(OSError):  # the file may belong to another user
         os.close(os.open(file, os.O_RDWR | os.O_CREAT, OWNER_ONLY))

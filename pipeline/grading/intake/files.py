@@ -131,12 +131,12 @@ def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") ->
 def _files(sources: Sequence[Path]) -> Iterator[tuple[str, Path]]:
     """Yield each file to grade as (name relative to the hand-in, path), sorted by name.
 
-    If the files together are too large, the largest are left out, because data files are small and
-    films are not. `submission.toml` is left out only if it is too large itself.
+    If the files together are too large, the largest are left out: probably videos, because data
+    files are small. `submission.toml` is left out only if it alone is too large.
 
     If there are too many files, one more than the limit is kept, so that every machine refuses the
-    hand-in. A recording that is too large to be read is kept too, so that it is refused and not
-    reported as missing. Invalid bytes in names are replaced.
+    hand-in. A recording too large to be read is also kept, so that it is not reported as missing.
+    Invalid bytes in names are replaced.
     """
     found: list[tuple[int, str, Path]] = []
     for source in sources:

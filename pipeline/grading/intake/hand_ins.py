@@ -50,7 +50,7 @@ class HandIn:
         (moodle 1024)"; or "".
     handed_in : time of the hand-in in ISO 8601, or "" if the platform does not give it.
     problem : why the files cannot be opened, if this is already known; or "".
-    parent : name of the parent folder, which is needed until the id is unique.
+    parent : name of the parent folder, which may be used to make the id unique.
     """
 
     id: str
@@ -333,12 +333,14 @@ def _name_inside(sources: Sequence[Path]) -> str:
 
 
 def _with_ids(found: Sequence[HandIn], *, known: Iterable[str] = ()) -> list[HandIn]:
-    """Name every hand-in after its folder; if names are equal, add the parent folder as a prefix.
+    """Name every hand-in after its folder.
+
+    If names are equal, the parent folder is added as a prefix, and a number if that is not enough.
 
     Parameters
     ----------
-    known : ids of the current class. A hand-in whose id in the class begins with the parent folder
-        keeps that id.
+    known : ids of the current class. A hand-in that is in the class under its name with the prefix
+        keeps the prefix.
     """
     names = [_fit(one.id) for one in found]
     longer = [_fit(f"{one.parent}-{one.id}") for one in found]

@@ -83,7 +83,7 @@ class _Budget:
 
 
 def is_debris(path: PurePosixPath) -> bool:
-    """Return whether a file is one that macOS or Windows creates without being asked."""
+    """Return whether a file is one that macOS or Windows creates by itself."""
     name = path.name.lower()
     return (
         any(part in _DEBRIS_FOLDERS for part in path.parts)
@@ -178,7 +178,7 @@ _TROUBLE = (
 
 
 def _let_through(error: Exception) -> None:
-    """Raise the error again if this computer caused it, not the archive."""
+    """Re-raise an error that was caused by this computer and not by the archive."""
     if isinstance(error, OSError) and not is_name_fault(error):
         raise error
 
@@ -201,7 +201,7 @@ def _why(error: Exception) -> str:
 class _Bounded(io.BufferedReader):
     """A file that refuses to read too many bytes at once.
 
-    `zipfile` reads the whole table of contents at once, and the archive itself states its length.
+    `zipfile` reads the whole table of contents at once, and an archive may state any length for it.
     """
 
     def __init__(self, path: Path, *, most: int) -> None:

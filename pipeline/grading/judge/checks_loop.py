@@ -33,7 +33,7 @@ def _loop(work: Work) -> tuple[Controller, Array] | Verdict:
 
 @dataclass(frozen=True, kw_only=True)
 class _Best:
-    """The response that earns most, among those on all models, and its share of the points.
+    """The simulated response that earns the most points of all models, and its share of the points.
 
     Attributes
     ----------

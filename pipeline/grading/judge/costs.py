@@ -1,4 +1,4 @@
-"""The least that a flag costs: a share of its criterion's points, set by the rubric."""
+"""Make each flag cost at least the share of its criterion's points that the rubric states."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,8 +1,9 @@
 """Compute points under a changed rubric from stored errors, without reading recordings.
 
-The gradebook stores the error of each number as an exact fraction. The usual code applies the new
-points, tolerances, costs of flags, lateness and step to these errors. If a change of the rubric
-alters the errors, recordings must be graded again; `needs_recordings` finds such changes.
+The gradebook stores the error of each number as an exact fraction. The usual code computes points
+from these errors with the new tolerances, costs of flags, late deduction and rounding. If a change
+to the rubric alters the errors, recordings must be graded again; `needs_recordings` finds such
+changes.
 """
 
 import json
@@ -56,7 +57,7 @@ def read_findings(text: str) -> dict[str, Verdict]:
 
 
 def reweigh(grade: Grade, findings: Mapping[str, Verdict], *, rubric: Rubric) -> Grade:
-    """Return a grade with its points under another rubric, without points given by hand.
+    """Return the grade that another rubric gives; points given by hand are not included.
 
     Outcomes and points are the same as if the recordings were graded again, but messages are empty.
     Criteria without stored verdicts are left out.

@@ -95,7 +95,7 @@ class Analysed:
 
     Attributes
     ----------
-    springs : springs that the recordings show but the rubric lacks.
+    springs : springs that the recordings show but that are missing from the rubric.
     notes : one note for each setting of the submission that the rubric replaced.
     """
 
@@ -219,8 +219,8 @@ def _prepare(
 def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tuple[str, ...]]:
     """Return a submission with the rubric's system, and notes on what was replaced.
 
-    If the rubric states no sign or no calibration, that of the submission stays. The submission's
-    unit of length also stays, because the students' numbers use it; the rubric's calibration is
+    If the rubric states no sign or calibration, the submission's is kept. The submission's unit of
+    length is always kept, because the students' numbers use it. The rubric's calibration is
     converted to this unit.
     """
     own, set_ = submission.system, rubric.system
@@ -259,10 +259,10 @@ def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tu
 
 
 def _under_calibration(experiment: Experiment, system: System) -> Experiment:
-    """Return the experiment without its own input scale if the rubric states one.
+    """Remove the input scale of an experiment if the rubric states an input scale.
 
     A closed-loop run keeps its scale, because under feedback a bench may log another signal as its
-    input. The experiment's own sign stays too; the analysis checks it against the data.
+    input. The experiment's sign is also kept; the analysis checks it against the data.
     """
     own = experiment.input
     if own is None or experiment.kind == "closed_loop" or not system.input.per_count:

@@ -39,9 +39,9 @@ class Mistake:
     least : the mistake is credible only if at least this many numbers match.
     table_wide : whether the mistake also explains every other wrong number of the table.
     tries : number of variants tried; with more variants, a match by chance is more likely.
-    beside : parameters that must be right for this mistake to be credible.
+    beside : other parameters; the mistake is credible only if their numbers are right.
     from_time_records : whether the mistake is made when reading a decay or a step. A final table
-        then has it only if its numbers were copied from the initial table.
+        contains such a mistake only if its numbers were copied from the initial table.
     """
 
     codes: tuple[Code, ...]
@@ -296,7 +296,7 @@ def _swinging(turns: Mapping[str, StepTurns], gains: Numbers) -> Iterator[Mistak
 
 
 def _count(name: str, analysis: Analysis) -> float:
-    """Return the encoder step of a gain's cart in position units; 0 if it is not known."""
+    """Return one encoder count in position units, for the cart of a gain; 0 if unknown."""
     cart = read_name(name).cart or 1
     steps = [r.encoder_step(cart) for r in analysis.records if cart in r.carts and cart in r.free]
     step = float(np.median(steps)) if steps else 0.0

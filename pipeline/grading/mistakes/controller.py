@@ -65,9 +65,9 @@ class Controller:
         return [numbers for numbers in found if numbers is not None]
 
     def runaway(self, gains: Array) -> LoopNumbers | None:
-        """Return the loop on the carts from the recordings; None unless it is clearly unstable.
+        """Return the loop simulated on the identified carts; None unless it is clearly unstable.
 
-        Growth by less than a factor e within the required settling time may be a model error.
+        Growth by less than a factor of e within the required settling time may be a model error.
         """
         numbers = self._on(self.reference, gains) if self.reference is not None else None
         if numbers is None or numbers.stable:
@@ -97,12 +97,12 @@ class Controller:
         overshoot: float = limits.OVERSHOOT,
         settling: float = limits.SETTLING,
     ) -> bool:
-        """Return whether a loop meets the goal, or misses it by less than the allowed excess.
+        """Return whether a loop meets the goal, apart from the given allowances.
 
         Parameters
         ----------
         overshoot : allowed overshoot above the goal, in percentage points.
-        settling : allowed factor on the goal's settling time.
+        settling : allowed settling time, as a multiple of the goal's.
         """
         return (
             numbers.stable
@@ -124,9 +124,9 @@ class Controller:
         return ratio is not None and 1 / limits.CLAIM_SETTLING <= ratio <= limits.CLAIM_SETTLING
 
     def is_of_other_gains(self, numbers: LoopNumbers) -> bool:
-        """Return whether the claimed settling time must be that of other gains.
+        """Return whether the claimed settling time must belong to different gains.
 
-        That is so if it differs from the simulated one by more than a factor of 2.5.
+        It must if it differs from the simulated one by more than a factor of 2.5.
         """
         if self.settling is None or self.settling <= 0 or numbers.settling_time is None:
             return False

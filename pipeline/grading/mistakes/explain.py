@@ -204,7 +204,7 @@ def _by_way(tried: Sequence[_Tried]) -> list[list[_Tried]]:
 def _cover(way: Sequence[_Tried], remaining: Sequence[str]) -> _Cover:
     """Explain as many numbers as possible by one mistake.
 
-    Variants are added one by one, first the one that explains most numbers.
+    Variants are added one by one; each time, the one that explains the most numbers.
     """
     fits: list[tuple[Mistake, list[str]]] = []
     open_ = list(remaining)

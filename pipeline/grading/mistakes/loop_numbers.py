@@ -18,9 +18,9 @@ _BLOWN_UP = 1e6  # a response this many times the reference counts as diverged
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LoopNumbers:
-    """Numbers of the simulated closed loop, which is sampled.
+    """Results of a simulation of the sampled closed loop.
 
-    The controller makes up for its delay of one sample by predicting the state.
+    The controller compensates for its delay of one sample by predicting the state.
 
     Attributes
     ----------

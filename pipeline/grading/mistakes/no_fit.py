@@ -14,9 +14,9 @@ from pipeline.submission import Reported
 def copied_final(reported: Reported, *, references: References) -> list[str]:
     """Return the final estimates that equal the initial ones, if this is no coincidence.
 
-    Students may honestly keep the numbers of single carts. So the equal numbers must include most
-    of those that only a fit can give. The strongest evidence is a damping that was guessed at first
-    and did not change. Tables typed with single digits are ignored, because they agree by rounding.
+    Students may honestly keep the numbers of single carts, so most numbers that only a fit can give
+    must be equal too. The strongest evidence is a guessed damping that did not change. Tables typed
+    with single digits are ignored, because rounding makes them agree.
     """
     both = [name for name in reported.final if name in reported.initial]
     same = [n for n in both if _same(reported, n)]

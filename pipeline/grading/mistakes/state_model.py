@@ -303,7 +303,7 @@ def model_harm(
     n: int,
     tied: bool,
 ) -> Harm | None:
-    """Return in which impossible way wrong entries would make the model behave, or None.
+    """Return how wrong entries make the model behave as no real bench can; None if they do not.
 
     `unstable`: the motion grows without limit. `wrong_way`: a positive input drives a cart to the
     negative side. Imprecise entries are replaced by right ones first, because honest errors in a
@@ -395,7 +395,7 @@ def diagnose_state_space(
 
 
 def _slip(space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int) -> str:
-    """Return the first mistake, in words, that turns the right [A B] into the reported; or ""."""
+    """Return, in words, the first mistake that leads to the reported [A B]; "" if none does."""
     typed, kinds = _matrix(space, n), _kinds(n)
     A = {at: number for at, number in typed.items() if at[1] < 2 * n}
     B = {at: number for at, number in typed.items() if at[1] == 2 * n}

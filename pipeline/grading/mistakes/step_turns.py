@@ -23,8 +23,8 @@ class StepTurns:
     Attributes
     ----------
     by_edge : for each edge, and each recording that repeats it, the first three turning points.
-    furthest : for each edge, the largest displacement in each recording. When two motions beat,
-        this is not the first turning point.
+    furthest : for each edge, the largest displacement in each recording. If two modes beat, it may
+        come after the first turning point.
     """
 
     by_edge: dict[Edge, list[list[float]]]

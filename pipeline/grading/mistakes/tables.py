@@ -274,7 +274,7 @@ def _disagreements(
 
     Parameters
     ----------
-    blurred : whether to allow as large a difference as between readings of the recordings.
+    blurred : whether to allow the difference that honest readings of the recordings may have.
     """
     apart: list[tuple[float, str]] = []
     for name, final in reported.final.items():

@@ -209,7 +209,7 @@ def _shared(page: PageBuilder, lines: Sequence[Line], clusters: Sequence[Cluster
 
 
 def _listed(links: Sequence[Span]) -> list[str | Span]:
-    """Return links separated by commas; of a long list, the first few and the number of others."""
+    """Return links separated by commas; a long list is cut short and ends with "and 7 more"."""
     text: list[str | Span] = [part for link in links[:_NAMED] for part in (link, ", ")][:-1]
     more = len(links) - _NAMED
     return [*text, f" and {more} more"] if more > 0 else text

@@ -233,7 +233,7 @@ def numbers_table(
 
 
 def evidence_table(flag: Flag, *, units: Units | None, numbers: count) -> Table | None:
-    """Return the numbers and texts that support a flag; None without any."""
+    """Return a table of the numbers and texts that support a flag; None if it would be empty."""
     of = flag.evidence.get("parameter")
     found = {
         name: value
@@ -265,7 +265,7 @@ def _label(name: str, units: Units | None) -> str | tuple[Span, ...]:
 
 
 def _called(name: str) -> str:
-    """Return the name of a quantity; without a name, its key in grade.json made readable."""
+    """Return the name of a quantity, or a readable form of its key in `grade.json`."""
     key = f"quantity_{name}"
     return WORDS.text(key) if key in WORDS.by_key else _capital(clean(name).replace("_", " "))
 

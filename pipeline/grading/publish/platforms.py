@@ -1,7 +1,7 @@
 """The tables of learning platforms: their columns and the values written into them.
 
-The text of a column has names in braces, which are replaced by values of a student; see
-`export.values_of`. In the name of a column, `{title}` is replaced by the title of the assignment.
+The text for a column contains placeholders in braces, which are replaced by the student's values;
+see `export.values_of`. In column names, `{title}` is replaced by the title of the assignment.
 """
 
 from collections.abc import Mapping

@@ -58,7 +58,7 @@ class Roster:
         return cls(file=path.name, table=table)
 
     def check_maximum(self, out_of: float, *, title: str) -> None:
-        """Refuse a table whose maximum grade differs, because an import would not change it.
+        """Refuse a table with a different maximum grade; importing it would not change the maximum.
 
         Raises
         ------
@@ -216,7 +216,7 @@ def _row_of(student: Student, index: Mapping[tuple[str, str], Any]) -> Any:
 
 
 def _words(student: Student) -> tuple[tuple[str, str], ...]:
-    """Return the texts by which the row of a student can be found, the surest first."""
+    """Return the texts by which the row of a student can be found, the most reliable first."""
     return (
         ("number", student.number),
         _id_of(student),
@@ -229,10 +229,7 @@ def _id_of(student: Student) -> tuple[str, str]:
 
 
 def _number(text: str) -> float | None:
-    """Return a number as the platform writes it, perhaps with a decimal comma.
-
-    None for other text.
-    """
+    """Read a number from a platform's table, also with a decimal comma; None for other text."""
     try:
         return float(text.replace(",", "."))
     except ValueError:

@@ -23,8 +23,8 @@ class Student:
     id : id of the author in the submission; or "".
     name, number : name and number of the account that submitted, on the platform for which grades
         are exported; or "".
-    uploader : whether this is the account that submitted, and it is unknown to which of several
-        authors it belongs.
+    uploader : whether this entry is the account that submitted; it belongs to one of several
+        authors, but it is unknown to which.
     undecided : message that names the submissions, if the student is in several with different
         points.
     """
@@ -123,9 +123,10 @@ def not_exported(why: str, students: Sequence[Student]) -> Remark:
 
 
 def _students(entry: Entry, *, platform: Platform) -> list[Student]:
-    """Return the authors of a submission, plus its account if it matches no single author.
+    """Return the authors of a submission.
 
-    If a submission names no authors, those named with its points by hand are used.
+    On Canvas, the account that submitted is added if there are several authors. If a submission
+    names no authors, the authors stored with its points given by hand are used.
     """
     name, of, number = read_owner(entry.owner)
     number = number if of in ("", platform) else ""

@@ -38,10 +38,10 @@ def readings(name: str, analysis: Analysis) -> list[float]:
 
 
 def _by_size(steps: Sequence[StepGain]) -> list[float]:
-    """Return the gain as a slope from small to large steps, if it depends on the size of the step.
+    """Return the slope between small and large steps, if the gain depends on the size of the step.
 
-    The slope is the difference of levels divided by the difference of inputs. A dead zone, or an
-    amplifier that responds only above a threshold, subtracts the same from every step.
+    The slope is the difference in level divided by the difference in input. It is needed because a
+    dead zone, or an amplifier with a threshold, subtracts the same amount from every step.
     """
     edges = sorted(
         (abs(e.u_after - e.u_before), abs(e.level_after - e.level_before))
@@ -60,7 +60,7 @@ def _by_size(steps: Sequence[StepGain]) -> list[float]:
 
 
 def _held(cart: int, analysis: Analysis) -> float:
-    """Return the largest input step that did not move a free cart, because friction held it."""
+    """Return the largest input step that friction prevented from moving a free cart."""
     held = [
         float(np.abs(r.u).max())
         for r in analysis.records
@@ -74,10 +74,10 @@ def _held(cart: int, analysis: Analysis) -> float:
 
 
 def _shortest(edge: StepEdge, *, held: float) -> float:
-    """Return the smallest gain that fits a step's edge, if friction held the cart too far out.
+    """Return the gain from a step's edge, if friction stopped the cart beyond its equilibrium.
 
     Parameters
     ----------
-    held : the largest input that friction can hold.
+    held : the largest input that friction can balance.
     """
     return abs((edge.level_after - edge.level_before) / (abs(edge.u_after - edge.u_before) + held))

@@ -81,7 +81,7 @@ class References:
 
 
 def off_scale(analysis: Analysis) -> set[str]:
-    """Return the scales (of positions, input or both) that contradict the submission's."""
+    """Return which scales (position, input or both) contradict those that the submission states."""
     return {c.kind for c in analysis.checks if c.kind in ("position_scale", "input_scale")}
 
 
@@ -318,10 +318,10 @@ def _undamped(analysis: Analysis) -> bool:
 
 
 def _by_decays(chain: Chain, analysis: Analysis) -> list[dict[str, float]]:
-    """Return two tables of the fitted chain: with the least and the largest dampings of the decays.
+    """Return two tables of the fitted chain, with the smallest and largest dampings from decays.
 
     A cart without decays keeps the damping of the fit. No tables are returned without decays, for
-    carts that no spring ties to a wall, or if the least damping is not positive.
+    carts that no spring ties to a wall, or if the smallest damping is not positive.
     """
     decays = [readings(f"zeta_{cart}", analysis) for cart in range(1, chain.n + 1)]
     if not any(decays) or not chain.is_tied:

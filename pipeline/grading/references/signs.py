@@ -15,7 +15,7 @@ _NOTE = (
 
 
 def turned_round(reported: Reported, records: Sequence[Record]) -> tuple[Reported, tuple[str, ...]]:
-    """Return the reported numbers as for a bench that is not reversed, and a note if any changed.
+    """Return the numbers as reported on a bench that is not reversed, and a note if any changed.
 
     On a reversed bench, gains, B and the controller have the opposite sign in the log. Students may
     report them with this sign or as positive numbers; both are right.

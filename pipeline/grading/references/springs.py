@@ -20,8 +20,8 @@ def with_all_springs(
     """Return the analysis with all springs, and the names of added springs, if the data need them.
 
     Otherwise, the analysis is returned unchanged. All springs are tried at once, because a spring
-    that does not exist is fitted with zero stiffness. So no other choice explains more. On a single
-    cart, nothing is tried, because only the sum of the springs matters.
+    that does not exist is fitted with zero stiffness. So no other set of springs can explain more.
+    On a single cart, nothing is tried, because only the sum of the springs matters.
     """
     fit, springs = analysis.fit, submission.system.springs
     if analysis.bench.n == 1 or all(springs) or (fit is not None and is_explained(analysis)):

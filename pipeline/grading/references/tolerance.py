@@ -143,7 +143,7 @@ def to_step(points: Fraction, step: float) -> Fraction:
 def late_deduction(earned: Fraction, *, late: Late, step: float, days_late: float) -> Fraction:
     """Return the deduction from the points earned, for every day begun after the grace period.
 
-    It is rounded to the rubric's step, halves down, which favours the student.
+    It is rounded to the rubric's step; a half is rounded down, in the student's favour.
     """
     days = max(0, math.ceil(days_late - late.grace_days))
     share = min(exact(late.percent_per_day) * days, exact(late.most_percent)) / 100

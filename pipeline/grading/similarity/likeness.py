@@ -1,7 +1,7 @@
-"""Measure how similar the noise of two recordings is, beyond what the whole class shares.
+"""Measure how similar the noise of two recordings is, apart from what the whole class shares.
 
 A copy has the noise of its original, even if more noise was added. So if one noise is regressed on
-the other, in the same scale, the slope is one.
+the other, at the same scale, the slope is one.
 
 Honest recordings also have something in common: the knocks and end stops of the bench are as sudden
 as noise and equal in every run, and an encoder rounds equal motions equally. All this occurs in the
@@ -60,7 +60,7 @@ class Likeness:
 
     @property
     def is_whole(self) -> bool:
-        """Return whether the similarity is sure, and the slope is that of a full copy."""
+        """Return whether the similarity is certain and the slope is near one, as in a full copy."""
         return self.is_sure and (1 - self.slope) * self.sigmas <= _SPREAD * self.slope
 
 

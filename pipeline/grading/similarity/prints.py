@@ -57,13 +57,13 @@ class Print:
     group : the kind of run; only recordings of the same group are compared.
     residual : the filtered signals as whole numbers, shape (n_rows, n), with one row for each free
         cart, and one for the input of a closed loop.
-    step : what 1 in each row of the residual means, in the recording's position or input unit;
-        shape (n_rows,).
-    anchors : lists of samples that can be found again in a copy, the surest first; they give the
-        shift of the copy. One list has midpoints between two extrema of the motion, which noise
+    step : how much 1 is worth in each row of the residual, in the recording's position or input
+        unit; shape (n_rows,).
+    anchors : lists of samples that can be found again in a copy, the most reliable first; they give
+        the shift of the copy. One list has midpoints between two extrema of the motion, which noise
         does not affect. The others have maxima of the noise, which cutting does not affect.
-    motion : motion of the first cart at every few samples, from which the scale between two
-        recordings is found.
+    motion : motion of the first cart, at every n-th sample; it gives the scale between two
+        recordings.
     start : time of the first sample, in s.
     interval : time between samples, in s.
     """

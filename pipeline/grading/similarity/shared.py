@@ -69,7 +69,7 @@ class SharedRecord:
 
     Attributes
     ----------
-    submission, other_experiment : the other submission, and the recording's name there.
+    submission, other_experiment : the other submission, and the recording's name in it.
     sigmas : agreement of the noise, in standard deviations above chance.
     equal_rows : number of consecutive rows that are equal up to one factor per column; 0 if this is
         not the evidence.
