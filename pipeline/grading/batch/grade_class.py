@@ -73,7 +73,7 @@ class Options:
     Attributes
     ----------
     jobs : number of grading processes on this machine.
-    cluster : address of a Dask scheduler; if given, grading runs on its cluster, not on this machine.
+    cluster : address of a Dask scheduler. If given, its cluster grades, not this machine.
     time_limit : time limit for one submission, in s.
     memory_limit : memory limit for one submission, in bytes.
     anonymous : whether to leave names out of all files; a rubric may also require this.

@@ -21,7 +21,7 @@ class Setup:
     ----------
     scratch : folder for copies of the submissions during grading.
     time_limit : time limit for one submission, in s.
-    memory_limit : memory limit for one submission, in bytes, in addition to what an idle process needs.
+    memory_limit : memory limit for one submission, in bytes, added to what an idle process needs.
     """
 
     rubric: Rubric

@@ -413,8 +413,7 @@ class OpenBook(Gradebook):
 def _line(row: Row, given: Mapping[int, HandPoints] | None, *, rubric: Rubric) -> Line:
     """Return a line of the class list with its current grade.
 
-    `given` holds the overrides, or is None without any. Only overrides make it necessary to read the
-    whole grade.
+    `given` holds the line's overrides, if it has any. The whole grade is read only if it has.
     """
     shared = read_flag(row.shared)
     if given:
