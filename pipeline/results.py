@@ -287,7 +287,7 @@ class StepGain:
 
 @result(eq=False)
 class FrequencyResponse:
-    """X_cart/U at each frequency, on its own frequency grid; arrays (n_w,), never interpolated."""
+    """X_cart/U of one cart at the measured frequencies, never interpolated; arrays (n_w,)."""
 
     cart: int = written()
     omega: Array = written("rad/s, ascending")
@@ -740,7 +740,7 @@ class Analysis:
     authors : (id, name) of each author.
     tables : frequency responses that the students computed, even if dwells replace them.
     rows : the table of parameters.
-    fit : the fitted chain, or None; `skipped` then says why.
+    fit : the fitted chain; if it is None, `skipped` says why.
     files : the SHA-256 of each data file.
     unreadable : for each experiment that could not be read, the reason.
     unexplained : for each driven recording with motion, the share of its power that the fitted
@@ -799,7 +799,7 @@ class Analysis:
     @property
     @computed(key="hardware")
     def hardware_by_cart(self) -> tuple[HardwareCheck, ...]:
-        """One entry per run and cart: the simulated loop, with its check on the measured input."""
+        """One entry per run and cart: the simulated loop, and the plant on the measured input."""
         found: dict[tuple[str, int], HardwareCheck] = {}
         for check in sorted(self.hardware, key=lambda check: check.loop):  # "closed" before "open"
             key = (check.experiment, check.cart)

@@ -42,7 +42,7 @@ _WORDS = phrases("skipped")
 def analyse(
     submission: Submission, *, design: bool = True, progress: Progress = silent
 ) -> Analysis:
-    """Run every stage that the submission's data support; skip the others and record why.
+    """Run every stage for which the submission has data; skip all other stages and record why.
 
     Without `design`, no controller is designed; see `reference_design`.
 

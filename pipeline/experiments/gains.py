@@ -182,7 +182,7 @@ def _typed(value: float) -> float:
 
 
 def _law(loop: StateLoop, design: FeedbackDesign | None) -> StateFeedback:
-    """Return the gains in the bench's form, as stated in the plan or else as designed."""
+    """Return the gains for the bench: those in the plan or, if none are stated, the design's."""
     if loop.gains and loop.prefilter is not None:
         return StateFeedback(gains=np.array(loop.gains), prefilter=loop.prefilter)
     if design is None:

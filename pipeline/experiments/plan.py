@@ -66,8 +66,8 @@ class Recording(TomlTable):
     release : the cart that is pulled out and released by hand; None if no cart is released.
     controller : the controller that closes the loop.
     settle : time of rest before the run, in s.
-    aim : the parameter for which cartlab chose the recording, such as "zeta_2". Empty for a
-        standard recording and for one that a person chose.
+    aim : the goal for which cartlab chose the recording, such as "zeta_2" or "gap". It is empty for
+        a standard recording, and for one that a person chose.
     """
 
     id: str

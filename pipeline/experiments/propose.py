@@ -296,7 +296,7 @@ def large_steps(chain: Chain, limits: PlanLimits) -> list[Recording]:
 
 
 def _driven(chain: Chain, limits: PlanLimits) -> list[Recording]:
-    """Return steps and dwells that move the carts as far as intended."""
+    """Return steps and dwells in which the carts move as far as intended."""
     aim, furthest = AIM * limits.travel, FURTHEST * limits.travel
     settle = rounded(settling_wait(chain, time_constants=SETTLED))
     recordings = large_steps(chain, limits)

@@ -38,7 +38,8 @@ class Clock:
     rounding : decimal step in s of which all stamps are multiples; zero if there is no such step.
     pieces : number of straight lines that replaced the rounded stamps; zero if they are unchanged.
     period : interval of these lines in s if it is common to the session; otherwise None.
-    stopped : index (from 0) of the first sample at which time does not advance, or None.
+    stopped : index (from 0) of the first sample at which time does not advance; None if it always
+        does.
     gaps : indices (from 0) of the samples before which time is missing.
     """
 

@@ -63,7 +63,7 @@ class Found:
     state : whether the table is new, was completed or was already complete; or why the file is not
         used. It may be a copy, unknown, broken, missing, refused because of its name, or not read.
     experiment : id of the file's table; empty if there is no table.
-    carts : the free carts, as far as the file shows; () means all.
+    carts : the carts that seem to be free, judged by the file; () means all.
     inspection : result of the inspection; None if the file cannot be read.
     remarks : faults found in the file.
     unsure : questions for a person.
@@ -118,7 +118,7 @@ def examine_file(folder: Path, file: str, *, columns: Mapping[str, str | int] = 
 
     Parameters
     ----------
-    columns : columns by role, as far as `submission.toml` states them.
+    columns : the columns that `submission.toml` states, by role.
     """
     try:
         inspection = inspect_file(folder / file, columns=columns)
@@ -461,7 +461,7 @@ def _carts_seen(looked: Sequence[Found]) -> int:
 
 
 def _state_units(document: tomlkit.TOMLDocument, looked: Sequence[Found]) -> None:
-    """Write the units stated by headings into a new document; counts are its default."""
+    """Write the units stated by headings into a new document, except counts."""
     system: Any = document["system"]
     for inspection in (one.inspection for one in looked if one.inspection):
         for column in inspection.columns:

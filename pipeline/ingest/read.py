@@ -35,7 +35,7 @@ class Ingested:
     files : SHA-256 of each data file, sorted by path.
     unreadable : for each experiment whose file is not used, the reason: the file is missing,
         broken, or from another experiment.
-    signs : signs of the inputs, as stated and from the data.
+    signs : the stated signs of the inputs, and the signs found in the data.
     warnings : the warnings that concern more than one record.
     """
 
@@ -366,7 +366,7 @@ def _beyond_volts(values: Array) -> bool:
 
 
 def _reference(opened: _Opened, keep: slice) -> Array | None:
-    """Return the set point of a closed loop, as stated for the experiment or else from its file."""
+    """Return the set point of a closed loop, from the experiment's table or else from its file."""
     table, experiment, columns = opened.table, opened.experiment, opened.columns
     if experiment.kind != "closed_loop":
         return None

@@ -68,7 +68,7 @@ def nearest(name: object, candidates: Sequence[str]) -> str:
 
 @cache
 def list_tables(root: type[BaseModel]) -> Mapping[str, type[BaseModel]]:
-    """Return the tables of a format by dotted path, including the variants that a key selects."""
+    """Return the tables of a format by dotted path; each variant of a table has a path."""
     found: dict[str, type[BaseModel]] = {}
     for name, field in root.model_fields.items():
         kinds = [kind for kind in _kinds(field.annotation) if isinstance(kind, type)]

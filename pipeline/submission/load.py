@@ -122,7 +122,7 @@ def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submissio
 
 
 def with_reported(submission: Submission, reported: Mapping[str, Any]) -> Submission:
-    """Return the submission with new numbers under `[reported]`, checked like those of a file.
+    """Return the submission with new numbers under `[reported]`, checked as if read from a file.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ def name_span(name: str) -> Span:
 
 
 def symbol_text(name: str) -> str:
-    """Return a parameter's symbol as plain text, "ζ₁", as far as Unicode has the index."""
+    """Return a parameter's symbol as plain text, such as "ζ₁" if Unicode has the index."""
     read, text = read_name(name), name_span(name).text
     return text if read.cart is None else text.removesuffix(f"_{read.cart}") + subscript(read.cart)
 

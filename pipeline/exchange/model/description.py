@@ -132,12 +132,12 @@ class Bristle:
 
     @property
     def rate_slope(self) -> str:
-        """The derivative of the rate by the bend."""
+        """The derivative of the rate with respect to the bend."""
         return f"{substitute(self.rate, {'z': '1'})} - ({self.rate_at_zero})"
 
     @property
     def most(self) -> str:
-        """The derivative of the force by the bend."""
+        """The derivative of the force with respect to the bend."""
         return substitute(f"({self.force})", {"z": "1"}) + (
             f" - ({substitute(self.force, {'z': '0'})})"
         )

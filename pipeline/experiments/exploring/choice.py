@@ -1,4 +1,4 @@
-"""Choose the next recording of an exploration, with its reason."""
+"""Choose the next recording of an exploration, and say why."""
 
 import json
 from collections.abc import Iterator, Sequence

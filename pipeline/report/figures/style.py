@@ -242,7 +242,7 @@ def plot_points(
 def plot_line(
     ax: Axes, t: Array, y: Array, look: Look, *, name: str, in_legend: bool = True
 ) -> None:
-    """Draw a line, thinned to what the eye can resolve; zooming in shows every sample."""
+    """Draw a line, thinned to what the eye can see; zooming in shows every sample."""
     (line,) = ax.plot(*thin(t, y), label=name if in_legend else None, **look)
     attach_data(line, t, y, name=name)
 

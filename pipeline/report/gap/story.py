@@ -372,7 +372,7 @@ def _predicted(page: Page, gap: Gap) -> list[Block]:
 def _distinct_effects(
     one: AugmentedChain, other: AugmentedChain
 ) -> tuple[Sequence[str], Sequence[str]]:
-    """Return the names of the effects that only one of two models has."""
+    """Return, for each of two models, the names of the effects that the other one lacks."""
     mine, yours = (
         [effect_name(term.effect, term.where) for term in model.terms] for model in (one, other)
     )
@@ -385,9 +385,9 @@ def _distinct_effects(
 def _apart_names(
     first: Sequence[str], second: Sequence[str], *, most: int | None = None
 ) -> tuple[str, str]:
-    """Return names for two models, made from the effects that only one of them has.
+    """Return names for two models, from the lists of effects that only one of them has.
 
-    If only the first model has effects of its own, the second is "without it" or "without them".
+    If the second list is empty, the second model is "without it" or "without them".
     """
     one = f"with {listing(first, most=most)}"
     if second:

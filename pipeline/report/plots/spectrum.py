@@ -32,8 +32,8 @@ def amplitude_spectrum(t: Array, y: Array) -> tuple[Array, Array]:
 def thin_lines(amplitudes: Sequence[Array]) -> tuple[NDArray[np.intp], list[Array]]:
     """Return the indices (k,) of the lines to keep, and each spectrum's values (k,) at these lines.
 
-    Neighbouring lines on the logarithmic axis are replaced by one line with their largest value, so
-    that every peak stays. Its frequency is the one at which the first spectrum is largest.
+    Lines that are close together on the logarithmic axis are merged into one, with their largest
+    value, so every peak stays. Its frequency is where the first spectrum is largest.
     """
     count = amplitudes[0].size
     if count <= MOST_LINES:

@@ -46,7 +46,7 @@ def discussion_blocks(markdown: str) -> tuple[Block, ...]:
 
 
 def even_headings(blocks: Iterable[Block]) -> tuple[Block, ...]:
-    """Return blocks whose headings never skip a level, as an outline needs."""
+    """Return the blocks with new heading levels, so that the outline skips no level."""
     above: list[int] = []  # levels of the headings above this one, as typed
 
     def even(block: Block) -> Block:

@@ -62,7 +62,7 @@ def _origins(analysis: Analysis) -> Spans:
 
 
 def parameter_table(page: Page) -> Table:
-    """Return initial and final estimates like the paper's Tables 1-3, with errors and verdicts."""
+    """Return initial and final estimates with errors and verdicts, as in the paper's Tables 1-3."""
     words, carts = {1: "one", 2: "two", 3: "three", 4: "four"}, page.analysis.bench.n
     rows, steps = page.analysis.rows, page.analysis.steps
     # Without a fit, only the first four columns are filled.
