@@ -241,9 +241,7 @@ class Dwell:
     def _drop_drifting(
         self, y: Array, start: int, *, latest: int, floor: float
     ) -> tuple[int, float]:
-        """Move the start until both halves of the steady part agree, at most to `latest`.
-
-        Return the start and the remaining error.
+        """Return a start, at most `latest`, that makes both halves agree, and the error left.
 
         At a resonance, the transient has the frequency of the dwell and is hidden in its amplitude.
         If the difference between the halves exceeds the noise, half of it is still in the mean.
