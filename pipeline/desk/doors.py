@@ -114,7 +114,7 @@ class JupyterDoor:
     def site(self, headers: Headers) -> str:
         """Return the address at which the browser reaches Jupyter, from the headers.
 
-        A page of another site has another origin, so it is refused.
+        Pages from other sites have a different origin, so they are refused.
         """
         scheme = headers.get("origin", "").partition("://")[0] or "http"
         return f"{scheme}://{headers.get('host', '')}"

@@ -31,7 +31,7 @@ class Job:
     Attributes
     ----------
     task : name and arguments of the task.
-    message : the current stage; at the end the error, or the answer of the task if it is a text.
+    message : the current stage; at the end, the error, or the task's result if it is text.
     version : number that grows with every change of state or stage.
     """
 

@@ -224,7 +224,7 @@ def propose_recordings(folder: str, stock: bool, *, progress: Progress) -> str:
 def weigh_recording(
     folder: str, recording: dict[str, Any], goal: str, *, progress: Progress
 ) -> dict[str, Any]:
-    """Return what a recording would improve, and what the best choice would improve."""
+    """Return how much a custom recording would improve, next to the best one that cartlab finds."""
     from pipeline.bench.host.raw import known_commands
     from pipeline.experiments.plan import Recording
     from pipeline.experiments.plan_words import what_words
@@ -383,7 +383,7 @@ def _draw_lines(rows: Sequence[Array]) -> list[str]:
 
 
 def _write_points(row: Array) -> str:
-    """Return values from 0 to 1 as points: in turn the largest and the least of a stretch."""
+    """Return values from 0 to 1 as points: alternately the maximum and minimum of a stretch."""
     stretches = np.array_split(row, min(row.size, _ACROSS))
     heights = [(s.max(), s.min())[i % 2] for i, s in enumerate(stretches)]
     step = _ACROSS / max(len(heights) - 1, 1)

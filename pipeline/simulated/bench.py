@@ -26,7 +26,7 @@ _SHORTEST_STEP = 1e-5  # s; with steps this short, a session takes half an hour 
 
 @dataclass(frozen=True, kw_only=True)
 class ReleasingHand:
-    """A hand that holds one cart away from its rest and lets it go.
+    """A hand that holds one cart away from its rest position and lets it go.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class BenchRun:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrueMotion:
-    """The true input (n,) and the positions (n_carts, n) relative to the springs' rest.
+    """The true input (n,), and the positions (n_carts, n) relative to rest.
 
     If a sensor has its own scale, the positions are scaled by it.
     """

@@ -205,7 +205,7 @@ def _refuse_second(term: EffectTerm, present: Sequence[EffectTerm], *, where: st
 def _session_scales(
     effect: Effect, chain: Chain, *, place: int, travel: float
 ) -> tuple[PlaceScales, float]:
-    """Return the typical sizes of motion at a place in a session, and the side of the larger step.
+    """Return typical sizes of motion at a place, and on which side the larger step moves it.
 
     The sizes are those of the larger step. A spring counts as stretched at least by the travel, as
     when a cart is released.

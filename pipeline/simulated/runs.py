@@ -97,7 +97,7 @@ def plan_decays(session: SimulatedSession, rng: np.random.Generator) -> list[Ben
 
 
 def plan_steps(session: SimulatedSession) -> list[BenchRun]:
-    """Return steps of the input, on and off: a small one, and a larger one to the other side."""
+    """Return input steps, on and off: small ones, and larger ones in the other direction."""
     chain = session.chain
     wait = settling_wait(chain, time_constants=SETTLED)
     t = session.clock(_REST + 2 * wait)

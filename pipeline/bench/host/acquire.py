@@ -41,7 +41,7 @@ def acquire(
     only: Collection[str] = (),
     buttons: Buttons | None = None,
 ) -> tuple[RunOutcome, ...]:
-    """Record the planned experiments that the submission lacks; return how each run ended.
+    """Record the planned experiments still missing in the submission; return how each run ended.
 
     Every complete run is entered in submission.toml at once, so an interrupted session can be
     continued. The data of a run that ended early are saved separately, and the run is repeated.
@@ -51,8 +51,8 @@ def acquire(
     port : name of the serial port, or a URL that pyserial knows.
     observers : displays of the session. The first one also asks a person to do the work at the
         bench.
-    only : ids of the recordings to make. By default the whole plan, which is extended if new data
-        allow it.
+    only : ids of the recordings to make. By default the whole plan; dwells and a closed loop
+        are added once the data are sufficient.
     buttons : the buttons with which a person ends or repeats a run.
 
     Raises

@@ -143,7 +143,7 @@ def cart_remarks(submission: Submission, bench: Description) -> list[str]:
 
 
 def limit_words(limits: PlanLimits, submission: Submission, bench: Description) -> str:
-    """Return the limits of a plan as text, also in encoder counts and beside the full scale.
+    """Return a plan's limits as text, with the bench's full scale and the travel in encoder counts.
 
     Raises
     ------

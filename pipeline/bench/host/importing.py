@@ -158,7 +158,7 @@ class Importer:
             return None
 
     def _take(self, path: Path, *, final: bool) -> Imported | None:
-        """Copy a file into the submission and enter it; None if it is refused or already there.
+        """Copy a file into the submission and add an experiment; None if it is refused or known.
 
         A file with an incomplete last line may still grow, so it is tried again later.
 

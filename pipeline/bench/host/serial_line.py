@@ -341,7 +341,7 @@ class SerialLine:
 
 
 class _Ear:
-    """Notice that the motor is on, from two lines in a row; a single line may be garbled."""
+    """Detect that the motor is on, from two lines in a row; a single line may be garbled."""
 
     def __init__(self) -> None:
         self._tail, self._on = b"", False

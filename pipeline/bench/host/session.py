@@ -97,7 +97,7 @@ class Session:
         Raises
         ------
         HardwareError : the carts do not come to rest, or nobody can confirm that they are held.
-        Runaway : without an order, the motor is on or a cart is too far out.
+        Runaway : the motor is on or a cart is too far out, although no run was ordered.
         """
         recording = order.recording
         self.wish = None
@@ -274,9 +274,9 @@ class Session:
     def _zero_at_rest(self, recording: Recording) -> None:
         """Set the counts to zero before the motor's first run on this line, while the carts rest.
 
-        The carts may have been swinging when the line was opened, so the positions of that moment
-        are no zero for the travel limit. Before a run by hand the counts are not set to zero,
-        because a cart held by hand never rests exactly.
+        The carts may have been swinging when the line was opened, so its positions are no reliable
+        zero for the travel limit. The counts are not set to zero before a release by hand, because
+        a cart held by hand never rests exactly.
         """
         if self._zeroed or not recording.amplitude:
             return

@@ -44,7 +44,7 @@ def fit_stamps(stamps: Stamps, *, period: float, stated: bool = False) -> StampF
 
     Parameters
     ----------
-    stamps : (n,) time stamps in ms, never falling.
+    stamps : (n,) time stamps in ms, never decreasing.
     period : expected period, in ms.
     stated : whether the bench itself stated the period.
     """

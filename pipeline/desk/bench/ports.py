@@ -30,7 +30,7 @@ class Port:
 
 
 def list_ports(ask: Ask) -> list[Port]:
-    """Return the ports at which a person may record, the likeliest first.
+    """Return the ports at which a person may record, the most likely first.
 
     The last port used in this folder comes first if it still exists. Ports with a device follow,
     and then the virtual benches on this computer. On a lab server, only the ports in the list of

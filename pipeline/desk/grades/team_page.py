@@ -161,7 +161,7 @@ def _link_items(
 def _show_chosen(
     ask: Ask, shown: Class, grade: Grade, now: TeamNow, *, chosen: Item, wrong: str
 ) -> dict[str, Any]:
-    """Return what the page shows beside the list: the chosen criterion or flag and its evidence."""
+    """Return what is shown next to the list: the chosen criterion or flag, with its evidence."""
     name, drawn = grade.submission, open_book(ask).figures(now.entry)
     asked = next((c for c in now.rubric.criteria if c.id == chosen.id), None)
     if chosen.is_remark or asked is None:

@@ -211,7 +211,7 @@ def _widen(ask: Ask, shown: Class, wanted: Filter) -> tuple[str, int] | None:
 
 
 def _list_rows(ask: Ask, shown: Class, asked: Criterion, *, typed: str) -> list[Row]:
-    """Return the teams of the filter and of the form, each with its points before and after."""
+    """Return the teams that pass the filter or were in the form, with points before and after."""
     sent = ask.sent.getlist("team")
     names = [team.line.submission for team in Filter.read(ask.request.query_params).chosen(shown)]
     names += [str(name) for name in sent if name in shown.teams and name not in names]

@@ -143,7 +143,7 @@ def _free_folder(root: Path) -> Path:
 
 
 def _check_exercise(ask: Ask) -> tuple[dict[str, str], dict[str, Any]]:
-    """Return the bench of the form, and what the worker process finds about it and its effects."""
+    """Return the bench as typed, and the worker's check of the bench and its effects."""
     bench = _read_bench(ask)
     known = {effect.key: effect for effect in CATALOGUE}
     chosen = [

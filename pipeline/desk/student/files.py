@@ -83,7 +83,7 @@ def _unpack(content: BinaryIO, scratch: Path, *, workers: WorkerPool) -> list[tu
 
 
 class _Room:
-    """The files and bytes that a submission may still get, counted once per upload.
+    """The files and bytes that a submission may still receive, counted once per upload.
 
     Files that were set aside, or that a command made, are not part of the submission and do not
     count.

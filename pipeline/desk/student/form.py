@@ -174,7 +174,7 @@ def fill_experiment(document: Mapping[str, Any], index: int) -> tuple[Field, ...
 
 
 def sign_fields(document: Mapping[str, Any], signs: Mapping[str, int]) -> list[Field]:
-    """Return the fields, filled in, of the input signs that the tables do not state.
+    """Return a filled-in field for each input sign that its table does not state.
 
     Parameters
     ----------

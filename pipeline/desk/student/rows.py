@@ -131,7 +131,7 @@ def list_rows(
 
     Parameters
     ----------
-    doubts : for each table, the doubts that the table marks as unsure.
+    doubts : for each table, the texts of the doubts that are marked in it.
     """
     # Further tables are not shown; their number is a problem that the page reports.
     listed = list_experiments(document)[:MOST_EXPERIMENTS]
@@ -237,8 +237,8 @@ def _question(
 def gather_remarks(rows: Sequence[Row]) -> dict[str, str]:
     """Return each remark that many files have, with a sentence that names these files.
 
-    Remarks that differ only in numbers of ms or pieces share a sentence with the range of these
-    numbers.
+    Remarks that differ only in durations in ms or in counts are combined, with the range of each
+    number.
     """
     remarks = [(row.file.removeprefix("data/"), remark) for row in rows for remark in row.remarks]
     times = Counter(_MEASURED.sub("#", remark) for _, remark in remarks)
@@ -254,7 +254,7 @@ def gather_remarks(rows: Sequence[Row]) -> dict[str, str]:
 
 
 def _span_numbers(remarks: Sequence[str]) -> str:
-    """Return remarks that differ only in numbers as one, with the range of each number."""
+    """Combine remarks that differ only in numbers, with the range of each number."""
     columns = zip(*(_MEASURED.findall(one) for one in remarks), strict=True)
     ends = [(min(column, key=float), max(column, key=float)) for column in columns]
     spans = iter([low if low == high else f"{low} to {high}" for low, high in ends])

@@ -77,7 +77,7 @@ def _read(path: Path) -> RunningBench | None:
 def _began(pid: int) -> float:
     """Return when a process began, s; 0 if there is no such process.
 
-    If the system gives the number to a new process, that process has another time.
+    If the system reuses the number for a new process, the time is different.
     """
     try:
         return psutil.Process(pid).create_time()

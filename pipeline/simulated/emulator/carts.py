@@ -121,7 +121,8 @@ class VirtualCarts:
 def input_per_count(bench: SimulatedBench) -> float:
     """Return input units per duty count: full scale is 5 times a power of ten.
 
-    Full-scale input holds the carts some ten travels out, so one travel is hundreds of duty counts.
+    Full-scale input would hold the carts at some ten times the travel, so the travel is hundreds of
+    duty counts.
     """
     hold = bench.travel / float(np.max(np.abs(bench.chain.static_gains())))
     return 5.0 * 10.0 ** round(math.log10(REACH * hold / 5.0)) / FULL_SCALE
