@@ -100,7 +100,7 @@ def physical_values(chain: Chain, *, bench: Bench) -> dict[str, float]:
 def check_vanishing(fit: ChainFit, *, bench: Bench) -> list[Check]:
     """Return a failed check for each mass, damping or spring that may not exist.
 
-    A parameter may not exist if its value is zero within its standard error, or negligible beside
+    A parameter may not exist if its value is zero within its standard error, or small compared with
     its larger neighbour of the same kind.
     """
     if not fit.converged:
@@ -213,7 +213,7 @@ def _gain_order_check(values: Mapping[str, float], *, chain: Chain) -> Check:
 
 
 def _frequency_order_checks(values: Mapping[str, float], *, n: int) -> list[Check]:
-    """Check the order of resonances, nulls and the carts' own frequencies.
+    """Check the order of resonances, nulls, and frequencies of single carts.
 
     With heavy damping, a wrong order is no failure, because damping may change the order.
     """

@@ -40,7 +40,7 @@ def minimise(
 def evaluated_once(at: Callable[[Array], T]) -> Callable[[Array], T]:
     """Return `at` with its last result cached, for repeated calls with the same p (n_p,).
 
-    Scipy asks for the residual at p, and then often for its derivatives there.
+    Scipy asks for the residual at p, and then often for its derivatives at the same p.
     """
     last: list[tuple[Array, T]] = []
 

@@ -1,4 +1,4 @@
-"""The gap workflow: split the runs, fit the chain, search for effects, and describe the rest."""
+"""The gap workflow: split the runs, fit the chain, find effects, describe the remaining error."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -132,7 +132,7 @@ def _fit_points(
 def _is_doubted(fitted: Fitted, dwells: Sequence[Record]) -> bool:
     """Whether the fit does not explain the points, and most motions are only a few encoder steps.
 
-    Rounding then hides the rest of a transient. Near a sharp resonance, this changes the amplitude
+    Rounding then hides the end of a transient. Near a sharp resonance, this changes the amplitude
     of a dwell by several standard errors.
     """
     assert fitted.fit is not None

@@ -17,7 +17,7 @@ _BETTER = 5.0
 
 
 def find_late_channels(records: Sequence[Record], *, carts: int) -> tuple[LateChannel, ...]:
-    """Find the carts whose channel is read later, or earlier, than that of the first cart.
+    """Find the carts whose channel is read later, or earlier, than the first cart's.
 
     Each kind of experiment is tested separately, since one kind may have been logged differently. A
     delay of the input moves all channels equally and is not found here.

@@ -28,7 +28,7 @@ class Repeats:
     Attributes
     ----------
     checks : one check for each number that was measured more than once.
-    odd : the runs that differ, by id, each with its fault.
+    odd : the runs that disagree with the others, by id, each with its fault.
     undecided : the numbers whose runs contradict each other, if nothing shows which runs are right.
     """
 

@@ -261,7 +261,7 @@ def _estimates(names: Sequence[str], extrema: Sequence[_Extremum]) -> Mapping[st
 
 
 def _between(extrema: Sequence[_Extremum], modes: Sequence[_Extremum]) -> list[_Extremum]:
-    """Return the extrema below the highest mode; a chain has its nulls there."""
+    """Return the extrema below the highest mode, where a chain has its nulls."""
     top = max((mode.omega for mode in modes), default=np.inf)
     return [e for e in extrema if e.omega < top]
 

@@ -107,7 +107,7 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
 def _pole_errors(pole: complex, covariance: Array) -> tuple[float, float]:
     """Return the standard errors of zeta and omega_n.
 
-    `covariance` (2, 2) is that of decay rate and damped frequency.
+    `covariance` (2, 2) belongs to decay rate and damped frequency.
     """
     per_zeta = np.array([pole.imag**2, pole.real * pole.imag]) / abs(pole) ** 3
     per_omega = np.array([-pole.real, pole.imag]) / abs(pole)

@@ -344,7 +344,7 @@ def _driven(record: Record) -> slice:
 
 
 def _frequency(t: Array, u: Array, *, stated: float | None) -> tuple[float, str]:
-    """Return the frequency, rad/s: as stated, unless the input clearly has another one."""
+    """Return the frequency, rad/s: as stated, unless the input clearly has a different one."""
     grid = np.linspace(t[0], t[-1], t.size)
     even = np.interp(grid, t, u - np.mean(u))
     n = 4 * t.size  # padded, so that the peak is found to a quarter of a line

@@ -161,7 +161,7 @@ def _settle(
 
 
 def _level(t: Array, y: Array, *, n_modes: int, size: float, step: float) -> _Level | None:
-    """Return the level at which y (n,) settles, or None."""
+    """Return the level at which y (n,) settles; None if it does not settle."""
     motion, pace = float(np.ptp(y)), _pace(t, y, size=size)
     flat = _flat_from(y, span=_FLAT * size)
     if flat == 0 or t[-1] - t[flat] >= pace:

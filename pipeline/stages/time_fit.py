@@ -159,7 +159,7 @@ def _undetermined(name: str) -> DataError:
 
 
 def _negligible(attempt: Attempt, covariance: Array) -> tuple[str, ...]:
-    """Return the wall springs, or else the dampings, that the fit has moved to zero.
+    """Return the wall springs that the fit has moved to zero, or else such dampings.
 
     Carts without springs keep their dampings, because a body without forces has no modes.
     """

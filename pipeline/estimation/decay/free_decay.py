@@ -32,7 +32,10 @@ _RELEASE_MARGIN = 1 / 40  # share of a period, in which the fingers leave the ca
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Stretch:
-    """Samples [first, stop) with constant input; `level` is the input, or None without one."""
+    """Samples [first, stop) of a record; `level` is their constant input.
+
+    It is None for a whole record, whose input may vary or be missing.
+    """
 
     first: int
     stop: int
@@ -86,7 +89,10 @@ def find_decay(record: Record, *, cart: int, size: float) -> tuple[Stretch, list
 
 
 def _stretches(record: Record) -> list[list[Stretch]]:
-    """Return the stretches of constant input: those without input first, the whole record last."""
+    """Return groups of stretches to search, in order: with zero input, and with constant input.
+
+    For a decay, or without an input, the whole record comes last.
+    """
     whole = Stretch(first=0, stop=record.t.size, level=None)
     if record.u is None:
         return [[whole]]

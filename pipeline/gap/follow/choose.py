@@ -141,7 +141,7 @@ def _one_friction(follow: Follow, records: Records) -> Follow:
 
 
 def rivals_of(lean: Follow, records: Records) -> list[Follow]:
-    """Return models in which one law is exchanged for another, refitted, the best first."""
+    """Return refitted models in which one law is replaced by another, the best first."""
     everything = smooth_laws(lean.laws.bench, columns=records.columns)
     out: list[Follow] = []
     for group in lean.laws.groups():

@@ -70,7 +70,7 @@ class FollowedRun(NamedTuple):
 
 
 class FollowedState(NamedTuple):
-    """Positions and velocities (n,), and the laws' own states and terms `aux` (laws, ROOM).
+    """Positions and velocities (n,), and the laws' states and terms `aux` (laws, ROOM).
 
     `DX`, `DV` (n, lanes) and `DA` (2 laws, lanes) are the derivatives. The lanes are the parameters
     `p`, then those of the run: zeros, starts, velocities and factors on dry friction (n each).

@@ -4,8 +4,8 @@ At every sample the simulated state is corrected by a share `gain` of the error:
 
     e = y - x,   x <- x + gain e,   v <- v + 0.3 gain² e / Δt.
 
-Then it moves freely to the next sample. So the model is never far from the data, and the cost has
-a single minimum where that of a free simulation has many. With `gain` 0 the simulation is free.
+Then it moves freely to the next sample. So the model is never far from the data, and its cost has
+a single minimum, while a free simulation's cost has many. With `gain` 0 the simulation is free.
 The derivatives are integrated with the state and are exact for the numerical scheme.
 
 The steps are those of the leapfrog method. Dry friction is set-valued, and a cart that reverses

@@ -80,7 +80,7 @@ class Search:
     def add_constant_force(self) -> None:
         """Add a constant force if the rest points imply one.
 
-        With the force in the model, the encoder zeros are those of the file, known to half the
+        With the force in the model, the file's encoder zeros count as right to within half the
         noise. All hypotheses are then judged with these zeros.
         """
         self.path = steps_to(self.chosen, self.found, self.study)
@@ -137,7 +137,7 @@ class Search:
         return find_hypotheses(baseline, self._timed(study))
 
     def _try(self, study: Study, *, only_at_floor: bool = False) -> bool:
-        """Search with another study; return whether its result was complete and is kept."""
+        """Search with a changed study; return whether its result was complete and is kept."""
         self.linear = fit_model(self.linear.without_nuisance, study.training, study.fitting)
         chosen, found = self._look(study)
         kept = not self.deadline.cut and (chosen.at_floor or not only_at_floor)

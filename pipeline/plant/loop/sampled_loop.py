@@ -17,7 +17,7 @@ made at the last tick:
 With a `model`, the prediction for the next tick is exact and includes the acting input. Without a
 model it is x + sample_time v with v unchanged, so v is a filtered difference of the readings. With
 `delay` 1 the gains multiply the prediction, which is the state at the moment when the effort begins
-to act. So the delay needs no gain of its own. The poles of the delayed loop are those of the loop
+to act. So the delay needs no further gain. The poles of the delayed loop are those of the loop
 without delay, and one more at z = 0. The observer starts at the first reading, at rest.
 
 **PID.** The effort is scale (kp e + ki ∫e + kd de/dt) with e = r - y of one cart, in the units of
@@ -82,7 +82,7 @@ class LoopRun:
     Attributes
     ----------
     t : times (n,), s.
-    x : readings (f, n) of the free carts. They include the rest, but not the encoder's rounding.
+    x : readings (f, n) of the free carts. They include the rest position, but no encoder rounding.
     u : effort (n,) that acts from each time on, clipped like the input in a bench's log.
     """
 

@@ -63,7 +63,7 @@ class EffectParameter:
         effects in a practice bench.
     signed : whether the parameter may change its sign in a fit.
     side : whether the parameter's sign selects a side. Such a sign never changes.
-    neutral : the value without effect, or None.
+    neutral : the value at which the effect vanishes, if there is one.
     lower, upper : bounds of the magnitude, in multiples of `scale`.
     reach : the largest step of the parameter's logarithm in a fit.
     reported : False for a detail of a contact, which the simulation needs but users do not ask for.
