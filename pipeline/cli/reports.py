@@ -84,7 +84,7 @@ def inspect(
         typer.echo("\n\n".join(format_inspection(i) for i in inspections))
     for message in (*unreadable, *not_read_notes(not_read)):
         say(f"cartlab: {message}")
-    if unreadable:
+    if unreadable or any(one.unusable for one in inspections):
         raise typer.Exit(1 if inspections else 2)
 
 
@@ -111,11 +111,14 @@ def fill(folder: Folder, as_json: AsJson = False) -> None:
         say(f"cartlab: {message}")
     gone = [f.file for f in left if f.state == "missing"]
     unused = [f.file for f in left if f.state != "missing"]
+    spoilt = [f.file for f in found if f.inspection and f.inspection.unusable]
     if gone:
         say(f"cartlab: there is no such file: {', '.join(gone)}")
     if unused:
         say(f"cartlab: not used yet: {', '.join(unused)}")
-    if left:
+    if spoilt := [file for file in spoilt if file not in unused]:
+        say(f"cartlab: a report cannot use these files as they are: {', '.join(spoilt)}")
+    if left or spoilt:
         raise typer.Exit(1)
 
 

@@ -27,6 +27,7 @@ from pipeline.desk.users import Place, User, name_place
 from pipeline.errors import ConfigError
 from pipeline.processes import Failed
 from pipeline.resources import TEMPLATES
+from pipeline.words.text import breakable
 
 NOTHING_KNOWN: dict[str, Any] = {
     "kind": None, "format": "", "duration": None, "remarks": [], "unusable": [], "unsure": [],
@@ -286,7 +287,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["called"] = name_place
+    environment.filters |= {"called": name_place, "breakable": breakable}
     # This random number in the addresses of style sheets and scripts keeps browsers from using old
     # copies.
     environment.globals["fresh"] = secrets.token_hex(4)

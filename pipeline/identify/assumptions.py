@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from pipeline.checks.carts import physical_values
+from pipeline.ingest.channels import little_motion
 from pipeline.ingest.columns import is_count
 from pipeline.ingest.read import DUTY_COUNT, Ingested
 from pipeline.results import Assumption, ChainFit, Check, Record
@@ -175,6 +176,8 @@ def _free_carts(
             support, reason = "contradicted", f"in {abridge(contrary)} another cart moves"
         elif still:
             reason = f"in {abridge(still)} a cart stated as free does not move"
+        elif little := [record.id for record in alike if _hardly_moving(record)]:
+            reason = f"in {abridge(little)} a cart stated as free hardly moves"
         elif unseen:
             what = "a held cart" if held else "a cart"
             reason = f"in {abridge(unseen)} {what} was not measured"
@@ -189,6 +192,14 @@ def _free_carts(
             experiments=names,
             reason=reason,
         )
+
+
+def _hardly_moving(record: Record) -> bool:
+    """Return whether a free cart moves so little that it may have been held."""
+    if record.kind == "sine":  # near a null, a free cart hardly moves
+        return False
+    ranges = {cart: float(np.ptp(record.position(cart))) for cart in record.carts}
+    return any(cart in record.free for cart in little_motion(ranges))
 
 
 def _stands_still(record: Record, cart: int) -> bool:

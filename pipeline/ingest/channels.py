@@ -1,4 +1,6 @@
-"""Checks of single channels: encoder step, copied column, stuck encoder, clipped input."""
+"""Checks of channels: encoder step, little motion, copied column, stuck encoder, clipped input."""
+
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -31,6 +33,11 @@ def encoder_step(x: Array) -> float:
     off_grid = distances / step - np.round(distances / step)
     # With a larger rms distance (in steps), the values are not multiples of one step.
     return step if np.sqrt(np.mean(off_grid**2)) < 0.15 else 0.0
+
+
+def little_motion(ranges: Mapping[int, float]) -> tuple[int, ...]:
+    """Return the carts that move less than 5 % as far as another cart, from their ranges."""
+    return tuple(cart for cart, range_ in ranges.items() if range_ < 0.05 * max(ranges.values()))
 
 
 def mirrors(reference: Array, x1: Array) -> bool:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import tomlkit
 
 from pipeline.errors import ConfigError, SubmissionError
-from pipeline.ingest.channels import never_changes
+from pipeline.ingest.channels import little_motion, never_changes
 from pipeline.ingest.columns import is_count, is_known, position_units
 from pipeline.ingest.folder import (
     NotRead,
@@ -157,8 +157,7 @@ def hardly_moving(inspection: Inspection) -> tuple[int, ...]:
     if inspection.kind == "sine":  # near a null, a free cart hardly moves
         return ()
     ranges, carts = _ranges(inspection), _moving(inspection)
-    # Less than 5 % of the largest cart motion.
-    return tuple(cart for cart in carts if ranges[cart] < 0.05 * max(ranges.values()))
+    return tuple(cart for cart in little_motion(ranges) if cart in carts)
 
 
 def _moving(inspection: Inspection) -> tuple[int, ...]:

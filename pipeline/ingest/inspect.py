@@ -10,13 +10,13 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
-from pipeline.ingest.clock import Clock, clock_notes, read_clock
+from pipeline.ingest.clock import FEWEST_SAMPLES, Clock, clock_notes, read_clock
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
 from pipeline.ingest.formats.recognise import FORM_TITLES, read_table
 from pipeline.ingest.formats.table import FileTable, Variable
 from pipeline.ingest.unnamed import Roles, find_roles
 from pipeline.results import Kind
-from pipeline.words.numbers import by_note, first_few
+from pipeline.words.numbers import by_note, count, first_few
 
 NO_CLOCK = "no time column: state `sample_rate`"
 _MOST_COLUMNS = 16  # most columns listed in a sentence
@@ -213,12 +213,15 @@ def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str])
 
     Raises
     ------
-    SubmissionError : time stands still or goes back.
+    SubmissionError : there are too few samples, or time stands still or goes back.
     """
     column, n = columns.get("time"), table.values.shape[1]
     factor = conversion(column.unit, "s") if column else None
-    if column is None or factor is None or n < 3:
-        problems.append(NO_CLOCK if n >= 3 else f"only {n} samples")
+    if n < FEWEST_SAMPLES:
+        few = f"only {count(n, 'sample')}; at least {FEWEST_SAMPLES} are needed"
+        raise SubmissionError(f"{table.source} {few}")
+    if column is None or factor is None:
+        problems.append(NO_CLOCK)
         return None
     clock = read_clock(table.values[column.index] * factor)
     problems += clock_notes(table, column, clock, sample_rate=None)

@@ -307,7 +307,8 @@ def _position_scale(opened: _Opened, column: Column) -> float:
             return 1.0
         raise SubmissionError(
             f"{table.source}: {column.name!r} holds encoder counts; state how many {unit} one "
-            f"count is: position = {{ unit = {unit!r}, per_count = … }}"
+            f"count is: position = {{ unit = {unit!r}, per_count = … }}; or use counts: "
+            "position = { unit = 'count' }"
         )
     return _unit_scale(opened, column, unit, "position")
 

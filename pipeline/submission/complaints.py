@@ -151,10 +151,11 @@ def explain(error: ErrorDetails, document: dict, *, root: type[BaseModel] = Subm
     text = f"{where}: {refusal(error)}"
     if kind == "tuple_type" and isinstance(found, dict):
         text += f"; start each with [[{where}]], in double brackets"
-    if kind == "literal_error" and isinstance(found, str):
-        close = get_close_matches(
-            found, re.findall(r"'([^']*)'", error.get("ctx", {}).get("expected", "")), n=1
-        )
+    context = error.get("ctx", {})
+    typed = context["tag"] if kind == "union_tag_invalid" else found
+    if kind in ("literal_error", "union_tag_invalid") and isinstance(typed, str):
+        valid = str(context.get("expected") or context.get("expected_tags"))
+        close = get_close_matches(typed, re.findall(r"'([^']*)'", valid), n=1)
         text += f"; did you mean {close[0]!r}?" if close else ""
     return text
 
@@ -169,6 +170,8 @@ def first_refusal(error: ValidationError) -> str:
 def refusal(error: ErrorDetails) -> str:
     """Return what was expected and what was found, for one pydantic error."""
     kind, found = error["type"], quote(error["input"])
+    if kind == "union_tag_invalid":  # the input is the whole table
+        found = quote(error.get("ctx", {})["tag"])
     if kind == "json_invalid":
         return "not JSON, or truncated"
     if kind == "value_error":  # its message says what was found

@@ -3,12 +3,15 @@
 import re
 import unicodedata
 
+from markupsafe import Markup, escape
+
 from pipeline.names import read_name
 from pipeline.words.math import GREEK, symbol
 from pipeline.words.numbers import listing, subscript, typeset
 from pipeline.words.spans import Span, Spans
 
 _NAME = re.compile(r"\b(?:omega|zeta|K|X|m|c|k)_(?:\d|[a-h]|[nxy])\b|\b(?:omega|zeta)\b")
+_BREAK = re.compile(r"(?<=\w[._-])(?=[^\W\d])")  # "zeta_1" stays whole
 
 
 def rich(text: str) -> Spans:
@@ -51,6 +54,11 @@ def clean(text: str) -> str:
         c if c in "\n\t" or unicodedata.category(c)[0] != "C" else "�"
         for c in text.replace("\r\n", "\n")
     )
+
+
+def breakable(name: str) -> Markup:
+    """Return a name as HTML that a narrow column breaks only after a dot, "_" or "-"."""
+    return Markup(_BREAK.sub("<wbr>", str(escape(name))))
 
 
 def capital(text: str) -> str:

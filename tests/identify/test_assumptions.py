@@ -4,8 +4,10 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from pipeline.ingest.fill import fill_submission
 from pipeline.json_files import file_model, json_text
 from pipeline.report.document import Table
 from pipeline.report.draft.content import build_document
@@ -154,3 +156,19 @@ def test_a_large_misfit_leaves_a_certain_spring_supported(tmp_path):
         assert alone is not None
         apart = alone.chain.k[1] - analysis.fit.chain.k[1]
         assert abs(apart) < 3 * alone.std["k_2"]
+
+
+def test_a_free_cart_that_hardly_moves_is_open(tmp_path):
+    """If `fill` asks whether a cart was held, the assumption that it is free is open."""
+    data = tmp_path / "bench" / "data"
+    data.mkdir(parents=True)
+    source = EXAMPLES / "two-cart" / "data" / "decay-2a.csv"
+    rows = np.loadtxt(source, delimiter=",", skiprows=1)
+    rows[:, 2] = np.round(0.02 * rows[:, 3], 4)  # cart 1 moves 2 % as far as cart 2
+    head = "time,input,x1,x2"
+    np.savetxt(data / "decay.csv", rows, fmt="%.6g", delimiter=",", header=head, comments="")
+    (found,) = fill_submission(data.parent)
+    assert found.unsure == ("cart 1 hardly moves; if it was held: carts = [2]",)
+    free = by_key(analyse(load_submission(data.parent), design=False))["experiments.carts (1, 2)"]
+    assert free.support == "open"
+    assert free.reason == "in decay a cart stated as free hardly moves"

@@ -508,3 +508,19 @@ def test_a_bare_matrix_without_a_clock_says_how_to_name_it(tmp_path):
     assert not any("sample_rate" in remark or "columns" in remark for remark in found.remarks)
     (record,) = read_data(load_submission(tmp_path)).records
     assert record.sample_time == pytest.approx(0.01)
+
+
+def test_a_truncated_export_is_a_problem_for_inspect_and_fill(tmp_path):
+    """An ECP export without its closing bracket ends `inspect` and `fill` with exit status 1."""
+    new_submission(tmp_path / "bench", carts=1)
+    rows = "".join(
+        f"{i} {t:.3f} 0 {x:.0f};\n" for i, (t, x) in enumerate(zip(T, RING, strict=True))
+    )
+    text = f"Sample Time Commanded Pos Encoder 1 Pos\n[ {rows}"
+    (tmp_path / "bench" / "data" / "cut.txt").write_text(text, encoding="utf-8")
+    reason = "the closing bracket is missing; the file is truncated: export it again"
+    for command in ("inspect", "fill"):
+        done = CliRunner().invoke(app, [command, str(tmp_path / "bench")])
+        assert done.exit_code == 1
+        assert reason in done.stdout
+    assert "a report cannot use these files as they are: data/cut.txt" in done.stderr

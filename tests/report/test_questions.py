@@ -311,3 +311,18 @@ def test_real_carts_raise_friction_and_damping(tmp_path, real_data):
     assert ids[:4] == ["sign", "zeta_2", "friction-1", "friction-2"]
     assert "hardware" in ids
     assert len(ids) <= 6
+
+
+@pytest.mark.parametrize(
+    ("heading", "hint"),
+    [
+        ("zeta-b", "; “## zeta-b” answers none of them, did you mean “## zeta_b”?"),
+        ("Why zeta?", ""),
+        ("Rest", ""),
+    ],
+)
+def test_a_misspelt_id_is_named(heading, hint):
+    """Only a heading that is almost the id of an unanswered question is named."""
+    analysis = replace(off("zeta_b", 65.0), discussion=f"## {heading}\n\nText.\n")
+    asked = "1 question to answer in notes.md, under “## zeta_b”"
+    assert open_line(analysis) == asked + hint

@@ -12,6 +12,7 @@ from pipeline.report.draft.content import build_document
 from pipeline.report.render.html import render_html
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.report.solution.write import build_solution
+from pipeline.words.text import breakable
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.grading_students import student
 
@@ -48,3 +49,10 @@ def test_grades_show_symbols():
     shown = results_text(grade, rubric=one.rubric)
     assert raw("".join(re.findall(r'"output": "(.*)"', shown))) == []
     assert "ζ_b" in shown
+
+
+def test_a_name_breaks_only_at_its_joints():
+    """A name in HTML may break after dots, underscores and hyphens, and before no number."""
+    assert breakable("initial_final.zeta_1") == "initial_<wbr>final.<wbr>zeta_1"
+    assert breakable("manual2_test1.csv") == "manual2_<wbr>test1.<wbr>csv"
+    assert breakable("<a-b>") == "&lt;a-<wbr>b&gt;"

@@ -124,6 +124,10 @@ BAD_TOML = {
         GOOD + 'controller = { type = "pid", kpp = 1 }\n',
         r"experiments\[1\]\.controller\.kpp \(step-a\): unknown key; did you mean 'kp'\?",
     ),
+    "unknown controller": (
+        GOOD + 'controller = { type = "pidd", kp = 1 }\n',
+        r"found 'pidd'; did you mean 'pid'\?",
+    ),
     "key with a line end": (GOOD + '"a\\nb" = 1\n', r"unknown key"),
     "folder is no key": ('folder = "/etc"\n' + GOOD, r"folder: unknown key"),
     "text for a number": (
@@ -338,7 +342,7 @@ BAD_DATA = {
     "time in metres": ("\n".join(good_rows()).replace("time", "time [m]"), r"not a unit of time"),
     "counts without a scale": (
         _ecp(ECP_ROWS + "]\n"),
-        r"'Encoder 1 Pos' holds encoder counts; state how many cm one count is",
+        r"'Encoder 1 Pos' holds encoder counts; state how many cm one count is.*or use counts",
     ),
     "ECP cut in a row": (_ecp(ECP_ROWS + ";\n 20  0.2"), r"line \d+: .*truncated"),
     "ECP without the bracket": (_ecp(ECP_ROWS + ";\n"), r"line 22: the closing bracket is missing"),
@@ -362,7 +366,7 @@ BAD_DATA = {
     "gzip": (gzip.compress(b"time,x1\n"), r"a gzip archive; unpack it"),
     "HDF5": (b"\x89HDF\r\n\x1a\n" + bytes(100), r"an HDF5 file that MATLAB did not write"),
     "MATLAB 7.3": (b"MATLAB 7.3 MAT-file" + bytes(600), r"the \.mat file is damaged or truncated"),
-    "picture": (b"\x89PNG\r\n" + bytes(100), r"a picture"),
+    "picture": (b"\x89PNG\r\n" + bytes(100), r"a picture; export the recording as CSV"),
     "binary": (bytes(range(256)) * 10, r"neither text nor a \.mat file"),
     "broken UTF-16": (b"\xff\xfea", r"broken UTF-16 text"),
     ".mat header only": (b"MATLAB 5.0 MAT-file".ljust(100), r"the \.mat file is damaged"),

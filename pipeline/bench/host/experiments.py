@@ -156,8 +156,8 @@ def limit_words(limits: PlanLimits, submission: Submission, bench: Description) 
     if limits.input > 1.01 * full:  # the limit may be typed with fewer digits
         raise ConfigError(
             f"plan.toml: limits.input is {limits.input:g} {unit}, but this bench gives at most "
-            f"{full:g} {unit}: the plan was made for another bench. Delete plan.toml to get a new "
-            "plan, or lower limits.input and every amplitude"
+            f"{full:g} {unit}: the plan was made for another bench, or before the bench was known. "
+            "Delete plan.toml to get a new plan, or lower limits.input and every amplitude in it"
         )
     counts = limits.travel / abs(system.position.per_count or bench.position_per_count)
     return (

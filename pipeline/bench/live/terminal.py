@@ -61,7 +61,7 @@ class Terminal:
         ConfigError : nobody is at the keyboard.
         """
         if self._yes:
-            self.remark(f"{instruction}: counts as done (--yes)")
+            self.remark(f"{instruction}: confirmed by --yes, continuing")
             return
         if not sys.stdin.isatty():
             raise ConfigError(

@@ -43,9 +43,9 @@ _STRANGERS = (
     (b"\xd0\xcf\x11\xe0", "an old Excel workbook, or a locked one; save it as .xlsx, unlocked"),
     (b"\x89HDF", "an HDF5 file that MATLAB did not write; save the recording as CSV"),
     (b"\x1f\x8b", "a gzip archive; unpack it"),
-    (b"%PDF", "a PDF document"),
-    (b"\x89PNG", "a picture"),
-    (b"\xff\xd8\xff", "a picture"),
+    (b"%PDF", "a PDF document; export the recording as CSV"),
+    (b"\x89PNG", "a picture; export the recording as CSV"),
+    (b"\xff\xd8\xff", "a picture; export the recording as CSV"),
 )
 
 

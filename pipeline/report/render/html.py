@@ -21,6 +21,7 @@ from pipeline.resources import TEMPLATES
 from pipeline.words.math import Term, to_mathml
 from pipeline.words.numbers import unbroken
 from pipeline.words.spans import plain
+from pipeline.words.text import breakable
 
 # The style sheet defines each colour for light and dark pages.
 _ROLES = {
@@ -124,7 +125,7 @@ def _environment() -> Environment:
     )
     environment.filters |= {
         "mathml": _mathml, "svg": _svg, "tails": _tails, "heads": _heads, "board": _board,
-        "unbroken": unbroken,
+        "unbroken": unbroken, "breakable": breakable,
     }  # fmt: skip
     return environment
 

@@ -77,7 +77,8 @@ def taken_text(one: Assumption) -> str:
         return f"cart{'s' if len(one.value) > 1 else ''} {carts} free"
     if isinstance(one.value, str):
         return one.value
-    return f"{one.value:+g}" if one.key == "system.input.sign" else f"{one.value:g}"
+    number = f"{one.value:+g}" if one.key == "system.input.sign" else f"{one.value:g}"
+    return number.replace("-", "−")
 
 
 def skipped_blocks(page: Page) -> list[Block]:

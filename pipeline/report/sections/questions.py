@@ -6,6 +6,7 @@ after a heading that begins with the question's id. All other notes are the disc
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from typing import Literal
 
 import numpy as np
@@ -331,9 +332,24 @@ def open_questions(
 def open_line(analysis: Analysis) -> str:
     """Return a line for the terminal on questions that are still open; "" if none are."""
     asked = ask(analysis)
-    answers, _ = split_notes(discussion_blocks(analysis.discussion or ""), asked)
+    answers, rest = split_notes(discussion_blocks(analysis.discussion or ""), asked)
     missing = [question.id for question in asked if question.id not in answers]
     if not missing:
         return ""
     ids = ", ".join(f"“## {id_}”" for id_ in missing)
-    return f"{count(len(missing), 'question')} to answer in notes.md, under {ids}"
+    nearly = "".join(
+        f"; “## {heading}” answers none of them, did you mean “## {id_}”?"
+        for heading, id_ in _misspelt(rest, missing)
+    )
+    return f"{count(len(missing), 'question')} to answer in notes.md, under {ids}{nearly}"
+
+
+def _misspelt(notes: Iterable[Block], missing: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield headings that are almost the id of an unanswered question, each with this id."""
+    ids = {id_.lower(): id_ for id_ in missing}
+    for block in notes:
+        if isinstance(block, Heading):
+            heading = plain(block.text)
+            # A cutoff of 0.8 accepts one wrong character of five.
+            for id_ in get_close_matches(named(heading), ids, n=1, cutoff=0.8):
+                yield heading, ids[id_]

@@ -1,6 +1,8 @@
 """Work out the controller: sampled plant, gains by Ackermann's formula or Riccati's equation."""
 
+import re
 from dataclasses import dataclass
+from textwrap import wrap
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
@@ -21,6 +23,7 @@ from pipeline.words.phrases import phrases
 _WORDS = phrases("solution")
 _INVERSE = row("−", "1")
 _PHI_T, _GAMMA_T = power("Φ", "T"), power("Γ", "T")
+_LONGEST_LINE = 72  # characters of code in a line of the PDF
 _WEIGHED = row("R", "+", _GAMMA_T, "P", "Γ")
 
 
@@ -138,7 +141,7 @@ def design_blocks(page: Page) -> list[Block]:
         ),
         _pole_table(page, design, worked),
         paragraph(_WORDS.text("in_matlab")),
-        Code(_matlab(design)),
+        Code(matlab_code(design)),
         paragraph(_simulated(design, drive=page.drive)),
         *_margins(design),
         paragraph(_WORDS.text("not_unique")),
@@ -238,7 +241,7 @@ def _polynomial(name: str, falling: Array) -> Math:
     return row(name, parens("z"), "=", total(terms))
 
 
-def _matlab(design: FeedbackDesign) -> str:
+def matlab_code(design: FeedbackDesign) -> str:
     """Return MATLAB commands that give the same gains from A and B of the state model."""
     c = f"c = zeros(1, {design.gains.size}); c({2 * design.cart - 1}) = 1;"
     poles = design.poles if design.requested_poles is None else design.requested_poles
@@ -256,7 +259,23 @@ def _matlab(design: FeedbackDesign) -> str:
         *gains,
         f"{c}  prefilter = 1/(c/(eye({design.gains.size}) - Phi + Gamma*G)*Gamma)",
     ]
-    return "\n".join(lines)
+    return "\n".join(_broken(line) for line in lines)
+
+
+def _broken(statement: str) -> str:
+    """Return a statement in lines that fit on the page; "..." continues it in MATLAB.
+
+    A matrix breaks between its rows first.
+    """
+    if len(statement) <= _LONGEST_LINE:
+        return statement
+    rows = re.split(r"(?<=;) +", statement)
+    pieces = [
+        piece
+        for row_ in rows
+        for piece in wrap(row_, _LONGEST_LINE - 8, break_long_words=False, break_on_hyphens=False)
+    ]
+    return " ...\n    ".join(pieces)
 
 
 def _overshoot(zeta: float) -> float:

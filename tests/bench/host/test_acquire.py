@@ -512,7 +512,7 @@ def test_without_a_keyboard_nothing_is_confirmed(monkeypatch):
         view.confirm("Hold cart 2")
     view, out = shown(terminal=False, yes=True)
     view.confirm("Hold cart 2")
-    assert out.getvalue() == "Hold cart 2: counts as done (--yes)\n"
+    assert out.getvalue() == "Hold cart 2: confirmed by --yes, continuing\n"
 
 
 @pytest.mark.parametrize(

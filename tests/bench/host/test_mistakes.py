@@ -152,7 +152,7 @@ def test_no_report_is_offered_if_nothing_was_recorded(tmp_path, fast):
         _, said = process.communicate()
     assert process.returncode == 1
     assert "divide the amplitude in plan.toml by four. If the bench" in said
-    assert "again: counts as done" not in said
+    assert "again: confirmed by --yes" not in said
     assert "cartlab report" not in said
 
 
