@@ -106,6 +106,31 @@ def test_a_late_submission_graded_alone_keeps_the_class(school, tmp_path):
     ]  # fmt: skip
 
 
+def test_forgotten_lateness_gives_a_message(school, tmp_path):
+    """If a late submission is graded again without the table of days late, a message says so.
+
+    A table that names the submission with 0 days gives no message.
+    """
+    out, late = tmp_path / "out", tmp_path / "late.csv"
+
+    def grade_late(days: str | None):
+        late.write_text(f"submission,days_late\nteam-1,{days}\n", encoding="utf-8")
+        options = Options(figures=False, lateness=None if days is None else late)
+        return grade_class(
+            [school / "A" / "team-1"], rubric_file=Path("throne-1dof"), out=out, options=options
+        ).remarks
+
+    assert grade_late("2") == ()
+    assert grade_late("2") == ()
+    assert grade_late(None) == (
+        "late at the last grading, but not in this run: team-1 (if their days late should still "
+        "count, grade again with --lateness FILE)",
+    )
+    assert float(rows(out)["team-1"]["days_late"]) == 0
+    assert grade_late("2") == ()
+    assert grade_late("0") == ()
+
+
 def test_a_renamed_folder_is_the_same_submission(school, tmp_path):
     """A submission whose folder was renamed keeps its row, its points by hand and its requests.
 

@@ -3,7 +3,7 @@
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -141,10 +141,16 @@ def grade_class(
                 progress=_without_names(progress, hand_ins) if hidden else progress,
             )
             now = rubric.model_copy(update={"anonymous": hidden})
+            late_before = book.days_late()
             changes = book.finish(batch, rubric=now, shown=shown)
             remarks = [
                 *_skip_messages(passed, unknown, late_file=options.lateness, hidden=hidden),
                 *_class_messages(batch, book, shown=shown),
+                *_lateness_messages(
+                    {batch.moved.get(name, name): days for name, days in late_before.items()},
+                    [hand_in for hand_in in hand_ins if hand_in.id.casefold() not in late_table],
+                    shown=shown,
+                ),
             ]
             failed = [
                 (shown(name), hidden_reason(reason, name, shown(name)) if hidden else reason)
@@ -238,6 +244,28 @@ def _class_messages(batch: Batch, book: Gradebook, *, shown: Callable[[str], str
     )
     if others := sorted(map(shown, set(book.by_other_rubrics()) & set(batch.kept))):
         yield f"graded with an earlier version of the rubric; grade them again: {_names(others)}"
+
+
+def _lateness_messages(
+    before: Mapping[str, float], hand_ins: Sequence[HandIn], *, shown: Callable[[str], str]
+) -> Iterator[str]:
+    """Yield a message if submissions that were late are no longer late.
+
+    Parameters
+    ----------
+    before : days late by submission at the last grading.
+    hand_ins : the submissions of this run that the late table does not name.
+    """
+    lost = [
+        shown(hand_in.id)
+        for hand_in in hand_ins
+        if before.get(hand_in.id, 0.0) > 0 and hand_in.days_late == 0
+    ]
+    if lost:
+        yield (
+            f"late at the last grading, but not in this run: {_names(sorted(lost))} (if their "
+            "days late should still count, grade again with --lateness FILE)"
+        )
 
 
 def _people(authors: Sequence[str]) -> str:

@@ -157,6 +157,18 @@ class Gradebook:
             lines = [] if last is None else lines_of(connection, last)
         return read_members(self._database, [line["grading_id"] for line in lines])
 
+    def days_late(self) -> dict[str, float]:
+        """Return the days late of each submission on the current class list.
+
+        The result is empty until a batch is complete.
+        """
+        with self._database.reading() as connection:
+            last = self._newest(connection)
+            if last is None:
+                return {}
+            rows = connection.execute(class_list(last, submissions.c.name, gradings.c.days_late))
+            return {row.name: row.days_late for row in rows}
+
     def finish(
         self, batch: Batch, *, rubric: Rubric, shown: Callable[[str], str] = str
     ) -> list[str]:
