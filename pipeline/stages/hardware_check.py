@@ -56,7 +56,7 @@ def check_hardware(
     run = measured_run(record, chain)
     opened = _open(run) if run.driven else None
     law = _plant_law(controller, controlled_cart, position_scale=record.position_scale)
-    closed, trouble = None, ""
+    closed, trouble = None, controller.missing_gains if controller else ""
     if law is not None and record.reference is not None:
         try:
             closed = _close(run, law, reference=record.reference, opened=opened, limit=input_limit)
@@ -135,6 +135,8 @@ def _plant_law(
     A PID controller acts on the error in the file's own counts, which `position_scale` converted to
     positions.
     """
+    if controller is None or controller.missing_gains:
+        return None
     if isinstance(controller, submission.PidController):
         return Pid(
             kp=controller.kp,
@@ -143,8 +145,6 @@ def _plant_law(
             scale=controller.scale / position_scale,
             cart=_steered_cart(controller, cart) or 1,
         )
-    if controller is None or not controller.gains:
-        return None
     return StateFeedback(gains=np.array(controller.gains), prefilter=controller.prefilter)
 
 

@@ -144,6 +144,11 @@ class StateFeedbackController(TomlTable):
     )
     prefilter: Finite = Field(default=1.0, title="Prefilter")
 
+    @property
+    def missing_gains(self) -> str:
+        """A sentence that asks for the gains; "" if they are stated."""
+        return "" if self.gains else "the controller has no gains: state them"
+
 
 class PidController(TomlTable):
     """u = scale (kp e + ki ∫e + kd de/dt), e in the file's own counts or units."""
@@ -156,6 +161,12 @@ class PidController(TomlTable):
     kd: Finite = Field(default=0.0, title="kd")
     scale: Finite = Field(default=1.0, title="scale")
     cart: int = Field(default=1, title="Cart that a PID feeds back")
+
+    @property
+    def missing_gains(self) -> str:
+        """A sentence that asks for the gains; "" if at least one is not zero."""
+        stated = any((self.kp, self.ki, self.kd))
+        return "" if stated else "the controller has no gains: state kp, ki or kd"
 
 
 Controller = Annotated[StateFeedbackController | PidController, Field(discriminator="type")]

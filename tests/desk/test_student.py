@@ -942,6 +942,7 @@ def test_the_controller_of_a_closed_loop_is_folded_until_filled_in(filled):
     page = visitor.get(HERE).text
     assert f'id="loop-{place}" open><summary>What controller ran?' in page
     assert f"experiments.{place}.controller.kp" in page
+    assert "state kp, ki or kd of the controller" in page
     assert f"experiments.{place}.controller.gains" not in page
     dwells = {str(i) for i, kind in enumerate(kinds) if kind == "sine"}
     assert set(re.findall(r'name="experiments\.(\d+)\.frequency"', page)) == dwells

@@ -440,17 +440,31 @@ def test_without_an_input_the_loop_alone_is_checked():
 
 
 @pytest.mark.parametrize(
-    "controller",
-    [None, submission.StateFeedbackController(type="state_feedback", gains=(), prefilter=1.0)],
+    ("controller", "note"),
+    [
+        (None, ""),
+        (
+            submission.StateFeedbackController(type="state_feedback", gains=(), prefilter=1.0),
+            "the controller has no gains: state them",
+        ),
+        (
+            submission.PidController(type="pid"),
+            "the controller has no gains: state kp, ki or kd",
+        ),
+    ],
 )
-def test_without_gains_the_measured_input_alone_is_checked(controller):
-    """If no gains are stated, only the simulation with the measured input is made."""
+def test_without_gains_the_measured_input_alone_is_checked(controller, note):
+    """If no gains are stated, only the simulation with the measured input is made.
+
+    A note asks for the gains of a stated controller.
+    """
     law = Pid(kp=0.02, kd=0.001)
     y, u = bench(TWO, law)
 
     checks = check_hardware(record(y, u=u, reference=STEPS), TWO, controller=controller)
 
     assert [check.loop for check in checks] == ["open", "open"]
+    assert checks[0].note == note
     assert all(check.overshoot_measured is not None for check in checks)
 
 

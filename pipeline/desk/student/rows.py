@@ -33,6 +33,12 @@ _KINDS = (
     ("bode", "Tables of ratios"),
 )
 
+# By type of controller: the keys of its gains, and the request for them.
+_GAINS = {
+    "pid": (("kp", "ki", "kd"), "state kp, ki or kd of the controller"),
+    "state_feedback": (("gains",), "state the gains of the controller"),
+}
+
 # The numbers in which otherwise equal remarks differ.
 _MEASURED = re.compile(r"\d+(?:\.\d+)?(?= (?:ms|pieces)\b)")
 
@@ -188,6 +194,8 @@ def _describe(
     problems += [f"state {need} below" for need in look["needs"] if need not in table]
     if _lacks_controller(fields):
         problems.append("state the controller that ran")
+    if missing := _missing_gains(fields):
+        problems.append(missing)
     known = {remark for cart, remark in look["still"].items() if int(cart) not in carts}
     known.update(problems)
     if "sample_rate" in table:
@@ -205,6 +213,13 @@ def _describe(
 
 def _lacks_controller(fields: Sequence[Field]) -> bool:
     return any(field.path.endswith("controller.type") and not field.value for field in fields)
+
+
+def _missing_gains(fields: Sequence[Field]) -> str:
+    """Return the gains that a controller lacks, as a request; "" if it lacks none."""
+    stated = {field.path.rpartition("controller.")[2]: field.value for field in fields}
+    keys, request = _GAINS.get(stated.get("type", ""), ((), ""))
+    return "" if any(stated.get(key) for key in keys) else request
 
 
 def _free_carts(document: Mapping[str, Any], table: Mapping[str, Any]) -> list[int]:
