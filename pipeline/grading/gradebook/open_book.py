@@ -31,6 +31,7 @@ from pipeline.grading.gradebook.schema import (
     submissions,
 )
 from pipeline.grading.rubric import Rubric
+from pipeline.grading.words import points_text
 
 State = tuple[int, int, int]
 
@@ -237,7 +238,8 @@ class OpenBook(Gradebook):
     ) -> HandPoints:
         """Set the points of a criterion by hand, unless they have changed in the meantime.
 
-        If the criterion already has these points, `why` is only added as a comment.
+        If the criterion already has these points, exactly or as `points_text` shows them, `why` is
+        only added as a comment.
 
         Parameters
         ----------
@@ -252,7 +254,7 @@ class OpenBook(Gradebook):
             _check_seen(connection, row, criterion, seen)
             rubric = read_rubric(last)
             now = final_entry(connection, row, shared=read_flag(row.shared), rubric=rubric)
-            same = points is not None and points == points_of(now.grade, criterion)
+            same = is_unchanged(points, now.grade, criterion)
             asked = WantedPoints(
                 submission=team,
                 criterion=criterion,
@@ -475,6 +477,15 @@ def _is_same(asked: WantedPoints, newest: Row | None) -> bool:
 def points_of(grade: Grade, criterion: str) -> float | None:
     """Return the points of a criterion; None if it was never judged."""
     return next((own.points for own in grade.criteria if own.id == criterion), None)
+
+
+def is_unchanged(points: float | None, grade: Grade, criterion: str) -> bool:
+    """Return whether typed points are those that a page shows for a criterion.
+
+    A page shows at most two decimals, so 1.33 leaves points of 4/3 as they are.
+    """
+    now = points_of(grade, criterion)
+    return now is not None and points in (now, float(points_text(now)))
 
 
 def _changed_at(batch: Row, at: str) -> Select:

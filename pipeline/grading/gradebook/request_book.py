@@ -11,9 +11,9 @@ from pipeline.grading.gradebook.open_book import (
     Conflict,
     OpenBook,
     find_version,
+    is_unchanged,
     name_version,
     newest_overrides,
-    points_of,
 )
 from pipeline.grading.gradebook.override import WantedPoints
 from pipeline.grading.gradebook.requests import (
@@ -215,7 +215,7 @@ class RequestBook(OpenBook):
                 raise RequestRefused(
                     "this request has an answer already; reopen it to answer again"
                 )
-            if points == points_of(_entry(connection, last, row).grade, criterion):
+            if is_unchanged(points, _entry(connection, last, row).grade, criterion):
                 points = None
             if points is not None:
                 wish = WantedPoints(
