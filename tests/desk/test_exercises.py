@@ -116,8 +116,16 @@ def test_a_class_equals_what_simulate_writes(visitor, tmp_path):
         assert made == path.read_bytes()
         assert b"friction" not in made
     assert force[1] in told
-    again = visitor.post("/exercises/make", out=str(out), folders="1", seed="0")
-    assert again.status == 422  # the folder is not empty
+    sent = {"preset": "throne-1dof", "out": str(out), "folders": "0", "seed": "7"}
+    again = visitor.post("/exercises/make", **sent, effect="coulomb_friction")
+    assert again.status == 422
+    text = unescape(again.text)
+    assert f'id="out-wrong">{out}: is not empty; choose a new folder</p>' in text
+    assert 'id="folders-wrong">folders: expected a whole number from 1 to 500' in text
+    assert "--out" not in text
+    assert f'id="out" value="{out}"' in text
+    assert 'id="seed" value="7"' in text
+    assert 'name="effect" value="coulomb_friction" checked' in text
 
 
 def test_a_custom_chain_is_used_or_its_error_named(visitor):

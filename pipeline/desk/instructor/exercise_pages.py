@@ -1,6 +1,7 @@
 """The instructor's room: exercises with hidden effects, solutions, and the catalogue of effects."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -25,11 +26,23 @@ _SHOWN_ON = "throne-2dof"  # the smallest bench with a spring between two carts
 
 def show(ask: Ask) -> Response:
     """Show the form as filled in, with a picture of every chosen effect."""
-    sent = ask.request.query_params
-    bench, found = _check_exercise(ask)
+    return _show_form(ask, *_check_exercise(ask), wrong={})
+
+
+def _show_form(
+    ask: Ask, bench: Mapping[str, str], found: Mapping[str, Any], *, wrong: Mapping[str, str]
+) -> Response:
+    """Show the form as filled in.
+
+    Parameters
+    ----------
+    wrong : why a field was refused, by name of the field.
+    """
+    sent = ask.sent
     pictures = [_write_picture_url(bench, one["hide"]) for one in found["effects"]]
     return ask.page(
         "exercises",
+        status=422 if wrong else 200,
         title="Exercises",
         presets=sorted(PRESETS),
         catalogue=CATALOGUE,
@@ -42,6 +55,7 @@ def show(ask: Ask) -> Response:
         folders=sent.get("folders", "1"),
         seed=sent.get("seed", "0"),
         reported=bool(sent.get("reported")),
+        wrong=wrong,
     )
 
 
@@ -54,17 +68,21 @@ def draw(ask: Ask) -> Response:
 def make(ask: Ask) -> Response:
     """Start the task that makes an exercise, or one for each team of a class."""
     bench, found = _check_exercise(ask)
-    if found["wrong"]:
-        raise ConfigError(found["wrong"])
-    out = _read_folder(ask)
-    if not out.parent.is_dir():
-        raise ConfigError(f"{out}: the folder {out.parent} does not exist")
-    folders = read_whole_number(ask.text("folders"), name="folders", least=1, most=500)
-    seed = read_whole_number(ask.text("seed"), name="seed", least=0, most=2**31)
+    wrong = {"found": found["wrong"]} if found["wrong"] else {}
+    with _wrong_field("out", wrong):
+        out = new_folder(_read_folder(ask))
+        if not out.parent.is_dir():
+            raise ConfigError(f"{out}: the folder {out.parent} does not exist")
+    with _wrong_field("folders", wrong):
+        folders = read_whole_number(ask.text("folders"), name="folders", least=1, most=500)
+    with _wrong_field("seed", wrong):
+        seed = read_whole_number(ask.text("seed"), name="seed", least=0, most=2**31)
+    if wrong:
+        return _show_form(ask, bench, found, wrong=wrong)
     ask.desk.jobs.start(
         "make_exercises",
         title="The exercise",
-        place=new_folder(out),
+        place=out,
         bench=bench,
         hide=[one["hide"] for one in found["effects"]],
         out=str(out),
@@ -169,6 +187,15 @@ def _read_bench(ask: Ask) -> dict[str, str]:
     if "preset" not in ask.sent:
         bench["preset"] = _SHOWN_ON
     return bench
+
+
+@contextmanager
+def _wrong_field(name: str, wrong: dict[str, str]) -> Iterator[None]:
+    """Keep the reason for which a field of the form is refused."""
+    try:
+        yield
+    except ConfigError as error:
+        wrong[name] = str(error).removesuffix(" with --out")
 
 
 def _write_picture_url(bench: Mapping[str, str], hide: str) -> str:
