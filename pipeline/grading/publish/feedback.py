@@ -1,5 +1,6 @@
 """Feedback for one submission: reported and recomputed numbers, reasons, and where to look."""
 
+import math
 import re
 from collections.abc import Sequence
 from html import unescape
@@ -40,6 +41,7 @@ _TITLE = re.compile(r"<title>(.*?)</title>", re.DOTALL)
 _NAME = re.compile(r"(omega|zeta|K)(_\w)?")
 TONES: dict[Outcome, Tone] = {"pass": "good", "partial": "", "fail": "bad", "skip": "quiet"}
 _ENTRY = re.compile(r"([AB])\((\d+)(?:, (\d+))?\)")
+_MOST_PERCENT = 1000.0  # a larger difference is given as a ratio
 _SHARE = "_percent"  # end of the key of a number that is already a percentage
 _FINEST = 2  # decimals of such a percentage
 
@@ -305,7 +307,12 @@ def _difference(name: str, found: Any, expected: Any) -> str:
     if name.endswith(_SHARE):
         apart = round(float(found), _FINEST) - round(float(expected), _FINEST)
         return WORDS.text("points_apart", difference=typeset(f"{apart:+.3g}")) if apart else "0"
-    return percent(100 * (float(found) / float(expected) - 1), signed=True) if expected else NOTHING
+    if not expected:
+        return NOTHING
+    ratio = float(found) / float(expected)
+    if _MOST_PERCENT < 100 * abs(ratio) < math.inf:
+        return WORDS.text("times_as_large", ratio=significant(ratio))
+    return percent(100 * (ratio - 1), signed=True)
 
 
 def _is_number(value: Any) -> bool:

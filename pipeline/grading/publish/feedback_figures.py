@@ -18,7 +18,7 @@ from pipeline.report.figures.svg import to_svg
 from pipeline.report.sections.page import Page
 from pipeline.results import Analysis, Record
 from pipeline.submission import Reported
-from pipeline.words.text import clean, name_span
+from pipeline.words.text import clean, symbol_text
 
 _RESPONSE = "response"  # the names of these figures begin with this
 _MOST_CARTS = 3  # with more carts, a table does not determine the transfer functions
@@ -74,7 +74,7 @@ def draw_records(analysis: Analysis, criteria: Iterable[Criterion]) -> tuple[tup
     unit, drawn = clean(analysis.bench.units.position), []
 
     def keep(draw: Callable[..., Any], names: Sequence[str], *, record: Record, **how) -> None:
-        reported = ", ".join(f"{name_span(name).text} {pairs[name][0]:.4g}" for name in names)
+        reported = ", ".join(f"{symbol_text(name)} {pairs[name][0]:.4g}" for name in names)
         recomputed = ", ".join(f"{pairs[name][1]:.4g}" for name in names)
         title = f"reported {reported}; recomputed {recomputed}"
         figure = draw(record=record, title=title, position_unit=unit, **how)

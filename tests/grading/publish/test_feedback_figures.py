@@ -73,7 +73,7 @@ def test_a_number_that_lost_points_is_shown_on_its_record():
     of_gain = next(file for file in figures if numbers_in(file) == {"K_1"})
     known = next(c.expected["K_1"] for c in criteria if "K_1" in c.expected)
     reported = two.value("initial", "K_1")
-    title = f"reported K_1 {reported:.4g}; recomputed {known:.4g}"
+    title = f"reported K₁ {reported:.4g}; recomputed {known:.4g}"
     assert title in figures[of_gain]
     steps = {record.id for record in two.analysis.records if record.kind == "step"}
     assert any(f"<title>{id_}: {title}" in figures[of_gain] for id_ in steps)
@@ -90,5 +90,5 @@ def test_numbers_of_no_oscillation_are_written_but_not_drawn(omega, zeta):
         expected={"omega_1": 20.0, "zeta_1": 0.05}, found={"omega_1": omega, "zeta_1": zeta},
     )  # fmt: skip
     ((_, svg),) = draw_records(two.analysis, [criterion])
-    assert f"reported ω_1 {omega:.4g}, ζ_1 {zeta:.4g}; recomputed 20, 0.05" in svg
+    assert f"reported ω₁ {omega:.4g}, ζ₁ {zeta:.4g}; recomputed 20, 0.05" in svg
     assert "your numbers" not in svg

@@ -294,6 +294,20 @@ def test_the_feedback_compares_reported_and_recomputed_numbers():
     assert re.search(r"YoursFrom your recordingsDifference\s+.*rad/s\]3\.1219\.6−84\.1 %", text)
 
 
+@pytest.mark.parametrize(
+    ("found", "shown"), [(20.0, "+900 %"), (2538.0, "1269 times"), (-2538.0, "−1269 times")]
+)
+def test_a_large_difference_is_a_ratio(found, shown):
+    """Above ten times the recomputed number, the feedback gives the ratio, not percent."""
+    criterion = Criterion(
+        id="gains", title="", outcome="fail", points=0.0, out_of=1.0, message="",
+        expected={"K_1": 2.0}, found={"K_1": found},
+    )  # fmt: skip
+    table = numbers_table(criterion, check="initial", units=None, numbers=count(1))
+    assert table is not None
+    assert shown in str(table)
+
+
 def test_feedback_on_shared_data_names_nobody_and_does_not_praise():
     """If data are shared, the feedback neither names the other team nor says "Well done"."""
     grade = make_grade("team-1", flags=(shared_flag("b-team"),))
