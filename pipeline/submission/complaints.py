@@ -60,10 +60,17 @@ def _summary(value: dict | tuple | list) -> str:
 
 def nearest(name: object, candidates: Sequence[str]) -> str:
     """Return "; did you mean …?" or, if no candidate is similar, the first few candidates."""
-    close = get_close_matches(str(name)[:_LONGEST_QUOTE], candidates, n=1, cutoff=0.5)
+    typed = str(name)[:_LONGEST_QUOTE]
+    close = [one for one in candidates if _without_zeros(one) == _without_zeros(typed)]
+    close = close or get_close_matches(typed, candidates, n=1, cutoff=0.5)
     if close:
         return f"; did you mean {close[0]!r}?"
     return f"; known: {first_few(candidates, _MOST_KNOWN)}" if candidates else ""
+
+
+def _without_zeros(name: str) -> str:
+    """Return a name without the leading zeros of its numbers."""
+    return re.sub(r"(?<!\d)0+(?=\d)", "", name)
 
 
 @cache
@@ -195,6 +202,21 @@ def relevant_errors(errors: Sequence[ErrorDetails]) -> list[ErrorDetails]:
 
     others = [error for error in errors if error["type"] != "extra_forbidden"]
     return [*unknown, *(e for e in others if e["type"] != "missing" or not is_misspelt(e))]
+
+
+def merge_equal(problems: Sequence[tuple[Location, str]]) -> list[str]:
+    """Return the problems as text; equal ones in several tables of a list are counted.
+
+    After a search-and-replace, problems differ only in the numbers and ids of the tables.
+    """
+    found: dict[tuple, list[str]] = {}
+    for at, what in problems:
+        keys = tuple("" if isinstance(part, int) else part for part in at)
+        found.setdefault((keys, what.partition(": ")[2]), []).append(what)
+    return [
+        same[0] if len(same) == 1 else f"{same[0]} (and {len(same) - 1} more)"
+        for same in found.values()
+    ]
 
 
 def list_faults(where: str, problems: Sequence[str], *, more: int = 0) -> str:

@@ -23,6 +23,7 @@ from pipeline.submission.complaints import (
     explain,
     list_faults,
     list_keys,
+    merge_equal,
     nearest,
     quote,
     relevant_errors,
@@ -78,14 +79,15 @@ class InvalidSubmission(SubmissionError):
 
     Attributes
     ----------
-    problems : the first problems found, each with its place. The error's text has a line for each.
+    problems : the first problems found, each with its place. The error's text has a line for each,
+        but only one for equal problems in several tables of a list.
     """
 
     def __init__(
         self, where: str, problems: Sequence[tuple[Location, str]], *, more: int = 0
     ) -> None:
         self.problems = tuple(problems)
-        super().__init__(list_faults(where, [what for _, what in problems], more=more))
+        super().__init__(list_faults(where, merge_equal(problems), more=more))
 
 
 def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submission:

@@ -283,6 +283,7 @@ def test_an_override_never_exceeds_the_points_of_the_rubric(open_book):
     ("arguments", "why", "message"),
     [
         (("team-2", "pieces", 1.0), "x", "team-2: no such submission; did you mean .team-1"),
+        (("team-01", "pieces", 1.0), "x", "no such submission; did you mean .team-1.?"),
         (("team-1", "peices", 1.0), "x", "peices: the rubric has no such criterion; .*pieces"),
         (("team-1", "xyz", 1.0), "x", "no such criterion; known: pieces, .*"),
         (("team-1", "pieces", 1.5), "x", "pieces: expected 0 to 1 points, found 1.5"),
