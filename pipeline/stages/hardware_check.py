@@ -273,7 +273,7 @@ def _median_ratio(logged: Array, stated: Array) -> float:
 
 
 def _not_as_stated(run: MeasuredRun, closed: _Simulated, opened: _Simulated) -> str:
-    """Return a note if the plant follows the logged input, but the loop does not follow the run."""
+    """Return a note if the chain fits under the logged input but not under the controller."""
     loop, plant = run.misfit(closed.y), run.misfit(opened.y)
     # Another controller ran if the plant is accurate to 2 % under the logged input, but the loop's
     # error is a tenth of the motion and five times as large. A stable loop increases a plant's

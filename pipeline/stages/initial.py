@@ -13,7 +13,7 @@ def combine_repeats(
 ) -> Estimate:
     """Combine repeats of one number into their mean.
 
-    Its standard error follows from their spread or from their errors, whichever gives more.
+    Its standard error follows from their spread or from their errors, whichever makes it larger.
     """
     v = np.array(values, dtype=float)
     within = float(np.sqrt(np.sum(np.square(std))) / v.size)

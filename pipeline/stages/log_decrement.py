@@ -167,7 +167,7 @@ def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
 
 
 def _slope(weight: Array) -> Array:
-    """Return weights (n,) that give, from values, the slope per step of a fitted weighted line."""
+    """Return w (n,) such that w @ values is the slope, per step, of a weighted line fit."""
     line = np.vander(np.arange(float(weight.size)), 2)
     return (np.linalg.pinv(line * weight[:, None]) * weight)[0]
 

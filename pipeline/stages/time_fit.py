@@ -159,7 +159,7 @@ def _undetermined(name: str) -> DataError:
 
 
 def _negligible(attempt: Attempt, covariance: Array) -> tuple[str, ...]:
-    """Return the wall springs that the fit has moved to zero, or else such dampings.
+    """Return the wall springs that the fit moved to zero; failing that, such dampings.
 
     Carts without springs keep their dampings, because a body without forces has no modes.
     """

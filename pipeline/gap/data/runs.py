@@ -239,7 +239,7 @@ def _begins_at_rest(y: Array, u: Array, still: Array, sample_time: float) -> tup
 
 
 def _held_input(t: Array, u: Array) -> tuple[Array, Array]:
-    """Return knots, and a held input with the band-limited input's mean between knots."""
+    """Return knots, and a held input that keeps the band-limited input's mean between knots."""
     knots, smooth = interpolate_band_limited(t, u)
     return knots, np.append(0.5 * (smooth[1:] + smooth[:-1]), smooth[-1])
 

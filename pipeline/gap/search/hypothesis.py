@@ -79,8 +79,8 @@ class Study:
     """The context of the search: runs, springs, catalogue, and options of fits.
 
     `repeatability` is the relative difference of runs with the same input, 0 without repeats.
-    `whole` is filled for benches without springs. It holds the training runs, with the run that was
-    cut in two at its full length, so that slowly growing errors show.
+    `whole` is filled for benches without springs. It holds the training runs. A run that was cut
+    in two is included at full length, so that slowly growing errors show.
     """
 
     training: tuple[GapRun, ...]
