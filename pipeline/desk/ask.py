@@ -264,7 +264,7 @@ class Ask:
         return Response(headers={"HX-Redirect": self.request.scope.get("prefix", "") + to})
 
     def back(self, to: str, *messages: str | Message, place: str = "") -> Response:
-        """Return to a page that shows messages once, at its top or at its part `place`."""
+        """Return to a page that shows messages once, at the top or in the part named `place`."""
         if messages:
             lines = [Message(one) if isinstance(one, str) else one for one in messages]
             self.desk.messages.setdefault(self._room(place), []).extend(lines)

@@ -74,14 +74,14 @@ class FlagCosts(
         ),
     )
 ):
-    """The least cost of each flag, as a share of its criterion's points.
+    """The minimum cost of each flag, as a share of its criterion's points.
 
     By default most flags cost nothing, because the tolerances already judge each wrong number. But
     one wrong entry of A or B makes the whole model wrong, although it is a small share of the
     entries.
 
     `shared_data` has no cost, because a person must decide whether a recording was copied, and set
-    points by hand.
+    the points by hand.
     """
 
     def of(self, code: Code) -> float:

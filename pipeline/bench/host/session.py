@@ -274,9 +274,9 @@ class Session:
     def _zero_at_rest(self, recording: Recording) -> None:
         """Set the counts to zero before the motor's first run on this line, while the carts rest.
 
-        The carts may have been swinging when the line was opened, so its positions are no reliable
-        zero for the travel limit. The counts are not set to zero before a release by hand, because
-        a cart held by hand never rests exactly.
+        The carts may have been swinging when the line was opened, so their positions at that
+        moment cannot be the zeros for the travel limit. Before a release by hand, the counts are
+        not set to zero, because a cart held by hand is never exactly at rest.
         """
         if self._zeroed or not recording.amplitude:
             return

@@ -38,9 +38,9 @@ class Item:
     Attributes
     ----------
     id : id of the criterion, or code of the flag.
-    lost : points lost in the automatic grading, so that points by hand do not move the row.
+    lost : points lost in the automatic grading, so that points given by hand do not move the row.
     doubt : whether a person should look or has looked: points were lost, the criterion was not
-        judged, or there is a flag or points by hand.
+        judged, or there is a flag or points given by hand.
     """
 
     id: str

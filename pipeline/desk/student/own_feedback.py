@@ -170,7 +170,7 @@ def _show_why(asked: Asked, grade: Grade, found: OwnFeedback, *, hidden: bool) -
 
     Parameters
     ----------
-    hidden : whether to show only the titles of flags and the reasons for points by hand.
+    hidden : whether to show only the titles of flags and the reasons for points given by hand.
     """
     own = next((c for c in grade.criteria if c.id == asked.id), None)
     if own is None or not hidden:

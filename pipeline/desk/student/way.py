@@ -90,7 +90,7 @@ def _check(facts: Facts) -> Status:
 
 
 def _has_result(facts: Facts) -> bool:
-    """Return whether the current files gave a report, or a check that agrees.
+    """Return whether the current files have a report, or a check in which all numbers agree.
 
     Doubts then no longer block the next steps.
     """
@@ -132,7 +132,8 @@ def find_steps(facts: Facts) -> tuple[Step, ...]:
 def next_step(steps: Sequence[Step]) -> Step:
     """Return the first step that is not done, or the last step.
 
-    Files that need a person are skipped once there is a report, or a check that agrees.
+    Files that need a person are skipped once there is a report, or a check in which all numbers
+    agree.
     """
     has_result = any(s.state == "done" for s in steps if s.key in ("report", "check"))
     open_ = [s for s in steps if s.state != "done" and not (has_result and s.key == "files")]

@@ -179,7 +179,7 @@ def _refuse_submission(out: Path) -> None:
 
 
 def _refuse_another_class(out: Path, *, assignment: str) -> None:
-    """Raise a ConfigError if `out` holds another class, whose points by hand would be lost."""
+    """Raise a ConfigError if `out` holds another class; points given by hand would be lost."""
     try:
         with Gradebook(out) as book:
             before = book.assignment

@@ -138,7 +138,7 @@ class Gradebook:
         """Return all submissions with the fingerprints of their recordings, without repetitions.
 
         Earlier versions of submissions are included, because their recordings may have been passed
-        on.
+        on to other teams.
 
         Parameters
         ----------

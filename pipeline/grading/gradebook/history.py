@@ -29,7 +29,7 @@ class Event:
 
     `graded` is a grading by the rubric alone. `listed` is a new or changed entry of a class list,
     with shared data and overrides. `removed` is the removal from the class list. `override` gives
-    points by hand, or removes them if `points` is None. `comment` leaves the points automatic.
+    points by hand, or removes them if `points` is None. `comment` leaves the automatic points.
     `asked`, `answered` and `reopened` belong to a student's request to review a criterion.
 
     Attributes

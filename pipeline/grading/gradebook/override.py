@@ -138,7 +138,8 @@ def with_comments(grade: Grade, comments: Mapping[str, HandPoints]) -> Grade:
 def with_overrides(grade: Grade, overrides: Mapping[str, HandPoints], *, rubric: Rubric) -> Grade:
     """Return the grade with points given by hand and the deduction for lateness.
 
-    If the submission could not be graded, it has no criteria; those with points by hand are added.
+    If the submission could not be graded, it has no criteria; the criteria with points given
+    by hand are added.
     """
     given = {key: o.points for key, o in overrides.items() if o.points is not None}
     if not given:

@@ -214,7 +214,7 @@ def _only_submission(tomls: Sequence[Path], into: Path) -> Path:
 def _gather_loose(folder: Path) -> None:
     """Copy the files next to `submission.toml` into a new folder `data/`, unless it exists.
 
-    Some platforms accept only single files, so that the folders are lost.
+    Some platforms accept only single files, so the folder structure is lost.
     """
     data = folder / "data"
     if not os.path.lexists(data):

@@ -32,8 +32,8 @@ class Deviation:
     Attributes
     ----------
     error : the error in percent, or in percentage points for an overshoot.
-    by : name of the tolerance. `exact` is for an entry of a state model that must be 0 or 1. Such
-        an entry counts only if it is wrong, because a right one is no achievement.
+    by : name of the tolerance. `exact` is for an entry of a state model that must be 0 or 1. A
+        right 0 or 1 is ignored, because it is no achievement.
     """
 
     error: Fraction

@@ -167,7 +167,7 @@ def _comment(student: Student) -> str:
 
 
 def _comment_lines(grade: Grade, *, by_hand: Collection[str]) -> list[str]:
-    """Return a line for each criterion that lost points or has points by hand, and for each flag.
+    """Return a line for each criterion with lost points or points given by hand, and for each flag.
 
     The deduction for lateness comes last.
     """

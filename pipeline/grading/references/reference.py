@@ -115,7 +115,7 @@ def recompute(analysis: Analysis) -> References:
 
     If a number can be measured in several ways, its bounds include the results of all of them, in
     both tables. Dry friction adds to every damping ratio, but a damping ratio without this part is
-    right too.
+    also right.
     """
     chain = trusted_chain(analysis)
     trusted, tables = chain is not None, _by_decays(chain, analysis) if chain else []

@@ -43,7 +43,7 @@ def rounding(typed: Decimal) -> Fraction:
 
 
 def is_vague(typed: Decimal) -> bool:
-    """Return whether a number has so few digits that grading does not excuse all its rounding."""
+    """Return whether a number has so few digits that its rounding is not fully excused."""
     return half_digit(typed) > _MOST_ROUNDING * abs(Fraction(typed))
 
 

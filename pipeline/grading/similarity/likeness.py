@@ -67,7 +67,7 @@ class Likeness:
 def compare(
     a: Print, b: Print, *, shift: int, others: Sequence[tuple[Print, int]] = ()
 ) -> Likeness:
-    """Compare the noise of two recordings, beyond what other recordings explain.
+    """Compare the noise of two recordings, after removing what other recordings explain.
 
     Parameters
     ----------

@@ -62,8 +62,8 @@ class ReferenceCore:
 
     Parameters
     ----------
-    description : the bench's answer to a query. The control laws use its period. Without
-        `commands`, it is a stock bench, which does not answer queries.
+    description : the bench's answer to a query. The control laws use its period. A bench
+        without `commands` is a stock bench, which does not answer queries.
     """
 
     def __init__(self, description: Description) -> None:
