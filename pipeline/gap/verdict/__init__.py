@@ -1,1 +1,1 @@
-"""Describe the result of a search: the verdict, the errors, and where the model still fits badly."""
+"""Describe the result of a search: the verdict, the errors, and where the model fits badly."""

@@ -97,7 +97,7 @@ def choose_experiment(
 ) -> str:
     """Return advice on the next recording, for example how to decide between two effects.
 
-    `left` are the windows in which the chosen model still fits badly, the worst first. `repeated` is
+    `left` are the windows in which the chosen model fits badly, the worst first. `repeated` is
     true if some runs have the same input, so that their scatter is known.
     """
     if verdict == "ambiguous":
