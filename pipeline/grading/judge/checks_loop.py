@@ -193,7 +193,7 @@ def judge_hardware(criterion: asked.Hardware, work: Work) -> Verdict:
     if not closed:
         skipped = work.analysis.skipped
         reasons = [one.reason for one in skipped if one.stage is Stage.HARDWARE_CHECK]
-        why = reasons[0] if reasons else "the controller that ran is not stated"
+        why = reasons[0] if reasons else "the controller that ran or its gains are not stated"
         return Verdict(share=NONE, message=f"The loop cannot be compared: {why}.")
     errors = {run: 100 * float(np.sqrt(np.mean(np.square(e)))) for run, e in closed.items()}
     run = min(errors, key=lambda name: errors[name])
