@@ -381,6 +381,11 @@ def test_only_an_up_to_date_report_lists_assumptions(filled):
     page = visitor.get(HERE + "hand-in").text
     assert "system.springs" not in page
     assert page.count("You will see them once the report of these files is made.") == 2
+    question = {"id": "zeta_1", "section": "parameters", "text": "Why?"}
+    asked.write_text(json.dumps(told | {"questions": [question]}), encoding="utf-8")
+    page = visitor.get(HERE + "hand-in").text
+    assert page.count("You will see them once the report of these files is made.") == 1
+    assert "0 of 1 of the last report answered." in page
 
 
 def test_a_failed_report_does_not_prevent_handing_in(filled):
