@@ -257,7 +257,8 @@ def matlab_code(design: FeedbackDesign) -> str:
         f"T = {design.sample_time:.10g};  sampled = c2d(ss(A, B, eye({design.gains.size}), 0), T);",
         "Phi = sampled.A;  Gamma = sampled.B;",
         *gains,
-        f"{c}  prefilter = 1/(c/(eye({design.gains.size}) - Phi + Gamma*G)*Gamma)",
+        c,
+        f"prefilter = 1/(c/(eye({design.gains.size}) - Phi + Gamma*G)*Gamma)",
     ]
     return "\n".join(_broken(line) for line in lines)
 
