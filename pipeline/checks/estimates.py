@@ -33,9 +33,9 @@ def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
             continue
         limit = change_limit(row.name)
         outcome, verdict = verdicts[row.consistent]
-        sigmas = "" if row.change_sigmas is None else f", {row.change_sigmas:.1f} standard errors"
+        sigmas = "" if row.change_sigmas is None else f" or {row.change_sigmas:.1f} standard errors"
         advice = _advice(row) if outcome == "fail" else ""
-        same = "" if row.independent is not False else " Both rest on the same recordings."
+        same = "" if row.independent is not False else " Both use the same recordings."
         checks.append(
             Check(
                 kind="initial_final",
@@ -43,7 +43,7 @@ def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
                 outcome=outcome,
                 value=abs(row.change_percent),
                 limit=limit,
-                message=f"Initial and final {row.name} {verdict}: "
+                message=f"Initial and final {row.name} {verdict}: the difference is "
                 f"{row.change_percent:+.1f} %{sigmas} (limit {limit:.0f} %).{same}{advice}",
             )
         )
@@ -95,7 +95,7 @@ def check_decays(
             continue
         found = (
             "is not exponential: dry friction can hold the cart within "
-            f"±{test.drop:.3g} {bench.units.position} of its rest. The envelope's ζ = "
+            f"±{test.drop:.3g} {bench.units.position} of its rest position. The envelope's ζ = "
             f"{decay.zeta:.3g} is biased; without the friction, ζ = {test.zeta:.3g}."
             if test.present
             else "is exponential within the noise "
@@ -157,7 +157,7 @@ def _step_check(step: StepGain, *, shown: Sequence[str], bench: Bench) -> Check:
             "skip",
             (
                 f"has the same gain at every edge, but shows dry friction in {runs}. Friction may "
-                "hold it off its level here too, by the same distance on both sides."
+                "stop it short of its level here too, by the same distance at every edge."
             ),
         )
     elif edges < 2:

@@ -44,7 +44,7 @@ def verify_design(chain: Chain, design: FeedbackDesign) -> Check:
     loop. The other one belongs to the requested poles or, with LQR, to the loop that scipy's
     Riccati solver gives.
     """
-    asked = "the requested poles" if design.Q is None else "the loop of scipy's Riccati solver"
+    asked = "the requested poles" if design.Q is None else "the same loop as scipy's Riccati solver"
     try:
         ours, wanted, level = _loops(chain, design)
     except (np.linalg.LinAlgError, ValueError, ZeroDivisionError):

@@ -297,7 +297,8 @@ def export_grades(
         typer.Option(metavar="CSV", help="The table exported from the platform, to fill in."),
     ] = None,
     title: Annotated[
-        str | None, typer.Option(help="Title of the assignment there; default: the rubric's.")
+        str | None,
+        typer.Option(help="Title of the assignment on the platform; default: the rubric's."),
     ] = None,
     assignment: Lab = None,
 ) -> None:

@@ -279,7 +279,7 @@ def gap(
         typer.Option(
             metavar="SECONDS",
             min=0.0,
-            help="Time limit of the search; the best answer so far is then marked as such. "
+            help="Time limit of the search, after which it gives the best answer so far. "
             "Without a limit the answer is the same on every computer.",
         ),
     ] = None,

@@ -31,7 +31,7 @@ NEEDED: dict[RecordingKind, tuple[str, ...]] = {
     "sine": ("amplitude", "frequency"),
     "decay": (),
 }
-TYPED = {"frequency_end": "to"}
+TYPED = {"frequency_end": "frequency at the end"}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -93,7 +93,7 @@ def find_goal(name: str, known: Knowledge, *, feedback: FeedbackDesign | None) -
     if name == VOLUME:
         return Goal(
             name=name,
-            words="the mean error of masses, dampings and springs",
+            words="the mean error of masses, damping coefficients and stiffnesses",
             rows=rows,
             mean="volume",
         )

@@ -90,8 +90,9 @@ def design_feedback(chain: Chain, task: Design) -> FeedbackDesign:
             return _design(plant, goal, method=task.method)
     except np.linalg.LinAlgError:
         raise DataError(
-            "state feedback needs masses, dampings and springs within some ten orders of "
-            f"magnitude, found m {_range(chain.m)}, c {_range(chain.c)}, k {_range(chain.k)}"
+            "state feedback needs masses, damping coefficients and stiffnesses within some ten "
+            f"orders of magnitude, found m {_range(chain.m)}, c {_range(chain.c)}, "
+            f"k {_range(chain.k)}"
         ) from None
 
 
@@ -335,7 +336,7 @@ def _message(plant: SampledPlant, goal: _Goal, design: FeedbackDesign) -> str:
     if not plant.stays_stable(design.gains):
         parts.append(
             f"the loop may be unstable if masses or springs are off by {100 * MASS_SPRING_ERROR:g} "
-            f"%, or dampings by {100 * DAMPING_ERROR:g} %"
+            f"%, or damping coefficients by {100 * DAMPING_ERROR:g} %"
         )
     error = float(level_error_percent(plant.chain, design.gains, cart=plant.cart))
     if error > 5.0:

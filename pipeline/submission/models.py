@@ -48,8 +48,8 @@ class InputScale(TomlTable):
     )
     per_count: Positive | None = Field(
         default=None,
-        title="Input of one duty count",
-        description="only for logs that hold duty counts",
+        title="Size of one duty count",
+        description="in the unit of the input; only for logs of duty counts",
     )
 
 
@@ -70,8 +70,8 @@ class PositionScale(TomlTable):
     )
     per_count: Positive | None = Field(
         default=None,
-        title="Position of one encoder count",
-        description="in that unit: 0.00227 cm on an ECP 210; only for files that hold counts",
+        title="Size of one encoder count",
+        description="in the unit of positions: 0.00227 cm on an ECP 210; only for files of counts",
     )
 
 
@@ -83,7 +83,7 @@ class System(TomlTable):
 
     carts: int = Field(ge=1, le=MOST_CARTS, title="Carts")
     springs: tuple[bool, ...] = Field(
-        default=(), title="Springs on the bench", description="from one wall to the other"
+        default=(), title="Springs on the bench", description="in order, from one wall to the other"
     )
     input: InputScale = InputScale()
     position: PositionScale = PositionScale()

@@ -184,8 +184,8 @@ def test_exploring_has_its_own_form(tmp_path):
         assert fields["acquire"] == ports
         sound = {"port": "socket://127.0.0.1:1", "what": "all", "error": "1,5", "minutes": "0,5"}
         for name, typed, said in (
-            ("error", "", "to within ± %: expected a number above 0 and below 100"),
-            ("error", "100", "to within ± %"),
+            ("error", "", "Accuracy to reach, ± %: expected a number above 0 and below 100"),
+            ("error", "100", "Accuracy to reach, ± %"),
             ("minutes", "-1", "minutes: expected a number above 0"),
             ("minutes", "soon", "minutes"),
         ):

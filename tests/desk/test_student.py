@@ -939,13 +939,13 @@ def test_the_controller_of_a_closed_loop_is_folded_until_filled_in(filled):
     seen = page.value("seen")
     visitor.post(HERE + f"experiments/{place}", seen=seen, **{path: "closed_loop"})
     page = visitor.get(HERE)
-    assert f'id="loop-{place}"><summary>What controller ran?' in page.text
+    assert f'id="loop-{place}"><summary>Which controller ran?' in page.text
     path = f"experiments.{place}.controller.type"
     assert f"experiments.{place}.controller.kp" not in page.text
     assert f'id="more-{place}"><summary>' in page.text  # no other field of the loop is asked for
     visitor.post(HERE + f"experiments/{place}", seen=page.value("seen"), **{path: "pid"})
     page = visitor.get(HERE).text
-    assert f'id="loop-{place}" open><summary>What controller ran?' in page
+    assert f'id="loop-{place}" open><summary>Which controller ran?' in page
     assert f"experiments.{place}.controller.kp" in page
     assert "state kp, ki or kd of the controller" in page
     assert f"experiments.{place}.controller.gains" not in page

@@ -48,12 +48,20 @@ def test_a_recording_is_added_at_the_end_of_the_plan(work, kind, numbers, expect
         ("step", {"amplitude": 0.0}, "amplitude: 0 moves nothing"),
         ("sine", {"amplitude": 0.1}, "frequency: expected 0.001 to 1000 Hz, found 0"),
         ("sine", {"amplitude": 0.1, "frequency": 1e308}, "frequency: expected"),
-        ("sweep", {"amplitude": 0.1, "frequency": 1.0}, "to: expected 0.001 to 1000 Hz, found 0"),
-        ("sweep", {"amplitude": 0.1, "frequency": 1.0, "frequency_end": -3.0}, "to: expected"),
+        (
+            "sweep",
+            {"amplitude": 0.1, "frequency": 1.0},
+            "frequency at the end: expected 0.001 to 1000 Hz, found 0",
+        ),
+        (
+            "sweep",
+            {"amplitude": 0.1, "frequency": 1.0, "frequency_end": -3.0},
+            "frequency at the end: expected",
+        ),
         (
             "sweep",
             {"amplitude": 0.1, "frequency": 1.0, "frequency_end": 1.0},
-            "to: a chirp must end at a different",
+            "frequency at the end: a chirp must end at a different",
         ),
         ("decay", {"cart": 1, "seconds": 1e-320}, "seconds: expected 1 to 120 s"),
         ("decay", {"cart": 1, "seconds": 121.0}, "seconds: .* found 121"),

@@ -405,7 +405,7 @@ def test_an_effect_only_in_the_held_out_data_is_found():
     assert names(gap) == [("cubic_spring", 1)]
     assert gap.verdict == "named"
     assert gap.final < 1.05 * gap.noise_floor
-    assert any("changed sides" in note for note in gap.notes)
+    assert any("were exchanged" in note for note in gap.notes)
 
 
 def test_an_overflow_in_the_derivatives_ends_a_fit(monkeypatch):

@@ -121,7 +121,7 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
         until(lambda: "bumped" in (folder / NAME).read_text(encoding="utf-8"))
         expect(row).to_be_visible()  # a row that was opened stays open
         expect(window.locator("#files").get_by_text("Saved.")).to_be_visible()
-        window.get_by_text("What controller ran?").click()
+        window.get_by_text("Which controller ran?").click()
         window.get_by_label("Controller", exact=True).select_option("state_feedback")
         expect(window.locator("#kind-closed_loop .chip")).to_have_text("understood")
         expect(window.get_by_label("Prefilter").first).to_be_visible()  # not folded away
@@ -344,8 +344,8 @@ def test_the_desk_is_accessible(show, tmp_path):
         unfold(window)
         table = window.locator(".wide").filter(has=window.locator("table.files")).first
         assert table.evaluate("it => it.scrollWidth <= it.clientWidth")  # the table fits its frame
-        window.get_by_label("Position of one encoder count").fill("0")
-        window.get_by_label("Position of one encoder count").press("Enter")
+        window.get_by_label("Size of one encoder count").fill("0")
+        window.get_by_label("Size of one encoder count").press("Enter")
         expect(window.locator("#system-position-per_count-wrong")).to_be_visible()
         for summary in window.locator("details.kind:not([open]) > summary").all()[::-1]:
             summary.press("Enter")

@@ -99,8 +99,8 @@ def test_an_exploration_is_watched_and_steered(show, tmp_path):
         window.get_by_text("Explore: the bench records").click()
         window.locator("#explore-port").select_option(bench.address)
         window.get_by_label("Parameter to find").select_option(label="the damping ratio ζ")
-        window.get_by_label("to within ± %").fill("0,0001")
-        window.get_by_label("to within ± %").press("Enter")  # Enter works like the button
+        window.get_by_label("Accuracy to reach, ± %").fill("0,0001")
+        window.get_by_label("Accuracy to reach, ± %").press("Enter")  # Enter works like the button
 
         thought = window.locator("#thought")
         expect(thought).to_contain_text(re.compile(r"^ζ is known .* The next recording is \S+:"))

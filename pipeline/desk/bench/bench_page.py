@@ -53,7 +53,7 @@ def acquire(ask: Ask) -> Response:
 
 def explore(ask: Ask) -> Response:
     """Start an exploration."""
-    error = read_number(ask.text("error"), name="to within ± %", above=0, below=100)
+    error = read_number(ask.text("error"), name="Accuracy to reach, ± %", above=0, below=100)
     minutes = read_number(ask.text("minutes"), name="minutes", above=0, below=10_000)
     until, limit = f"{ask.text('what')} {error!r}%", f"{minutes!r} min"
     read_error_goal(until)  # report an invalid goal before anything starts
@@ -177,7 +177,7 @@ def _read_recording(typed: Mapping[str, str], submission: Submission) -> Recordi
         seconds=read_number(typed["seconds"], name="duration"),
         amplitude=read_number(typed["amplitude"], name="amplitude"),
         frequency=read_number(typed["frequency"], name="frequency"),
-        frequency_end=read_number(typed["frequency_end"], name="to") or None,
+        frequency_end=read_number(typed["frequency_end"], name="frequency at the end") or None,
         cart=read_whole_number(typed["cart"] or "1", name="cart", least=1, most=carts),
     )
     return make_recording(wanted, plan=current_plan(submission), submission=submission)

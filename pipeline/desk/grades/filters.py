@@ -16,7 +16,7 @@ _STATES: Mapping[str, tuple[str, Callable[[Listing], bool]]] = {
     "hand": ("changed by hand", lambda team: bool(team.line.by_hand)),
     "remark": ("with a remark", lambda team: bool(team.line.codes)),
 }
-_SEEN = {"no": "not yet reviewed", "yes": "looked at"}
+_SEEN = {"no": "not yet reviewed", "yes": "reviewed"}
 _ORDERS = {"name": "name", "points": "points, lowest first", "late": "days late, latest first"}
 
 

@@ -31,7 +31,9 @@ class Chain:
     """Masses, dampings and stiffnesses of a chain, in input units because the input gain is 1."""
 
     m: Array = written("masses (n), cart 1 first, input unit s² per position unit; all > 0")
-    c: Array = written("viscous dampings (n), cart 1 first, input unit s per position unit")
+    c: Array = written(
+        "viscous damping coefficients (n), cart 1 first, input unit s per position unit"
+    )
     k: Array = written(
         "stiffnesses (n + 1) wall-1, 1-2, …, n-wall, input unit per position unit; 0 for no "
         "spring; (sum, 0) for one cart on two springs, because only their sum can be identified"

@@ -100,7 +100,7 @@ def state_blocks(page: Page) -> list[Block]:
         blocks += worked(equations, values)
     blocks += [Heading(spans("The state model")), *_matrices(n, values)]
     blocks += [
-        Heading(spans("Masses, dampings and springs")),
+        Heading(spans("Masses, damping coefficients and stiffnesses")),
         *worked(derivation.physical(springs), values),
         table,
     ]
