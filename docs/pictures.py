@@ -95,7 +95,7 @@ def exploration(team: Path) -> None:
         page.get_by_role("link", name="Bench").click()
         page.get_by_text("Explore: the bench records").click()
         page.locator("#explore-port").select_option(address)
-        page.get_by_label("to within ± %").fill("0.01")
+        page.get_by_label("Accuracy to reach, ± %").fill("0.01")
         page.get_by_role("button", name="Explore").click()
         page.locator("#thought:not([hidden])").wait_for(timeout=1e5)
         page.locator("#status", has_text="Recording").wait_for(timeout=1e5)
