@@ -121,7 +121,7 @@ def test_a_spring_too_many_is_found_on_the_examples(name, tmp_path):
 def test_a_far_spring_that_the_real_rig_lacks_is_asked_about(tmp_path):
     """If a far spring is declared that the real bench lacks, a check asks about it.
 
-    The fit explains dry friction by a far spring of 1 % of its neighbour's stiffness.
+    The fit mistakes dry friction for a far spring with 1 % of its neighbour's stiffness.
     """
     folder: Path = write_two_cart_submission(tmp_path / "s", REAL_DATA, steps=(1, 2, 3, 4, 5))
     assert vanishing(analyse(load_submission(folder), design=False).checks) == {}

@@ -36,7 +36,7 @@ def test_gain_intervals_of_a_sticking_cart_may_be_disjoint():
 def test_a_step_that_friction_stops_short_does_not_pass(tmp_path):
     """If friction stops a cart short at every edge, the step does not pass the check.
 
-    In the test, one gain fits all edges, but other records show the friction.
+    In the test, some steps have one gain at all edges; only other recordings show the friction.
     """
     hidden = "coulomb_friction:cart=1,force=0.003"
     done = CliRunner().invoke(
@@ -59,7 +59,7 @@ def test_a_step_that_friction_stops_short_does_not_pass(tmp_path):
 def test_one_edge_does_not_show_whether_a_cart_sticks():
     """A step with one edge cannot show whether a cart sticks, so the check is skipped.
 
-    A step on and off again is checked.
+    A step that goes on and off again has two edges and is checked.
     """
     (gain, *_) = analysed("one-cart").step_gains
     both, one = check_steps(

@@ -78,8 +78,8 @@ def test_the_closed_loop_gives_the_step_of_the_design(name, method):
 def test_margins_are_the_edge_of_stability(name, method, sample_time, settling_time):
     """Within its margins the loop is stable, and just beyond them it is unstable.
 
-    A gain or a phase multiplies the loop by a factor, so the poles show both margins exactly. |1 +
-    L| is never below the modulus margin, and reaches it.
+    The test changes the loop's gain or phase up to each margin and beyond, and computes the poles.
+    |1 + L| is never below the modulus margin, and reaches it.
     """
     chain = PLANTS[name]
     design, controller = designed(

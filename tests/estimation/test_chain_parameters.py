@@ -1,4 +1,4 @@
-"""A chain becomes the vector of a fit and back, and named parameters get standard errors."""
+"""A chain is converted to a fit's vector and back, and named parameters get standard errors."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from pipeline.set_up import Bench
 
 @st.composite
 def chains(draw: st.DrawFn) -> Chain:
-    """Draw chains of one to four carts with springs at both walls; sizes span two decades."""
+    """Draw chains of one to four carts with springs at both walls and values over two decades."""
     n = draw(st.integers(1, 4))
     size = st.floats(0.1, 10.0)
     m, c, k = (
@@ -119,7 +119,7 @@ def test_standard_errors_of_one_cart_follow_its_formulas():
 
 
 def test_standard_errors_agree_with_a_sample():
-    """In a random sample of chains, named parameters scatter as their standard errors state."""
+    """In 1000 random chains, the named parameters scatter as much as their standard errors say."""
     chain = PRESETS["throne-3dof"]
     P = Parametrisation(bench=Bench(springs=(True,) * 4))
     p = P.physical(chain)
@@ -138,7 +138,7 @@ def test_standard_errors_agree_with_a_sample():
 
 
 def test_a_start_is_a_possible_chain():
-    """A start for the fit keeps the masses and gets positive springs and a usual damping.
+    """The start of a fit keeps the masses and gets positive springs and dampings of 5 %.
 
     A spring declared as missing stays zero.
     """

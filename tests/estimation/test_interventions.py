@@ -41,9 +41,9 @@ def unmatched(case: Case) -> tuple[list[tuple[str, Hand]], list[Intervention]]:
     [(1, 113.1, ()), (2, 250.0, ()), (3, 1000.0, ()), (2, 250.0, ("coulomb_friction",))],
 )
 def test_hands_are_found_and_nothing_else(n, rate, effect):
-    """Plucks, a nudge and a push are found on benches with any effect, and nothing else is found.
+    """Plucks, a nudge and a push are found, even with dry friction, and nothing else is found.
 
-    In many such cases 476 of 486 touches were found; a short pull may be missed.
+    One short pull may be missed; in a larger sample, 476 of 486 touches were found.
     """
     case = make_case(seed=60 + n, n=n, rate=rate, effects=effect, handled=True, dirt=True)
     missed, more = unmatched(case)

@@ -7,7 +7,7 @@ from pipeline.estimation.minimise import evaluated_once
 
 
 class _Decay:
-    """A model exp(-p t) that keeps the array p it was made with."""
+    """A model exp(-p t) that stores the array p itself and not a copy."""
 
     def __init__(self, t, p):
         self.t, self.p = t, p

@@ -190,7 +190,7 @@ def test_a_strangers_folder_does_not_replace_a_team(school, tmp_path, author):
 
 
 def test_a_rubric_of_another_name_is_refused(school, tmp_path):
-    """A run is refused if its rubric has another file name than that of the existing class.
+    """A run is refused if its rubric's file name differs from that of the class's rubric.
 
     Otherwise, files and points given by hand would be lost.
     """
@@ -256,7 +256,7 @@ def test_teams_that_exchange_folders_keep_their_points(tmp_path):
 
 
 def test_submissions_are_recognised_by_number_files_or_authors(tmp_path):
-    """Two submissions count as one if their platform numbers agree, or else files, or authors."""
+    """A submission is recognised by its platform's number, else by its files or its authors."""
     old = make_outcome(make_grade("old", authors=("ann",)), key="k-files", owner="A (canvas 7)")
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         book.put(old)

@@ -155,7 +155,7 @@ def test_letters_that_a_console_lacks_are_written_as_numbers(grades, monkeypatch
 
 @pytest.mark.parametrize("lms", ["canvas", "moodle", "gradescope"])
 def test_an_export_is_written_beside_the_grades(run, grades, tmp_path, lms):
-    """An export is written beside the grades, or into the given folder."""
+    """An export is written next to the grades, or into the given folder."""
     status, out, err = run("export", grades, "--lms", lms)
     assert (status, out) == (0, "")
     assert f"wrote {grades / lms}.csv" in err
@@ -189,7 +189,7 @@ def test_an_export_that_omits_points_ends_with_status_1(run, grades, tmp_path):
 
 
 def test_a_class_without_grades_asks_about_the_rubric(run, tmp_path):
-    """If no submission could be graded, the message asks whether the rubric is another lab's.
+    """If no submission could be graded, the message asks if the rubric belongs to another lab.
 
     Lateness is recorded nevertheless.
     """

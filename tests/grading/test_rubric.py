@@ -49,7 +49,7 @@ def write(folder: Path, text: str) -> Path:
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_shipped_rubrics_are_valid_and_worth_twenty_points(path):
-    """Each shipped rubric loads by path and by name, and lists its criteria."""
+    """Each shipped rubric loads by path and by name, lists its criteria and gives 20 points."""
     rubric = load_rubric(path)
     assert load_rubric(Path(path.stem)) == rubric
     assert rubric.out_of == 20
@@ -182,7 +182,7 @@ def test_a_misspelt_rubric_gives_the_nearest_shipped_one():
 
 
 def test_every_flag_may_have_a_cost():
-    """Each flag may have a cost, except that for shared data, on which a person decides."""
+    """Every flag except the one for shared data may have a cost; a person decides on that one."""
     assert {*FlagCosts.model_fields} == {*CODES} - {"shared_data"}
     assert all(load_rubric(path).flags.of("wrong_state_space") == 0.5 for path in SHIPPED)
 

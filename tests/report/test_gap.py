@@ -535,9 +535,9 @@ def test_two_effects_have_two_letters_in_the_equations():
     "keys", list(permutations(("saturation", "actuator_lag", "dead_zone", "input_delay")))[::5]
 )
 def test_changes_of_the_input_are_applied_as_in_the_simulator(keys):
-    """In whatever order effects are listed, each input change starts from the one before.
+    """The input's changes are applied in the simulator's order, however the effects are listed.
 
-    Only the last change pushes cart 1, and the load-dependent friction uses this last change.
+    The input after the last change pushes cart 1 and enters the load-dependent friction.
     """
     terms = make_gap("named", (*keys, "load_friction")).model.terms
     laws = [to_text(law(terms, index).math) for index in in_order(terms)]

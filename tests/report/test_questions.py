@@ -1,4 +1,4 @@
-"""The report asks questions that its data raise, and shows each answer beside its question."""
+"""The report asks questions that its data raise, and shows each answer next to its question."""
 
 import re
 from dataclasses import replace
@@ -200,7 +200,7 @@ Oil it.
 
 
 def test_an_answer_is_shown_beside_its_question():
-    """An answer is shown beside its question; other notes stay in the discussion."""
+    """An answer is shown next to its question; other notes stay in the discussion."""
     analysis = replace(off("zeta_b", 65.0), discussion=NOTES.format(heading="zeta_b"))
     ((section, question),) = questions_of(analysis)
     assert section == "parameters"

@@ -226,7 +226,7 @@ def test_the_list_of_files_is_never_alone_on_a_page():
 
 
 def test_the_page_loads_nothing(folders):
-    """The page loads nothing, and its policy lets only its own script run."""
+    """The page loads nothing, and its security policy lets only its own script run."""
     page, _ = read(folders[2])
 
     (policy,) = (
@@ -525,7 +525,7 @@ def test_unusual_chains_are_shown(name, tmp_path):
 
 
 def test_the_summary_reports_a_poor_result(tmp_path):
-    """If results disagree or the fit failed, the summary says so and what to do."""
+    """If results disagree or the fit failed, the summary says so and advises what to do."""
     analysis = make_analysis(2)
     assert analysis.fit is not None
     fit = replace(analysis.fit, converged=False, message="k_1 at its bound", chi_square_per_dof=9.0)

@@ -375,7 +375,7 @@ def test_bounds_in_the_solution_earn_all_points(carts, hide):
 
 
 def test_another_rubric_has_other_bounds(tmp_path):
-    """With `--rubric`, page and file have the bounds of this rubric and its title."""
+    """With another rubric, the page and the file show its bounds and title."""
     analysis = make_analysis(2)
     text = (RUBRICS / "throne-2dof.toml").read_text(encoding="utf-8")
     text = text.replace(
@@ -397,7 +397,7 @@ def test_another_rubric_has_other_bounds(tmp_path):
 @given(chains(min_carts=2, max_carts=3), st.integers(0, 2**32 - 1))
 @settings(max_examples=20)
 def test_tolerances_of_entries_cover_tolerated_tables(chain, seed):
-    """If a table's errors are a third of its tolerances, most entries of A and B are tolerated."""
+    """If a table's errors are within its tolerances, most entries of A are within theirs."""
     rng = np.random.default_rng(seed)
     table = derivation.given(chain)
     tolerances = {name: 1e-3 * value for name, value in table.items()}
@@ -462,7 +462,7 @@ def test_every_kind_of_question_has_a_model_answer(kind):
 
 
 def test_without_a_fit_the_solution_is_only_the_derivation():
-    """Without a fit, the solution has only the derivation; that of a rigid cart is short."""
+    """Without a fit, the solution is only the derivation; a fitted rigid cart has a state model."""
     bare = replace(make_analysis(2), fit=None, rows=(), feedback=None)
     ids = [section.id for section in build_solution(bare).sections]
     assert ids[1:3] == ["motion", "transfer-functions"]

@@ -113,7 +113,7 @@ def test_independent_initial_estimates_are_named():
     ],
 )
 def test_one_parameter_is_singular(judged, said):
-    """The summary counts the parameters that agree, and one of them is in the singular."""
+    """The number of parameters that agree is given with the right singular or plural."""
     analysis = make_analysis(2)
     flags = [*judged, *[None] * (len(analysis.rows) - len(judged))]
     rows = tuple(
@@ -170,7 +170,7 @@ def test_a_failed_check_of_unknown_kind_is_named():
 def test_without_runs_of_all_carts_the_summary_says_what_to_record(drop, tmp_path):
     """If no run has all carts, the summary says what to record.
 
-    The advice neither repeats the reason nor asks for an impossible table.
+    The advice does not repeat the reason, and every failed check is named.
     """
     shutil.copytree(EXAMPLES / "two-cart", tmp_path / "s")
     toml = tmp_path / "s" / "submission.toml"
@@ -202,7 +202,7 @@ def test_no_failure_is_listed_if_no_check_failed():
 
 
 def test_a_question_about_one_recording_does_not_mention_two():
-    """If both estimates use the same recordings, the question does not mention two amplitudes."""
+    """If both estimates use the same recordings, the question says so."""
     analysis = make_analysis(1)
     rows = tuple(
         replace(row, consistent=False, change_percent=80.0, independent=False)

@@ -45,7 +45,7 @@ def test_a_number_is_not_compared_with_an_assumed_value():
 
 
 def test_a_number_without_an_estimate_has_a_dash():
-    """A reported number without an estimate has a dash beside it.
+    """A reported number without an estimate has a dash next to it.
 
     A wrong mass gets no hint, since no known mistake explains it.
     """
@@ -60,7 +60,7 @@ def test_a_number_without_an_estimate_has_a_dash():
 
 
 def test_a_verdict_is_shown_beside_its_limit():
-    """Beside each verdict, the table gives its limit: 15 % for frequencies, 50 % for dampings."""
+    """Next to each verdict is its limit: 15 % for frequencies and 50 % for dampings."""
     rows = [row for row in make_analysis(1).rows if row.consistent is not None]
     table = parameter_table(page(rows))
     limits = {plain(row[0].text): plain(row[6].text) for row in table.rows}

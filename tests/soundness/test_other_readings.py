@@ -1,4 +1,4 @@
-"""A wrong factor in all records of a kind is a wrong unit; otherwise it is not called a mistake."""
+"""A wrong factor is reported as a wrong unit only if all records of a kind share it."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -55,13 +55,13 @@ def kept(found: Mapping[str, Misread], *others: Record, sizes: Mapping[str, floa
     ],
 )
 def test_a_unit_must_be_wrong_in_all_records_of_a_kind(misread, sizes, others, unit):
-    """A factor is taken for a unit if all records of a kind share it and no limit explains it."""
+    """A factor is called a wrong unit if all records of a kind share it without an input limit."""
     found = {name: misread for name in sizes}
     assert kept(found, *others, sizes=sizes) == (set(sizes) if unit else set())
 
 
 def test_another_clock_needs_another_sampling_rate():
-    """A single dwell is said to have another clock only if its sampling rate differs."""
+    """The clock of a single dwell is called wrong only if the dwell's sampling rate differs too."""
     others = [record("sine-2"), record("sine-3")]
     assert kept({"sine-1": SLOW}, *others, sizes={"sine-1": 1.0}) == set()
     slow = replace(record("sine-1"), t=np.linspace(0.0, 1.98, 100))

@@ -124,7 +124,7 @@ def test_a_rigid_body_has_mass_and_damping():
 
 
 def test_the_staged_fit_is_reported_as_well():
-    """From exact data, the stage-by-stage fit finds all parameters, also the recomputed ones."""
+    """From exact data, the stage-by-stage fit finds all parameters, even the recomputed ones."""
     chain = PRESETS["throne-3dof"]
 
     got = fit_bode(exact(chain), bench=Bench(springs=(True,) * 4), initial=PAPER_STARTS[3])
@@ -223,7 +223,7 @@ def test_a_damping_at_its_bound_widens_the_modes_errors():
 
 
 def test_a_damping_that_the_response_leaves_open_is_the_decays():
-    """If points beside a sharp peak leave the damping open, the damping of the decay is used."""
+    """If points near a sharp peak do not determine the damping, the decay's damping is used."""
     decay = Estimate(value=0.017, std=0.0005, source="log_decrement")
     got = fit_bode(exact(SHARP, BESIDE), bench=Bench(springs=(True, True)), decays={1: decay})
 
@@ -235,7 +235,7 @@ def test_a_damping_that_the_response_leaves_open_is_the_decays():
 
 
 def test_if_one_damping_is_open_all_decays_are_used():
-    """If the response leaves one of two dampings open, the fit also uses both carts' decays."""
+    """If the response leaves one of two dampings unknown, the fit also uses both carts' decays."""
     chain = PRESETS["throne-2dof"]
     decays = {
         cart: Estimate(value=float(zeta), std=0.02 * float(zeta), source="log_decrement")
@@ -329,7 +329,7 @@ def test_good_phases_sharpen_the_dampings():
 
 
 def test_a_misfit_widens_the_errors():
-    """If points scatter by 5 % but claim 0.01 %, the standard errors correspond to 5 %."""
+    """If points scatter by 5 % but state errors of 0.01 %, standard errors correspond to 5 %."""
     chain = PRESETS["throne-2dof"]
     rng = np.random.default_rng(4)
     scattered = [

@@ -153,7 +153,7 @@ def test_a_negative_spring_is_named():
 
 
 def test_the_papers_third_table_breaks_two_redundancies():
-    """The paper's Table 3 violates the redundancies R4 and R5, but breaks no law of order."""
+    """The paper's Table 3 violates the redundancies R4 and R5, but passes every check of order."""
     gains = {"K_1": 39.4, "K_2": 30.6, "K_3": 16.0}
     modes = {"omega_a": 6.9, "omega_b": 24.1, "omega_c": 34.1}
     dampings = {"zeta_a": 0.25, "zeta_b": 0.03, "zeta_c": 0.03}

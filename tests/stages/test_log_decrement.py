@@ -56,7 +56,7 @@ def record(t, y, *, u=None, kind: Kind = "decay", count=COUNT):
 
 
 def released(*, zeta, fs=FS, duration=None, count=COUNT, noise=0.0, rng=None, **motion):
-    """Return a record of a release by hand of 4.5 time constants, or of 10 s if that is less."""
+    """Return a record of a release by hand that lasts 4.5 time constants, but at most 10 s."""
     t = np.arange(0, duration or RELEASE + min(4.5 / (zeta * OMEGA), 10.0), 1 / fs)
     y = held_then_free(t, zeta=zeta, **motion)
     if rng is not None:
@@ -152,7 +152,7 @@ def test_the_hold_before_the_release_is_left_out():
 
 
 def test_a_record_may_begin_at_the_release():
-    """If the first sample is already free, the whole record is used."""
+    """If the cart is already free at the first sample, the whole record is used."""
     t = np.arange(0, 4, 1 / FS)
     got = fit_log_decrement(record(t, held_then_free(t, zeta=0.05, release=-0.1)), cart=1)
     assert got.release == 0.0

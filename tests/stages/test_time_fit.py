@@ -1,4 +1,4 @@
-"""The joint fit to time records finds unknown chains without starting values."""
+"""The time-domain fit finds unknown chains without starting values."""
 
 from dataclasses import replace
 
@@ -75,7 +75,7 @@ def test_modes_and_simulation_agree(free, jitter):
 @pytest.mark.parametrize("zeta", [0.1, 1.0, 1.5])
 @pytest.mark.parametrize("at_rest", [True, False])
 def test_the_jacobian_is_that_of_the_misfit(zeta, at_rest):
-    """The Jacobian agrees with differences of the cost, even if two poles of a cart coincide."""
+    """The Jacobian agrees with finite differences, even if two poles of a cart coincide."""
     m, k = np.array([2e-4, 1e-4]), np.array([0.03, 0.04, 0.02])
     chain = Chain(m=m, c=2 * zeta * np.sqrt(m * (k[:-1] + k[1:])), k=k)
     record = step_record(chain, rng=np.random.default_rng(1), noise=0.01)
@@ -322,7 +322,7 @@ def test_records_that_no_chain_explains_give_no_fit():
 
 
 def test_a_search_at_its_limit_returns_the_best_so_far():
-    """If a search reaches its limit of comparisons, it returns the best result so far."""
+    """If a search reaches its limit on comparisons with records, it returns the best so far."""
     rng = np.random.default_rng(12)
     record = step_record(PRESETS["throne-1dof"], rng=rng)
     assert record.u is not None
@@ -351,7 +351,7 @@ def test_a_decay_is_used_from_its_release_on():
 
 
 def test_correlated_residuals_widen_the_error():
-    """For correlated residuals, the error of a sum follows from their spectrum."""
+    """The variance of a sum of correlated residuals is found from their spectrum."""
     rng = np.random.default_rng(14)
     n, phi, runs = 1000, 0.8, 60
     slow, fast = np.ones((1, 1, n)), (-1.0) ** np.arange(n, dtype=np.float64)[None, None]
@@ -395,7 +395,7 @@ def test_a_long_rest_before_the_step_is_one_reading():
 
 
 def test_readings_of_a_rest_share_an_error():
-    """All readings of the first rest count together as one reading with a common error."""
+    """Readings of the first rest share an error, so their total weight stays limited."""
     chain, rng = PRESETS["throne-2dof"], np.random.default_rng(19)
     window = open_window(step_record(chain, rng=rng, noise=0.0))
     n = window.n_resting

@@ -31,5 +31,5 @@ def test_the_fit_is_efficient_and_its_errors_are_right(preset, phases):
 @pytest.mark.parametrize(("kind", "least"), [("paper", 0.995), ("random", 0.99), ("wide", 0.94)])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_fit_converges_from_poor_starts(preset, kind, least):
-    """From the paper's, random and wide starts, the fit finds the right resonances."""
+    """From at least 94 % of poor starting values, the fit finds the right resonances."""
     assert converged_share(PRESETS[preset], kind=kind, seeds=400) >= least

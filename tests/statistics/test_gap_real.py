@@ -31,7 +31,7 @@ def explain_five(folder: Path, name: str, *, column: int, kind: str) -> Gap:
 
 
 def test_driven_cart_has_dry_friction(real_data):
-    """In five steps of a real cart, dry friction is found, and unseen repeats are right to 2.7 %.
+    """In five steps of a real cart, dry friction is found; unseen repeats are predicted to 2.7 %.
 
     No model can have a smaller error than the difference between the repeats.
     """
@@ -57,7 +57,7 @@ def test_released_cart_has_dry_friction(real_data):
 
 
 def test_a_cart_held_in_all_runs_is_a_wall(real_data, tmp_path):
-    """Steps of cart 1 in a two-cart folder give the same errors as in a one-cart folder."""
+    """Steps of cart 1 with cart 2 held are predicted as well as steps of a bench with one cart."""
     folder = write_two_cart_submission(tmp_path / "lab", real_data, steps=())
     analysis = analyse(load_submission(folder), design=False)
     records = [r for r in analysis.records if r.id.startswith("alone-1")]

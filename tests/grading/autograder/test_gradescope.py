@@ -264,7 +264,7 @@ def test_an_upload_without_a_submission_gets_the_reason(root, tmp_path, files, s
 
 
 def test_code_in_an_upload_is_not_run(root, team, shown, tmp_path):
-    """No code in an upload is run, even if a file has the name of one that the grader uses."""
+    """No code in an upload is run, even if its file is named like one that the grader uses."""
     given, mark = tmp_path / "given", tmp_path / "was-run"
     shutil.copytree(team, given)
     code = f"open({str(mark)!r}, 'w')\n"

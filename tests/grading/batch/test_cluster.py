@@ -100,7 +100,7 @@ def test_a_cluster_gives_the_same_rows_even_if_a_worker_dies(cluster, tmp_path):
 
 
 def test_an_address_that_is_not_a_schedulers_is_refused():
-    """An address must belong to a scheduler, and must be encrypted if on another machine."""
+    """Only a scheduler's address is accepted, and on another machine only with encryption."""
     with pytest.raises(ConfigError, match="expected a scheduler's address"):
         run_on("http://localhost:8786")
     with pytest.raises(ConfigError, match=r"tls://"):

@@ -27,7 +27,7 @@ _MEMBER = 3_000_000  # bytes in a file that compresses to a tenth of its size
 
 @pytest.fixture(scope="module")
 def teams(tmp_path_factory) -> Path:
-    """Return two teams that share a step recording; as zip files they are small."""
+    """Write two teams that share a step recording, with large files that compress well."""
     folder = tmp_path_factory.mktemp("teams")
     for number in (0, 2):
         write_submission(
@@ -100,7 +100,8 @@ def test_a_full_disk_costs_nobody_a_grade(zips, tmp_path):
 def test_a_file_with_an_impossible_name_is_refused_for_good(tmp_path):
     """If the file system cannot store a member of an archive, the member is refused for good.
 
-    One name is too long; another needs a folder where a file is. Trying again cannot help.
+    One name is too long; another needs a folder with the name of an existing file. Trying again
+    cannot help.
     """
     archive = tmp_path / "odd.zip"
     with zipfile.ZipFile(archive, "w") as packed:
@@ -140,7 +141,8 @@ print(json.dumps(told))
 def starved(source: Path, scratch: Path, limit: str, soft: range) -> list[list]:
     """Grade once without a limit, then once with each limit.
 
-    Return for each grading: whether it is final, whether space was short, the reason, the grade.
+    For each grading, return whether it is final, whether the disk was full, the reason and the
+    grade.
     """
     scratch.mkdir()
     words = [sys.executable, "-c", _STARVED, source, scratch, limit, *soft]

@@ -51,7 +51,7 @@ def school(tmp_path_factory):
 
 
 def run(paths, out, *, jobs=1, time_limit=PATIENCE, execute=None, progress=lambda *_: None):
-    """Grade into a new gradebook; return the batch, and outcome and grade of each submission."""
+    """Grade into a new gradebook; return the batch, and each submission's outcome and grade."""
     scratch = out / "scratch"
     scratch.mkdir(parents=True, exist_ok=True)
     with Gradebook(out, create=True) as book:
@@ -145,7 +145,7 @@ def kill_next(monkeypatch):
 
 
 def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup, kill_next):
-    """If a worker process dies during a task, that row says so and the next task is graded."""
+    """If a worker process dies during a task, its row says so and the next task is graded."""
     with closing(Grader(setup)) as worker:
         assert worker.run(task).status == "graded"
         kill_next()
@@ -165,7 +165,7 @@ def test_a_worker_killed_while_it_starts_is_started_again(task, setup, kill_next
 
 
 def test_a_grade_is_kept_if_its_figures_fail(school, tmp_path, monkeypatch):
-    """If figures cannot be drawn, the row has its points without figures.
+    """If figures cannot be drawn, the submission still gets its points.
 
     The next run grades the submission again.
     """

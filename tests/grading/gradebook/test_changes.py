@@ -45,7 +45,7 @@ def test_a_rubric_is_compared_by_its_criteria():
 
 
 def test_a_rubric_of_another_version_is_not_compared():
-    """If the earlier rubric was written by another version, the summary says only that."""
+    """If another version of cartlab wrote the earlier rubric, the summary says only that."""
     assert rubric_changes('{"version": 0}', RUBRIC.model_dump_json()) == [
         "the earlier rubric was written by another version of cartlab"
     ]
@@ -61,7 +61,7 @@ def test_points_are_compared_by_name():
 def test_changes_are_printed_and_kept_in_the_history(tmp_path):
     """After a regrade the changes are printed and kept in the history.
 
-    A first class list is not a change, nor is a second run with the same result.
+    Neither the first class list nor a second run with the same result counts as a change.
     """
     outcome = make_outcome(make_grade("a", share=0.5))
     batch = Batch(keys=(outcome.key,), shared={})
@@ -89,7 +89,7 @@ _LEFT = 4
 def test_ctrl_c_says_how_to_go_on(tmp_path):
     """After Ctrl-C one line says how to continue, and the same command then continues.
 
-    Not every submission is graded yet, and the exit status is 130, that of an interrupt.
+    Ctrl-C comes before every submission is graded, and the exit status is 130.
     """
     for number in range(_LEFT + 1):
         write_submission(tmp_path / "c" / f"t{number}", "throne-1dof", seed=number,

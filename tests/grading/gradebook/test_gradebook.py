@@ -68,7 +68,7 @@ def finish(book, *outcomes, shared=None):
 
 
 def test_an_outcome_is_read_back_unchanged(open_book):
-    """An outcome, Unicode included, is unchanged after the gradebook is closed and reopened."""
+    """An outcome with any Unicode text is unchanged after the gradebook is reopened."""
     grade = make_grade("tëam 学 '\"; DROP TABLE gradings; --", share=0.5, flags=(hertz_flag(),))
     outcome = make_outcome(
         grade,
@@ -426,7 +426,7 @@ def assert_nothing_lost(place: str, *, kills: int) -> None:
 
 
 def test_a_place_without_a_gradebook_is_an_error(tmp_path):
-    """If a place has no gradebook, reading it is an error and makes no file."""
+    """If a place has no gradebook, reading it is an error and creates no file."""
     with pytest.raises(ConfigError, match=r"holds no gradebook\.sqlite; give the --out folder"):
         Gradebook(tmp_path)
     assert list(tmp_path.iterdir()) == []
@@ -453,9 +453,9 @@ def test_a_useless_address_is_an_error_without_the_password(url, message):
 
 
 def test_a_file_that_is_not_a_gradebook_is_an_error(tmp_path):
-    """A file that is not a gradebook of this version is an error and stays as it is.
+    """A file that is not a gradebook of this version is refused with an error.
 
-    The file is a text, another program's database, or a gradebook of a later version.
+    It may be a text file, another program's database, or a gradebook of a later version.
     """
     file = tmp_path / FILE
     file.write_text("name,points\n" * 100, encoding="utf-8")

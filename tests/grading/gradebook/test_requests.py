@@ -28,7 +28,7 @@ CRITERIA = [criterion.id for criterion in RUBRIC.criteria]
 
 @pytest.fixture
 def book(place):
-    """Return a released class of two teams that lost half of every criterion."""
+    """Return a class of two teams that lost half of all points; the grades are released."""
     with RequestBook(place, assignment="lab", create=True) as book:
         finish(book, *(make_grade(name, share=0.5) for name in ("team-1", "team-2")))
         book.release(True, by="prof")
@@ -334,7 +334,7 @@ def test_a_kill_leaves_an_answer_with_its_points_or_neither(tmp_path):
 @pytest.mark.sample
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
 def test_in_postgresql_a_kill_leaves_an_answer_with_its_points_or_neither(place_in_postgresql):
-    """If the answering process is killed, PostgreSQL too has the answer with its points or not."""
+    """In PostgreSQL too, a kill leaves an answer stored with its points or not at all."""
     assert_whole(place_in_postgresql, kills=8)
 
 

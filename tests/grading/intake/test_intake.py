@@ -301,7 +301,7 @@ def test_a_zip_with_a_deleted_member_is_accepted(tmp_path):
 def test_a_hostile_submission_in_a_download_fails_alone(tmp_path):
     """A hostile submission in a class download fails alone; all others are graded.
 
-    The faults are paths out of the folder, very deep folders, a password and broken bytes.
+    The faults are paths that leave the folder, very deep folders, a password and broken bytes.
     """
     download = archive(
         tmp_path / "class.zip",

@@ -17,7 +17,7 @@ BRIEF = UnpackLimits(total=1_000_000, directory=10_000)
 
 
 def zipped(path, members, *, mode=None):
-    """Write an archive of names and texts; `mode` is the Unix mode of every member."""
+    """Write a zip file from names and texts; `mode` is the Unix mode of every member."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, text in members.items():
             info = zipfile.ZipInfo(name)

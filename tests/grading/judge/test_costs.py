@@ -1,4 +1,4 @@
-"""What costs points: a harmful model, the least cost of a flag, and rounding to a step."""
+"""Harmful models and flagged mistakes cost points, and points are rounded to a step."""
 
 from dataclasses import replace
 from decimal import Decimal

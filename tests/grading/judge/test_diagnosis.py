@@ -64,7 +64,7 @@ def test_numbers_typed_with_two_digits_are_honest_too(carts):
 
 @pytest.mark.parametrize(("carts", "hide"), [(1, ()), (2, ()), (3, ()), (2, FRICTION)])
 def test_textbook_methods_get_no_flag(carts, hide):
-    """A student who uses textbook methods and starts with the last cart gets no flag."""
+    """A student who uses textbook methods and fits the last cart first gets no flag."""
     one = student(carts, hide=hide)
     records = one.analysis.records
     initial = by_eye(records, carts) if carts > 1 else {}
@@ -129,7 +129,7 @@ def test_frequencies_in_hz_are_flagged(carts, table):
 def test_one_mistake_in_two_tables_gets_one_flag():
     """If the frequencies of both tables are in Hz, one flag names them all.
 
-    Other messages give no further advice.
+    Messages of the criteria then omit their usual advice.
     """
     one = student(2)
     names = [n for n in one.reported.final if n.startswith("omega")]
@@ -167,9 +167,9 @@ def test_a_single_wrong_damping_is_not_a_wrong_logarithm(carts):
 @pytest.mark.parametrize("carts", [1, 2, 3])
 @pytest.mark.parametrize("k", [1, 2, 3])
 def test_one_period_too_many_is_flagged(carts, k):
-    """If one period too many was counted, a flag says so.
+    """If k + 1 periods were counted instead of k, a flag says so.
 
-    Then ω is (k + 1)/k times its true value, and ζ is smaller by the same factor.
+    Then ω is (k + 1)/k times too large, and ζ is too small by the same factor.
     """
     one = student(carts)
     omegas, zetas = own("omega", carts), own("zeta", carts)

@@ -100,7 +100,7 @@ def test_result_files_in_a_submission_are_ignored(folder, honest, tmp_path):
 def test_a_recordings_own_scale_counts_only_under_feedback(folder):
     """An input scale stated for a recording counts only for closed-loop recordings.
 
-    A bench may log another signal under feedback. Otherwise the rubric's scale counts.
+    Under feedback, a bench may log another signal. In all other runs the rubric's scale counts.
     """
     submission, rubric = load_submission(folder), load_rubric(Path("throne-1dof"))
     system = rubric.system.model_copy(update={"input": InputScale(sign=1, per_count=1e-4)})
@@ -123,7 +123,7 @@ def test_a_recordings_own_scale_counts_only_under_feedback(folder):
 
 @pytest.mark.parametrize("turned", [True, False])
 def test_the_data_decide_between_two_stated_signs(folder, honest, tmp_path, turned):
-    """If a step states another sign than the rubric, the sign that fits the data is used."""
+    """If a step and the rubric state different signs, the sign that fits the data is used."""
     other = tmp_path / "team-07"
     shutil.copytree(folder, other)
     for path in (other / "data").glob("step-*.csv") if turned else ():

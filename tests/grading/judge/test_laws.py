@@ -32,9 +32,9 @@ def broken(table: dict[str, str], *, n: int) -> set[str]:
 
 
 def test_table_2_of_the_paper_fails_in_its_first_cart():
-    """Table 2 of the paper breaks the law for ω_1, and also R1 unless ζ_b is 0.034 instead of 0.03.
+    """Table 2 of the paper breaks the law for ω_1: 19.8 is below the recomputed 20.07 to 20.49.
 
-    ω_1 = 19.8 is below the recomputed range of 20.07 to 20.49.
+    With ζ_b = 0.03, as printed, the table also breaks R1; with 0.034 it does not.
     """
     assert broken({**TABLE_2, "zeta_b": "0.034"}, n=2) == {"recomputed.omega_1"}
     assert broken(TABLE_2, n=2) == {"recomputed.omega_1", "redundancy.R1"}

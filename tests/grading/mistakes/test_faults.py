@@ -134,7 +134,7 @@ LONG = [pytest.mark.slow, pytest.mark.sample]
 
 
 def _cases() -> Iterator[Any]:
-    """Yield each case with no sign stated; cases that look like a wrong sign also state one."""
+    """Yield each case without a stated sign; cases like a wrong sign come again with one."""
     for case in SPOILT:
         yield pytest.param(case, "", marks=LONG if case in SEARCHED else ())
         if "turned" in case or "exchanged" in case:
@@ -304,7 +304,7 @@ def test_a_sound_repeat_is_kept_if_most_have_swapped_columns(bench, tmp_path):
 
 
 def test_times_in_milliseconds_throughout_fail_a_check(bench, tmp_path):
-    """If all times are in milliseconds, a check finds all dwell frequencies off by 1000."""
+    """If all times are in milliseconds, a check finds all dwell frequencies 1000 times off."""
     folder = shutil.copytree(bench, tmp_path / "slow")
     for path in files(folder, ""):
         spoil(path, in_milliseconds)
@@ -350,7 +350,7 @@ def test_columns_swapped_in_every_recording_are_named(bench, tmp_path):
 
 
 def test_contradicting_dwells_and_steps_identify_nothing(bench, tmp_path):
-    """If the inputs of all dwells are ten times off those of all steps, nothing is identified.
+    """If the inputs of dwells and steps disagree by a factor of ten, nothing is identified.
 
     The report gives two possible explanations: wrong dwells or wrong steps.
     """
@@ -373,7 +373,7 @@ def test_contradicting_dwells_and_steps_identify_nothing(bench, tmp_path):
 
 
 def test_a_recording_of_no_linear_carts_is_left_out_but_not_called_wrong(bench, tmp_path):
-    """A recording that no linear carts could make is left out, but not called wrong.
+    """A recording that linear carts cannot produce is left out, but not called wrong.
 
     In the test, something besides the input moves the cart.
     """
@@ -435,7 +435,7 @@ def test_files_with_fewer_decimals_are_not_in_another_unit(bench, tmp_path):
 
 
 def test_sticking_carts_are_not_in_another_unit_of_time(bench):
-    """If carts stick and creep, the recording is not said to be in another unit of time."""
+    """If carts stick and creep, the recording is not taken for one in another unit of time."""
     chain = PRESETS[PRESET]
     dwell = next(
         r for r in analyse(load_submission(bench), design=False).records if r.kind == "sine"
@@ -450,7 +450,7 @@ def test_sticking_carts_are_not_in_another_unit_of_time(bench):
 def test_a_cart_moving_too_far_blames_no_gain(bench, tmp_path):
     """If cart 2 seems to move farther than the cart that pulls it, no gain is called wrong.
 
-    In every file the column of cart 2 is in another unit, so nothing is identified.
+    In the test, the column of cart 2 is in millimetres in every file. Only the data are flagged.
     """
     folder = shutil.copytree(bench, tmp_path / "millimetres")
     for path in files(folder, ""):

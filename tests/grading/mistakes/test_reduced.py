@@ -78,7 +78,7 @@ def test_a_slip_in_the_table_is_named(carts, code, change):
 def test_without_dwells_a_table_is_judged_by_steps_and_decays(code, factor):
     """Without dwells, the fit to the table is compared with steps and decays.
 
-    If the two differ by one factor for all carts, a flag names the mistake.
+    If they differ by the same factor for all carts, a flag names the mistake.
     """
     analysis = student(2).analysis
     symbol = "K" if code == "peak_to_peak" else "omega"

@@ -326,7 +326,7 @@ def test_a_row_that_two_submissions_match_is_unchanged(tmp_path):
 
 
 def test_an_upload_does_not_decide_between_two_submissions(tmp_path):
-    """If an author is in two submissions and uploaded one, neither one's points are exported.
+    """If an author is in two submissions, no points are exported, even if the author uploaded one.
 
     One message names both submissions.
     """
@@ -342,7 +342,7 @@ def test_an_upload_does_not_decide_between_two_submissions(tmp_path):
 
 @pytest.mark.parametrize("own", [False, True])
 def test_an_author_is_named_if_the_uploader_got_the_points(tmp_path, own):
-    """If an author's points go to another student who uploaded, a message names the author.
+    """If another student uploads an author's work and gets the points, a message names the author.
 
     The uploader's number takes precedence over the authors' ids. If `own` is true, the author also
     has an ungraded submission.

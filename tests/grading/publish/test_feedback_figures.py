@@ -1,4 +1,4 @@
-"""The figures in the feedback draw the curve of the reported numbers beside the measurement."""
+"""The figures in the feedback draw the curve of the reported numbers next to the measurement."""
 
 import numpy as np
 import pytest
@@ -59,7 +59,7 @@ def test_a_zero_or_infinite_frequency_has_no_curve(value):
 
 
 def test_a_number_that_lost_points_is_shown_on_its_record():
-    """Each number that lost points is drawn on its recording, beside the recomputed one."""
+    """Each number that lost points is drawn on its recording, next to the recomputed one."""
     honest = student(2)
     wrong = {"K_1": 1.4 * honest.value("initial", "K_1"), "omega_2": 5.24}
     two = honest.reporting(initial=wrong)

@@ -280,7 +280,7 @@ def test_every_flag_has_a_name_and_a_place_to_look():
 
 
 def test_the_feedback_compares_reported_and_recomputed_numbers():
-    """The feedback shows reported number, recomputed number and difference, with message and help.
+    """The feedback shows reported and recomputed numbers, their difference, a message and help.
 
     It also shows the deduction for lateness.
     """
@@ -350,7 +350,7 @@ def test_feedback_lists_every_mistake_of_a_broken_submission(tmp_path):
 
 
 def test_numbers_of_a_criterion_have_words_and_units():
-    """Numbers of a criterion have words and units, and an overshoot of 10⁻⁷ % is shown as 0."""
+    """A criterion's numbers have labels and units, and an overshoot of 10⁻⁷ % is shown as 0."""
     units = Units(position="cm", input="V")
     claims = Criterion(
         id="c", title="claims", outcome="partial", points=1, out_of=2, message="",
@@ -442,7 +442,7 @@ def test_the_class_page_shows_statistics():
 def shares(*found: tuple[str, str, str]) -> Flag:
     """Return a flag for shared data.
 
-    Each argument names a recording, another submission, and the other recording.
+    Each argument names a recording, the submission that shares it, and its name there.
     """
     keys = ("experiment", "submission", "other_experiment")
     recordings = [{**dict(zip(keys, one, strict=True)), "sigmas": 9.5} for one in found]

@@ -22,7 +22,7 @@ LATE = {"team-1": 1.3}
 
 @pytest.fixture(scope="module")
 def school(tmp_path_factory) -> Path:
-    """Write an honest team, a late one with Hz, one with a wrong gain, and an unreadable one."""
+    """Write four teams: honest, late with numbers in Hz, with a wrong gain, and unreadable."""
     folder = tmp_path_factory.mktemp("class")
     for number in range(3):
         own = folder / f"team-{number}"

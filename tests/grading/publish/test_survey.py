@@ -99,7 +99,7 @@ def test_answers_off_the_scale_are_an_error(tmp_path, rows, message):
 
 
 def test_answers_may_be_written_in_many_ways(tmp_path):
-    """Answers are read with any capitals and apostrophes; scores may be words."""
+    """Capitals and the kind of apostrophe do not matter in answers, and scores may be words."""
     path = tmp_path / "a.csv"
     path.write_text(
         "Q;post_knowledge: x\nstrongly agree;Moderate\nI don’t know;4\nDon't know.;high, used it\n",

@@ -11,7 +11,7 @@ from tests.helpers.grading_students import student
 
 
 def with_gain_off(analysis: Analysis, *, sigmas: float) -> Analysis:
-    """Return the analysis with the fitted K_1 this many standard errors from that of the steps."""
+    """Move the fitted K_1 this many combined standard errors away from the K_1 of the steps."""
     rows = []
     for row in analysis.rows:
         if row.name == "K_1":
@@ -46,7 +46,7 @@ def test_the_errors_grow_with_the_contradiction(sigmas):
 
 
 def test_a_wrong_recording_does_not_make_the_fit_doubtful():
-    """Steps 1.5 times too large contradict a fit that explains the data, and so do not count."""
+    """If step gains are 1.5 times too large but the fit explains the data, its errors stay."""
     analysis = student(2).analysis
     before = recompute(analysis).final
     rows = tuple(

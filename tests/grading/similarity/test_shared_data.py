@@ -149,7 +149,7 @@ def test_honest_teams_with_coarse_encoders_share_nothing(tmp_path, per_cm):
     ids=str,
 )
 def test_a_disguised_copy_of_one_recording_is_found(teams, others, kind, disguise):
-    """One copied recording among honest ones is found, and both submissions name it."""
+    """One copied recording is found among honest ones; each finding names the other submission."""
     rng = np.random.default_rng(7)
     copied = disguised(of_kind(teams[0], kind), rng, **disguise)
     found = find_shared([prints("a", teams[0]), prints("b", [*teams[1], copied]), *others])
@@ -239,7 +239,7 @@ def test_a_copy_from_an_earlier_batch_is_found(teams):
 
 @pytest.fixture
 def compared(monkeypatch):
-    """Return a list; each comparison at one time shift adds its pair of recordings."""
+    """Return a list to which each comparison at one time shift adds its pair of recordings."""
     pairs, compare = [], shared.compare
 
     def counted(a, b, **how):
@@ -264,7 +264,7 @@ def test_a_recording_under_many_names_is_compared_once(teams, compared):
 
 @pytest.mark.parametrize("alike", ["cuts of one run", "one hum in all"])
 def test_the_cost_grows_with_the_recordings_not_their_square(teams, alike, compared):
-    """If submissions look the same everywhere, the time grows only in proportion to their size."""
+    """If all recordings look alike, at most ten comparisons are made for each recording."""
     rng = np.random.default_rng(5)
     record = of_kind(teams[0], "decay")
     if alike == "cuts of one run":
