@@ -3,10 +3,10 @@
     python -m benchmarks [NAME…] [--quick] [--out PAGE.md]
 
 Without a name all benchmarks run. With names, only their sections change. `--quick` runs small
-versions, only to show that everything works; they are printed, or written to `--out`.
+versions, only to show that everything works. Their results are printed, or written to `--out`.
 
-A benchmark is a module of this folder whose name is in `PAGES`, in the order of its page. The
-module has four names.
+A benchmark is a module of this folder that is listed in `PAGES`, which also sets the order of
+sections on each page. The module defines four names.
 
     TITLE = "…"             heading of its section
     WORDS = "…"             the question, and the data (Markdown)

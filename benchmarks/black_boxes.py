@@ -40,7 +40,7 @@ class Part:
 
 @dataclass(frozen=True, kw_only=True)
 class Model:
-    """A learnt model: its free run, with a value at every `every` samples, and its text."""
+    """A learnt model: its free run, with one value per `every` samples, and its equation."""
 
     run: Callable[[Part], Array]
     every: int
@@ -75,7 +75,7 @@ def best(models: Iterator[Model], parts: Sequence[Part]) -> Model | None:
 
 
 def _thinned(part: Part, every: int) -> tuple[Array, Array]:
-    """Return every n-th position, and the mean input until the next one."""
+    """Return one position per `every` samples, and the mean input from each to the next."""
     n = part.y.size // every * every
     u = part.u[:n].reshape(-1, every).mean(axis=1) if every > 1 else part.u
     return u, part.y[::every][: u.size]
@@ -210,7 +210,7 @@ def frols(
     degrees: Sequence[int] = (1, 2, 3),
     thinnings: Sequence[int] = (2, 4, 8),
 ) -> Iterator[Model]:
-    """Select the terms of a polynomial NARX by SysIdentPy's FROLS and the Akaike criterion."""
+    """Select the terms of a polynomial NARX with SysIdentPy's FROLS and the Akaike criterion."""
     selection = import_module("sysidentpy.model_structure_selection")
     basis = import_module("sysidentpy.basis_function")
     estimators = import_module("sysidentpy.parameter_estimation")
@@ -342,7 +342,7 @@ def recurrent(
         return params[2] @ x
 
     def by_state(params: Any, x0: Any) -> Any:
-        """Return the sum over all states of the norm of the weights that belong to a state."""
+        """Return the group-lasso penalty: the sum of the norms of each state's weights."""
         A, B, C, W1, _, _, W3 = params
         own = jnp.concatenate([A, A.T, B, C.T, W1.T, W3], axis=1)
         return jnp.sum(jnp.sqrt(jnp.sum(own**2, axis=1) + 1e-12))

@@ -92,7 +92,7 @@ def _rms(values: Array) -> float:
 
 
 def modes_named(chain: Chain, values: Sequence[float]) -> Modes:
-    """Return the resonances and gains among named parameters; only these are compared."""
+    """Return the resonances and gains, which are compared, from the chain's parameter values."""
     named = dict(zip(chain.parameters(), values, strict=True))
     keys = "n" if chain.n == 1 else "abc"[: chain.n]
     zetas = ["zeta"] if chain.n == 1 else [f"zeta_{key}" for key in keys]
@@ -192,7 +192,7 @@ def from_records(*, seeds: int) -> Trials:
 def rows_of(
     data: str, trials: Trials, *, tools: Sequence[tuple[str, str]], middle: float
 ) -> list[list[str]]:
-    """Return a row for each tool: errors at the middle noise by carts, successes, and time."""
+    """Return each tool's row: errors at `middle` noise by number of carts, successes, times."""
     rows = []
     for name, tool in ((OURS, ""), *tools):
         if tool and not installed(tool):

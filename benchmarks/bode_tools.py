@@ -107,7 +107,7 @@ class Dwells:
         )
 
     def parts(self, G: ComplexArray, *, log: bool = False) -> Array:
-        """Return the numbers to fit: magnitudes, real and imaginary parts, or logarithms."""
+        """Return the numbers to fit: magnitudes, or real and imaginary parts; `log` takes logs."""
         if log:
             G = np.array(np.log(np.abs(G) + _TINY) + 1j * np.angle(G), dtype=complex)
         elif not self.phases:
@@ -255,7 +255,10 @@ def modal(record: Record, *, method: str) -> Modes:
 
 
 def responses_of(record: Record) -> tuple[Array, ComplexArray]:
-    """Return frequencies (Hz) and X_i/U (n, n_w), without first period and effect of the hold."""
+    """Return frequencies (Hz) and X_i/U (n, n_w).
+
+    The first period is left out, and the effect of the hold is divided out.
+    """
     period = round(PERIOD / record.sample_time)
     assert record.u is not None
     U, Y = (

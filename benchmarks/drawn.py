@@ -67,9 +67,9 @@ def draw(seed: int, *, effects: int, sizes: tuple[float, float] = USUAL) -> Draw
 
 
 def counted(effect: Effect, place: int, value: float) -> Named:
-    """Return an effect and its place as counted in the study.
+    """Return the effect's key and place under which the study counts it.
 
-    Effects that the data cannot separate share a name. The data show only ratios of the sensors'
+    Effects that the data cannot separate share a key. The data show only ratios of the sensors'
     gains, so all sensors count as one. A lag much shorter than a tick of the bench counts as a
     delay.
     """
@@ -97,8 +97,8 @@ def acted(drawn: Drawn, submission: Submission) -> list[list]:
 def _sized(effect: Effect, place: int, chain: Chain, share: float) -> EffectTerm:
     """Return an effect at a share of its usual size.
 
-    The first parameter's difference from no effect is multiplied by `share`. All forces of dry
-    friction are scaled together, because a static force below the sliding one is impossible.
+    Only the parameter that gives the effect its strength is scaled. For dry friction all forces
+    are scaled together, because a static force below the sliding force is impossible.
     """
     values = default_values(effect, chain, place=place, travel=1.0)
     forces = [p.name for p in effect.parameters if p.unit == "input"] or [effect.names[0]]

@@ -252,7 +252,7 @@ class Assistant(Person):
             **{f"seen.{team}": seen for team, seen in chosen}})  # fmt: skip
 
     def answer(self) -> None:
-        """Answer one of the open requests; without any, let a team ask again."""
+        """Answer an open request, or if all are settled, reopen one."""
         text = self.get("requests", "/grades/0/again")
         names = ("team", "criterion", "seen")
         hidden = "".join(rf'<input type="hidden" name="{name}" value="(.*?)">' for name in names)
@@ -302,7 +302,7 @@ class Student(Person):
         return f"/student/{self._folder}/"
 
     def finish(self) -> None:
-        """Let the desk write the tables that it could not write before it was killed."""
+        """Let the desk write all tables that are still missing because it was killed."""
         for number in range(self._folder + 1):
             self._folder = number
             self._complete(self.get("submission", self.room))

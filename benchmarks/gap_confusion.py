@@ -1,9 +1,9 @@
-"""How often the gap workflow names the hidden effects: confusion matrix, gaps, times.
+"""How often the gap workflow names the hidden effects: confusion matrix, remaining errors, times.
 
     python benchmarks/gap_confusion.py singles --count 300 --jobs 2 --out singles.jsonl
 
 Benches are random, and are simulated by an independent program (tests/truth). Thresholds were set
-on other seeds than those that `--report` uses. A run that was stopped continues where it stopped;
+on seeds that `--report` does not use. A run that was stopped continues where it stopped;
 its file has one JSON line per case.
 """
 
@@ -33,7 +33,7 @@ DRY = ("coulomb_friction", "stiction", "presliding_friction")
 
 
 def plan(suite: str, index: int) -> tuple[int, tuple[str, ...], float, bool]:
-    """Return the number of carts, the effects, the severity and the dirt of a case."""
+    """Return a case's number of carts, effects and severity, and whether its records are dirty."""
     from tests.truth.cases import EFFECTS
 
     rng = np.random.default_rng([SUITES.index(suite), index])

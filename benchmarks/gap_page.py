@@ -102,7 +102,7 @@ def _is_right(row: dict) -> bool:
 
 
 def _bounds(right: int, of: int) -> str:
-    """Return the bounds of a rate (C. J. Clopper, E. S. Pearson, Biometrika 26, 1934, 404-413)."""
+    """Return a rate's 95 % bounds (C. J. Clopper, E. S. Pearson, Biometrika 26, 1934, 404-413)."""
     low = beta.ppf(0.025, right, of - right + 1) if right else 0.0
     high = beta.ppf(0.975, right + 1, of - right) if right < of else 1.0
     return f"{100 * low:.1f} to {100 * high:.1f} %"
@@ -276,7 +276,7 @@ def _hands(gap: Gap) -> list[str]:
 
 
 def _steps(gap: Gap, rig: Rig) -> Iterator[tuple[Study, Hypothesis, Hypothesis]]:
-    """Yield the linear model together with the model with one effect, two, …, all fitted."""
+    """Yield the linear model paired with the fitted model of one effect, then two, and so on."""
     hands = find_interventions(rig.records)
     runs = prepare(rig.records, springs=rig.springs, interventions=hands, notes=[])
     training, held_out = take_sides(runs, notes=[])

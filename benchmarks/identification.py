@@ -91,7 +91,7 @@ def least_possible_std(chain: Chain, *, phases: bool = False, noise: float = 1.0
 
 
 def bound(chain: Chain, measured: Callable[[Chain], Array]) -> Array:
-    """Return the Cramér-Rao bound by name, if all measured values have a standard error of 1."""
+    """Return each named parameter's Cramér-Rao bound for measured values with standard error 1."""
     P = Parametrisation(bench=Bench(springs=(True,) * (chain.n + 1)))
     p = P.physical(chain)
     steps = 1e-6 * np.where(p > 0, p, np.max(chain.k))

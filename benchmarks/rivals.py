@@ -71,7 +71,7 @@ def look(folder: Path) -> Gap:
 
 
 def told(gap: Gap) -> dict:
-    """Return a row with the verdict of a gap and its proposal."""
+    """Return a row with a gap's verdict, effects, remaining error and proposed recording."""
     return {
         "verdict": gap.verdict,
         "found": sorted(

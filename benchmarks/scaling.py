@@ -112,8 +112,8 @@ class Cluster:
 
     Attributes
     ----------
-    loss : rate at which each machine fails. Another one repeats its work; it returns after
-        `repair`.
+    loss : rate at which each machine fails. Another machine repeats its work, and the failed
+        machine returns after `repair` s.
     hang : share of submissions that reach the time limit and so are not graded.
     """
 

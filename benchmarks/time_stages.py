@@ -88,7 +88,7 @@ def errors(*, decays: int, dwells: int) -> Table:
 
 
 def _row(words: str, off: Array, z: Array | None = None) -> list[str]:
-    """Return a row of the table: errors, absolute and in units of their standard errors."""
+    """Return a table row: count, RMS and largest error, and the share with |z| below `INSIDE`."""
     inside = "–" if z is None else f"{np.mean(np.abs(z) < INSIDE):.0%}"
     size = np.abs(off)
     return [

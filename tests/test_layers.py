@@ -133,7 +133,7 @@ def test_stages_never_import_each_other(stage):
 
 
 def test_each_outside_package_has_one_place():
-    """Each outside package is imported by one part of the program: matplotlib by the report."""
+    """Each outside package is imported only where `HOMES` allows, such as matplotlib in reports."""
     abroad = []
     for path in MODULES:
         place = ".".join(path.relative_to(PIPELINE).with_suffix("").parts) + "."

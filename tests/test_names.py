@@ -30,7 +30,7 @@ def test_a_rigid_body_has_a_damping_but_no_ratio():
 
 
 def test_a_table_without_its_last_resonance_sets_no_upper_bound():
-    """Without the last resonance, single carts may be faster than the first resonance."""
+    """Without the last resonance, single carts' frequencies have only a lower bound."""
     names = ["K_1", "K_2", "omega_1", "omega_2", "omega_a"]
     found = [(lesser, greater) for lesser, greater, _ in orders(names)]
     assert found == [("K_2", "K_1"), ("omega_a", "omega_1"), ("omega_a", "omega_2")]

@@ -26,7 +26,7 @@ from pipeline.output import (
 
 
 def test_a_file_is_replaced_whole(tmp_path):
-    """A file gets its new content at once, and no temporary file is left."""
+    """An existing file is replaced by its new content, and no temporary file is left."""
     path = tmp_path / "results.json"
     write_file(path, "old")
     write_file(path, "ω\n")
@@ -61,7 +61,7 @@ def test_a_write_removes_old_temporary_files(tmp_path):
 
 
 def test_old_files_are_searched_once_per_folder(tmp_path):
-    """Old temporary files are searched once per folder, as a search takes longer than a write."""
+    """Each folder is searched for old temporary files only once, as a search takes longer."""
     write_file(tmp_path / "notes.md", "whole")
     left = tmp_path / f".{16 * '0'}.part"
     left.write_text("half")

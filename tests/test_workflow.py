@@ -52,7 +52,7 @@ def test_same_input_gives_same_bytes(analyses):
 
 
 def test_unexplained_shares_are_returned(analyses):
-    """`analyse` returns each record's unexplained share, equal to that of a new computation."""
+    """`analyse` returns each record's unexplained share, as `follow` computes it."""
     for analysis in analyses.values():
         fits = follow(analysis.records, analysis.chain)
         assert fits

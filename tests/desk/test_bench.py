@@ -37,7 +37,7 @@ def begun(visitor: Visitor, work: Path, name: str, room: str = "acquire", **fiel
 
 
 def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
-    """Ticked recordings are made and can be watched; a Stop without scripts ends the session."""
+    """A ticked recording is made and can be watched, and Stop ends the session without scripts."""
     work = write_work(tmp_path / "team", [sine("short", seconds=1), sine("long", seconds=300)])
     with DeskServer(folder=work) as server:
         visitor = Visitor.of(server.url)
@@ -75,9 +75,9 @@ def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
 
 
 def test_many_viewers_block_nobody(tmp_path, real):
-    """If sixty viewers watch a session, eight are connected and the others refused at once.
+    """If sixty viewers open a session, eight are connected and the others are refused at once.
 
-    Other pages still open.
+    Meanwhile the desk still serves its other pages.
     """
     work = write_work(tmp_path / "team", [sine("long", seconds=300)])
     with DeskServer(folder=work) as server, ExitStack() as streams:
@@ -241,7 +241,7 @@ def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
 def test_ports_are_listed_and_the_one_used_is_remembered(tmp_path, real):
     """The list of ports has each virtual bench that runs on this computer.
 
-    A port that was used and has gone stays in the list with a mark.
+    The port used last stays in the list, marked as "not found now" if it is gone.
     """
     work = write_work(tmp_path / "team", [sine("long", seconds=300)])
     with DeskServer(folder=work) as server:

@@ -197,7 +197,7 @@ def root(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def lab(root):
-    """Start a desk for four people behind a proxy; return one visitor by each name."""
+    """Start a desk for four people behind a proxy; return a visitor for each name."""
     for name in ("one", "two", "three", "four"):
         a_submission(root / name)
     write_class(root / "grades")

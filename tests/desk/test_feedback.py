@@ -119,7 +119,7 @@ def test_students_see_nothing_before_the_release(lab):
 
 
 def test_nobody_reads_the_feedback_of_another_student(released):
-    """No number, path or role gives a student another's feedback, or lets them ask about it."""
+    """No number, path or role lets a student read or question another student's feedback."""
     student = released("s4")
     assert student.get("/").headers["location"] == HERE
     assert "team-04" in student.get(HERE).text
@@ -138,9 +138,9 @@ def test_nobody_reads_the_feedback_of_another_student(released):
 
 
 def test_a_student_sees_the_grade_that_the_list_names(released):
-    """A student sees the grade of exactly that submission which the file of users names.
+    """A student sees only the grade of the submission that the file of users names.
 
-    No page shows anything about the server.
+    If that grade is missing, the page says that it cannot be read at the moment.
     """
     six = released("s6")
     assert "team-06" in six.get(HERE).text

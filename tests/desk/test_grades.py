@@ -346,7 +346,7 @@ def test_forged_forms_change_nothing(ta, grades):
 def test_accept_opens_the_next_team_of_the_filter(ta):
     """After a team is accepted, the next unreviewed team of the filter is shown.
 
-    After the last one the class is shown. A mark can be removed.
+    After the last team the class is shown. The "reviewed" mark can be removed again.
     """
     query = {"flag": "hz_for_rad_s", "seen": "no"}
     expected = names(ta.get(f"{ROOM}?{urlencode(query)}"))
@@ -478,7 +478,7 @@ def test_a_table_is_imported_whole_or_not_at_all(ta, grades):
 
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 def test_the_export_equals_that_of_the_command(ta, grades, tmp_path, platform):
-    """The desk's export equals that of the command byte by byte; several files come as a zip."""
+    """The desk exports the same bytes as the command; several files come as a zip."""
     with Gradebook(grades) as book:
         done = export(book, platform, tmp_path / "out", title="Lab 3")
     answer = ta.post(ROOM + "export", lms=platform, title="Lab 3")
@@ -626,7 +626,7 @@ def listed(answer: Answer) -> dict[str, list[str]]:
 
 
 def together(**more: str) -> str:
-    """Return the address of the list of teams with a frequency in Hz that lost points for laws."""
+    """Return the address that lists teams flagged for Hz that lost points for "laws"."""
     about = {"criterion": "laws", "flag": "hz_for_rad_s", "lost": "laws"}
     return f"{ROOM}together?{urlencode(about | more)}"
 

@@ -574,7 +574,7 @@ def test_an_answer_that_is_refused_stays_on_the_page(filled):
 
 
 def test_lines_of_a_note_stay_lines(filled):
-    """The lines of a note stay as they are when its row changes; blank lines around it go."""
+    """When a recording's row changes, its note keeps its lines, blank ones included."""
     visitor, folder = filled
     note = "one\n\ntwo\n"
     edit_submission(folder, lambda d: d["experiments"][0].update(note=note))

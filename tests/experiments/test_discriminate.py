@@ -348,7 +348,7 @@ def test_a_proposal_of_other_data_or_limits_is_refused(proposed, tmp_path, other
 
 
 def test_a_recording_that_would_break_the_plan_is_not_added(proposed, tmp_path):
-    """A recording that passes a limit, or frees a cart that is not there, is not written."""
+    """A plan is not saved if a recording passes a limit or frees a cart that does not exist."""
     submission = shipped(tmp_path)
     plan = load_plan(submission)
     entry = Recording.model_validate_json(json.dumps(proposed.proposal.recording))

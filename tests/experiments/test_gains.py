@@ -223,7 +223,7 @@ def test_a_loop_that_would_do_harm_is_refused(loop, limits, amplitude, message):
 
 
 def test_a_slow_bench_that_misses_the_goal_is_refused(identified):
-    """At a tenth of the rate the delay spoils the design; the message says what to change."""
+    """If the bench's rate is too low for the designed loop, the error says what to change."""
     submission, analysis = identified
     slow = replace(BENCH, period=0.05)
     with pytest.raises(DataError, match=r"set design.sample_time = 0\.05 in submission.toml"):

@@ -115,7 +115,7 @@ def test_existing_recordings_are_not_proposed_again():
     ],
 )
 def test_limits_come_from_the_submission(system, design, expected):
-    """Limits come from the design, the input's scale and the unit, or are the usual ones."""
+    """Limits follow from the design, the input's scale and the units; otherwise defaults apply."""
     limits = propose_plan(bare(**system, design=design)).limits
     assert (limits.input, limits.travel) == expected
 

@@ -34,7 +34,7 @@ def sine(name: str, *, seconds: float, frequency: float = 2.0, settle: float = 0
 def write_work(
     folder: Path, recordings: Sequence[Recording], *, limits: PlanLimits = LIMITS, scales: str = ""
 ) -> Path:
-    """Write a submission of two carts with this plan; the bench will state the scales."""
+    """Write a submission of two carts with this plan; scales not given come from the bench."""
     folder.mkdir(parents=True, exist_ok=True)
     text = f'version = 1\n\n[system]  # ours\ncarts = 2\nposition = {{ unit = "cm" }}\n{scales}'
     (folder / NAME).write_text(text, encoding="utf-8")

@@ -1,7 +1,7 @@
 """A class of honest teams on benches of every kind, with numbers found by textbook methods.
 
-Each number is what a student reads by the textbook, if that is near the true value. If the method
-cannot get near it on this bench, a more careful student's number is used.
+Each number is what a student reads by the textbook, if that is near the true value. Otherwise a
+more careful student's number is used.
 """
 
 import tempfile
@@ -58,7 +58,7 @@ class Bench:
 
     Attributes
     ----------
-    count, travel : encoder step, and travel wanted for the carts, both in cm.
+    count, travel : encoder step, and how far the carts should move, both in cm.
     friction : dry friction of each cart, as a share of the force of the small step.
     digits : number of digits that the team types.
     """

@@ -106,7 +106,7 @@ def log10_for_ln(team: Team) -> Team:
 
 
 def carts_swapped(team: Team) -> Team:
-    """Swap the gains, the frequencies with their dampings, or all numbers of two carts."""
+    """Swap two carts' gains, their frequencies and dampings, or all these numbers."""
     i, j = team.rng.choice(np.arange(1, team.bench.chain.n + 1), 2, replace=False)
     groups = [["K"], ["omega", "zeta"], ["K", "omega", "zeta"]][int(team.rng.integers(3))]
     truth = team.bench.chain.parameters()
@@ -144,12 +144,12 @@ def _one_off(team: Team, table: str) -> Team:
 
 
 def final_off(team: Team) -> Team:
-    """Make one gain or frequency of the final table wrong by no known mistake."""
+    """Make one gain or frequency in the final table wrong, but not by any known mistake."""
     return _one_off(team, "final")
 
 
 def initial_off(team: Team) -> Team:
-    """Make one gain or frequency of a cart in the initial table wrong by no known mistake."""
+    """Make one cart's gain or frequency in the initial table wrong, not by any known mistake."""
     return _one_off(team, "initial")
 
 

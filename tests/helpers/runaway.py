@@ -63,7 +63,7 @@ class RunawayBench(threading.Thread):
     is_stopped : whether the last command was a stop.
     is_pulled : whether the virtual hand was ever told to pull a cart out.
     offence : time in ms of the first line that shows the fault, or None so far.
-    told : time in ms of the first stop command after `offence`, or None so far.
+    stopped_at : time in ms of the first stop command after `offence`, or None so far.
     started_after : start commands received after `offence`.
     """
 

@@ -55,7 +55,7 @@ def step_record(
     x0: Array | None = None,
     id: str = "step",
 ) -> Record:
-    """Return a step, on from 0.1 s to half time, that moves cart 1 by `swing` cm."""
+    """Return a step that moves cart 1 by `swing` cm, on at 0.1 s and off after half the record."""
     carts = free or tuple(range(1, chain.n + 1))
     t = np.arange(int(duration * rate)) / rate
     t = t + jitter / rate * rng.uniform(-0.5, 0.5, t.size)

@@ -40,7 +40,7 @@ def edited(folder: Path, *changes: tuple[str, str], head: str = "") -> Analysis:
 
 
 def by_key(analysis: Analysis) -> dict[str, Assumption]:
-    """Return the assumptions by key and place; those about carts by the free carts."""
+    """Return the assumptions by key and subject, such as a spring or a tuple of free carts."""
     return {
         f"{a.key} {a.about or (a.value if isinstance(a.value, tuple) else '')}".rstrip(): a
         for a in analysis.assumptions
@@ -137,10 +137,10 @@ def test_a_held_cart_that_was_not_measured_is_open(tmp_path):
 
 @pytest.mark.skipif(not (REAL_DATA / "ecp210-ucsd").is_dir(), reason="no real recordings here")
 def test_a_large_misfit_leaves_a_certain_spring_supported(tmp_path):
-    """The springs of carts that do not explain the data are supported by their standard errors.
+    """Even if the fit does not explain the data, springs that it finds for certain are supported.
 
-    These include the misfit: five recordings, each on its own, give the spring between the carts
-    within three of them.
+    Their standard errors include the misfit: each of five recordings alone gives the spring between
+    the carts within three standard errors.
     """
     folder = write_two_cart_submission(tmp_path / "s", REAL_DATA, steps=(1, 2, 3, 4, 5))
     analysis = analyse(load_submission(folder), design=False)

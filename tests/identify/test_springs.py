@@ -50,7 +50,7 @@ def step(k: list[float], *, seconds: float = 8.0) -> Record:
     ],
 )
 def test_steps_show_which_wall_springs_there_are(k, present, not_told):
-    """If all gains are equal, there is no far spring; if carts do not return, no wall spring."""
+    """Equal gains mean that there is no far spring; if carts do not return, no wall has one."""
     found = decide_springs([step(k)], n=len(k) - 1)
     assert found.present == tuple(present)
     assert found.open == not_told

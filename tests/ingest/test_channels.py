@@ -20,7 +20,7 @@ T = np.arange(900, dtype=np.float64) / RATE
     seed=st.integers(0, 2**32 - 1),
 )
 def test_the_encoder_step_is_recovered(step, travel, decimals, seed):
-    """From whole counts times a step, printed to 0.01 step or finer, the step is found."""
+    """The encoder step is found from positions printed to a hundredth of the step or finer."""
     rng = np.random.default_rng(seed)
     counts = np.round(travel * np.sin(np.linspace(0, 20, 2000)) + rng.standard_normal(2000))
     digits = decimals - int(np.floor(np.log10(step)))

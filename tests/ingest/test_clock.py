@@ -123,7 +123,7 @@ def test_the_decimal_step_of_stamps_is_found(values, step):
 
 
 def a_session(interval: float, *, n: int = 15, jitter: float = 0.0) -> list[np.ndarray]:
-    """Return the stamps in whole ms of records of 1 s to 15 s that start at any time."""
+    """Return records' stamps, rounded to 1 ms; they last 1 s to 15 s and start at random times."""
     rng = np.random.default_rng(7)
     sizes = np.linspace(1, 15, n) / interval
     true = [rng.uniform(0, 1) + interval * np.arange(int(size)) for size in sizes]

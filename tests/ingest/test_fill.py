@@ -250,7 +250,7 @@ def test_a_moving_column_without_a_cart_is_asked_about(tmp_path, carts, asked):
 
 
 def test_a_stated_held_cart_is_not_questioned(tmp_path):
-    """A cart that its table states as held is mentioned once; without that line, `fill` asks."""
+    """`fill` says once that it wrote a cart as held; if a person removes that line, it asks."""
     put(tmp_path, "run.csv", time=T, input=STEP, x1=RING, x2=0.4 * RING)
     put(tmp_path, "pull.csv", time=T, input=0 * T, x1=RING, x2=0 * T)
     first, second = fill_submission(tmp_path), fill_submission(tmp_path)

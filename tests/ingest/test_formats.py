@@ -274,7 +274,7 @@ def test_the_matrix_of_a_mat_file_is_the_recording():
 
 
 def test_a_matrix_beside_vectors_of_its_length_gives_its_columns_too():
-    """The columns of a matrix are numbered and read too if it is as long as the vectors."""
+    """If a matrix is as long as the vectors beside it, its columns are numbered and also read."""
     got = table(mat(t=TIME, y=np.column_stack([X1, U])))
     assert set(got.names) == {"t", "y column 1", "y column 2"}
     assert_array_equal(column(got, "y column 2"), U)
@@ -365,7 +365,7 @@ def test_a_hostile_matlab_7_3_file_is_refused(spoil, tmp_path):
 
 
 def scipy_element(values: np.ndarray, *, name: str) -> bytes:
-    """Return the bytes of a variable in a file, under a name of the same length."""
+    """Return the bytes of a variable in a .mat file; the variable may have an empty name."""
     stream = BytesIO()
     scipy.io.savemat(stream, {name or "x": values})
     raw = stream.getvalue()[128:]

@@ -50,7 +50,7 @@ SPECIAL = "***Start_Special***\r\nWaveform\t1,2\r\n***End_Special***\r\n\r\n"
 
 
 def multi(clock: np.ndarray) -> str:
-    """Return a file with an X column for each channel; the second channel's holds `clock`."""
+    """Return a file with an X column for each channel; that of the second channel is `clock`."""
     rows = ["\t".join(f"{v:.6f}" for v in row) for row in zip(TIME, U, clock, X1, strict=True)]
     text = GOOD[: GOOD.index("X_Value")] + "X_Value\tinput\tX_Value\tx1\tComment\r\n"
     return text.replace("X_Columns\tOne", "X_Columns\tMulti") + "\r\n".join(rows) + "\r\n"
@@ -155,7 +155,7 @@ def test_an_lvm_cut_between_two_rows_is_recognised():
 
 @given(st.integers(0, len(GOOD) - 1))
 def test_any_piece_of_an_lvm_is_cut_or_refused(end):
-    """If an .lvm file is cut before its last row, it is refused or reported as cut."""
+    """An .lvm file cut anywhere is refused, reported as cut, or still has all its samples."""
     got = table_or_one_line(GOOD[:end].encode())
     assert got is None or got.cut or got.values.shape[1] == N
 
@@ -219,7 +219,7 @@ def lead_in(flags: int, length: int, data: int) -> bytes:
 
 
 def objects(*named: tuple[str, int]) -> bytes:
-    """Return metadata: each path, with its number of doubles in a chunk if there are any."""
+    """Return the metadata of objects, given each one's path and number of doubles per chunk."""
     body = struct.pack("<I", len(named))
     for path, count in named:
         body += struct.pack("<I", len(path)) + path.encode()

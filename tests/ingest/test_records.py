@@ -431,7 +431,7 @@ def test_a_wrong_sign_of_a_session_is_one_sentence(tmp_path):
 
 
 def test_signs_may_differ_between_experiments(tmp_path):
-    """A record with the other sign is found; an unclear one gets the sign of others of its kind."""
+    """A record with the opposite sign is found; one that shows no sign gets that of its kind."""
     toml = "version = 1\n[system]\ncarts = 2\n"
     runs = {
         "step": ("step", csv(time=T, input=-U, x1=X1)),

@@ -26,7 +26,7 @@ LATE = ("input_delay:delay=0.014", "actuator_lag:time_constant=0.018")
 
 
 def one(u: Array, x: Array) -> list[Record]:
-    """Return the record of cart 1 on a bench without any other measured carts."""
+    """Return a record of three free carts, of which only cart 1 is measured."""
     return [
         Record(
             id="a",
@@ -125,7 +125,7 @@ def reversed_in(records: Sequence[Record], names: Collection[str]) -> list[Recor
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_late_input_does_not_turn_the_sign_of_dwells(bench, sign):
-    """With a late input a fast dwell may seem reversed, but all dwells give the right sign."""
+    """With a late input a fast dwell may seem reversed, but every record gets the right sign."""
     records = driven(bench)
     names = {record.id for record in records}
     found = find_signs(reversed_in(records, names if sign < 0 else ()), stated={})

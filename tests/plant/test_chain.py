@@ -81,7 +81,7 @@ def test_static_gains_and_polynomials_give_the_chain(chain):
 
 @pytest.mark.parametrize(("carts", "redundancies"), [(1, 0), (2, 1), (3, 5)])
 def test_number_of_redundancies(carts, redundancies):
-    """One cart's table has no redundancies, that of two carts has one, that of three has five."""
+    """The tables of one, two and three carts have no, one and five redundancies."""
     got = recover_from_parameters(PRESETS[f"throne-{carts}dof"].parameters())
 
     assert list(got.residuals) == [f"R{i}" for i in range(1, redundancies + 1)]
@@ -100,7 +100,7 @@ def test_an_inconsistent_table_shows_in_the_redundancies(name, broken):
 
 
 def test_the_names_of_the_tables():
-    """Parameter names are in the order of the paper's tables; a rigid body has its own two."""
+    """Names are in the order of the paper's tables; a rigid body has only mass and damping."""
     assert parameter_names(2) == [
         "K_1", "K_2", "omega_a", "omega_b", "zeta_a", "zeta_b",
         "omega_1", "omega_2", "zeta_1", "zeta_2",
@@ -256,7 +256,7 @@ def test_frequencies_interlace(chain):
 
 @given(chains(min_carts=2), st.data())
 def test_a_held_cart_is_a_wall(chain, data):
-    """If all other carts are held, a cart has the frequency and damping that bear its number."""
+    """If all other carts are held, cart i has the frequency omega_i and damping ratio zeta_i."""
     cart = data.draw(st.integers(1, chain.n))
 
     A, B, _, _ = chain.state_space(free=[cart])

@@ -42,7 +42,7 @@ def test_without_gains_the_prefilter_drives_the_open_loop():
 
 @pytest.mark.parametrize("delay", [0, 1])
 def test_with_an_exact_prediction_a_delay_only_shifts_the_motion(delay):
-    """With the true model, a loop with delay moves as Phi - Gamma G, but later."""
+    """With the true model, a loop with delay moves as without delay, only later."""
     run = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=1.0, setup=LoopSetup(delay=delay))
 
     phi, gamma = discretise(TWO, T)
@@ -69,7 +69,7 @@ def test_the_loop_matrix_gives_the_motion_of_the_loop(model):
 
 
 def test_an_exact_observer_moves_no_pole():
-    """The poles of Phi - Gamma G are poles of the whole loop (separation)."""
+    """The eigenvalues of Phi - Gamma G are poles of the whole loop (separation principle)."""
     phi, gamma = discretise(TWO, T)
     wanted = np.linalg.eigvals(phi - np.outer(gamma, GAINS))
     found = np.linalg.eigvals(loop_matrix(TWO, feedback(TWO), sample_time=T))

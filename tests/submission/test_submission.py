@@ -280,7 +280,7 @@ def test_a_new_submission_overwrites_nothing(tmp_path):
 
 
 def test_a_wrong_number_of_carts_is_the_only_mistake(tmp_path):
-    """If `carts` contradicts two lengths that agree, only `carts` is called wrong."""
+    """If two lists of gains agree on another number of carts, only `carts` is called wrong."""
     text = """
 version = 1
 [system]

@@ -21,7 +21,7 @@ FORMS = {"xlsx": xlsx, "tdms": tdms_of, "lvm": lvm}
 
 @pytest.fixture(scope="module")
 def teams(tmp_path_factory) -> Path:
-    """A class of four copies of one team's work, each with files of another format."""
+    """Write a class with one team's work in several copies, each in a different file format."""
     root = tmp_path_factory.mktemp("forms")
     folder = root / "csv"
     write_submission(
@@ -51,7 +51,7 @@ def test_the_results_have_the_same_numbers(teams):
 
 
 def test_the_grade_has_the_same_points(teams, tmp_path):
-    """All file formats get the same points, LabVIEW's six decimals included; copies are flagged."""
+    """All formats get the same points, even LabVIEW's with six decimals; copies are flagged."""
     out = tmp_path / "grades"
     rubric = RUBRICS / "throne-1dof.toml"
     done = cartlab_here("grade", teams, "--rubric", rubric, "--out", out, "--jobs", 1,

@@ -140,7 +140,7 @@ def test_the_plan_shows_the_state_of_each_recording(folder):
 
 
 def test_an_instruction_waits_for_its_own_answer(folder):
-    """Only its own answer, or the end of the page, ends an instruction."""
+    """An instruction waits until it is answered by its number, or until the page ends."""
     state = LiveState(folder)
     assert not state.answer(1)
     waiting = threading.Thread(target=state.confirm, args=("hold cart 2",))
@@ -351,7 +351,7 @@ def test_only_connections_without_the_secret_time_out(folder, monkeypatch):
 
 
 def test_the_page_does_not_delay_a_run(folder):
-    """While two pages read and one does not, the page processes 50 lines within a heartbeat."""
+    """With two browsers that read and one that does not, 50 lines take less than a heartbeat."""
     took = []
     with ExitStack() as opened:
         with LivePage(folder) as page:

@@ -65,7 +65,7 @@ def test_earlier_grades_do_not_count_as_speed():
 
 
 def test_each_time_says_if_it_has_passed():
-    """The progress line says which of its two times has passed and which is still to come."""
+    """The progress line labels the elapsed time "so far" and the remaining time "to go"."""
     now = 0.0
     bar = Progress(*columns(), get_time=lambda: now, disable=True)
     show = counting(bar)

@@ -38,7 +38,7 @@ def test_single_carts_have_their_frequencies_and_friction(two_carts):
 
 
 def test_a_wrongly_logged_input_is_found(two_carts):
-    """The logged input of the PID run has another sign or scale than that of the model."""
+    """The PID run's logged input is found to differ from the model's in sign or scale."""
     closed = {h.cart: h for h in two_carts.hardware if h.loop == "closed"}
     assert set(closed) == {1, 2}
     # On the bench and in the model, the loop holds cart 1 at the set point.

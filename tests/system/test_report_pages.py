@@ -156,7 +156,7 @@ _WORD = re.compile(r'<word xMin="(.*?)" yMin="(.*?)" xMax="(.*?)" yMax="(.*?)">(
 
 @pytest.mark.skipif(shutil.which("pdftotext") is None, reason="no pdftotext: poppler-utils")
 def test_no_word_of_the_pdf_is_cut_or_covered(made):
-    """In the PDF each word lies on its page, and no word lies on another."""
+    """In the PDF no word is cut off by the edge of its page, and no word covers another."""
     pdf = next(made.glob("*.pdf"), None)
     if pdf is None:
         pytest.skip("this page has no PDF")

@@ -10,7 +10,7 @@ from pipeline.cli.stopping import ctrl_c_says
 
 
 def _work(said: list[str], *, look: bool = False, error: Exception | None = None) -> None:
-    """Press Ctrl-C during work that swallows it; then check for the interrupt or raise an error."""
+    """Press Ctrl-C during work that swallows it; then raise `error`, or check if `look` is set."""
     with ctrl_c_says(lambda: said.append("stopped")) as looked:
         with contextlib.suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)

@@ -37,9 +37,9 @@ class Hand:
     """An unmeasured hand on one cart from `start` to `end` (s).
 
     The hand may grip the cart with a spring and a damper. It then moves the cart by `pull`
-    (position units) until the share `there` of its time, holds it, and releases it over the last
-    tenth. Otherwise it pushes with a force that rises to `push` (input units) and falls again. A
-    soft hold is a grip that never pulls.
+    (position units), holds it, and releases it. The pull ends at the fraction `there` of the time,
+    and the release takes the last tenth. Otherwise the hand pushes with a force that rises to
+    `push` (input units) and falls again. A soft hold is a grip that never pulls.
     """
 
     cart: int

@@ -71,7 +71,7 @@ def test_values_in_a_sentence_are_never_markup(tmp_path):
 
 @pytest.mark.parametrize("subject", SUBJECTS)
 def test_a_catalogue_is_plain_toml(subject):
-    """A catalogue is one table of strings, in which braces are only around values."""
+    """A catalogue is one table of strings, and braces in them only enclose values."""
     found = tomllib.loads((TEMPLATES / "words" / f"{subject}.toml").read_text(encoding="utf-8"))
     for key, text in found.items():
         assert isinstance(text, str), key

@@ -63,7 +63,7 @@ def decay(name: str, cart: int = 1) -> Recording:
 
 
 def last_run(bench) -> dict:
-    """Return what the bench reports of the last run that was stopped or cut."""
+    """Wait until a stop or the watchdog has ended a run; return the bench's report of it."""
     while (sent := bench.event("run"))["ended"] not in ("stopped", "watchdog"):
         pass
     return sent
@@ -126,7 +126,7 @@ def test_a_plan_becomes_a_submission(tmp_path, fast):
 
 
 def test_a_folder_without_a_submission_gets_one(tmp_path):
-    """For a folder without a submission, the bench's description starts one, and a plan is made."""
+    """An empty folder gets a submission with the bench's description, and a plan."""
     with emulator("--speed", "20", "--period", "5.003", preset="throne-1dof") as bench:
         outcomes = acquire(
             tmp_path / "new", port=bench.address, observers=[Notes()], only=["step-1"]
@@ -519,5 +519,5 @@ def test_without_a_keyboard_nothing_is_confirmed(monkeypatch):
     ("values", "bars"), [([5, 5], "▁▁"), ([0, 7], "▁█"), (range(8), "▁▂▃▄▅▆▇█")]
 )
 def test_a_sparkline_has_a_bar_for_each_value(values, bars):
-    """A sparkline has a bar for each value, as high as the value; equal values are low."""
+    """A sparkline has one bar per value, scaled from lowest to highest; equal values are low."""
     assert sparkline(values) == bars

@@ -192,7 +192,7 @@ def test_a_motor_driven_with_another_duty_than_the_target_is_stopped(tmp_path, f
     stated=st.booleans(),
 )
 def test_any_stamps_have_a_clock(steps, still, period, stated):
-    """Any stamps that do not fall give a positive period, and no negative number of losses."""
+    """Time stamps that never decrease give a positive period and no negative number of losses."""
     stamps = np.cumsum([0, *steps, *[still] * 60])
     fit = fit_stamps(stamps, period=period, stated=stated)
     assert fit.period > 0

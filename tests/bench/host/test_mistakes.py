@@ -44,7 +44,7 @@ def test_a_bench_with_more_carts_is_reported(tmp_path):
 
 
 def test_a_run_in_which_nothing_moves_is_not_recorded(tmp_path):
-    """A dwell in which no encoder moves is not recorded, but tried twice more."""
+    """A dwell in which no encoder moves is tried three times and never recorded."""
     work = write_work(tmp_path, [sine("dwell", seconds=2)])
     notes = Notes()
     dead = ("--fault", "stuck=1@0", "--fault", "stuck=2@0")
@@ -131,7 +131,7 @@ def test_nouns_agree_with_their_numbers():
 
 
 def test_a_new_submission_says_what_the_bench_does_not_know(tmp_path):
-    """A new submission lists its springs to check, and has comments for authors and design."""
+    """A new submission asks to check its springs, and has authors and design as comments."""
     bench = Description(name="two", encoders=2, carts=2, commands=EXTENSIONS, position_unit="cm")
     folder = tmp_path / "new"
     assert prepare_submission(folder, bench, stock=False).authors == ()

@@ -49,42 +49,42 @@ def decay(name: str) -> Recording:
 
 
 def before_start(bench: RunawayBench) -> bool:
-    """Return a bench that misbehaves from its first answer until the first run."""
+    """Return whether the bench has answered but has not yet started a run."""
     return bench.resets > 0 and not bench.starts
 
 
 def resting(bench: RunawayBench) -> bool:
-    """Return a bench that misbehaves while the carts come to rest."""
+    """Return whether the host is waiting for the carts to come to rest."""
     return bench.run_on is not None and bench.run_on.amplitude == 0 and bench.run_on.frequency < 2
 
 
 def resting_again(bench: RunawayBench) -> bool:
-    """Return a bench that misbehaves before the second recording, with the carts zeroed at rest."""
+    """Return whether the host is waiting for rest before the second recording."""
     return resting(bench) and len(bench.starts) > 2
 
 
 def running(bench: RunawayBench) -> bool:
-    """Return a bench that misbehaves while the motor should move the carts."""
+    """Return whether the motor should be moving the carts."""
     return bench.run_on is not None and bench.run_on.amplitude != 0
 
 
 def between(bench: RunawayBench) -> bool:
-    """Return a bench that misbehaves between the stop of the first run and the next rest."""
+    """Return whether the first recording is over and the next rest has not started."""
     return bench.is_stopped and len(bench.starts) == 2
 
 
 def tried(bench: RunawayBench) -> bool:
-    """Return a bench that misbehaves in the empty run that shows whether it is a stock bench."""
+    """Return whether the empty run that shows whether this is a stock bench is in progress."""
     return bench.run_on is not None and len(bench.starts) == 1
 
 
 def ended(bench: RunawayBench) -> bool:
-    """Return a stock bench that misbehaves after its first recording."""
+    """Return whether a stock bench has finished its first recording."""
     return bench.run_on is None and len(bench.starts) == 3
 
 
 def at_the_end(bench: RunawayBench) -> bool:
-    """Return a bench that misbehaves after the last recording."""
+    """Return whether the last recording is over."""
     return bench.is_stopped and len(bench.starts) == 4
 
 
@@ -126,7 +126,7 @@ def test_a_motor_that_is_on_without_a_run_ends_the_session(tmp_path, wrong, comm
 @pytest.mark.parametrize("duty", [FULL, 3])
 @pytest.mark.parametrize("wrong", [resting, resting_again, running])
 def test_a_motor_with_another_duty_than_ordered_ends_the_session(tmp_path, wrong, duty):
-    """If the motor has another duty than ordered, full or slight, the session ends."""
+    """If the motor's duty differs from the ordered duty, by a lot or a little, the session ends."""
     work = write_work(tmp_path, plan())
     with RunawayBench(wrong, duty=duty) as bench:
         (partial,), error = session(work, bench)

@@ -88,9 +88,9 @@ def test_a_plan_for_a_stronger_bench_moves_nothing(tmp_path, real):
 
 
 def test_the_limits_are_printed_before_anything_moves(tmp_path, fast):
-    """Before anything moves, the limits are printed in units and counts, with full scale.
+    """Before anything moves, the limits and the bench's full scale are printed.
 
-    2.5 cm in counts of 0.00227 cm are 1101.
+    At 0.00227 cm per count, the travel limit of 2.5 cm is 1101 counts.
     """
     work = write_work(tmp_path, [sine("dwell", seconds=1)])
     notes = Notes()
@@ -263,7 +263,10 @@ class Answers(threading.Thread):
 
 
 def test_a_description_must_arrive_twice():
-    """The bench's description is asked for until two answers agree, as one may be damaged."""
+    """The host asks for the bench's description until two answers agree, as one may be damaged.
+
+    If no two answers agree, the error says to check the cable.
+    """
     true = DESCRIPTION.encode() + b"\n"
     wrong = [true.replace(b"0.002cm", b"0.00%dcm" % digit) for digit in (1, 3, 6)]
     port = Answers([wrong[0], true, true])
@@ -277,9 +280,9 @@ def test_a_description_must_arrive_twice():
 
 
 def test_a_run_starts_only_after_both_answers():
-    """A run starts only after both answers to two queries have arrived.
+    """Before a run the host waits for late answers to its queries, so that no byte is left over.
 
-    If an answer is lost, here through a stray byte before it, the start is not delayed.
+    One damaged answer, here with a stray byte before it, is no error.
     """
     described = DESCRIPTION.encode() + b"\n"
 
@@ -302,7 +305,7 @@ def test_a_run_starts_only_after_both_answers():
 
 
 def test_a_stock_bench_may_take_half_a_second_to_begin(monkeypatch):
-    """Lines of a stock bench's trial run are accepted if they come half a second late."""
+    """A stock bench is recognised even if the lines of its trial run come half a second late."""
     monkeypatch.setattr("pipeline.bench.host.serial_line._ANSWER", 0.05)  # no answer comes
     door = socket.create_server(("127.0.0.1", 0))
 
@@ -324,9 +327,9 @@ def test_a_stock_bench_may_take_half_a_second_to_begin(monkeypatch):
 
 @pytest.fixture
 def _hearing() -> Iterator[None]:
-    """Let programs started here end with their terminal, even under nohup.
+    """Let programs started by a test end with their terminal, even if pytest runs under nohup.
 
-    Programs inherit an ignored signal, as nohup wants, but not a function that ignores it.
+    A program inherits the signal that nohup ignores, but not a handler that does nothing.
     """
     before = signal.signal(signal.SIGHUP, lambda number, frame: None)
     yield

@@ -87,7 +87,7 @@ def test_lost_lines_are_distinguished_from_skips_of_the_clock(period, share):
 
 
 def test_a_short_run_counts_by_the_expected_period():
-    """A short run uses the period of earlier runs, since 300 stamps cannot show the period."""
+    """In a short run, losses are counted with the expected period, which 300 stamps cannot show."""
     stamps = np.delete(clock(300, period=1.0024, phase=0.0), [50, 51, 200])
     # In 300 lines the clock skips 0.7 times on average; one loss may be taken for a skip.
     assert fit_stamps(stamps, period=1.0024).missing == 2
@@ -171,7 +171,7 @@ def test_a_bench_that_restarts_ends_the_run():
 
 
 def test_the_last_line_of_an_earlier_run_does_not_count():
-    """A last line of the run before, or half of it, is not taken for this run's first line."""
+    """The last line of the previous run, whole or in part, is not taken for a line of this run."""
     sent = lines(100)
     got, _ = read(b"5:0:0\n" + format_reading(lines(9000)[-1]) + join(sent))
     assert got == sent
@@ -210,7 +210,7 @@ def test_late_lines_are_counted_and_kept():
 def test_a_busy_host_makes_no_line_late():
     """Lines that waited because the host was busy do not count as late.
 
-    The host counts from the last time when it read and found the port empty.
+    Lateness is measured from the last time that the host found the port empty.
     """
     sent = lines(1000, period=1.0)
     stream = Stream(encoders=2)

@@ -79,7 +79,7 @@ def test_stop_ends_the_session_whatever_else_was_pressed(tmp_path, before, real)
 
 
 def test_skip_goes_on_with_the_next(tmp_path, fast):
-    """Skip ends the run, keeps its data apart, and asks nothing more about it."""
+    """Skip ends the run, saves its data as partial, and asks nothing more about it."""
     work = write_work(tmp_path, [sine("long", seconds=300), sine("next", seconds=1)])
     finger = Finger("skip", "repeat")
     outcomes = record(work, fast.address, finger, "long", "next")

@@ -138,7 +138,7 @@ def test_a_malformed_command_does_nothing(data):
 
 
 def test_a_stock_bench_knows_three_commands():
-    """A stock bench drops the letters and fields of the extensions, and has no chirp."""
+    """A stock bench ignores the extensions' letters and fields, and knows no chirp."""
     data = b"?;s;k;f;1;2;3;4;5;c;20;h;1;0;d;c;o;o;1;100;1;"
     assert read(data, extensions=()) == []
     known = [Start(wave=Wave.SINE, frequency=1.0, amplitude=5), PidGains(kp=1, ki=0, kd=0)]
@@ -164,7 +164,7 @@ def test_lines_are_read_as_sent(reading):
 
 @given(readings, readings, st.integers(0, 255), st.data())
 def test_spoilt_lines_are_not_readings(first, second, byte, data):
-    """Two lines in one, or a byte that no line has, are not taken for a reading."""
+    """Two merged lines, or a line with a byte that no reading contains, are not read."""
     merged = format_reading(first)[:-1] + format_reading(second)
     assert parse_reading(merged) is None
     line = format_reading(first)

@@ -65,7 +65,7 @@ def compiled(
 
 
 def off(found: Array, expected: Array) -> float:
-    """Return the root mean square of a difference, over that of the motion."""
+    """Return the RMS of the difference, divided by the RMS of the expected motion."""
     return float(np.sqrt(np.mean((found - expected) ** 2) / np.mean(expected**2)))
 
 
@@ -336,7 +336,7 @@ def test_an_fmu_can_be_reset_and_returned_to_a_state(hard_fmu):
 
 @no_compiler
 def test_an_fmu_refuses_unsupported_calls(hard_fmu):
-    """A step before the start, setting a state, and a cart that runs away are errors."""
+    """The FMU refuses a step before the start, a set state, and a step of a runaway cart."""
     instance, refer = instantiate(hard_fmu)
     with pytest.raises(FMICallException, match="DoStep"):
         instance.doStep(currentCommunicationPoint=0.0, communicationStepSize=0.01)
@@ -349,7 +349,7 @@ def test_an_fmu_refuses_unsupported_calls(hard_fmu):
 
 @no_compiler
 def test_the_same_model_gives_the_same_bytes(hard_fmu):
-    """The same model gives the same bytes of an FMU, and another model has another GUID."""
+    """The same model gives an FMU with the same bytes; a different model has a different GUID."""
     assert fmu(describe(HARD, units=PAPER_UNITS))[0] == hard_fmu.read_bytes()
     other, _ = fmu(describe(model_of("coulomb_friction"), units=PAPER_UNITS))
     guids = {read_model_description(f).guid for f in (io.BytesIO(other), str(hard_fmu))}
@@ -357,7 +357,7 @@ def test_the_same_model_gives_the_same_bytes(hard_fmu):
 
 
 def test_without_a_compiler_the_fmu_has_only_sources(monkeypatch):
-    """Without a compiler the FMU contains only its sources, and `fmu` returns False with it."""
+    """Without a compiler the FMU has only sources, and `fmu` reports that nothing was compiled."""
     monkeypatch.setattr(fmu_module.shutil, "which", lambda name: None)
     whole, compiled_too = fmu(describe(HARD, units=PAPER_UNITS))
     assert not compiled_too

@@ -34,7 +34,7 @@ def analysis() -> Analysis:
 
 
 def test_the_files_are_saved_and_cleared(analysis, tmp_path):
-    """All four files of a model are written, and later only these are removed."""
+    """All four files of a model are written, and `clear_model` removes only these."""
     (tmp_path / "model.slx").write_text("mine")
     said = save_model(with_effect("coulomb_friction"), analysis, tmp_path, free=(1,))
     assert all((tmp_path / name).stat().st_size > 1000 for name in FILES)

@@ -44,7 +44,7 @@ def values(text: str) -> float:
 
 
 def named() -> dict[str, float]:
-    """Return every symbol under its name in the model, as the given language writes it."""
+    """Return the value of every symbol under its name in the model, s0, s1 and so on."""
     return {f"s{i}": values(name) for i, name in enumerate(SYMBOLS)} | VALUES
 
 

@@ -120,7 +120,7 @@ def test_an_exploration_writes_a_submission_and_a_diary(explored):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_an_exploration_keeps_only_runs_that_its_diary_shows(explored):
-    """An earlier decision keeps only the run in its picture; the last one keeps all runs."""
+    """Each earlier decision keeps one run, for its picture; the last decision keeps all runs."""
     folder, turns, _, _ = explored
     *earlier, last = [turn.gap for turn in turns]
     assert earlier

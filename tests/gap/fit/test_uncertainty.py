@@ -23,7 +23,7 @@ from tests.truth.cases import make_case
 
 
 def standardised(folder, *, preset, hide, seed):
-    """Return the error of each parameter of the true model, in standard errors."""
+    """Fit the true model, and return each parameter's error in standard errors."""
     bench = VirtualBench(prepare_bench(preset=preset, model=None, hide=hide), seed=seed)
     hidden = bench.carts._bench
     springs = tuple(bool(k > 0) for k in hidden.chain.k)
@@ -60,8 +60,8 @@ def standardised(folder, *, preset, hide, seed):
 def test_stated_standard_errors_are_right(tmp_path, preset, hide, seeds):
     """Standard errors are right even if friction holds a cart still for seconds.
 
-    For these few numbers, the root mean square scatters by a quarter. If noise were taken as white,
-    it would be about four.
+    The root mean square of so few errors scatters by a quarter around one. If the noise were
+    treated as white, it would be about four.
     """
     z = np.array(
         [

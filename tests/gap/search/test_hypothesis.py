@@ -42,7 +42,7 @@ def judged(
     ],
 )
 def test_an_effect_must_improve_training_and_held_out_runs(child, worth):
-    """An effect must improve training and held-out runs, counted in independent residuals."""
+    """An effect must clearly improve training and held-out runs; few residuals are not enough."""
     parent = judged(CUBIC, chi=6.0, held=6.0)
     both = judged(CUBIC, DELAY, **child)
     study: Any = SimpleNamespace(explains=lambda h: True)
@@ -55,7 +55,7 @@ def test_an_effect_must_improve_training_and_held_out_runs(child, worth):
      (0.014, False, 0.01, False)],
 )  # fmt: skip
 def test_more_than_noise_may_mean_missing_effects(error, contact, repeatability, said):
-    """If more than noise remains, effects may be missing, except with contacts or poor repeats."""
+    """An error above the noise means missing effects, except with contacts or poor repeats."""
     chosen: Any = SimpleNamespace(error=error, has_contact=contact)
     study: Any = SimpleNamespace(floor=0.01, repeatability=repeatability)
     assert Study.may_be_half(study, chosen) == said

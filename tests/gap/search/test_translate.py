@@ -25,7 +25,7 @@ ALL = frozenset().union(*(filled(effect) for effect in CATALOGUE))
     ],
 )
 def test_an_effect_is_tried_only_where_it_would_show(kind, free, places):
-    """An effect is tried only at places where it would show, and once for equal stretches."""
+    """An effect is tried only where it would show, and on one of springs that stretch equally."""
     bench = FollowedBench(
         chain=PRESETS["throne-2dof"], springs=(True,) * 3, largest=1.0, free=tuple(free)
     )

@@ -108,7 +108,7 @@ def left_by_the_chain(records: list[Record], *, springs: tuple[bool, ...]) -> tu
     ids=["drag", "root friction", "van der Pol", "force by place", "two laws"],
 )
 def test_a_law_is_found_from_the_unexplained_force(law, terms):
-    """From the unexplained force, exactly the terms of a law are found, to 6 %.
+    """From the unexplained force, exactly the terms of a law are found, within 6 %.
 
     The least certain term, the square root, has a standard error of 2 %.
     """
