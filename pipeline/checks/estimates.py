@@ -147,8 +147,8 @@ def _step_check(step: StepGain, *, shown: Sequence[str], bench: Bench) -> Check:
         outcome, found = (
             "fail",
             (  # the shift of the rest points gives the least friction that can hold the cart
-                f"sticks: its rest points put the static gain between {low:.4g} and {high:.4g} "
-                f"{bench.units.gain}, and the true gain may be outside."
+                f"sticks: judged by its rest positions, the static gain is between {low:.4g} and "
+                f"{high:.4g} {bench.units.gain}, and may even be outside."
             ),
         )
     elif shown:
