@@ -55,9 +55,9 @@ class Health:
     Attributes
     ----------
     package : the folder of the code.
-    extras : the packages of each extra, by name; one with a problem means that the extra is
-        missing.
-    programs : the path of each program of the system; "" if it was not found.
+    extras : the packages of each extra, by name of the extra. If one package has a problem, the
+        extra counts as missing.
+    programs : the path of each system program that cartlab uses; "" if it was not found.
     compiled : the folder of the compiled simulator; "" if no folder can be written.
     fresh : whether the simulator is compiled for this version; if not, the first simulation
         compiles it.

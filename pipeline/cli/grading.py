@@ -195,7 +195,7 @@ def override(
 def remove(
     grades: Grades,
     teams: Annotated[
-        list[str], typer.Argument(metavar="TEAM…", help="Submissions, or one author of each.")
+        list[str], typer.Argument(metavar="TEAM…", help="Names of submissions or authors.")
     ],
     assignment: Lab = None,
     erase: Annotated[

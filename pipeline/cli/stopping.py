@@ -13,9 +13,9 @@ from pipeline.cli import INTERRUPTED
 def ctrl_c_says(say: Callable[[], None]) -> Iterator[Callable[[], None]]:
     """Call `say` when Ctrl-C is pressed; yield a function that then ends the work.
 
-    A library may turn an interrupt into an error of its own, and Python drops an interrupt in the
-    callback of a weak reference, as during an import. In both cases the next call of the yielded
-    function ends the work.
+    A library may turn an interrupt into a different error. And Python drops an interrupt in the
+    callback of a weak reference, for example during an import. In both cases, the next call of the
+    yielded function ends the work.
     """
     pressed = False
 

@@ -145,8 +145,8 @@ class Ask:
     def place(self) -> Place | None:
         """The submission or gradebook that the URL names; None if the user has no such place.
 
-        The number in a URL counts only the user's own places, so no URL leads to places of
-        others.
+        The number in a URL counts only the user's own places, so no URL leads to another person's
+        place.
         """
         # A student may see only their own grade, not the gradebook.
         if self.here.startswith("/feedback/"):
@@ -220,7 +220,7 @@ class Ask:
         return "/".join(self.request.url.path.split("/")[:3]).rstrip("/") + "/"
 
     def _room(self, place: str = "") -> tuple[str, str]:
-        """Return the key for messages: the person, and the URL with the part of the page."""
+        """Return the key for messages: the person, and the room's URL followed by `place`."""
         return self.user.name, self.here + place
 
     @property

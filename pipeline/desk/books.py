@@ -17,7 +17,7 @@ from pipeline.grading.rubric import Rubric
 
 @dataclass(frozen=True)
 class Class:
-    """A class as pages show it; an anonymous class has pseudonyms and is sorted by them."""
+    """A class as pages show it. If it is anonymous, it has pseudonyms and is sorted by them."""
 
     now: ClassNow
     state: State
@@ -116,7 +116,10 @@ class Books:
         return known
 
     def drawn(self, place: Path | str, what: str, draw: Callable[[Class], Any]) -> Any:
-        """Return a drawing of a class; draw it again only after a change, one drawing at a time."""
+        """Return a drawing of a class; it is redrawn only after a change.
+
+        Only one drawing is made at a time.
+        """
         shown = self.of(place)
         with self._drawing:
             known = self._drawn.get((place, what))

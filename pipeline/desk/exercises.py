@@ -41,7 +41,7 @@ def check_exercise(
 
 
 def draw_effect(bench: Mapping[str, str], hide: str, *, progress: Progress) -> str:
-    """Return the picture of an effect's fingerprint on a bench: a run with and without it."""
+    """Return a picture that compares a run with an effect and a run without it."""
     from pipeline.report.effects.gallery import effect_picture
     from pipeline.report.figures.style import drawing
     from pipeline.report.figures.svg import plain_svg
@@ -111,7 +111,7 @@ def _read_numbers(name: str, typed: str) -> list[float]:
 
 
 def _describe_effect(bench: SimulatedBench, entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an effect with its parameters, as typed or at sizes that make the effect visible."""
+    """Return an effect for the form; parameters not typed get values that show the effect."""
     effect, chain = find_effect(entry["key"]), bench.chain
     places = {
         "input": [],
@@ -143,9 +143,10 @@ def _describe_effect(bench: SimulatedBench, entry: Mapping[str, Any]) -> dict[st
 def _describe_parameter(
     parameter: EffectParameter, usual: float, typed: Mapping[str, str], bench: SimulatedBench
 ) -> dict[str, Any]:
-    """Return one parameter for the form, with the slider and the number in agreement.
+    """Return one parameter for the form; its slider and its number agree.
 
-    A moved slider decides the value. Otherwise the typed number does, or else the usual value.
+    If the slider was moved, it sets the value. Otherwise the typed number is used, or the usual
+    value if nothing was typed.
     """
     none = parameter.neutral or 0.0
     value = typed.get("value", "") if typed.get("value") != typed.get("usual") else ""

@@ -75,7 +75,7 @@ def read_findings(folder: Path) -> dict[str, Any]:
 
 
 def _pick_assumptions(found: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return the assumptions about the bench: their texts, and the `value` of each."""
+    """Return the texts and the `value` of each assumption about the bench."""
     texts = _pick_texts(found, ("key", "about", "support", "taken", "why"))
     return [{**one, "value": raw.get("value")} for one, raw in zip(texts, found, strict=True)]
 

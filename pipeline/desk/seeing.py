@@ -26,9 +26,8 @@ REFUSED = (
 def sees_check(user: User, folder: Place | None) -> bool:
     """Return whether the room of a folder shows the check instead of the report.
 
-    On a lab server, the rubric in the list of users decides. Without a rubric there, `[students]
-    see` in submission.toml decides. This is only an agreement, because a student can change the
-    file.
+    On a lab server, the rubric in the list of users decides. If the list has no rubric, `[students]
+    see` in submission.toml decides. Students can change this file, so this is only an agreement.
     """
     if user.role == "instructor" or not isinstance(folder, Path):
         return False
@@ -56,8 +55,8 @@ def is_refused(path: str, user: User, folder: Place | None) -> bool:
 def show_job(job: Job | None, user: User, folder: Path) -> Job | None:
     """Return the job in a folder as the person may see it.
 
-    The job's stages are hidden if they could show numbers, because others may make a report in the
-    folder.
+    The job's stages are hidden if they could show numbers, because another person may be making
+    a report in the folder.
     """
     if job is None or job.task[0] in _TELLS_NONE or not sees_check(user, folder):
         return job

@@ -83,8 +83,8 @@ def list_not_read(folder: str, named: list[str], *, progress: Progress) -> list[
 def list_doubts(folder: str, *, progress: Progress) -> dict[str, Any]:
     """Return what `submission.toml` marks as unsure, and springs that the data do not determine.
 
-    The keys are `system` (the doubt for each key of `[system]`), `springs` (their numbers, from 1)
-    and `experiments` (the doubts of each table).
+    The keys are `system` (the doubt about each key of `[system]`), `springs` (numbers of the
+    springs, from 1) and `experiments` (the doubts in each table).
     """
     system = system_doubts(Path(folder))
     asked = "springs" in system
@@ -194,7 +194,7 @@ def make_plots(folder: str, *, progress: Progress) -> None:
 
 
 def check_numbers(folder: str, rubric: str, where: list[str], *, progress: Progress) -> None:
-    """Check the reported numbers, or find where to look for some; checks.jsonl gets the answer."""
+    """Check the reported numbers, or find where to look for some; write to checks.jsonl."""
     from pipeline.grading.rubric_file import load_rubric
     from pipeline.grading.self_check.check import check_numbers as check
 
@@ -332,7 +332,7 @@ def do(task: tuple[str, Mapping[str, Any]], progress: Progress) -> Any:
 
     Parameters
     ----------
-    asked : name and arguments of the task.
+    task : name and arguments of the task.
     """
     name, arguments = task
     return TASKS[name](**arguments, progress=progress)
@@ -374,7 +374,7 @@ def draw_thumbnail(folder: Path, found: Found, *, columns: Mapping[str, str | in
 
 
 def _draw_lines(rows: Sequence[Array]) -> list[str]:
-    """Return rows, all on the same scale, as points of SVG lines."""
+    """Return each row as the points of an SVG line; all lines have the same scale."""
     low = min((float(row.min()) for row in rows), default=0.0)
     high = max((float(row.max()) for row in rows), default=0.0)
     if not np.isfinite(high - low) or high == low:

@@ -1,4 +1,4 @@
-"""Read what people type into a form: a path on this computer, a whole number, a number."""
+"""Read what people type into a form: a path on this computer, or a number."""
 
 import math
 from pathlib import Path

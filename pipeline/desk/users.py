@@ -91,7 +91,7 @@ class User:
         return self.role not in ("student", "ta")
 
     def without_folders(self, text: str) -> str:
-        """Return a text as they may read it; students and TAs see no folders of the server."""
+        """Return a text without the server's folders if they may not see these."""
         if self.sees_places:
             return text
         listed = (*self.folders, *self.gradebooks, *(own.gradebook for own in self.grades))

@@ -81,7 +81,7 @@ class BenchRun:
 class TrueMotion:
     """The true input (n,), and the positions (n_carts, n) relative to rest.
 
-    If a sensor has its own scale, the positions are scaled by it.
+    If a sensor has a scale error, the positions include it.
     """
 
     u: Array
@@ -199,7 +199,7 @@ class SimulatedBench:
 
 
 def _release(chain: Chain, t: Array, hand: ReleasingHand, *, free: Sequence[int]) -> Array:
-    """Return the positions (f, n) of the free carts around the release by a hand.
+    """Return the positions (f, n) of the free carts before and after a hand releases one.
 
     Until the hand lets go, all other carts are at rest. At the release, the hand's force balances
     the springs, and then it fades. So the decay begins gradually, as with a real hand, and not with
@@ -222,7 +222,7 @@ def _release(chain: Chain, t: Array, hand: ReleasingHand, *, free: Sequence[int]
 
 
 def _release_with_effects(model: AugmentedChain, run: BenchRun, hand: ReleasingHand) -> Array:
-    """Return the readings (n_carts, n) of a run with a hand, as `_release`, but with effects.
+    """Return the readings (n_carts, n) of all carts, as `_release` does, but with effects.
 
     The hand pulls the cart out before the recording starts, which sets the state of friction and of
     hidden masses. The cart then follows the hand's tremor, and is released as in the linear chain.

@@ -55,7 +55,7 @@ def initial_estimates(
 
 
 def final_estimates(believed: Chain) -> dict[str, Value]:
-    """Return the students' fitted parameters, which agree because they come from one chain."""
+    """Return the students' fitted parameters, consistent because they come from one chain."""
     return {name: _significant(value) for name, value in believed.parameters().items()}
 
 

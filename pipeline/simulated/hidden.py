@@ -207,8 +207,8 @@ def _session_scales(
 ) -> tuple[PlaceScales, float]:
     """Return typical sizes of motion at a place, and on which side the larger step moves it.
 
-    The sizes are those of the larger step. A spring counts as stretched at least by the travel, as
-    when a cart is released.
+    The sizes are those in the larger step. But a spring is stretched by the travel or more,
+    because carts are also released by hand.
     """
     # The step goes to 0.9 of the travel, like the larger steps of a session.
     u = 0.9 * travel / float(np.max(np.abs(chain.static_gains())))

@@ -62,7 +62,7 @@ class SimulatedSession:
 
 
 def plan_decays(session: SimulatedSession, rng: np.random.Generator) -> list[BenchRun]:
-    """Return releases of each cart by hand, with the other carts held, several times.
+    """Return several decays of each cart, released by hand while the other carts are held.
 
     Carts without a spring are skipped.
     """
@@ -119,7 +119,7 @@ def plan_steps(session: SimulatedSession) -> list[BenchRun]:
 
 
 def plan_dwells(session: SimulatedSession) -> list[BenchRun]:
-    """Return dwells at one frequency after another, with inputs that move the carts well."""
+    """Return a dwell at each frequency, with an input that moves the carts far enough."""
     chain, runs = session.chain, []
     frequencies = dwell_frequencies(chain, n=session.n_dwells, among=[FIGURE_FREQUENCY])
     for number, hertz in enumerate(frequencies, start=1):

@@ -91,8 +91,9 @@ def find_site(sites: Collection[str], headers: Headers) -> str:
 def _find_refusal(headers: Headers, method: str, door: Door) -> str:
     """Return why a request must be refused, or "" if a person or our own page sent it.
 
-    A foreign name that leads to this computer has a different Host. Another page has a different
-    Origin, and browsers state in Sec-Fetch-Site which page caused a request.
+    A request that reached this computer under a foreign name has a different Host. A request by
+    another page has a different Origin. Browsers state in Sec-Fetch-Site which page caused a
+    request.
     """
     origin, site = headers.get("origin"), door.site(headers)
     if not site:

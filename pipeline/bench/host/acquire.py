@@ -49,8 +49,8 @@ def acquire(
     Parameters
     ----------
     port : name of the serial port, or a URL that pyserial knows.
-    observers : displays of the session. The first one also asks a person to do the work at the
-        bench.
+    observers : displays of the session. The first display also asks a person to do the work at
+        the bench.
     only : ids of the recordings to make. By default the whole plan; dwells and a closed loop
         are added once the data are sufficient.
     buttons : the buttons with which a person ends or repeats a run.
@@ -59,7 +59,7 @@ def acquire(
     ------
     Stopped : a signal or a button ended the session; call again to continue it.
     HardwareError : no bench answers.
-    Runaway : the motor of the bench was on between runs.
+    Runaway : the bench's motor was on between runs.
     ConfigError : another session writes to the folder, or the plan or submission does not fit the
         bench. If only one recording does not fit, its outcome says why, and the session continues.
     """
@@ -105,7 +105,7 @@ class _Acquisition:
         self._failed: dict[str, int] = {}  # number of failed attempts at each recording
 
     def outcomes(self) -> Iterator[RunOutcome]:
-        """Record until nothing is missing, and reopen a lost line; yield how each run ended."""
+        """Record until the plan is done, reconnecting if necessary; yield how each run ended."""
         lost = True
         while lost:
             with open_line(self._port, baud=self._baud()) as line:

@@ -158,7 +158,9 @@ class Importer:
             return None
 
     def _take(self, path: Path, *, final: bool) -> Imported | None:
-        """Copy a file into the submission and add an experiment; None if it is refused or known.
+        """Copy a file into the submission as an experiment.
+
+        Return None if the file is refused, tried again later, or already in the submission.
 
         A file with an incomplete last line may still grow, so it is tried again later.
 

@@ -34,7 +34,7 @@ class Order:
 
     Attributes
     ----------
-    commands : commands for the bench in the order to send; the last one starts the run.
+    commands : commands for the bench, in sending order; the last one starts the run.
     scales : factors from counts to `input_unit` and `position_unit`.
     most_duty : largest duty that a line may report, in duty counts.
     most_counts : largest distance of a cart from its zero, in encoder counts.
@@ -49,7 +49,7 @@ class Order:
     most_counts: float
 
     def rest(self) -> "Order":
-        """Return an order to rest while the carts settle, with the same limits."""
+        """Return an order with the same limits that keeps the motor off while the carts settle."""
         settle = self.recording.settle
         return replace(
             self,
@@ -58,9 +58,10 @@ class Order:
         )
 
     def strays(self, reading: Reading, *, period: float) -> bool:
-        """Return whether a line's target is not as ordered, for example after a digit was changed.
+        """Return whether a line's target is not the ordered one, as after a transmission error.
 
-        A jump may come one `period` (in ms) early or late, and rounding may change a target by one.
+        A jump of the target may come one `period` (in ms) early or late. Rounding may change a
+        target by one count.
         """
         start = self.commands[-1]
         assert isinstance(start, Start)
@@ -78,7 +79,7 @@ class Order:
     def drives_off(self, reading: Reading, *, before: Reading) -> bool:
         """Return whether the motor's duty differs from the target, which is a fault in open loop.
 
-        A jump may take effect one line later.
+        After a jump of the target, the duty may follow one line later.
         """
         if self.recording.controller is not None:
             return False

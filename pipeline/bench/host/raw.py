@@ -1,6 +1,6 @@
 """The raw file of a run: one line of description, then the bytes exactly as they arrived.
 
-`<name>.raw` contains one line of JSON and then the bytes from the port. `<name>.times` beside it
+`<name>.raw` contains one line of JSON and then the bytes from the port. `<name>.times` next to it
 has sixteen bytes for each chunk: the position of the chunk's end, and its time. Both files only
 grow, so they can be read even if the program is killed.
 """

@@ -19,7 +19,7 @@ def data_file(recording: Recording, *, partial: bool = False) -> str:
 
 
 def readings_of(run: RawRun) -> tuple[Reading, ...]:
-    """Return the valid lines of a run in order, judged as they were during the run."""
+    """Return the valid lines of a run in order, by the same checks as during the run."""
     stream = Stream(
         encoders=run.header.bench.encoders,
         period=1e3 * run.header.bench.period,

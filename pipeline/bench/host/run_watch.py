@@ -1,4 +1,4 @@
-"""Check arriving lines against the limits and the wave, during a run and the rest before it."""
+"""Check arriving lines against the limits and the wave, while the carts settle and in a run."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -14,13 +14,13 @@ class LineWatch:
 
     Parameters
     ----------
-    carts : number of carts whose travel is watched; 0 if the counts have no true zero.
+    carts : number of carts whose travel is watched; 0 if the zero of the counts is not reliable.
     period : ms between lines; None for a stock bench, because its wave is not known to the ms.
 
     Attributes
     ----------
     is_astray : whether the motor's duty was not as ordered.
-    is_too_far : whether a cart was farther from its zero than its limit.
+    is_too_far : whether a cart was farther from its zero than the limit allows.
     is_unsafe : whether the run was stopped because it was not safe to continue.
     """
 

@@ -144,7 +144,7 @@ class SerialLine:
             return data
 
     def _run_away(self, why: str) -> None:
-        """Raise `Runaway`: the bench acted without an order. Later starts raise it again."""
+        """Raise `Runaway`: the bench acted without an order. Any later start raises it again."""
         self._runaway = Runaway(f"stopped: the bench {why}; switch its motor off and find out why")
         raise self._runaway
 
@@ -288,8 +288,8 @@ class SerialLine:
     def _answer(self, beginning: bytes = b"?") -> bytes | None:
         """Send a query; return the last answer, or None.
 
-        Answers to earlier queries may arrive first. If no further answer arrives for a while, the
-        missing ones count as lost.
+        Answers to earlier queries may arrive first. If no answer arrives for a while, those still
+        missing count as lost.
 
         Parameters
         ----------

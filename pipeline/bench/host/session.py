@@ -92,11 +92,14 @@ class Session:
         self.wish: Wish | None = None
 
     def prepare(self, order: Order) -> str:
-        """Have the carts held and released as ordered, and wait for rest; return a problem, or "".
+        """Have carts held as ordered, wait until all rest, and have a cart pulled out for release.
+
+        Returns a message if the carts still move, or "".
 
         Raises
         ------
-        HardwareError : the carts do not come to rest, or nobody can confirm that they are held.
+        HardwareError : the line failed, or the wait ended early.
+        ConfigError : nobody can confirm that the carts are held.
         Runaway : the motor is on or a cart is too far out, although no run was ordered.
         """
         recording = order.recording
@@ -219,7 +222,7 @@ class Session:
         )
 
     def _rest(self, order: Order) -> str:
-        """Wait until the carts rest; a run without motion shows their positions.
+        """Wait until the carts rest, in a run with the motor off that reports their positions.
 
         Returns a message if the carts still move, or "".
         """
@@ -253,12 +256,12 @@ class Session:
         return f"not at rest when the run began: {swings} within half a second"
 
     def _watch_rest(self, nothing: Order, watch: LineWatch) -> None:
-        """Carry out an order to rest.
+        """Wait for the carts to settle while `watch` checks the lines.
 
         Raises
         ------
-        HardwareError : the rest ended early.
-        Runaway : the rest ended early because the bench acted without an order.
+        HardwareError : the wait ended early.
+        Runaway : the wait ended early because the bench acted without an order.
         """
         settle = nothing.recording.settle
         trouble = self._carry_out(nothing, self._stream(()), seconds=settle, watch=watch)
@@ -268,7 +271,7 @@ class Session:
 
     @property
     def _zeroed(self) -> int:
-        """The number of carts whose counts have a true zero: all or none."""
+        """The number of carts with a reliable zero: all after a reset at rest, otherwise 0."""
         return self._moving if self._line.resets == self._zeroed_at else 0
 
     def _zero_at_rest(self, recording: Recording) -> None:

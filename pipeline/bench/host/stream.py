@@ -34,7 +34,7 @@ class Stream:
 
     Attributes
     ----------
-    broken : a fault of the bench's clock that ended the run; "" without one.
+    broken : the fault of the bench's clock that ended the run; otherwise "".
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Stream:
 
     @property
     def latest(self) -> int:
-        """The stamp of the newest line in ms, judged or not; -1 without lines."""
+        """The time stamp of the newest line in ms, even if not yet judged; -1 before any line."""
         newest = self._held or self._before
         return -1 if newest is None else newest.ms
 
@@ -226,10 +226,10 @@ def _stands_out(before: Reading, held: Reading, after: Reading, *, closed: bool)
 class _MissingSoFar:
     """An estimate of the missing lines, second by second.
 
-    Even without a loss, the time stamps skip a value now and then. If a regular clock explains all
-    stamps of one second, no line is missing in that second, and its period is used for other
-    seconds. Before the first such second, the smallest mean spacing serves as the period, because
-    lost lines only increase the spacing.
+    Even if no line is lost, the time stamps skip a value now and then. If a regular clock explains
+    all stamps of one second, no line is missing in that second. The period of this clock is then
+    used for later seconds. Until then, the smallest mean spacing serves as the period, because lost
+    lines only increase the spacing.
     """
 
     def __init__(self, period: float) -> None:

@@ -55,13 +55,13 @@ class ShownSession(ABC):
 
     @abstractmethod
     def heed(self, wish: str, number: int) -> bool:
-        """Accept a pressed button; return whether it counts.
+        """Handle a pressed button; return whether it is accepted.
 
         Parameters
         ----------
         wish : `done`, or one of the buttons of a run.
-        number : number of the instruction that is done, or of the turn in which the page showed the
-            button.
+        number : number of the instruction that was carried out, or of the turn in which the page
+            showed the button.
         """
 
     def points(self, *, run: int, start: int) -> dict[str, Any]:
@@ -82,7 +82,7 @@ class ShownSession(ABC):
             }
 
     def follow(self, *, version: int = 0) -> Iterator[list[tuple[str, Mapping[str, Any]]]]:
-        """Yield at each step the changes since the last step, as pairs of a kind and its content.
+        """Yield at each step the changes since the last step, as ("state" or "points", content).
 
         Parameters
         ----------
@@ -226,7 +226,7 @@ class LiveState(ShownSession):
         self._change("thinking", None)
 
     def thought(self, sentence: str) -> None:
-        """Announce what is known, what is uncertain, and the next recording with its reason."""
+        """Announce what is known, what is uncertain, which recording is next, and why."""
         with self._lock:
             self._thoughts += 1
             self._thought = sentence
@@ -253,7 +253,7 @@ class LiveState(ShownSession):
     # ------------------------------------------------------------------ by the server
 
     def answer(self, number: int) -> bool:
-        """Confirm the current instruction if it has this number; return whether it has."""
+        """Confirm the current instruction if it has this number; otherwise return False."""
         with self._lock:
             if self._instruction is None or self._instruction[0] != number:
                 return False

@@ -108,7 +108,7 @@ class Observer(Protocol):
         ...
 
     def thought(self, sentence: str) -> None:
-        """Announce what is known, what is uncertain, and the next recording with its reason."""
+        """Announce what is known, what is uncertain, which recording is next, and why."""
         ...
 
 
@@ -159,7 +159,7 @@ class Observers:
             observer.thinking(stage)
 
     def thought(self, sentence: str) -> None:
-        """Announce what is known, what is uncertain, and the next recording with its reason."""
+        """Announce what is known, what is uncertain, which recording is next, and why."""
         for observer in self._observers:
             observer.thought(sentence)
 

@@ -30,10 +30,10 @@ _WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
 class CommandReader:
     """Split the bytes that arrive at a bench into commands; count and drop anything else.
 
-    A field that does not fit breaks off the current command, and may begin another one. A lost byte
-    must never hide a stop. So a field that ends in the letter of a stop or a reset counts as one,
-    whatever noise precedes the letter. So does an `s` that was read as the wave of a start, if the
-    next field of this start does not fit.
+    A field that does not fit ends the current command, and may begin a new one. A lost byte must
+    never hide a stop. So a field that ends in the letter of a stop or a reset counts as that
+    command, whatever noise precedes the letter. In a start, `s` means a sine; if the next field
+    does not fit, this `s` counts as a stop.
 
     Parameters
     ----------

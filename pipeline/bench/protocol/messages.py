@@ -121,7 +121,7 @@ class Tone:
 
 @dataclass(frozen=True, kw_only=True)
 class Hands:
-    """`h`: let the hands of a virtual bench hold some carts, and release one in the next run.
+    """`h`: let a virtual bench hold some carts by hand, and release one cart in the next run.
 
     Attributes
     ----------
@@ -199,7 +199,7 @@ def format_reading(reading: Reading) -> bytes:
 
 
 def parse_reading(line: bytes) -> Reading | None:
-    """Return the content of a line, with or without its end; None for any other text."""
+    """Return the content of a line, with or without a line end; None if it cannot be read."""
     text = line.decode("latin-1").rstrip("\r\n")
     if not _LINE.fullmatch(text):
         return None
@@ -216,8 +216,8 @@ class Description:
     name : name of the bench, one word.
     encoders : number of encoder counts in a line, two or three.
     carts : number of encoders that are on carts.
-    period : nominal s between lines.
-    commands : letters of the commands beyond the stock ones. With `c` the bench also knows the wave
+    period : nominal time between lines, in s.
+    commands : letters of the commands that a stock bench lacks. With `c` the bench also knows the
         chirp, and with `m` the multisine.
     input_unit, input_per_count : unit of the input, and its value per duty count.
     position_unit, position_per_count : unit of the positions, and its value per encoder count.

@@ -38,9 +38,9 @@ class StampFit:
 def fit_stamps(stamps: Stamps, *, period: float, stated: bool = False) -> StampFit:
     """Return the clock that explains the time stamps of a run.
 
-    The expected period is used only if the stamps are not conclusive: in a short run with losses,
-    if the clock is within about 1e-5 of 1 ms, or if it ticks twice within a millisecond. A period
-    that the bench stated is also used if too many lines are missing to find a comb.
+    The expected period is used only if the stamps are not conclusive. This can happen in a short
+    run with losses, with a period below 1 ms, or with one within about 1e-5 of 1 ms. A period that
+    the bench stated is also used if too many lines are missing.
 
     Parameters
     ----------
@@ -95,9 +95,10 @@ def even_period(stamps: Stamps) -> float | None:
 
 
 def _other_period(stamps: Stamps, stated: float) -> StampFit | None:
-    """Return the clock of the pieces without a lost line, if it differs from the stated one.
+    """Return the clock measured in parts of the run without a lost line.
 
-    If many lines are lost, there are too few such pieces, and the result is None.
+    The result is None if there are too few such parts, if their periods differ, or if the stated
+    period is right.
     """
     long = 200  # lines in a piece; if one line in a hundred is lost, most pieces lack some
     pieces = [stamps[i : i + long + 1] for i in range(0, stamps.size - long, long)]
@@ -119,7 +120,7 @@ def _other_period(stamps: Stamps, stated: float) -> StampFit | None:
 def _comb(absent: Sequence[int]) -> list[int]:
     """Return the skips of the clock: the longest evenly spaced series of missing stamps.
 
-    The spacing must hold up to the last missing stamp.
+    The series must reach the last missing stamp, or end less than one spacing before it.
     """
     there = frozenset(absent)
     best: list[int] = []
@@ -133,7 +134,7 @@ def _comb(absent: Sequence[int]) -> list[int]:
 
 
 def _follow(first: int, second: int, *, there: frozenset[int], last: int) -> list[int]:
-    """Return the series that two missing stamps begin; [] if it breaks off before `last`."""
+    """Return the evenly spaced series that begins with two given stamps; [] if it has a gap."""
     if second - first < _CLOSEST_TEETH:
         return []
     teeth = [first, second]

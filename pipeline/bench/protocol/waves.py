@@ -1,4 +1,4 @@
-"""The target of a run over time, for a bench that follows it and a plan that predicts it."""
+"""The target of a run over time."""
 
 import math
 from collections.abc import Sequence
@@ -51,7 +51,7 @@ def shape_at(
 
 
 def _chirp_turns(start: Start, t: float, chirp_end: float | None) -> float:
-    """Return the turns of a chirp, whose frequency grows by the same factor every second."""
+    """Return the number of periods of a chirp until `t`; its frequency grows exponentially."""
     span = CHIRP_SPAN if chirp_end is None else chirp_end / start.frequency
     if span == 1.0:
         return start.frequency * t

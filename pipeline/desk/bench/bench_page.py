@@ -43,7 +43,7 @@ def plan(ask: Ask) -> Response:
 
 
 def acquire(ask: Ask) -> Response:
-    """Start to acquire the ticked recordings, or the whole plan if no recording is ticked."""
+    """Start acquiring the ticked recordings, or the whole plan if no recording is ticked."""
     only = [value for value in ask.form.getlist("only") if isinstance(value, str)]
     port = read_port(ask)
     _note_plan(ask)

@@ -15,7 +15,7 @@ from pipeline.submission.load import NAME, file_problem
 
 
 def plan_ids(folder: Path) -> frozenset[str] | None:
-    """Return the ids of the recordings in a folder's plan; None without a readable plan."""
+    """Return the ids of the recordings in a folder's plan; None if it has no readable plan."""
     try:
         submission = load_submission(folder)
         if plan_path(submission).exists():

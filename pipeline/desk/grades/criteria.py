@@ -38,7 +38,8 @@ class Item:
     Attributes
     ----------
     id : id of the criterion, or code of the flag.
-    lost : points lost in the automatic grading, so that points given by hand do not move the row.
+    lost : points lost in the automatic grading. Points given by hand do not count, so the row
+        stays in its place.
     doubt : whether a person should look or has looked: points were lost, the criterion was not
         judged, or there is a flag or points given by hand.
     """
@@ -55,7 +56,7 @@ class Item:
 
 
 def list_items(grade: Grade, now: TeamNow) -> list[Item]:
-    """Return the rows for criteria and flags: first those in doubt, then by points lost."""
+    """Return the rows: those in doubt first, flags before criteria, then by points lost."""
     judged = {criterion.id: criterion for criterion in grade.criteria}
     items = [
         Item(id=flag.code, is_remark=True, title=capital(WORDS.text(f"title_{flag.code}")))
@@ -83,9 +84,10 @@ def list_items(grade: Grade, now: TeamNow) -> list[Item]:
 
 
 def point_steps(out_of: float, *, step: float) -> list[float]:
-    """Return up to nine numbers of points, one for each key from 1 to 9, including none and all.
+    """Return up to nine choices of points from 0 to `out_of`, one for each key from 1 to 9.
 
-    These are the steps of the rubric if there are few, otherwise quarters rounded to a step.
+    These are the multiples of the rubric's step. If those are too many, they are the quarters of
+    `out_of`, rounded to a step.
     """
     whole = exact(out_of)
     fine = [n * exact(step) for n in range(MOST_STEPS) if n * exact(step) < whole]
@@ -106,7 +108,7 @@ def describe_criterion(
 
     Parameters
     ----------
-    typed : refused fields of the criterion's form (points, other, why), and the reason (wrong).
+    typed : fields of a refused form (points, other, why), and why it was refused (wrong).
     """
     own = next((c for c in grade.criteria if c.id == asked.id), None)
     by_hand = now.entry.overrides.get(asked.id) or now.entry.comments.get(asked.id)
@@ -164,7 +166,7 @@ def show_figures(
     Parameters
     ----------
     drawn : file name and SVG of each figure.
-    own : the judged criterion, with its numbers.
+    own : the criterion as judged; None if it was not judged.
     first : file that the person wants to see first.
     """
     worst = _find_worst(own) if own else ""
@@ -206,7 +208,7 @@ def _is_positive(value: Any) -> bool:
 
 
 def _shows(file: str, name: str) -> bool:
-    """Return whether a figure shows a number's recording, or the response of its cart."""
+    """Return whether a figure shows the recording of a number, or the response of its cart."""
     if is_response(file):
         return bool(name) and file.endswith(f"-{read_name(name).cart}.svg")
     return name in numbers_in(file)

@@ -33,7 +33,7 @@ def find_recordings(ask: Ask, shown: Class, entry: Entry) -> Path | None:
 
 
 def _list_candidates(ask: Ask, name: str) -> Iterator[Path]:
-    """Yield folders of this name: open at the desk, graded from here, or next to the gradebook."""
+    """Yield folders that may be the submission: open ones, graded ones, or near the gradebook."""
     place = ask.place_or_404()
     yield from (folder for folder in ask.user.folders if folder.name == name)
     for path in ask.desk.books.asked.get(place, {}).get("paths", "").splitlines():

@@ -191,7 +191,7 @@ def _show_chosen(
 def _link_figures(
     ask: Ask, name: str, figures: Sequence[dict[str, str]], chosen: Item
 ) -> list[dict[str, str]]:
-    """Return figures with two addresses: of the figure, and of the page with this figure first."""
+    """Add two addresses to each figure: its own, and that of the page that shows it first."""
     found = []
     for figure in figures:
         own = {"of": name, "figure": figure["file"]}

@@ -84,7 +84,7 @@ def apply(ask: Ask) -> Response:
 
 
 def _undo(ask: Ask) -> Response:
-    """Undo a set of changes; teams that were changed again since are kept and named."""
+    """Undo a set of changes. Teams that were changed again since keep theirs and are named."""
     shown, book = read_class(ask), open_book(ask)
     if ask.text("set") not in [one.at for one in book.changed_together(least=1)]:
         raise HTTPException(404, "there is no such change in this class")

@@ -30,7 +30,7 @@ _NEW = "new"  # version in a form whose file does not exist yet
 def show(ask: Ask) -> Response:
     """Show a rubric in the editor, or the list of rubrics if the request names no rubric.
 
-    The text of a new file is a shipped rubric, or empty.
+    A new file starts as a copy of a shipped rubric, or empty.
     """
     start = ask.text("start")
     if not start and not ask.text("file"):
@@ -55,7 +55,7 @@ def check(ask: Ask) -> Response:
 
 
 def save(ask: Ask) -> Response:
-    """Save a valid rubric, but only over the version of the file that was shown."""
+    """Save a valid rubric, unless the file has changed since it was shown."""
     path, typed, seen = read_rubric_path(ask), read_typed(ask.form), ask.text("seen")
     now = rubric_source(path) if path.exists() else None
     if seen != (_NEW if now is None else text_digest(now)):

@@ -43,9 +43,10 @@ def shipped_rubrics() -> list[ShelvedRubric]:
 
 
 def own_rubrics(user: User) -> list[ShelvedRubric]:
-    """Return the rubrics in a user's workshop; for the owner, those near the open folders.
+    """Return the rubrics in a user's workshop.
 
-    The owner also gets those in the folder in which the desk was started.
+    The owner has no workshop. They get the rubrics near the open folders, and those in the folder
+    in which the desk was started.
     """
     found: dict[Path, ShelvedRubric] = {}
     for root in _roots(user):

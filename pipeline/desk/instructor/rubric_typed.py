@@ -38,7 +38,7 @@ class TypedRubric:
     edited : text as the editor shows it, without the form's numbers if they cannot be inserted.
     rubric : the parsed rubric; None if something is wrong.
     form : the form with the numbers of the edited text; None if this text has a mistake.
-    typed : by name, the numbers of the form that are not in the edited text.
+    typed : by name, the changed numbers of the form that could not be inserted into the text.
     wrong : by name, what is wrong with a number of the form.
     """
 
@@ -52,7 +52,7 @@ class TypedRubric:
 
     @property
     def shown(self) -> str:
-        """The numbers that the page shows, as JSON, so that the next request finds changed ones."""
+        """The numbers that the page shows, as JSON; the next request finds changes by them."""
         if self.form is None:
             return json.dumps(dict.fromkeys(self.typed, ""))
         return json.dumps({field.name: field.value for field in self.form.fields()})

@@ -83,9 +83,9 @@ def _unpack(content: BinaryIO, scratch: Path, *, workers: WorkerPool) -> list[tu
 
 
 class _Room:
-    """The files and bytes that a submission may still receive, counted once per upload.
+    """Count the files and bytes that a submission may still receive during one upload.
 
-    Files that were set aside, or that a command made, are not part of the submission and do not
+    Files that were set aside, or made by a command, are not part of the submission and do not
     count.
     """
 

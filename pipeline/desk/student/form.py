@@ -224,7 +224,7 @@ def find_changes(fields: Iterable[Field], form: Mapping[str, Any], values: Any) 
 def mark_errors(
     fields: Sequence[Field], changed: Sequence[Field], error: SubmissionError | None
 ) -> tuple[tuple[Field, ...], list[str]]:
-    """Return the fields with typed values and problems, and the problems that have no field."""
+    """Return the fields with their typed values and problems; list other problems separately."""
     now = {field.path: field for field in changed}
     shown = [now.get(field.path, field) for field in fields]
     left: list[str] = []

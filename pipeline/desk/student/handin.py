@@ -49,13 +49,13 @@ def list_held(folder: Path, *, report: bool = True) -> list[str]:
 
 
 def list_beside(folder: Path, *, report: bool = True) -> list[str]:
-    """Return the existing files of `BESIDE` for the zip, without a report that is out of date."""
+    """Return which files of `BESIDE` go into the zip; an outdated report is left out."""
     left_out = "" if report and find_state(folder) == "current" else _REPORT
     return [name for name in BESIDE if name != left_out and file_problem(folder, name) is None]
 
 
 def list_missing(folder: Path) -> list[str]:
-    """Return what prevents a submission from being handed in, one reason each."""
+    """Return the reasons why a submission cannot be handed in."""
     try:
         submission = load_submission(folder)
     except SubmissionError as error:
@@ -71,7 +71,7 @@ def list_missing(folder: Path) -> list[str]:
 
 
 def _is_made(folder: Path, name: str) -> bool:
-    """Return whether a file is in a folder of computed results, by its name or through a link."""
+    """Return whether a file, or the target of its link, is in a folder of computed results."""
     root = folder.resolve()
     places = (Path(os.path.normpath(root / name)), (folder / name).resolve())
     return any(place.is_relative_to(root / made) for place in places for made in _MADE)

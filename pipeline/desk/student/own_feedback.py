@@ -129,7 +129,7 @@ def _describe_criteria(
     Parameters
     ----------
     refused : by criterion, a reason as typed and why it was refused.
-    hidden : whether to show no number that the student must find.
+    hidden : whether to hide numbers that the student must find.
     """
     judged = {criterion.id: criterion for criterion in grade.criteria}
     lost = points_lost(grade, found.rubric)

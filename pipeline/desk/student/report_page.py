@@ -124,7 +124,7 @@ def _show_questions(
 
 
 def _list_signs(room: Room) -> str:
-    """Return the signs that one click writes, with their runs; "" without such signs."""
+    """Return, as text, the signs that one click writes and their runs; "" for no signs."""
     document, signs = read_document(room.text), room.findings["turned"]
     tables = list_experiments(document)
     open_: dict[str, list[str]] = {}

@@ -1,4 +1,4 @@
-"""The recordings of a submission as rows, grouped by kind, with what needs a person."""
+"""The recordings of a submission as rows grouped by kind, and what a person must check."""
 
 import re
 from collections import Counter
@@ -50,8 +50,8 @@ class Row:
     Attributes
     ----------
     look : what the file contains; see `tasks.describe_file`.
-    index : index of the table in the file; None without a table.
-    problems : why the row needs a person.
+    index : index of the table in submission.toml; None if the file has no table.
+    problems : why a person must look at the row.
     """
 
     file: str
@@ -87,7 +87,7 @@ class Row:
 
     @property
     def is_recording(self) -> bool:
-        """Whether the file is a recording, not for example a text or an empty file."""
+        """Whether the file is a recording, and not, for example, a text or an empty file."""
         return self.index is not None or bool(self.look["format"])
 
     @property
@@ -238,9 +238,9 @@ def _question(
     carts: Sequence[int],
     marked: Sequence[str],
 ) -> Field:
-    """Return a field; the field of free carts gets a question if a cart hardly moves.
+    """Return a field; if it lists the free carts and one hardly moves, add a question.
 
-    The question is asked until the table states the free carts and marks no doubt about them.
+    The question disappears when the table states the free carts and marks no doubt about them.
     """
     if not field.path.endswith(".carts"):
         return field

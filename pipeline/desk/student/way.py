@@ -20,7 +20,7 @@ class Facts:
     report : state of the report: "none", "current", "answered" or "older"; see `find_state`.
     questions, unanswered : numbers of questions in the last report.
     handed : whether the zip was downloaded in its current state.
-    check : state of the check, in a lab that has it instead of the report.
+    check : state of the check; None in a lab that has a report instead.
     """
 
     recordings: int = 0
@@ -92,7 +92,7 @@ def _check(facts: Facts) -> Status:
 def _has_result(facts: Facts) -> bool:
     """Return whether the current files have a report, or a check in which all numbers agree.
 
-    Doubts then no longer block the next steps.
+    If so, doubts no longer block the next steps.
     """
     return (_check if facts.check else _report)(facts)[0] == "done"
 

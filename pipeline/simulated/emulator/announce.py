@@ -1,4 +1,4 @@
-"""Announce the virtual benches that run on this computer, by one file each."""
+"""Announce the virtual benches that run on this computer, each by a file."""
 
 import json
 import os
@@ -49,7 +49,7 @@ def running_benches() -> list[RunningBench]:
 
 
 def _find_folder() -> Path:
-    """Return the folder of the files; no other user can write there, if the system has users."""
+    """Return the path of the folder for the files; each user has a separate folder."""
     own = str(os.getuid()) if hasattr(os, "getuid") else "user"
     root = os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()
     return Path(root) / f"cartlab-benches-{own}"
@@ -64,7 +64,7 @@ def _is_own(folder: Path) -> bool:
 
 
 def _read(path: Path) -> RunningBench | None:
-    """Return the bench of a file; None if its process has ended."""
+    """Return the bench that a file announces; None if its process has ended."""
     try:
         entry = json.loads(path.read_text(encoding="utf-8"))
         if entry["began"] != _began(int(path.stem)):

@@ -132,7 +132,7 @@ class Faults:
         return self._hold(end, clock=clock)
 
     def behind(self, data: bytes, *, clock: float) -> bytes:
-        """Return the bytes to send for text outside the stream, which must not overtake a line."""
+        """Return the bytes to send now, given an answer; it must not overtake a delayed line."""
         return self._hold(data, clock=clock)
 
     def _hold(self, data: bytes, *, clock: float) -> bytes:
@@ -166,7 +166,7 @@ class Faults:
         return ""
 
     def _rewritten(self, line: bytes, *, reset: bool) -> bytes:
-        """Return the line with the readings of stuck encoders, and with a restarted clock."""
+        """Return the line as changed by stuck encoders and a restarted clock."""
         *counts, target, duty, stamp = line.rstrip().split(b":")
         ms = int(stamp)
         if reset or ms < self._ms:  # or another run has begun
