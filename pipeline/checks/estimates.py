@@ -148,7 +148,7 @@ def _step_check(step: StepGain, *, shown: Sequence[str], bench: Bench) -> Check:
             "fail",
             (  # the shift of the rest points gives the least friction that can hold the cart
                 f"sticks: judged by its rest positions, the static gain is between {low:.4g} and "
-                f"{high:.4g} {bench.units.gain}, and may even be outside."
+                f"{high:.4g} {bench.units.gain}, but the true gain may be outside."
             ),
         )
     elif shown:
