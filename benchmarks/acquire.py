@@ -90,7 +90,7 @@ def faults(folder: Path, *, seconds: float) -> None:
 
 
 def stops(folder: Path, *, n: int) -> None:
-    """Pass the travel limit; print the time from the first line beyond it to the last line, ms."""
+    """Pass the travel limit; print how many ms after the first line beyond it the bench stopped."""
     delays = []
     with emulator() as bench:
         for trial in range(n):
@@ -110,7 +110,7 @@ def stops(folder: Path, *, n: int) -> None:
 
 
 def kills(folder: Path, *, n: int) -> None:
-    """Kill the host at random; print how much the raw file lacks, and when the motor stops."""
+    """Kill the host at random times; print how much the raw file lacks and when the motor stops."""
     rng, missing, off = np.random.default_rng(0), [], []
     with emulator() as bench:
         for trial in range(n):

@@ -95,8 +95,8 @@ class Size:
 def graded_class(place: str, size: Size, *, folder: Path, seed: int) -> list[Files]:
     """Grade a class into a gradebook and release it; return the recordings of each base submission.
 
-    A few simulated submissions, called bases, are analysed. Each team reports the numbers of one
-    base with its own mistakes, and is graded on them. Its figures are those of its base.
+    A few simulated submissions, called bases, are analysed. Each team reports one base's numbers
+    with some mistakes, and is graded on them. Its feedback has that base's figures.
     """
     rubric, draw = load_rubric(Path(PRESET)), random.Random(f"{seed} class")
     bases = [_base(folder / f"base-{n}", rubric, seed=seed + n) for n in range(size.bases)]
@@ -437,7 +437,7 @@ def _count_said(log: Path) -> dict[str, int]:
 
 
 def _page_times(journal: Journal) -> dict[str, dict[str, float]]:
-    """Return for each page the number of answers and their times in s."""
+    """Return each page's number of answers, and statistics of their times in s."""
     times: Mapping[str, list[float]] = defaultdict(list)
     for page, seconds in journal.times:
         times[page].append(seconds)
@@ -604,7 +604,7 @@ def exploration_words(made: Mapping[str, Any]) -> str:
 
 
 def memory_words(seen: Mapping[str, float]) -> str:
-    """Return the median, the largest value and the slope of a memory over time."""
+    """Return the median, maximum and slope of memory use in words."""
     return (
         f"median {seen['median']:.0f} MB, most {seen['most']:.0f} MB, slope {seen['slope']:+.0f} ± "
         f"{seen['std']:.0f} MB an hour, over {60 * seen['hours']:.0f} minutes"
@@ -618,7 +618,7 @@ def load_words(made: Mapping[str, Any]) -> str:
 
 
 def page_table(pages: Mapping[str, Mapping[str, float]]) -> str:
-    """Return a Markdown table of answer times, with slow pages first and most others together."""
+    """Return a Markdown table of answer times: a row per slow page, and one for all other pages."""
     lines = [
         "| page or form | answers | median | 99 % | most | over 1 s |",
         "|---|---|---|---|---|---|",

@@ -87,7 +87,7 @@ def check_book(place: str, journal: Journal, *, teams: Sequence[str], found: Fou
 def check_folders(
     folders: Mapping[tuple[str, str], Path], journal: Journal, *, found: Found
 ) -> None:
-    """Check that the folders have each recording and each note, by student and folder number."""
+    """Check that each folder has the recordings and notes that its student sent to it."""
     mine: dict[tuple[str, str], list[Change]] = defaultdict(list)
     for change in journal.sent:
         if change.kind in ("upload", "row"):

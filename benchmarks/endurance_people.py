@@ -175,7 +175,7 @@ class Person(threading.Thread):
 
 
 class Assistant(Person):
-    """A TA who reviews teams, gives points, also to several teams, and answers requests."""
+    """A TA who reviews teams, gives points to one team or several, and answers requests."""
 
     def habits(self) -> Mapping[Callable[[], None], float]:
         """Return the actions, which are mostly reviews."""
@@ -200,7 +200,7 @@ class Assistant(Person):
             self.get("feedback in full", f"/grades/0/feedback/{team}/feedback.html")
 
     def review(self) -> None:
-        """Change a criterion's points, or only comment on them; then perhaps accept the grade."""
+        """Change a criterion's points or comment on them; in half of the cases accept the grade."""
         team = self.draw.choice(self.lab.teams)
         path = f"/grades/0/team?of={team}"
         text = self.get("team", path)

@@ -1,11 +1,11 @@
-"""Benches that investigate themselves: effects named, errors stated and time needed.
+"""How well benches investigate themselves: effects named, errors stated and time needed.
 
     python -m benchmarks.explorations [--count 100] [--minutes 60]
 
 Each random bench has one to three carts and up to two hidden effects. It has the carts, encoders
-and controller of the emulator, simulated tick by tick without a serial line. `cartlab explore` gets
-the list of springs, and aims at an error of 1 % in all parameters within ten minutes. A study that
-was stopped continues where it stopped.
+and controller of the emulator, simulated tick by tick without a serial line. `cartlab explore` knows
+which springs exist, and aims at an error of 1 % in all parameters within ten minutes. An
+interrupted study continues where it stopped.
 """
 
 import os

@@ -22,7 +22,7 @@ OURS, LINEAR_CART = "cartlab", "linear"
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """One tool's result on one bench: its model (None if all diverge), error, and time in s."""
+    """One tool's result on one bench; the model is None if all of the tool's models diverge."""
 
     model: Model | None
     error: float

@@ -1,4 +1,4 @@
-"""Which laws of friction a servo and a cart need, found by models with more and more laws.
+"""Which laws of friction a servo and a cart need, found by comparing simple and rich models.
 
 The search of `cartlab gap` runs once for each model, with only the laws of that model.
 """

@@ -268,7 +268,7 @@ def explain_rig(rig: Rig, tell: Callable[[str], None]) -> str:
 
 
 def _hands(gap: Gap) -> list[str]:
-    """Return a sentence about the times in which a hand moved a cart."""
+    """Return a sentence that lists when a hand moved a cart; the list is empty if none did."""
     if not gap.interventions:
         return []
     times = (f"{one.experiment} {one.start:.2f} to {one.end:.2f} s" for one in gap.interventions)

@@ -1,4 +1,4 @@
-"""How often grading names a mistake and spares an honest team, its cost, and other graders.
+"""How often grading names mistakes and spares honest teams, what it costs, and other graders.
 
 Benches cover everything that a lab may have (`tests/helpers/grading_class.py`). Each team is graded
 as it is, and then with a few kinds of mistakes in its own recordings and numbers
@@ -6,7 +6,7 @@ as it is, and then with a few kinds of mistakes in its own recordings and number
 
     python -m benchmarks.grading --start 50000 --count 300 --out grading.jsonl
 
-It writes one JSON line per grading, and prints the flags of each wrong one.
+It writes one JSON line per grading, and prints the flags of each grading that is wrong.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""A class to grade: the cost of a batch, disguised copies that are found, and kills.
+"""Grade a class: what a batch costs, which disguised copies are found, and what a kill destroys.
 
     python -m benchmarks.grading_batch [--kills 300]
 

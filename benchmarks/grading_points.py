@@ -25,7 +25,7 @@ STRICT, LENIENT = 0.5, 2.0  # tolerances are multiplied by these factors
 
 @dataclass(frozen=True, kw_only=True)
 class Judged:
-    """One grading: its share of the points, and how many criteria lost points by the mistake.
+    """One grading: its share of the points, and how many criteria lost points.
 
     Attributes
     ----------

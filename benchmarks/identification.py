@@ -1,8 +1,9 @@
 """Noisy dwells of the throne presets, the smallest possible error, and the error of the fit.
 
-Dwells: 20, 25 and 30 frequencies, logarithmic from 0.3 to 7 Hz. The input amplitude gives the
-cart that moves most 1 cm, but is 1 V at most. Errors: 1 % of the amplitude and 0.00115 cm (half
-an encoder count of 0.00227 cm), added in quadrature; as much in phase where phases are used.
+Dwells: 20, 25 and 30 frequencies, spaced logarithmically from 0.3 to 7 Hz. The input amplitude
+moves the cart that moves most by 1 cm, but is at most 1 V. Errors: 1 % of the amplitude and
+0.00115 cm (half an encoder count of 0.00227 cm), added in quadrature. A phase in rad has the same
+error as the relative magnitude.
 
 Starts: "paper" has the initial estimates of the paper's Tables 1-3. "Random" draws gains within
 20 %, frequencies within 20 % (log-normal sigma 0.1) and dampings from 0.02 to 0.3. "Wide" draws

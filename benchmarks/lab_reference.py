@@ -1,4 +1,4 @@
-"""Compute the numbers of the one-cart lab from a team's own files, as a TA would write it.
+"""Compute the numbers of the one-cart lab from a team's files, with code that a TA might write.
 
 nbgrader and otter-grader get this file together with the assignment (`grading_notebooks.py`). It
 uses numpy, scipy and textbook methods: the level of a step, the logarithms of a decay's peaks, a

@@ -45,7 +45,7 @@ FIGURE = Path(__file__).with_name("figures") / "next.svg"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Stage:
-    """The relative errors of all named parameters after `seconds` of bench time."""
+    """Stated and true relative errors of all named parameters after `seconds` of bench time."""
 
     seconds: float
     stated: Array

@@ -62,7 +62,7 @@ def installed(tool: str) -> bool:
 
 
 def version(tool: str) -> str:
-    """Return the version of a distribution, or that it is not installed."""
+    """Return the version of a distribution, or `NOT_INSTALLED`."""
     try:
         return version_of(tool)
     except PackageNotFoundError:
@@ -86,7 +86,7 @@ def spread(values: Iterable[float] | Array, *, digits: int = 2) -> str:
 
 
 def significant(value: float, *, digits: int = 2) -> str:
-    """Return a number with some significant digits, with an exponent only for extreme values."""
+    """Return a number with `digits` significant digits; only extreme values have an exponent."""
     if not np.isfinite(value) or value == 0 or not 1e-4 < abs(value) < 1e6:
         return f"{value:.{digits}g}"
     places = max(0, digits - 1 - int(np.floor(np.log10(abs(value)))))
@@ -94,7 +94,7 @@ def significant(value: float, *, digits: int = 2) -> str:
 
 
 def share(hits: int, of: int) -> str:
-    """Return a share in percent, with its two counts."""
+    """Return a share in percent, followed by the two counts."""
     if not of:
         return "–"
     digits = 1 if 0 < hits < of and not 0.5 < 100 * hits / of < 99.5 else 0

@@ -4,8 +4,8 @@
 
 Each random bench has one or two small hidden effects and records one sweep, as `cartlab explore`
 does first. If the verdict is "ambiguous" or "partial", the experiment that `cartlab gap` proposes
-is recorded and the search repeated, at most twice. The search gets the list of springs. A
-study that was stopped continues where it stopped.
+is recorded and the search repeated, at most twice. The search knows which springs exist.
+An interrupted study continues where it stopped.
 """
 
 import os

@@ -422,7 +422,7 @@ def test_forged_names_are_refused(lab):
     ],
 )
 def test_a_wrong_list_is_one_line(text, why, tmp_path):
-    """An error in the file of users is one line that names it, and nothing is served."""
+    """An error in the file of users is refused with a message that names it."""
     for name in ("one", "two", "three", "grades", "shop"):
         (tmp_path / name).mkdir()
     (tmp_path / "users.toml").write_text(text, encoding="utf-8")

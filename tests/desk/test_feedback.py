@@ -217,7 +217,7 @@ def test_a_request_goes_from_the_student_to_the_ta_and_back(released, book):
 
 
 def test_a_refused_request_is_explained_at_its_field(released, book):
-    """If a request or answer is not allowed, a message is at its field and the typed text stays."""
+    """If a request or answer is refused, its field shows a message and keeps the typed text."""
     student, ta = released("s4"), released("Ada")
     long = "x" * (MOST_LETTERS + 1)
     refused = ask(student, why=long)

@@ -293,7 +293,7 @@ def test_criteria_that_lost_points_come_first(ta):
     ],
 )
 def test_points_come_in_steps_of_the_rubric(out_of, step, steps):
-    """Keys on the keyboard give points in steps of the rubric, or in quarters if those are many."""
+    """Keys give points in the rubric's steps, or in quarters if there are too many steps."""
     assert point_steps(out_of, step=step) == steps
 
 

@@ -240,7 +240,7 @@ def test_an_exception_that_ends_a_process_is_reported(module, line):
 
 
 def test_a_job_whose_thread_fails_is_over(jobs, monkeypatch, tmp_path):
-    """If a job cannot be started for whatever reason, it is reported as over."""
+    """If the desk itself fails to start a job, the job ends and is reported as failed."""
 
     def no_more(module: str) -> LineProcess:
         raise MemoryError("no more")

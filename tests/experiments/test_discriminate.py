@@ -150,7 +150,7 @@ def test_another_dispute_gets_another_recording(proposed):
 
 
 def test_a_hopeless_contender_decides_nothing(proposed):
-    """An explanation of almost no weight does not influence which recording is proposed."""
+    """An explanation with almost no weight does not influence which recording is proposed."""
     gap = disputed(DRY, DRAG, STIFF)
     hopeless = replace(gap.contenders[2], weight=1e-12)
     two = with_proposal(replace(gap, contenders=(*gap.contenders[:2], hopeless)), limits=LIMITS)

@@ -29,7 +29,7 @@ def cartlab(*arguments: object, cwd: Path | None = None) -> Done:
 
 
 def cartlab_here(*arguments: object, cwd: Path | None = None) -> Done:
-    """Run a command in this process, which saves the start of another; exceptions are raised."""
+    """Run a command in this process, which is faster than starting one; exceptions are raised."""
     words = ["cartlab", *map(str, arguments)]
     out, err = StringIO(), StringIO()
     with (

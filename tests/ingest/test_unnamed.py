@@ -117,7 +117,7 @@ def test_a_velocity_gets_no_role():
 
 
 def test_a_reference_is_distinguished_from_the_input():
-    """Reference and controller output jump together, and each gets its own role."""
+    """Although reference and controller output jump together, each gets its right role."""
     effort = STEP - 0.2 * ANSWER
     got = find_roles(bare(T, STEP, ANSWER, effort))
     assert got == Roles(columns={"time": 1, "input": 4, "reference": 2, "x1": 3})

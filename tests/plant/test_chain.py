@@ -72,7 +72,7 @@ def test_chain_to_parameters_and_back(chain):
 
 @given(chains())
 def test_static_gains_and_polynomials_give_the_chain(chain):
-    """Static gains and the chain's polynomials give back all numbers of up to four carts."""
+    """Masses, dampings and springs of up to four carts follow from static gains and polynomials."""
     got = recover_chain(chain.static_gains(), chain.tails()[:-1])
 
     assert_same_chain(got, chain, rtol=1e-9)

@@ -185,7 +185,7 @@ def test_energy_never_grows_without_input(key):
 
 
 def test_delay_shifts_the_response():
-    """A delay of n samples makes the readings n samples later; a negative delay, earlier."""
+    """A delay of n samples shifts the readings n samples later, or earlier if it is negative."""
     chain = PRESETS["throne-2dof"]
     t = sample_times(500, 0.005)
     u = np.where(t > 0.1, 0.03, 0.0)

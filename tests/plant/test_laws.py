@@ -45,7 +45,7 @@ def coordinates_of(effect: Effect) -> np.ndarray:
 
 
 def terms_of(kind: int, p: np.ndarray, x: float, v: float, u: float, on: float) -> np.ndarray:
-    """Return the law of a kind and its derivatives by x, v, u and each coordinate."""
+    """Return a law's force and its derivatives with respect to x, v, u and each coordinate."""
     out = np.zeros(terms.TERMS)
     terms.terms(kind, p, 0, x, v, 0.1, u, on, out)
     return out
@@ -73,7 +73,7 @@ def test_derivatives_are_those_of_the_law(effect, state):
 
 @pytest.mark.parametrize("key", ["end_stop", "slack_spring"])
 def test_contacts_give_the_force_of_the_law(key):
-    """The stiffness, damping and start of a contact give the force of its law."""
+    """A contact's stiffness, damping and place in the simulator give the force of its law."""
     effect = find_effect(key)
     law, kind = effect.law, CATALOGUE.index(effect)
     assert isinstance(law, ContactLaw)

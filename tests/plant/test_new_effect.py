@@ -71,7 +71,7 @@ def test_columns_force_and_derivatives_are_generated(made):
 
 
 def test_the_fit_gets_the_new_law(made):
-    """The fit gets the new law with its derivatives, including that by the coefficient."""
+    """The fit gets the new law and its derivatives, also with respect to its coefficient."""
     source = made["simulator/terms.py"]
     kinds = kinds_of(source, "Kind")
     terms = function_of("terms", source, Kind=type("Kind", (), kinds))

@@ -58,7 +58,7 @@ def test_the_grading_pages_are_accessible(show, tmp_path):
 
 
 def test_a_class_is_graded_by_keys(show, tmp_path):
-    """Keys change points for one team or all with a flag, and each change can be undone."""
+    """Keys change points for one team, or for all teams with a flag; each change can be undone."""
     grades = write_class(tmp_path / "grades")
     with DeskServer(folder=grades) as server:
         window = show(server.url, size=LAPTOP)

@@ -1,4 +1,4 @@
-"""The website loads nothing from other hosts, and its catalogue of effects is the program's."""
+"""The website loads nothing from other hosts, and shows the program's own catalogue of effects."""
 
 import pytest
 

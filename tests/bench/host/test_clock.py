@@ -112,7 +112,7 @@ def leapt(lines: list[Reading]) -> Iterator[Reading]:
     ],
 )
 def test_a_clock_that_stops_or_leaps_ends_the_run(tmp_path, lines, said, kept):
-    """A run whose clock stands still or leaps is partial; the lines before that are saved."""
+    """A run whose clock stops or leaps is ended as partial; the lines received so far are saved."""
     work = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)])
     tracemalloc.start()
     outcomes = acquire(work, port=OddBench(lines).address, observers=[Notes()], only=["dwell"])
@@ -158,7 +158,7 @@ def test_any_number_of_lost_lines_is_counted(tmp_path, share):
 
 @pytest.mark.parametrize("lost", [(), (500, 1700, 1701)])
 def test_a_clock_slower_than_stated_loses_nothing(tmp_path, lost):
-    """A line every 1.3 ms instead of 1.0 is noted once, and only really lost lines are counted."""
+    """A period of 1.3 ms instead of 1 ms is noted once, and only missing lines count as lost."""
 
     def slow(lines: list[Reading]) -> Iterator[Reading]:
         for k in range(round(len(lines) / 1.3)):

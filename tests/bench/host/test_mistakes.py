@@ -145,7 +145,7 @@ def test_a_new_submission_says_what_the_bench_does_not_know(tmp_path):
 
 
 def test_no_report_is_offered_if_nothing_was_recorded(tmp_path, fast):
-    """If no recording was possible, the message names the limit and offers no report."""
+    """If every run passes a limit, the message says what to change and offers no report."""
     near = PlanLimits(input=0.5, travel=0.05)
     work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=near)
     with host(work, fast.address, "--only", "dwell", "--yes") as process:
@@ -157,7 +157,7 @@ def test_no_report_is_offered_if_nothing_was_recorded(tmp_path, fast):
 
 
 def test_files_are_imported_only_into_a_submission(tmp_path):
-    """If the folder for imported files does not exist, the message says how to make it."""
+    """If the folder to import into does not exist, the message says how to make a submission."""
     where = str(tmp_path / "new")
     done = CliRunner().invoke(app, ["acquire", where, "--import", str(tmp_path), "--once"])
     assert isinstance(done.exception, ConfigError)

@@ -138,7 +138,7 @@ def test_a_motor_with_another_duty_than_ordered_ends_the_session(tmp_path, wrong
 
 
 def test_a_cart_past_its_limit_at_rest_ends_the_session(tmp_path):
-    """Once the carts are zeroed, their travel is watched in every rest."""
+    """Once the carts are zeroed, a cart beyond its travel limit ends the session, even at rest."""
     work = write_work(tmp_path, plan())
     with RunawayBench(resting_again, out=FAR) as bench:
         (partial,), _ = session(work, bench)
@@ -200,7 +200,7 @@ def test_an_ignored_stop_is_sent_again(tmp_path):
 
 @pytest.mark.parametrize("period", [1, 2, 5, 10])
 def test_a_bench_of_few_lines_is_stopped_after_two(period):
-    """A bench that sends few lines is also stopped after two faulty lines."""
+    """However seldom a bench sends lines, it is stopped after at most two faulty ones."""
     order = make_order(
         plan()[0],
         limits=PlanLimits(input=0.5, travel=2.5),

@@ -382,7 +382,7 @@ DESCRIPTION = (
     ],
 )
 def test_a_description_with_a_useless_scale_is_refused(stated, wrong):
-    """A description whose counts are worth zero or infinity is refused: no limit would hold."""
+    """A description with an impossible scale, period or number is refused: no limit would hold."""
     assert parse_description(DESCRIPTION.encode()).carts == 2
     with pytest.raises(DataError, match=f"describes itself as .*{wrong}.* is wrong"):
         parse_description(DESCRIPTION.replace(stated, wrong).encode())

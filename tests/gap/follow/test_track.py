@@ -39,7 +39,7 @@ JUMPS = (*DRY, Kind.BACKLASH)
 @pytest.mark.parametrize("gain", [0.5, 0.1, 0.0])
 @pytest.mark.parametrize("kind", SIZES)
 def test_derivatives_agree_with_differences_of_the_errors(kind, gain):
-    """Derivatives by all parameters, and by a run's start, agree with differences."""
+    """Derivatives with respect to parameters and a run's start agree with finite differences."""
     case = make_case(seed=44, n=2, rate=113.1)
     chain = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
     track = make_track(make_run(case.records[0], n=2))

@@ -31,9 +31,9 @@ def make_core(**changes) -> ReferenceCore:
 
 
 def run(core: ReferenceCore, commands: bytes, y, *, ticks: int, first: int = 0) -> list[Reading]:
-    """Send something to the core, then tick it; return its lines.
+    """Send commands to the core, advance it by some ticks, and return its lines.
 
-    `y` gives the counts at each tick.
+    `y` gives the encoder counts at each tick.
     """
     core.receive(commands)
     for k in range(first, first + ticks):
