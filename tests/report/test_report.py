@@ -30,7 +30,7 @@ from pipeline.set_up import Bench, Units
 from pipeline.words.spans import plain, spans
 from tests.helpers.analysis_factory import make_analysis
 
-VOID = {"meta", "link", "br", "img", "hr", "input", "wbr"}
+VOID = {"meta", "link", "br", "img", "hr", "input"}
 
 
 class Page(HTMLParser):
