@@ -23,7 +23,7 @@ from tests.helpers.ucsd import write_two_cart_submission
 def fitted(
     chain: Chain, *, relative: float = 1e-3, converged: bool = True, **std: float
 ) -> ChainFit:
-    """Return a fit of a chain with errors of the given size."""
+    """Return a fit of a chain with the given standard errors, relative or by name."""
     values = {f"m_{i}": v for i, v in enumerate(chain.m, 1)}
     values |= {f"c_{i}": v for i, v in enumerate(chain.c, 1)}
     values |= {f"k_{i}": v for i, v in enumerate(chain.k, 1) if v or f"k_{i}" in std}
@@ -83,7 +83,7 @@ def test_a_part_that_may_not_exist_fails_a_check(name, value, std, found):
 def test_a_spring_declared_as_missing_is_not_asked_about(preset):
     """If a spring is declared as missing, no check asks about it.
 
-    The paper's plants have no spring wall-1.
+    The paper's plants have no spring between the wall and cart 1.
     """
     chain = PRESETS[preset]
     springs = tuple(bool(k > 0) for k in chain.k)

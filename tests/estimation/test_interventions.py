@@ -121,7 +121,7 @@ def test_a_record_is_cut_at_its_touches():
 
 
 def test_closed_loops_and_unmeasured_carts_have_no_touches():
-    """No touch is reported for closed-loop runs, or beside a cart that was not measured."""
+    """No touch is reported for closed-loop runs, or if a neighbouring cart was not measured."""
     case = make_case(seed=62, n=2, rate=250.0, handled=True)
     assert find_interventions(case.records) != ()
 

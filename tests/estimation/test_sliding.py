@@ -10,7 +10,7 @@ from pipeline.estimation.sliding import most_around
 @pytest.mark.parametrize("width", [1, 3, 7, 61])
 @pytest.mark.parametrize("n", [1, 2, 30, 500])
 def test_the_sliding_maximum_is_that_of_scipy(n, width):
-    """The sliding maximum equals that of scipy, even near the ends or with a long window."""
+    """The sliding maximum equals scipy's, even near the ends or with a long window."""
     values = np.random.default_rng(n + width).standard_normal(n)
 
     assert np.array_equal(most_around(values, width), maximum_filter1d(values, width))

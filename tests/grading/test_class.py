@@ -1,4 +1,4 @@
-"""Teams and classes that were once judged wrongly are now judged correctly."""
+"""Teams and classes that are easily misjudged are judged correctly."""
 
 import tempfile
 from dataclasses import replace

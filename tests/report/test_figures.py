@@ -187,7 +187,7 @@ def test_a_dwell_shades_the_transient():
 
 @given(st.integers(10, 3000), st.integers(0, 2**32 - 1))
 def test_thinning_keeps_the_envelope(n, seed):
-    """Thinning keeps the largest and smallest values and ascending times, and few points remain."""
+    """Thinning leaves few points, in order of time, and keeps the largest and smallest values."""
     rng = np.random.default_rng(seed)
     t, y = np.sort(rng.uniform(0, 1, n)), rng.normal(size=n)
     thin_t, thin_y = thin(t, y)

@@ -1,4 +1,4 @@
-"""The gap report, its file, and its quote in the main report are right for all verdicts."""
+"""The gap report, its file and its summary in the main report are right for all verdicts."""
 
 import json
 import re

@@ -115,7 +115,7 @@ def test_control_characters_are_replaced():
 
 @given(st.text(alphabet=st.sampled_from("ab<>&\"'`*_[]()!#-|\n \\$:/h1.{}%~+="), max_size=80))
 def test_any_text_gives_a_page_without_foreign_tags(markdown):
-    """Whatever is written, the page has only the tags of its template."""
+    """Whatever the notes contain, the page has only the tags of its template."""
     html = page(note_blocks(markdown)).split("<main>")[1].split("<script>")[0]
     names = set(re.findall(r"<\s*/?\s*([a-zA-Z][\w-]*)", html))
     ours = "section h2 h3 h4 h5 h6 p ul ol li em strong code pre blockquote a div table thead tbody"

@@ -1,4 +1,4 @@
-"""The page of plots contains all that was measured and simulated, in few bytes."""
+"""The page of plots contains all that was measured and simulated, and stays small."""
 
 import json
 import re

@@ -157,7 +157,7 @@ def test_the_way_back_to_masses_and_springs_is_true(truth):
 
 @pytest.mark.parametrize("n", [2, 3, 4])
 def test_coefficients_are_those_of_the_product_of_factors(n):
-    """The printed coefficients are those of the product of the quadratic factors."""
+    """The printed coefficients are correct: the quadratic factors, multiplied out, give them."""
     modes = {"d": "abcd"[:n]} | ({"n": "xy"} if n == 3 else {})
     table = {
         f"{greek}_{mode}": sympy.Symbol(f"{greek}_{mode}")

@@ -67,7 +67,7 @@ def test_a_late_channel_is_reported_with_its_delay(tmp_path):
 @pytest.mark.parametrize("kinds", [("step",), ("sweep",), ("decay",)])
 @pytest.mark.parametrize("cart", [1, 2, 3])
 def test_a_late_channel_is_found_without_dwells(kinds, cart):
-    """From steps, a sweep or a decay, a late channel is found with its delay to half a sample."""
+    """Steps, a sweep or a decay show a late channel and its delay to within half a sample."""
     late = find_late_channels(motions(kinds, late=cart), carts=3)
     told = {one.cart: one.delay / SAMPLE for one in late}
     assert told == pytest.approx(
@@ -90,7 +90,7 @@ def test_a_channel_late_only_in_the_sweep_is_reported_only_for_it():
 
 @pytest.mark.parametrize(("late", "told"), [(0, []), (LATE, [2])])
 def test_the_channels_of_a_real_bench_are_not_late(late, told, real_data, tmp_path):
-    """Real steps with much dry friction pass, unless cart 2 is made late."""
+    """Real steps with much dry friction pass, unless the channel of cart 2 is delayed."""
     folder = write_two_cart_submission(tmp_path / "real", real_data, steps=(1, 2, 3, 4, 5))
     records = [
         replace(record, y=np.array([record.y[0], delayed(record.y[1], late)]))

@@ -169,7 +169,7 @@ def test_a_logged_input_of_another_sign_or_scale_is_corrected(name, cart, factor
 
 
 def test_a_gain_of_the_bench_20_percent_off_is_not_corrected():
-    """If the bench's gain is 20 % above that of the model, this is reported but not corrected."""
+    """If the bench's gain is 20 % above the model's gain, this is reported but not corrected."""
     y = encoder(1.2 * simulate_linear(TWO, CLOCK, 0.06 * STEPS))
 
     checks = check_hardware(record(y, u=0.06 * STEPS, kind="step"), TWO)

@@ -131,7 +131,7 @@ def test_placed_gains_agree_with_control():
 
 @pytest.mark.parametrize("name", ["throne-2dof", "throne-3dof", "four"])
 def test_level_error_is_the_effect_of_wrong_springs(name):
-    """The stated error of the level is the sum of the errors caused by 3 % in each spring."""
+    """The stated error of the level adds up what a 3 % error of each spring causes."""
     chain, cart = PLANTS[name], 2
     gains = design(chain, cart=cart, method="poles").gains
 
@@ -309,7 +309,7 @@ def test_an_unreachable_settling_time_gives_the_best_design(method):
 
 
 def test_gains_that_cancel_a_soft_plant_give_a_warning():
-    """If requested poles are far from those of a soft plant, a warning gives the level's error.
+    """If requested poles are far from the poles of a soft plant, a warning gives the level's error.
 
     The level is then sensitive to errors in the springs.
     """

@@ -224,7 +224,7 @@ def test_a_drift_does_not_change_the_gain():
 
 
 def sticking(t, *, rests, levels=(0.0, 0.9, 0.0)):
-    """Return exponential moves between levels, each short of its level by the friction band."""
+    """Return exponential moves that end off their levels by the values of `rests`."""
     y = np.full_like(t, rests[0])
     for edge, level, miss in zip((1.0, 6.0), levels[1:], rests[1:], strict=True):
         after = t >= edge

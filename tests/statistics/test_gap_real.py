@@ -1,4 +1,4 @@
-"""The gap workflow is given real recordings and what was published about the benches."""
+"""The gap workflow on real recordings agrees with what was published about the benches."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""In recordings of a real rig, exactly those hands are found that a person sees in a plot."""
+"""In recordings of a real rig, exactly those touches are found that a plot shows."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def test_hands_are_found_where_a_person_sees_them(rig):
 
 
 def test_three_plucks_give_three_decays(rig):
-    """Three plucks in one recording count as three decays, with equal frequencies to 1 %."""
+    """Three plucks in one recording are three decays, whose frequencies agree within 1 %."""
     decays = [d for d in rig.log_decrements if d.experiment == "14-Feb-2025_09_22_43"]
 
     assert [decay.number for decay in decays] == [1, 2, 3]

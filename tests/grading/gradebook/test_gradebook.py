@@ -118,7 +118,7 @@ def test_the_newest_of_a_key_counts(open_book):
 
 
 def test_fingerprints_are_those_of_the_newest_outcomes(open_book):
-    """Each submission has one fingerprint, which is that of its newest outcome.
+    """Only the newest outcome of each submission gives its fingerprints.
 
     Fingerprints of other assignments are included.
     """
@@ -264,7 +264,7 @@ def test_the_same_submission_has_a_grade_in_each_assignment(open_book):
 
 
 def test_an_override_never_exceeds_the_points_of_the_rubric(open_book):
-    """If a changed rubric gives fewer points for a criterion, an override is lowered to them."""
+    """If a changed rubric has fewer points than an override, the override is lowered to them."""
     book = open_book()
     outcome = make_outcome(make_grade("team-1", share=0.0))
     finish(book, outcome)

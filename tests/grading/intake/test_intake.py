@@ -185,7 +185,7 @@ def test_folders_named_like_canvas_files_are_separate_submissions(tmp_path):
 
 
 def test_a_folder_keeps_its_name_whatever_platform_it_looks_like(tmp_path):
-    """A team's folder keeps its name, even if the name looks like that of a file from Canvas."""
+    """A team's folder keeps its name, even if it looks like the name of a file from Canvas."""
     names = ("throne_2026_03_alpha", "throne_2026_03_beta", "sec_01_02_x", "ME405_03_07_team")
     tree(tmp_path / "c", {f"{name}/submission.toml": TOML for name in names})
     found = hand_ins(tmp_path, tmp_path / "c")
@@ -361,7 +361,7 @@ def test_folders_of_results_are_not_graded(tmp_path):
 def test_an_archive_of_another_format_gets_a_row(tmp_path, name):
     """An archive in a format other than zip gets a row that says so.
 
-    Inside a team's own folder such an archive is taken for a backup and ignored.
+    Inside a team's folder, the archive is taken for a backup and ignored.
     """
     tree(tmp_path / "c", {"a/submission.toml": TOML, "b/lab/submission.toml": TOML, name: "packed"})
     tree(tmp_path / "c" / "b", {name: "packed"})

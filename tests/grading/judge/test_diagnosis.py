@@ -308,7 +308,7 @@ def test_a_number_that_no_mistake_explains_is_only_off(carts):
 
 
 def test_a_frequency_out_of_order_gets_one_flag():
-    """A wrong frequency of a null gets one flag, even if it also breaks the order of the nulls.
+    """A wrong ω_2 gets one flag, even if it also breaks the order of the frequencies.
 
     The flag's message gives the frequency computed from the recordings.
     """
@@ -321,7 +321,7 @@ def test_a_frequency_out_of_order_gets_one_flag():
 
 
 def test_impossible_numbers_are_flagged():
-    """A negative damping is impossible, and so is a far cart that moves more than a near one."""
+    """A negative damping is flagged as impossible, and so is a K_2 larger than K_1."""
     one = student(2)
     flag = only_flag(scaled(one, "final", ["zeta_a"], -1.0))
     assert (flag.code, flag.parameters) == ("physically_impossible", ("zeta_a",))

@@ -1,4 +1,4 @@
-"""Stored findings under another rubric give the same points as a new grading."""
+"""Points from stored findings under another rubric equal those of a new grading."""
 
 from dataclasses import replace
 from decimal import Decimal
@@ -74,7 +74,7 @@ def _changes(draw, rubric: Rubric) -> Rubric:
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
 def test_reweighed_points_are_those_of_grading_again(carts, data):
-    """Under any changed rubric, stored findings give the same points as a new grading."""
+    """Under any changed rubric, points from stored findings equal those of a new grading."""
     team, before = _erring(carts), _graded(carts)
     now = data.draw(_changes(team.rubric))
     kept = read_findings(findings_text(before.verdicts))

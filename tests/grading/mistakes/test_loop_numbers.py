@@ -28,7 +28,7 @@ def test_a_loops_step_figures_are_those_of_the_textbook(sample_time):
 
 
 def test_a_loop_without_a_static_gain_has_no_step_figures():
-    """If carts are so stiff that the loop has no static gain, no step figures are computed."""
+    """If extreme carts give the loop no finite static gain, no step figures are computed."""
     K, omega, zeta = 28.9, 1e20, 2.0
     stiff = Chain(
         m=np.array([1 / (K * omega**2)]),

@@ -85,7 +85,7 @@ def tree(folder: Path) -> dict[str, bytes]:
 
 
 def test_every_submission_has_its_row(graded):
-    """Every submission has a row in `grades.csv`; that of a broken submission gives the reason.
+    """Every submission has a row in `grades.csv`; for a broken submission it gives the reason.
 
     The row has points by criterion, lateness and points given by hand.
     """
