@@ -45,7 +45,7 @@ def demo(
 
 @contextmanager
 def search_beside(out: Path) -> Iterator[subprocess.Popen[str]]:
-    """Search for a hidden effect in a second process; this takes as long as all the rest."""
+    """Search for a hidden effect in a second process; this halves the time of the demo."""
     command = [sys.executable, "-P", "-m", "pipeline.cli.hidden_bench", str(out)]
     pipe, none = subprocess.PIPE, subprocess.DEVNULL
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=none, text=True) as beside:

@@ -141,7 +141,7 @@ def _packages() -> tuple[list[Package], dict[str, list[Package]]]:
 
 
 def _find_package(name: str, wanted: str) -> Package:
-    """Return a package with its problem, if it is missing, too old, or does not load."""
+    """Return a package, and its problem if it is missing, too old, or does not load."""
     from packaging.specifiers import SpecifierSet
 
     found = problem = ""

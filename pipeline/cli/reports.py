@@ -218,7 +218,7 @@ def check(
 ) -> None:
     """List your numbers that disagree with your recordings; if asked again, say where to look.
 
-    It never shows the right value. DIR/checks.jsonl, part of your submission, counts the checks.
+    The right value is never shown. DIR/checks.jsonl, part of your submission, counts the checks.
     """
     from pipeline.grading.rubric_file import load_rubric
     from pipeline.grading.self_check.check import check_numbers

@@ -204,7 +204,7 @@ class Ask:
 
         Parameters
         ----------
-        arguments : further arguments of the task.
+        arguments : arguments of the task, apart from the folder.
         """
         folder = self.folder()
         self.desk.jobs.start(task, title=title, place=folder, folder=str(folder), **arguments)

@@ -135,8 +135,8 @@ class Benches:
 
     Attributes
     ----------
-    planned : for each folder, the ids of the plan before recordings were last added; None if there
-        was no plan.
+    planned : for each folder, the ids of the recordings that the plan had before the latest
+        addition; None if there was no plan.
     """
 
     def __init__(self) -> None:

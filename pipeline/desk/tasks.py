@@ -306,7 +306,7 @@ def regrade_class(
 
 
 def preview_rubric(folder: str, text: str, *, progress: Progress) -> dict[str, Any]:
-    """Return the points of a graded class under another rubric; see `RubricPreview`."""
+    """Return the points of a graded class under a different rubric; see `RubricPreview`."""
     from pipeline.grading.gradebook.book import Gradebook
     from pipeline.grading.publish.rubric_preview import preview_rubric as preview
     from pipeline.grading.rubric_file import parse_rubric

@@ -148,7 +148,7 @@ def plan_dwells(session: SimulatedSession) -> list[BenchRun]:
 
 
 def plan_sweep(session: SimulatedSession) -> BenchRun:
-    """Return a sweep from below the first resonance to above the last, with its ringing."""
+    """Return a sweep from below the first resonance to above the last, and 2 s of ringing."""
     chain = session.chain
     omega = quadratic_factors(chain.poles)[0]
     low, high = 0.4 * omega[0], 1.4 * omega[-1]

@@ -227,7 +227,7 @@ class _Acquisition:
         return self._buttons.pressed or "repeat"
 
     def _keep(self, run: "_Run") -> RunOutcome:
-        """Enter a run that ended early as an experiment, with a note on why it ended."""
+        """Enter a run that ended early as an experiment, and note why it ended."""
         remark = f"partial, kept by hand: {run.outcome.partial}"
         outcome = replace(run.outcome, partial="", remarks=(*run.outcome.remarks, remark))
         with signals_held():

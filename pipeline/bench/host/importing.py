@@ -124,7 +124,7 @@ class Importer:
         return sorted(ready, key=lambda path: (self._last_state[path][1], path.name))
 
     def _is_other(self, path: Path) -> bool:
-        """Return whether a path cannot be a data file; if so, report it."""
+        """Return True, and report it, if a path cannot be a data file."""
         if path.is_dir():
             why = "it is a folder"
         elif path.suffix.casefold() not in ENDINGS:

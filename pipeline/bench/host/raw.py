@@ -163,7 +163,7 @@ def free_raw_path(folder: Path, recording: Recording) -> Path:
 def known_commands(folder: Path) -> frozenset[str]:
     """Return the extra commands of the bench that made the latest recording.
 
-    Without a recording, assume only the chirp.
+    Before the first recording, assume that the bench knows only the chirp.
     """
     for path in sorted((folder / FOLDER).glob("*.raw"), key=lambda p: p.stat().st_mtime)[::-1]:
         try:

@@ -143,7 +143,7 @@ class RestWatch(LineWatch):
         self._readings: list[Reading] = []
 
     def check(self, batch: Sequence[Reading]) -> str:
-        """Return why the rest must stop, or ""."""
+        """Return why the wait must stop, or ""."""
         self._readings += [reading for reading in batch if reading.ms >= self._since]
         return super().check(batch)
 

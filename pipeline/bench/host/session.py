@@ -65,7 +65,7 @@ class Session:
 
     Attributes
     ----------
-    wish : the button that ended the run or the rest before it; None if no button did.
+    wish : the button that ended the run or the wait before it; None if no button did.
     """
 
     def __init__(

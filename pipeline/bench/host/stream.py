@@ -272,7 +272,7 @@ class _EncoderWatch:
 
     @property
     def stuck(self) -> int:
-        """The number of encoders that stopped while driven, or never moved although they should."""
+        """The number of encoders that stopped while driven, or never moved but should have."""
         moved = {encoder: seen.width for encoder, seen in self._overall.items()}
         pushed = self._driven.width >= _DRIVEN
         never = {
@@ -329,7 +329,7 @@ class _Range:
 
     @property
     def width(self) -> int:
-        """The largest minus the smallest; 0 without integers."""
+        """The largest integer minus the smallest; 0 before the first integer."""
         return 0 if self._low is None else self._high - self._low
 
     def widen(self, values: Sequence[int]) -> None:

@@ -271,7 +271,7 @@ class LiveState(ShownSession):
         return heeded
 
     def heed(self, wish: str, number: int) -> bool:
-        """Accept a pressed button; return whether it counts. See `ShownSession.heed`."""
+        """Handle a pressed button; return whether it is accepted. See `ShownSession.heed`."""
         if wish == "done":
             return self.answer(number)
         return wish in WISHES and self.press(wish, turn=number)

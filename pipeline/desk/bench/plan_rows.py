@@ -33,7 +33,8 @@ def read_plan(
     Parameters
     ----------
     session : the last session in the folder; it knows why a run ended early.
-    before : ids of the plan before recordings were last added; None if no recording is new.
+    before : ids of the recordings that the plan had before the latest addition; None if no
+        recording is new.
     """
     found = {"sound": False, "rows": [], "left": "", "wrong": "", "units": None, "parameters": []}
     found |= {"carts": 0, "recorded": 0}
@@ -66,7 +67,7 @@ def _describe(
     why: Mapping[str, str],
     before: Collection[str] | None,
 ) -> dict[str, Any]:
-    """Return a row for each recording, and the total time of those still to record."""
+    """Return a row for each recording, and the total time of the recordings still to make."""
     done = {experiment.id for experiment in submission.experiments}
     left = [recording for recording in plan.recordings if recording.id not in done]
     following = left[0].id if left else ""

@@ -117,7 +117,7 @@ class Group:
 
     @property
     def open(self) -> bool:
-        """Whether the group is shown unfolded, because something in it needs a person."""
+        """Whether the group is shown open, because something is missing or wrong in it."""
         return bool(self.missing) or any(field.wrong for field in self.fields)
 
 
@@ -159,8 +159,8 @@ def fill_form(document: Mapping[str, Any]) -> list[Group]:
 def fill_experiment(document: Mapping[str, Any], index: int) -> tuple[Field, ...]:
     """Return the fields of one experiment, filled in from its table.
 
-    Only the fields for the experiment's kind and controller are returned, and any others that the
-    table contains.
+    These are the fields for the experiment's kind and controller, and any further fields in the
+    table.
     """
     table = f"experiments.{index}"
     kind = _find(document, f"{table}.kind")

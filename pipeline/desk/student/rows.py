@@ -106,7 +106,7 @@ class FileGroup:
 
     @property
     def to_look_at(self) -> int:
-        """How many rows need a person."""
+        """The number of rows that a person must look at."""
         return sum(row.needs_a_person for row in self.rows)
 
     @property

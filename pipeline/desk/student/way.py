@@ -14,7 +14,7 @@ class Facts:
 
     Attributes
     ----------
-    to_look_at : number of files that need a person.
+    to_look_at : number of files that a person must look at.
     missing : groups of the set-up in which something is missing.
     sound : whether `submission.toml` exists and is valid.
     report : state of the report: "none", "current", "answered" or "older"; see `find_state`.
@@ -132,8 +132,8 @@ def find_steps(facts: Facts) -> tuple[Step, ...]:
 def next_step(steps: Sequence[Step]) -> Step:
     """Return the first step that is not done, or the last step.
 
-    Files that need a person are skipped once there is a report, or a check in which all numbers
-    agree.
+    Files that a person must look at are skipped once there is a report, or a check in which all
+    numbers agree.
     """
     has_result = any(s.state == "done" for s in steps if s.key in ("report", "check"))
     open_ = [s for s in steps if s.state != "done" and not (has_result and s.key == "files")]

@@ -1,8 +1,8 @@
 """Deliberate faults on a serial line, inserted into the lines that a bench sends.
 
 A fault is written `KIND=RATE`, `KIND@SECONDS` or, for an encoder, `stuck=ENCODER@SECONDS`. The
-first form affects a random share of the lines. The other forms occur once, after so many seconds of
-streaming in all runs together.
+first form affects a random share of the lines. The other forms occur once, after the bench
+has sent lines for so many seconds, counted over all runs.
 """
 
 import re

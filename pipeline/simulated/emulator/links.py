@@ -57,8 +57,8 @@ def open_link(port: str, *, remote: bool = False) -> Link:
 
     Raises
     ------
-    ConfigError : the port has another form or is taken, or other computers could reach it although
-        `remote` is False.
+    ConfigError : the port is written differently or is taken, or other computers could reach it
+        although `remote` is False.
     """
     if port == "pty":
         return _open_pty()

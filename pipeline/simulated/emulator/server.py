@@ -171,7 +171,7 @@ class Server:
                 self._overhear(command)
 
     def _overhear(self, command: Command) -> None:
-        """Note what the hands and the log need from the controller's commands."""
+        """Note a command to the controller that concerns the hands or the log."""
         match command:
             case Start():
                 self._end_run("restarted")
