@@ -85,7 +85,7 @@ def _describe_rows(
 
 
 def _find_typed(number: str, submission: Submission) -> str:
-    """Return a number as typed; "" if it is not an entry of a table, such as a matrix element."""
+    """Return an initial or final estimate as typed; "" for any other number."""
     table, _, name = number.partition(".")
     typed = submission.typed.get(table, {}).get(name)
     return "" if typed is None else str(typed)
