@@ -44,7 +44,7 @@ def fitted(
 
 
 def vanishing(checks: tuple[Check, ...]) -> dict[str, str]:
-    """Return the message for each parameter that may not exist, by parameter name."""
+    """Return, by parameter name, the message about each part that may not exist."""
     return {check.about: check.message for check in checks if check.kind == "vanishing"}
 
 

@@ -130,7 +130,7 @@ def test_an_unstable_loop_has_no_margins():
 def test_undamped_carts_have_no_margins():
     """If a fit puts a damping at zero, no margins are given.
 
-    Otherwise, the largest stable gain would say nothing about the bench.
+    The largest stable gain of the undamped model would say nothing about the bench.
     """
     design, _ = designed(UNDAMPED, "lqr")
     with pytest.raises(DataError, match="a mode of the carts has no damping"):

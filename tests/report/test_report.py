@@ -671,7 +671,7 @@ def test_estimates_too_uncertain_to_compare_are_both_given():
 def test_steps_that_contradict_the_fit_ask_about_the_springs():
     """If steps contradict a fit with few springs, the summary says to check the springs.
 
-    Dry friction is mentioned separately.
+    It does not say so if all springs are declared or if the fit is good.
     """
     analysis = make_analysis(2)
     assert analysis.fit is not None

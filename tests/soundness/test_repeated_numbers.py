@@ -76,7 +76,7 @@ def test_without_a_fit_the_majority_of_repeats_decides():
 
 
 def test_a_run_with_one_odd_number_is_named():
-    """A run with an odd K_1 is named, but the check of K_2, which agrees, passes."""
+    """A run in which only K_1 is odd is named, and the check of K_2 still passes."""
     steps = [step(run, gain, cart=cart) for run in "abc" for cart, gain in ((1, 2.0), (2, 1.5))]
     steps += [step("d", 2.3, cart=1), step("d", 1.5, cart=2)]
     found = compared(steps=steps)
@@ -89,7 +89,7 @@ def test_a_run_with_one_odd_number_is_named():
 
 
 def test_a_run_with_a_large_error_is_not_odd():
-    """A run with a gain off by a quarter is odd, unless its error is large."""
+    """A run with a gain off by a quarter is odd, unless the gain's standard error is large."""
     steps = [step("a", 2.0), step("b", 2.6), step("c", 2.05), step("vague", 2.5, std=0.2)]
     assert list(compared(steps=steps, K_1=2.0).odd) == ["b"]
 

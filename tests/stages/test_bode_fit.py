@@ -193,7 +193,7 @@ BESIDE = np.sqrt(300.0) * np.array([0.4, 0.6, 0.8, 1.25, 1.5, 2.0])
 def test_a_damping_at_its_bound_has_no_standard_error():
     """If the fit holds a damping at zero, a note says so, and the damping has no standard error.
 
-    Gain and frequency still have their standard errors.
+    Gain and frequency are still found.
     """
     got = fit_bode(exact(SHARP, BESIDE), bench=Bench(springs=(True, True)))
 

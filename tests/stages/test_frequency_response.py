@@ -124,7 +124,7 @@ def test_repeats_around_half_a_turn_do_not_cancel():
 def test_an_unsettled_dwell_counts_little():
     """A dwell that did not settle gets an error of 5 %.
 
-    If there is also a settled dwell at the frequency, the unsettled one hardly counts.
+    Next to a settled dwell at the same frequency, it hardly counts.
     """
     (alone,) = collect_dwells([dwell(omega=5.0, gain=2.0, settled=False)])
     (both,) = collect_dwells(

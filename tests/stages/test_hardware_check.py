@@ -279,7 +279,7 @@ def test_noisy_velocities_do_not_change_the_scale():
     ],
 )
 def test_fast_and_slow_controllers_are_simulated_to_the_noise(law, sample_time):
-    """For slow and fast controllers, with or without a model, the simulations err only by noise."""
+    """For slow and fast controllers, with or without a model, simulation errors are only noise."""
     y, u = bench(TWO, law, sample_time=sample_time)
     controller: submission.Controller
     if isinstance(law, Pid):

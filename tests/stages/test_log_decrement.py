@@ -287,7 +287,7 @@ def test_damping_that_grows_with_amplitude_is_not_dry_friction():
 
 
 def flags(seeds, *, d):
-    """Return for each random decay with friction band d whether dry friction is found."""
+    """Return, for each random decay with friction band d, whether dry friction is found."""
     found = []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)

@@ -276,7 +276,7 @@ HOSTILE = {
 def test_hostile_submissions_get_rows(tmp_path):
     """Every hostile submission gets a row with a printable reason.
 
-    No file is written outside the scratch folder.
+    No reason quotes a file from outside the submission.
     """
     for name, text in HOSTILE.items():
         folder = tmp_path / "class" / name.replace("/", "_")

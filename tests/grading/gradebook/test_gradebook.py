@@ -348,7 +348,7 @@ def test_the_history_says_who_did_what_when_and_why(open_book):
 
 
 def test_the_history_gives_the_new_name_of_a_team(open_book):
-    """If a team's folder has a new name in the next run, the history of both names says so."""
+    """If a team's folder has a new name in the next run, the history says so under both names."""
     book = open_book()
     finish(
         book, make_outcome(make_grade("team-1", authors=("ann",))), make_outcome(make_grade("b"))

@@ -94,7 +94,7 @@ def test_zip_bombs_are_stopped(tmp_path, members, reason):
 
 
 def test_the_64_bit_length_of_the_contents_is_limited_too(tmp_path):
-    """A table of contents is refused as too long even if its length is in the 64-bit record."""
+    """A table of contents that is too long is refused even if only the 64-bit record says so."""
     archive = zipped(tmp_path / "a.zip", {"y" * 4_000 + str(i): "" for i in range(19)})
     with pytest.raises(SubmissionError, match="table of contents"):
         unpack(archive, tmp_path / "plain", limits=BRIEF)

@@ -191,7 +191,7 @@ def test_a_decrement_with_log10_is_flagged(carts):
 @pytest.mark.parametrize("carts", [1, 2, 3])
 @pytest.mark.parametrize("table", ["initial", "final"])
 def test_gains_from_peak_to_peak_and_in_counts_are_flagged(carts, table):
-    """Gains that are twice too large are flagged as read from peak to peak.
+    """Gains that are twice the true gains are flagged as read from peak to peak.
 
     Gains divided by the encoder step are flagged as counts; a gain can have both flags.
     """

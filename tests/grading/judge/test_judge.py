@@ -218,7 +218,7 @@ def test_a_cut_file_costs_its_own_run_only(folder, tmp_path):
 
 
 def test_a_missing_file_costs_its_run_and_its_criteria(folder, honest, tmp_path):
-    """If a file is missing, its run is flagged; a criterion that needs the file is missing too."""
+    """If a file cannot be read, its run is flagged; an unreadable closed loop is missing too."""
     less = tmp_path / "team-07"
     shutil.copytree(folder, less)
     (less / "data" / "decay-1a.csv").unlink()

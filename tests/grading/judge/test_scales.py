@@ -47,7 +47,7 @@ def in_counts(tmp_path_factory):
 def test_counts_stated_as_centimetres_fail_a_check(in_counts):
     """Recordings in counts that are stated as centimetres fail a check.
 
-    Every gain is then hundreds of times too large; all other checks pass.
+    The check of the closed loop fails too, since no stated gain fits positions in counts.
     """
     failed = [c.id.split(".")[0] for c in analyse(load_submission(in_counts)).checks
               if c.outcome == "fail"]  # fmt: skip

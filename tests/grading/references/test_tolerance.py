@@ -72,7 +72,8 @@ def test_the_error_grows_with_the_distance(value, steps, sign):
 def test_rounding_and_standard_errors_are_subtracted_first():
     """Rounding and then the standard errors are subtracted from the difference.
 
-    A typed 105 is 4.5 % above 100. With a standard error of 1 and 3 sigmas, it is 104.5/103 − 1.
+    A typed 105 is 4.5 % off 100. With a standard error of 1 and 3 sigmas, the error is
+    104.5/103 − 1.
     """
     assert percent_off(Decimal("105"), at(100.0), sigmas=3.0) == Fraction(9, 2)
     error = percent_off(Decimal("105"), at(100.0, std=1.0), sigmas=3.0)

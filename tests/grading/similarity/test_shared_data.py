@@ -1,4 +1,4 @@
-"""A shared recording is found however it is disguised, and teams on one bench are not flagged."""
+"""Disguised copies of recordings are found, and teams that share only a bench are not flagged."""
 
 import json
 import zlib
