@@ -23,7 +23,7 @@ _ROOMS = ("student", "bench", "solution")
 
 
 def show_home(ask: Ask) -> Response:
-    """Show what a person can do here; a person with only one place goes directly there."""
+    """Show what a person can do here; a person with only one place is taken to it."""
     user = ask.user
     places = {"student": user.folders, "grades": user.gradebooks, "feedback": user.grades}
     rooms = [room for room, listed in places.items() for _ in listed]

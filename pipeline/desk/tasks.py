@@ -70,7 +70,7 @@ def list_files(folder: str, *, progress: Progress) -> list[str]:
 
 
 def list_not_read(folder: str, named: list[str], *, progress: Progress) -> list[dict[str, str]]:
-    """Return the files that are not read, with the reason and what to do about each.
+    """Return the files that are not read, and for each, why and what to do about it.
 
     Parameters
     ----------

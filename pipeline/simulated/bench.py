@@ -104,7 +104,7 @@ class SimulatedBench:
     sample_time : sample time of the controller, the input and the log, in s.
     noise_counts : standard deviation of a free cart's encoder noise. With 0.2, the reading flickers
         between two counts.
-    zero_error_counts : largest error of an encoder's zero, which is set by hand, in counts.
+    zero_error_counts : largest error, in counts, of an encoder's zero, which is set by hand.
     """
 
     chain: Chain

@@ -26,12 +26,12 @@ class Students:
 
     Attributes
     ----------
-    authors : ids of the authors. By default two ids that depend on the seed, so that a class has no
-        duplicates.
+    authors : ids of the authors. By default, these are two ids that depend on the seed, so that no
+        two teams share one.
     title : title of the submission. By default it names the bench and the seed.
-    springs : whether they declare each spring as present. By default as in the chain.
-    time_decimals : decimals of the log's time stamps. 3 gives rounded stamps as in an ECP export.
-    notes : text of `notes.md`. Without a text there is no file.
+    springs : whether they declare each spring as present. By default, they state the true springs.
+    time_decimals : decimals of the log's time stamps. With 3, they are rounded as in an ECP export.
+    notes : text of `notes.md`. If it is empty, the file is not written.
     """
 
     authors: Sequence[str] = ()
@@ -59,8 +59,8 @@ def write_submission(
     ----------
     folder : folder to write; it is made if necessary. Files of the same names are replaced.
     bench : the true plant, or the name of a preset.
-    compact : whether to record less: fewer repeats and dwells, and most dwells without their
-        transient, for half the size.
+    compact : whether to record less, which halves the size: fewer repeats and dwells, and most
+        dwells without their transient.
     reported : whether to add `[reported]`, the numbers that honest students report.
 
     Raises

@@ -115,7 +115,7 @@ def prepare_submission(folder: Path, bench: Description, *, stock: bool) -> Subm
 
 
 def scale_remarks(submission: Submission, bench: Description) -> list[str]:
-    """Return notes on scales of the submission that differ from those of the bench."""
+    """Return a note on each scale of the submission that differs from the bench's scale."""
     system = submission.system
     pairs = {
         "input": (system.input, bench.input_unit, bench.input_per_count),

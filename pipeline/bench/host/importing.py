@@ -75,7 +75,7 @@ class Importer:
 
         Parameters
         ----------
-        once : import only the files that are there now.
+        once : import only the files that exist now.
         """
         self._ask()
         while True:

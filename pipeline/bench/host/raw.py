@@ -152,7 +152,7 @@ def _header(line: bytes, *, name: str) -> RawHeader:
 
 
 def free_raw_path(folder: Path, recording: Recording) -> Path:
-    """Return an unused path for a raw file; each attempt at a recording has its own."""
+    """Return an unused path for a raw file; each attempt at a recording gets a separate file."""
     parent = own_folder(folder, FOLDER)
     number = 1
     while (path := parent / f"{recording.id}-{number}.raw").exists():

@@ -19,7 +19,7 @@ class LineWatch:
 
     Attributes
     ----------
-    is_astray : whether the motor's duty was not as ordered.
+    is_astray : whether the motor's duty differed from the order.
     is_too_far : whether a cart was farther from its zero than the limit allows.
     is_unsafe : whether the run was stopped because it was not safe to continue.
     """

@@ -135,8 +135,8 @@ class Session:
 
         Parameters
         ----------
-        let_in : called while lines arrive; raises an interrupt that was held back. After the last
-            line the run is complete, and interrupts wait.
+        let_in : function that raises an interrupt that was held back; called while lines arrive.
+            After the last line the run is complete, and interrupts are held.
         """
         recording = order.recording
         stream = self._stream(recording.carts, closed=recording.controller is not None)

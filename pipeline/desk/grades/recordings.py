@@ -16,7 +16,7 @@ _ADDED = (PLOTS, PLOTS_OF, f"{Path(PLOTS).parent.name}/{LOCK}")
 
 
 def find_recordings(ask: Ask, shown: Class, entry: Entry) -> Path | None:
-    """Return the folder that was graded; None if it is not found or not for this person.
+    """Return the folder that was graded; None if it is not found or not allowed.
 
     The folder's files must be those that were graded, because a later version would show other
     recordings. Plots that were added since do not matter.

@@ -1,4 +1,4 @@
-"""The check in the student's room: which numbers disagree and where to look, never a value."""
+"""The check in the student's room: which numbers disagree and where to look, but no values."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -128,7 +128,7 @@ def _describe_criteria(
 
     Parameters
     ----------
-    refused : by criterion, a reason as typed and why it was refused.
+    refused : by criterion, the typed reason and why it was refused.
     hidden : whether to hide numbers that the student must find.
     """
     judged = {criterion.id: criterion for criterion in grade.criteria}

@@ -90,7 +90,7 @@ def _show_questions(
 
     Parameters
     ----------
-    refused : by question, an answer as typed and why it was refused.
+    refused : by question, the typed answer and why it was refused.
     sign_error : why a sign was not written.
     """
     folder, room = ask.folder(), read_room(ask)
