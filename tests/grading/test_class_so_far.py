@@ -132,7 +132,7 @@ def test_forgotten_lateness_gives_a_message(school, tmp_path):
 
 
 def test_a_renamed_folder_is_the_same_submission(school, tmp_path):
-    """A submission whose folder was renamed keeps its row, its points by hand and its requests.
+    """A submission whose folder was renamed keeps its row and its points by hand.
 
     A message gives the new name.
     """

@@ -261,7 +261,7 @@ def test_an_anonymous_grading_names_nobody_on_stderr(run, tmp_path, monkeypatch)
 def test_only_the_owner_can_read_names_and_grades(run, tmp_path):
     """The folder of grades, gradebook and key can be read only by their owner, whatever the umask.
 
-    The permissions of files from earlier runs are restricted too.
+    Files from earlier runs are restricted too, but a group keeps its access to the gradebook.
     """
     (tmp_path / "c" / "team-1").mkdir(parents=True)
     (tmp_path / "c" / "team-1" / "submission.toml").write_text("version = 1\n", encoding="utf-8")

@@ -247,7 +247,7 @@ def test_decays_in_millimetres_give_a_warning_and_are_used(which, bench, tmp_pat
 
 
 def test_frequencies_in_rad_per_s_stated_as_hz_are_named(bench, tmp_path):
-    """If frequencies in rad/s were stated as Hz, the message says so and blames no file."""
+    """If frequencies in rad/s were stated as Hz, the reason given for each file says so."""
     folder = shutil.copytree(bench, tmp_path / "spoilt")
     path = folder / "submission.toml"
     path.write_text(

@@ -345,7 +345,7 @@ def test_three_equal_copies_among_six_teams_are_flagged(teams):
 
 
 def test_a_flag_says_which_rows_are_equal(teams):
-    """The flag's evidence and message say which rows at which times are equal."""
+    """The flag's evidence and message say how many rows are equal, and at which times."""
     copied = disguised(of_kind(teams[0], "step"), np.random.default_rng(6), scale=10.0, later=3.0)
     (record,) = find_shared([prints("a", teams[0]), prints("b", [copied])])["b"]
     (evidence,) = shared_flag([record]).evidence["recordings"]
