@@ -3,8 +3,8 @@
     python -m benchmarks.explorations [--count 100] [--minutes 60]
 
 Each random bench has one to three carts and up to two hidden effects. It has the carts, encoders
-and controller of the emulator, simulated tick by tick without a serial line. `cartlab explore` knows
-which springs exist, and aims at an error of 1 % in all parameters within ten minutes. An
+and controller of the emulator, simulated tick by tick without a serial line. `cartlab explore`
+knows which springs exist, and aims at an error of 1 % in all parameters within ten minutes. An
 interrupted study continues where it stopped.
 """
 

@@ -34,7 +34,7 @@ def lab() -> Lab:
 
 
 def test_the_package_exports_analyse(lab):
-    """`from pipeline import analyse` gives the notebook's function, with a report's results."""
+    """`from pipeline import analyse` gives the notebook's function; its results are a report's."""
     assert pipeline.analyse is analyse
     assert json_text(lab.results) == json_text(analysed("two-cart"))
 

@@ -132,7 +132,7 @@ def test_a_report_by_an_instructor_shows_them_no_number(lab):
 def test_the_check_says_which_number_is_wrong_then_where(lab, root):
     """First the check names the wrong number, then it says where to look.
 
-    No page shows the value.
+    No page shows the right value.
     """
     student = lab("s1")
     assert "not checked yet" in words_of(student.get(f"{HERE}check"))

@@ -237,9 +237,9 @@ def test_students_see_only_their_own_folder(lab):
 
 
 def test_a_form_can_be_saved_after_many_other_changes(lab, root):
-    """A form can still be saved after others have saved many times.
+    """Many changes in another student's folder do not make the desk forget a form that it showed.
 
-    It saves only what was typed into it.
+    If the form is outdated, only the field that was typed into it counts as a conflict.
     """
     page = lab("s1").get("/student/0/")
     shown, seen = {name: page.value(name) for name in ("title", "section")}, page.value("seen")

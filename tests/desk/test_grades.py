@@ -503,9 +503,9 @@ def test_a_table_that_is_not_a_roster_is_refused(ta):
 
 
 def test_a_class_is_graded_again_from_the_desk(tmp_path):
-    """If a class is graded again, unchanged submissions are skipped and points by hand stay.
+    """A submission can be graded into an open class from the desk, and earlier grades stay.
 
-    Only the owner of the computer may type a folder's path.
+    A form without a path is refused.
     """
     team = a_submission(tmp_path / "class" / "team-05", "one-cart")
     grades = tmp_path / "grades"
@@ -577,7 +577,7 @@ def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
 
 
 def test_each_line_of_a_class_equals_its_grade(grades):
-    """Each line of the class page equals its team's grade, even if cached."""
+    """Each line of the class page equals its team's grade; only changed lines are made again."""
     from pipeline.grading.gradebook.class_lines import Line
 
     with OpenBook(grades) as book:

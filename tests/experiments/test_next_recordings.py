@@ -331,7 +331,7 @@ def test_clipped_phases_keep_the_swing_low():
 
 
 def test_the_tones_of_a_multisine_peak_at_its_amplitude(known):
-    """The shares of a multisine's sines are scaled so that the input peaks at its amplitude."""
+    """The components of a multisine are scaled so that the input peaks at its amplitude."""
     for name in ("mean", "K_1"):
         recording = multisine(known, find_goal(name, known, feedback=None))
         h, share, phase = np.array(recording.tones).T[:, :, None]
@@ -404,7 +404,7 @@ def test_the_command_adds_its_choice_to_the_plan(work):
 
 
 def test_added_recordings_are_counted(work):
-    """The message counts the recordings that were added, those of a new plan included."""
+    """The message counts the recordings that were added, including those of a new plan."""
     done = cartlab_here("plan", work, "--next", 2, "--for", "zeta")
     usual = len(propose_plan(load_submission(work)).recordings)
     usual_words = f"the {usual} recordings that every plan begins with"
@@ -416,7 +416,7 @@ def test_added_recordings_are_counted(work):
 
 
 def test_a_misfit_makes_the_predicted_errors_doubtful(analysis, tmp_path):
-    """If the records show more than noise, a message doubts the predicted errors."""
+    """If the fit's misfit is larger than the noise, a message doubts the predicted errors."""
     for chi_square, doubted in ((556.0, True), (1.0, False)):
         fit = replace(analysis.fit, chi_square_per_dof=chi_square)
         assert bool(_doubt(replace(analysis, fit=fit), tmp_path)) == doubted

@@ -435,7 +435,7 @@ def test_a_mistake_is_one_line_that_names_the_key(tmp_path, text, message):
 
 
 def test_a_plan_that_is_a_link_is_refused(tmp_path):
-    """A plan that is a link is refused, for reading and for writing."""
+    """If plan.toml is a link, a plan is not saved through it."""
     submission = bare().model_copy(update={"folder": tmp_path})
     (tmp_path / "other").write_text(with_run(), encoding="utf-8")
     plan_path(submission).symlink_to(tmp_path / "other")

@@ -188,7 +188,7 @@ def one_gap() -> Gap:
 
 
 def test_gap_json_has_the_documented_keys(one_gap):
-    """`gap.json` has the documented keys, no NaN, and figures that agree with each other."""
+    """`gap.json` has the documented keys, no NaN, and numbers that agree with each other."""
     document = json.loads(json.dumps(plain(one_gap), allow_nan=False))
 
     assert document["schema"] == "cartlab-gap/1"
@@ -236,7 +236,7 @@ def test_a_run_listed_twice_is_used_once():
 
 
 def test_single_run_is_cut_in_time():
-    """If there is only one run, its last part is held out, and a note says so."""
+    """If there is only one run, its last 40 % are held out, and a note says so."""
     case = make_case(seed=47, n=1, effects=["coulomb_friction"], rate=113.1)
 
     gap = explain_gap(case.records[:1], Bench(springs=case.springs))

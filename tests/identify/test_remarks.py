@@ -13,9 +13,9 @@ from pipeline.submission import load_submission
 
 @pytest.mark.parametrize("name", ["one-cart", "two-cart", "three-cart"])
 def test_centimetres_stated_as_metres_raise_a_question(name):
-    """Carts that would move at 60 km/h raise the question whether metres are the right unit.
+    """If metres as the unit would make carts impossibly fast, a remark questions the unit.
 
-    Data stated in centimetres, millimetres or counts do not.
+    Centimetres, millimetres, inches and counts are not questioned.
     """
     data = read_data(load_submission(EXAMPLES / name))
     (said,) = [one for one in reading_remarks(data, unit="m") if "m/s" in one]

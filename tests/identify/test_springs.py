@@ -107,7 +107,7 @@ def test_fill_prints_a_doubt_about_an_existing_unit(unit, said, tmp_path):
 
 @pytest.mark.skipif(not (REAL_DATA / "ecp210-ucsd").is_dir(), reason="no real recordings here")
 def test_the_real_rig_has_no_far_spring(tmp_path):
-    """The real rig has no far spring, since its gains differ only by dry friction."""
+    """From the real rig's files, `fill` finds that it has no far spring, without any doubt."""
     folder = tmp_path / "s"
     (folder / "data").mkdir(parents=True)
     for file in (REAL_DATA / "ecp210-ucsd").glob("DOF*_test?.csv"):

@@ -44,7 +44,7 @@ def states(folder: Path) -> dict[str, tuple[str, str, str | None]]:
 
 
 def test_a_folder_of_files_becomes_a_submission(tmp_path):
-    """`fill` finds carts, units, kinds and free carts; everything else in the file is a comment."""
+    """`fill` finds carts, units, kinds and free carts, and writes what is unsure as comments."""
     still = 0 * T
     put(tmp_path, "run 10.csv", time=T, input=SINE, x1__cm=RING / 300, x2__cm=0.4 * RING / 300)
     put(tmp_path, "run 2.csv", time=T, input=STEP, x1__cm=RING / 300, x2__cm=0.4 * RING / 300)
@@ -70,7 +70,7 @@ def test_a_folder_of_files_becomes_a_submission(tmp_path):
 
 
 def test_a_second_run_prints_as_much_as_the_first(tmp_path):
-    """A second `fill` repeats free carts and doubts, until a person removes the "doubtful" mark."""
+    """A second `fill` repeats free carts and doubts, until a person removes "unsure" comments."""
     still = 0 * T
     put(tmp_path, "pull.csv", time=T, input=still, x1=RING, x2=still)
     put(tmp_path, "loop.csv", time=T, input=RING / 999, reference=STEP, x1=RING, x2=RING)
@@ -105,7 +105,7 @@ def test_an_old_spreadsheet_is_named_as_not_read(tmp_path, command):
 
 
 def test_every_file_is_named_except_hidden_ones(tmp_path):
-    """Files that are not recordings are named, except files that a tool hides."""
+    """Files that are not recordings are named, except hidden ones; long lists are shortened."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     data = tmp_path / "data"
     for name in (".git/HEAD", ".cache/b.csv", "report/bode.svg", "plot.py", "Thumbs.db"):

@@ -148,7 +148,7 @@ def test_columns_without_headings_are_numbered():
 
 
 def test_one_column_alone_is_read():
-    """A single channel without a time column is read, if its sample rate is stated."""
+    """A table with a single channel and no time column is read."""
     got = table("displacement\n" + "\n".join(f"{x:g}" for x in X1))
     assert got.names == ("displacement",)
     assert_array_equal(got.values[0], X1)

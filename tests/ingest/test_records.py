@@ -160,7 +160,7 @@ def test_whole_ecp_values_without_a_scale_are_counts(tmp_path):
     ],
 )
 def test_fractions_of_a_count_are_asked_about(system, asked, tmp_path):
-    """Fractions of a count in a column without a unit are questioned: counts are whole."""
+    """Positions with decimals are questioned if their unit is counts, stated or by default."""
     folder = tmp_path / "s"
     data = read(folder, system, STEP, csv(time=T, input=U, x1=Y[0] / 440, x2=Y[1] / 440))
     checks = check_units(data.records, bench=load_submission(folder).system.bench)

@@ -54,7 +54,7 @@ def terms_of(kind: int, p: np.ndarray, x: float, v: float, u: float, on: float) 
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("effect", FOLLOWED, ids=lambda effect: effect.key)
 def test_derivatives_are_those_of_the_law(effect, state):
-    """Derivatives by position, velocity, input and each coordinate agree with differences."""
+    """A law's derivatives, also with respect to each coordinate, agree with finite differences."""
     kind, p = CATALOGUE.index(effect), coordinates_of(effect)
     x, v, u, on = state
     out = terms_of(kind, p, *state)
@@ -165,7 +165,7 @@ def test_a_law_vanishes_with_its_coefficients(effect):
 
 
 def test_dead_zone_and_saturation_shape_the_input():
-    """A dead zone makes the input zero, or smaller by its width; saturation limits the input."""
+    """A dead zone removes small inputs and reduces larger ones by its width; saturation clips."""
     drive = np.zeros(len(TABLES["input"]))
     for key in ("dead_zone", "saturation"):
         effect = find_effect(key)

@@ -71,7 +71,7 @@ def test_the_system_moves_as_the_simulator_does(effect, driven):
 
 
 def test_without_effects_it_is_the_linear_chain():
-    """Without effects the rates of change are A x + B u."""
+    """Without effects the system is the linear state model A x + B u."""
     rng = np.random.default_rng(1)
     system = EquationsOfMotion(AugmentedChain(chain=CHAIN)).to_control()
     A, B, *_ = CHAIN.state_space()
@@ -85,7 +85,7 @@ def test_without_effects_it_is_the_linear_chain():
 
 
 def test_some_effects_have_their_own_states():
-    """A hidden mass, and an input with memory, add named states to the system."""
+    """A hidden mass, presliding friction, and an input with memory add named states."""
     own = {
         "extra_mode": ["x2_hidden", "v2_hidden"],
         "presliding_friction": ["z2"],

@@ -113,7 +113,7 @@ def linear(tmp_path_factory):
 
 @pytest.mark.parametrize(("key", "preset"), list(_cases()))
 def test_an_effect_hides_in_a_whole_submission(tmp_path, linear, key, preset):
-    """A session with a hidden effect is read like any other, shows it, and never names it."""
+    """A hidden effect clearly changes a session's recordings, but no file names it."""
     chain = PRESETS[preset]
 
     write_submission(
@@ -156,7 +156,7 @@ def test_the_linear_path_compiles_nothing():
 @pytest.mark.parametrize("key", KEYS)
 @pytest.mark.parametrize("make_run", [step, decay, control], ids=lambda f: f.__name__)
 def test_a_tiny_effect_gives_the_linear_bench(key, make_run):
-    """At a hundred-thousandth of its usual size, no effect changes a run by a count."""
+    """At a hundred-thousandth of its usual size, an effect changes a run by at most a count."""
     term = usual(key)
     # These parameters grow with the effect too, but have no neutral value.
     further = {
@@ -228,7 +228,7 @@ def test_closed_loops_agree_with_the_independent_simulator(key):
 
 @pytest.mark.parametrize("key", ["coulomb_friction", "quadratic_drag", "cubic_spring"])
 def test_releases_agree_with_the_independent_simulator(key):
-    """From the release on, the 50-µs simulator under the hand's force gives the same motion."""
+    """From the release on, the 50-µs simulator moves the same way under the hand's force."""
     run, term = decay(), usual(key)
     hand = run.hand
     assert hand is not None
@@ -302,7 +302,7 @@ def test_a_sensor_deceives_the_controller():
 
 
 def test_a_hand_stops_before_the_end_stop():
-    """A hand never pulls a cart into an end stop, and otherwise holds it as planned."""
+    """A hand pulls a cart as far as planned, but never into an end stop."""
     stop = usual("end_stop", position=-1.0)
 
     assert bench(stop).move(decay()).x[0, 0] == pytest.approx(-0.9, rel=0.01)

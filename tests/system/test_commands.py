@@ -116,7 +116,7 @@ def test_failed_checks_are_status_one(tmp_path):
 def test_an_unreadable_file_affects_only_its_run(tmp_path):
     """If one file is missing and one is broken, both are reported and everything else is computed.
 
-    The exit status is 1. A solution from these files is doubtful, and gives each reason once. If no
+    The exit status is 1. `solution` also ends with status 1, and prints each reason once. If no
     file can be read, there is no report and the status is 2.
     """
     folder = tmp_path / "team"

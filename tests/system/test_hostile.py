@@ -140,7 +140,7 @@ def test_every_submission_has_a_row_with_a_reason(graded):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux names the file of a descriptor")
 def test_grading_writes_only_into_its_folder_and_makes_no_connection(graded):
-    """Grading writes only into its own folder, makes no connection and starts only Python."""
+    """Grading writes only into its own folder, makes no connection, starts only known programs."""
     base, _, _ = graded
     lines = (base / "audit.txt").read_text(encoding="utf-8").splitlines()
     events = [line.partition("\t")[::2] for line in lines]
@@ -177,7 +177,7 @@ def test_the_honest_are_graded_as_if_they_were_alone(graded):
 
 
 def test_no_page_runs_or_loads_anything_hostile(graded):
-    """Feedback pages hold only our scripts, no event handlers, no address of another host."""
+    """Pages have only our own script, no event handlers, and no addresses of other hosts."""
     base, _, _ = graded
     out = base / "out-school"
     pages = [out / "class.html", *sorted((out / "feedback").glob("*/feedback.html"))]
@@ -240,7 +240,7 @@ def test_no_cell_is_a_formula_and_all_json_is_valid(graded):
     not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root changes user"
 )
 def test_an_unreadable_folder_affects_only_its_row(tmp_path_factory):
-    """If a folder or file may not be read, only the row of its submission says so."""
+    """If a folder or file may not be read, only its own submission cannot be opened."""
     base = tmp_path_factory.mktemp("rights")
     for name in ("folder", "inside", "toml", "listed", "good"):
         (base / "class" / name / "data").mkdir(parents=True)
@@ -270,7 +270,7 @@ def test_an_unreadable_folder_affects_only_its_row(tmp_path_factory):
 
 
 def test_a_file_changed_meanwhile_affects_only_its_row(tmp_path):
-    """If a file disappears or changes during grading, only the row of its submission says so."""
+    """If a submission's file disappears or changes during grading, its digest differs."""
     for name in ("gone", "changed"):
         (tmp_path / "class" / name).mkdir(parents=True)
         (tmp_path / "class" / name / "submission.toml").write_text(

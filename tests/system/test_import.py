@@ -104,7 +104,7 @@ def test_a_file_is_imported_once(work, source):
 
 
 def test_the_usb_logger_is_known(tmp_path, source):
-    """A file headed `Time [us],Displacement [mm]` is a decay of the one cart it measures."""
+    """A file headed `Time [us],Displacement [mm]` is imported as a decay of cart 1, in s and cm."""
     work = write_work(tmp_path / "one", [])
     toml = work / "submission.toml"
     text = toml.read_text(encoding="utf-8")

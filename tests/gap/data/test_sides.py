@@ -48,7 +48,7 @@ def analysis(tmp_path_factory):
 
 
 def test_a_run_that_the_report_leaves_out_is_not_used(analysis):
-    """The run with the weight is neither fitted nor a test, and `gap.json` has the reason."""
+    """The run with the weight is neither fitted nor held out, and `gap.json` has the reason."""
     (odd,) = analysis.left_out
     assert (odd.experiment, odd.is_wrong) == ("step-4", False)
 
@@ -65,7 +65,7 @@ def test_a_run_that_the_report_leaves_out_is_not_used(analysis):
 
 
 def test_an_older_gap_file_is_still_read(analysis):
-    """A `gap.json` written by an older version, without `left_out`, is read as an empty list."""
+    """An older `gap.json` without `left_out` is read as if no recording had been left out."""
     document = json.loads(json_text(investigate(analysis, progress=lambda text: None)))
     del document["left_out"]
     assert read_gap(json.dumps(document)).left_out == ()

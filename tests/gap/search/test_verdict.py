@@ -71,7 +71,7 @@ def test_an_effect_that_a_later_one_makes_needless_is_removed():
     ],
 )
 def test_two_effects_with_equal_rivals_are_ambiguous(rival, verdict):
-    """If two other effects explain as much as the two found, the verdict is "ambiguous"."""
+    """Equally good rivals make the verdict "ambiguous", except richer forms of the same laws."""
     one = hypothesis(COULOMB, error=0.2, bic=-100)
     both = hypothesis(COULOMB, SECOND, error=0.015, bic=-1000)
     same = hypothesis(*rival, error=0.015, bic=-999.5)
