@@ -308,7 +308,7 @@ def test_a_corrected_id_of_an_author_flags_nobody(school, tmp_path):
 
 
 def test_kept_submissions_keep_their_rubric(tmp_path):
-    """Submissions kept from an earlier run keep their rubric, and a message says so."""
+    """Submissions kept from an earlier run keep their rubric, and a list names them."""
     a, b = make_outcome(make_grade("a")), make_outcome(make_grade("b"))
     other = RUBRIC.model_copy(update={"criteria": RUBRIC.criteria[:-1]})
     with Gradebook(tmp_path, assignment="lab", create=True) as book:

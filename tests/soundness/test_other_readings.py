@@ -55,7 +55,7 @@ def kept(found: Mapping[str, Misread], *others: Record, sizes: Mapping[str, floa
     ],
 )
 def test_a_unit_must_be_wrong_in_all_records_of_a_kind(misread, sizes, others, unit):
-    """A factor is called a wrong unit if all records of a kind share it without an input limit."""
+    """A factor is called a wrong unit if all records of a kind share it and no limit causes it."""
     found = {name: misread for name in sizes}
     assert kept(found, *others, sizes=sizes) == (set(sizes) if unit else set())
 

@@ -244,7 +244,7 @@ def test_units_do_not_matter(scale):
 
 
 def test_a_small_decay_is_measured_within_its_error():
-    """If a cart is released at only thirty counts, the damping is within its standard error."""
+    """If a cart is released at only thirty counts, the damping is right to four standard errors."""
     got = fit_log_decrement(released(zeta=0.03, start=30 * COUNT), cart=1)
     assert abs(got.zeta - 0.03) < 4 * got.zeta_std
     assert got.zeta_std > 1e-3 * 0.03

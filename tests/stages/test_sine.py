@@ -83,7 +83,7 @@ def test_an_exact_steady_state_gives_the_exact_response():
 
 
 def test_a_smooth_input_is_taken_as_sampled():
-    """If the input is band-limited, its amplitude is that of the samples."""
+    """A band-limited input has the amplitude of its sampled sine."""
     t, omega = sampled(4.0), 2 * np.pi * 5.0
     run = record(t, 0.5 * np.sin(omega * t), np.sin(omega * t - 1.0)[None], omega=omega, count=0.0)
     got = fit_sine(replace(run, hold="band_limited"), cart=1)

@@ -181,7 +181,7 @@ def test_one_sample_of_rest_before_the_edge_is_enough():
 
 @pytest.mark.parametrize("noise", [0.5, 3.0])
 def test_noise_is_averaged(noise):
-    """Noise on the position is averaged, and the gain is within its standard error."""
+    """Noise on the position is averaged, and the gain is right to four standard errors."""
     chain, t = PRESETS["throne-2dof"], seconds(14.0)
     u = staircase(t, (1.0, 0.03), (7.0, 0.0))
     got = fit_step_gain(run_of(chain, t, u, noise=noise * COUNT), cart=1)

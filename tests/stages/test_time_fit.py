@@ -252,7 +252,7 @@ def test_a_damping_at_its_bound_has_no_standard_error():
 
 
 def test_a_missing_spring_is_held_at_zero():
-    """If the last spring is declared but missing, the fit holds it at zero, with a note."""
+    """A declared spring that is missing is zero within its error, or held at zero with a note."""
     rng = np.random.default_rng(1)
     chain = Chain(m=np.array([3e-4, 2e-4]), c=np.array([6e-4, 4e-4]), k=np.array([0.1, 0.06, 0]))
     fit = fit_records([step_record(chain, rng=rng)], bench=Bench(springs=(True,) * 3))
@@ -340,7 +340,7 @@ def test_a_search_at_its_limit_returns_the_best_so_far():
 
 
 def test_a_decay_is_used_from_its_release_on():
-    """A decay is used from its release on, whatever the encoder's zero."""
+    """A decay is used from less than a quarter of a period after its release."""
     record = decay_record(PRESETS["throne-1dof"], free=(1,), rng=np.random.default_rng(13))
     start = record.t[usable_segment(record)][0]
     # The release is at 1.5 s; a quarter of the period of 0.48 s later, half the swing is lost.
