@@ -218,7 +218,7 @@ def test_on_a_students_computer_the_submission_hides_the_report(tmp_path):
     ],
 )
 def test_a_wrong_rubric_in_the_list_is_one_line(root, entry, said):
-    """If the file of users names a wrong rubric, the error is one line and no desk starts."""
+    """A wrong rubric in the file of users is refused with an error that says what is wrong."""
     with pytest.raises(ConfigError, match=said):
         read_users(write_users(root, f'[[users]]\nname = "x"\n{entry}\n'))
 

@@ -170,7 +170,7 @@ def test_a_student_sees_the_grade_that_the_list_names(released):
     ],
 )
 def test_a_wrong_grade_on_the_list_is_one_line(users, why, tmp_path):
-    """If the file of users names a wrong grade, the error is one line and nothing is served."""
+    """A wrong grade in the file of users is refused with an error that says what is wrong."""
     (tmp_path / "g").mkdir()
     path = write_users(tmp_path, f'[[users]]\nname = "s"\n{users}\n')
     with pytest.raises(ConfigError, match=why):

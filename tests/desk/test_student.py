@@ -473,9 +473,9 @@ def test_edits_from_outside_are_shown_and_not_overwritten(filled):
 
 
 def test_a_page_can_be_saved_a_hundred_changes_later():
-    """A page can be saved even if others have saved a hundred times since it was opened.
+    """The desk remembers the state that a page showed, even after a hundred further changes.
 
-    The memory used for each person is limited.
+    If the states need too much memory, the oldest are forgotten.
     """
     desk, seen = Desk(), "seen"
     desk.keep_shown("title = ''", digest=seen, to="")

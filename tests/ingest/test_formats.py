@@ -187,7 +187,7 @@ def mat(compress: bool = False, **variables: object) -> bytes:
 @pytest.mark.parametrize("compress", [False, True])
 @pytest.mark.parametrize("dtype", ["i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8"])
 def test_mat_vectors_of_every_number_type_are_read(dtype, compress):
-    """Integers of every type in a .mat file are read as scipy reads them."""
+    """Integers and floats of every size in a .mat file are read as scipy reads them."""
     values = np.arange(0, 100, 2).astype(dtype)
     raw = mat(compress=compress, time=TIME[None, :], enc1=values, duty=values[:, None])
 

@@ -152,7 +152,7 @@ def test_a_bench_log_in_a_workbook_is_a_bench_log():
 
 
 def test_dates_and_times_of_day_become_seconds():
-    """Dates become seconds from 0, times of day keep their hour, and the heading gets the unit."""
+    """Dates become seconds since the first one, and times of day seconds since midnight."""
     begin = dt.datetime.fromisoformat("2026-01-05 12:00")
 
     def dates(ws) -> None:
