@@ -97,7 +97,7 @@ def test_hostile_markdown_stays_text(markdown):
 
 
 def test_web_and_mail_links_stay():
-    """Links to web pages and mail addresses keep their address and send no referrer."""
+    """Links to web pages and mail addresses keep their addresses."""
     (block,) = note_blocks("[paper](https://example.org/a?b=1&c=2) <mailto:a@example.org>")
     assert isinstance(block, Paragraph)
     assert [span.url for span in block.text if span.url] == [
@@ -141,7 +141,7 @@ def test_headings_go_down_one_level_at_a_time():
 
 @pytest.mark.parametrize("nest", ["> " * 20, "> " * 90, "- " * 40, "1. " * 30])
 def test_deeply_nested_notes_give_a_page(nest):
-    """Notes with deeply nested quotes or lists still give a page and a PDF."""
+    """Deeply nested quotes and lists keep their text, but quotes are nested at most six deep."""
     blocks = note_blocks(f"{nest}deep")
     assert "deep" in str(blocks)
     assert str(blocks).count("kind='quote'") <= 6

@@ -447,7 +447,7 @@ def test_without_results_and_reasons_there_is_still_a_report(tmp_path):
      "checks", "feedback", "hardware", "discussion"],
 )  # fmt: skip
 def test_any_part_may_be_missing(part, tmp_path):
-    """If one part of the analysis is missing, the page still has all other parts."""
+    """If one part of the analysis is missing, the page is made without it and shows no None."""
     analysis = make_analysis(1, repeats=1)
     empty = None if part in ("fit", "feedback", "discussion") else ()
     page, _ = render(replace(analysis, **{part: empty}), tmp_path, pdf=False)

@@ -37,7 +37,7 @@ def test_reports_show_symbols(carts):
 
 
 def test_grades_show_symbols():
-    """The feedback to a student shows parameters as symbols, also in its text for a platform."""
+    """Feedback shows parameters as symbols, both on its page and in its text for a platform."""
     one = student(2)
     off = {name: one.value("final", name) * 2 for name in ("zeta_b", "omega_1", "K_1")}
     feedback = one.reported.feedback
