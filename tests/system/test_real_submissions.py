@@ -16,7 +16,7 @@ def two_carts(real_data, tmp_path_factory):
 
 
 def test_two_carts_have_the_masses_and_springs_found_before(two_carts):
-    """Masses and springs agree within 10 % with those of another fit with viscous damping."""
+    """Masses and springs agree within 10 % with those of an earlier fit with viscous damping."""
     chain = two_carts.chain
     assert_allclose(chain.m, [5.5e-6, 3.7e-6], rtol=0.1)
     assert_allclose(chain.k[:2], [1.79e-3, 1.03e-3], rtol=0.1)

@@ -81,8 +81,8 @@ def fast_bench() -> Iterator[Emulator]:
 def test_hosts_talk_to_a_pseudo_terminal_one_after_the_other():
     """At a pseudo-terminal a host gets a description, and a run in real time.
 
-    The next host finds the bench as the last one left it, and a signal ends the bench with exit
-    status 0.
+    After a host has left, the next one can use the bench. A signal ends the bench with exit status
+    0.
     """
     with emulator("--port", "pty", "--hide", "coulomb_friction:force=0.004") as bench:
         for _ in range(2):
@@ -125,7 +125,7 @@ def test_a_step_gives_the_static_gain(fast_bench):
 
 
 def test_a_released_cart_swings_at_its_own_frequency(fast_bench):
-    """With cart 1 held, cart 2 swings at ω_2 and ζ_2 of the chain after its release."""
+    """With cart 1 held, a released cart 2 swings with the chain's frequency ω_2 and damping ζ_2."""
     chain = PRESETS["throne-2dof"]
     with host(fast_bench) as line:
         line.write(encode(Hands(held=(1,), released=2)))
