@@ -46,7 +46,7 @@ def test_the_errors_grow_with_the_contradiction(sigmas):
 
 
 def test_a_wrong_recording_does_not_make_the_fit_doubtful():
-    """If step gains are 1.5 times too large but the fit explains the data, its errors stay."""
+    """If step gains are 1.5 times too large, a fit that explains the data keeps its errors."""
     analysis = student(2).analysis
     before = recompute(analysis).final
     rows = tuple(
