@@ -49,7 +49,7 @@ def test_full_pages_are_left_as_they_are():
 
 
 def test_a_table_stays_whole_if_this_saves_white_space():
-    """A table is kept on one page if this leaves less white space."""
+    """A table is kept on one page if less white space remains that way."""
 
     def lay_out(choices: Choices) -> Pages:
         begun = 2 if choices.whole == (7,) else 1
