@@ -35,7 +35,7 @@ class _Once(Notes):
     """An observer that never repeats a recording and ignores all lines."""
 
     def confirm(self, instruction: str) -> None:
-        """Refuse, as nobody is there to confirm."""
+        """Refuse, as nobody can confirm the instruction."""
         raise ConfigError(instruction)
 
     def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:

@@ -1,4 +1,4 @@
-"""A command collects garbage rarely, and not at all when it ends."""
+"""A command rarely collects garbage while it runs, and never when it ends."""
 
 import subprocess
 import sys

@@ -163,7 +163,7 @@ _MEANT = st.text(st.sampled_from("=+-@;,\"'\r\n\t \u3000\u00ad\u200eab1")) | st.
 @given(st.lists(st.lists(_MEANT, min_size=2, max_size=2), max_size=4))
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
 def test_texts_add_no_rows_and_no_formulas(separator, rows):
-    """A spreadsheet sees as many rows as were written and no formula, whatever its separator is."""
+    """With any separator, a spreadsheet sees exactly the rows that were written, and no formula."""
     text = csv_text(("a", "b"), rows)
     assert not [c for c in text if unicodedata.category(c).startswith("C") and c != "\n"]
     assert text.count("\n") == len(rows) + 1

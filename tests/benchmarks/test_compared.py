@@ -60,7 +60,7 @@ def test_curve_fit_finds_the_truth_in_dwells_without_noise():
 
 
 def test_the_responses_for_a_modal_analysis_are_those_of_the_chain():
-    """The responses given to the modal analysis are those of the chain to 1 %."""
+    """The responses given to the modal analysis equal those of the chain within 1 %."""
     chain = PRESETS["throne-2dof"]
     hertz, G = responses_of(multisine(chain, rng=np.random.default_rng(0), noise=1e-12))
 

@@ -24,7 +24,7 @@ def _points(token: str, points: float, *, confirmed: bool = True) -> Change:
 
 @pytest.fixture(scope="module")
 def book(tmp_path_factory):
-    """Return a class with points by hand, some given twice, and one request that was answered."""
+    """Return a class with manual points, some of them changed twice, and one answered request."""
     place = str(tmp_path_factory.mktemp("book"))
     fill_book(place)
     with RequestBook(place) as book:

@@ -443,7 +443,7 @@ def test_a_file_of_users_that_others_can_read_is_refused(tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
 def test_a_file_of_users_that_others_can_write_is_refused(tmp_path):
-    """The file of users is refused if others can write it or its folder."""
+    """The file of users is refused if others can write to it or to its folder."""
     folder = tmp_path / "desk"
     folder.mkdir()
     path = write_users(folder, '[[users]]\nname = "s1"\nrole = "student"\n')

@@ -224,7 +224,7 @@ def test_each_criterion_shows_its_recording(tmp_path):
 
 
 def test_the_figure_of_the_largest_error_comes_first(tmp_path):
-    """If a criterion has two figures, the first is that of the number with the largest error.
+    """If a criterion has two figures, the one for the number with the largest error comes first.
 
     The other figure is one click away, without scripts.
     """

@@ -836,7 +836,7 @@ def answers(page: str) -> dict[str, str]:
 
 
 def test_one_click_sets_a_unit_and_saves_the_form(room):
-    """One click sets a unit and saves the rest of the form; the doubt is gone."""
+    """One click sets a unit, saves the whole form and settles the doubt about the unit."""
     visitor, folder = room
     visitor.upload(HERE + "files", some_files())
     page = visitor.get(HERE)

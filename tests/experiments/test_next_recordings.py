@@ -197,7 +197,7 @@ def test_the_design_goal_is_the_spread_of_the_peak(known, analysis):
 
 
 def test_each_choice_serves_its_own_goal(analysis):
-    """An experiment chosen for one parameter reduces its error at least as much as others do."""
+    """An experiment chosen for one parameter reduces its error more than one chosen for another."""
     plan = Plan(limits=LIMITS)
     left = {}
     for goal in ("K_1", "zeta_2"):

@@ -159,7 +159,7 @@ def test_repeats_are_aligned_at_the_edge_of_their_input():
     "said", [pytest.param((1,), marks=[pytest.mark.slow, pytest.mark.sample]), (1, 2)]
 )
 def test_a_cart_held_in_all_runs_is_a_wall(said):
-    """If cart 2 is held in all runs of a two-cart folder, the result is that of one cart."""
+    """If cart 2 of two is held in all runs, the effect on cart 1 is found as on a single cart."""
     hidden = Hidden(effect="coulomb_friction", place=1, parameters={"force": 0.0025})
     case = make_case(seed=45, n=2, effects=[hidden], rate=113.1)
     alone = [r for r in case.records if r.id.startswith("decay-1")]

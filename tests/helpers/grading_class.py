@@ -110,7 +110,7 @@ def make_bench(rng: np.random.Generator, *, carts: int) -> Bench:
 
 
 def rubric_of(bench: Bench) -> Rubric:
-    """Return the rubric of a class that has such a bench."""
+    """Return the rubric of a class that uses this bench."""
     rubric = load_rubric(Path(f"throne-{bench.chain.n}dof"))
     runs = tuple(
         run.model_copy(update={"at_least": min(run.at_least, DWELLS[0])})

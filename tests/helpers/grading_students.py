@@ -79,7 +79,7 @@ class Student:
 
 
 def typed(value: float | Decimal) -> Decimal:
-    """Return a number rounded to three digits, or a text as it is."""
+    """Return a float rounded to three digits, or a `Decimal` unchanged."""
     if isinstance(value, Decimal):
         return value
     return Decimal(f"{value:#.3g}".removesuffix("."))

@@ -45,8 +45,8 @@ _PAUSE = 0.001  # s
 class RunawayBench(threading.Thread):
     """A bench that keeps to the protocol, except while `wrong` returns True.
 
-    Use it as a context manager. The position of cart 1 is a fifth of the present duty, that of cart
-    2 half of it.
+    Use it as a context manager. Cart 1's position is a fifth of the present duty, and
+    cart 2's is half of it.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ def settled(y: Array) -> float:
 
 
 def gain(record: Record, cart: int) -> float | None:
-    """Return the gain at the first edge: the change of level divided by that of the input."""
+    """Return the gain at the first edge: change of level divided by change of input."""
     assert record.u is not None
     edges = np.flatnonzero(np.diff(record.u)) + 1
     if not edges.size:

@@ -67,7 +67,7 @@ def step_record(
 def decay_record(
     chain: Chain, *, free: tuple[int, ...], rng: np.random.Generator, id: str = "decay"
 ) -> Record:
-    """Return a record of carts pulled aside in 0.5 s, held for 1 s and released.
+    """Return a record of carts that are pulled aside within 0.5 s, held for 1 s and released.
 
     The encoder's zero is not the rest position.
     """

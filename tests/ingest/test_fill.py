@@ -428,7 +428,7 @@ def test_an_outdated_change_is_refused(tmp_path):
 
 
 def test_stated_columns_identify_a_file(tmp_path):
-    """`columns` of `[system]` identify any file, and those of an experiment its own file."""
+    """`columns` in `[system]` apply to any file, and those in an experiment to its file alone."""
     put(tmp_path, "a.csv", clock=T, volts=STEP, sled=2 * RING)
     put(tmp_path, "b.csv", time=T, input=SINE, x1=RING)
     put(tmp_path, "c.csv", clock=T, volts=STEP, other=RING)

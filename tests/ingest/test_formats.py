@@ -260,7 +260,7 @@ def test_a_file_of_blanks_of_any_sort_is_empty():
 
 
 def test_the_matrix_of_a_mat_file_is_the_recording():
-    """A .mat file's matrix is the recording, even beside twelve settings and a list of gains."""
+    """A matrix in a .mat file is the recording, even if the file also has settings and gains."""
     matrix = np.column_stack([TIME, X1, U])
     stream = BytesIO()
     settings = {f"p{i}": float(i) for i in range(12)}
@@ -436,7 +436,7 @@ def test_a_matlab_7_3_file_takes_no_more_memory_than_a_recording():
 
 
 def test_the_class_of_a_matlab_7_3_variable_is_one_line():
-    """Whatever its class attribute holds, a variable of version 7.3 is named in one line."""
+    """A version 7.3 variable is described in one line, even if its class attribute is an array."""
 
     def fill(file: h5py.File) -> None:
         file["note"] = np.arange(5.0)

@@ -50,7 +50,7 @@ SPECIAL = "***Start_Special***\r\nWaveform\t1,2\r\n***End_Special***\r\n\r\n"
 
 
 def multi(clock: np.ndarray) -> str:
-    """Return a file with an X column for each channel; that of the second channel is `clock`."""
+    """Return a file in which each channel has an X column; the second channel's is `clock`."""
     rows = ["\t".join(f"{v:.6f}" for v in row) for row in zip(TIME, U, clock, X1, strict=True)]
     text = GOOD[: GOOD.index("X_Value")] + "X_Value\tinput\tX_Value\tx1\tComment\r\n"
     return text.replace("X_Columns\tOne", "X_Columns\tMulti") + "\r\n".join(rows) + "\r\n"

@@ -385,7 +385,7 @@ def test_a_mirrored_commanded_position_is_not_used(tmp_path):
 
 
 def test_a_stated_reference_replaces_that_of_the_file(tmp_path):
-    """A stated `reference` is constant, in position units, and replaces that of the file."""
+    """A stated `reference` is a constant in position units, and replaces the file's reference."""
     content = csv(time=T, input=U, x1=X1, reference=0 * T)
     record = read(tmp_path, CM, LOOP + "\nreference = 1.5", content).records[0]
     assert record.reference is not None
@@ -431,7 +431,7 @@ def test_a_wrong_sign_of_a_session_is_one_sentence(tmp_path):
 
 
 def test_signs_may_differ_between_experiments(tmp_path):
-    """A record with the opposite sign is found; one that shows no sign gets that of its kind."""
+    """Each record gets the sign that it shows, or else the sign of other records of its kind."""
     toml = "version = 1\n[system]\ncarts = 2\n"
     runs = {
         "step": ("step", csv(time=T, input=-U, x1=X1)),

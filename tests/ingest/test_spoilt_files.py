@@ -134,7 +134,7 @@ def damaged(raw: bytes, hits: list[tuple[str, float, bytes]]) -> bytes:
 
 @pytest.fixture(scope="module")
 def submission(tmp_path_factory) -> Submission:
-    """Return a submission that reads the same file as each kind of experiment."""
+    """Return a submission in which each kind of experiment uses the same file."""
     folder = tmp_path_factory.mktemp("fuzz")
     kinds = ('kind = "step"', 'kind = "closed_loop"', 'kind = "bode"', 'kind = "decay"')
     matrix = "columns = { time = 1, input = 2, x1 = 3 }\n"

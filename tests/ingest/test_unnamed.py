@@ -110,7 +110,7 @@ ANSWER = np.where(T > 1, 1 - np.cos(9 * (T - 1)), 0.0)
 
 
 def test_a_velocity_gets_no_role():
-    """A column that is the rate of another gets no role."""
+    """A column with the rate of change of another column gets no role."""
     rate = np.where(T > 1, 9 * np.sin(9 * (T - 1)), 0.0)
     got = find_roles(bare(T, STEP, ANSWER, rate))
     assert got == Roles(columns={"time": 1, "input": 2, "x1": 3})
@@ -142,7 +142,7 @@ def test_a_time_in_milliseconds_is_reported():
 
 
 def test_one_column_beside_the_time_is_a_position():
-    """A single column beside the time is a position, since a release has no input."""
+    """A single column next to the time is a position, since a release has no input."""
     assert find_roles(bare(T, RING)) == Roles(columns={"time": 1, "x1": 2})
     assert find_roles(bare(T, RING, 0.5 * RING)).columns == {"time": 1, "x1": 2, "x2": 3}
 

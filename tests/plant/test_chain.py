@@ -159,7 +159,7 @@ def test_zeros_make_each_response_vanish(chain):
 @given(chains())
 @settings(max_examples=30)
 def test_frequency_response_matches_state_space(chain):
-    """The response computed from impedances is that of the state model, C (sI - A)^-1 B."""
+    """The response computed from impedances equals the state model's, C (sI - A)^-1 B."""
     omega = np.geomspace(1.0, 100.0, 25)
 
     got = chain.frequency_response(omega)
@@ -173,7 +173,7 @@ def test_frequency_response_matches_state_space(chain):
 
 
 def test_frequency_response_of_a_preset_by_python_control():
-    """The frequency response of the three-cart preset is that of python-control."""
+    """python-control computes the same frequency response for the three-cart preset."""
     chain, omega = PRESETS["throne-3dof"], np.linspace(2.0, 50.0, 40)
 
     expected = control.ss(*chain.state_space())(1j * omega)[:, 0, :]

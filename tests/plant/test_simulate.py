@@ -29,7 +29,7 @@ def rms(x):
 
 @pytest.mark.parametrize("zeta", [0.02, 0.1, 0.7])
 def test_step_of_one_cart_is_the_textbook_step(zeta):
-    """At irregular times, one cart's step response is that of the textbook formula."""
+    """At irregular times, one cart's step response follows the textbook formula."""
     k, omega_n = 0.03, 13.2
     m = k / omega_n**2
     chain = Chain(m=np.array([m]), c=np.array([2 * zeta * omega_n * m]), k=np.array([k, 0.0]))

@@ -323,7 +323,7 @@ def test_nearest_ignores_leading_zeros():
 
 
 def test_only_the_first_of_many_mistakes_are_written_out(tmp_path):
-    """Of thousands of mistakes the first are written out, and the others only counted."""
+    """Of thousands of mistakes, only the first ones are listed, and the others are counted."""
     keys = "".join(f"k{i} = 1\n" for i in range(60_000))
     text = f"version = 1\n[system]\ncarts = 1\n{keys}"
     (tmp_path / "submission.toml").write_text(text, encoding="utf-8")

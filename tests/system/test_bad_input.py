@@ -504,7 +504,7 @@ SLIPS = {
 
 @pytest.mark.parametrize("typed", SLIPS)
 def test_a_typing_slip_gets_its_correction(typed, tmp_path):
-    """A typing slip that TOML refuses gives one line with its reason and perhaps a correction."""
+    """A typing slip that breaks the TOML gives one line that says why, often with a correction."""
     write(tmp_path / "team-01", "version = 1\n" + typed + "\n")
     words, mended = SLIPS[typed]
     with pytest.raises(SubmissionError, match=rf"toml line [234]: .*{words}") as caught:

@@ -88,7 +88,7 @@ class _Upload(_Save):
 
 @dataclass(kw_only=True)
 class _Override(_Save):
-    """Give points by hand, each time with the number of the change as the reason."""
+    """Give points by hand, with the running number of the change as the reason."""
 
     page: str = "/grades/0/"
     longest: float = 0.8
@@ -121,7 +121,7 @@ class _Override(_Save):
 
 @dataclass(kw_only=True)
 class _Regrade(_Save):
-    """Grade a changed submission again, in a class in which another one has points by hand."""
+    """Grade a changed submission again, in a class where another submission has manual points."""
 
     page: str = "/grades/0/"
     longest: float = 20.0

@@ -168,7 +168,7 @@ def test_a_stock_bench_is_driven_by_people(tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 def test_a_pty_is_a_port_like_any_other(tmp_path):
-    """From the same plan, a pseudo-terminal gives the same kind of record as a socket."""
+    """A plan can be recorded through a pseudo-terminal as well as through a socket."""
     work = write_work(tmp_path, [sine("dwell", seconds=1)])
     with emulator("--port", "pty", "--speed", "5") as bench:
         *_, outcome = acquire(work, port=bench.address, observers=[Notes()], only=["dwell"])

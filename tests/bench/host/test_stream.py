@@ -179,9 +179,9 @@ def test_the_last_line_of_an_earlier_run_does_not_count():
 
 @pytest.mark.parametrize("closed", [True, False])
 def test_a_duty_in_only_one_line_is_accepted_in_closed_loop(closed):
-    """A duty in only one line is accepted in a closed loop, where an encoder may flicker.
+    """A line whose duty differs from its neighbours' is accepted only in a closed loop.
 
-    In open loop such a line is not accepted.
+    In a closed loop a flickering encoder can cause it.
     """
     sent = lines(100, period=1.0)
     sent[50] = Reading(counts=sent[50].counts, target=0, duty=120, ms=sent[50].ms)

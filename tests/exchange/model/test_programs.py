@@ -133,10 +133,10 @@ def test_a_force_below_the_friction_moves_no_cart(tmp_path):
 @no_compiler
 @pytest.mark.parametrize("interval", [1e-5, 1e-3, 7e-3])
 def test_a_delay_is_right_at_any_step_length(interval, tmp_path):
-    """A delay shifts the whole motion by the same time, whatever the length of steps.
+    """A delay shifts the whole motion by the same time, at any step length.
 
-    The model remembers 254 jumps of the input within a delay. If there are more, as here with one
-    every 10 µs, it delays their mean.
+    The model stores up to 254 jumps of the input during a delay. If there are more, as here with
+    one every 10 µs, it delays their mean.
     """
     delay = SIZES["input_delay"]["delay"]
     t = np.arange(0.0, 0.2, interval)

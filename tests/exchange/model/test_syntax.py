@@ -53,7 +53,7 @@ MODELLED = [substitute(text, {name: f"s{i}" for i, name in enumerate(SYMBOLS)}) 
 
 
 def test_every_law_of_the_catalogue_is_an_expression():
-    """Every law of the catalogue is an expression, unless the effect has a state of its own."""
+    """Every law in the catalogue is an expression, except for effects with their own state."""
     assert all(laws(effect) or isinstance(effect.law, BuiltLaw) for effect in CATALOGUE)
     assert len(LAWS) >= 15
 

@@ -237,7 +237,7 @@ def test_an_exploration_ends_after_three_failures(tmp_path):
 def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
     """A recording that a person vetoes is replaced, and one that is added comes next.
 
-    gap.json is then written again, and proposes another recording than the vetoed one.
+    gap.json is then written again with a new proposal in place of the vetoed one.
     """
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     folder, offered, said = tmp_path / "work", [], []

@@ -100,7 +100,7 @@ def simulated(controller, reference, *, delay):
 
 @pytest.mark.parametrize("amplitude", [400, 40_000])
 def test_state_feedback_is_the_law_of_the_simulated_loop(amplitude):
-    """The duty of state feedback equals that of the loop's simulation, clipping included."""
+    """State feedback gives the same duty as the simulated loop, including the clipping."""
     gains = StateGains(gains=(0.02, 0.002, 0.05, -0.001), prefilter=0.3)
     start = Start(wave=Wave.SQUARE, encoder=1, frequency=2.0, amplitude=amplitude)
     r = np.array([float(target_at(start, PERIOD * k)) for k in range(500)])
