@@ -264,7 +264,7 @@ def test_a_recording_under_many_names_is_compared_once(teams, compared):
 
 @pytest.mark.parametrize("alike", ["cuts of one run", "one hum in all"])
 def test_the_cost_grows_with_the_recordings_not_their_square(teams, alike, compared):
-    """If all recordings look alike, comparisons grow in number only as the recordings do."""
+    """If all recordings look the same, at most ten comparisons per recording are needed."""
     rng = np.random.default_rng(5)
     record = of_kind(teams[0], "decay")
     if alike == "cuts of one run":
