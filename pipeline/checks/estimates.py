@@ -62,7 +62,7 @@ def _advice(row: ParameterRow) -> str:
         seen = (
             "a steady sine of amplitude A gives ζ + 2d/(πA)"
             if response
-            else "it increases the damping ratio of small swings more"
+            else "it raises them more for small swings"
         )
         return (
             f" Dry friction makes damping ratios differ: {seen}. Check which of the two methods "
@@ -96,7 +96,7 @@ def check_decays(
         found = (
             "is not exponential: dry friction can hold the cart within "
             f"±{test.drop:.3g} {bench.units.position} of its rest position. The envelope's ζ = "
-            f"{decay.zeta:.3g} is biased; without the friction, ζ = {test.zeta:.3g}."
+            f"{decay.zeta:.3g} is biased; with the friction in the fit, ζ = {test.zeta:.3g}."
             if test.present
             else "is exponential within the noise "
             f"(F = {test.f_statistic:.1f}; above {test.threshold:.1f} would mean dry friction)."
@@ -147,8 +147,8 @@ def _step_check(step: StepGain, *, shown: Sequence[str], bench: Bench) -> Check:
         outcome, found = (
             "fail",
             (  # the shift of the rest points gives the least friction that can hold the cart
-                f"sticks: judged by its rest positions, the static gain is between {low:.4g} and "
-                f"{high:.4g} {bench.units.gain}, but the true gain may be outside."
+                f"sticks: its rest positions give static gains from {low:.4g} to {high:.4g} "
+                f"{bench.units.gain}, but the true gain may be outside this range."
             ),
         )
     elif shown:

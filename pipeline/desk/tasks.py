@@ -224,7 +224,7 @@ def propose_recordings(folder: str, stock: bool, *, progress: Progress) -> str:
 def weigh_recording(
     folder: str, recording: dict[str, Any], goal: str, *, progress: Progress
 ) -> dict[str, Any]:
-    """Return how much a custom recording would improve, next to the best one that cartlab finds."""
+    """Return how much a typed recording would reduce the error, and how much the best one would."""
     from pipeline.bench.host.raw import known_commands
     from pipeline.experiments.plan import Recording
     from pipeline.experiments.plan_words import what_words

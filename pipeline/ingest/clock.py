@@ -121,7 +121,7 @@ def clock_notes(
     if clock.pieces:
         even = "" if clock.pieces == 1 else f", in {clock.pieces} pieces"
         notes.append(
-            f"time stamps rounded to {clock.rounding:g} s were straightened: "
+            f"time stamps rounded to {clock.rounding:g} s were replaced by even ones: "
             f"one sample every {1e3 * (clock.period or clock.mean_interval):.6g} ms{even}"
         )
     for i in clock.gaps[:3]:

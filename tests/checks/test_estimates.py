@@ -30,7 +30,7 @@ def test_gain_intervals_of_a_sticking_cart_may_be_disjoint():
     ]
     checks = check_steps(steps, bench=Bench(springs=(True, True)))
     assert [check.outcome for check in checks] == ["fail", "fail"]
-    assert all("the true gain may be outside" in check.message for check in checks)
+    assert all("the true gain may be outside this range" in check.message for check in checks)
 
 
 def test_a_step_that_friction_stops_short_does_not_pass(tmp_path):

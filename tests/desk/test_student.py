@@ -380,11 +380,11 @@ def test_only_an_up_to_date_report_lists_assumptions(filled):
     os.utime(folder / load_submission(folder).experiments[0].file, (1e9, 1e9))
     page = visitor.get(HERE + "hand-in").text
     assert "system.springs" not in page
-    assert page.count("You will see them once the report of these files is made.") == 2
+    assert page.count("You will see them after the report of these files is made.") == 2
     question = {"id": "zeta_1", "section": "parameters", "text": "Why?"}
     asked.write_text(json.dumps(told | {"questions": [question]}), encoding="utf-8")
     page = visitor.get(HERE + "hand-in").text
-    assert page.count("You will see them once the report of these files is made.") == 1
+    assert page.count("You will see them after the report of these files is made.") == 1
     assert "0 of 1 of the last report answered." in page
 
 
@@ -396,7 +396,7 @@ def test_a_failed_report_does_not_prevent_handing_in(filled):
     assert "is a link" in page
     assert "There is no report yet, so the zip will not contain one." in page
     assert (
-        page.count("You will see them once the report of these files is made.") == 2
+        page.count("You will see them after the report of these files is made.") == 2
     )  # the page does not say that no questions are open
     assert "report/report.pdf" not in zipped(visitor).namelist()
 
@@ -921,7 +921,7 @@ def test_warnings_that_differ_in_a_number_appear_once(room):
         visitor.upload(HERE + "files", [(f"{name}.csv", text.encode())])
     page = visitor.get(HERE).text
     assert "1 remark on several files" in page
-    assert page.count("were straightened") == 1
+    assert page.count("were replaced by even ones") == 1
     assert "one sample every 10.3 to 10.5 ms" in page
 
 

@@ -70,7 +70,7 @@ def test_a_folder_of_files_becomes_a_submission(tmp_path):
 
 
 def test_a_second_run_prints_as_much_as_the_first(tmp_path):
-    """A second `fill` repeats free carts and doubts, until a person removes "unsure" comments."""
+    """A second `fill` prints the same doubts, until a person removes the "unsure" comments."""
     still = 0 * T
     put(tmp_path, "pull.csv", time=T, input=still, x1=RING, x2=still)
     put(tmp_path, "loop.csv", time=T, input=RING / 999, reference=STEP, x1=RING, x2=RING)

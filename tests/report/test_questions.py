@@ -146,7 +146,7 @@ def test_a_cart_that_sticks_is_asked_about_with_its_interval():
     assert isinstance(stuck, StepGain)
     (question,) = ask(replace(analysis, step_gains=(stuck,)))
     assert question.id == "sticking-1"
-    assert "between 23.1 and 26.4" in question.text
+    assert "from 23.1 to 26.4" in question.text
 
 
 def test_a_poor_fit_asks_about_its_worst_point():

@@ -237,7 +237,7 @@ def test_requests_of_other_pages_are_refused(page):
     ],
 )
 def test_nonsense_confirms_nothing(page, body, status):
-    """A malformed, unknown or too long answer is refused, and the page still works."""
+    """A malformed, unknown or overlong answer is refused, and the page still works."""
     origin = page.url[: page.url.index("/", 8)]
     assert ask(page, "press", "POST", body, Origin=origin)[0].status == status
     assert ask(page)[0].status == 200

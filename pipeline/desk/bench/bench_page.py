@@ -78,7 +78,7 @@ def add(ask: Ask) -> Response:
 
 
 def weigh(ask: Ask) -> Response:
-    """Show how much the typed recording would improve, next to the best one that cartlab finds."""
+    """Show how much a typed recording would reduce the error, and how much the best one would."""
     from pipeline.experiments.goal import WORST
 
     folder, typed = ask.folder(), {name: ask.text(name) for name in _TYPED}

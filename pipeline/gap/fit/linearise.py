@@ -64,7 +64,7 @@ def fresh_nuisance(run: GapRun) -> Nuisance:
 
 
 def simulate_run(model: GapModel, run: GapRun, nuisance: Nuisance) -> Array:
-    """Return the simulated readings (rows, samples) of one run, with encoder zeros."""
+    """Return the simulated readings (rows, samples) of one run, including the encoder zeros."""
     y, _ = _simulate_variants([model], run, [nuisance.start])
     return y[0] + nuisance.zero[list(run.rows)][:, None]
 

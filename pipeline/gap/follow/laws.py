@@ -72,7 +72,7 @@ class TrialLaw:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FollowedBench:
-    """The properties of a bench that limit the laws.
+    """The properties of a bench that decide which laws are possible.
 
     Attributes
     ----------

@@ -164,7 +164,7 @@ def grade_analysis(
 def prepare_work(
     submission: Submission, analysis: Analysis, *, rubric: Rubric
 ) -> tuple[Work, tuple[Flag, ...], tuple[str, ...]]:
-    """Return the input of the checks, all flags in the order of `CODES`, and notes.
+    """Return the input to the checks, all flags in the order of `CODES`, and notes.
 
     The notes say whether reported signs were reversed, because the recordings have the opposite
     sign.
@@ -179,7 +179,7 @@ def prepare_work(
 def _prepare(
     submission: Submission, analysis: Analysis, *, rubric: Rubric
 ) -> tuple[Work, tuple[Flag, ...]]:
-    """Return the input of the checks, and the flags of the parameter tables."""
+    """Return the input to the checks, and the flags of the parameter tables."""
     reported, n = submission.reported or Reported(), rubric.system.carts
     measured, chain = in_scale(
         recompute(analysis),

@@ -1,4 +1,4 @@
-"""The input of the checks, and their results (verdicts)."""
+"""The input to the checks, and their results (verdicts)."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -153,7 +153,7 @@ def _positive(response: FrequencyResponse) -> FrequencyResponse:
 
 
 def _points(ax: Axes, x: Array, y: Array, error: Array | None, *, label: str = "") -> None:
-    """Plot diamonds with error bars; all bars together are one path.
+    """Plot diamonds with error bars; all bars are drawn as one path.
 
     Parameters
     ----------

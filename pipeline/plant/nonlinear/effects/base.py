@@ -31,7 +31,7 @@ Axis = Literal["velocity", "position", "stretch", "input", "time", "frequency"]
 
 @dataclass(frozen=True, kw_only=True)
 class PlaceScales:
-    """Typical sizes at one place of a bench, from its recordings and its linear model.
+    """Typical sizes at one cart or spring of a bench, from its recordings and its linear model.
 
     Attributes
     ----------
