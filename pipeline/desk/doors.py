@@ -112,7 +112,7 @@ class JupyterDoor:
         self._user, self._secret = user, secret
 
     def site(self, headers: Headers) -> str:
-        """Return the address at which the browser reaches Jupyter, from the headers.
+        """Find in the headers the address at which the browser reaches Jupyter.
 
         Pages from other sites have a different origin, so they are refused.
         """

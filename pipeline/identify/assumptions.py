@@ -161,7 +161,7 @@ def _sign(system: System, data: Ingested, *, failed: Sequence[Check]) -> Iterato
 def _free_carts(
     records: Sequence[Record], *, n: int, failed: Sequence[Check]
 ) -> Iterator[Assumption]:
-    """Yield one assumption for each set of free carts, with the recordings that have this set."""
+    """Yield one assumption for each set of free carts, with its recordings."""
     if n == 1:
         return
     wrong = {check.run for check in failed if check.kind == "setup"}
@@ -180,7 +180,7 @@ def _free_carts(
             reason = f"in {abridge(little)} a cart stated as free hardly moves"
         elif unseen:
             what = "a held cart" if held else "a cart"
-            reason = f"in {abridge(unseen)} {what} was not measured"
+            reason = f"in {abridge(unseen)} the position of {what} was not recorded"
         else:
             support = "supported"
             reason = "the held carts hardly move" if held else "all carts move"

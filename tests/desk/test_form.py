@@ -127,7 +127,7 @@ def test_a_row_has_the_fields_of_its_kind_only(table, keys):
 
 
 def test_comments_survive_every_change(tmp_path):
-    """All comments of the file that `cartlab new` writes survive every change."""
+    """All comments in the file that `cartlab new` writes survive every change."""
     new_submission(tmp_path / "team", carts=2)
     text = (tmp_path / "team" / "submission.toml").read_text(encoding="utf-8")
     values = {"title": "x", "system.position.unit": "cm", "system.position.per_count": "0.1",

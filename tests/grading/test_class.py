@@ -121,7 +121,10 @@ def test_a_gain_that_two_mistakes_explain_names_both():
 
 
 def tied(seed: int) -> tuple[Team, Grade]:
-    """Return a team of two carts with both wall springs; its rubric lacks the near spring."""
+    """Return a team whose two carts have springs to both walls, and its grade.
+
+    The rubric has no spring to the wall near cart 1.
+    """
     with tempfile.TemporaryDirectory() as folder:
         team = make_team(seed, folder=Path(folder), digits=3, chain=TIED)
         rubric = load_rubric(Path("throne-2dof"))

@@ -127,7 +127,7 @@ def test_a_held_cart_that_was_not_measured_is_open(tmp_path):
     folder = write_two_cart_submission(tmp_path / "s", REAL_DATA, steps=(1, 2, 3, 4, 5))
     found = by_key(analyse(load_submission(folder), design=False))
     assert found["experiments.carts (1,)"].support == "open"
-    assert "was not measured" in found["experiments.carts (1,)"].reason
+    assert "was not recorded" in found["experiments.carts (1,)"].reason
     assert found["system.position.unit"].support == "supported"
     sign = found["system.input.sign"]
     assert (sign.value, sign.origin, sign.support) == (-1.0, "data", "supported")

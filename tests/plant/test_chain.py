@@ -112,7 +112,7 @@ def test_the_names_of_the_tables():
 
 
 def test_units_of_parameters():
-    """Gains, frequencies and a rigid body's two numbers have units; damping ratios do not."""
+    """Gains, frequencies, mass and damping coefficient have units; damping ratios do not."""
     units = {
         name: read_name(name).unit(PAPER_UNITS)
         for name in ("K_2", "omega_a", "zeta_1", "mass", "damping")

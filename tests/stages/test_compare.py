@@ -90,9 +90,9 @@ def test_a_final_value_at_its_bound_is_not_used():
     ("name", "std", "there"), [("K", 0.19, True), ("K", 0.21, False), ("zeta", 0.6, True)]
 )
 def test_a_very_uncertain_final_value_is_not_determined(name, std, there):
-    """If a final value's error is as large as its limit, the value is called not determined.
+    """If a final value's error is as large as the limit, the value is called "not determined".
 
-    The limit is 15 % for a gain and 50 % for a damping.
+    The limit is 15 % for a gain and 50 % for a damping ratio.
     """
     row = _row(1.0, 1.3, name=name, std=std)
     assert (row.final is not None) is there

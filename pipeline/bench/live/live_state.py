@@ -103,7 +103,7 @@ class ShownSession(ABC):
     def _keep(
         self, run: int, points: Sequence[Sequence[float]], counters: Mapping[str, int]
     ) -> None:
-        """Add points of the current or of a new run; the caller must hold the lock."""
+        """Add points of the current run or of a new one; the caller must hold the lock."""
         if run != self._run:
             self._run, self._end = run, 0
             self._points.clear()

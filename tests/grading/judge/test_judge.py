@@ -325,7 +325,7 @@ def test_further_flags_keep_the_order_of_the_codes():
 
 @pytest.mark.parametrize(("hide", "loosely"), [((), False), (("dead_zone",), True)])
 def test_a_message_says_if_numbers_are_judged_loosely(hide, loosely):
-    """If linear carts do not fit the recordings, the message asks a person to check the numbers."""
+    """If no linear model fits the recordings, the message asks a person to check the numbers."""
     criteria = {c.id: c for c in student(1, hide=hide).grade().criteria}
     for name in ("final-gains", "final-frequencies", "final-dampings"):
         message = criteria[name].message

@@ -1,4 +1,4 @@
-"""The figures in the feedback draw the curve of the reported numbers next to the measurement."""
+"""The figures in the feedback show measured points and the curve that the reported numbers give."""
 
 import numpy as np
 import pytest

@@ -46,7 +46,8 @@ EFFECT = Effect(
             typical=0.06 * 0.1 * 1.05,
         ),
     ),
-    fingerprint="There is one more resonance than there are carts, or a resonance has two peaks.",
+    fingerprint="There is one more resonance than there are carts, or a resonance is split into "
+    "two peaks.",
     deciding_run="A sweep through the extra resonance, then the same sweep with the suspected part "
     "held by hand.",
     reference="J. P. Den Hartog, Mechanical Vibrations, section 3.2",
