@@ -33,7 +33,9 @@ def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
             continue
         limit = change_limit(row.name)
         outcome, verdict = verdicts[row.consistent]
-        sigmas = "" if row.change_sigmas is None else f" or {row.change_sigmas:.1f} standard errors"
+        sigmas = (
+            "" if row.change_sigmas is None else f", or {row.change_sigmas:.1f} standard errors"
+        )
         advice = _advice(row) if outcome == "fail" else ""
         same = "" if row.independent is not False else " Both use the same recordings."
         checks.append(
@@ -43,8 +45,8 @@ def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
                 outcome=outcome,
                 value=abs(row.change_percent),
                 limit=limit,
-                message=f"Initial and final {row.name} {verdict}: the difference is "
-                f"{row.change_percent:+.1f} %{sigmas} (limit {limit:.0f} %).{same}{advice}",
+                message=f"Initial and final {row.name} {verdict} (limit {limit:.0f} %): the "
+                f"difference is {row.change_percent:+.1f} %{sigmas}.{same}{advice}",
             )
         )
     return checks

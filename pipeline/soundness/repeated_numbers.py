@@ -41,8 +41,8 @@ class Repeats:
 class _Reading:
     """The value from one run, its interval, and the size of the step that gave it.
 
-    `tolerance` is the largest difference between runs, in percent, that is no contradiction. With
-    dry friction, repeats differ by some percent.
+    `tolerance` is how far runs may differ, in percent, before they contradict each other. With dry
+    friction, repeats differ by a few percent.
     """
 
     run: str

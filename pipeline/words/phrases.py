@@ -48,7 +48,7 @@ class Phrases:
         return [_filled_in(part, values) for part in template.split(" | ")]
 
     def spans(self, key: str, **values: str | Spans) -> Spans:
-        """Return a sentence with its marks; values may have marks as well."""
+        """Return a sentence as formatted spans; its values may be formatted too."""
         return tuple(span for span in _spans(self._template(key, values), values) if span.text)
 
     def _template(self, key: str, values: Mapping[str, object]) -> str:

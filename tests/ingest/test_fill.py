@@ -274,7 +274,7 @@ def test_a_table_without_its_file_is_reported(tmp_path):
 
 
 def test_links_out_of_the_folder_are_not_followed(tmp_path):
-    """A file that is a link to outside the submission is refused, with its name."""
+    """A link that points outside the submission is refused, and the error names it."""
     put(tmp_path / "theirs", "a.csv", time=T, input=STEP, x1=RING)
     put(tmp_path / "mine", "b.csv", time=T, input=STEP, x1=RING)
     (tmp_path / "mine" / "data" / "a.csv").symlink_to(tmp_path / "theirs" / "data" / "a.csv")

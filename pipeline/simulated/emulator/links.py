@@ -40,7 +40,7 @@ class Link(Protocol):
         ...
 
     def send(self, data: bytes) -> None:
-        """Send bytes, or keep those that the host does not take yet; without a host drop them."""
+        """Send bytes, or keep those that the host cannot take yet; without a host, drop them."""
         ...
 
     def hang_up(self) -> None:

@@ -119,7 +119,7 @@ def test_a_cart_that_was_always_held_does_not_move(free, tmp_path):
 
 @no_compiler
 def test_a_force_below_the_friction_moves_no_cart(tmp_path):
-    """A force below the friction does not move a cart at all, and a moving cart finally stops."""
+    """A force below the friction does not move a cart, and a moving cart eventually stops."""
     model = model_of("coulomb_friction", last=False)
     in_c = compiled(model, tmp_path)
     held = in_c.simulate(T, np.full(T.size, 0.99e-3), x0=np.zeros(2))
