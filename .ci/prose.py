@@ -6,6 +6,11 @@ words of templates, docstrings, comments and messages. A folder with more odd se
 budget, so it can only fall. `python .ci/prose.py PATH...` lists the odd sentences in these files.
 
 Read a listed sentence aloud. Rewrite the whole thought, not only the word.
+
+Well-kept linters look for other things. In this project's documentation before it was edited (40,000
+words, 144 of these finds), proselint named 65 places, 63 of them quotation marks and signs of
+multiplication. retext (simplify, passive, readability) named 633, mostly passives and terms of the
+field, such as "effect" and "parameters".
 """
 
 import ast
