@@ -123,8 +123,12 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
         expect(window.locator("#files").get_by_text("Saved.")).to_be_visible()
         window.get_by_text("Which controller ran?").click()
         window.get_by_label("Controller", exact=True).select_option("state_feedback")
-        expect(window.locator("#kind-closed_loop .chip")).to_have_text("understood")
+        chip = window.locator("#kind-closed_loop .chip")
+        expect(chip).to_have_text("1 to look at")  # the gains are not stated yet
         expect(window.get_by_label("Prefilter").first).to_be_visible()  # not folded away
+        window.get_by_label("Gains").first.fill("0.002809, 0.003984")
+        window.locator("#kind-closed_loop").get_by_role("button", name="Save").click()
+        expect(chip).to_have_text("understood")
         assert fits(window)
 
         window.get_by_role("button", name="Make the report").click()
