@@ -1,15 +1,17 @@
-"""Choose the next recording of an exploration, and say why."""
+"""Choose the next recordings of an exploration, and say why."""
 
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from pipeline.errors import DataError
 from pipeline.experiments.discriminate import far_sweep
 from pipeline.experiments.exploring.turn_words import WORDS, name_model
-from pipeline.experiments.next_recordings import choose_next
+from pipeline.experiments.next_recordings import NextPlan, choose_next
 from pipeline.experiments.plan import Plan, PlanLimits, Recording
+from pipeline.experiments.plan_words import session_time
 from pipeline.experiments.propose import FURTHEST, identified_chain, large_steps
 from pipeline.gap.types import Gap
 from pipeline.results import Analysis
@@ -20,27 +22,34 @@ SETTLED = ("named", "none")
 _APART = 1.0
 # A recording with this share of the largest allowed amplitude is as good as the largest.
 _HARD = 0.8
+# One analysis plans this share of the recordings so far. Fewer data hardly change the next choice,
+# but each analysis takes as much longer as there are more recordings.
+_SHARE = 0.1
 _FAR_OUT = "far"  # the aim of a recording that shows effects at large motion
 
 
-def choose_recording(
+def choose_recordings(
     analysis: Analysis,
     gap: Gap | None,
     plan: Plan,
     *,
     missing: dict[str, float],
+    wanted: float,
+    seconds: float,
     refused: Sequence[Recording],
     commands: frozenset[str],
-) -> tuple[Recording | None, str]:
-    """Return the next recording and why it was chosen.
+) -> tuple[tuple[Recording, ...], str]:
+    """Return the next recordings and why they were chosen.
 
-    The recording is None if everything is known or nothing would help. A recording that
-    distinguishes explanations comes first, then one that improves the least known parameter, then
-    one that shows effects at large motion.
+    There are none if everything is known or nothing would help. A recording that distinguishes
+    explanations comes first, then some that improve the least known parameter, then one that shows
+    effects at large motion.
 
     Parameters
     ----------
     missing : the parameters that are not known well enough, with their relative errors.
+    wanted : the relative error to reach.
+    seconds : the time left at the bench; of several recordings, those beyond it are dropped.
     refused : recordings refused before; no similar recording is chosen.
     commands : the extensions of the protocol that the bench knows.
     """
@@ -54,17 +63,19 @@ def choose_recording(
         recording = Recording.model_validate_json(json.dumps(decides.recording))
         disputed = [name_model(one) for one in gap.contenders]
         names = " and ".join(f'"{disputed[i]}"' for i in predicted.pair)
-        return recording, WORDS.text("differ", names=names, times=f"{decides.separation:.2g}")
+        return (recording,), WORDS.text("differ", names=names, times=f"{decides.separation:.2g}")
     if missing and named:
         worst = max(missing, key=lambda name: missing[name])
         # Recordings of the plan without data give no information yet, so leave them out.
         made = plan.model_copy(update={"recordings": ()})
         try:
-            found = choose_next(analysis, made, n=1, goal=worst, commands=commands, without=refused)
+            n = max(1, int(_SHARE * len(analysis.records)))
+            found = choose_next(analysis, made, n=n, goal=worst, commands=commands, without=refused)
         except DataError as error:  # a large step is still possible
             end = str(error)
         else:
-            return found.recordings[0], found.summary
+            found = _as_needed(found, wanted=wanted, seconds=seconds)
+            return found.recordings, found.summary
     # Record each of these only once: carts that were held back would go no further the second time.
     recorded = {record.id for record in analysis.records}
     tried = [*refused, *(r for r in plan.recordings if r.id in recorded)]
@@ -75,8 +86,19 @@ def choose_recording(
         )
         if not alike and (unseen or not settled):
             why = unseen if settled else WORDS.text("as_far")
-            return recording.model_copy(update={"aim": _FAR_OUT}), why
-    return None, end
+            return (recording.model_copy(update={"aim": _FAR_OUT}),), why
+    return (), end
+
+
+def _as_needed(found: NextPlan, *, wanted: float, seconds: float) -> NextPlan:
+    """Return the plan without the recordings beyond the error to reach or the time left.
+
+    The first recording always stays.
+    """
+    for n in range(1, len(found.recordings)):
+        if found.errors[n] <= wanted or session_time(found.recordings[: n + 1]) > seconds:
+            return replace(found, recordings=found.recordings[:n], errors=found.errors[: n + 1])
+    return found
 
 
 def _reach_far_out(analysis: Analysis, limits: PlanLimits) -> Iterator[tuple[Recording, str]]:

@@ -12,7 +12,7 @@ from pipeline.errors import ConfigError, DataError
 from pipeline.estimation.chain.parametrisation import named_estimates
 from pipeline.experiments.by_hand import add_recording
 from pipeline.experiments.discriminate import propose_for
-from pipeline.experiments.exploring.choice import SETTLED, choose_recording
+from pipeline.experiments.exploring.choice import SETTLED, choose_recordings
 from pipeline.experiments.exploring.error_goal import ErrorGoal
 from pipeline.experiments.exploring.turn_words import (
     WORDS,
@@ -36,6 +36,7 @@ from pipeline.results import Analysis, Stage
 from pipeline.submission import System, load_submission
 from pipeline.submission.load import NAME
 from pipeline.submission.models import MOST_CARTS
+from pipeline.words.numbers import listing
 from pipeline.words.progress import Progress, silent
 from pipeline.words.text import capital
 from pipeline.workflow import analyse
@@ -122,9 +123,8 @@ class Exploration:
         """
         self._begin()
         self._analyse()
-        while (recording := self._take_turn()) is not None:
-            gc.collect()  # figures and searches are reference cycles with large arrays
-            self._try_out(recording)
+        while recordings := self._take_turn():
+            self._try_out(recordings)
         return tuple(self.turns)
 
     def _begin(self) -> None:
@@ -180,8 +180,11 @@ class Exploration:
 
     def _analyse(self) -> None:
         """Identify the carts and look for the gap with all data so far."""
-        analysis = analyse(load_submission(self.folder), progress=self.progress)
+        if self.turns:  # their arrays and the new ones need not be in memory together
+            del self.analysis
         self.gap: Gap | None = None
+        gc.collect()  # figures and searches are reference cycles with large arrays
+        analysis = analyse(load_submission(self.folder), progress=self.progress)
         try:
             self.gap = investigate(analysis, progress=self.progress, budget=_SEARCH)
         except DataError as error:
@@ -200,26 +203,27 @@ class Exploration:
         place.mkdir(exist_ok=True)
         write_file(place / "gap.json", json_text(self.gap))
 
-    def _take_turn(self) -> Recording | None:
-        """Report what is known; add the next recording to the plan and return it."""
+    def _take_turn(self) -> tuple[Recording, ...]:
+        """Report what is known; add the next recordings to the plan and return them."""
         self.progress("what to record next")
         gap, errors = self.gap, relative_errors(self.analysis)
         missing = self.goal.missing(errors)
-        recording, why = self._choose(missing)
+        recordings, why = self._choose(missing)
         doubt = describe_doubt(gap) if gap else WORDS.text("no_look")
         if gap and not gap.complete:
             doubt += WORDS.text("search_ended", seconds=f"{_SEARCH:.0f}")
         parts = [describe_accuracy(missing, errors), doubt, capital(why) or WORDS.text("the_end")]
         why_ended = ""
-        if recording and not self._has_time_for([recording]):
-            why_ended = WORDS.text("time_up", time=time_words(self.seconds), name=recording.id)
+        if recordings and not self._has_time_for(recordings[:1]):
+            name = recordings[0].id
+            why_ended = WORDS.text("time_up", time=time_words(self.seconds), name=name)
         # after three failures in a row, another choice does not help
-        elif recording and self.failures >= 3:
+        elif recordings and self.failures >= 3:
             why_ended = WORDS.text("none_came", count=self.failures)
         if why_ended:
-            recording = None
+            recordings = ()
         # whether something useful was left undone
-        is_cut_short = bool(why_ended or (self.failures and not recording))
+        is_cut_short = bool(why_ended or (self.failures and not recordings))
         turn = Turn(
             seconds=self.spent,
             recorded=self.made,
@@ -232,45 +236,70 @@ class Exploration:
             summary=". ".join(filter(None, [self.lost, *parts, why_ended])).replace("?. ", "? "),
             gap=gap,
         )
-        if self.turns:
-            self.turns[-1] = self.turns[-1].without_other_traces()
         self.turns.append(turn)
         self.made = ()
         write_diary(self.turns, self.analysis, self.folder, wanted=self.goal.error)
         self.announce(turn.summary)
-        return recording
+        return recordings
 
-    def _choose(self, missing: dict[str, float]) -> tuple[Recording | None, str]:
-        """Return the next recording as written in the plan, and its reason."""
-        plan, recording = load_plan(load_submission(self.folder)), None
+    def _choose(self, missing: dict[str, float]) -> tuple[tuple[Recording, ...], str]:
+        """Return the next recordings as written in the plan, and their reason."""
+        plan, recordings = load_plan(load_submission(self.folder)), ()
         try:
-            recording, why = choose_recording(
+            recordings, why = choose_recordings(
                 self.analysis,
                 self.gap,
                 plan,
                 missing=missing,
+                wanted=self.goal.error,
+                seconds=self.seconds - self.spent,
                 refused=self.refused,
                 commands=known_commands(self.folder),
             )
         except DataError as error:
             why = str(error)
-        # A person may have added a recording during the computation.
+        if added := self._added():  # during the computation
+            return (added,), WORDS.text("added", name=added.id)
+        if not recordings:
+            return (), why
+        still, planned = self._unrecorded(), []
+        for recording in recordings:
+            same = (o for o in still if o.aim == recording.aim and _shape(o) == _shape(recording))
+            planned.append(next(same, None) or add_recording(self.folder, recording))
+            still = [one for one in still if one.id != planned[-1].id]
+        key = "therefore" if len(planned) == 1 else "therefore_these"
+        names = listing([one.id for one in planned])
+        return tuple(planned), WORDS.text(key, name=names, why=why)
+
+    def _unrecorded(self) -> list[Recording]:
+        """Return the recordings of the plan that have no data."""
         submission = load_submission(self.folder)
         done = {experiment.id for experiment in submission.experiments}
-        still = [one for one in load_plan(submission).recordings if one.id not in done]
-        if added := next((one for one in still if one.id not in self.ours), None):
-            return added, WORDS.text("added", name=added.id)
-        if recording is None:
-            return None, why
-        same = (
-            one for one in still if one.aim == recording.aim and _shape(one) == _shape(recording)
-        )
-        recording = next(same, None) or add_recording(self.folder, recording)
-        return recording, WORDS.text("therefore", name=recording.id, why=why)
+        return [one for one in load_plan(submission).recordings if one.id not in done]
 
-    def _try_out(self, recording: Recording) -> None:
-        """Make the chosen recording and analyse all data again, or remember that it failed."""
-        self.ours.add(recording.id)
+    def _added(self) -> Recording | None:
+        """Return the first recording without data that a person added to the plan."""
+        return next((one for one in self._unrecorded() if one.id not in self.ours), None)
+
+    def _try_out(self, recordings: Sequence[Recording]) -> None:
+        """Make the chosen recordings, and analyse all data again if there are new ones.
+
+        One that fails, or that a person adds to the plan, ends the series.
+        """
+        self.turns[-1] = self.turns[-1].without_other_traces()
+        self.ours.update(one.id for one in recordings)
+        for recording in recordings:
+            if self.made and (self._added() or not self._has_time_for([recording])):
+                break
+            if not self._comes(recording):
+                break
+        if self.made:
+            self._analyse()
+        else:
+            self._propose(self.analysis)  # find again which recording decides
+
+    def _comes(self, recording: Recording) -> bool:
+        """Make a recording; return whether it was made, or else remember why not."""
         if self.vetoes(recording):
             came = Recorded(ids=(), seconds=0.0, vetoed=True)
         else:
@@ -279,14 +308,13 @@ class Exploration:
             self.lost, self.failures = "", 0
             if recording.aim == GAP:
                 self.asked.append(recording)
-            self._analyse()
-            return
+            return True
         self.refused.append(recording)
         self.failures = 0 if came.vetoed else self.failures + 1
         key = "vetoed" if came.vetoed else "lost_why" if came.why else "lost"
         values = {"name": recording.id} | ({"why": came.why} if key == "lost_why" else {})
         self.lost = WORDS.text(key, **values)
-        self._propose(self.analysis)  # find again which recording decides
+        return False
 
 
 def _identify_beside(analysis: Analysis, gap: Gap | None) -> Analysis:

@@ -10,13 +10,14 @@ from pipeline.errors import ConfigError, DataError
 from pipeline.experiments.by_hand import add_recording
 from pipeline.experiments.candidates import propose_candidates
 from pipeline.experiments.discriminate import propose_for
-from pipeline.experiments.exploring.choice import choose_recording
+from pipeline.experiments.exploring.choice import choose_recordings
 from pipeline.experiments.exploring.error_goal import ErrorGoal, read_error_goal, read_time
 from pipeline.experiments.exploring.exploration import Exploration, Recorded
 from pipeline.experiments.goal import find_goal
 from pipeline.experiments.information import Knowledge
 from pipeline.experiments.plan import PlanLimits
 from pipeline.experiments.plan_file import load_plan, save_plan
+from pipeline.experiments.plan_words import session_time, time_words
 from pipeline.experiments.propose import propose_plan
 from pipeline.report.exploration.diary import NAME
 from pipeline.simulated.hidden import prepare_bench
@@ -321,12 +322,81 @@ def test_a_large_step_is_proposed_after_all_else_was_refused(tmp_path):
     plan = plan.model_copy(update={"limits": PlanLimits(input=100.0, travel=100.0)})
     goal = find_goal("zeta", known := Knowledge.of(analysis), feedback=None)
     refused = propose_candidates(known, limits=plan.limits, commands=frozenset("c"), goal=goal)
-    step, why = choose_recording(
-        analysis, None, plan, missing={"zeta": 0.1}, refused=refused, commands=frozenset("c")
+    (step,), why = choose_recordings(
+        analysis,
+        None,
+        plan,
+        missing={"zeta": 0.1},
+        wanted=1e-7,
+        seconds=900.0,
+        refused=refused,
+        commands=frozenset("c"),
     )
-    assert step is not None
     assert step.aim == "far"
     assert "no input was above" in why
+
+
+def test_the_number_of_chosen_recordings_grows_with_the_data(tmp_path):
+    """A tenth of the data so far is chosen at once, but no more than goal and time need."""
+    submission = load_submission(a_recorded_cart(tmp_path / "work"))
+    analysis = analyse(submission)
+    often = replace(analysis, records=analysis.records * 12)
+    plan = propose_plan(submission)
+
+    def chosen(analysis, *, wanted=1e-7, seconds=900.0):
+        recordings, why = choose_recordings(
+            analysis,
+            None,
+            plan,
+            missing={"zeta": 0.1},
+            wanted=wanted,
+            seconds=seconds,
+            refused=(),
+            commands=frozenset("c"),
+        )
+        assert f"{time_words(session_time(recordings))} at the bench" in why
+        return recordings
+
+    several = chosen(often)
+    assert len(several) == len(often.records) // 10 >= 3
+    assert len(chosen(analysis)) == 1
+    assert len(chosen(often, wanted=0.09)) == 1
+    assert chosen(often, seconds=session_time(several[:2])) == several[:2]
+    assert len(chosen(often, seconds=1.0)) == 1
+
+
+@pytest.mark.usefixtures("no_gap")
+@pytest.mark.parametrize("ends", ["not", "added", "vetoed"])
+def test_a_series_ends_when_a_person_intervenes(tmp_path, monkeypatch, ends):
+    """Chosen recordings are made and then analysed together; a veto or an addition ends this."""
+    monkeypatch.setattr("pipeline.experiments.exploring.choice._SHARE", 1.0)
+    bench = VirtualBench(prepare_bench(preset="throne-1dof", model=None, hide=[]), seed=1)
+    folder, asked = tmp_path / "work", []
+    session = VirtualSession(folder, bench)
+
+    def vetoes(recording):
+        asked.append(recording.id)
+        if len(asked) == 2 and ends == "added":
+            add_recording(folder, recording.model_copy(update={"id": "mine"}))
+        if "mine" in asked or len(asked) > 3:
+            raise Stopped("by hand")
+        return len(asked) == 3 and ends == "vetoed"
+
+    exploration = Exploration(
+        folder=folder,
+        record=session,
+        goal=ErrorGoal(error=1e-7),
+        seconds=600.0,
+        announce=silent,
+        vetoes=vetoes,
+    )
+    with pytest.raises(Stopped):
+        exploration.run()
+    first, second = exploration.turns
+    assert f"The next recordings are {asked[0]}, {asked[1]} and " in first.summary
+    assert second.recorded == tuple(asked[:3] if ends == "not" else asked[:2])
+    assert second.summary.startswith(f"{asked[2]} was vetoed. " if ends == "vetoed" else "")
+    assert (asked[2] == "mine") == (ends == "added")
 
 
 def test_thinking_can_be_ended(tmp_path):
