@@ -41,7 +41,7 @@ def choose_recordings(
 ) -> tuple[tuple[Recording, ...], str]:
     """Return the next recordings and why they were chosen.
 
-    There are none if everything is known or nothing would help. A recording that distinguishes
+    The result is empty if everything is known or nothing would help. A recording that distinguishes
     explanations comes first, then some that improve the least known parameter, then one that shows
     effects at large motion.
 
