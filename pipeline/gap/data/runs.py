@@ -146,9 +146,12 @@ class GapRun:
             out += [y[..., first : first + 1], mean]
         return np.concatenate(out, axis=-1)
 
-    @cached_property
+    @property
     def excitation(self) -> Excitation:
-        """Return the run in the form that the simulator takes."""
+        """The run in the form that the simulator takes.
+
+        It is made anew each time, because it holds twice as much memory as the run.
+        """
         return describe_run(
             self.t,
             self.command,
