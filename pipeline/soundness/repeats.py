@@ -1,7 +1,6 @@
 """Compare repeats of one experiment, and find the one that differs from the others."""
 
 from collections.abc import Sequence
-from itertools import combinations
 
 import numpy as np
 
@@ -105,8 +104,9 @@ def _differences(group: Sequence[Record]) -> tuple[Array, Array]:
     u = np.concatenate([_at(t, record, _excitation(record)) for record in group])  # (n, n_t)
     y = np.stack([_at(t, record, record.y) for record in group])  # (n, p, n_t)
     y = y - np.median(y[:, :, :_START_SAMPLES], axis=2, keepdims=True)
-    by_input = np.sqrt(np.mean((u[:, None] - u) ** 2, axis=2)) / _rms(u)
-    differences = np.sqrt(np.mean((y[:, None] - y) ** 2, axis=(2, 3)))
+    # The differences of all pairs at once would need gigabytes for a hundred repeats.
+    by_input = np.sqrt([np.mean((one - u) ** 2, axis=1) for one in u]) / _rms(u)
+    differences = np.sqrt([np.mean((one - y) ** 2, axis=(1, 2)) for one in y])
     return differences, (_MATERIAL + _AMPLIFICATION * by_input) * _rms(y)
 
 
@@ -119,7 +119,8 @@ def _farthest(
     for index in left:
         others = [i for i in left if i != index]
         distance = float(np.median(differences[index, others]))
-        spread = float(np.median([differences[pair] for pair in combinations(others, 2)]))
+        pairs = differences[np.ix_(others, others)][np.triu_indices(len(others), 1)]
+        spread = float(np.median(pairs))
         if distance > max(threshold * spread, float(np.median(expected[index, others]))):
             candidates.append((index, distance, spread))
     return max(candidates, key=lambda found: found[1], default=None)

@@ -134,12 +134,8 @@ def condense(misfits: Sequence[Misfit]) -> Array:
     The result is the triangle of a QR decomposition, with the same products of columns as the full
     matrix. So least squares has the same solution with n_p + 1 rows instead of thousands.
     """
-    triangles = []
-    for misfit in misfits:
-        jacobian = misfit.jacobian.reshape(misfit.jacobian.shape[0], -1)
-        columns = np.vstack([jacobian, misfit.residual.reshape(1, -1)]).T
-        triangles.append(np.asarray(np.linalg.qr(columns, mode="r")))
-    return np.asarray(np.linalg.qr(np.concatenate(triangles), mode="r"))
+    triangles = np.concatenate([misfit.triangle for misfit in misfits])
+    return np.asarray(np.linalg.qr(triangles, mode="r"))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

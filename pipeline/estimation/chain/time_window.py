@@ -1,6 +1,7 @@
 """The part of a record that a chain can explain, and how well a given chain explains it."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -105,6 +106,13 @@ class Misfit:
     residual: Array
     jacobian: Array
     n_nuisance: int
+
+    @cached_property
+    def triangle(self) -> Array:
+        """The triangle of a QR decomposition of Jacobian and residual, the residual last."""
+        jacobian = self.jacobian.reshape(self.jacobian.shape[0], -1)
+        columns = np.vstack([jacobian, self.residual.reshape(1, -1)]).T
+        return np.asarray(np.linalg.qr(columns, mode="r"))
 
 
 def usable_segment(record: Record) -> slice:
