@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.arrays import Array
-from pipeline.estimation.modulating import bump_integral, window_weights
+from pipeline.estimation.modulating import bump_integral, is_even, window_weights
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA, grain
 from pipeline.results import Record
 
@@ -235,21 +235,28 @@ def _means(t: Array, y: Array, inputs: Array, at: NDArray[np.int64]) -> Array:
     follow: position, velocity, acceleration, and range of the readings.
     """
     local = t[at]
-    w, w1, w2 = window_weights(local)
-    s = (local - local[:, :1]) / (local[:, -1:] - local[:, :1])
+    # With an even clock, all windows have the weights of the first one.
+    clock = local[:1] if is_even(t) else local
+    w, w1, w2 = window_weights(clock)
+    s = (clock - clock[:, :1]) / (clock[:, -1:] - clock[:, :1])
     held = np.diff(bump_integral(s), axis=1) / bump_integral(np.ones(1))
     readings = [x[at] for x in y]
     return np.array(
         [
-            (w * local).sum(1),
-            *((held * u[at[:, :-1]]).sum(1) for u in inputs),
-            np.linalg.norm(w2, axis=1),
-            *((w * x).sum(1) for x in readings),
-            *(-(w1 * x).sum(1) for x in readings),
-            *((w2 * x).sum(1) for x in readings),
+            _weighed(w, local),
+            *(_weighed(held, u[at[:, :-1]]) for u in inputs),
+            np.broadcast_to(np.linalg.norm(w2, axis=1), len(at)),
+            *(_weighed(w, x) for x in readings),
+            *(-_weighed(w1, x) for x in readings),
+            *(_weighed(w2, x) for x in readings),
             *(np.ptp(x, axis=1) for x in readings),
         ]
     )
+
+
+def _weighed(weights: Array, x: Array) -> Array:
+    """Return the weighted sums (n,) over windows (n, samples), which may share their weights."""
+    return x @ weights[0] if len(weights) == 1 else (weights * x).sum(1)
 
 
 def _fit(parts: Sequence[tuple[Array, Array]], *, least: float) -> tuple[list[Array], float]:

@@ -29,6 +29,12 @@ def bump_integral(s: Array) -> Array:
     return s**5 * np.polyval([1 / 9, -1 / 2, 6 / 7, -2 / 3, 1 / 5], s)
 
 
+def is_even(t: Array) -> bool:
+    """Return whether the intervals between times (n,) differ only by rounding."""
+    dt = np.diff(t)
+    return bool(np.ptp(dt) <= 1e-9 * dt[0])
+
+
 def window_weights(t: Array) -> tuple[Array, Array, Array]:
     """Return weights (windows, samples) for the mean, the negative mean slope, and the curvature.
 

@@ -159,16 +159,16 @@ def _equations(
         return []
     weight, slope, bend = bump((np.arange(width) + 0.5) / width, span=width)
 
-    def under(cart: int, *, late: float = 0.0) -> Array:
-        return sliding_window_view(np.interp(t + late, record.t, record.position(cart)), width)
+    def at(cart: int, *, late: float = 0.0) -> Array:
+        return np.interp(t + late, record.t, record.position(cart))
 
-    own = under(cart)[places]
+    own = sliding_window_view(at(cart), width)[places]
     right = [own @ bend, -(own @ slope), own @ weight, np.zeros(places.size)]
     if cart + 1 in record.free:
-        right[3] = under(cart + 1, late=after)[places] @ weight
-    before = under(cart - 1)
-    shifts = range(-_MOST_LATE, _MOST_LATE + 1)
-    left = np.array([before[places - shift] @ weight for shift in shifts])
+        right[3] = sliding_window_view(at(cart + 1, late=after), width)[places] @ weight
+    before = np.correlate(at(cart - 1), weight)
+    shifts = np.arange(-_MOST_LATE, _MOST_LATE + 1)
+    left = before[places - shifts[:, None]]
     # Encoder zeros cancel, and each record has the same weight.
     left = left - left.mean(axis=1, keepdims=True)
     size = float(np.linalg.norm(left[_MOST_LATE]))

@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeline.arrays import Array, ComplexArray
 from pipeline.estimation.chain.parametrisation import Parametrisation
+from pipeline.estimation.modulating import is_even
 from pipeline.plant.linear.chain import Chain
 
 # Below this |lambda dt| the derivative of expm1(z)/z is computed from its series. Rounding would
@@ -121,8 +122,7 @@ def drive_modes(poles: ComplexArray, t: Array, u: Array) -> tuple[ComplexArray, 
     u (n,) is held from sample to sample. The result is exact for any sample times.
     """
     dt = np.diff(t)
-    uniform = np.ptp(dt) <= 1e-9 * dt[0]  # sample times differ only by rounding
-    step = dt[:1] if uniform else dt
+    step = dt[:1] if is_even(t) else dt
     z = poles[:, None] * step
     growth = np.exp(z)
     small = np.abs(z) < _SMALL_EXPONENT

@@ -173,25 +173,30 @@ def simulate_loop(
     plant = None if isinstance(start, np.ndarray) else start
     x = start if isinstance(start, np.ndarray) else np.zeros(2 * len(free))
     x = x if plant is None else plant.state
-    law = _law(controller, free=free, sample_time=T, y0=setup.read(x[0::2]))
+    law = _law(controller, free=free, sample_time=T, y0=setup.read(x[0::2]), delay=setup.delay)
     phi, gamma = discretise(chain, T, free=free)
     limit, drive = np.inf if setup.input_limit is None else setup.input_limit, setup.drive
-    states, efforts, acting = np.empty((ticks.size, x.size)), np.empty(ticks.size), 0.0
+    # One product advances carts, controller and effort, because many small ones take longer.
+    moves, n = _block(phi, law.moves), x.size
+    moves[:n, -1] = drive * gamma if setup.delay else 0.0
+    late = np.append(drive * gamma, law.late)
+    now = np.concatenate([x, law.start, np.zeros(len(free) + 2)])
+    readings = slice(late.size, -2)
+    states, efforts, acting = np.empty((ticks.size, n)), np.empty(ticks.size), 0.0
     for tick, set_point in enumerate(r[nearest].tolist()):
-        law.measure(setup.read(x[0::2]))
-        if setup.delay:
-            applied = acting
-            law.predict(applied)
-            acting = following = min(max(law.effort(set_point), -limit), limit)
-        else:
-            applied = following = min(max(law.effort(set_point), -limit), limit)
-            law.predict(applied)
-        states[tick], efforts[tick] = x, applied
-        if plant is None:
-            x = phi @ x + gamma * (drive * applied)
-        else:
-            plant.step(drive * applied, following=drive * following, interval=T)
-            x = plant.state
+        now[readings] = setup.read(now[0:n:2])
+        now[-2] = set_point
+        states[tick] = now[:n]
+        following = moves @ now
+        asked = min(max(float(following[-1]), -limit), limit)
+        now[: late.size] = following[:-1]
+        if not setup.delay:
+            now[: late.size] += late * asked
+        efforts[tick] = applied = acting if setup.delay else asked
+        now[-1] = acting = asked
+        if plant is not None:
+            plant.step(drive * applied, following=drive * asked, interval=T)
+            now[:n] = plant.state
 
     elapsed = (t - t[0]) / T
     x = _hermite(elapsed, states[:, 0::2].T, T * states[:, 1::2].T)
@@ -218,12 +223,14 @@ def replay(
     the actual motion, for comparison with the logged input.
     """
     T = float(t[-1] - t[0]) / (t.size - 1)
-    law = _law(controller, free=tuple(free), sample_time=T, y0=y[:, 0])
-    efforts = np.empty(t.size)
+    law = _law(controller, free=tuple(free), sample_time=T, y0=y[:, 0], delay=0)
+    now = np.concatenate([law.start, np.zeros(len(y) + 2)])
+    known = np.vstack([y, reference]).T
+    efforts, n = np.empty(t.size), law.start.size
     for i in range(t.size):
-        law.measure(y[:, i])
-        efforts[i] = law.effort(reference[i])
-        law.predict(0.0)
+        now[n:-1] = known[i]
+        following = law.moves @ now
+        now[:n], efforts[i] = following[:-1], following[-1]
     return efforts
 
 
@@ -275,60 +282,63 @@ def loop_matrix(chain: Chain, controller: StateFeedback, *, sample_time: float) 
 # ------------------------------------------------------------------- private parts
 
 
-class _Law(Protocol):
-    """A controller with its state: it takes readings, returns efforts, and predicts."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Law:
+    """A controller with a state c, as a linear system.
 
-    def measure(self, y: Array) -> None: ...
-    def predict(self, applied: float) -> None: ...
-    def effort(self, r: float) -> float: ...
+    Attributes
+    ----------
+    start : state (n_c,) before the first tick.
+    moves : matrix (n_c + 1, n_c + f + 2) from c, readings, reference and acting effort to the next
+        c and the effort.
+    late : what the applied effort adds to the next c, if this effort acts at once (n_c,).
+    """
 
-
-class _StateFeedbackLaw:
-    def __init__(
-        self, controller: StateFeedback, phi: Array, gamma: Array, *, sample_time: float, y0: Array
-    ) -> None:
-        self.gains, self.prefilter = controller.gains, controller.prefilter
-        self.phi, self.gamma = phi, gamma
-        self.correction = VELOCITY_CORRECTION / sample_time
-        self.state = np.zeros(2 * y0.size)
-        self.state[0::2] = y0
-
-    def measure(self, y: Array) -> None:
-        self.state[1::2] += self.correction * (y - self.state[0::2])
-        self.state[0::2] = y
-
-    def predict(self, applied: float) -> None:
-        self.state = self.phi @ self.state + self.gamma * applied
-
-    def effort(self, r: float) -> float:
-        return self.prefilter * r - float(self.gains @ self.state)
+    start: Array
+    moves: Array
+    late: Array
 
 
-class _PidLaw:
-    def __init__(self, controller: Pid, row: int, *, sample_time: float) -> None:
-        self.controller, self.row, self.sample_time = controller, row, sample_time
-        self.integral = self.last = self.y = 0.0
-
-    def measure(self, y: Array) -> None:
-        self.y = float(y[self.row])
-
-    def predict(self, applied: float) -> None:
-        """Do nothing: a PID controller has no plant model."""
-
-    def effort(self, r: float) -> float:
-        pid, error = self.controller, r - self.y
-        self.integral += error * self.sample_time
-        slope, self.last = (error - self.last) / self.sample_time, error
-        return pid.scale * (pid.kp * error + pid.ki * self.integral + pid.kd * slope)
-
-
-def _law(controller: Controller, *, free: tuple[int, ...], sample_time: float, y0: Array) -> _Law:
+def _law(
+    controller: Controller, *, free: tuple[int, ...], sample_time: float, y0: Array, delay: int
+) -> _Law:
     if isinstance(controller, Pid):
         if controller.cart not in free:
             raise DataError(f"PID needs cart {controller.cart} to be free, found free {list(free)}")
-        return _PidLaw(controller, free.index(controller.cart), sample_time=sample_time)
+        return _pid_law(controller, free.index(controller.cart), sample_time, n=len(free))
+    n = len(free)
     phi, gamma = _prediction(controller, free=free, sample_time=sample_time)
-    return _StateFeedbackLaw(controller, phi, gamma, sample_time=sample_time, y0=y0)
+    # The observer takes its positions from the readings, and corrects its velocities.
+    observed = np.zeros((2 * n, 3 * n + 2))
+    observed[0::2, 2 * n : -2] = np.eye(n)
+    observed[1::2, 1 : 2 * n : 2] = np.eye(n)
+    correction = VELOCITY_CORRECTION / sample_time * np.eye(n)
+    observed[1::2, 0 : 2 * n : 2], observed[1::2, 2 * n : -2] = -correction, correction
+    predicted = phi @ observed
+    predicted[:, -1] = gamma if delay else 0.0
+    effort = -controller.gains @ (predicted if delay else observed)
+    effort[-2] += controller.prefilter
+    start = np.zeros(2 * n)
+    start[0::2] = y0
+    return _Law(start=start, moves=np.vstack([predicted, effort]), late=gamma)
+
+
+def _pid_law(pid: Pid, row: int, sample_time: float, *, n: int) -> _Law:
+    """Return the law of a PID controller; its state is the integral and the last error."""
+    error = np.zeros(n + 4)
+    error[2 + row], error[-2] = -1.0, 1.0
+    integral, last = np.eye(2, n + 4)
+    integral = integral + sample_time * error
+    slope = (error - last) / sample_time
+    effort = pid.scale * (pid.kp * error + pid.ki * integral + pid.kd * slope)
+    return _Law(start=np.zeros(2), moves=np.array([integral, error, effort]), late=np.zeros(2))
+
+
+def _block(first: Array, second: Array) -> Array:
+    """Return the matrix with two blocks on its diagonal."""
+    whole = np.zeros(np.add(first.shape, second.shape))
+    whole[: len(first), : len(first)], whole[len(first) :, len(first) :] = first, second
+    return whole
 
 
 def _prediction(
