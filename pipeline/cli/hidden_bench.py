@@ -7,6 +7,7 @@ import threading
 from pathlib import Path
 
 from pipeline.cli.reports import explain
+from pipeline.garbage import collect_seldom
 from pipeline.words.progress import Progress, silent
 
 
@@ -28,5 +29,6 @@ def _end_with_parent() -> None:
 
 
 if __name__ == "__main__":
+    collect_seldom()
     threading.Thread(target=_end_with_parent, daemon=True).start()
     json.dump(find_hidden(Path(sys.argv[1]), progress=silent), sys.stdout)

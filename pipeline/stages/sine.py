@@ -34,8 +34,7 @@ class _Part:
 
     @classmethod
     def of(cls, columns: Array, *, angle: float) -> "_Part":
-        inverse = np.linalg.pinv(columns).astype(np.float64)
-        return cls(columns=columns, inverse=inverse, angle=angle)
+        return cls(columns=columns, inverse=_inverse(columns), angle=angle)
 
     def fit(self, y: Array) -> "_Sine":
         coefficients = self.inverse @ y
@@ -262,6 +261,23 @@ class Dwell:
 
 
 # ------------------------------------------------------------------- the fits
+
+
+def _inverse(columns: Array) -> Array:
+    """Return the pseudo-inverse (p, n) of columns (n, p).
+
+    For independent columns, the normal equations and one step of Newton's method give it ten times
+    as fast as numpy, which uses singular values.
+    """
+    with np.errstate(all="ignore"):
+        try:
+            inverse = np.linalg.inv(columns.T @ columns) @ columns.T
+        except np.linalg.LinAlgError:
+            return np.linalg.pinv(columns).astype(np.float64)
+        left = np.eye(len(inverse)) - inverse @ columns
+        if not np.max(np.abs(left)) < 1e-6:  # the step squares this error
+            return np.linalg.pinv(columns).astype(np.float64)
+    return inverse + left @ inverse
 
 
 def _columns(t: Array, *, omega: float) -> Array:
