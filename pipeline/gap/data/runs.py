@@ -150,7 +150,7 @@ class GapRun:
     def excitation(self) -> Excitation:
         """The run in the form that the simulator takes.
 
-        It is made anew each time, because it holds twice as much memory as the run.
+        Each call makes it again, because it takes twice as much memory as the run.
         """
         return describe_run(
             self.t,
