@@ -23,7 +23,7 @@ import psutil
 
 from pipeline.errors import PipelineError
 from pipeline.garbage import collect_seldom
-from pipeline.threads import ONE_EACH
+from pipeline.threads import with_one_thread
 from pipeline.words.progress import Progress, silent
 
 _GLANCE = 0.05  # s between checks of time, memory and stop requests
@@ -36,7 +36,7 @@ _LAST_WORDS = 300  # characters of a process's last output, or of an internal er
 _LUMP = 65_536  # bytes to read at once
 # Only one thread computes. The other one only listens and does not need its own heap, which takes
 # 64 MB in glibc.
-_SPARING = {**ONE_EACH, "MALLOC_ARENA_MAX": "1"}
+_SPARING = {"MALLOC_ARENA_MAX": "1"}
 
 
 class Failed(PipelineError):
@@ -209,7 +209,7 @@ class LineProcess:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=self._stderr,
-                env=_environment(),
+                env={**with_one_thread(), **_SPARING},
             )
         except OSError:
             self._stderr.close()
@@ -373,14 +373,6 @@ def limit_memory(more: int) -> None:
     limit = pages * resource.getpagesize() + more
     _, hard = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
-
-
-def _environment() -> dict[str, str]:
-    """Return the environment of a worker process: one thread, and the same package as here."""
-    package = str(Path(__file__).resolve().parents[1])
-    before = os.environ.get("PYTHONPATH")
-    path = f"{package}{os.pathsep}{before}" if before else package
-    return {**os.environ, **_SPARING, "PYTHONPATH": path}
 
 
 def _listen(sent: "queue.SimpleQueue[bytes]") -> None:

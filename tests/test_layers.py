@@ -20,7 +20,7 @@ LEVELS = (
     ("names",),
     ("words",),
     ("output",),
-    ("lock", "processes", "web"),
+    ("lock", "processes", "second_process", "web"),
     ("plant.linear", "plant.nonlinear.columns"),
     ("plant.loop", "plant.nonlinear.tables"),
     ("plant.nonlinear.effects", "plant.nonlinear.simulator"),

@@ -10,11 +10,12 @@ import typer
 
 from pipeline.cli.common import AsJson, Folder, app, progress_line, say
 from pipeline.errors import PipelineError
+from pipeline.second_process import SecondProcess
 from pipeline.words.progress import Progress
 
 if TYPE_CHECKING:
     from pipeline.report.draft.changes import DraftChanges
-    from pipeline.report.draft.write import Files
+    from pipeline.report.draft.files import Files
     from pipeline.results import Analysis
     from pipeline.submission import Submission
 
@@ -141,7 +142,7 @@ def report(
     as_json: AsJson = False,
 ) -> None:
     """Identify the carts, design the controller, check the hardware, write the report."""
-    from pipeline.report.draft.write import Files
+    from pipeline.report.draft.files import Files
 
     files = Files(pdf=pdf, tables=tables, plots=plots)
     analysis = run_report(folder, out=out, files=files, compare=compare)
@@ -160,24 +161,23 @@ def run_report(
     files: "Files",
     compare: Path | None = None,
 ) -> "Analysis":
-    """Write the report of a submission and print a short summary."""
-    from pipeline.output import named_folder, own_folder
-    from pipeline.report.draft.changes import changes_line
-    from pipeline.report.draft.write import make_report
-    from pipeline.report.sections.questions import open_line
-    from pipeline.report.sections.summary import terminal_summary
-    from pipeline.submission import load_submission
-    from pipeline.words.text import with_symbols
+    """Write the report of a submission and print a short summary.
 
-    submission = load_submission(folder)
-    out = named_folder(out) if out else own_folder(submission.folder, "report")
-    compared = _comparison(compare, submission)
-    with progress_line() as progress:
-        analysis, changes = make_report(
-            submission, out, compared=compared, files=files, progress=progress
-        )
-    lines = (changes and with_symbols(changes_line(changes)), open_line(analysis))
-    for line in (terminal_summary(analysis), *_unreadable(analysis), *filter(None, lines)):
+    A second process loads what draws the report while this one loads what analyses the data.
+    """
+    with SecondProcess("pipeline.report.draft.make", "make_draft") as second:
+        from pipeline.output import named_folder, own_folder
+        from pipeline.report.draft.write import make_report
+        from pipeline.submission import load_submission
+
+        submission = load_submission(folder)
+        out = named_folder(out) if out else own_folder(submission.folder, "report")
+        compared = _comparison(compare, submission)
+        with progress_line() as progress:
+            analysis, _, draft = make_report(
+                submission, out, compared=compared, make=second.do, files=files, progress=progress
+            )
+    for line in (draft.summary, *_unreadable(analysis), *draft.remarks):
         say(line)
     say(_wrote(out, "report", pdf=files.pdf))
     if files.plots:
@@ -313,24 +313,26 @@ def explain(
     progress: Progress,
 ) -> tuple[str, list[str]]:
     """Write the gap analysis of a submission; return the text of gap.json and the messages."""
-    from pipeline.json_files import json_text
-    from pipeline.output import named_folder, own_folder, write_file
-    from pipeline.report.gap.story import render_gap
-    from pipeline.report.gap.verdict import terminal_verdict
-    from pipeline.submission import load_submission
-    from pipeline.workflow import analyse
+    with SecondProcess("pipeline.report.gap.story", "make_gap_files") as second:
+        from pipeline.json_files import json_text
+        from pipeline.output import named_folder, own_folder, write_file
+        from pipeline.submission import load_submission
+        from pipeline.workflow import analyse
 
-    submission = load_submission(folder)
-    out = named_folder(out) if out else own_folder(submission.folder, "gap")
-    analysis = analyse(submission, design=False, progress=progress)
-    # These three imports load the compiled simulator.
-    from pipeline.exchange.model.saved import clear_model, save_model
-    from pipeline.experiments.discriminate import propose_for
-    from pipeline.gap.explain import investigate
+        submission = load_submission(folder)
+        out = named_folder(out) if out else own_folder(submission.folder, "gap")
+        analysis = analyse(submission, design=False, progress=progress)
+        # These imports load the compiled simulator.
+        from pipeline.exchange.model.saved import clear_model, save_model
+        from pipeline.experiments.discriminate import propose_for
+        from pipeline.gap.explain import investigate
+        from pipeline.report.gap.verdict import terminal_verdict
+        from pipeline.report.render.folder import write_files
 
-    found = investigate(analysis, budget=budget, progress=progress)
-    progress("choosing the next recording")
-    found = propose_for(found, submission)
+        found = investigate(analysis, budget=budget, progress=progress)
+        progress("choosing the next recording")
+        found = propose_for(found, submission)
+        made = second.do(found, analysis, pdf=pdf, progress=progress)
     out.mkdir(parents=True, exist_ok=True)
     write_file(out / "gap.json", text := json_text(found))
     clear_model(out)
@@ -339,7 +341,7 @@ def explain(
         unseen = {i for r in analysis.records for i in r.free if i not in r.carts}
         free = unseen | {row.cart for row in found.by_record}
         told.append(save_model(found.model, analysis, out, free=free))
-    render_gap(found, analysis, out, pdf=pdf, progress=progress)
+    write_files(made, out, name="gap")
     wrote = _wrote(out, "gap", pdf=pdf)
     return text, [*_unreadable(analysis), terminal_verdict(found), wrote, *told]
 

@@ -103,6 +103,7 @@ def fill_tables(folder: str, *, progress: Progress) -> list[dict[str, Any]]:
 def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
     """Write the report into the submission's folder, and compare it with the previous one."""
     from pipeline.report.draft.changes import changes_line, compare_drafts, read_results
+    from pipeline.report.draft.make import make_draft
     from pipeline.report.draft.write import make_report as write_report
     from pipeline.report.sections.housekeeping import taken_text
     from pipeline.report.sections.questions import ask
@@ -130,7 +131,9 @@ def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
             return None
 
     with lock_or_refuse(out):
-        analysis, changes = write_report(submission, out, compared=compared, progress=progress)
+        analysis, changes, _ = write_report(
+            submission, out, compared=compared, make=make_draft, progress=progress
+        )
         asked = [
             {"id": one.id, "section": one.section, "text": with_symbols(one.text)}
             for one in ask(analysis)
@@ -161,7 +164,8 @@ def make_gap(folder: str, *, progress: Progress) -> None:
     from pipeline.experiments.discriminate import propose_for
     from pipeline.gap.explain import investigate
     from pipeline.json_files import json_text
-    from pipeline.report.gap.story import render_gap
+    from pipeline.report.gap.story import make_gap_files
+    from pipeline.report.render.folder import write_files
     from pipeline.workflow import analyse
 
     submission = load_submission(Path(folder))
@@ -170,9 +174,10 @@ def make_gap(folder: str, *, progress: Progress) -> None:
         analysis = analyse(submission, design=False, progress=progress)
         found = investigate(analysis, progress=progress)
         found = propose_for(found, submission)
+        made = make_gap_files(found, analysis, progress=progress)
         write_file(out / "gap.json", json_text(found))
         clear_model(out)
-        render_gap(found, analysis, out, progress=progress)
+        write_files(made, out, name="gap")
 
 
 def make_plots(folder: str, *, progress: Progress) -> None:

@@ -51,8 +51,9 @@ from pipeline.report.draft.content import build_document
 from pipeline.report.equations.effects import augmented_equations, in_order, law
 from pipeline.report.figures.gap import predicted_figure
 from pipeline.report.gap.beside import with_gap
-from pipeline.report.gap.story import LEGEND, build_gap_document, render_gap
+from pipeline.report.gap.story import LEGEND, build_gap_document, make_gap_files
 from pipeline.report.gap.verdict import WORDS, kept_together, terminal_verdict
+from pipeline.report.render.folder import write_files
 from pipeline.report.render.html import render_html
 from pipeline.results import Provenance
 from pipeline.set_up import Bench
@@ -624,8 +625,8 @@ def test_a_spring_pulls_both_of_its_carts():
 def test_pdf_and_files_are_the_same_each_time(tmp_path):
     """PDF and other files are the same each time; the PDF's first page has the verdict."""
     for name in ("one", "two"):
-        (tmp_path / name).mkdir()
-        render_gap(make_gap(), two_cart_analysis(), tmp_path / name)
+        made = make_gap_files(make_gap(), two_cart_analysis())
+        write_files(made, tmp_path / name, name="gap")
     files = sorted(p.relative_to(tmp_path / "one") for p in (tmp_path / "one").rglob("*.*"))
     assert {"gap.html", "gap.pdf"} < {str(file) for file in files}
     for file in files:

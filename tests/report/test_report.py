@@ -8,6 +8,7 @@ import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -18,7 +19,9 @@ from pipeline.checks.recordings import check_files, check_left_out
 from pipeline.plant.linear.chain import Chain
 from pipeline.report.document import Block, Document, Paragraph, Picture, Section, Table, cell
 from pipeline.report.draft.content import build_document
-from pipeline.report.draft.write import Files, render_report
+from pipeline.report.draft.files import Files
+from pipeline.report.draft.make import make_draft
+from pipeline.report.draft.write import write_draft
 from pipeline.report.render.html import render_html
 from pipeline.report.render.pdf import lay_out, missing_characters, render_pdf
 from pipeline.report.sections.housekeeping import file_table, provenance_blocks
@@ -72,6 +75,11 @@ def render(analysis: Analysis, out: Path, *, pdf: bool = True) -> tuple[Page, st
     """Render a report; return the parsed page and the PDF's text."""
     render_report(analysis, out, files=Files(pdf=pdf))
     return read(out)
+
+
+def render_report(analysis: Analysis, out: Path, **options: Any) -> None:
+    """Make a report and write it into a folder."""
+    write_draft(make_draft(analysis, **options).files, out)
 
 
 @pytest.fixture(scope="module")

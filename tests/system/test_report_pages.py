@@ -19,9 +19,11 @@ from pypdf import PdfReader
 from pypdf.generic import DictionaryObject
 
 from pipeline.plant.nonlinear.effects import CATALOGUE
-from pipeline.report.draft.write import render_report
+from pipeline.report.draft.make import make_draft
+from pipeline.report.draft.write import write_draft
 from pipeline.report.effects.gallery import render_effects
-from pipeline.report.gap.story import render_gap
+from pipeline.report.gap.story import make_gap_files
+from pipeline.report.render.folder import write_files
 from pipeline.report.solution.write import render_solution
 from pipeline.results import Analysis
 from pipeline.submission import load_submission
@@ -54,7 +56,7 @@ def folder(tmp_path_factory):
             out = tmp_path_factory.mktemp(case)
             if case == "gap":
                 gap = make_gap(keys=("coulomb_friction", "input_delay", "cubic_spring"))
-                render_gap(gap, two_cart_analysis(), out)
+                write_files(make_gap_files(gap, two_cart_analysis()), out, name="gap")
             elif case in ("class", "feedback"):
                 out = write_class(out)
                 out = out / "feedback" / "team-02" if case == "feedback" else out
@@ -63,7 +65,7 @@ def folder(tmp_path_factory):
             elif case == "solution":
                 render_solution(analysed("two-cart"), out)
             else:
-                render_report(_analysis(case, out, request), out)
+                write_draft(make_draft(_analysis(case, out, request)).files, out)
             made[case] = out
         return made[case]
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 from pipeline import __version__
 from pipeline.arrays import Array
@@ -46,7 +45,8 @@ from pipeline.report.gap.verdict import (
     whole_model,
 )
 from pipeline.report.render.builder import Part
-from pipeline.report.render.write import write_document
+from pipeline.report.render.folder import Made
+from pipeline.report.render.write import make_files
 from pipeline.report.sections.housekeeping import provenance_blocks
 from pipeline.report.sections.page import Page, left_out, remarks
 from pipeline.report.sections.parameters import chain_table
@@ -62,17 +62,11 @@ _MOST_NAMES = 3  # most effects named in a caption; the text above it names all
 _MORE_TRACES = 3  # traces drawn in addition to the one in the summary
 
 
-def render_gap(
-    gap: Gap,
-    analysis: Analysis,
-    out: Path,
-    *,
-    pdf: bool = True,
-    progress: Progress = silent,
-) -> None:
-    """Write `gap.html`, `gap.pdf` and `figures/*.svg` into the folder `out`."""
-    document = build_gap_document(gap, analysis, progress=progress)
-    write_document(document, out, name="gap", pdf=pdf)
+def make_gap_files(
+    gap: Gap, analysis: Analysis, *, pdf: bool = True, progress: Progress = silent
+) -> Made:
+    """Return `gap.html`, `figures/*.svg` and, if asked for, `gap.pdf`."""
+    return make_files(build_gap_document(gap, analysis, progress=progress), name="gap", pdf=pdf)
 
 
 def build_gap_document(gap: Gap, analysis: Analysis, *, progress: Progress = silent) -> Document:

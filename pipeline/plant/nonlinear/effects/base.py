@@ -92,6 +92,11 @@ class EffectParameter:
         return self.unit.replace("position", position).replace("input", input)
 
 
+def always(values: Mapping[str, float]) -> bool:
+    """Return True. A function with a name, unlike a lambda, can be sent to another process."""
+    return True
+
+
 @dataclass(frozen=True, kw_only=True)
 class Effect:
     """One physical effect of the catalogue.
@@ -141,7 +146,7 @@ class Effect:
     equivalent: str = ""
     same_as: str = ""
     same_below: float = np.inf
-    genuine: Callable[[Mapping[str, float]], bool] = lambda p: True
+    genuine: Callable[[Mapping[str, float]], bool] = always
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -1,9 +1,17 @@
 """Stiction (Stribeck friction)."""
 
+from collections.abc import Mapping
+
 from pipeline.plant.limits import LEAST_SLIDING
 from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
 from pipeline.plant.nonlinear.effects.coulomb_friction import FORCE
 from pipeline.plant.nonlinear.effects.law import FrictionLaw, Growth
+
+
+def _drops(values: Mapping[str, float]) -> bool:
+    """Whether friction drops as sliding begins, but not to nothing; otherwise it is Coulomb's."""
+    return LEAST_SLIDING * values["static_force"] < values["force"] < values["static_force"]
+
 
 EFFECT = Effect(
     key="stiction",
@@ -26,6 +34,5 @@ EFFECT = Effect(
     axis="velocity",
     family="dry friction",
     grows_from="coulomb_friction",
-    # Without a drop, this would be Coulomb's law. Every dry surface has some sliding friction.
-    genuine=lambda p: LEAST_SLIDING * p["static_force"] < p["force"] < p["static_force"],
+    genuine=_drops,
 )
