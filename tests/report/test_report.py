@@ -17,7 +17,16 @@ import pytest
 
 from pipeline.checks.recordings import check_files, check_left_out
 from pipeline.plant.linear.chain import Chain
-from pipeline.report.document import Block, Document, Paragraph, Picture, Section, Table, cell
+from pipeline.report.document import (
+    Block,
+    Document,
+    Paragraph,
+    Picture,
+    Section,
+    Table,
+    Tiles,
+    cell,
+)
 from pipeline.report.draft.content import build_document
 from pipeline.report.draft.files import Files
 from pipeline.report.draft.make import make_draft
@@ -27,7 +36,7 @@ from pipeline.report.render.pdf import lay_out, missing_characters, render_pdf
 from pipeline.report.sections.housekeeping import file_table, provenance_blocks
 from pipeline.report.sections.measurements import decay_blocks
 from pipeline.report.sections.page import Page as Shown
-from pipeline.report.sections.summary import terminal_summary
+from pipeline.report.sections.summary import summary, terminal_summary
 from pipeline.results import Analysis, Check, Estimate, LeftOut, ParameterRow, Skipped, Stage
 from pipeline.set_up import Bench, Units
 from pipeline.words.spans import plain, spans
@@ -286,6 +295,18 @@ def test_a_report_without_a_title_uses_its_subject_once():
     nothing = build_document(replace(analysis, title="", section=""))
     assert nothing.subtitle == ""
     assert "kicker" not in render_html(nothing).split("<main", 1)[-1].split("<section", 1)[0]
+
+
+def test_a_goal_met_on_a_poor_model_is_not_green():
+    """The tile of a goal that the simulation meets is green only if the model explains the data."""
+    analysis = make_analysis(1)
+    assert analysis.fit
+    poor = replace(analysis.fit, chi_square_per_dof=1e4)
+    tones = []
+    for one in (analysis, replace(analysis, fit=poor)):
+        boards = [block for block in summary(Shown(one)) if isinstance(block, Tiles)]
+        tones += [t.tone for board in boards for t in board.tiles if t.url == "#feedback"]
+    assert tones == ["good", ""]
 
 
 def test_the_same_analysis_gives_the_same_bytes(folders, tmp_path):

@@ -204,7 +204,9 @@ def _verdict_board(analysis: Analysis) -> tuple[Tile, ...]:
         overshoot, verdict = percent(design.overshoot_percent), "met" if good else "not met"
         note = _WORDS.text("tile_settles", overshoot=overshoot, verdict=verdict)
         label = _WORDS.text("tile_feedback", cart=design.cart)
-        tiles.append(Tile(spans(label), spans(value), spans(note), _tone(good), "#feedback"))
+        # The goal is met on the model, which promises little if it does not explain the data.
+        tone = _tone(good) if _is_explained(analysis) or not good else ""
+        tiles.append(Tile(spans(label), spans(value), spans(note), tone, "#feedback"))
     if analysis.hardware:
         best, worst = _extremes(analysis)
         good, note = worst.nrmse <= CLOSE, _WORDS.text("tile_apart")
