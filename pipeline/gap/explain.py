@@ -10,6 +10,7 @@ from pipeline.estimation.interventions import find_interventions
 from pipeline.gap.data.sides import drop_left_out, prepare, take_sides
 from pipeline.gap.fit.baseline import fit_baseline
 from pipeline.gap.fit.levenberg_marquardt import Fitting, GapFit
+from pipeline.gap.follow.beside import follower_compiled
 from pipeline.gap.follow.track import compile_follower
 from pipeline.gap.search.deadline import Deadline
 from pipeline.gap.search.hypothesis import Study
@@ -52,7 +53,8 @@ def investigate(analysis: Analysis, *, progress: Progress, budget: float | None 
     """
     records, notes = drop_left_out(analysis.records, left_out=analysis.left_out)
     progress("preparing the simulator")
-    compile_simulator()
+    with follower_compiled():
+        compile_simulator()
     compile_follower()
     gap = explain_gap(
         records, analysis.bench, chain=analysis.chain, budget=budget, progress=progress

@@ -74,10 +74,10 @@ def kept_in(room: Path) -> Path | None:
     return None
 
 
-def is_compiled() -> bool:
-    """Return whether compiled code for this Python is stored already."""
-    folder, python = kept_in(ROOM), f"py{sys.version_info.major}{sys.version_info.minor}"
-    return folder is not None and any(folder.rglob(f"kernel._simulate*.{python}*.nbc"))
+def is_compiled(room: Path = ROOM, *, function: str = "_simulate") -> bool:
+    """Return whether a function in a package's `kernel.py` is compiled already for this Python."""
+    folder, python = kept_in(room), f"py{sys.version_info.major}{sys.version_info.minor}"
+    return folder is not None and any(folder.rglob(f"kernel.{function}-*.{python}*.nbc"))
 
 
 def content_of(room: Path) -> str:
