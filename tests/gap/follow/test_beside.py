@@ -1,0 +1,42 @@
+"""The follower is compiled in a second process, once."""
+
+import os
+import subprocess
+import sys
+
+import psutil
+import pytest
+
+from pipeline.gap.follow.beside import follower_compiled
+from pipeline.gap.follow.track import compile_follower
+from tests.helpers.places import ROOT
+
+SCRIPT = """
+from pipeline.gap.follow import beside
+from pipeline.plant.nonlinear.simulator.compiler import is_compiled
+
+print(is_compiled(beside._ROOM, function="follow_run"))
+with beside.follower_compiled():
+    pass
+print(is_compiled(beside._ROOM, function="follow_run"))
+"""
+
+
+def test_nothing_is_compiled_again():
+    """If compiled code is stored, no process is started."""
+    compile_follower()
+    before = psutil.Process().children()
+    with follower_compiled():
+        assert psutil.Process().children() == before
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+@pytest.mark.skipif(os.cpu_count() == 1, reason="needs two cores")
+def test_the_second_process_stores_the_compiled_code(tmp_path):
+    """After the block, compiled code is stored where there was none before."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["False", "True"]
