@@ -34,7 +34,7 @@ def test_nothing_is_compiled_again():
 @pytest.mark.sample
 @pytest.mark.skipif(os.cpu_count() == 1, reason="needs two cores")
 def test_the_second_process_stores_the_compiled_code(tmp_path):
-    """After the block, compiled code is stored where there was none before."""
+    """After the block, an empty folder contains the compiled code."""
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT], env=environment, capture_output=True, text=True, check=True
