@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -332,7 +333,8 @@ def explain(
         found = investigate(analysis, budget=budget, progress=progress)
         progress("choosing the next recording")
         found = propose_for(found, submission)
-        made = second.do(found, analysis, pdf=pdf, progress=progress)
+        drawn = replace(found, measure_left=tuple)  # which no page shows and no process can send
+        made = second.do(drawn, analysis, pdf=pdf, progress=progress)
     out.mkdir(parents=True, exist_ok=True)
     write_file(out / "gap.json", text := json_text(found))
     clear_model(out)

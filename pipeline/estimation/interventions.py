@@ -8,6 +8,7 @@ the cart, and occurs in a state in which the law holds at other times.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -44,6 +45,11 @@ def find_interventions(records: Sequence[Record]) -> tuple[Intervention, ...]:
 
     Runs under feedback are skipped, because part of what drives their motor is often not logged.
     """
+    return _found_in(tuple(records))
+
+
+@lru_cache(maxsize=1)  # a report and its gap analysis ask for the same records
+def _found_in(records: tuple[Record, ...]) -> tuple[Intervention, ...]:
     open_loop = [record for record in records if record.kind not in ("closed_loop", "bode")]
     first = {record.id: _first_copy(record, open_loop) for record in open_loop}
     alone = [record for record in open_loop if first[record.id] == record.id]

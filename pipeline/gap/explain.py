@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -142,7 +143,7 @@ def _describe(search: Search, bench: Bench) -> Gap:
     settled = enough and study.is_noise(chosen)
     left = () if enough else find_windows(chosen.fit, study.training)
     told = enough or (verdict == "ambiguous" and study.explains(chosen))
-    forces = left_forces(final, *zip(*search.judged, strict=True))
+    measure_left = cache(partial(left_forces, final, *zip(*search.judged, strict=True)))
     repeated = study.repeatability > 0
     return Gap(
         bench=bench,
@@ -166,8 +167,8 @@ def _describe(search: Search, bench: Bench) -> Gap:
         spread=_learnt_spread(chosen.fit),
         suspects=list_suspects(found, effects) if verdict == "unexplained" else (),
         left=left,
-        residual=() if told else map_residual(forces, replace(bench, units=units)),
-        left_forces=forces,
+        residual=() if told else map_residual(measure_left(), replace(bench, units=units)),
+        measure_left=measure_left,
         contenders=() if settled else list_contenders(chosen, close or found),
     )
 

@@ -1,5 +1,6 @@
 """The result types of the gap workflow."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -256,7 +257,8 @@ class Gap:
     Attributes
     ----------
     bench : the set-up to which the numbers refer.
-    traces, left_forces : data for the figures, missing in a gap that was read from a file.
+    traces : data for the figures, missing in a gap that was read from a file.
+    measure_left : computes `left_forces`, which few readers need.
     chain_covariance : covariance (n_p, n_p) of the parameters in `chain_std`. None if it could not
         be computed or the gap was read from a file.
     proposal : the next recording; None if no candidate was evaluated.
@@ -388,9 +390,14 @@ class Gap:
     title: str = ""
     bench: Bench
     traces: tuple[Trace, ...]
-    left_forces: tuple[LeftForce, ...] = ()
+    measure_left: Callable[[], tuple[LeftForce, ...]] = tuple
     chain_covariance: Array | None = None
     proposal: Proposal | None = None
+
+    @property
+    def left_forces(self) -> tuple[LeftForce, ...]:
+        """The force that the model does not explain, by run and cart."""
+        return self.measure_left()
 
     @classmethod
     def from_written(

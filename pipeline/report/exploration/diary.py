@@ -76,7 +76,7 @@ class Turn:
         if self.gap is None:
             return self
         shown = deciding_trace(self.gap, self.recorded)
-        kept = replace(self.gap, traces=(shown,) if shown else (), left_forces=())
+        kept = replace(self.gap, traces=(shown,) if shown else (), measure_left=tuple)
         return replace(self, gap=kept)
 
 
