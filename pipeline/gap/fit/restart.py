@@ -1,6 +1,6 @@
 """Restart the worst runs with other rest positions in the friction band."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,31 +29,28 @@ def restart_runs(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper) -> GapFit:
     band = _rest_band(fit)
     rest = np.array(fit.structure.dry)
 
-    def again(job: tuple[GapRun, Nuisance, bool, float]) -> Nuisance:
-        run, nuisance, bad, chi = job
-        if not bad:
-            return nuisance
+    def again(run: GapRun, start: Nuisance) -> GapFit:
+        how = Fitting(shared=False, iterations=6)
+        return fit_model(replace(fit, nuisance=(start,)), [run], how)
+
+    def starts(run: GapRun, own: Nuisance) -> Iterator[Nuisance]:
         free = np.array(run.free)
-        best, lowest = nuisance, chi * residual_points(run)
         for shift, factor in _RESTARTS:
             move = np.where(free, shift * band, 0.0)
-            start = Nuisance(
-                x0=nuisance.x0 - np.append(move, np.zeros(move.size))
-                if run.at_rest
-                else nuisance.x0,
-                v0=nuisance.v0,
+            yield Nuisance(
+                x0=own.x0 - np.append(move, np.zeros(move.size)) if run.at_rest else own.x0,
+                v0=own.v0,
                 zero=np.where(free, run.zero, 0.0) + move,
                 scatter=np.where(rest & free, factor, 1.0),
             )
-            trial = fit_model(
-                replace(fit, nuisance=(start,)), [run], Fitting(shared=False, iterations=6)
-            )
-            if trial.chi_square < lowest:
-                best, lowest = trial.nuisance[0], trial.chi_square
-        return best
 
-    jobs = zip(runs, fit.nuisance, worst, fit.run_chi, strict=True)
-    nuisance = tuple(mapper(again, jobs))
+    nuisance, bad = list(fit.nuisance), np.flatnonzero(worst).tolist()
+    lowest = [chi * residual_points(run) for run, chi in zip(runs, fit.run_chi, strict=True)]
+    trials = [(r, start) for r in bad for start in starts(runs[r], nuisance[r])]
+    fits = mapper(again, [runs[r] for r, _ in trials], [start for _, start in trials])
+    for (r, _), trial in zip(trials, fits, strict=True):
+        if trial.chi_square < lowest[r]:
+            nuisance[r], lowest[r] = trial.nuisance[0], trial.chi_square
     return evaluate(fit, runs, nuisance, spread=fit.spread, inflate=fit.inflation, mapper=mapper)
 
 

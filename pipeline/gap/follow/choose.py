@@ -6,13 +6,15 @@ an end stop), then drop needless ones.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.gap import limits
 from pipeline.gap.follow.drop import criterion, drop_needless, is_better, is_rough
 from pipeline.gap.follow.fit import Follow, Records
-from pipeline.gap.follow.laws import FollowedBench, TrialLaw, smooth_laws
+from pipeline.gap.follow.laws import FollowedBench, LawSet, TrialLaw, smooth_laws
 from pipeline.gap.follow.score import backlash_laws, score, shaped_trials
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects import CATALOGUE
@@ -34,14 +36,16 @@ def start_all(records: Records, *, springs: Sequence[bool], chains: Sequence[Cha
     largest = max(float(np.abs(track.command).max()) for track in tracks)
     free = tuple(tuple(track.free.tolist()) for track in tracks)
     pinned = int(np.argmax(np.any(free, axis=0))) if largest == 0.0 else None
-    fits = []
-    for chain in chains:
+
+    def fitted(chain: Chain) -> Follow:
         bench = FollowedBench(
             chain=chain, springs=tuple(springs), largest=largest, free=free, pinned=pinned
         )
         laws = smooth_laws(bench, columns=records.columns)
         start = records.begin(laws, laws.start(chain), gain=CLOSE)
-        fits.append(records.fit(start, iterations=_FIRST))
+        return records.fit(start, iterations=_FIRST)
+
+    fits = list(records.mapper(fitted, chains))
     return records.fit(min(fits, key=lambda follow: follow.total), gain=LOOSE)
 
 
@@ -159,9 +163,10 @@ def rivals_of(lean: Follow, records: Records) -> list[Follow]:
             if free and not laws.drive[q] and group != -1 - q:
                 drive = tuple(f or i == q for i, f in enumerate(laws.drive))
                 exchanged.append((replace(laws, drive=drive), bare.p))
-        out += [
-            _one_friction(records.refit(bare, *model, iterations=_FEW), records)
-            for model in exchanged
-        ]
+
+        def fitted(model: tuple[LawSet, Array], bare: Follow = bare) -> Follow:
+            return _one_friction(records.refit(bare, *model, iterations=_FEW), records)
+
+        out += records.mapper(fitted, exchanged)
     near = sorted((one for one in out if np.isfinite(one.cost)), key=lambda one: one.total)
-    return [records.fit(one, gain=lean.gain) for one in near[:_SHORT_LIST]]
+    return list(records.mapper(partial(records.fit, gain=lean.gain), near[:_SHORT_LIST]))

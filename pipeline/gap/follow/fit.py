@@ -128,12 +128,14 @@ class Records:
             track, own = pair
             run = errors_of(laws, follow.p, track, own, gain=follow.gain, derive=True)
             # An almost infinite slope has no finite square.
-            if run is None or not (run[1].min() > -1e100 and run[1].max() < 1e100):
+            if run is None or not np.vdot(run[1], run[1]) < 1e200:
                 nothing = np.full((size, size), np.nan)
                 return nothing, nothing[0], nothing
             E, J = run
             weight = track.weight[:, track.seen]
-            J = (J[:, :, track.seen] * weight).reshape(len(J), -1)
+            J = J if track.seen.all() else np.ascontiguousarray(J[:, :, track.seen])
+            J *= weight
+            J = J.reshape(len(J), -1)
             A, r = J @ J.T, J @ (E[:, track.seen] * weight).ravel()
             hold, off = track.prior(own, dry)
             mine = A[size:, size:] + np.diag((inflate * hold) ** 2)

@@ -1,6 +1,7 @@
 """One run for a model that follows it: thinned readings, the run's own parameters, errors."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -55,7 +56,7 @@ class Track:
     longest: float
     swing: float
 
-    @property
+    @cached_property
     def points(self) -> float:
         """The number of readings, each counted by its weight."""
         largest = np.maximum(self.weight.max(axis=0), 1e-300)
@@ -107,7 +108,7 @@ def make_track(run: GapRun) -> Track:
         y[:, row], weight[:, row] = thin.y[j], thin.weight[j] / thin.sigma[j]
         seen[row] = True
     return Track(
-        t=np.ascontiguousarray(thin.t),
+        t=np.array(thin.t),  # a copy, as numba would compile again for a read-only array
         y=y,
         weight=weight,
         free=free,
@@ -172,6 +173,7 @@ def errors_of(
     return (E, J) if fine and np.all(np.isfinite(E)) else None
 
 
+@lru_cache(maxsize=64)  # most models have no dead zone and no limit
 def _shaped(track: Track, dead: float, limit: float) -> Array:
     """Return the input after dead zone and limit, and its derivatives by the two, (3, 2, knots).
 

@@ -6,6 +6,7 @@ are fitted to whole runs. Each effect must lower the error on runs that the fit 
 come from the same fit with one law exchanged.
 """
 
+from collections.abc import Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -43,8 +44,7 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
             return baseline, found
         found.append(judge(fit_whole(_as_model(lean, study, records), study), study))
         study.progress(f"{found[-1].size} laws remain: error {found[-1].error:.1%}")
-        for rival in rivals_of(lean, records):
-            found.append(judge(fit_whole(_as_model(rival, study, records), study), study))
+        _judge_rivals(rivals_of(lean, records), found, study, records)
         found[1:] = [h for h in found[1:] if np.isfinite(h.error)]
         # An effect with a parameter at its bound is often not real, so it is removed.
         chosen = prune(min(found, key=lambda h: h.bic_of_all), study, found)
@@ -56,6 +56,21 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
     found = [h for h in found if np.isfinite(h.error) and h.sound]
     worth = [h for h in found if worth_it(h, baseline, study)]
     return min(worth, key=lambda h: h.bic, default=baseline), found
+
+
+def _judge_rivals(
+    rivals: Sequence[Follow], found: list[Hypothesis], study: Study, records: Records
+) -> None:
+    """Append the rivals, fitted to whole runs; those that are finished if the time is up."""
+    judged: dict[int, Hypothesis] = {}
+
+    def fit(at: int, rival: Follow) -> None:
+        judged[at] = judge(fit_whole(_as_model(rival, study, records), study), study)
+
+    try:
+        list(study.mapper(fit, range(len(rivals)), rivals))
+    finally:
+        found += [judged[at] for at in sorted(judged)]
 
 
 def _as_model(follow: Follow, study: Study, records: Records) -> GapModel:
