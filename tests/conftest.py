@@ -9,7 +9,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +40,16 @@ settings.register_profile(
 )  # fmt: skip
 settings.load_profile("cartlab")
 
-# chromium-headless-shell needs less than half of the processor time of chromium.
-CHROMIUM = shutil.which("chromium-headless-shell") or shutil.which("chromium")
 _BENCHES = "benches"  # group of the files that mostly wait for virtual benches
 _WITH_BENCHES = {
     "bench/host/test_acquire", "bench/host/test_mistakes", "bench/host/test_safety",
     "simulated/emulator/test_server", "system/test_live_page",
+}  # fmt: skip
+_PAGES = "pages"  # group of the files that share a browser
+_WITH_BROWSER = {
+    "system/test_desk", "system/test_desk_check", "system/test_desk_feedback",
+    "system/test_desk_grades", "system/test_desk_rooms", "system/test_plots_page",
+    "system/test_report_pages",
 }  # fmt: skip
 _LONGEST = {  # each takes ten seconds or more, so it must not start late
     "desk/test_bench", "desk/test_doors", "desk/test_grades", "desk/test_student",
@@ -53,16 +57,13 @@ _LONGEST = {  # each takes ten seconds or more, so it must not start late
     "grading/autograder/test_gradescope", "grading/batch/test_faults_of_the_computer",
     "grading/mistakes/test_faults", "grading/similarity/test_shared_data",
     "grading/test_class_so_far", "report/test_gap", "report/test_report", "report/test_solution",
-    "simulated/test_hidden", "statistics/test_gap", "system/test_desk", "system/test_desk_grades",
-    "system/test_desk_rooms", "system/test_report_pages",
+    "simulated/test_hidden", "statistics/test_gap",
 }  # fmt: skip
 _FEW = 2  # up to this many files, starting other processes takes more time than it saves
 
 # A shell starts background jobs with Ctrl-C ignored, and their children inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
-
-FLAGS = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking"
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -92,14 +93,15 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put tests that wait for benches first, then the longest files.
+    """Put tests that wait for benches first, then those with a browser, then the longest files.
 
     The short files come last, so that no worker is busy with a long file at the end.
     """
     groups = [_group(item.nodeid) for item in items]
     size = Counter(groups)
     order = {
-        group: (group != _BENCHES, group not in _LONGEST, size[group], group) for group in size
+        group: (group != _BENCHES, group != _PAGES, group not in _LONGEST, size[group], group)
+        for group in size
     }
     items.sort(key=lambda item: order[_group(item.nodeid)])
 
@@ -113,7 +115,7 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
-    """Give each file to one worker; all files that wait for benches share a worker."""
+    """Give each file to one worker; files that wait for benches share one, as do those of pages."""
     if config.getoption("dist") != "loadscope":
         return None  # the user chose another distribution of the tests
     from xdist.scheduler import LoadScopeScheduling
@@ -127,7 +129,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
 
 def _group(nodeid: str) -> str:
     file = nodeid.partition("::")[0].removesuffix(".py").removeprefix("tests/")
-    return _BENCHES if file in _WITH_BENCHES else file
+    return _BENCHES if file in _WITH_BENCHES else _PAGES if file in _WITH_BROWSER else file
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -140,28 +142,27 @@ def _patient_host() -> Iterator[None]:
         yield
 
 
-@pytest.fixture
-def work_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run the desk's jobs in this process instead of in new ones."""
+@contextmanager
+def _working_here() -> Iterator[None]:
     from tests.helpers.desks import WorkerHere
 
-    monkeypatch.setattr("pipeline.desk.jobs.Supervisor", WorkerHere)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipeline.desk.jobs.Supervisor", WorkerHere)
+        yield
+
+
+@pytest.fixture
+def work_here() -> Iterator[None]:
+    """Run the desk's jobs in this process instead of in new ones."""
+    with _working_here():
+        yield
 
 
 @pytest.fixture(scope="module")
-def browser():
-    """Return a real browser; tests that need it are skipped if no browser is installed."""
-    if CHROMIUM is None:
-        pytest.skip("no chromium: apt-get install chromium-headless-shell")
-    from playwright.sync_api import expect, sync_playwright
-
-    expect.set_options(timeout=1e3 * PATIENCE)
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=CHROMIUM, args=FLAGS.split(), timeout=1e3 * PATIENCE
-        )
-        yield browser
-        browser.close()
+def all_work_here() -> Iterator[None]:
+    """Run the jobs of all desks of a module in this process, also of those that its tests share."""
+    with _working_here():
+        yield
 
 
 @pytest.fixture(scope="session")

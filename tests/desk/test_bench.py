@@ -23,7 +23,7 @@ from tests.helpers.acquisitions import sine, write_work
 from tests.helpers.desks import Visitor, a_recorded_cart
 from tests.helpers.waiting import PATIENCE, kill, until
 
-pytestmark = pytest.mark.usefixtures("work_here")
+pytestmark = pytest.mark.usefixtures("all_work_here")
 NOBODY = "socket://127.0.0.1:1"
 SWEEP = sine("sweep", seconds=300).model_copy(update={"kind": "sweep", "wave": "square"})
 

@@ -20,7 +20,7 @@ from tests.helpers.desks import Answer, Visitor, a_submission, through_proxy, wr
 from tests.helpers.waiting import until
 
 HERE = "/student/0/"
-pytestmark = pytest.mark.usefixtures("work_here")
+pytestmark = pytest.mark.usefixtures("all_work_here")
 OPEN = {  # pages that show no computed number
     "", "files", "fill", "aside", "save", "experiments", "check", "hand-in", "hand-in.zip",
     "events", "stop",

@@ -22,7 +22,7 @@ from tests.helpers.desks import PROXY, Visitor, a_submission, through_proxy, wri
 from tests.helpers.grades import write_class
 from tests.helpers.waiting import PATIENCE, until
 
-pytestmark = pytest.mark.usefixtures("work_here")
+pytestmark = pytest.mark.usefixtures("all_work_here")
 PATHS = [re.sub(r"\{\w+:int\}", "0", re.sub(r"\{name(:path)?\}", "x.json", p)) for p, *_ in ROUTES]
 
 

@@ -17,7 +17,7 @@ from pipeline.plant.nonlinear.effects import CATALOGUE
 from tests.helpers.desks import Visitor, a_submission
 from tests.helpers.waiting import until
 
-pytestmark = pytest.mark.usefixtures("work_here")
+pytestmark = pytest.mark.usefixtures("all_work_here")
 FRICTION = {"effect": "coulomb_friction", "coulomb_friction.place": "2"}
 
 

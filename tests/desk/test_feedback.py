@@ -18,7 +18,7 @@ from tests.helpers.desks import Answer, Visitor, a_submission, through_proxy, wr
 from tests.helpers.grades import two_cart_rubric, write_class
 from tests.helpers.hostile import SECRET
 
-pytestmark = pytest.mark.usefixtures("work_here")
+pytestmark = pytest.mark.usefixtures("all_work_here")
 HERE, ROOM, QUEUE = "/feedback/0/", "/grades/0/", "/grades/0/again"
 USERS = """
 [[users]]

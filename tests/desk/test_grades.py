@@ -26,7 +26,7 @@ from tests.helpers.desks import BOUNDARY, Answer, Visitor, a_submission, through
 from tests.helpers.grades import fill_book, make_grade, make_outcome, two_cart_rubric, write_class
 from tests.helpers.waiting import until
 
-pytestmark = pytest.mark.usefixtures("work_here")
+pytestmark = pytest.mark.usefixtures("all_work_here")
 ROOM = "/grades/0/"
 
 

@@ -13,7 +13,7 @@ from pipeline.errors import ConfigError
 from tests.helpers.desks import Visitor, a_submission, through_proxy, write_users
 from tests.helpers.grades import write_class
 
-pytestmark = pytest.mark.usefixtures("work_here")
+pytestmark = pytest.mark.usefixtures("all_work_here")
 
 
 @pytest.fixture

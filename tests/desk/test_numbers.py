@@ -6,7 +6,7 @@ from pipeline.desk.app import DeskServer
 from pipeline.submission.load import NAME
 from tests.helpers.desks import Visitor, a_submission
 
-pytestmark = pytest.mark.usefixtures("work_here")
+pytestmark = pytest.mark.usefixtures("all_work_here")
 HERE = "/student/0/"
 
 

@@ -17,7 +17,7 @@ from pipeline.resources import RUBRICS
 from tests.helpers.desks import Answer, Visitor, wrongs
 from tests.helpers.grades import write_class_of_two
 
-pytestmark = pytest.mark.usefixtures("work_here")
+pytestmark = pytest.mark.usefixtures("all_work_here")
 ONE_CART = (RUBRICS / "throne-1dof.toml").read_text(encoding="utf-8")
 
 

@@ -6,6 +6,7 @@ import io
 import re
 import shutil
 from dataclasses import replace
+from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -103,11 +104,18 @@ def folders(tmp_path_factory) -> dict[int, Path]:
 
 def read(folder: Path) -> tuple[Page, str]:
     """Return the parsed page and the PDF's text, which is empty if there is no PDF."""
-    page = Page((folder / "report.html").read_text(encoding="utf-8"))
-    if not (folder / "report.pdf").exists():
-        return page, ""
+    return parsed(folder), printed_text(folder) if (folder / "report.pdf").exists() else ""
+
+
+def parsed(folder: Path) -> Page:
+    return Page((folder / "report.html").read_text(encoding="utf-8"))
+
+
+@cache
+def printed_text(folder: Path) -> str:
+    """Return the PDF's text; reading it takes half a second."""
     reader = pypdf.PdfReader(folder / "report.pdf")
-    return page, "\n".join(p.extract_text() for p in reader.pages).replace("\u00a0", " ")
+    return "\n".join(p.extract_text() for p in reader.pages).replace("\u00a0", " ")
 
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
@@ -138,7 +146,7 @@ def test_every_part_is_there(carts, folders):
 def test_figures_are_in_the_same_sections_in_print(folders):
     """In print, every figure and question is in the same section as on the page."""
     html = (folders[3] / "report.html").read_text(encoding="utf-8")
-    _, pdf = read(folders[3])
+    pdf = printed_text(folders[3])
     marks = re.findall(r"<h2[^>]*>([^<]+)</h2>|<b>(Figure \d+)\.|<b>(Question\.)", html)
 
     at, places = 0, []
@@ -244,7 +252,7 @@ def test_the_list_of_files_is_never_alone_on_a_page():
 
 def test_the_page_loads_nothing(folders):
     """The page loads nothing, and its security policy lets only its own script run."""
-    page, _ = read(folders[2])
+    page = parsed(folders[2])
 
     (policy,) = (
         attrs["content"] for tag, attrs in page.tags
@@ -265,7 +273,7 @@ def test_the_page_loads_nothing(folders):
 
 def test_the_page_is_accessible(folders):
     """Every section is linked, every figure has a description, and every formula is MathML."""
-    page, _ = read(folders[3])
+    page = parsed(folders[3])
 
     ids = set(page.values("id"))
     links = [href[1:] for href in page.values("href") if href.startswith("#")]

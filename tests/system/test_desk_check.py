@@ -12,7 +12,7 @@ from tests.system import test_desk
 from tests.system.test_report_pages import PHONE
 
 show, fits = test_desk.show, test_desk.fits
-pytestmark = pytest.mark.usefixtures("work_here")
+pytestmark = pytest.mark.usefixtures("all_work_here")
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from tests.system import test_desk
 from tests.system.test_report_pages import PHONE, WIDE
 
 show, fits = test_desk.show, test_desk.fits
-pytestmark = pytest.mark.usefixtures("work_here")
+pytestmark = pytest.mark.usefixtures("all_work_here")
 
 
 def test_a_session_is_watched_and_steered(show, tmp_path, real, monkeypatch):

@@ -100,8 +100,10 @@ def page_of(made: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def window(browser):
-    """Return a browser window for most pages, since opening a new one takes a second."""
-    return browser.new_context().new_page()
+    """Yield a browser window for most pages, since opening a new one takes a second."""
+    context = browser.new_context()
+    yield context.new_page()
+    context.close()
 
 
 @pytest.fixture

@@ -243,8 +243,9 @@ def simulate_truth(
         t,
         t,
         np.asarray(u, dtype=float),
-        np.zeros(n) if x0 is None else np.asarray(x0, dtype=float),
-        np.zeros(n) if v0 is None else np.asarray(v0, dtype=float),
+        # For strided arrays numba would compile again.
+        np.zeros(n) if x0 is None else np.ascontiguousarray(x0, dtype=float),
+        np.zeros(n) if v0 is None else np.ascontiguousarray(v0, dtype=float),
         np.ones(n) if scatter is None else scatter,
         step,
     )
