@@ -1,8 +1,6 @@
 """The JSON files and their schemas: the shipped schemas describe the files we write."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import jsonschema
@@ -13,6 +11,7 @@ from pipeline.json_files import DIALECT, file_model, json_text
 from pipeline.report.solution.expected import solution_text
 from pipeline.schemas import MODELS, schema_text
 from tests.helpers.analysis_factory import make_analysis
+from tests.helpers.commandline import cartlab_here
 from tests.helpers.examples import analysed
 from tests.helpers.grades import write_class
 from tests.helpers.places import ROOT
@@ -90,8 +89,7 @@ def test_a_broken_file_is_refused():
 
 def test_the_command_prints_the_schema():
     """`cartlab schema gap` prints the shipped schema; an unknown name gets the list of names."""
-    command = [sys.executable, "-m", "pipeline", "schema"]
-    done = subprocess.run([*command, "gap"], capture_output=True, encoding="utf-8", check=True)
+    done = cartlab_here("schema", "gap")
     assert done.stdout == (DOCS / "gap.schema.json").read_text(encoding="utf-8")
     with pytest.raises(ConfigError, match="there are results, gap, solution, grade"):
         schema_text("report")
