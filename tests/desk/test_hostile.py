@@ -67,7 +67,7 @@ def _quoted(name: str) -> str:
 
 @pytest.mark.parametrize(
     ("step", "least"),
-    [(6, 8), pytest.param(1, 50, marks=[pytest.mark.slow, pytest.mark.sample])],
+    [(12, 4), pytest.param(1, 50, marks=[pytest.mark.slow, pytest.mark.sample])],
 )
 def test_hostile_uploads_reach_nothing(tmp_path, step, least):
     """A sample of hostile and spoilt uploads changes nothing outside its folder.

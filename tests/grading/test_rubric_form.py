@@ -35,7 +35,7 @@ def _comments(text: str) -> list[str]:
     return [line.partition("#")[2] for line in text.splitlines() if "#" in line]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25)
 @given(data=st.data())
 def test_a_form_keeps_comments_and_order(data):
     """The file has the new values, and every other line is as it was."""

@@ -50,6 +50,8 @@ def test_the_results_have_the_same_numbers(teams):
     assert told["xlsx"] == told["tdms"] == told["csv"]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_grade_has_the_same_points(teams, tmp_path):
     """All formats get the same points, even LabVIEW's with six decimals; copies are flagged."""
     out = tmp_path / "grades"
