@@ -496,7 +496,7 @@ def run_exploration(*, hours: float, speed: float, seed: int) -> dict[str, Any]:
         "recordings": len(made),
         "turns": int(turns[1]) if turns else 0,
         "status": process.returncode,
-        "last": said[-2:],
+        "last": [line.strip().replace(str(folder), "DIR") for line in said[-2:]],
         "memory": memory.slope(min(SETTLING, seconds / 4)),
         "trace": {"at": np.round(memory.at[::15], 1).tolist(), "mb": memory.mb[::15]},
         "load": [float(np.median(load)), max(load)],
