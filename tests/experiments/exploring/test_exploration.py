@@ -436,8 +436,8 @@ def test_the_command_explores_a_bench_over_its_line(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_large_step_is_made_only_once(tmp_path):
-    """If drag keeps carts from the wanted distance, the large step is still made only once."""
+def test_the_large_step_and_the_far_sweep_are_made_only_once(tmp_path):
+    """If drag keeps carts from the wanted distance, the recordings for it are still made once."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=["quadratic_drag"])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=13))
     turns = Exploration(
@@ -447,5 +447,5 @@ def test_the_large_step_is_made_only_once(tmp_path):
         seconds=300.0,
         announce=silent,
     ).run()
-    assert [turn.verdict for turn in turns] == ["named"] * 2
-    assert turns[-1].recorded == ("step-3",)
+    assert [turn.verdict for turn in turns] == ["named"] * 3
+    assert [turn.recorded for turn in turns[1:]] == [("step-3",), ("sweep-2",)]
