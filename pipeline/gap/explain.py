@@ -8,10 +8,10 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pipeline.estimation.interventions import find_interventions
+from pipeline.gap.compile_beside import follower_compiled
 from pipeline.gap.data.sides import drop_left_out, prepare, take_sides
 from pipeline.gap.fit.baseline import fit_baseline
 from pipeline.gap.fit.levenberg_marquardt import Fitting, GapFit
-from pipeline.gap.follow.beside import follower_compiled
 from pipeline.gap.follow.track import compile_follower
 from pipeline.gap.search.deadline import Deadline
 from pipeline.gap.search.hypothesis import Study

@@ -38,7 +38,7 @@ def compile_all() -> None:
     """Compile the workflow's simulators and the tests' independent one."""
     import numpy as np
 
-    from pipeline.gap.follow.beside import follower_compiled
+    from pipeline.gap.compile_beside import follower_compiled
     from pipeline.plant.nonlinear.augmented import compile_simulator
     from tests.truth.bench import simulate_truth
 

@@ -7,12 +7,12 @@ import sys
 import psutil
 import pytest
 
-from pipeline.gap.follow.beside import follower_compiled
+from pipeline.gap.compile_beside import follower_compiled
 from pipeline.gap.follow.track import compile_follower
 from tests.helpers.places import ROOT
 
 SCRIPT = """
-from pipeline.gap.follow import beside
+from pipeline.gap import compile_beside as beside
 from pipeline.plant.nonlinear.simulator.compiler import is_compiled
 
 print(is_compiled(beside._ROOM, function="follow_run"))

@@ -10,7 +10,7 @@ from pathlib import Path
 from pipeline.plant.nonlinear.simulator.compiler import is_compiled, kept_in
 from pipeline.threads import with_one_thread
 
-_ROOM = Path(__file__).parent
+_ROOM = Path(__file__).parent / "follow"
 _SCRIPT = "from pipeline.gap.follow.track import compile_follower; compile_follower()"
 
 
