@@ -74,6 +74,8 @@ def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
     assert load_submission(work).experiments == ()
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_many_viewers_block_nobody(tmp_path, real):
     """If sixty viewers open a session, eight are connected and the others are refused at once.
 
@@ -140,6 +142,8 @@ def test_the_bench_is_stopped_when_the_desk_is_gone(tmp_path, real, name, room, 
     assert len(read_raw(work / "raw" / f"{name}-1.raw").content) > 10_000  # half a second of lines
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_plan_is_made_and_errors_are_named(tmp_path):
     """The desk makes the same plan as `cartlab plan`, and an error names a missing bench."""
     work = tmp_path / "team"
@@ -164,6 +168,8 @@ def test_a_plan_is_made_and_errors_are_named(tmp_path):
     assert load_plan(load_submission(work)).recordings
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_exploring_has_its_own_form(tmp_path):
     """Exploring has its own form with its own port, and Enter in a field starts exploring.
 

@@ -223,6 +223,8 @@ def test_a_wrong_rubric_in_the_list_is_one_line(root, entry, said):
         read_users(write_users(root, f'[[users]]\nname = "x"\n{entry}\n'))
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_ta_sees_how_often_the_check_was_run(root):
     """The team's page for the TA says how often the check was run."""
     for _ in range(2):

@@ -236,6 +236,8 @@ def test_students_see_only_their_own_folder(lab):
     assert lab("s1").get("/").headers["location"] == "/student/0/"
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_form_can_be_saved_after_many_other_changes(lab, root):
     """Many changes in another student's folder do not make the desk forget a form that it showed.
 
@@ -458,6 +460,8 @@ def test_a_file_of_users_that_others_can_write_is_refused(tmp_path):
     assert read_users(path)[0].header == "X-Remote-User"
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_connection_without_the_secret_times_out(server):
     """A connection that sends no secret is closed after a time limit."""
     began = time.monotonic()

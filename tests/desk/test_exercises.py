@@ -79,6 +79,8 @@ def test_a_moved_slider_or_a_typed_number_counts():
     assert other == force("throne-1dof")["value"] != usual
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_class_equals_what_simulate_writes(visitor, tmp_path):
     """A class of two folders has the same bytes as the class that `cartlab simulate` writes.
 

@@ -502,6 +502,8 @@ def test_a_table_that_is_not_a_roster_is_refused(ta):
     assert ta.post(ROOM + "export", lms="blackboard").status == 400
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_class_is_graded_again_from_the_desk(tmp_path):
     """A submission can be graded into an open class from the desk, and earlier grades stay.
 
@@ -738,6 +740,8 @@ def test_criteria_keep_their_order_during_grading(ta):
         assert titles() == before
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_recordings_of_a_team_are_one_click_away(tmp_path):
     """A team's page links to the recordings that were graded, unless a file has changed since."""
     team = a_submission(tmp_path / "lab" / "team-1")

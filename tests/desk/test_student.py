@@ -96,6 +96,8 @@ def zipped(visitor: Visitor) -> zipfile.ZipFile:
     return zipfile.ZipFile(io.BytesIO(visitor.get(HERE + "hand-in.zip").body))
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_from_an_empty_folder_to_the_zip(room):
     """Without scripts, uploaded files become a submission, then a report, answers and a zip."""
     visitor, folder = room
@@ -783,6 +785,8 @@ def test_a_report_page_that_is_not_ours_runs_nothing(filled):
 # -------------------------------------------------------------------------------- jobs
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_gap_is_found_as_a_job(filled):
     """The desk finds the gap as a job, keeps `gap.json`, and shows the page in a sandbox."""
     visitor, folder = filled
@@ -881,6 +885,8 @@ def test_one_click_reverses_a_contradicted_sign(filled):
     assert "Reverse the sign" not in answers(visitor.get(HERE).text)  # the report is out of date
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_one_click_states_the_sign_of_turned_runs(tmp_path):
     """If some runs have the opposite sign, one click states the sign in these runs only."""
     folder = a_submission(tmp_path / "team")

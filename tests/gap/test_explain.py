@@ -208,6 +208,8 @@ def test_gap_json_has_the_documented_keys(one_gap):
         assert 0.0 < window["share"] <= 1.0
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_same_records_give_the_same_document(one_gap):
     """The same records give the same bytes, even on a busy machine."""
     case = make_case(seed=45, n=1, effects=["dead_zone"], rate=113.1)

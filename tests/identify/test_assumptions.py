@@ -135,6 +135,8 @@ def test_a_held_cart_that_was_not_measured_is_open(tmp_path):
     assert "the opposite sign is shown by pid" in sign.reason
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.skipif(not (REAL_DATA / "ecp210-ucsd").is_dir(), reason="no real recordings here")
 def test_a_large_misfit_leaves_a_certain_spring_supported(tmp_path):
     """Even if the fit does not explain the data, springs that it finds for certain are supported.

@@ -350,6 +350,8 @@ def stored(prepared):
     return plain(gap)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_stored_model_gives_the_same_records(tmp_path):
     """Simulating from `gap.json` gives exactly the records of the bench that it describes."""
     prepared = prepare_bench(preset="throne-1dof", hide=["stiction", "backlash:gap=0.02"])

@@ -165,6 +165,8 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
     assert "bumped" in next(e for e in submission.experiments if e.id == step.id).note
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.usefixtures("work_here")
 def test_the_keyboard_alone_suffices_on_a_phone(show, tmp_path):
     """With keys alone, on a phone, a student answers a question about units and gets the zip."""
@@ -340,6 +342,8 @@ def test_zip_and_report_wait_for_unsaved_text(show, tmp_path):
         expect(title).to_have_value("typed again")
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.usefixtures("work_here")
 def test_the_desk_is_accessible(show, tmp_path):
     """The desk is accessible (axe) by day and night, fits every screen and works by keyboard."""
@@ -400,6 +404,8 @@ def test_the_command_prints_its_address_and_ends_on_a_signal(tmp_path):
         assert desk.stderr.read() == f"cartlab: the desk ends: {number.name}\n"
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.usefixtures("work_here")
 def test_typing_goes_on_while_a_field_is_saved(show, tmp_path):
     """While one field is saved, a user can type in the next without losing letters or messages."""

@@ -32,6 +32,8 @@ def press(window, key: str) -> None:
         window.keyboard.press(key)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_grading_pages_are_accessible(show, tmp_path):
     """Class page, team page and a refused change are accessible (axe) and fit the screen."""
     with DeskServer(folder=write_class(tmp_path / "grades")) as server:
@@ -57,6 +59,8 @@ def test_the_grading_pages_are_accessible(show, tmp_path):
         assert fits(window)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_class_is_graded_by_keys(show, tmp_path):
     """Keys change points for one team, or for all teams with a flag; each change can be undone."""
     grades = write_class(tmp_path / "grades")
@@ -192,6 +196,8 @@ def test_two_tas_see_each_others_changes(show):
             assert (given.points, given.by) == (1.0, "Ada")
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_an_anonymous_class_shows_no_name(show, tmp_path):
     """An anonymous class shows no name on any page or in any address that the browser requests."""
     grades = write_class(tmp_path / "g", anonymous=True)

@@ -20,6 +20,8 @@ show, fits = test_desk.show, test_desk.fits
 pytestmark = pytest.mark.usefixtures("all_work_here")
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_session_is_watched_and_steered(show, tmp_path, real, monkeypatch):
     """Buttons keep one run and end another, and the session still goes on to its end."""
     monkeypatch.chdir(tmp_path)
@@ -214,6 +216,8 @@ def test_a_rubric_is_edited_by_keyboard(show, tmp_path, monkeypatch):
         assert (rubric.late.percent_per_day, rubric.students.see) == (50, "check")
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_picture_of_an_effect_is_drawn_on_a_phone(show):
     """On a phone an effect's picture is drawn once its row is opened."""
     with DeskServer() as server:

@@ -4,6 +4,8 @@ import json
 import os
 from importlib.metadata import version
 
+import pytest
+
 from tests.helpers.commandline import cartlab, cartlab_here
 
 
@@ -23,6 +25,8 @@ def test_all_that_is_needed_works_here():
     assert os.access(health["compiled"], os.W_OK)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_package_that_does_not_load_is_named(tmp_path, monkeypatch):
     """If a package cannot be loaded, `doctor` names it with its error and ends with status 1."""
     (tmp_path / "yaml.py").write_text("raise ImportError('its library is gone')")

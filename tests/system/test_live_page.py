@@ -539,6 +539,8 @@ def test_by_night_the_curves_change_colour(page, show):
     assert BLUE not in window.evaluate(INK, "positions")
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_page_says_that_the_session_is_over(folder, browser):
     """After the session the page says that it is over, keeps its curves, and sends no requests."""
     context = browser.new_context()

@@ -24,6 +24,8 @@ def shown(window) -> str:
     return window.evaluate("location.hash")
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.usefixtures("work_here")
 def test_runs_and_models_are_compared_by_keyboard(show, tmp_path):  # noqa: F811
     """By keyboard a student compares two runs, then views one cart's residual and spectrum."""

@@ -573,6 +573,8 @@ def test_without_scripts_everything_can_be_read(three, show):
     assert page.get_by_text("The fit converged").is_visible()
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.skipif(shutil.which("pdftotext") is None, reason="no pdftotext: poppler-utils")
 def test_printing_opens_folded_tables(three, show, tmp_path):
     """Printing opens the folded tables, and omits buttons that work only on a screen."""

@@ -37,6 +37,8 @@ def running_bench() -> Iterator[str]:
         server.close()
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @no_compiler
 def test_friction_is_compensated_on_the_virtual_bench(tmp_path):
     """With friction in the model the cart rests on the target; without it, far from the target.

@@ -139,6 +139,8 @@ def no_gap(monkeypatch):
     monkeypatch.setattr("pipeline.experiments.exploring.exploration.investigate", none)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.usefixtures("no_gap")
 def test_an_exploration_ends_before_it_exceeds_its_time(tmp_path):
     """A recording that would exceed the time is not begun, and the diary names it.
@@ -336,6 +338,8 @@ def test_a_large_step_is_proposed_after_all_else_was_refused(tmp_path):
     assert "no input was above" in why
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_number_of_chosen_recordings_grows_with_the_data(tmp_path):
     """A tenth of the data so far is chosen at once, but no more than goal and time need."""
     submission = load_submission(a_recorded_cart(tmp_path / "work"))
@@ -365,6 +369,8 @@ def test_the_number_of_chosen_recordings_grows_with_the_data(tmp_path):
     assert len(chosen(often, seconds=1.0)) == 1
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.usefixtures("no_gap")
 @pytest.mark.parametrize("ends", ["not", "added", "vetoed"])
 def test_a_series_ends_when_a_person_intervenes(tmp_path, monkeypatch, ends):
@@ -419,6 +425,8 @@ def test_thinking_can_be_ended(tmp_path):
     assert len(load_submission(tmp_path / "work").experiments) == 3
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_command_explores_a_bench_over_its_line(tmp_path):
     """`cartlab explore` makes a submission with its diary from an empty folder, over a socket.
 

@@ -159,6 +159,8 @@ def grade_here(submission: Path, scratch: Path) -> Grade:
     return read_grade(grade_task(task, rubric=load_rubric(RUBRIC), scratch=scratch).grade)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_submission_gets_the_points_of_cartlab_grade(shown, team, tmp_path):
     """Points and total equal those of `cartlab grade`, and lateness costs nothing.
 
@@ -220,6 +222,8 @@ HOSTILE = (  # one archive of each kind; `tests/system/test_hostile.py` grades a
 )  # fmt: skip
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_hostile_upload_gets_a_reason_and_reaches_no_other_file(root, team, tmp_path):
     """A hostile upload, such as a zip bomb or a link, gets a result that names the reason.
 
@@ -263,6 +267,8 @@ def test_an_upload_without_a_submission_gets_the_reason(root, tmp_path, files, s
     assert said in results["output"]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_code_in_an_upload_is_not_run(root, team, shown, tmp_path):
     """No code in an upload is run, even if its file is named like one that the grader uses."""
     given, mark = tmp_path / "given", tmp_path / "was-run"

@@ -152,6 +152,8 @@ def starved(source: Path, scratch: Path, limit: str, soft: range) -> list[list]:
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @POSIX
 def test_a_limit_on_file_size_costs_nobody_a_grade(zips, teams, tmp_path):
     """If the system limits file sizes, the submission is not graded; the next run tries again.

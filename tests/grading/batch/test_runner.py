@@ -144,6 +144,8 @@ def kill_next(monkeypatch):
     return lambda: doomed.append(True)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup, kill_next):
     """If a worker process dies during a task, its row says so and the next task is graded."""
     with closing(Grader(setup)) as worker:

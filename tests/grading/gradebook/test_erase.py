@@ -88,6 +88,8 @@ def test_no_file_of_a_folder_keeps_a_trace(tmp_path):
         assert connection.execute("PRAGMA freelist_count").fetchone() == (0,)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_no_row_in_postgresql_keeps_a_trace(server, place_in_postgresql):
     """After an erasure, neither a dump of the database nor its table files contain the student."""
     url = place_in_postgresql

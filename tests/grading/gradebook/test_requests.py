@@ -324,6 +324,8 @@ def test_a_gradebook_without_requests_gets_them(tmp_path):
         assert book.entry("team-1").grade.points == 10.5
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
 def test_a_kill_leaves_an_answer_with_its_points_or_neither(tmp_path):
     """If the answering process is killed, an answer is stored with its points or not at all."""

@@ -55,6 +55,8 @@ def _grade(school: Path, out: Path, rubric: Rubric) -> Gradebook:
     return book
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_preview_gives_the_points_of_a_new_grading(school, tmp_path):
     """The preview of a changed rubric gives the same points as a new grading.
 
