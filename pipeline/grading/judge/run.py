@@ -6,6 +6,7 @@ Numbers that students computed are judged, but the analysis does not use them.
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from typing import Any
 
 from pipeline.errors import SubmissionError
 from pipeline.grading.grade import CODES, Flag, Grade
@@ -28,10 +29,17 @@ from pipeline.grading.references.signs import turned_round
 from pipeline.grading.references.springs import with_all_springs
 from pipeline.grading.references.tolerance import late_deduction, rounding
 from pipeline.grading.rubric import Rubric
-from pipeline.ingest.columns import conversion
+from pipeline.ingest.columns import conversion, is_count
 from pipeline.results import Analysis
 from pipeline.soundness.bad_recordings import find_bad_recordings
-from pipeline.submission import Experiment, InputOverride, Reported, Submission, System
+from pipeline.submission import (
+    Experiment,
+    InputScale,
+    PositionScale,
+    Reported,
+    Submission,
+    System,
+)
 from pipeline.words.progress import Progress, silent
 from pipeline.workflow import analyse
 
@@ -219,33 +227,31 @@ def _prepare(
 def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tuple[str, ...]]:
     """Return a submission with the rubric's system, and notes on what was replaced.
 
-    If the rubric states no sign or calibration, the submission's is kept. The submission's unit of
-    length is always kept, because the students' numbers use it. The rubric's calibration is
-    converted to this unit.
+    Only what is named here is replaced, so the recordings are read as the report reads them. If the
+    rubric states no sign, calibration or columns, the submission's are kept.
     """
     own, set_ = submission.system, rubric.system
-    notes = []
-    unit, per_count = set_.position.unit, set_.position.per_count
-    factor = None if own.position.unit == "count" else conversion(unit, own.position.unit)
-    if factor is not None and own.position.unit != unit:
-        unit = own.position.unit
-        per_count = None if per_count is None else per_count * factor
-        notes.append(f"lengths are in {unit}, as submitted; the rubric has {set_.position.unit}")
+    position, input_ = _scale(own.position, set_.position), _scale(own.input, set_.input)
+    notes = [
+        f"{what} are in {scale['unit']}, as submitted; the rubric has {asked.unit}"
+        for what, scale, asked in (
+            ("lengths", position, set_.position),
+            ("inputs", input_, set_.input),
+        )
+        if scale["unit"] != asked.unit
+    ]
     # For a single cart, only the sum of the springs matters.
     if own.springs != set_.springs and set_.carts > 1:
         notes.append("the springs are the rubric's, not those of the submission")
-    system = System(
-        carts=set_.carts,
-        springs=set_.springs,
-        input=set_.input.model_copy(
-            update={
-                "sign": set_.input.sign or own.input.sign,
-                "per_count": set_.input.per_count or own.input.per_count,
-            }
-        ),
-        position=set_.position.model_copy(
-            update={"unit": unit, "per_count": per_count or own.position.per_count}
-        ),
+    system = own.model_copy(
+        update={
+            "springs": set_.springs,
+            "input": own.input.model_copy(
+                update={**input_, "sign": set_.input.sign or own.input.sign}
+            ),
+            "position": own.position.model_copy(update=position),
+            "columns": {**set_.columns, **own.columns},
+        }
     )
     experiments = tuple(_under_calibration(e, set_) for e in submission.experiments)
     if experiments != submission.experiments:
@@ -258,6 +264,19 @@ def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tu
     return submission.model_copy(update=update), tuple(notes)
 
 
+def _scale(own: PositionScale | InputScale, asked: PositionScale | InputScale) -> dict[str, Any]:
+    """Return the unit and the size of a count, by the name of their keys.
+
+    The submission's unit is kept, because the students' numbers use it, and the rubric's size of a
+    count is converted to it. The rubric's unit is used only if it measures another quantity.
+    """
+    factor = conversion(asked.unit, own.unit)
+    if factor is None and not is_count(asked.unit):
+        return {"unit": asked.unit, "per_count": asked.per_count or own.per_count}
+    per_count = factor * asked.per_count if factor and asked.per_count else own.per_count
+    return {"unit": own.unit, "per_count": per_count}
+
+
 def _under_calibration(experiment: Experiment, system: System) -> Experiment:
     """Remove the input scale of an experiment if the rubric states an input scale.
 
@@ -267,7 +286,7 @@ def _under_calibration(experiment: Experiment, system: System) -> Experiment:
     own = experiment.input
     if own is None or experiment.kind == "closed_loop" or not system.input.per_count:
         return experiment
-    return experiment.model_copy(update={"input": InputOverride(sign=own.sign)})
+    return experiment.model_copy(update={"input": own.model_copy(update={"per_count": None})})
 
 
 # ------------------------------------------------------------------------------- flags
