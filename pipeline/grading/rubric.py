@@ -118,9 +118,19 @@ class _Graded(_Criterion):
 
 
 class RequiredPieces(_Criterion):
-    """Check how many of the items in `[required]` are present; points are in proportion."""
+    """Check how many of the items in `[required]` are present; points are in proportion.
+
+    Recordings and typed numbers count half each. If something is missing, at least one step of the
+    points is lost.
+
+    Attributes
+    ----------
+    experiments : the kinds of recording to judge; default: every item that no other criterion
+        names.
+    """
 
     check: Literal["required"]
+    experiments: tuple[Kind, ...] = ()
 
 
 class DataQuality(_Criterion):

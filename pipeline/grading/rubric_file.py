@@ -14,7 +14,7 @@ from pydantic_core import ErrorDetails
 
 from pipeline.errors import ConfigError
 from pipeline.grading import rubric
-from pipeline.grading.rubric import InitialFinal, Parameters, Rubric, matching
+from pipeline.grading.rubric import InitialFinal, Parameters, RequiredPieces, Rubric, matching
 from pipeline.names import read_name
 from pipeline.resources import RUBRICS
 from pipeline.submission.complaints import (
@@ -305,6 +305,11 @@ def _contradictions(
                 if not matching((pattern,), names):
                     known = _nearest(pattern, names)
                     yield ("criteria", i, "parameters"), f"no parameter {pattern!r}{known}"
+        if isinstance(criterion, RequiredPieces):
+            asked = list(dict.fromkeys(runs.kind for runs in found.required.experiments))
+            for kind in (kind for kind in criterion.experiments if kind not in asked):
+                what = f"no [[required.experiments]] has kind {kind!r}{nearest(kind, asked)}"
+                yield ("criteria", i, "experiments"), what
         for full in (name for name in type(criterion).model_fields if "full" in name):
             none = full.replace("full", "none")
             if getattr(criterion, full) > getattr(criterion, none):

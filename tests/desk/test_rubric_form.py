@@ -125,7 +125,7 @@ def test_every_shipped_rubric_is_one_click_away(visitor, lab, tmp_path, monkeypa
     page = unescape(visitor.get("/rubric/").text)
     for path in RUBRICS.glob("*.toml"):
         assert f'href="/rubric/?start={path.stem}"' in page
-    assert "20 points in 14 criteria; fits submissions with 3 carts." in page
+    assert "20 points in 15 criteria; fits submissions with 3 carts." in page
     assert "Open lab.toml" in page
     assert "It contains errors." in page
     assert "other.toml" not in page
@@ -151,7 +151,7 @@ def test_a_workshop_shows_only_its_own_files(tmp_path):
 def test_a_page_begins_with_a_summary_of_the_rubric(visitor, lab):
     """A rubric's page begins with its points, criteria and carts."""
     page = editor(visitor, lab).text
-    assert '<p class="result">20 points in 13 criteria; fits submissions with 1 cart</p>' in page
+    assert '<p class="result">20 points in 14 criteria; fits submissions with 1 cart</p>' in page
 
 
 def test_one_number_changes_one_line(visitor, lab):

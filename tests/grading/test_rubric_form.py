@@ -126,7 +126,7 @@ def test_an_inline_table_is_not_changed():
 def test_a_line_of_a_longer_text_is_not_changed():
     """A line of a longer text is not changed, even if it looks like a key with its value."""
     text = SHIPPED["throne-1dof"].replace(
-        'title = "everything the lab asks for"\npoints = 1',
+        'title = "everything else that the lab asks for"\npoints = 1',
         'title = """the pieces\npoints = 7\n"""\npoints = 1',
     )
     new = typed_into(text, criteria__pieces__points="2")

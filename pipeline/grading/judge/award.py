@@ -26,6 +26,10 @@ def award(
         verdict = _waiting(failed) if failed else verdicts[wanted.id]
         verdict = charge(verdict, wanted, flags, rubric=rubric)
         points = to_step((verdict.share or 0) * exact(wanted.points), rubric.step)
+        if (
+            wanted.check == "required" and verdict.share != 1
+        ):  # rounding never hides what is missing
+            points = max(Fraction(0), min(points, exact(wanted.points) - exact(rubric.step)))
         outcome = _outcome(verdict.share, points, out_of=exact(wanted.points))
         advised = outcome in ("partial", "fail") and not verdict.explained
         more = f" {wanted.message}" if wanted.message and advised else ""

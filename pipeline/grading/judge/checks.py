@@ -15,7 +15,7 @@ from pipeline.grading.judge.checks_loop import (
 )
 from pipeline.grading.judge.earned import ALL, NONE, Deviation, earned, earned_by
 from pipeline.grading.judge.laws import MOST_WIDENING, judge_laws
-from pipeline.grading.judge.work import Verdict, Work, asked_pieces
+from pipeline.grading.judge.work import Verdict, Work, pieces_for, say_missing, share_there
 from pipeline.grading.mistakes.impossible import not_positive
 from pipeline.grading.mistakes.state_model import model_harm
 from pipeline.grading.references.reference import OFF_SCALE, Reference, is_linear, off_scale
@@ -36,19 +36,18 @@ def judge(criterion: asked.Criterion, work: Work) -> Verdict:
 # ------------------------------------------------------------------- pieces and data
 
 
-def _required(_: asked.RequiredPieces, work: Work) -> Verdict:
-    pieces, missing = asked_pieces(work.rubric), work.missing
+def _required(criterion: asked.RequiredPieces, work: Work) -> Verdict:
+    pieces = pieces_for(criterion, work.pieces, work.rubric)
     if not pieces:
         return Verdict(share=ALL, message="Nothing in particular is required.")
+    missing = [piece for piece in pieces if piece.share < 1]
     unread = first_few(list(work.analysis.unreadable), _NAMED)
-    here = "Everything required is here" + (
-        f", except {unread}, which cannot be read" if unread else ""
-    )
+    said = say_missing(missing, most=_NAMED) or "Everything required is here."
     return Verdict(
-        share=ALL - Fraction(len(missing), len(pieces)),
-        message=f"Missing: {first_few(missing, _NAMED)}." if missing else f"{here}.",
-        expected={"pieces": pieces},
-        found={"missing": missing},
+        share=share_there(pieces),
+        message=said + (f" Not counted, because they cannot be read: {unread}." if unread else ""),
+        expected={"pieces": [piece.name for piece in pieces]},
+        found={"missing": [piece.name for piece in missing]},
     )
 
 

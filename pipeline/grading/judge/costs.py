@@ -50,6 +50,8 @@ def charge(
 
 def concerns(flag: Flag, criterion: asked.Criterion, *, names: list[str]) -> bool:
     """Return whether a flag concerns what a criterion judges."""
+    if flag.code == "missing" and "criteria" in flag.evidence:
+        return criterion.id in flag.evidence["criteria"]
     if flag.code in _ABOUT:
         return _ABOUT[flag.code] == criterion.check
     tables = {flag.evidence.get("table"), flag.evidence.get("also_in")} - {None}

@@ -21,7 +21,9 @@ from pipeline.grading.rubric import Rubric
 # Keys of a rubric that change the errors themselves. If one changes, the recordings must be graded
 # again.
 _OF_RUBRIC = ("system", "design", "required", "examples")
-_OF_CRITERION = ("check", "parameters", "sigmas", "frequency_percent", "damping_percent")
+_OF_CRITERION = (
+    "check", "experiments", "parameters", "sigmas", "frequency_percent", "damping_percent",
+)  # fmt: skip
 
 
 def findings_text(verdicts: Mapping[str, Verdict]) -> str:

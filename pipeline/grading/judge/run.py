@@ -307,7 +307,7 @@ def _flags(work: Work) -> list[Flag]:
         flags += diagnose_controller(work.controller)
     flags += diagnose_reduced(work.analysis)
     if work.missing:
-        flags.append(missing_flag(work.missing))
+        flags.append(missing_flag(work.missing, work.rubric))
     if work.bad:
         flags.append(data_flag(work.bad))
     return flags

@@ -7,15 +7,38 @@ from functools import cached_property
 from typing import Any
 
 from pipeline.grading.grade import Flag
-from pipeline.grading.judge.earned import ALL, Deviation
+from pipeline.grading.judge.earned import ALL, Deviation, mean_share
 from pipeline.grading.mistakes.controller import Controller
 from pipeline.grading.mistakes.explain import Label
 from pipeline.grading.mistakes.state_model import MatrixEntry, StateMatrices, compare_entries
 from pipeline.grading.references.reference import References
-from pipeline.grading.rubric import RequiredRuns, Rubric, matching
-from pipeline.results import Analysis
-from pipeline.submission import Experiment, Reported, Submission
+from pipeline.grading.rubric import RequiredPieces, RequiredRuns, Rubric, matching
+from pipeline.results import Analysis, Kind
+from pipeline.submission import Experiment, Reported, ReportedStateSpace, Submission
 from pipeline.words.numbers import first_few
+
+
+@dataclass(frozen=True, kw_only=True)
+class Piece:
+    """A required item: a typed number, or recordings of one kind.
+
+    Attributes
+    ----------
+    name : name in flags, such as "decay of cart 2", "12 sine" or "final.K_1".
+    text : the item in words, such as "decay of cart 2" or "12 sine dwells".
+    kind : kind of recording; None for a typed number.
+    """
+
+    name: str
+    text: str
+    kind: Kind | None = None
+    there: int = 0
+    needed: int = 1
+
+    @property
+    def share(self) -> Fraction:
+        """The share that is there."""
+        return Fraction(min(self.there, self.needed), self.needed)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,10 +63,15 @@ class Work:
     bad: Mapping[str, str]
     named: Mapping[Label, frozenset[str]]
 
+    @cached_property
+    def pieces(self) -> list[Piece]:
+        """The required items; an unreadable file counts as missing."""
+        return find_pieces(self.submission, self.rubric, unreadable=self.analysis.unreadable)
+
     @property
-    def missing(self) -> list[str]:
-        """The required items that are missing; an unreadable file counts as missing."""
-        return missing_pieces(self.submission, self.rubric, unreadable=self.analysis.unreadable)
+    def missing(self) -> list[Piece]:
+        """The required items that are missing, wholly or in part."""
+        return [piece for piece in self.pieces if piece.share < 1]
 
     @cached_property
     def entries(self) -> list[MatrixEntry]:
@@ -91,32 +119,77 @@ class Verdict:
 # Kinds of recording that meet a requirement for only some of the carts. A step also counts as a
 # decay, because the carts ring down after it.
 _SERVES = {"decay": ("decay", "step"), "sine": ("sine",), "step": ("step",)}
+_RECORDING = {"sine": "sine dwell", "closed_loop": "closed-loop run", "bode": "Bode table"}
 
 
-def asked_pieces(rubric: Rubric) -> list[str]:
-    """Return the names of all items that a rubric requires, such as recordings and parameters."""
-    return list(_pieces(None, rubric))
-
-
-def missing_pieces(
-    submission: Submission, rubric: Rubric, *, unreadable: Collection[str]
-) -> list[str]:
-    """Return the names of the required items that are missing.
+def find_pieces(
+    submission: Submission, rubric: Rubric, *, unreadable: Collection[str] = ()
+) -> list[Piece]:
+    """Return all items that a rubric requires, and how much of each is in a submission.
 
     An experiment whose file cannot be read counts as missing.
     """
-    left = tuple(e for e in submission.experiments if e.id not in unreadable)
-    submission = submission.model_copy(update={"experiments": left})
-    return [name for name, there in _pieces(submission, rubric).items() if not there]
+    required, reported = rubric.required, submission.reported or Reported()
+    left = [e for e in submission.experiments if e.id not in unreadable]
+    found = [_recordings(runs, left, carts=rubric.system.carts) for runs in required.experiments]
+    typed: dict[str, bool] = {}
+    for label in ("initial", "final"):
+        for name in matching(getattr(required, label), rubric.names):
+            typed[f"{label}.{name}"] = name in getattr(reported, label)
+    if required.state_space:
+        space = reported.state_space or ReportedStateSpace()
+        typed |= {"state_space.A": bool(space.A), "state_space.B": bool(space.B)}
+    for name in required.feedback:
+        typed[f"feedback.{name}"] = getattr(reported.feedback, name, None) not in (None, ())
+    return found + [Piece(name=n, text=n, there=int(there)) for n, there in typed.items()]
 
 
-def missing_flag(missing: list[str]) -> Flag:
-    """Return the flag for missing items."""
+def pieces_for(criterion: RequiredPieces, pieces: Sequence[Piece], rubric: Rubric) -> list[Piece]:
+    """Return the items that one criterion judges.
+
+    These are the recordings of its own kinds. A criterion without kinds judges every item that no
+    other criterion names.
+    """
+    if criterion.experiments:
+        return [piece for piece in pieces if piece.kind in criterion.experiments]
+    others = [c.experiments for c in rubric.criteria if isinstance(c, RequiredPieces)]
+    named = {kind for kinds in others for kind in kinds}
+    return [piece for piece in pieces if piece.kind not in named]
+
+
+def share_there(pieces: Sequence[Piece]) -> Fraction:
+    """Return the share of items that are there; recordings count as much as typed numbers do."""
+    groups = [
+        [piece.share for piece in pieces if (piece.kind is None) == typed]
+        for typed in (True, False)
+    ]
+    return mean_share([mean_share(group) for group in groups if group])
+
+
+def say_missing(pieces: Sequence[Piece], *, most: int) -> str:
+    """Return sentences on items that are missing; "" if none is.
+
+    At most `most` of them are named.
+    """
+    some = [f"{p.there} of {p.text}" for p in pieces if 0 < p.share < 1]
+    none = [p.text for p in pieces if not p.share]
+    said = {"Incomplete": some, "Missing": none}
+    return " ".join(f"{what}: {first_few(them, most)}." for what, them in said.items() if them)
+
+
+def missing_flag(pieces: Sequence[Piece], rubric: Rubric) -> Flag:
+    """Return the flag for missing items; its evidence names the criteria that they concern."""
+    names = [piece.name for piece in pieces]
+    own = [c for c in rubric.criteria if isinstance(c, RequiredPieces)]
+    said = say_missing(pieces, most=6)
     return Flag(
         code="missing",
-        parameters=tuple(missing),
-        message=f"missing: {first_few(missing, 6)}.",
-        evidence={"missing": missing},
+        parameters=tuple(names),
+        message=said[0].lower() + said[1:],
+        evidence={
+            "missing": names,
+            "criteria": [c.id for c in own if pieces_for(c, pieces, rubric)],
+        },
     )
 
 
@@ -134,41 +207,20 @@ def data_flag(bad: Mapping[str, str]) -> Flag:
     )
 
 
-def _pieces(submission: Submission | None, rubric: Rubric) -> dict[str, bool]:
-    required = rubric.required
-    pieces = {
-        run_name(runs): submission is not None and _enough(submission, runs)
-        for runs in required.experiments
-    }
-    reported = submission.reported if submission else None
-    for label in ("initial", "final"):
-        table = getattr(reported, label) if reported else {}
-        for name in matching(getattr(required, label), rubric.names):
-            pieces[f"{label}.{name}"] = name in table
-    if required.state_space:
-        space = reported.state_space if reported else None
-        pieces["state_space.A"] = space is not None and bool(space.A)
-        pieces["state_space.B"] = space is not None and bool(space.B)
-    feedback = reported.feedback if reported else None
-    for name in required.feedback:
-        pieces[f"feedback.{name}"] = getattr(feedback, name, None) not in (None, ())
-    return pieces
-
-
-def run_name(runs: RequiredRuns) -> str:
-    """Return the name of a required run, such as "decay of cart 2" or "12 sine"."""
-    carts = f" of cart {', '.join(map(str, runs.carts))}" if runs.carts else ""
-    return f"{runs.at_least} {runs.kind}{carts}" if runs.at_least > 1 else f"{runs.kind}{carts}"
-
-
-def _enough(submission: Submission, runs: RequiredRuns) -> bool:
-    everyone = tuple(range(1, submission.system.carts + 1))
-    carts = tuple(sorted(runs.carts)) or everyone
-    kinds = _SERVES.get(runs.kind, (runs.kind,)) if carts != everyone else (runs.kind,)
-
-    def counts(experiment: Experiment) -> bool:
-        return experiment.kind in kinds and (experiment.carts or everyone) == carts
-
-    if runs.kind == "sine" and any(e.kind == "bode" for e in submission.experiments):
-        return True
-    return sum(map(counts, submission.experiments)) >= runs.at_least
+def _recordings(runs: RequiredRuns, experiments: Sequence[Experiment], *, carts: int) -> Piece:
+    """Return required recordings as an item; a Bode table counts as all dwells."""
+    everyone = tuple(range(1, carts + 1))
+    free = tuple(sorted(runs.carts)) or everyone
+    kinds = _SERVES.get(runs.kind, (runs.kind,)) if free != everyone else (runs.kind,)
+    there = sum(e.kind in kinds and (e.carts or everyone) == free for e in experiments)
+    if runs.kind == "sine" and any(e.kind == "bode" for e in experiments):
+        there = max(there, runs.at_least)
+    of, many = f" of cart {', '.join(map(str, runs.carts))}" if runs.carts else "", runs.at_least
+    word = _RECORDING.get(runs.kind, runs.kind)
+    return Piece(
+        name=f"{many} {runs.kind}{of}" if many > 1 else f"{runs.kind}{of}",
+        text=f"{many} {word}s{of}" if many > 1 else f"{word}{of}",
+        kind=runs.kind,
+        there=there,
+        needed=many,
+    )

@@ -311,7 +311,7 @@ def test_recordings_earn_points_without_reported_numbers():
     graded = silent.grade()
     assert [flag.code for flag in graded.flags] == ["missing"]
     earned = {c.id: c.points for c in graded.criteria if c.points}
-    assert set(earned) == {"pieces", "data", "hardware"}
+    assert set(earned) == {"pieces", "dwells", "data", "hardware"}
 
 
 def test_further_flags_keep_the_order_of_the_codes():
