@@ -22,6 +22,7 @@ from enum import StrEnum
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline import __version__
 from pipeline.arrays import Array, ComplexArray, freeze
@@ -44,6 +45,9 @@ def passed(good: bool) -> CheckOutcome:
 # Limit of χ² per degree of freedom: below it, model and noise explain the data. By chance it stays
 # under 1.5 with 30 or more points; standard errors that are 40 % too small give 2.
 EXPLAINED = 2.0
+
+
+SIGNAL = 3.0  # standard errors; a smaller magnitude may be noise alone
 
 
 # --------------------------------------- a recording, and results of single recordings
@@ -302,6 +306,11 @@ class FrequencyResponse:
 
     def __post_init__(self) -> None:
         freeze(self, "omega", "magnitude", "magnitude_std", "phase", "phase_std")
+
+    @property
+    def has_signal(self) -> NDArray[np.bool_]:
+        """Whether each magnitude (n_w,) is above the noise, by three standard errors."""
+        return self.magnitude > SIGNAL * self.magnitude_std
 
 
 @dataclass(frozen=True, kw_only=True)

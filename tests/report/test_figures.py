@@ -1,5 +1,6 @@
 """Figures have the right content and ticks, and the same data give the same bytes."""
 
+import re
 import subprocess
 import sys
 from base64 import b64decode
@@ -15,11 +16,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text
+from numpy.testing import assert_array_equal
 
 from pipeline.plant.linear.chain import Chain
 from pipeline.report.document import Picture
 from pipeline.report.figures.bode import bode_figure, overview_figure, plot_phase
-from pipeline.report.figures.colours import CARTS
+from pipeline.report.figures.colours import CARTS, MEASURED, QUIET
 from pipeline.report.figures.grading import distribution_figure
 from pipeline.report.figures.style import (
     drawing,
@@ -40,10 +42,11 @@ from pipeline.report.figures.time import (
     sine_figure,
     step_figure,
 )
-from pipeline.report.sections.measurements import step_blocks
+from pipeline.report.sections.measurements import response_blocks, step_blocks
 from pipeline.report.sections.page import Page
 from pipeline.results import FrequencyResponse
 from pipeline.set_up import PAPER_UNITS, Units
+from pipeline.words.numbers import significant
 from pipeline.words.spans import plain
 from tests.helpers.analysis_factory import make_analysis
 
@@ -169,6 +172,77 @@ def test_a_zero_in_a_table_of_ratios_is_left_out():
         )
         root = ElementTree.fromstring(to_svg(figure, name="x", alt=""))
     assert len(list(root.iter(f"{SVG}use"))) == 23 + 1  # and one diamond in the legend
+
+
+def _faint_and_far(cart: int) -> FrequencyResponse:
+    """Return a response with one point of noise far off the fit, and one clear point far off."""
+    response = make_analysis(3).frequency_responses[cart - 1]
+    magnitude, std = response.magnitude.copy(), response.magnitude_std.copy()
+    magnitude[-1] *= 1e4  # an amplitude of noise alone, where the carts hardly move
+    std[-1] = 0.6 * magnitude[-1]
+    magnitude[5] *= 1.8
+    return replace(response, magnitude=magnitude, magnitude_std=std)
+
+
+@pytest.mark.parametrize("cart", [1, 2, 3])
+def test_points_without_signal_are_grey_and_not_counted(cart):
+    """A point within the noise is grey in every panel, and the caption only counts it."""
+    response, analysis = _faint_and_far(cart), make_analysis(3)
+    with drawing():
+        figure = bode_figure(response, chain=analysis.chain, units=PAPER_UNITS)
+    for ax in figure.axes:
+        drawn = [line for line in ax.lines if line.get_marker() == "D"]
+        measured, faint = drawn
+        assert measured.get_color() == MEASURED
+        assert faint.get_color() == QUIET
+        assert_array_equal(faint.get_xdata(), response.omega[-1:])
+        assert_array_equal(measured.get_xdata(), response.omega[:-1])
+    page = Page(replace(analysis, frequency_responses=(response,)))
+    (picture,) = (block for block in response_blocks(page) if isinstance(block, Picture))
+    caption = plain(picture.caption)
+    assert f"at {significant(response.omega[5], digits=3)} rad/s" in caption  # the farthest point
+    assert "Grey: 1 point with an amplitude within the noise" in caption
+    assert re.search(r"rad/s, lies (79|8\d) % above it", caption)  # 80 %, and 1 % of noise
+    assert f"to {significant(response.omega[-2], digits=3)} rad/s" in picture.alt
+
+
+@pytest.mark.parametrize("factor", [0.2, 1.8, 300.0])
+def test_the_residual_axis_is_clipped_with_a_mark(factor):
+    """A far point does not hide the others: the axis is clipped, and a triangle marks the point."""
+    analysis = make_analysis(3)
+    response = analysis.frequency_responses[0]
+    magnitude = response.magnitude.copy()
+    magnitude[5] *= factor
+    with drawing():
+        figure = bode_figure(
+            replace(response, magnitude=magnitude), chain=analysis.chain, units=PAPER_UNITS
+        )
+    residual = figure.axes[-1]
+    low, high = residual.get_ylim()
+    points = np.asarray(residual.lines[1].get_ydata(), dtype=float)
+    outside = np.abs(points) > high
+    assert_array_equal(np.flatnonzero(outside), [5])
+    (mark,) = (line for line in residual.lines if line.get_marker() in ("^", "v"))
+    assert mark.get_marker() == ("^" if factor > 1 else "v")
+    assert_array_equal(mark.get_xdata(), response.omega[5:6])
+    assert low < float(np.asarray(mark.get_ydata())[0]) < high
+    # The limit is 30 medians and a margin of 15 %; the test's median includes the far point.
+    assert 25.0 * np.median(np.abs(points)) < high < 40.0 * np.median(np.abs(points))
+
+
+def test_residuals_without_a_far_point_are_all_shown():
+    """Without far points the axis is not clipped and nothing is marked."""
+    for carts in (1, 2, 3):
+        analysis = make_analysis(carts)
+        for response in analysis.frequency_responses:
+            with drawing():
+                figure = bode_figure(response, chain=analysis.chain, units=PAPER_UNITS)
+            residual = figure.axes[-1]
+            assert not [line for line in residual.lines if line.get_marker() in ("^", "v")]
+            low, high = residual.get_ylim()
+            points = np.asarray(residual.lines[1].get_ydata(), dtype=float)
+            assert low < points.min()
+            assert points.max() < high
 
 
 def test_a_dwell_shades_the_transient():

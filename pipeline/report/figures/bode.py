@@ -19,6 +19,11 @@ from pipeline.set_up import Units
 from pipeline.words.numbers import subscript
 
 _DB_PER_NEPER = 20 / np.log(10)
+_NOISE = "within the noise"
+# Limit of the residual axis in medians. On sound data, points on a sharp peak reach up to 22.
+_MOST_RESIDUAL = 30.0
+_LEAST_LIMIT = 0.1  # percent; residuals below it are never outside
+_MARGIN = 1.15  # room for the marks
 
 
 def bode_figure(response: FrequencyResponse, *, chain: Chain | None, units: Units) -> Figure:
@@ -61,9 +66,12 @@ def overview_figure(
     for response in responses:
         name = f"cart {response.cart}"
         colour, ls, *_ = CARTS[(response.cart - 1) % len(CARTS)]
-        decibel = _decibel(response.magnitude)
-        (points,) = ax.plot(response.omega, decibel, "D", ms=3.2, mew=0.8, mfc="white", mec=colour)
-        attach_data(points, response.omega, decibel, name=f"{name}, measured")
+        clear, decibel = response.has_signal, _decibel(response.magnitude)
+        for shown, edge, what in ((clear, colour, "measured"), (~clear, QUIET, _NOISE)):
+            if shown.any():
+                x, y = response.omega[shown], decibel[shown]
+                (points,) = ax.plot(x, y, "D", ms=3.2, mew=0.8, mfc="white", mec=edge)
+                attach_data(points, x, y, name=f"{name}, {what}")
         if chain:
             omega, line = _fitted(response, chain)
             look = {"color": colour, "ls": ls}
@@ -87,13 +95,8 @@ def plot_magnitude(
     """Plot the magnitude in dB: diamonds with error bars, and the fit as a line."""
     # An error bar in decibels cannot extend down to zero.
     relative = np.clip(response.magnitude_std / response.magnitude, 0.0, 0.9)
-    _points(
-        ax,
-        response.omega,
-        _decibel(response.magnitude),
-        np.vstack([-_DB_PER_NEPER * np.log1p(-relative), _DB_PER_NEPER * np.log1p(relative)]),
-        label="measured",
-    )
+    error = np.vstack([-_DB_PER_NEPER * np.log1p(-relative), _DB_PER_NEPER * np.log1p(relative)])
+    _points(ax, response, _decibel(response.magnitude), error, in_legend=True)
     if chain:
         ax.plot(*_fitted(response, chain), color=MODEL, label="fit")
         _mark_modes(ax, response.omega, chain)
@@ -115,7 +118,7 @@ def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) ->
     error = (
         None if response.phase_std is None else np.degrees(np.clip(response.phase_std, 0, np.pi))
     )
-    _points(ax, response.omega, np.degrees(phase), error)
+    _points(ax, response, np.degrees(phase), error)
     low, high = ax.dataLim.intervaly
     margin = 0.08 * max(high - low, 90.0)
     bottom, top = ax.set_ylim(low - margin, high + margin)
@@ -128,16 +131,30 @@ def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) ->
 
 
 def plot_residual(ax: Axes, response: FrequencyResponse, *, chain: Chain) -> None:
-    """Plot the difference of measured and fitted magnitude in percent."""
+    """Plot the difference of measured and fitted magnitude in percent.
+
+    The axis shows 30 times the median residual of the points with a signal. A triangle at the edge
+    marks each point outside.
+    """
     fitted = np.abs(chain.frequency_response(response.omega)[response.cart - 1])
+    residual, clear = 100 * (response.magnitude / fitted - 1), response.has_signal
     ax.axhline(0.0, color=MODEL)
-    _points(
-        ax,
-        response.omega,
-        100 * (response.magnitude / fitted - 1),
-        100 * response.magnitude_std / fitted,
-    )
+    _points(ax, response, residual, 100 * response.magnitude_std / fitted)
     ax.set_ylabel("residual [%]")
+    size = np.abs(residual)
+    if not clear.any():
+        clear = np.full_like(clear, True)
+    middle = float(np.quantile(size[clear], 0.5, method="lower"))
+    limit = max(_MOST_RESIDUAL * middle, _LEAST_LIMIT)
+    outside = size > limit
+    if not outside.any():
+        return
+    ax.set_ylim(-_MARGIN * limit, _MARGIN * limit)
+    for above, mark in ((True, "^"), (False, "v")):
+        for shown, color in ((outside & clear, MEASURED), (outside & ~clear, QUIET)):
+            if (at := shown & ((residual > 0) == above)).any():
+                edge = np.full(int(at.sum()), limit if above else -limit)
+                ax.plot(response.omega[at], edge, mark, ms=4.0, mew=0, color=color)
 
 
 def _positive(response: FrequencyResponse) -> FrequencyResponse:
@@ -152,21 +169,30 @@ def _positive(response: FrequencyResponse) -> FrequencyResponse:
     return replace(response, **kept)
 
 
-def _points(ax: Axes, x: Array, y: Array, error: Array | None, *, label: str = "") -> None:
+def _points(
+    ax: Axes, response: FrequencyResponse, y: Array, error: Array | None, *, in_legend: bool = False
+) -> None:
     """Plot diamonds with error bars; all bars are drawn as one path.
+
+    Points without a signal are grey and have no bars, because a bar would fill the panel.
 
     Parameters
     ----------
-    error : (n,), or (2, n) for the parts below and above the point; None draws no bars.
+    y : (n_w,) values at the frequencies of the response.
+    error : (n_w,), or (2, n_w) for the parts below and above the point; None draws no bars.
     """
-    (drawn,) = ax.plot(
-        x, y, "D", ms=3.2, mew=0.8, mfc="white", color=MEASURED, label=label or None, zorder=3
-    )
-    attach_data(drawn, x, y, name="measured")
-    if error is not None:
-        below, above = np.broadcast_to(error, (2, x.size))
-        ends = np.column_stack([y - below, y + above, np.full(x.size, np.nan)])
-        ax.plot(x.repeat(3), ends.ravel(), color=MEASURED, lw=0.7, zorder=2.9)
+    for clear, color, name in ((True, MEASURED, "measured"), (False, QUIET, _NOISE)):
+        if not (shown := response.has_signal == clear).any():
+            continue
+        x, at = response.omega[shown], y[shown]
+        label = name if in_legend else None
+        look = {"ms": 3.2, "mew": 0.8, "mfc": "white", "color": color, "zorder": 3}
+        (drawn,) = ax.plot(x, at, "D", label=label, **look)
+        attach_data(drawn, x, at, name=name)
+        if error is not None and clear:
+            below, above = np.broadcast_to(error, (2, y.size))[:, shown]
+            ends = np.column_stack([at - below, at + above, np.full(x.size, np.nan)])
+            ax.plot(x.repeat(3), ends.ravel(), color=color, lw=0.7, zorder=2.9)
 
 
 def _fitted(response: FrequencyResponse, chain: Chain) -> tuple[Array, Array]:

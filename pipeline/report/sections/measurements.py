@@ -15,6 +15,7 @@ from pipeline.words.spans import spans
 from pipeline.words.text import clean
 
 _WORDS = phrases("measurements")
+_MANY = 900.0  # percent; above this, the caption states the ratio
 _MOST_PANELS = 6  # most repeats drawn in one figure; the tables have all repeats
 
 
@@ -62,9 +63,14 @@ def overview_blocks(page: Page) -> list[Block]:
 
 
 def _bode_words(page: Page, response: FrequencyResponse) -> dict[str, object]:
-    """Return values for the caption: range of the points, quality of the fit, largest error."""
+    """Return values for the caption: range of the points, quality of the fit, largest error.
+
+    Points without a signal are only counted.
+    """
     chain, n, cart = page.analysis.chain, page.analysis.bench.n, response.cart
-    omega, magnitude = response.omega, response.magnitude
+    clear = response.has_signal if response.has_signal.any() else response.magnitude > 0
+    omega, magnitude = response.omega[clear], response.magnitude[clear]
+    faint = response.omega.size - omega.size
     peak = int(np.argmax(magnitude))
     numbers = {"first": omega[0], "last": omega[-1], "peak": omega[peak]}
     numbers["magnitude"] = magnitude[peak]
@@ -76,21 +82,23 @@ def _bode_words(page: Page, response: FrequencyResponse) -> dict[str, object]:
         "points": omega.size,
         "unit": page.units.gain,
         "fitted": "",
+        "faint": _WORDS.text("bode_faint", points=count(faint, "point")) if faint else "",
         "marks": listing(omega_names(mode_suffixes(n))),
     }
     if chain is None:
         return values
     off = 100 * (magnitude / np.abs(chain.frequency_response(omega)[cart - 1]) - 1)
     middle = percent(float(np.median(np.abs(off))))
-    shown = magnitude > 0
-    omega, off = omega[shown], off[shown]
     worst = int(np.argmax(np.abs(off)))
     return values | {
         "fitted": _WORDS.text("bode_alt_fitted", middle=middle),
         "half": significant(float(np.median(np.abs(off))), digits=2),
         "omega": significant(float(omega[worst]), digits=3),
-        "most": significant(float(abs(off[worst])), digits=2),
-        "side": "above" if off[worst] > 0 else "below",
+        "far": _WORDS.text(
+            "times" if off[worst] > _MANY else "above" if off[worst] > 0 else "below",
+            most=significant(float(abs(off[worst])), digits=2),
+            times=significant(float(1 + off[worst] / 100), digits=2),
+        ),
     }
 
 
