@@ -13,6 +13,7 @@ is given, its rows and columns stay and only the grades are filled in.
 """
 
 import html
+import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +30,10 @@ from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import on_one_line, points_text
 from pipeline.output import csv_text, named_folder, own_folder, write_file
 from pipeline.words.text import with_symbols
+
+# Canvas takes a column whose heading contains one of these words and "Score", "Points" or "Grade"
+# for its own, and skips it (`NON_ASSIGNMENT_COLUMN_HEADERS` of its importer).
+_IGNORED = re.compile(r"\b(?:current|final|override)\b", re.IGNORECASE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +69,14 @@ def export(
     rubric = book.rubric
     title = title or rubric.title or "cartlab"
     entries = list(book.entries())
-    students, remarks = students_of(entries, platform=platform)
+    students, remarks = students_of(entries, platform=platform, blank=roster is None)
+    if platform == "canvas" and (word := _IGNORED.search(title)):
+        remarks.append(
+            Remark(
+                text=f"the title contains {word[0]!r}: Canvas does not import columns such as "
+                "'Final Score'; see in its preview whether it lists this column"
+            )
+        )
     if roster:
         own = Roster.read(roster, platform=platform)
         own.check_maximum(rubric.out_of, title=title)
@@ -95,8 +107,8 @@ def _fill_own(
     roster: Roster, platform: Platform, students: Sequence[Student], rubric: Rubric, *, title: str
 ) -> tuple[str, list[Remark]]:
     """Return the platform's own table with grades filled in, and remarks on mismatches."""
-    form = WORKSHEET if _has_numbers(platform, "Identifier" in roster.table) else FORMS[platform]
-    there = {name: text for name, text in form.if_there.items() if name in roster.table}
+    form = WORKSHEET if _has_numbers(platform, roster.has("Identifier")) else FORMS[platform]
+    there = {name: text for name, text in form.if_there.items() if roster.has(name)}
     columns = {
         name.format(title=title): lambda student, text=text: text.format_map(
             values_of(student, rubric)

@@ -1,19 +1,21 @@
 """Fill grades into the table of students (roster) that a learning platform exports."""
 
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
+from pipeline.grading.gradings import person
 from pipeline.grading.intake.lms_names import Platform
 from pipeline.grading.publish.platforms import FORMS
 from pipeline.grading.publish.students import Remark, Student, not_exported, one_of
 from pipeline.output import csv_text
 from pipeline.submission.complaints import quote
+from pipeline.words.numbers import first_few
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -24,17 +26,26 @@ _MAXIMUM = "Maximum Grade"  # column of Moodle, whose import refuses a higher gr
 _NUMBERS = ("ID", "Identifier", "Submission ID")
 _IDS = ("SIS User ID", "SIS Login ID", "ID number", "SID", "Username", "Email", "Email address")
 _NAMES = ("Student", "Full name", "Name")
-_PARTICIPANT = re.compile(r"^\D+ (\d+)$")  # a participant of Moodle, in any language
+# A participant of Moodle in any language, such as "Participant 1024" or "Teilnehmer/in1024".
+_PARTICIPANT = re.compile(r"^(\D+)(\d+)$")
+_ID = re.compile(r"(?=.*\d)\S+")  # an id number: no spaces, and at least one digit
 # A title in Canvas, perhaps followed by the assignment's id.
 _TITLE = re.compile(r"(.*?)(?: \(\d+\))?")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Roster:
-    """The table that a platform exports; all cells are texts."""
+    """The table that a platform exports; all cells are texts.
+
+    Attributes
+    ----------
+    headings : the table's own headings by Moodle's English ones, if the table is in another
+        language.
+    """
 
     file: str
     table: "pd.DataFrame"
+    headings: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def read(cls, path: Path, *, platform: Platform) -> "Roster":
@@ -46,7 +57,9 @@ class Roster:
             columns of the same name.
         """
         table = read_table(path)
-        if not any(columns <= set(table.columns) for columns in FORMS[platform].own):
+        known = any(columns <= set(table.columns) for columns in FORMS[platform].own)
+        headings = {} if known or platform != "moodle" else _moodle_headings(table)
+        if not (known or headings):
             wanted = ", or ".join(" and ".join(sorted(columns)) for columns in FORMS[platform].own)
             raise ConfigError(
                 f"{path.name}: is not {platform.capitalize()}'s table; "
@@ -55,7 +68,11 @@ class Roster:
         twice = table.columns[table.columns.duplicated() & (table.columns != "")]
         if len(twice):
             raise ConfigError(f"{path.name}: has two columns {quote(twice[0])}")
-        return cls(file=path.name, table=table)
+        return cls(file=path.name, table=table, headings=headings)
+
+    def has(self, name: str) -> bool:
+        """Return whether the table has a column, given by its English heading."""
+        return self.headings.get(name, name) in self.table
 
     def check_maximum(self, out_of: float, *, title: str) -> None:
         """Refuse a table with a different maximum grade; importing it would not change the maximum.
@@ -65,7 +82,8 @@ class Roster:
         ConfigError : Moodle's column or Canvas' row of possible points has a different maximum.
         """
         column = self._title(title)
-        stated = [*self.table[_MAXIMUM].unique()] if _MAXIMUM in self.table else []
+        maximum = self.headings.get(_MAXIMUM, _MAXIMUM)
+        stated = [*self.table[maximum].unique()] if maximum in self.table else []
         if column in self.table:
             stated += [*self.table.loc[self._of_all(), column]]
         for text in stated:
@@ -85,10 +103,12 @@ class Roster:
     ) -> tuple[str, list[Remark]]:
         """Return the table with grades filled in, and remarks on mismatches; other cells stay.
 
+        A student without points keeps the cells of the table; only empty ones are filled.
+
         Parameters
         ----------
-        columns : for each column title, the function that gives a student's value; a missing column
-            is added at the end.
+        columns : for each column title, the function that gives a student's value, the points
+            first; a missing column is added at the end.
         keep : other columns to keep; default: all.
         possible : the maximum points, for Canvas' first row.
         """
@@ -106,11 +126,14 @@ class Roster:
             if at is not None:
                 found.setdefault(at, []).append(student)
         settled = {at: one_of(several) for at, several in found.items()}
-        for at, student in settled.items():
+        filled = {at: student for at, student in settled.items() if not student.undecided}
+        for at, student in filled.items():
             for title, value in columns.items():
-                if not student.undecided:
+                if student.points or not table.loc[at, titles[title]].strip():
                     table.loc[at, titles[title]] = value(student)
+        graded = [at for at, student in filled.items() if student.points]
         remarks = self._remarks(students, matched, found, settled)
+        remarks += self._kept(table[titles[next(iter(columns))]].drop(index=graded))
         return csv_text([*table.columns], table.itertuples(index=False)), remarks
 
     def _remarks(
@@ -176,6 +199,26 @@ class Roster:
             )
         return remarks
 
+    def _kept(self, grades: "pd.Series") -> list[Remark]:
+        """Return a remark on grades in the table for which cartlab has none.
+
+        Parameters
+        ----------
+        grades : the column of grades, without the rows that cartlab filled in.
+        """
+        kept = grades[grades.str.strip().ne("") & ~self._of_all()[grades.index]]
+        if kept.empty:
+            return []
+        column = next((name for name, role in self._roles() if role in _NAMES), None)
+        called = self.table.iloc[:, 0] if column is None else self.table[column]
+        named = first_few([f"{called[at]} ({grade})" for at, grade in kept.items()], 8)
+        return [Remark(text=f"no grade from cartlab, so {self.file} keeps its own: {named}")]
+
+    def _roles(self) -> Iterable[tuple[Any, Any]]:
+        """Yield each column and its heading in English, as far as known."""
+        english = {own: name for name, own in self.headings.items()}
+        return ((name, english.get(name, name)) for name in self.table.columns)
+
     def _of_all(self) -> "pd.Series":
         """Return a mask of the rows that are about assignments, not about a student."""
         # There may be several columns without a name, and the first column may be one.
@@ -183,6 +226,8 @@ class Roster:
         return students.str.contains(POINTS_POSSIBLE, regex=False)
 
     def _title(self, title: str) -> str:
+        if title in self.headings:
+            return self.headings[title]
         for name in self.table.columns:
             found = _TITLE.fullmatch(str(name))
             if name == title or (found and found[1] == title):
@@ -195,13 +240,13 @@ class Roster:
         import pandas as pd
 
         words = []
-        for name, cells in self.table.items():
-            if name in _NUMBERS:
-                words.append(("number", cells.str.replace(_PARTICIPANT, r"\1", regex=True)))
-            if name in _IDS or name == "ID":
-                ids = cells.str.casefold()
-                words += [("id", ids), ("id", ids.str.split("@").str[0])]
-            if name in _NAMES:
+        for name, role in self._roles():
+            cells = self.table[name].map(person)
+            if role in _NUMBERS:
+                words.append(("number", cells.str.replace(_PARTICIPANT, r"\2", regex=True)))
+            if role in _IDS or role == "ID":
+                words += [("id", cells), ("id", cells.str.split("@").str[0])]
+            if role in _NAMES:
                 words.append(("name", cells.map(_letters)))
         found = pd.concat(
             pd.DataFrame({"kind": kind, "word": cells, "row": cells.index}) for kind, cells in words
@@ -225,7 +270,7 @@ def _words(student: Student) -> tuple[tuple[str, str], ...]:
 
 
 def _id_of(student: Student) -> tuple[str, str]:
-    return "id", student.id.casefold()
+    return "id", person(student.id)
 
 
 def _number(text: str) -> float | None:
@@ -238,4 +283,50 @@ def _number(text: str) -> float | None:
 
 def _letters(name: str) -> str:
     """Return a name as Canvas writes it in file names: "Doe, Jane" becomes "doejane"."""
-    return "".join(c for c in name.casefold() if c.isalnum())
+    return "".join(c for c in person(name) if c.isalnum())
+
+
+def _moodle_headings(table: "pd.DataFrame") -> dict[str, str]:
+    """Return the headings of a table of Moodle in another language, by the English ones.
+
+    Moodle translates the headings, but their order is always the same: participant, name, columns
+    such as id number and email address, status, grade, maximum grade, and last the comment. A table
+    from the gradebook is known by the email addresses. Empty if the table is neither.
+    """
+    cells = [[text.strip() for text in table.iloc[:, i]] for i in range(table.shape[1])]
+    if not any(cells):
+        return {}
+    roles: dict[str, int] = {}
+    numbers = (i for i, column in enumerate(cells) if _participants(column))
+    if (first := next(numbers, None)) is not None:
+        for i in range(first + 2, len(cells)):
+            grades, most = cells[i - 1], cells[i]
+            same = len(set(most)) == 1 and _number(most[0]) is not None
+            if same and all(not text or _number(text) is not None for text in grades):
+                roles |= {"Identifier": first, "Grade": i - 1, _MAXIMUM: i}
+        last = len(cells) - 1
+        if last > roles.get(_MAXIMUM, last) and "-" not in cells[last]:
+            roles["Feedback comments"] = last
+    if roles and roles["Grade"] > first + 1:
+        roles["Full name"] = first + 1
+    end = roles.get("Grade", len(cells))
+    for i, column in enumerate(cells[:end]):
+        given = [text for text in column if text]
+        if i in roles.values() or not given or len(set(given)) < len(given):
+            continue
+        if all("@" in text for text in given):
+            roles.setdefault("Email address", i)
+        elif "Email address" not in roles and all(_ID.fullmatch(text) for text in given):
+            roles.setdefault("ID number", i)
+    if "Identifier" not in roles and "Email address" not in roles:
+        return {}
+    return {name: str(table.columns[i]) for name, i in roles.items()}
+
+
+def _participants(column: Sequence[str]) -> bool:
+    """Return whether a column has Moodle's participants: one word and a different number each."""
+    found = [_PARTICIPANT.fullmatch(text) for text in column]
+    if not all(found):
+        return False
+    words, numbers = zip(*(one.groups() for one in found if one), strict=True)
+    return len(set(words)) == 1 and len(set(numbers)) == len(numbers)

@@ -11,7 +11,7 @@ from pipeline.grading.words import points_text
 
 # Gradescope's specification of the score in `results.json`: "optional, but required if not on each
 # test case".
-_GRADESCOPE_BLANK = "left blank in gradescope.csv, but 0 in results.json, where a score is required"
+_GRADESCOPE_NEEDS = " in gradescope.csv, but 0 in results.json, where a score is required"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,9 +86,15 @@ def one_of(several: Sequence[Student]) -> Student:
 
 
 def students_of(
-    entries: Sequence[Entry], *, platform: Platform
+    entries: Sequence[Entry], *, platform: Platform, blank: bool = True
 ) -> tuple[list[Student], list[Remark]]:
-    """Return every student once, and remarks on students whose grade or name is unclear."""
+    """Return every student once, and remarks on students whose grade or name is unclear.
+
+    Parameters
+    ----------
+    blank : whether a student without a grade gets an empty cell; False if the platform's own table
+        is filled in, which keeps its cell.
+    """
     found: dict[str, list[Student]] = {}
     for entry in entries:
         for student in _students(entry, platform=platform):
@@ -108,10 +114,11 @@ def students_of(
         for s in students
         if s.by_hand or s not in strangers
     ]
-    blank = dict.fromkeys(s.grade.submission for s in students if not (s.points or s.undecided))
-    if blank:
-        where = _GRADESCOPE_BLANK if platform == "gradescope" else "left blank"
-        remarks.append(Remark(text=f"could not be graded, {where}: {', '.join(blank)}"))
+    ungraded = dict.fromkeys(s.grade.submission for s in students if not (s.points or s.undecided))
+    if ungraded:
+        left = "left blank" if blank else "left as it was"
+        where = f"{left}{_GRADESCOPE_NEEDS if platform == 'gradescope' else ''}"
+        remarks.append(Remark(text=f"could not be graded, {where}: {', '.join(ungraded)}"))
     return students, remarks
 
 

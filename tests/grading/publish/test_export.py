@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import re
+import unicodedata
 from dataclasses import replace
 from pathlib import Path
 
@@ -171,7 +172,50 @@ def test_a_canvas_roster_is_filled_in(tmp_path):
         tmp_path, HALF, FULL, BROKEN, platform="canvas", title="Lab 3", roster=roster
     )
     assert canvas_import(rows) == {"Lab 3 (77)": {"1024": "10", "7": "20", "8": "20", "9": "5"}}
-    assert remarks[-1] == "not in roster.csv, so not exported: roeric"
+    assert remarks[-2:] == (
+        "not in roster.csv, so not exported: roeric",
+        "no grade from cartlab, so roster.csv keeps its own: Zed, Al (5)",
+    )
+
+
+def test_a_grade_typed_by_hand_is_kept_if_cartlab_has_none(tmp_path):
+    """A submission that could not be graded keeps the roster's grade and comment."""
+    roster = "Student,ID,Section,Lab 3 (77)\n    Points Possible,,,20\nRoe Eric,1026,A,17\n"
+    rows, remarks = write(tmp_path, BROKEN, platform="canvas", title="Lab 3", roster=roster)
+    assert rows[-1][-1] == "17"
+    assert remarks == (
+        "could not be graded, left as it was: team-3",
+        "no grade from cartlab, so roster.csv keeps its own: Roe Eric (17)",
+    )
+
+
+@pytest.mark.parametrize("login", ["a1", "A1", " a1 ", "a1\u00a0", "a1@uni.example"])
+@pytest.mark.parametrize("column", ["SIS User ID", "SIS Login ID"])
+def test_spaces_and_case_of_an_id_do_not_matter(tmp_path, login, column):
+    """An id in a roster is found with other spaces and other capitals."""
+    team = make_outcome(make_grade("t", authors=("a1",)))
+    roster = f'Student,ID,{column},Section,Lab 3\n"B, A",,{login},S1,\n'
+    rows, _ = write(tmp_path, team, platform="canvas", title="Lab 3", roster=roster)
+    assert rows[-1][-1] == "20"
+
+
+@pytest.mark.parametrize("form", ["NFC", "NFD"])
+def test_a_name_is_found_in_every_unicode_form(tmp_path, form):
+    """Composed and decomposed accents are the same name."""
+    name = unicodedata.normalize(form, "Müller, Zoë")
+    team = make_outcome(make_grade("t", authors=("x",)), owner="müllerzoë (canvas 1024)")
+    roster = f'Student,ID,SIS Login ID,Section,Lab 3\n"{name}",,zz,S1,\n'
+    rows, _ = write(tmp_path, team, platform="canvas", title="Lab 3", roster=roster)
+    assert rows[-1][-1] == "20"
+
+
+@pytest.mark.parametrize(
+    ("title", "warned"), [("Final Score", True), ("Finals", False), ("Lab 3 (final)", True)]
+)
+def test_a_title_that_canvas_may_skip_is_named(tmp_path, title, warned):
+    """A title with a word of Canvas' own columns gets a message."""
+    _, remarks = write(tmp_path, HALF, platform="canvas", title=title)
+    assert any("the title contains" in text for text in remarks) == warned
 
 
 def test_an_author_twice_in_a_roster_is_named_in_a_message(tmp_path):
@@ -217,6 +261,61 @@ def test_a_moodle_worksheet_is_filled_in(tmp_path):
     assert found["6"][1] == "kept"
     assert rows[1][8:10] == ["Friday, 3 May", "-"]
     assert remarks == ("not in roster.csv, so not exported: =ann",)
+
+
+WORKSHEETS = {  # heading, participant, status, yes
+    "German": (
+        'ID,"Vollständiger Name",E-Mail-Adresse,Status,Bewertung,Bestwertung,"Bewertung kann '
+        'geändert werden","Zuletzt geändert (Abgabe)","Zuletzt geändert (Bewertung)","Feedback als '
+        'Kommentar"',
+        "Teilnehmer/in{}", "Zur Bewertung abgegeben", "Ja",
+    ),
+    "French": (
+        "Identifiant;Nom complet;Adresse de courriel;Statut;Note;Note maximale;La note peut être "
+        "modifiée;Dernière modification (travail remis);Dernière modification (note);Feedback par "
+        "commentaires",
+        "Participant {}", "Remis pour évaluation", "Oui",
+    ),
+    "Japanese": (
+        "ID,フルネーム,メールアドレス,ステータス,評点,最大評点,評点の変更可,最終更新日時 (提出),"
+        "最終更新日時 (評点),フィードバックコメント",
+        "参加者 {}", "評定のために提出済み", "Yes",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("language", WORKSHEETS)
+@pytest.mark.parametrize("students", [1, 3])
+def test_a_worksheet_in_any_language_is_filled_in(tmp_path, language, students):
+    """A worksheet is recognised by its structure: points and comment are in the right columns."""
+    head, participant, status, yes = WORKSHEETS[language]
+    sep = ";" if ";" in head else ","
+    people = [(1024, "Jane Doe", ""), (5, "Bo Lee", ""), (6, "Al Zed", "12,50")][:students]
+    lines = [
+        sep.join(
+            [participant.format(number), name, f"u{number}@x.edu", status, f'"{grade}"', '"20,00"',
+             yes, "-", "-", ""]
+        )
+        for number, name, grade in people
+    ]  # fmt: skip
+    roster = "\n".join([head, *lines])
+    rows, _ = write(tmp_path, HALF, platform="moodle", roster=roster)
+    assert rows[0] == next(csv.reader([head], delimiter=sep))
+    assert [row[4] for row in rows[1:]] == ["10", "", "12,50"][:students]
+    assert rows[1][5:9] == ["20,00", yes, "-", "-"]
+    assert "Hz" in rows[1][9]
+
+
+def test_a_gradebook_of_moodle_in_another_language_is_filled_in(tmp_path):
+    """Without participants, students are found by email address or id number."""
+    roster = (
+        "Vorname,Nachname,ID-Nummer,E-Mail-Adresse,Aufgabe: Versuch 1 (Punkte)\n"
+        "Bo,Lee,,bo@x.edu,-\nAl,Zed,u9,al@x.edu,3\n"
+    )
+    own = make_outcome(make_grade("t", authors=("U9",), share=0.5))
+    rows, _ = write(tmp_path, FULL, own, platform="moodle", title="Lab 3", roster=roster)
+    assert [row[4:] for row in rows[1:]] == [["-", "20"], ["3", "10"]]
+    assert rows[0][5] == "Lab 3 (Real)"
 
 
 def test_a_worksheet_with_another_maximum_is_refused(tmp_path):
