@@ -134,7 +134,7 @@ class RequiredPieces(_Criterion):
 
 
 class DataQuality(_Criterion):
-    """Check the recordings; points are in proportion to the number without problems."""
+    """Check the recordings; points are in proportion to those that are required and sound."""
 
     check: Literal["data"]
 

@@ -15,7 +15,15 @@ from pipeline.grading.judge.checks_loop import (
 )
 from pipeline.grading.judge.earned import ALL, NONE, Deviation, earned, earned_by
 from pipeline.grading.judge.laws import MOST_WIDENING, judge_laws
-from pipeline.grading.judge.work import Verdict, Work, pieces_for, say_missing, share_there
+from pipeline.grading.judge.work import (
+    Verdict,
+    Work,
+    lacking,
+    pieces_for,
+    say_missing,
+    share_sound,
+    share_there,
+)
 from pipeline.grading.mistakes.impossible import not_positive
 from pipeline.grading.mistakes.state_model import model_harm
 from pipeline.grading.references.reference import OFF_SCALE, Reference, is_linear, off_scale
@@ -23,7 +31,7 @@ from pipeline.grading.references.tolerance import NO_CREDIT, as_typed, percent_o
 from pipeline.grading.rubric import matching
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
-from pipeline.words.numbers import first_few
+from pipeline.words.numbers import by_note, first_few
 
 _NAMED = 4  # largest number of parameters or laws in one message
 
@@ -52,15 +60,16 @@ def _required(criterion: asked.RequiredPieces, work: Work) -> Verdict:
 
 
 def _data(_: asked.DataQuality, work: Work) -> Verdict:
-    runs = len(work.submission.experiments)
-    bad = work.bad
+    bad, runs = work.bad, len(work.submission.experiments)
+    share = share_sound(work)
+    said = by_note((run, why.rstrip(".")) for run, why in bad.items())[:_NAMED]
+    faults = " ".join(text if text.endswith("?") else f"{text}." for text in said)
+    if not runs:
+        faults = "There are no recordings."
+    elif share == 1 and bad:
+        faults = f"{faults} The other recordings are as many as the lab asks for."
     return Verdict(
-        share=ALL - Fraction(min(len(bad), runs), runs) if runs else NONE,
-        message="; ".join(f"{run}: {why.rstrip('.')}" for run, why in list(bad.items())[:_NAMED])
-        + "."
-        if bad
-        else "The recordings are sound.",
-        found={"problems": dict(bad)},
+        share=share, message=faults or "The recordings are sound.", found={"problems": dict(bad)}
     )
 
 
@@ -78,6 +87,11 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
     impossible = not_positive(table)
     judged = [n for n in names if n in known or n in impossible]
     guessed = [n for n in names if n not in known and n not in judged]
+    needs = lacking(work) if criterion.check == "initial" else {}
+    unproved = {n: f"no usable {needs[n]}" for n in judged if n in needs and n in table}
+    if unproved and len(unproved) == len(judged):
+        why = "; ".join(by_note(unproved.items()))
+        return Verdict(share=None, message=f"Not checked, so it earns no points. {why}.")
     if not judged:
         reasons = [s.reason for s in work.analysis.skipped]
         if off_scale(work.analysis):
@@ -90,6 +104,9 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
             wrong.add(name)
             deviations.append(_deviation(NO_CREDIT, name))
             off.append(f"{name} is not reported")
+            continue
+        if name in unproved:
+            deviations.append(_deviation(NO_CREDIT, name))
             continue
         error = (
             percent_off(table[name], known[name], sigmas=criterion.sigmas)
@@ -109,15 +126,17 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
     loose = any(n in known for n in judged) and not is_linear(work.analysis)
     right = WORDS.text("agrees_loosely" if loose else "agrees")
     message = f"{'; '.join(off[:_NAMED])}." if off else right
+    if unproved:
+        left += f" Not checked, so without points: {'; '.join(by_note(unproved.items()))}."
     look = f" {WORDS.text('judged_loosely')}" if loose else ""
     return Verdict(
         share=earned(criterion, deviations),
         models=(tuple(deviations),),
         message=message + left + look,
-        explained=bool(wrong) and wrong <= work.named[criterion.check],
+        explained=bool(wrong or unproved) and wrong <= work.named[criterion.check],
         expected={n: known[n].value for n in judged if n in known},
         found={n: float(table[n]) for n in judged if n in table},
-        agrees={n: n not in wrong for n in judged if n in table},
+        agrees={n: n not in wrong for n in judged if n in table and n not in unproved},
     )
 
 

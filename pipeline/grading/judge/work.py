@@ -7,12 +7,14 @@ from functools import cached_property
 from typing import Any
 
 from pipeline.grading.grade import Flag
-from pipeline.grading.judge.earned import ALL, Deviation, mean_share
+from pipeline.grading.judge.earned import ALL, NONE, Deviation, mean_share
 from pipeline.grading.mistakes.controller import Controller
 from pipeline.grading.mistakes.explain import Label
 from pipeline.grading.mistakes.state_model import MatrixEntry, StateMatrices, compare_entries
+from pipeline.grading.references.readings import readings
 from pipeline.grading.references.reference import References
 from pipeline.grading.rubric import RequiredPieces, RequiredRuns, Rubric, matching
+from pipeline.names import read_name
 from pipeline.results import Analysis, Kind
 from pipeline.submission import Experiment, Reported, ReportedStateSpace, Submission
 from pipeline.words.numbers import first_few
@@ -167,7 +169,7 @@ def share_there(pieces: Sequence[Piece]) -> Fraction:
 
 
 def say_missing(pieces: Sequence[Piece], *, most: int) -> str:
-    """Return sentences on items that are missing; "" if none is.
+    """Return sentences on the items that are missing; "" if everything is there.
 
     At most `most` of them are named.
     """
@@ -209,18 +211,68 @@ def data_flag(bad: Mapping[str, str]) -> Flag:
 
 def _recordings(runs: RequiredRuns, experiments: Sequence[Experiment], *, carts: int) -> Piece:
     """Return required recordings as an item; a Bode table counts as all dwells."""
-    everyone = tuple(range(1, carts + 1))
-    free = tuple(sorted(runs.carts)) or everyone
-    kinds = _SERVES.get(runs.kind, (runs.kind,)) if free != everyone else (runs.kind,)
-    there = sum(e.kind in kinds and (e.carts or everyone) == free for e in experiments)
-    if runs.kind == "sine" and any(e.kind == "bode" for e in experiments):
-        there = max(there, runs.at_least)
     of, many = f" of cart {', '.join(map(str, runs.carts))}" if runs.carts else "", runs.at_least
     word = _RECORDING.get(runs.kind, runs.kind)
+    found = meeting(runs, experiments, carts=carts)
     return Piece(
         name=f"{many} {runs.kind}{of}" if many > 1 else f"{runs.kind}{of}",
         text=f"{many} {word}s{of}" if many > 1 else f"{word}{of}",
         kind=runs.kind,
-        there=there,
+        there=many if any(e.kind != runs.kind == "sine" for e in found) else len(found),
         needed=many,
     )
+
+
+def meeting(
+    runs: RequiredRuns, experiments: Sequence[Experiment], *, carts: int
+) -> list[Experiment]:
+    """Return the experiments that count for a requirement; Bode tables replace all dwells."""
+    everyone = tuple(range(1, carts + 1))
+    free = tuple(sorted(runs.carts)) or everyone
+    kinds = _SERVES.get(runs.kind, (runs.kind,)) if free != everyone else (runs.kind,)
+    tables = [e for e in experiments if e.kind == "bode"] if runs.kind == "sine" else []
+    return tables or [e for e in experiments if e.kind in kinds and (e.carts or everyone) == free]
+
+
+# ---------------------------------------------------------------------- sound recordings
+
+
+def share_sound(work: Work) -> Fraction:
+    """Return the share of sound recordings among those that the rubric asks for.
+
+    Bad recordings beyond the number asked for cost nothing, and missing ones are not judged here.
+    If the rubric asks for no recordings, all count.
+    """
+    experiments, shares = work.submission.experiments, []
+    for runs in work.rubric.required.experiments:
+        handed = meeting(runs, experiments, carts=work.rubric.system.carts)
+        needed = min(runs.at_least, len(handed))
+        sound = sum(e.id not in work.bad for e in handed)
+        shares += [Fraction(min(sound, needed), needed)] if needed else []
+    if not shares and experiments:
+        sound = sum(e.id not in work.bad for e in experiments)
+        shares = [Fraction(sound, len(experiments))]
+    return mean_share(shares) if shares else NONE
+
+
+def lacking(work: Work) -> dict[str, str]:
+    """Return the initial numbers whose recordings are all unusable or missing, and what they need.
+
+    These are gains, which rest on steps, and the frequency and damping of a cart alone, which rest
+    on its decays. A fit to other recordings may know the numbers too, but it does not show that the
+    students measured them. Recordings that the rubric does not require may be missing.
+    """
+    asked, carts = work.rubric.required.experiments, work.rubric.system.carts
+    found = {}
+    for name in work.rubric.names:
+        read = read_name(name)
+        if read.is_by_eye or readings(name, work.analysis):
+            continue
+        of = () if read.is_gain else (read.cart or 1,)
+        kind = "step" if read.is_gain else "decay"
+        runs = RequiredRuns(kind=kind, carts=of)
+        handed = meeting(runs, work.submission.experiments, carts=carts)
+        required = any(one.kind == kind and (not of or one.carts == of) for one in asked)
+        if all(e.id in work.bad for e in handed) if handed else required:
+            found[name] = _recordings(runs, (), carts=carts).text
+    return found
