@@ -105,6 +105,7 @@ def _read(submission: Submission, *, log: Log) -> tuple[Ingested, tuple[Interven
     data = read_data(submission)
     for name, reason in data.unreadable.items():
         log.skip(Stage.READING, reason, run=name)
+    log.warn([f"not used, because it cannot be read: {part.message}" for part in submission.unread])
     log.warn(reading_remarks(data, unit=submission.system.bench.units.position))
     interventions = find_interventions(data.records)
     log.warn(hand_remarks(interventions, records=data.records))

@@ -169,9 +169,8 @@ def run_report(
     with SecondProcess("pipeline.report.draft.make", "make_draft") as second:
         from pipeline.output import named_folder, own_folder
         from pipeline.report.draft.write import make_report
-        from pipeline.submission import load_submission
 
-        submission = load_submission(folder)
+        submission = _load(folder)
         out = named_folder(out) if out else own_folder(submission.folder, "report")
         compared = _comparison(compare, submission)
         with progress_line() as progress:
@@ -184,6 +183,16 @@ def run_report(
     if files.plots:
         say(f"wrote {out / 'compare.html'}")
     return analysis
+
+
+def _load(folder: Path) -> "Submission":
+    """Read a submission, and tell which reported numbers cannot be read."""
+    from pipeline.submission import load_submission
+
+    submission = load_submission(folder)
+    for part in submission.unread:
+        say(f"cartlab: not used, because it cannot be read: {part.message}")
+    return submission
 
 
 def _unreadable(analysis: "Analysis") -> list[str]:
@@ -225,11 +234,10 @@ def check(
     from pipeline.grading.self_check.check import check_numbers
     from pipeline.grading.self_check.log import answer_line
     from pipeline.grading.self_check.words import answer_lines
-    from pipeline.submission import load_submission
 
     asked = load_rubric(rubric) if rubric else None
     with progress_line() as progress:
-        answer = check_numbers(load_submission(folder), rubric=asked, progress=progress)
+        answer = check_numbers(_load(folder), rubric=asked, progress=progress)
     typer.echo(answer_line(answer) if as_json else "\n".join(answer_lines(answer)), nl=not as_json)
     if answer.disagree:
         raise typer.Exit(1)
@@ -253,10 +261,9 @@ def solution(
     from pipeline.grading.rubric_file import load_rubric
     from pipeline.output import named_folder, own_folder
     from pipeline.report.solution.write import make_solution
-    from pipeline.submission import load_submission
     from pipeline.words.text import with_symbols
 
-    submission, asked = load_submission(folder), load_rubric(rubric) if rubric else None
+    submission, asked = _load(folder), load_rubric(rubric) if rubric else None
     out = named_folder(out) if out else own_folder(submission.folder, "solution")
     with progress_line() as progress:
         analysis, text = make_solution(submission, out, rubric=asked, pdf=pdf, progress=progress)
@@ -317,10 +324,9 @@ def explain(
     with SecondProcess("pipeline.report.gap.story", "make_gap_files") as second:
         from pipeline.json_files import json_text
         from pipeline.output import named_folder, own_folder, write_file
-        from pipeline.submission import load_submission
         from pipeline.workflow import analyse
 
-        submission = load_submission(folder)
+        submission = _load(folder)
         out = named_folder(out) if out else own_folder(submission.folder, "gap")
         analysis = analyse(submission, design=False, progress=progress)
         # These imports load the compiled simulator.

@@ -27,7 +27,7 @@ from pipeline.submission.complaints import (
     without_tag,
 )
 from pipeline.submission.load import spring_names
-from pipeline.submission.toml_file import Toml, at_line, read_text, read_toml
+from pipeline.submission.toml_file import Toml, at_line, key_lines, read_text, read_toml
 
 _MAX_BYTES = 1_000_000
 _CHECKS: dict[str, type[BaseModel]] = {
@@ -38,9 +38,7 @@ _CHECKS: dict[str, type[BaseModel]] = {
 _OF_CRITERIA = tuple(rubric.DataQuality.model_fields)  # keys that every criterion has
 # Valid values that replace wrong or missing ones, so that further mistakes can be found.
 _HARMLESS: dict[str | int, Any] = {"version": 1, "points": 1.0, "id": "criterion", "kind": "step"}
-_HEADER = re.compile(r"\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
 _ID = re.compile(r"^\s*id\s*=\s*[\"']([^\"']*)", re.MULTILINE)
-_KEY = re.compile(r"\s*([A-Za-z0-9_.\"'-]+)\s*=")
 
 
 def load_rubric(path: Path) -> Rubric:
@@ -107,7 +105,7 @@ def parse_rubric(text: str, *, where: str) -> Rubric:
     InvalidRubric : the rubric has mistakes; all of them are listed.
     """
     read = read_toml(text, root=Rubric)
-    problems = list(read.slips)
+    problems = [(slip.line, slip.what) for slip in read.slips]
     if read.document or not problems:
         lost = set(_ID.findall(text)) if problems else set()
         found = _validate(_tuples(read.document), lost=lost)
@@ -149,7 +147,7 @@ def _is_of_slip(complaint: _Complaint, line: int, read: Toml) -> bool:
     headings = [n for n, typed in enumerate(lines, start=1) if typed.lstrip().startswith("[")]
     end = next((n for n in headings if n > line), len(lines) + 1)
     # If the invalid line is a heading, the whole table seems missing.
-    return any(len(complaint.at) == 1 or line <= slip < end for slip, _ in read.slips)
+    return any(len(complaint.at) == 1 or line <= slip.line < end for slip in read.slips)
 
 
 def _validate(document: dict, *, lost: Collection[str]) -> _Validated:
@@ -335,19 +333,3 @@ def _line_of(text: str, at: Location) -> int:
         if depth == len(path) and depth > best:
             best, line = depth, number
     return line
-
-
-def key_lines(text: str) -> Iterator[tuple[int, tuple[int | str, ...]]]:
-    """Yield line and path of every table heading, and of every key at the beginning of a line."""
-    table: tuple[int | str, ...] = ()
-    counts: dict[str, int] = {}
-    for number, line in enumerate(text.splitlines(), start=1):
-        if header := _HEADER.match(line):
-            keys = tuple(part.strip(" \"'") for part in header[2].split("."))
-            table = keys
-            if header[1] == "[[":
-                counts[header[2]] = counts.get(header[2], -1) + 1
-                table = (*keys, counts[header[2]])
-            yield number, table
-        elif key := _KEY.match(line):
-            yield number, (*table, *(part.strip("\"'") for part in key[1].split(".")))

@@ -15,10 +15,10 @@ from typing import Any, Literal, get_args
 from pipeline.errors import ConfigError
 from pipeline.grading import rubric as asked
 from pipeline.grading.rubric import Rubric, matching
-from pipeline.grading.rubric_file import key_lines
 from pipeline.names import read_name
 from pipeline.submission import Students
 from pipeline.submission.complaints import quote
+from pipeline.submission.toml_file import key_lines
 
 Unit = Literal["points", "percent", "share", "days", "percentage points", "choice"]
 Key = tuple[str | int, ...]  # path of a value: ("criteria", 3, "points")

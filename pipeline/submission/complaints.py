@@ -48,29 +48,34 @@ _EXPECTED = {
 
 def quote(value: object) -> str:
     """Return a found value as one short printable line."""
-    text = repr(value) if not isinstance(value, dict | tuple | list) else _summary(value)
+    if isinstance(value, Decimal):
+        text = str(value)
+    else:
+        text = _summary(value) if isinstance(value, dict | tuple | list) else repr(value)
     return text if len(text) <= _LONGEST_QUOTE else text[: _LONGEST_QUOTE - 1] + "…"
 
 
 def _summary(value: dict | tuple | list) -> str:
     if isinstance(value, dict):
         return "a table"
-    return f"a list of {len(value)}" if len(value) > 4 else repr(list(value))
+    if len(value) > 4:
+        return f"a list of {len(value)}"
+    return f"[{', '.join(quote(item) for item in value)}]"
 
 
 def nearest(name: object, candidates: Sequence[str]) -> str:
     """Return "; did you mean …?" or, if no candidate is similar, the first few candidates."""
     typed = str(name)[:_LONGEST_QUOTE]
-    close = [one for one in candidates if _without_zeros(one) == _without_zeros(typed)]
+    close = [one for one in candidates if _plain_name(one) == _plain_name(typed)]
     close = close or get_close_matches(typed, candidates, n=1, cutoff=0.5)
     if close:
         return f"; did you mean {close[0]!r}?"
     return f"; known: {first_few(candidates, _MOST_KNOWN)}" if candidates else ""
 
 
-def _without_zeros(name: str) -> str:
-    """Return a name without the leading zeros of its numbers."""
-    return re.sub(r"(?<!\d)0+(?=\d)", "", name)
+def _plain_name(name: str) -> str:
+    """Return a name in lower case, without the leading zeros of its numbers."""
+    return re.sub(r"(?<!\d)0+(?=\d)", "", name.casefold())
 
 
 @cache

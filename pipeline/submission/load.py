@@ -29,16 +29,26 @@ from pipeline.submission.complaints import (
     relevant_errors,
     without_tag,
 )
-from pipeline.submission.models import Experiment, Reported, StateFeedbackController, Submission
+from pipeline.submission.models import (
+    Experiment,
+    Reported,
+    StateFeedbackController,
+    Submission,
+    Unread,
+)
 from pipeline.submission.toml_file import (
     UnusableNumber,
+    at_line,
     backslash_words,
     check_number,
+    key_lines,
     parse_toml,
     read_text,
+    read_toml,
 )
 
 NAME = "submission.toml"
+_MOST_ROUNDS = 30  # most times that a file is checked again without what cannot be read
 MAX_TOML_BYTES = 1_000_000  # a tenth is enough for the experiments of a full class section
 MAX_NOTES_BYTES = 1_000_000
 MAX_DATA_BYTES = 100_000_000  # over half an hour at 1 kHz
@@ -49,12 +59,13 @@ def load_submission(path: Path) -> Submission:
     """Read and check a submission, given as the folder or as its `submission.toml`.
 
     If an experiment has no `carts`, all carts are filled in. `file` is normalised to forward
-    slashes. Numbers under `[reported]` keep their digits as typed.
+    slashes. Numbers under `[reported]` keep their digits as typed. A number or table there that
+    cannot be read is left out, and listed in `unread`.
 
     Raises
     ------
-    SubmissionError : the submission is invalid. Each line names the file and the key, and says what
-        was expected and found.
+    SubmissionError : the submission is invalid elsewhere. Each line names the file and the key, and
+        says what was expected and found.
     """
     path = Path(path)
     toml = path if path.is_file() or path.suffix == ".toml" else path / NAME
@@ -67,11 +78,13 @@ def load_submission(path: Path) -> Submission:
         raise SubmissionError(f"{quote(str(path))}: contains no {NAME}{hint}")
     if (problem := file_problem(folder, toml.name)) is not None:
         raise SubmissionError(f"{where}: {problem}")
-    return parse_submission(
-        read_text(toml, where=where, limit=MAX_TOML_BYTES, error=SubmissionError),
-        folder=folder,
-        where=where,
-    )
+    text = read_text(toml, where=where, limit=MAX_TOML_BYTES, error=SubmissionError)
+    try:
+        return parse_submission(text, folder=folder, where=where)
+    except SubmissionError:
+        if (submission := _without_unread(text, folder=folder, where=where)) is None:
+            raise
+        return submission
 
 
 class InvalidSubmission(SubmissionError):
@@ -81,12 +94,13 @@ class InvalidSubmission(SubmissionError):
     ----------
     problems : the first problems found, each with its place. The error's text has a line for each,
         but only one for equal problems in several tables of a list.
+    more : the number of further problems.
     """
 
     def __init__(
         self, where: str, problems: Sequence[tuple[Location, str]], *, more: int = 0
     ) -> None:
-        self.problems = tuple(problems)
+        self.problems, self.more = tuple(problems), more
         super().__init__(list_faults(where, merge_equal(problems), more=more))
 
 
@@ -104,6 +118,63 @@ def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submissio
     """
     # Decimals are kept, so that no typed digit is lost.
     document = parse_toml(text, where=where, error=SubmissionError, as_typed=True)
+    return _check(document, folder=folder, where=where)
+
+
+def _without_unread(text: str, *, folder: Path, where: str) -> Submission | None:
+    """Return a submission without the parts of `[reported]` that cannot be read.
+
+    None if something else cannot be read either.
+    """
+    read, unread = read_toml(text, as_typed=True), dict[tuple[str, ...], Unread]()
+    document, lines = read.document, dict[Location, int]()
+    for number, at in key_lines(read.text):
+        lines.setdefault(at, number)
+
+    def leave_out(problems: Sequence[tuple[Location, str]]) -> bool:
+        """Leave out the number or table of each problem; return whether all are in `[reported]`."""
+        nonlocal document
+        for at, message in problems:
+            part = tuple(map(str, at[: 3 if len(at) > 2 else 2]))
+            if part[:1] != ("reported",):
+                return False
+            document = _without(document, part)
+            unread.setdefault(part, Unread(at=part, message=message))
+        return True
+
+    slips = [
+        (at, at_line(NAME, slip.line, slip.what))
+        for slip in read.slips
+        for at in slip.spoilt or [()]
+    ]
+    if not leave_out(slips):
+        return None
+    for _ in range(_MOST_ROUNDS):  # a round finds the first problems of one kind
+        try:
+            submission = _check(document, folder=folder, where=where)
+            return submission.model_copy(update={"unread": tuple(unread.values())})
+        except InvalidSubmission as wrong:
+            told = wrong.problems
+            if not leave_out(
+                [(at, at_line(NAME, lines.get((*at[:3],), 0), what)) for at, what in told]
+            ):
+                return None
+        except SubmissionError:
+            return None
+    return None
+
+
+def _without(document: dict[str, Any], at: Sequence[str]) -> dict[str, Any]:
+    """Return a document without a key, which need not exist."""
+    key, *below = at
+    if not below:
+        return {name: value for name, value in document.items() if name != key}
+    if not isinstance(document.get(key), dict):
+        return document
+    return document | {key: _without(document[key], below)}
+
+
+def _check(document: dict[str, Any], *, folder: Path, where: str) -> Submission:
     submission = _validate(document, where=where)
     if found := list(_problems(submission, folder)):
         worded = [(at, f"{dotted(at, document)}: {what}") for at, what in found]
@@ -169,13 +240,14 @@ def _validate(document: dict, *, where: str) -> Submission:
         for key in islice((key for key in document if key not in keys), MOST_LISTED)
     ]
     document = {key: value for key, value in document.items() if key in keys}
+    unusable: list[UnusableNumber] = []
     try:
-        plain = {key: _plain(value, (key,)) for key, value in document.items()}
-    except UnusableNumber as error:
-        what = f"{dotted(error.at, document)}: {error}"
-        raise InvalidSubmission(where, [(error.at, what)]) from None
+        plain = {key: _plain(value, (key,), unusable) for key, value in document.items()}
     except RecursionError:
         raise SubmissionError(f"{where}: lists or tables nest too deeply") from None
+    if unusable:
+        listed = [(e.at, f"{dotted(e.at, document)}: {e}") for e in unusable[:MOST_LISTED]]
+        raise InvalidSubmission(where, listed, more=len(unusable) - len(listed))
     try:
         submission = Submission.model_validate(plain, strict=True)
     except ValidationError as error:
@@ -189,15 +261,22 @@ def _validate(document: dict, *, where: str) -> Submission:
     return submission
 
 
-def _plain(value: object, at: tuple[int | str, ...]) -> object:
-    """Return lists as tuples; decimals become floats, except under `reported`."""
+def _plain(value: object, at: tuple[int | str, ...], unusable: list[UnusableNumber]) -> object:
+    """Return lists as tuples; decimals become floats, except under `reported`.
+
+    Numbers that cannot be used are added to `unusable`.
+    """
     if isinstance(value, dict):
-        return {key: _plain(item, (*at, key)) for key, item in value.items()}
+        return {key: _plain(item, (*at, key), unusable) for key, item in value.items()}
     if isinstance(value, list):
-        return tuple(_plain(item, (*at, i)) for i, item in enumerate(value))
+        return tuple(_plain(item, (*at, i), unusable) for i, item in enumerate(value))
     if isinstance(value, bool) or not isinstance(value, int | Decimal):
         return value
-    check_number(value, at)
+    try:
+        check_number(value, at)
+    except UnusableNumber as error:
+        unusable.append(error)
+        return None
     if at[0] == "reported":
         return Decimal(value)
     return float(value) if isinstance(value, Decimal) else value

@@ -264,6 +264,19 @@ class Students(TomlTable):
     see: Literal["report", "check"] = "report"
 
 
+class Unread(TomlTable):
+    """A part of `[reported]` that cannot be read, so it counts as not reported.
+
+    Attributes
+    ----------
+    at : keys of the part, such as ("reported", "final", "omega_a"), or of its table.
+    message : what is wrong, with the line and what to write instead.
+    """
+
+    at: tuple[str, ...]
+    message: str
+
+
 class Submission(TomlTable):
     """A validated submission; `folder` is the folder that contains it."""
 
@@ -287,6 +300,7 @@ class Submission(TomlTable):
     students: Students = Students()
     folder: Path = Field(default=Path(), exclude=True)
     discussion: str | None = Field(default=None, exclude=True)
+    unread: tuple[Unread, ...] = Field(default=(), exclude=True)
 
     @property
     def typed(self) -> dict[str, dict[str, Decimal]]:

@@ -2,12 +2,12 @@
 
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from pydantic import BaseModel
 
@@ -21,6 +21,13 @@ _LONGEST_LINE, _SHOWN = 300, 60  # characters of a line that are checked, and th
 # exponent; larger than that of any physical number, yet numbers can still be multiplied
 _LARGEST = 30
 _AT = re.compile(r" \(at line (\d+), column (\d+)\)$")
+_HEADER = re.compile(r"\s*(\[\[?)\s*([^\[\],]+?)\s*\]\]?\s*(?:#.*)?$")
+_KEY = re.compile(r"\s*([A-Za-z0-9_.\"'-]+)\s*=")
+# A heading, even if a bracket of it is missing; not a row of numbers in a longer list.
+_HEADING = re.compile(
+    r"\s*(?:\[+\s*|(?=[^=]*\]\s*(?:#.*)?$)|\W+(?=reported\b))([A-Za-z_\"'][^,=\[\]()]*)[^,=]*$"
+)
+_NAME = re.compile(r"\s*([^\W\d][\w.-]*)")  # the name at the beginning of a line
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +82,21 @@ def _too_large(where: str, size: int, limit: int) -> str:
     return f"{where}: {size:,} bytes, the limit is {limit:,}"
 
 
+class TomlSlip(NamedTuple):
+    """A mistake in a TOML text.
+
+    Attributes
+    ----------
+    line : number of the line that is not readable; 0 means the whole text.
+    what : what is wrong, and what to write instead.
+    spoilt : the keys and tables that cannot be read because of it; empty if this is not known.
+    """
+
+    line: int
+    what: str
+    spoilt: tuple[Location, ...] = ()
+
+
 @dataclass(frozen=True, kw_only=True)
 class Toml:
     """The readable part of a TOML text, and its mistakes (slips).
@@ -83,12 +105,11 @@ class Toml:
     ----------
     document : the content of the readable lines.
     text : the readable lines, each in its place; all other lines are empty.
-    slips : (line, what is wrong) for each line that is not readable. Line 0 means the whole text.
     """
 
     document: dict[str, Any]
     text: str
-    slips: tuple[tuple[int, str], ...] = ()
+    slips: tuple[TomlSlip, ...] = ()
 
 
 def parse_toml(
@@ -116,7 +137,7 @@ def parse_toml(
     """
     read = read_toml(text, as_typed=as_typed, root=root)
     if read.slips:
-        raise error("\n".join(at_line(where, line, what) for line, what in read.slips))
+        raise error("\n".join(at_line(where, slip.line, slip.what) for slip in read.slips))
     return read.document
 
 
@@ -135,8 +156,8 @@ def read_toml(
     for key in re.finditer(r"[\w\"'-]+(?:[ \t]*\.[ \t]*[\w\"'-]+)*", text):
         if key.group().count(".") > 30:  # tomllib takes time with the square of a key's depth
             line = text.count("\n", 0, key.start()) + 1
-            return Toml(document={}, text="", slips=((line, "keys nest too deeply"),))
-    typed, slips = text.split("\n"), list[tuple[int, str]]()
+            return Toml(document={}, text="", slips=(TomlSlip(line, "keys nest too deeply"),))
+    typed, slips = text.split("\n"), list[TomlSlip]()
     lines, emptied = list(typed), -1  # last line of the previous mistake
     for _ in range(30 if len(text) <= 50_000 else 1):  # a long text is read only once
         try:
@@ -152,20 +173,27 @@ def read_toml(
             slip = _find_slip(shown, _AT.sub("", message))
             # The rest of a list or text with a bad first line is not a second mistake.
             begins = re.match(r"\s*(#|\[|[\w\"'.-]+\s*=)", typed[line - 1])
-            if line != emptied + 1 or begins:
-                words = _explain_slip(slip, shown, root)
-                shown = shown if shown.isprintable() and len(shown) <= _SHOWN else quote(shown)
-                slips.append((line, f"{words}; found {shown or 'the end'}"))
+            told = line != emptied + 1 or begins
             first, emptied = _find_spoilt(lines, line, slip)
+            if told:
+                spoilt = tuple(_spoilt_keys(typed, first, emptied))
+                numbers = root is Submission and spoilt[0][:1] == ("reported",)
+                words = _explain_slip(slip, shown, root, numbers=numbers)
+                shown = shown if shown.isprintable() and len(shown) <= _SHOWN else quote(shown)
+                slips.append(TomlSlip(line, f"{words}; found {shown or 'the end'}", spoilt))
             if not any(map(str.strip, lines[first - 1 : emptied])):
                 break
             lines[first - 1 : emptied] = [""] * (emptied + 1 - first)
         except RecursionError:
-            slips.append((0, "lists or tables nest too deeply"))
+            slips.append(TomlSlip(0, "lists or tables nest too deeply"))
             break
         except ValueError:  # an integer of thousands of digits
-            slips.append((_long_number(text), "a number has too many digits"))
-            break
+            line = _long_number("\n".join(lines))
+            spoilt = tuple(_spoilt_keys(typed, line, line)) if line else ()
+            slips.append(TomlSlip(line, "a number has too many digits", spoilt))
+            if not line:
+                break
+            lines[line - 1] = ""
     return Toml(document={}, text="", slips=tuple(slips))
 
 
@@ -214,7 +242,7 @@ def _decimal(text: str) -> Decimal:
         return Decimal((0, (1,), 10 * _LARGEST))
 
 
-def _with_floats(value: Any, at: tuple[int | str, ...], slips: list[tuple[int, str]]) -> Any:
+def _with_floats(value: Any, at: tuple[int | str, ...], slips: list[TomlSlip]) -> Any:
     """Return a document with floats in place of decimals.
 
     A number that is too large is added to `slips` and becomes 1.
@@ -228,7 +256,7 @@ def _with_floats(value: Any, at: tuple[int | str, ...], slips: list[tuple[int, s
     try:
         check_number(value, at)
     except UnusableNumber as unusable:
-        slips.append((0, f"{dotted(unusable.at, {})}: {unusable}"))
+        slips.append(TomlSlip(0, f"{dotted(unusable.at, {})}: {unusable}"))
         return 1
     return float(value) if isinstance(value, Decimal) else value
 
@@ -245,10 +273,46 @@ def _find_spoilt(lines: Sequence[str], line: int, slip: _Slip) -> tuple[int, int
         for n in range(line - 1, 0, -1):
             if lines[n - 1].count("[") > lines[n - 1].count("]"):
                 return n, line - 1
-    if lines[line - 1].lstrip().startswith("["):  # otherwise the previous table would get its keys
+    if _HEADING.match(lines[line - 1]):  # otherwise the previous table would get its keys
         after = (n for n in range(line, len(lines)) if lines[n].lstrip().startswith("["))
         return line, next(after, len(lines))
     return line, line
+
+
+def _spoilt_keys(lines: list[str], first: int, last: int) -> Iterator[Location]:
+    """Yield the table or the keys in some lines.
+
+    A line that begins with neither a heading nor a name belongs to the key above it.
+    """
+    if heading := _HEADING.match(lines[first - 1]):
+        yield tuple(re.split(r"[\s.]+", heading[1].strip(" \"'\r")))
+        return
+    places: list[tuple[Location, int]] = [((), 0)]
+    places += [(at, number) for number, at in key_lines("\n".join(lines[:last]))]
+    above = [(at, number) for at, number in places if number <= first]
+    name = _NAME.match(lines[first - 1])
+    if name and above[-1][1] < first:
+        headings = (at for at, n in reversed(above) if not n or _HEADER.match(lines[n - 1]))
+        yield (*next(headings), *name[1].split("."))
+    else:
+        yield above[-1][0]
+    yield from (at for at, number in places if number > first)
+
+
+def key_lines(text: str) -> Iterator[tuple[int, tuple[int | str, ...]]]:
+    """Yield line and path of every table heading, and of every key at the beginning of a line."""
+    table: tuple[int | str, ...] = ()
+    counts: dict[str, int] = {}
+    for number, line in enumerate(text.splitlines(), start=1):
+        if header := _HEADER.match(line):
+            keys = tuple(part.strip(" \"'") for part in header[2].split("."))
+            table = keys
+            if header[1] == "[[":
+                counts[header[2]] = counts.get(header[2], -1) + 1
+                table = (*keys, counts[header[2]])
+            yield number, table
+        elif key := _KEY.match(line):
+            yield number, (*table, *(part.strip("\"'") for part in key[1].split(".")))
 
 
 def _find_slip(line: str, message: str) -> _Slip:
@@ -261,11 +325,16 @@ def _find_slip(line: str, message: str) -> _Slip:
     return _Slip(words=f"not valid TOML: {message}")
 
 
-def _explain_slip(slip: _Slip, line: str, root: type[BaseModel]) -> str:
-    """Return what is wrong, with ": write …" and the corrected line if it is known."""
+def _explain_slip(slip: _Slip, line: str, root: type[BaseModel], *, numbers: bool) -> str:
+    """Return what is wrong, with ": write …" and the corrected line if it is known.
+
+    Parameters
+    ----------
+    numbers : whether the table of the line takes only numbers.
+    """
     line = line[:_LONGEST_LINE]
     key = line.partition("=")[0].strip()
-    if slip.code == "unquoted_text" and takes_numbers(key, root):
+    if slip.code == "unquoted_text" and (numbers or takes_numbers(key, root)):
         return f"{key} takes a number, written in digits"
     new = line
     for pattern, put in slip.mends:

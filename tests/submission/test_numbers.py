@@ -162,16 +162,21 @@ def test_any_number_of_a_benchs_description(number, key):
 
 @pytest.mark.parametrize("number", ["1e1000000", "-1e-1000000", "9" * 5000, "0x" + "f" * 5000])
 def test_fill_and_desk_refuse_an_impossible_number(tmp_path, number):
-    """`fill` and the desk refuse an impossible number with its key or line before they write."""
+    """`fill` and the desk refuse an impossible number with its key or line before they write.
+
+    A submission is read without this number.
+    """
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "a.csv").write_text("time,input,x1\n0,0,0\n0.1,0,0\n", encoding="utf-8")
     (tmp_path / NAME).write_text(
         f"version = 1\n[system]\ncarts = 2\n[reported.initial]\nK_1 = {number}\n", encoding="utf-8"
     )
     said = r"reported\.initial\.K_1: expected a number|line 5: a number has too many digits"
-    for change in (lambda: fill_submission(tmp_path), lambda: load_submission(tmp_path)):
-        with pytest.raises(SubmissionError, match=said):
-            change()
+    with pytest.raises(SubmissionError, match=said):
+        fill_submission(tmp_path)
+    (part,) = load_submission(tmp_path).unread
+    assert part.at == ("reported", "initial", "K_1")
+    assert re.search(said, part.message)
     with pytest.raises(SubmissionError, match=rf"{said}|at line 5"):
         edit_submission(tmp_path, lambda document: document.update({"title": "t"}))
 

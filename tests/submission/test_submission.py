@@ -152,8 +152,8 @@ def test_a_cart_without_springs_reports_mass_and_damping(tmp_path):
     assert reported is not None
     assert set(reported.final) == {"mass", "damping"}
     (tmp_path / "submission.toml").write_text(head + "K = 2.0\n")
-    with pytest.raises(SubmissionError, match=r"reported\.final\.K: unknown parameter; known: ma"):
-        load_submission(tmp_path)
+    (part,) = load_submission(tmp_path).unread
+    assert "reported.final.K: unknown parameter; known: mass, damping" in part.message
 
 
 @pytest.mark.parametrize(

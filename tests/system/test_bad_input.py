@@ -98,14 +98,6 @@ BAD_TOML = {
         GOOD.replace('unit = "cm"', r'unit = "c\nm"'),
         r"unit: expected one line of printable characters",
     ),
-    "many digits": (
-        GOOD + f"[reported.final]\nK_1 = 1.{'3' * 500_000}\n",
-        r"K_1: expected a number of at most 1000 digits",
-    ),
-    "no physical number": (
-        GOOD + "[reported.final]\nK_1 = 1e31\n",
-        r"K_1: expected a number between",
-    ),
     "no slip we know": (HEAD + "carts = &2\n", r"line 5: not valid TOML: Invalid value; found "),
     "empty": ("", r"version: is required"),
     "no system": ("version = 1\n", r"system: is required"),
@@ -186,7 +178,6 @@ BAD_TOML = {
     "window too short": (GOOD + "window = [0.1, 0.11]\n", r"holds 2 samples"),
     "nan": (GOOD + "frequency = nan\n", r"frequency .*finite number, found NaN"),
     "infinity": (GOOD + "window = [0, inf]\n", r"window\[2\] .*finite number"),
-    "nan reported": (GOOD + "[reported.final]\nK_1 = nan\n", r"reported\.final\.K_1: .*finite"),
     "huge number": (GOOD + "frequency = 1e400\n", r"frequency .*1e-30 and 1e\+30"),
     "huge whole number": (GOOD + f"frequency = 1{'0' * 200}\n", r"1e-30 and 1e\+30"),
     "thousands of digits": (GOOD + f"frequency = {'1' * 5000}\n", r"too many digits"),
@@ -200,18 +191,6 @@ BAD_TOML = {
         r"no column 'x9'; it has time, input, x1, x2",
     ),
     "column too far": (GOOD + "columns = { x1 = 5 }\n", r"no column 5, the file has 4"),
-    "parameter": (
-        GOOD + "[reported.final]\nK1 = 2.0\n",
-        r"reported\.final\.K1: unknown parameter; did you mean 'K_1'\?",
-    ),
-    "parameter, fewer carts": (
-        GOOD + "[reported.initial]\nomega_x = 2.0\n",
-        r"reported\.initial\.omega_x: unknown parameter",
-    ),
-    "reported text": (GOOD + '[reported.final]\nK_1 = "2"\n', r"K_1: expected a number, found '2'"),
-    "A": (GOOD + "[reported.state_space]\nA = [[1, 2]]\n", r"expected 4 rows of 4 numbers"),
-    "B": (GOOD + "[reported.state_space]\nB = [[1], [2]]\n", r"expected 4 numbers, found 2"),
-    "reported gains": (GOOD + "[reported.feedback]\ngains = [1]\n", r"expected 4 gains"),
     "no experiments": (HEAD, r"no \[\[experiments\]\] table yet"),
     "not UTF-8": (GOOD.encode() + b'note = "\xe9t\xe9"\n', r"line 9: not UTF-8 text"),
     "UTF-16": (GOOD.encode("utf-16"), r"line 1: not UTF-8 text"),
@@ -251,10 +230,45 @@ BAD_TOML = {
 }
 
 
+# Mistakes in the reported numbers, which cost only the number or list concerned.
+BAD_NUMBERS = {
+    "many digits": (
+        GOOD + f"[reported.final]\nK_1 = 1.{'3' * 500_000}\n",
+        r"K_1: expected a number of at most 1000 digits",
+    ),
+    "no physical number": (
+        GOOD + "[reported.final]\nK_1 = 1e31\n",
+        r"K_1: expected a number between",
+    ),
+    "nan reported": (GOOD + "[reported.final]\nK_1 = nan\n", r"reported\.final\.K_1: .*finite"),
+    "parameter": (
+        GOOD + "[reported.final]\nK1 = 2.0\n",
+        r"reported\.final\.K1: unknown parameter; did you mean 'K_1'\?",
+    ),
+    "parameter, fewer carts": (
+        GOOD + "[reported.initial]\nomega_x = 2.0\n",
+        r"reported\.initial\.omega_x: unknown parameter",
+    ),
+    "reported text": (GOOD + '[reported.final]\nK_1 = "2"\n', r"K_1: expected a number, found '2'"),
+    "A": (GOOD + "[reported.state_space]\nA = [[1, 2]]\n", r"expected 4 rows of 4 numbers"),
+    "B": (GOOD + "[reported.state_space]\nB = [[1], [2]]\n", r"expected 4 numbers, found 2"),
+    "reported gains": (GOOD + "[reported.feedback]\ngains = [1]\n", r"expected 4 gains"),
+}
+
+
 @pytest.mark.parametrize(("toml", "pattern"), BAD_TOML.values(), ids=BAD_TOML.keys())
 def test_each_mistake_in_the_submission_file_is_one_line(toml, pattern, tmp_path):
     """Each mistake in submission.toml gives one line, which names its key or line."""
     one_line(write(tmp_path / "team-01", toml), pattern, most=MOST_LISTED)
+
+
+@pytest.mark.parametrize(("toml", "pattern"), BAD_NUMBERS.values(), ids=BAD_NUMBERS.keys())
+def test_each_mistake_in_a_reported_number_costs_this_number(toml, pattern, tmp_path):
+    """Each mistake in a reported number leaves the number out, with one line that names it."""
+    folder = write(tmp_path / "team-01", toml)
+    (part,) = load_submission(folder).unread
+    assert "\n" not in part.message
+    assert re.search(pattern, part.message)
 
 
 def _replaced(line: int, text: str) -> str:

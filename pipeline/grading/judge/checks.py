@@ -98,12 +98,15 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
             reasons = [OFF_SCALE]
         why = reasons[0] if reasons else "these are first guesses that no recording can confirm"
         return Verdict(share=None, message=f"Not checked: {why}.")
-    deviations, off, wrong = [], [], set()
+    unread = {name: work.why_unread(criterion.check, name) for name in judged}
+    said = by_note(unread.items())
+    off = [f"Cannot be read: {'; '.join(said)}"] if said else []
+    deviations, wrong = [], set()
     for name in judged:
         if name not in table:
             wrong.add(name)
             deviations.append(_deviation(NO_CREDIT, name))
-            off.append(f"{name} is not reported")
+            off += [] if unread[name] else [f"{name} is not reported"]
             continue
         if name in unproved:
             deviations.append(_deviation(NO_CREDIT, name))
@@ -195,7 +198,9 @@ def _laws(criterion: asked.Laws, work: Work) -> Verdict:
         damping_percent=criterion.damping_percent,
     )
     if laws is None:
-        return Verdict(share=None, message="Not checked: the final table is not complete.")
+        missing = (n for n in work.rubric.names if n not in work.reported.final)
+        why = next(filter(None, (work.because_unread("final", n) for n in missing)), "")
+        return Verdict(share=None, message=f"Not checked: the final table is not complete.{why}")
     broken = [law for law in laws if law.widening > 0]
     meanings = dict.fromkeys(law.meaning for law in broken)  # two laws may have the same meaning
     worst = max((law.widening for law in laws), default=Fraction(0))
@@ -215,7 +220,9 @@ def _laws(criterion: asked.Laws, work: Work) -> Verdict:
 def _state_space(criterion: asked.StateModel, work: Work) -> Verdict:
     space = work.reported.state_space
     if space is None or not (space.A and space.B):
-        return Verdict(share=NONE, message="A and B are not both reported.")
+        why = [work.because_unread("state_space", n) for n in "AB"]
+        told = "".join(dict.fromkeys(why))
+        return Verdict(share=NONE, message=f"A and B are not both reported.{told}")
     if not (entries := work.entries):
         return Verdict(share=None, message="Not checked: there is no table or fit to compare with.")
     deviations = tuple(

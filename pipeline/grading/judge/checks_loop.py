@@ -25,7 +25,8 @@ def _loop(work: Work) -> tuple[Controller, Array] | Verdict:
     """Return the controller and its gains, or a verdict that says why they cannot be judged."""
     feedback = work.reported.feedback
     if feedback is None or not feedback.gains:
-        return Verdict(share=NONE, message="No gains are reported.")
+        why = work.because_unread("feedback", "gains")
+        return Verdict(share=NONE, message=f"No gains are reported.{why}")
     if work.controller is None or work.controller.gains is None:
         return Verdict(share=None, message="Not checked: the carts were not identified.")
     return work.controller, work.controller.gains
@@ -129,12 +130,13 @@ def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
     if best is None:
         return Verdict(share=NONE, message="These gains cannot be simulated.")
     share, expected = best.share, _claimable(best.numbers)
+    unread = "".join(work.because_unread("feedback", name) for name in claims)
     return Verdict(
         share=share,
         models=best.models,
         message="The reported numbers match the gains."
         if share == 1
-        else f"Simulated on your carts with these gains: {does(best.numbers)}.",
+        else f"Simulated on your carts with these gains: {does(best.numbers)}.{unread}",
         expected=expected,
         found={name: float(v) for name, v in claims.items() if v is not None},
         agrees={
@@ -153,7 +155,8 @@ def judge_prefilter(criterion: asked.Prefilter, work: Work) -> Verdict:
     controller, gains = loop
     typed = controller.prefilter
     if typed is None:
-        return Verdict(share=NONE, message="No prefilter is reported.")
+        why = work.because_unread("feedback", "prefilter")
+        return Verdict(share=NONE, message=f"No prefilter is reported.{why}")
 
     def judged(numbers: LoopNumbers) -> tuple[Deviation, ...]:
         signed = typed if numbers.prefilter > 0 else -typed

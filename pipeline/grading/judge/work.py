@@ -90,6 +90,16 @@ class Work:
         """The reported numbers; empty if nothing is reported."""
         return self.submission.reported or Reported()
 
+    def why_unread(self, *at: str) -> str:
+        """Return why a number of `[reported]`, or its whole table, cannot be read; else ""."""
+        parts = {one.at[1:]: one.message for one in self.submission.unread}
+        return next((parts[at[:n]] for n in range(len(at) + 1) if at[:n] in parts), "")
+
+    def because_unread(self, *at: str) -> str:
+        """Return the reason as a further sentence, with a space before it; "" without a reason."""
+        why = self.why_unread(*at)
+        return f" Cannot be read: {why}." if why else ""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:

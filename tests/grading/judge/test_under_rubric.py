@@ -30,6 +30,7 @@ from pipeline.submission import (
     System,
     load_submission,
 )
+from pipeline.submission.models import Unread
 from pipeline.workflow import analyse
 
 RUN = Experiment(
@@ -84,6 +85,7 @@ FULL = Submission(
     students=Students(see="check"),
     folder=Path("somewhere"),
     discussion="Friction matters.",
+    unread=(Unread(at=("reported", "final", "K_2"), message="line 9: expected a number"),),
 )
 
 

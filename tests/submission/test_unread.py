@@ -1,0 +1,183 @@
+"""A reported number that cannot be read costs that number, and a table that table."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import SubmissionError
+from pipeline.grading.judge.run import grade_submission
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.simulated.submission import write_submission
+from pipeline.submission import Reported, Submission, load_submission
+from pipeline.submission.edit import edit_submission
+from pipeline.workflow import analyse
+from tests.helpers.commandline import cartlab_here
+
+TEXT = """\
+version = 1
+[system]
+carts = 2
+[reported.initial]
+K_1 = 25.6
+omega_a = 10.0
+[reported.final]
+K_1 = 24.3
+omega_a = 10.1
+zeta_a = 0.1
+[reported.state_space]
+A = [[0, 1, 0, 0], [-1, -2, 3, 0], [0, 0, 0, 1], [4, 0, -5, -6]]
+B = [0, 3196.70, 0, 0]
+[reported.feedback]
+gains = [1, 2, 3, 4]
+prefilter = 2.5
+"""
+ROWS = TEXT.replace("[[0, 1", "[\n  [0, 1").replace("], [", "],\n  [").replace("-6]]", "-6]\n]")
+
+
+def read(folder: Path, text: str) -> Submission:
+    (folder / "submission.toml").write_text(text, encoding="utf-8")
+    return load_submission(folder)
+
+
+def numbers(reported: Reported | None) -> set[str]:
+    """Return the dotted names of all reported numbers and matrices."""
+    reported = reported or Reported()
+    found = {f"{table}.{n}" for table in ("initial", "final") for n in getattr(reported, table)}
+    for table in ("state_space", "feedback"):
+        for name, value in getattr(reported, table) or ():
+            found |= {f"{table}.{name}"} if value not in (None, ()) else set()
+    return found
+
+
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        ("omega_a = 10,1", "line 9: a decimal comma; write a point: write omega_a = 10.1"),
+        ('omega_a = "n/a"', "line 9: reported.final.omega_a: expected a number, found 'n/a'"),
+        ("omega_a = n/a", "line 9: omega_a takes a number, written in digits; found omega_a = n/a"),
+        ("omega_a = nan", "line 9: reported.final.omega_a: expected a finite number, found NaN"),
+        ("omega_a = -inf", "expected a finite number, found -Infinity"),
+        ("omega_a = 10.1 rad/s", "without a unit or a formula: write omega_a = 10.1"),
+        ("omega_a = 10.1 ± 0.2", "only a number is allowed"),
+        ("omega_a =", "the value after = is missing"),
+        ("omega_a = [10.1]", "expected a number, found [10.1]"),
+        ("omega_a: 10.1", "there must be = between a name and its value: write omega_a = 10.1"),
+        ("omega_a = −10.1", "type the minus of the keyboard"),
+        ('omega_a = "10.1', "the quote is not closed"),
+        ("omega_a = 10.1\nomega_a = 10.2", "line 10: this name already has a value"),
+        (f"omega_a = {'1' * 5000}", "line 9: a number has too many digits"),
+        ("omega_a = 1e999999999999", "expected a number between 1e-30 and 1e+30"),
+        ("omega_A = 10.1", "unknown parameter; did you mean 'omega_a'?"),
+        ("ω_a = 10.1", "line 9: not valid TOML"),
+        ("omega a = 10.1", "line 9: there must be ="),
+    ],
+)
+def test_a_number_that_cannot_be_read_costs_this_number(tmp_path, typed, said):
+    """One mistyped number is left out, and its message has the line and what to write."""
+    whole = numbers(read(tmp_path, TEXT).reported)
+    found = read(tmp_path, TEXT.replace("omega_a = 10.1", typed))
+    assert whole - numbers(found.reported) == {"final.omega_a"}
+    (part,) = found.unread
+    assert part.at[:2] == ("reported", "final")
+    assert part.message.startswith("submission.toml line ")
+    assert said in part.message
+
+
+@pytest.mark.parametrize(
+    ("text", "lost"),
+    [
+        (TEXT.replace("-6]]", "-6]"), "state_space.A"),
+        (TEXT.replace("3, 0],", "3, 0,"), "state_space.A"),
+        (TEXT.replace("-2, 3, 0]", "-2,5 3, 0]"), "state_space.A"),
+        (TEXT.replace("[-1, -2, 3, 0]", "[-1 -2 3 0]"), "state_space.A"),
+        (TEXT.replace("[0, 0, 0, 1], ", ""), "state_space.A"),
+        (TEXT.replace("-2, 3, 0]", "-2, nan, 0]"), "state_space.A"),
+        (ROWS.replace("[-1, -2", "[-1, n/a"), "state_space.A"),
+        (ROWS.replace("[4, 0", "[n/a, 0"), "state_space.A"),
+        (ROWS.replace("-6]\n]", "-6]\n"), "state_space.A"),
+        (ROWS.replace("3, 0],", "3, 0]"), "state_space.A"),
+        (TEXT.replace("3196.70, 0, 0]", "3196.70, 0, 0"), "state_space.B"),
+        (TEXT.replace("gains = [1, 2, 3, 4]", "gains = [1, 2, 3, 4"), "feedback.gains"),
+        (TEXT.replace("gains = [1, 2, 3, 4]", "gains = 1, 2, 3, 4]"), "feedback.gains"),
+        (TEXT.replace("gains = [1, 2, 3, 4]", "gains = [1, 2, 3]"), "feedback.gains"),
+        (TEXT.replace("prefilter", "perfilter"), "feedback.prefilter"),
+    ],
+)
+def test_a_list_that_cannot_be_read_costs_this_list(tmp_path, text, lost):
+    """A matrix or list with a wrong bracket, comma or entry is left out; the rest is read."""
+    whole = numbers(read(tmp_path, TEXT).reported)
+    found = read(tmp_path, text)
+    assert whole - numbers(found.reported) == {lost}
+    assert len(found.unread) == 1
+
+
+@pytest.mark.parametrize(
+    "heading",
+    [
+        "[reported.final",
+        "reported.final]",
+        "[reported final]",
+        "(reported.final)",
+        "[reported.finl]",
+    ],
+)
+def test_a_table_that_cannot_be_read_costs_this_table(tmp_path, heading):
+    """A table with a wrong heading is left out; its numbers do not go to another table."""
+    whole = numbers(read(tmp_path, TEXT).reported)
+    found = read(tmp_path, TEXT.replace("[reported.final]", heading))
+    assert whole - numbers(found.reported) == {"final.K_1", "final.omega_a", "final.zeta_a"}
+    assert found.reported is not None
+    assert str(found.reported.initial["K_1"]) == "25.6"
+    (part,) = found.unread
+    assert part.message.startswith("submission.toml line 7: ")
+
+
+def test_all_numbers_may_be_unreadable(tmp_path):
+    """A table full of nan, and four kinds of mistakes, cost the numbers that have them."""
+    every = TEXT.replace("25.6", "nan").replace("10.0", "nan").replace("24.3", "nan")
+    found = read(tmp_path, every.replace("10.1", "inf").replace("0.1\n", "nan\n"))
+    assert len(found.unread) == 5
+    four = TEXT.replace("25.6", "25,6").replace("10.0", '"x"').replace("24.3", "nan")
+    found = read(tmp_path, four.replace("omega_a = 10.1", "omega_q = 10.1"))
+    at = {".".join(part.at[1:]) for part in found.unread}
+    assert at == {"initial.K_1", "initial.omega_a", "final.K_1", "final.omega_q"}
+
+
+def test_a_mistake_elsewhere_is_an_error_as_before(tmp_path):
+    """A mistake outside `[reported]` is an error, and its message lists the others too."""
+    text = TEXT.replace("carts = 2", "carts = 2,0").replace("10.1", "10,1")
+    with pytest.raises(SubmissionError) as told:
+        read(tmp_path, text)
+    assert [line.split(":")[0].split()[-1] for line in str(told.value).split("\n")] == ["3", "9"]
+
+
+def test_an_edit_still_needs_a_valid_file(tmp_path):
+    """A program does not edit a file with a number that cannot be read."""
+    read(tmp_path, TEXT.replace("10.1", '"n/a"'))
+    with pytest.raises(SubmissionError, match="expected a number, found 'n/a'"):
+        edit_submission(tmp_path, lambda document: document.update({"title": "t"}))
+
+
+def test_one_typo_costs_one_number_in_grading(tmp_path):
+    """With one decimal comma, the criterion says so; everything else is graded as before.
+
+    `report` and `check` say it too. The report goes on.
+    """
+    folder = tmp_path / "team-07"
+    write_submission(folder, "throne-1dof", seed=3, compact=True, reported=True)
+    toml = folder / "submission.toml"
+    head, final = toml.read_text("utf-8").split("[reported.final]")
+    line = next(line for line in final.split("\n") if line.startswith("omega_n = "))
+    text = f"{head}[reported.final]{final.replace(line, line.replace('.', ','), 1)}"
+    toml.write_text(text, "utf-8", newline="\n")
+    submission = load_submission(folder)
+    grade = grade_submission(submission, rubric=load_rubric(Path("throne-1dof")), name="t").grade
+    lost = {c.id: c for c in grade.criteria if c.points < c.out_of}
+    assert set(lost) == {"pieces", "final-frequencies"}
+    found = lost["final-frequencies"].message
+    assert f"a decimal comma; write a point: write {line}" in found
+    assert found.startswith("Cannot be read: omega_n: submission.toml line ")
+    assert [flag.code for flag in grade.flags] == ["missing"]
+    assert any("a decimal comma" in said for said in analyse(submission).warnings)
+    done = cartlab_here("check", folder)
+    assert "a decimal comma; write a point" in done.stderr
