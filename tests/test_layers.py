@@ -59,7 +59,7 @@ LEVELS = (
     ("grading.autograder",),
     ("desk",),
     ("desk.student", "desk.bench", "desk.grades", "desk.instructor"),
-    ("desk.app",),
+    ("desk.app", "desk.tasks"),
     ("schemas",),
     ("cli", "notebook"),
     ("__main__",),

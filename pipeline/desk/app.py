@@ -28,7 +28,7 @@ from pipeline.desk.grades import (
 from pipeline.desk.home import enter, open_place, show_folders, show_home
 from pipeline.desk.instructor import exercise_pages, rubric_editor, rubric_preview_page
 from pipeline.desk.scratch import clear_scratch
-from pipeline.desk.seeing import REFUSED, is_refused
+from pipeline.desk.seeing import REFUSED
 from pipeline.desk.served_files import serve_file, serve_static
 from pipeline.desk.student import (
     check_page,
@@ -84,7 +84,7 @@ async def _events(ask: Ask, place: Any) -> AsyncIterator[str]:
     while (job := ask.desk.jobs.of(place)) is not None:
         if job.version != version:
             version, quiet = job.version, 0.0
-            shown = ask.job or job
+            shown = await run_in_threadpool(lambda: ask.job) or job
             message = " ".join(ask.user.without_folders(shown.message).split())
             yield f"event: {'end' if job.over else 'stage'}\ndata: {message}\n\n"
         elif quiet > 5.0:  # s without an event; the line sent then keeps the connection open
@@ -268,16 +268,14 @@ def _answer(desk: Desk, handler: Handler, *, path: str) -> Callable[[Request], A
             form = await request.form(max_files=HAND_IN.members, max_fields=5_000)
         ask = Ask(desk=desk, user=user, request=request, form=form)
         try:
-            ask.require_place()
-            if room == "student" and is_refused(path, user, ask.place):
-                raise HTTPException(403, REFUSED)
-            if iscoroutinefunction(handler):
-                return await handler(ask)
             # A Stop must not wait until one of the shared threads is free, so it gets a thread of
             # its own.
             at_once = path.endswith(("/stop", "/press"))
             run = asyncio.to_thread if at_once else run_in_threadpool
-            return await run(handler, ask)
+            if iscoroutinefunction(handler):
+                await run(_admit, ask, path)
+                return await handler(ask)
+            return await run(lambda: (_admit(ask, path), handler(ask))[1])
         except PipelineError as error:
             return plain_error(ask, str(error), status=422)
         except OSError as error:
@@ -288,6 +286,13 @@ def _answer(desk: Desk, handler: Handler, *, path: str) -> Callable[[Request], A
             await form.close()
 
     return answer
+
+
+def _admit(ask: Ask, path: str) -> None:
+    """Refuse a request whose folder is gone, or that could show what the student must find."""
+    ask.require_place()
+    if ask.desk.seeing.is_refused(path, ask.user, ask.place):
+        raise HTTPException(403, REFUSED)
 
 
 def _explain(desk: Desk) -> Callable[[Request, Exception], Response]:

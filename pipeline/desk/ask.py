@@ -22,7 +22,7 @@ from pipeline.desk.books import Books
 from pipeline.desk.browse import find_root
 from pipeline.desk.jobs import Job, Jobs, WorkerPool
 from pipeline.desk.rooms import list_rooms
-from pipeline.desk.seeing import show_job
+from pipeline.desk.seeing import Seeing
 from pipeline.desk.users import Place, User, name_place
 from pipeline.errors import ConfigError
 from pipeline.processes import Failed
@@ -69,10 +69,14 @@ class Desk:
     benches: Benches = field(default_factory=Benches)
     books: Books = field(default_factory=Books)
     messages: dict[tuple[str, str], list[Message]] = field(default_factory=dict)
+    seeing: Seeing = field(init=False)
     # By folder: the files that the last downloaded zip contained, with their time and size.
     handed: dict[Path, dict[str, list[int]]] = field(default_factory=dict)
     _shown: dict[str, OrderedDict[str, str]] = field(default_factory=dict)
     _described: OrderedDict[Path, tuple[Stamp, dict[str, Any]]] = field(default_factory=OrderedDict)
+
+    def __post_init__(self) -> None:
+        self.seeing = Seeing(self.workers)
 
     def describe_files(
         self, folder: Path, stated: Callable[[str], dict[str, str | int]]
@@ -189,6 +193,11 @@ class Ask:
             )
 
     @property
+    def sees_check(self) -> bool:
+        """Whether the room shows this person the check instead of the report."""
+        return self.desk.seeing.sees_check(self.user, self.place)
+
+    @property
     def job(self) -> Job | None:
         """The last job in the place that the URL names.
 
@@ -197,7 +206,7 @@ class Ask:
         place = self.place
         if not isinstance(place, Path):
             return None
-        return show_job(self.desk.jobs.of(place), self.user, place)
+        return self.desk.seeing.show_job(self.desk.jobs.of(place), self.user, place)
 
     def start(self, task: str, *, title: str, **arguments: Any) -> None:
         """Start a long task in the folder that the URL names.

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import SubmissionError
-from pipeline.report.sections.answers import written_answer
 from pipeline.submission.load import MAX_NOTES_BYTES, NAME, file_problem, list_experiments
 from pipeline.submission.toml_file import read_text
 
@@ -23,16 +22,39 @@ PLOTS_OF = "report/plots.json"  # state of the sources of the plots
 
 
 def stat_sources(folder: Path) -> dict[str, list[int]]:
-    """Return time and size of every file from which a report is made.
+    """Return time and size of every file from which a report is made; only workers call this.
 
     The result also changes if a file is deleted or replaced by an older one.
     """
-    data = (path.relative_to(folder).as_posix() for path in (folder / "data").rglob("*"))
     named = (str(table.get("file", "")) for table in list_experiments(_read_document(folder)))
-    names = sorted({NAME, NOTES, "gap/gap.json", *data, *named})
-    present = [name for name in names if file_problem(folder, name) is None]
-    infos = {name: (folder / name).stat() for name in present}
-    return {name: [info.st_mtime_ns, info.st_size] for name, info in infos.items()}
+    return stat_files(folder, named)
+
+
+def stat_files(folder: Path, named: Iterable[str]) -> dict[str, list[int]]:
+    """Return time and size of the sources of a report; [] for each file that is missing.
+
+    Parameters
+    ----------
+    named : files that `submission.toml` names. A later change of these names changes the time of
+        `submission.toml`, so an earlier list is enough to notice it.
+    """
+    data = (path.relative_to(folder).as_posix() for path in (folder / "data").rglob("*"))
+    found = {}
+    for name in sorted({NAME, NOTES, "gap/gap.json", *data, *named}):
+        found[name] = []
+        if file_problem(folder, name) is None:
+            info = (folder / name).stat()
+            found[name] = [info.st_mtime_ns, info.st_size]
+    return found
+
+
+def is_unchanged(folder: Path, made_of: object, *, except_for: str = "") -> bool:
+    """Return whether the sources are those of an earlier `stat_sources`."""
+    if not isinstance(made_of, dict):
+        return False
+    now = stat_files(folder, made_of)
+    names = (now.keys() | made_of.keys()) - {except_for}
+    return all((now.get(name) or []) == (made_of.get(name) or []) for name in names)
 
 
 def find_state(folder: Path) -> str:
@@ -43,19 +65,17 @@ def find_state(folder: Path) -> str:
     """
     if file_problem(folder, "report/report.html") is not None:
         return "none"
-    made_of, now = _read_findings_file(folder).get("made_of"), stat_sources(folder)
-    if made_of == now:
+    made_of = _read_findings_file(folder).get("made_of")
+    if is_unchanged(folder, made_of):
         return "current"
-    if not isinstance(made_of, dict):
-        return "older"
-    return "answered" if {**made_of, NOTES: 0} == {**now, NOTES: 0} else "older"
+    return "answered" if is_unchanged(folder, made_of, except_for=NOTES) else "older"
 
 
 def plots_are_current(folder: Path) -> bool:
     """Return whether there are plots and their sources have not changed."""
     if file_problem(folder, PLOTS) is not None:
         return False
-    return _read_small(folder, PLOTS_OF).get("made_of") == stat_sources(folder)
+    return is_unchanged(folder, _read_small(folder, PLOTS_OF).get("made_of"))
 
 
 def read_findings(folder: Path) -> dict[str, Any]:
@@ -82,19 +102,6 @@ def _pick_assumptions(found: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]
 
 def _pick_texts(found: Iterable[Mapping[str, Any]], keys: Sequence[str]) -> list[dict[str, str]]:
     return [{key: str(one.get(key, "")) for key in keys} for one in found]
-
-
-def list_unanswered(folder: Path) -> list[dict[str, str]]:
-    """Return the questions of the last report that have no answer yet."""
-    try:
-        notes = read_notes(folder)
-    except SubmissionError:  # the report's page says what is wrong
-        notes = ""
-    return [
-        one
-        for one in read_findings(folder)["questions"]
-        if not written_answer(notes, one["id"]).strip()
-    ]
 
 
 def read_notes(folder: Path) -> str:

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -19,22 +18,19 @@ from pipeline.desk.exercises import (
     make_solution,
 )
 from pipeline.desk.last_report import FINDINGS, PLOTS_OF, stat_sources
+from pipeline.desk.student.folder_tasks import FOLDER_TASKS
 from pipeline.desk.typed import read_path
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.identify.springs import fill as fill_folder
-from pipeline.identify.springs import find_springs
 from pipeline.ingest.channels import never_changes
 from pipeline.ingest.columns import assign_columns
 from pipeline.ingest.fill import (
-    UNSURE,
     Found,
     data_files,
     examine_file,
-    experiment_doubts,
     hardly_moving,
     has_fractions,
     passed_over,
-    system_doubts,
 )
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.read import read_data
@@ -78,21 +74,6 @@ def list_not_read(folder: str, named: list[str], *, progress: Progress) -> list[
     """
     found = passed_over(Path(folder), named=named)
     return [{"file": one.file, "reason": one.remarks[0], "advice": one.advice} for one in found]
-
-
-def list_doubts(folder: str, *, progress: Progress) -> dict[str, Any]:
-    """Return what `submission.toml` marks as unsure, and springs that the data do not determine.
-
-    The keys are `system` (the doubt about each key of `[system]`), `springs` (numbers of the
-    springs, from 1) and `experiments` (the doubts in each table).
-    """
-    system = system_doubts(Path(folder))
-    asked = "springs" in system
-    return {
-        "system": {key: doubt.removeprefix(UNSURE) for key, doubt in system.items()},
-        "springs": find_springs(load_submission(Path(folder))).open if asked else (),
-        "experiments": experiment_doubts(Path(folder)),
-    }
 
 
 def fill_tables(folder: str, *, progress: Progress) -> list[dict[str, Any]]:
@@ -207,17 +188,6 @@ def check_numbers(folder: str, rubric: str, where: list[str], *, progress: Progr
     check(load_submission(Path(folder)), rubric=asked, where=where, progress=progress)
 
 
-def unpack_upload(archive: str, into: str, *, progress: Progress) -> list[str]:
-    """Unpack an uploaded zip within the limits of a hand-in; return the names of its files."""
-    from pipeline.grading.intake.unpack import HAND_IN, unpack
-
-    target = Path(into)
-    shutil.rmtree(target, ignore_errors=True)
-    if refused := unpack(Path(archive), target, limits=HAND_IN):
-        raise SubmissionError(next(iter(refused.values())))
-    return sorted(p.relative_to(target).as_posix() for p in target.rglob("*") if p.is_file())
-
-
 def propose_recordings(folder: str, stock: bool, *, progress: Progress) -> str:
     """Write plan.toml, or add recordings to it; return the reason if nothing can be planned."""
     from pipeline.experiments.propose import make_plan
@@ -324,10 +294,10 @@ def preview_rubric(folder: str, text: str, *, progress: Progress) -> dict[str, A
 TASKS: Mapping[str, Callable[..., Any]] = {
     task.__name__: task
     for task in (
-        describe_file, list_files, list_not_read, list_doubts, fill_tables, make_report, make_gap,
-        check_numbers, unpack_upload, propose_recordings, weigh_recording, publish_grades,
-        regrade_class, preview_rubric, check_exercise, draw_effect, make_exercises,
-        make_solution, describe_exercise, make_plots,
+        *FOLDER_TASKS, describe_file, list_files, list_not_read, fill_tables, make_report, make_gap,
+        check_numbers, propose_recordings, weigh_recording, publish_grades, regrade_class,
+        preview_rubric, check_exercise, draw_effect, make_exercises, make_solution,
+        describe_exercise, make_plots,
     )
 }  # fmt: skip
 

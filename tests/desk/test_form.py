@@ -8,13 +8,14 @@ import tomlkit
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.desk.student.folder_tasks import read_document
 from pipeline.desk.student.form import (
+    Fault,
     Field,
     fill_experiment,
     fill_form,
     find_changes,
     mark_errors,
-    read_document,
     write_fields,
 )
 from pipeline.errors import SubmissionError
@@ -154,7 +155,7 @@ def test_an_error_is_shown_at_its_field(path, value, wrong):
     write_fields(document, now)
     with pytest.raises(SubmissionError) as error:
         parse_submission(tomlkit.dumps(document), folder=EXAMPLES / "two-cart")
-    shown, left = mark_errors(tuple(fields(WHOLE).values()), now, error.value)
+    shown, left = mark_errors(tuple(fields(WHOLE).values()), now, Fault.of(error.value))
     assert {field.path: wrong in field.wrong for field in shown if field.wrong} == {path: True}
     assert left == []
 

@@ -22,7 +22,7 @@ from pipeline.desk.jobs import WorkerPool
 from pipeline.desk.last_report import stat_sources
 from pipeline.desk.student import files as uploads
 from pipeline.desk.student.files import take_uploads
-from pipeline.desk.tasks import make_report
+from pipeline.desk.tasks import TASKS, make_report
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.ingest.formats.recognise import parse_table
@@ -63,6 +63,17 @@ def workers():
     workers = WorkerPool()
     yield workers
     workers.close()
+
+
+@pytest.fixture
+def worker_here():
+    """Return a worker in this process, in which a test can change limits."""
+
+    class Here:
+        def do(self, task: str, **arguments):
+            return TASKS[task](**arguments, progress=silent)
+
+    return Here()
 
 
 def take_upload(name: str, content: io.BytesIO, folder: Path, *, workers: WorkerPool) -> list[str]:
@@ -716,31 +727,31 @@ def test_an_uploaded_archive_must_obey_the_limits(tmp_path, workers):
     assert [path.name for path in tmp_path.rglob("*.csv")] == ["a.csv"]
 
 
-def test_a_folder_accepts_files_up_to_the_limits(tmp_path, workers, monkeypatch):
+def test_a_folder_accepts_files_up_to_the_limits(tmp_path, worker_here, monkeypatch):
     """A folder accepts files up to the limits on a submission's size and number of files."""
     monkeypatch.setattr(uploads, "MAX_DATA_BYTES", 10)
     (tmp_path / "whole").mkdir()
-    (said,) = take_upload("a.csv", io.BytesIO(b"x" * 11), tmp_path, workers=workers)
+    (said,) = take_upload("a.csv", io.BytesIO(b"x" * 11), tmp_path, workers=worker_here)
     assert "larger than 10 bytes" in said
     limits = uploads.HAND_IN.__class__(members=2, total=15)
     monkeypatch.setattr(uploads, "HAND_IN", limits)
-    assert take_upload("a.csv", io.BytesIO(b"x" * 10), tmp_path, workers=workers) == []
-    (said,) = take_upload("b.csv", io.BytesIO(b"y" * 6), tmp_path, workers=workers)
+    assert take_upload("a.csv", io.BytesIO(b"x" * 10), tmp_path, workers=worker_here) == []
+    (said,) = take_upload("b.csv", io.BytesIO(b"y" * 6), tmp_path, workers=worker_here)
     assert "at most 2 files and 15 bytes" in said
     three = [(f"{n}.csv", io.BytesIO(b"123456"[:n])) for n in (4, 5, 6)]
-    (said,) = take_uploads(three, tmp_path / "whole", workers=workers)
+    (said,) = take_uploads(three, tmp_path / "whole", workers=worker_here)
     assert said.text.startswith("'6.csv': not uploaded: a submission has at most 2 files")
 
 
-def test_files_outside_the_zip_do_not_count_towards_the_limits(tmp_path, workers, monkeypatch):
+def test_files_outside_the_zip_do_not_count_towards_the_limits(tmp_path, worker_here, monkeypatch):
     """Files that will not be in the zip do not count towards the limits on a folder."""
     for name in ("set-aside/old.csv", "report/report.html", "gap/gap.json", "raw/session-1/a.bin"):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).write_bytes(bytes(100))
     monkeypatch.setattr(uploads, "HAND_IN", uploads.HAND_IN.__class__(members=2, total=50))
     (tmp_path / "notes.md").write_bytes(b"So.")
-    assert take_upload("a.csv", io.BytesIO(b"x"), tmp_path, workers=workers) == []
-    (said,) = take_upload("b.csv", io.BytesIO(b"y"), tmp_path, workers=workers)
+    assert take_upload("a.csv", io.BytesIO(b"x"), tmp_path, workers=worker_here) == []
+    (said,) = take_upload("b.csv", io.BytesIO(b"y"), tmp_path, workers=worker_here)
     assert "at most 2 files" in said
 
 

@@ -1,9 +1,11 @@
-"""Store uploaded files in `data/`, within the limits of a hand-in; never overwrite another file."""
+"""Store uploaded files in `data/`, within the limits of a hand-in; never overwrite another file.
+
+Only workers read the files; the desk itself copies their bytes.
+"""
 
 import re
 import shutil
-from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
@@ -13,7 +15,7 @@ from pipeline.desk.jobs import WorkerPool
 from pipeline.desk.scratch import scratch_folder
 from pipeline.desk.student.handin import BESIDE
 from pipeline.errors import SubmissionError
-from pipeline.grading.intake.unpack import HAND_IN, is_debris
+from pipeline.grading.intake.unpack import HAND_IN, is_debris, unpack
 from pipeline.ingest.formats.recognise import ENDINGS
 from pipeline.lock import lock_when_free
 from pipeline.output import own_folder, write_file
@@ -37,31 +39,48 @@ _ASIDE = "set-aside"  # folder for recordings that are not part of the submissio
 def take_uploads(
     sent: Iterable[tuple[str, BinaryIO]], folder: Path, *, workers: WorkerPool
 ) -> list[Message]:
-    """Store uploaded files and the content of zip files.
+    """Let a worker store uploaded files; return messages about unexpected results."""
+    names = []
+    with scratch_folder() as scratch:
+        for number, (name, content) in enumerate(sent):
+            names.append(name)
+            with (scratch / str(number)).open("xb") as file:
+                shutil.copyfileobj(content, file)
+        try:
+            lines = workers.do("store_files", folder=str(folder), names=names, scratch=str(scratch))
+        except Failed as error:
+            return [
+                Message(f"Your files were not uploaded, or not all of them: {error}", "refused")
+            ]
+    return [Message(**line) for line in lines]
 
-    Return messages about unexpected results.
+
+def store(names: Sequence[str], scratch: Path, folder: Path) -> list[Message]:
+    """Store files and the content of zip files; return messages about unexpected results.
+
+    Parameters
+    ----------
+    names : the names as sent; the content of the first file is `0` in `scratch`, and so on.
     """
     messages: list[Message | None] = []
-    with scratch_folder() as scratch:
-        files: list[tuple[str, BinaryIO | Path]] = []
-        for number, (name, content) in enumerate(sent):
-            if PurePosixPath(name.replace("\\", "/")).suffix.lower() != ".zip":
-                files.append((name, content))
-                continue
+    found: list[tuple[str, Path]] = []
+    for number, name in enumerate(names):
+        content = scratch / str(number)
+        if PurePosixPath(name.replace("\\", "/")).suffix.lower() != ".zip":
+            found.append((name, content))
+            continue
+        try:
+            found += _unpack(content, scratch / f"{number}-files")
+        except SubmissionError as error:
+            messages.append(_refuse(name, error))
+    with lock_when_free(folder):
+        room = _Room(folder)
+        for name, path in found:
             try:
-                files += _unpack(content, scratch / str(number), workers=workers)
-            except (SubmissionError, Failed) as error:
+                with path.open("rb") as file:
+                    messages.append(_take(name, file.read(MAX_DATA_BYTES + 1), folder, room=room))
+            except SubmissionError as error:
                 messages.append(_refuse(name, error))
-        with lock_when_free(folder):
-            room = _Room(folder)
-            for name, source in files:
-                try:
-                    with _open(source) as file:
-                        messages.append(
-                            _take(name, file.read(MAX_DATA_BYTES + 1), folder, room=room)
-                        )
-                except SubmissionError as error:
-                    messages.append(_refuse(name, error))
     return [line for line in messages if line]
 
 
@@ -69,17 +88,17 @@ def _refuse(name: str, error: Exception) -> Message:
     return Message(f"{quote(name)}: not uploaded: {error}", "refused")
 
 
-def _open(source: BinaryIO | Path) -> AbstractContextManager[BinaryIO]:
-    return source.open("rb") if isinstance(source, Path) else nullcontext(source)
-
-
-def _unpack(content: BinaryIO, scratch: Path, *, workers: WorkerPool) -> list[tuple[str, Path]]:
-    scratch.mkdir()
-    archive, into = scratch / "upload.zip", scratch / "files"
-    with archive.open("xb") as file:
-        shutil.copyfileobj(content, file)
-    members = workers.do("unpack_upload", archive=str(archive), into=str(into))
-    return [(name, into / name) for name in members if not is_debris(PurePosixPath(name))]
+def _unpack(archive: Path, into: Path) -> list[tuple[str, Path]]:
+    """Unpack a zip within the limits of a hand-in; return the names and paths of its files."""
+    if refused := unpack(archive, into, limits=HAND_IN):
+        raise SubmissionError(next(iter(refused.values())))
+    files = sorted(path for path in into.rglob("*") if path.is_file())
+    names = [path.relative_to(into) for path in files]
+    return [
+        (name.as_posix(), path)
+        for name, path in zip(names, files, strict=True)
+        if not is_debris(PurePosixPath(name.as_posix()))
+    ]
 
 
 class _Room:

@@ -6,7 +6,6 @@ supplies the help and the type of each field.
 """
 
 import re
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -57,6 +56,27 @@ _OF_LOOP = (
 _OF_CONTROLLER = {
     "state_feedback": ("gains", "prefilter"), "pid": ("kp", "ki", "kd", "scale", "cart"),
 }  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fault:
+    """Why `submission.toml` is refused, as plain data.
+
+    Attributes
+    ----------
+    text : the message.
+    problems : the first problems, each with the path of its key; () if they have no keys.
+    """
+
+    text: str
+    problems: Sequence[tuple[str, str]] = ()
+
+    @classmethod
+    def of(cls, error: SubmissionError) -> "Fault":
+        """Return the fault that an error describes."""
+        problems = error.problems if isinstance(error, InvalidSubmission) else ()
+        located = tuple((".".join(map(str, at)), what) for at, what in problems)
+        return cls(text=str(error), problems=located)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,14 +139,6 @@ class Group:
     def open(self) -> bool:
         """Whether the group is shown open, because something is missing or wrong in it."""
         return bool(self.missing) or any(field.wrong for field in self.fields)
-
-
-def read_document(text: str) -> dict[str, Any]:
-    """Return the tables of a file with numbers as typed text; {} if it is not valid TOML."""
-    try:
-        return tomllib.loads(text, parse_float=str)  # type: ignore[arg-type]
-    except (tomllib.TOMLDecodeError, RecursionError, ValueError):
-        return {}
 
 
 def fill_form(document: Mapping[str, Any]) -> list[Group]:
@@ -222,17 +234,15 @@ def find_changes(fields: Iterable[Field], form: Mapping[str, Any], values: Any) 
 
 
 def mark_errors(
-    fields: Sequence[Field], changed: Sequence[Field], error: SubmissionError | None
+    fields: Sequence[Field], changed: Sequence[Field], fault: Fault | None
 ) -> tuple[tuple[Field, ...], list[str]]:
     """Return the fields with their typed values and problems; list other problems separately."""
     now = {field.path: field for field in changed}
     shown = [now.get(field.path, field) for field in fields]
     left: list[str] = []
-    problems = error.problems if isinstance(error, InvalidSubmission) else ()
-    if error is not None and not problems:
-        left.append(str(error))
-    for location, what in problems:
-        path = ".".join(map(str, location))
+    if fault is not None and not fault.problems:
+        left.append(fault.text)
+    for path, what in fault.problems if fault else ():
         place = next((i for i, f in enumerate(shown) if f"{path}.".startswith(f"{f.path}.")), None)
         if place is None:
             left.append(what)

@@ -1,8 +1,9 @@
-"""Make the zip to hand in: the files that the submission names, and nothing else."""
+"""The files to hand in: those that the submission names, and nothing else.
 
-import io
+Only workers call this, because it reads the submission.
+"""
+
 import os
-import zipfile
 from pathlib import Path
 
 from pipeline.desk.last_report import NOTES, find_state
@@ -14,26 +15,6 @@ from pipeline.submission.load import NAME, file_problem
 _REPORT = "report/report.pdf"
 BESIDE = (NOTES, CHECKS, _REPORT)
 _MADE = ("report", "gap", "solution")  # folders of computed results, which contain no recordings
-
-
-def pack(folder: Path, *, report: bool = True) -> bytes:
-    """Return the zip of a submission.
-
-    Parameters
-    ----------
-    report : whether to include the report if it is up to date.
-
-    Raises
-    ------
-    SubmissionError : the submission is not valid, or lacks a file that it names.
-    """
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in list_held(folder, report=report):
-            # A fixed date, so that the same files give the same bytes.
-            info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
-            archive.writestr(info, (folder / name).read_bytes(), zipfile.ZIP_DEFLATED)
-    return buffer.getvalue()
 
 
 def list_held(folder: Path, *, report: bool = True) -> list[str]:

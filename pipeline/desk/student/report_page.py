@@ -2,19 +2,14 @@
 
 from collections.abc import Mapping
 
-import tomlkit
 from starlette.responses import Response
 
 from pipeline.desk.ask import Ask
-from pipeline.desk.last_report import NOTES, read_findings, read_notes
-from pipeline.desk.student.form import read_document, sign_fields, write_fields
+from pipeline.desk.last_report import NOTES, read_findings
+from pipeline.desk.student.form import sign_fields
 from pipeline.desk.student.room import Room, read_room
-from pipeline.errors import SubmissionError
-from pipeline.lock import lock_when_free
-from pipeline.output import write_file
-from pipeline.report.sections.answers import with_answer, written_answer
-from pipeline.submission.edit import Outdated, edit_submission, text_digest
-from pipeline.submission.load import MAX_NOTES_BYTES, file_problem, list_experiments
+from pipeline.processes import Failed
+from pipeline.submission.load import file_problem, list_experiments
 from pipeline.words.numbers import abridge
 
 
@@ -38,44 +33,38 @@ def answer(ask: Ask) -> Response:
     """Write the answer to a question into `notes.md`; if it is refused, show it again as typed."""
     folder, id_, words = ask.folder(), ask.text("id"), ask.text("answer")
     try:
-        with lock_when_free(folder):
-            notes = read_notes(folder)
-            if ask.text("seen") != text_digest(notes):
-                return ask.page(
-                    "outdated",
-                    status=409,
-                    title=f"{NOTES} was changed meanwhile",
-                    name=NOTES,
-                    text=notes,
-                    changed=[(f"Answer to {id_}", words, "")],
-                    had="You typed",
-                    back=f"{ask.here}questions",
-                )
-            if id_ not in [one["id"] for one in read_findings(folder)["questions"]]:
-                raise SubmissionError(f"the report has no question {id_!r}")
-            new = with_answer(notes, id_, words)
-            if len(new.encode()) > MAX_NOTES_BYTES:
-                raise SubmissionError(f"{NOTES} would exceed {MAX_NOTES_BYTES:,} bytes")
-            write_file(folder / NOTES, new)
-    except SubmissionError as error:
+        notes = ask.desk.workers.do(
+            "answer_question", folder=str(folder), id_=id_, words=words, seen=ask.text("seen")
+        )
+    except Failed as error:
         return _show_questions(ask, status=422, refused={id_: (words, str(error))})
+    if notes is not None:
+        return ask.page(
+            "outdated",
+            status=409,
+            title=f"{NOTES} was changed meanwhile",
+            name=NOTES,
+            text=notes,
+            changed=[(f"Answer to {id_}", words, "")],
+            had="You typed",
+            back=f"{ask.here}questions",
+        )
     place = f"question-{id_}"
     return ask.back(f"{ask.here}questions#{place}", "Written into notes.md.", place=place)
 
 
 def state_signs(ask: Ask) -> Response:
     """Write the sign of the input into the tables of runs whose sign the report reversed."""
-    signs = read_findings(ask.folder())["turned"]
-
-    def change(document: tomlkit.TOMLDocument) -> None:
-        write_fields(document, sign_fields(document, signs))
-
-    try:
-        edit_submission(ask.folder(), change, seen=ask.text("seen") or "nothing")
-    except SubmissionError as error:
-        return _show_questions(
-            ask, status=409 if isinstance(error, Outdated) else 422, sign_error=error
-        )
+    folder = ask.folder()
+    found = ask.desk.workers.do(
+        "edit_file",
+        folder=str(folder),
+        seen=ask.text("seen"),
+        signs=read_findings(folder)["turned"],
+    )
+    if "fault" in found:
+        status = 409 if "outdated" in found else 422
+        return _show_questions(ask, status=status, sign_error=found["fault"]["text"])
     return ask.back(f"{ask.here}questions#question-sign", "Saved.", place="question-sign")
 
 
@@ -84,7 +73,7 @@ def _show_questions(
     *,
     status: int = 200,
     refused: Mapping[str, tuple[str, str]] = {},
-    sign_error: SubmissionError | None = None,
+    sign_error: str = "",
 ) -> Response:
     """Show the questions.
 
@@ -95,13 +84,10 @@ def _show_questions(
     """
     folder, room = ask.folder(), read_room(ask)
     findings = read_findings(folder)
-    problems, notes = [why for _, why in refused.values()], ""
-    if sign_error:
-        problems.append(str(sign_error))
-    try:
-        notes = read_notes(folder)
-    except SubmissionError as error:
-        problems = [str(error)]
+    found = ask.desk.workers.do("read_questions", folder=str(folder), ids=list(refused))
+    problems = [why for _, why in refused.values()] + [sign_error] * bool(sign_error)
+    if found["problem"]:
+        problems = [found["problem"]]
     questions, known = [], [one["id"] for one in findings["questions"]]
     others = [
         {"id": id_, "section": "", "text": f"Answer to {id_}"}
@@ -109,7 +95,7 @@ def _show_questions(
         if id_ not in known
     ]
     for one in [*findings["questions"], *others]:
-        words, why = refused.get(one["id"]) or (written_answer(notes, one["id"]), "")
+        words, why = refused.get(one["id"]) or (found["answers"][one["id"]], "")
         questions.append({**one, "answer": words, "wrong": why})
     return ask.page(
         "questions",
@@ -119,13 +105,13 @@ def _show_questions(
         questions=questions,
         signs=_list_signs(room),
         problems=problems,
-        seen=text_digest(notes),
+        seen=found["seen"],
     )
 
 
 def _list_signs(room: Room) -> str:
     """Return, as text, the signs that one click writes and their runs; "" for no signs."""
-    document, signs = read_document(room.text), room.findings["turned"]
+    document, signs = room.document, room.findings["turned"]
     tables = list_experiments(document)
     open_: dict[str, list[str]] = {}
     for field in sign_fields(document, signs):

@@ -2,23 +2,22 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from pipeline.desk import last_report
 from pipeline.desk.ask import Ask
-from pipeline.desk.seeing import sees_check
-from pipeline.desk.student.check_state import find_check_state
 from pipeline.desk.student.doubts import NO_DOUBTS, ask_doubts
-from pipeline.desk.student.form import Field, Group, fill_form, mark_errors, read_document
+from pipeline.desk.student.form import Fault, Field, Group, fill_form, mark_errors
 from pipeline.desk.student.rows import Row, list_rows
 from pipeline.desk.student.summaries import summarise
 from pipeline.desk.student.way import Facts, Step, find_steps, next_step
-from pipeline.errors import SubmissionError
-from pipeline.ingest.fill import UNSURE
 from pipeline.processes import Failed
-from pipeline.submission.edit import submission_text, text_digest
-from pipeline.submission.load import NAME, parse_submission
+from pipeline.submission.edit import text_digest
+from pipeline.submission.load import NAME
+
+_UNREADABLE: Mapping[str, Any] = {
+    "text": "", "document": {}, "doubts": None, "keeps": [], "unanswered": [], "checked": None,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +27,9 @@ class Room:
     Attributes
     ----------
     text : text of `submission.toml`; "" if the file is missing.
+    document : the tables in it, with numbers as typed text.
+    keeps : why a valid submission cannot be handed in yet.
+    unanswered : the questions of the last report without an answer.
     rows : one row for each recording.
     groups : groups of the set-up; empty if the file cannot be read.
     wrong : problems of the file that belong to no field.
@@ -36,6 +38,9 @@ class Room:
     """
 
     text: str
+    document: Mapping[str, Any]
+    keeps: Sequence[str]
+    unanswered: Sequence[Mapping[str, str]]
     rows: tuple[Row, ...]
     groups: tuple[Group, ...]
     wrong: tuple[str, ...]
@@ -58,31 +63,28 @@ class Room:
         return next_step(self.steps)
 
 
-def read_room(
-    ask: Ask, *, changed: Sequence[Field] = (), error: SubmissionError | None = None
-) -> Room:
+def read_room(ask: Ask, *, changed: Sequence[Field] = (), fault: Fault | None = None) -> Room:
     """Return the data of the room that the URL names.
 
     Parameters
     ----------
     changed : fields that could not be written, as typed.
-    error : why the fields could not be written.
+    fault : why the fields could not be written.
     """
-    folder, text = ask.folder(), ""
+    folder, sees_check = ask.folder(), ask.sees_check
     try:
-        text = submission_text(folder) if (folder / NAME).exists() else ""
-    except SubmissionError as unreadable:
-        error = unreadable
-    document = read_document(text)
+        found = ask.desk.workers.do("read_folder", folder=str(folder), check=sees_check)
+    except Failed as error:  # the page still takes a new file
+        found = {**_UNREADABLE, "fault": {"text": f"{NAME}: cannot be read ({error})"}}
+    text, document, doubts = found["text"], found["document"], found["doubts"] or NO_DOUBTS
     ask.desk.keep_shown(text, digest=text_digest(text), to=ask.user.name)
-    if error is None and text:
-        error = _find_error(text, folder)
-    doubts = _list_doubts(ask, folder) if UNSURE in text else NO_DOUBTS
+    if fault is None and found["fault"]:
+        fault = Fault(**found["fault"])
     rows = list_rows(ask, folder, document, doubts=doubts["experiments"])
     form = fill_form(document)
     every = [f for group in form for f in group.fields] + [f for row in rows for f in row.fields]
-    shown, left = mark_errors(every, changed, error)
-    check = find_check_state(folder) if sees_check(ask.user, ask.folder()) else None
+    shown, left = mark_errors(every, changed, fault)
+    check = tuple(found["checked"]) if found["checked"] else None
     report = "none" if check else last_report.find_state(folder)
     findings = last_report.NO_FINDINGS if check else last_report.read_findings(folder)
     asked = ask_doubts(
@@ -98,6 +100,9 @@ def read_room(
     job = ask.desk.jobs.of(folder)
     return Room(
         text=text,
+        document=document,
+        keeps=found["keeps"],
+        unanswered=found["unanswered"],
         rows=tuple(rows),
         groups=tuple(groups),
         wrong=tuple(left),
@@ -106,28 +111,12 @@ def read_room(
             recordings=sum(row.is_recording for row in rows),
             to_look_at=sum(row.needs_a_person for row in rows),
             missing=tuple(group.title for group in groups if group.missing),
-            sound=bool(text) and error is None,
+            sound=bool(text) and fault is None,
             report=report,
             making=bool(job and not job.over and job.task[0] == "make_report"),
             questions=len(findings["questions"]),
-            unanswered=0 if check else len(last_report.list_unanswered(folder)),
-            handed=ask.desk.handed.get(folder) == last_report.stat_sources(folder),
+            unanswered=len(found["unanswered"]),
+            handed=last_report.is_unchanged(folder, ask.desk.handed.get(folder)),
             check=check,
         ),
     )
-
-
-def _list_doubts(ask: Ask, folder: Path) -> Mapping[str, Any]:
-    try:
-        return ask.desk.workers.do("list_doubts", folder=str(folder))
-    except Failed:  # the page says what is wrong with the file
-        return NO_DOUBTS
-
-
-def _find_error(text: str, folder: Path) -> SubmissionError | None:
-    """Return what is wrong with the stored file, or None."""
-    try:
-        parse_submission(text, folder=folder)
-    except SubmissionError as error:
-        return error
-    return None

@@ -1,40 +1,34 @@
 """The student's room: files, form, zip. The files in the folder are the only stored state."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import tomlkit
 from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
-from starlette.responses import Response
+from starlette.responses import FileResponse, Response
+from starlette.types import Receive, Scope, Send
 
 from pipeline.desk import last_report
 from pipeline.desk.ask import Ask, Message
-from pipeline.desk.seeing import sees_check
-from pipeline.desk.student.files import put_aside, take_uploads
+from pipeline.desk.scratch import scratch_folder
+from pipeline.desk.student.files import take_uploads
 from pipeline.desk.student.form import (
+    Fault,
     Field,
-    clear_marks,
     fill_experiment,
     fill_form,
     find_changes,
-    read_document,
     read_value,
-    remove_experiment,
-    write_fields,
 )
-from pipeline.desk.student.handin import list_held, list_missing, pack
 from pipeline.desk.student.room import Room, read_room
 from pipeline.desk.student.rows import describe_all, gather_remarks, group_rows
 from pipeline.desk.typed import read_whole_number
-from pipeline.errors import SubmissionError
-from pipeline.lock import lock_when_free
 from pipeline.processes import Failed
-from pipeline.submission.edit import Outdated, edit_submission, submission_text
 from pipeline.submission.load import NAME, file_problem, list_experiments, posix
 from pipeline.words.numbers import by_note, count
 
@@ -57,13 +51,9 @@ def upload(ask: Ask) -> Response:
 def set_aside(ask: Ask) -> Response:
     """Move a recording that no table names out of `data/`."""
     folder, file = ask.folder(), ask.text("file")
-    if file not in ask.desk.workers.do("list_files", folder=str(folder)):
+    message = ask.desk.workers.do("set_aside", folder=str(folder), file=file)
+    if message is None:
         raise HTTPException(404, "there is no such recording")
-    with lock_when_free(folder):
-        document = read_document(submission_text(folder) if (folder / NAME).exists() else "")
-        if any(posix(str(table.get("file", ""))) == file for table in list_experiments(document)):
-            raise SubmissionError(f"{file}: {NAME} uses it; remove it there first")
-        message = put_aside(file, folder)
     return _go_back(ask, [Message(message)], _FILES)
 
 
@@ -76,24 +66,19 @@ def save(ask: Ask) -> Response:
     """Write the form into `submission.toml`."""
     fields = [field for group in fill_form(_read_shown(ask)) for field in group.fields]
     changed = find_changes(fields, ask.form, ask.form.getlist)
-    return _edit(ask, lambda document: write_fields(document, changed), changed, place=_SET_UP)
+    return _edit(ask, changed, place=_SET_UP)
 
 
 def save_experiment(ask: Ask) -> Response:
     """Write one row of the list of recordings into `submission.toml`, or remove its table."""
     index = ask.request.path_params["index"]
     if ask.text("remove"):
-        return _edit(ask, lambda document: remove_experiment(document, index), (), place=_FILES)
+        return _edit(ask, (), place=_FILES, remove=index)
     shown = _read_shown(ask)
     changed = find_changes(fill_experiment(shown, index), ask.form, ask.form.getlist)
     says_carts = any(field.path.endswith(".carts") for field in changed)
-    answered = _list_doubts(ask, shown, index) if says_carts else ()
-
-    def change(document: tomlkit.TOMLDocument) -> None:
-        write_fields(document, changed)
-        clear_marks(document, index, answered)
-
-    return _edit(ask, change, changed, place=_FILES)
+    doubts = [(index, _list_doubts(ask, shown, index))] if says_carts else []
+    return _edit(ask, changed, place=_FILES, doubts=doubts)
 
 
 def answer_together(ask: Ask) -> Response:
@@ -110,19 +95,13 @@ def answer_together(ask: Ask) -> Response:
         for field in fill_experiment(shown, number)
         if field.path.endswith(".carts")
     ]
-    answered = {number: _list_doubts(ask, shown, number) for number in numbers}
-
-    def change(document: tomlkit.TOMLDocument) -> None:
-        write_fields(document, changed)
-        for number, doubts in answered.items():
-            clear_marks(document, number, doubts)
-
-    return _edit(ask, change, changed, place=_FILES)
+    doubts = [(number, _list_doubts(ask, shown, number)) for number in numbers]
+    return _edit(ask, changed, place=_FILES, doubts=doubts)
 
 
 def start_hand_in(ask: Ask) -> Response:
     """Make the report again if a source has changed; then show the hand-in page."""
-    if not sees_check(ask.user, ask.folder()) and last_report.find_state(ask.folder()) != "current":
+    if not ask.sees_check and last_report.find_state(ask.folder()) != "current":
         ask.start("make_report", title="The report")
     return ask.back(f"{ask.here}hand-in")
 
@@ -130,39 +109,62 @@ def start_hand_in(ask: Ask) -> Response:
 def show_hand_in(ask: Ask) -> Response:
     """Show what is done, what is missing, what was assumed, and the content of the zip."""
     folder, room = ask.folder(), read_room(ask)
-    keeps = list_missing(folder)
-    names = [] if keeps else list_held(folder, report=not sees_check(ask.user, ask.folder()))
+    files = [] if room.keeps else _do(ask, "list_hand_in", report=not room.facts.check)
     return ask.page(
         "handin",
         title=f"Hand in: {folder.name}",
         room=room,
-        keeps=keeps,
-        files=[(name, (folder / name).stat().st_size) for name in names],
-        unanswered=[] if room.facts.check else last_report.list_unanswered(folder),
+        keeps=room.keeps,
+        files=files,
+        unanswered=room.unanswered,
         authors=_list_authors(room),
     )
 
 
 def download_hand_in(ask: Ask) -> Response:
     """Return the zip."""
-    name = f"{ask.folder().name}.zip"
+    folder = ask.folder()
+    name = f"{folder.name}.zip"
     # A name in plain letters; the real name follows in the form of RFC 5987.
     plain = re.sub(r"[^A-Za-z0-9_.-]", "-", name)
     disposition = f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name, safe='')}"
     headers = {"Content-Disposition": disposition}
-    made_of = last_report.stat_sources(ask.folder())
-    packed = pack(ask.folder(), report=not sees_check(ask.user, ask.folder()))
-    ask.desk.handed[ask.folder()] = made_of
-    return Response(packed, media_type="application/zip", headers=headers)
+    with ExitStack() as scratch:
+        packed = scratch.enter_context(scratch_folder()) / "hand-in.zip"
+        made_of = _do(ask, "pack_hand_in", into=str(packed), report=not ask.sees_check)
+        ask.desk.handed[folder] = made_of
+        return _Temporary(packed, scratch.pop_all(), headers=headers)
 
 
 # ------------------------------------------------------------------------------- parts
 
 
+class _Temporary(FileResponse):
+    """A zip file that is removed when it was sent, or when the connection is lost."""
+
+    def __init__(self, path: Path, scratch: ExitStack, *, headers: Mapping[str, str]) -> None:
+        super().__init__(path, media_type="application/zip", headers=headers)
+        self._scratch = scratch
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the file, then remove it."""
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._scratch.close()
+
+
+def _do(ask: Ask, task: str, **arguments: Any) -> Any:
+    """Let a worker do a task in the folder that the URL names."""
+    return ask.desk.workers.do(task, folder=str(ask.folder()), **arguments)
+
+
 def _read_shown(ask: Ask) -> dict[str, Any]:
     """Return the version of `submission.toml` from which the form was filled in."""
     text = ask.desk.shown(ask.text("seen"), to=ask.user.name)
-    return read_document(submission_text(ask.folder()) if text is None else text)
+    if text is None:
+        return _do(ask, "read_folder", check=False)["document"]
+    return ask.desk.workers.do("read_document", text=text)
 
 
 def _list_authors(room: Room) -> list[str]:
@@ -201,10 +203,10 @@ def _show_page(
     *,
     status: int = 200,
     changed: Sequence[Field] = (),
-    error: SubmissionError | None = None,
+    fault: Fault | None = None,
 ) -> Response:
     """Show the room; fields with errors show what was typed."""
-    folder, room = ask.folder(), read_room(ask, changed=changed, error=error)
+    folder, room = ask.folder(), read_room(ask, changed=changed, fault=fault)
     named = [row.file for row in room.rows if row.index is not None]
     return ask.page(
         "student",
@@ -213,39 +215,42 @@ def _show_page(
         room=room,
         file_groups=group_rows(room.rows),
         often=gather_remarks(room.rows),
-        not_read=ask.desk.workers.do("list_not_read", folder=str(folder), named=named),
-        keeps=list_missing(folder) if room.facts.sound else [],
+        not_read=_do(ask, "list_not_read", named=named),
+        keeps=room.keeps if room.facts.sound else [],
         gap=file_problem(folder, "gap/gap.html") is None,
     )
 
 
 def _edit(
     ask: Ask,
-    change: Callable[[tomlkit.TOMLDocument], None],
     changed: Sequence[Field],
     *,
     place: str,
+    doubts: Sequence[tuple[int, Sequence[str]]] = (),
+    remove: int | None = None,
 ) -> Response:
     """Change `submission.toml`; show typed values again if they are invalid or outdated.
 
     Parameters
     ----------
-    changed : the fields that `change` writes.
+    changed : the fields to write.
     place : part of the page from which the request came.
+    doubts, remove : doubts to clear, and table to remove; see `folder_tasks.edit_file`.
     """
-    folder = ask.folder()
-    try:
-        edit_submission(folder, change, seen=ask.text("seen") or "nothing")
-    except Outdated as error:
-        return _show_outdated(ask, error.text, changed)
-    except SubmissionError as error:
-        return _show_page(ask, status=422, changed=changed, error=error)
+    fields = [{"path": one.path, "kind": one.kind, "value": one.value} for one in changed]
+    seen = ask.text("seen")
+    found = _do(ask, "edit_file", seen=seen, fields=fields, doubts=doubts, remove=remove)
+    if "outdated" in found:
+        return _show_outdated(ask, changed, **found["outdated"])
+    if "fault" in found:
+        return _show_page(ask, status=422, changed=changed, fault=Fault(**found["fault"]))
     return _go_back(ask, [Message("Saved.")], place)
 
 
-def _show_outdated(ask: Ask, text: str, changed: Sequence[Field]) -> Response:
+def _show_outdated(
+    ask: Ask, changed: Sequence[Field], *, text: str, document: Mapping[str, Any]
+) -> Response:
     """Show both versions: the current file, and what was typed."""
-    now = read_document(text)
     # If the page is too old, nobody can tell which of its values were typed.
     known = ask.desk.shown(ask.text("seen"), to=ask.user.name) is not None
     return ask.page(
@@ -254,7 +259,7 @@ def _show_outdated(ask: Ask, text: str, changed: Sequence[Field]) -> Response:
         title=f"{NAME} was changed meanwhile",
         name=NAME,
         text=text,
-        changed=[(field.label, field.value, read_value(now, field)) for field in changed],
+        changed=[(field.label, field.value, read_value(document, field)) for field in changed],
         had="You typed" if known else "Your page had",
         back=ask.here,
     )

@@ -1,0 +1,290 @@
+"""What the desk asks about a student's folder; only worker processes run this and read its files.
+
+The desk's own process answers everybody, so it parses nothing that a student wrote.
+"""
+
+import tomllib
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+
+from pipeline.desk import last_report
+from pipeline.desk.last_report import NOTES, read_findings, read_notes
+from pipeline.desk.student import check_state, files
+from pipeline.desk.student.form import (
+    Fault,
+    Field,
+    clear_marks,
+    remove_experiment,
+    sign_fields,
+    write_fields,
+)
+from pipeline.desk.student.handin import list_held, list_missing
+from pipeline.errors import SubmissionError
+from pipeline.identify.springs import find_springs
+from pipeline.ingest.fill import UNSURE, data_files, experiment_doubts, system_doubts
+from pipeline.lock import lock_when_free
+from pipeline.output import write_file
+from pipeline.report.sections.answers import with_answer, written_answer
+from pipeline.submission import load_submission
+from pipeline.submission.edit import Outdated, edit_submission, submission_text, text_digest
+from pipeline.submission.load import (
+    MAX_NOTES_BYTES,
+    NAME,
+    list_experiments,
+    parse_submission,
+    posix,
+)
+from pipeline.submission.toml_file import parse_toml
+from pipeline.words.progress import Progress, silent
+
+_DEEPEST = 50  # tables and lists inside each other that a form can show
+_LARGEST = 10_000  # bits of a whole number that is shown in decimal digits
+
+
+def read_document(text: str, *, progress: Progress = silent) -> dict[str, Any]:
+    """Return the tables of a file with numbers as typed text; {} if it is not valid TOML."""
+    try:
+        return _plain(tomllib.loads(text, parse_float=str))  # type: ignore[arg-type]
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError):
+        return {}
+
+
+def _plain(value: Any, depth: int = 0) -> Any:
+    """Return a value without dates and without numbers that JSON cannot carry."""
+    if depth > _DEEPEST:
+        raise RecursionError
+    if isinstance(value, dict):
+        return {key: _plain(item, depth + 1) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item, depth + 1) for item in value]
+    if isinstance(value, int) and value.bit_length() > _LARGEST:
+        return hex(value)  # it can only have been typed so
+    return value if isinstance(value, str | int) else str(value)
+
+
+def students_see(folder: str, *, progress: Progress) -> str:
+    """Return what `[students] see` of `submission.toml` states; "" if it states nothing."""
+    try:
+        document = parse_toml(submission_text(Path(folder)), where=NAME, error=SubmissionError)
+    except (SubmissionError, OSError):  # the page says what is wrong
+        return ""
+    students = document.get("students")
+    return str(students.get("see", "")) if isinstance(students, dict) else ""
+
+
+def read_folder(folder: str, check: bool, *, progress: Progress) -> dict[str, Any]:
+    """Return the state of a folder, as `Room` shows it.
+
+    The keys are the `text` of `submission.toml` and the `document` in it, the `fault` of the text
+    (None without one), the `doubts` that it marks, why the folder cannot be handed in (`keeps`),
+    the questions that are `unanswered`, and the state of the check (`checked`).
+
+    Parameters
+    ----------
+    check : whether the room shows the check instead of the report.
+    """
+    place, text, fault = Path(folder), "", None
+    try:
+        text = submission_text(place) if (place / NAME).exists() else ""
+        if text:
+            parse_submission(text, folder=place)
+    except SubmissionError as error:
+        fault = Fault.of(error)
+    return {
+        "text": text,
+        "document": read_document(text),
+        "fault": fault and asdict(fault),
+        "doubts": _list_doubts(place) if UNSURE in text else None,
+        "keeps": list_missing(place),
+        "unanswered": [] if check else list_unanswered(place),
+        "checked": check_state.find_check_state(place) if check else None,
+    }
+
+
+def _list_doubts(folder: Path) -> dict[str, Any] | None:
+    """Return what `submission.toml` marks as unsure, and springs that the data do not determine.
+
+    The keys are `system` (the doubt about each key of `[system]`), `springs` (numbers of the
+    springs, from 1) and `experiments` (the doubts in each table). The result is None if the file
+    is not valid.
+    """
+    try:
+        system = system_doubts(folder)
+        asked = "springs" in system
+        return {
+            "system": {key: doubt.removeprefix(UNSURE) for key, doubt in system.items()},
+            "springs": find_springs(load_submission(folder)).open if asked else (),
+            "experiments": experiment_doubts(folder),
+        }
+    except SubmissionError:  # the page says what is wrong with the file
+        return None
+
+
+def list_unanswered(folder: Path) -> list[dict[str, str]]:
+    """Return the questions of the last report that have no answer yet."""
+    try:
+        notes = read_notes(folder)
+    except SubmissionError:  # the report's page says what is wrong
+        notes = ""
+    return [
+        one
+        for one in read_findings(folder)["questions"]
+        if not written_answer(notes, one["id"]).strip()
+    ]
+
+
+def edit_file(
+    folder: str,
+    seen: str,
+    fields: Sequence[Mapping[str, str]] = (),
+    doubts: Sequence[tuple[int, Sequence[str]]] = (),
+    signs: Mapping[str, int] = {},
+    remove: int | None = None,
+    *,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Change `submission.toml`; return `outdated` or `fault` if it was not changed, or neither.
+
+    Parameters
+    ----------
+    seen : digest of the text for which the change was prepared.
+    fields : path, kind and new value of each changed field.
+    doubts : for each of some tables, its index and the doubts to clear.
+    signs : sign of the input that is written into each of these experiments.
+    remove : index of the table to remove.
+    """
+
+    def change(document: tomlkit.TOMLDocument) -> None:
+        changed = [
+            Field(path=one["path"], label="", kind=one["kind"], value=one["value"])
+            for one in fields
+        ]
+        write_fields(document, [*changed, *sign_fields(document, signs)])
+        for index, cleared in doubts:
+            clear_marks(document, index, cleared)
+        if remove is not None:
+            remove_experiment(document, remove)
+
+    try:
+        edit_submission(Path(folder), change, seen=seen or "nothing")
+    except Outdated as error:
+        now = read_document(error.text)
+        fault = asdict(Fault.of(error))
+        return {"outdated": {"text": error.text, "document": now}, "fault": fault}
+    except SubmissionError as error:
+        return {"fault": asdict(Fault.of(error))}
+    return {}
+
+
+def store_files(
+    folder: str, names: Sequence[str], scratch: str, *, progress: Progress
+) -> list[dict[str, str]]:
+    """Store uploaded files in a folder; return the messages for the page.
+
+    Parameters
+    ----------
+    names : the names as sent; the content of the first file is `0` in `scratch`, and so on.
+    """
+    return [asdict(line) for line in files.store(names, Path(scratch), Path(folder))]
+
+
+def set_aside(folder: str, file: str, *, progress: Progress) -> str | None:
+    """Move a recording that no table names out of `data/`; None if there is no such recording."""
+    place = Path(folder)
+    if file not in data_files(place):
+        return None
+    with lock_when_free(place):
+        text = submission_text(place) if (place / NAME).exists() else ""
+        tables = list_experiments(read_document(text))
+        if any(posix(str(table.get("file", ""))) == file for table in tables):
+            raise SubmissionError(f"{file}: {NAME} uses it; remove it there first")
+        return files.put_aside(file, place)
+
+
+def list_hand_in(folder: str, report: bool, *, progress: Progress) -> list[tuple[str, int]]:
+    """Return name and size of each file that would be handed in; see `handin.list_held`."""
+    held = list_held(Path(folder), report=report)
+    return [(name, (Path(folder) / name).stat().st_size) for name in held]
+
+
+def pack_hand_in(
+    folder: str, into: str, report: bool, *, progress: Progress
+) -> dict[str, list[int]]:
+    """Write the zip to hand in; return the state of the sources that it holds.
+
+    Parameters
+    ----------
+    report : whether to include the report if it is up to date.
+
+    Raises
+    ------
+    SubmissionError : the submission is not valid, or lacks a file that it names.
+    """
+    place = Path(folder)
+    made_of = last_report.stat_sources(place)
+    with zipfile.ZipFile(into, "x", zipfile.ZIP_DEFLATED) as archive:
+        for name in list_held(place, report=report):
+            # A fixed date, so that the same files give the same bytes.
+            info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
+            info.compress_type = zipfile.ZIP_DEFLATED
+            info.file_size = (place / name).stat().st_size
+            with (place / name).open("rb") as file, archive.open(info, "w") as packed:
+                while chunk := file.read(1 << 20):
+                    packed.write(chunk)
+    return made_of
+
+
+def describe_check(folder: str, *, progress: Progress) -> dict[str, Any]:
+    """Return what the page of the check shows; see `check_state.describe`."""
+    return check_state.describe(Path(folder))
+
+
+def read_questions(folder: str, ids: Sequence[str], *, progress: Progress) -> dict[str, Any]:
+    """Return the answers in `notes.md` by question, the digest of the file, and what is wrong.
+
+    Parameters
+    ----------
+    ids : further questions, which the last report does not ask.
+    """
+    notes = problem = ""
+    try:
+        notes = read_notes(Path(folder))
+    except SubmissionError as error:
+        problem = str(error)
+    known = [one["id"] for one in read_findings(Path(folder))["questions"]]
+    answers = {id_: written_answer(notes, id_) for id_ in [*known, *ids]}
+    return {"answers": answers, "seen": text_digest(notes), "problem": problem}
+
+
+def answer_question(
+    folder: str, id_: str, words: str, seen: str, *, progress: Progress
+) -> str | None:
+    """Write an answer into `notes.md`; return the text of the file if it is not the seen one.
+
+    Parameters
+    ----------
+    seen : digest of the text for which the answer was typed.
+    """
+    place = Path(folder)
+    with lock_when_free(place):
+        notes = read_notes(place)
+        if seen != text_digest(notes):
+            return notes
+        if id_ not in [one["id"] for one in read_findings(place)["questions"]]:
+            raise SubmissionError(f"the report has no question {id_!r}")
+        new = with_answer(notes, id_, words)
+        if len(new.encode()) > MAX_NOTES_BYTES:
+            raise SubmissionError(f"{NOTES} would exceed {MAX_NOTES_BYTES:,} bytes")
+        write_file(place / NOTES, new)
+    return None
+
+
+FOLDER_TASKS = (
+    read_document, students_see, read_folder, edit_file, store_files, set_aside, list_hand_in,
+    pack_hand_in, describe_check, read_questions, answer_question,
+)  # fmt: skip
