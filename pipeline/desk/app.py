@@ -18,6 +18,7 @@ from starlette.routing import Route
 from pipeline.desk.ask import Ask, Desk, plain_error, prepare_pages
 from pipeline.desk.bench import bench_page
 from pipeline.desk.doors import PAGE_HEADERS, JupyterDoor, ProxyDoor, SecretDoor, limit_bodies
+from pipeline.desk.flow import limit_each_person
 from pipeline.desk.grades import (
     class_actions,
     class_table,
@@ -227,7 +228,7 @@ class DeskServer:
         prepare_pages()
         if listed and any(user.folders for user in listed[1].values()):
             self._desk.workers.start()
-        limited = limit_bodies(application(self._desk), uploads=HAND_IN.total)
+        limited = limit_each_person(limit_bodies(application(self._desk), uploads=HAND_IN.total))
         self._served = Served(Guard(limited, door, headers=PAGE_HEADERS), listener)
 
     def __enter__(self) -> Self:

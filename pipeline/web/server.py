@@ -2,7 +2,8 @@
 
 Anybody on this computer can connect. Connections that are not yet admitted share a fixed number of
 places, so the server never runs out of file descriptors. The limits of uvicorn do not ensure this:
-it keeps every idle connection, and its `limit_concurrency` refuses all later ones.
+it keeps every idle connection, and its `limit_concurrency` refuses all later ones. Each request
+must arrive, apart from its body, within the same time.
 """
 
 import asyncio
@@ -74,10 +75,13 @@ def let_in(scope: Scope) -> None:
 def _limit_strangers() -> type[asyncio.Protocol]:
     """Return an HTTP protocol that closes connections soon unless `let_in` admits a request."""
     strangers: dict[asyncio.Transport, asyncio.TimerHandle] = {}  # oldest first
+    # Connections whose next request has not arrived completely.
+    between: dict[asyncio.Transport, asyncio.TimerHandle] = {}
 
     def forget(transport: asyncio.Transport) -> None:
-        if timer := strangers.pop(transport, None):
-            timer.cancel()
+        for timers in (strangers, between):
+            if timer := timers.pop(transport, None):
+                timer.cancel()
 
     class Limited(H11Protocol):
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -89,6 +93,13 @@ def _limit_strangers() -> type[asyncio.Protocol]:
                 oldest = next(iter(strangers))
                 forget(oldest)
                 oldest.abort()
+
+        def on_response_complete(self) -> None:
+            forget(self.transport)
+            if not self.transport.is_closing():
+                loop = asyncio.get_running_loop()
+                between[self.transport] = loop.call_later(_STRANGER_STAYS, self.transport.abort)
+            super().on_response_complete()
 
         def connection_lost(self, exc: Exception | None) -> None:
             forget(self.transport)

@@ -128,7 +128,7 @@ def _archives(good: Files, rng: random.Random) -> dict[str, bytes]:
         "ratio, lzma": _zip({"z": zeros}, method=zipfile.ZIP_LZMA),
         "nested": nested,
         "members": _zip({f"{i}": b"" for i in range(2_500)}),
-        "overlapping": _overlapping(zeros, copies=300),
+        "overlapping": overlapping(zeros, copies=300),
         "lying": lying,
         "contents": _zip({"x" * 60_000 + str(i): b"" for i in range(40)}),
         "encrypted": bytes(encrypted),
@@ -149,7 +149,7 @@ def _archives(good: Files, rng: random.Random) -> dict[str, bytes]:
     }  # fmt: skip
 
 
-def _overlapping(zeros: bytes, *, copies: int) -> bytes:
+def overlapping(zeros: bytes, *, copies: int) -> bytes:
     """Return an archive in which many members share the same packed bytes."""
     packer = zlib.compressobj(9, zlib.DEFLATED, -15)
     packed = packer.compress(zeros) + packer.flush()

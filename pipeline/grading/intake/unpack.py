@@ -1,7 +1,6 @@
 """Unpack archives from strangers: write only inside the target folder, within limits."""
 
 import io
-import lzma
 import re
 import stat
 import struct
@@ -9,7 +8,7 @@ import sys
 import unicodedata
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import islice
@@ -168,7 +167,6 @@ _TROUBLE = (
     _Refused,
     zipfile.BadZipFile,
     zlib.error,
-    lzma.LZMAError,
     struct.error,
     EOFError,
     OSError,
@@ -224,6 +222,8 @@ def _opened(archive: Path, *, limits: UnpackLimits) -> Iterator[zipfile.ZipFile]
     with _Bounded(archive, most=limits.directory) as file, zipfile.ZipFile(file) as opened:
         if _is_cut(file, opened.start_dir):
             raise zipfile.BadZipFile("its own table of contents is missing")
+        if _overlap(opened.infolist(), end=opened.start_dir):
+            raise _Refused("two of its files share the same bytes, as in no archive of a person")
         yield opened
 
 
@@ -241,6 +241,20 @@ def _is_cut(file: IO[bytes], contents: int) -> bool:
     end = file.read(_END_OF_ZIP)
     (stated,) = struct.unpack_from("<L", end, end.rindex(b"PK\x05\x06") + _PLACE)
     return stated not in (contents, _ELSEWHERE)
+
+
+def _overlap(members: Sequence[zipfile.ZipInfo], *, end: int) -> bool:
+    """Return whether members share bytes; a small archive could then unpack to a huge one.
+
+    Parameters
+    ----------
+    end : where the table of contents begins.
+    """
+    places = sorted((info.header_offset, info.compress_size) for info in members)
+    begins = [*(begin for begin, _ in places[1:]), end]
+    return any(
+        begin + _HEAD + size > after for (begin, size), after in zip(places, begins, strict=True)
+    )
 
 
 def _extract(opened: zipfile.ZipFile, into: Path, *, budget: _Budget) -> dict[PurePosixPath, str]:
@@ -262,6 +276,11 @@ def _extract(opened: zipfile.ZipFile, into: Path, *, budget: _Budget) -> dict[Pu
         try:
             if info.flag_bits & _ENCRYPTED:
                 raise _Refused("is encrypted; pack it without a password")
+            if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise _Refused(
+                    f"{quote(str(path))} is packed by an unusual method; pack it again as a plain "
+                    "zip (method Deflate)"
+                )
             target.parent.mkdir(parents=True, exist_ok=True)
             with opened.open(info) as packed, target.open("xb") as file:
                 _copy(packed, file, info, budget=budget, shown=str(path))

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.unpack import HAND_IN, UnpackLimits, is_debris, member_names, unpack
+from tests.helpers.hostile import overlapping
 
 SMALL = UnpackLimits(members=20, total=100_000, ratio=200.0, directory=10_000)
 BRIEF = UnpackLimits(total=1_000_000, directory=10_000)
@@ -175,3 +176,21 @@ def test_debris_is_distinguished_from_work():
     assert is_debris(PurePosixPath("a/._step.csv"))
     assert is_debris(PurePosixPath("__MACOSX/a"))
     assert not is_debris(PurePosixPath("a/_step.csv"))
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_an_unusual_method_of_packing_is_refused(method, tmp_path):
+    """Only stored and deflated files are unpacked, because other methods can take much longer."""
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", method) as archive:
+        archive.writestr("submission.toml", "x")
+    with pytest.raises(SubmissionError, match="method Deflate"):
+        unpack(tmp_path / "a.zip", tmp_path / "out", limits=HAND_IN)
+
+
+@pytest.mark.parametrize("copies", [2, 40])
+def test_files_that_share_bytes_are_refused(copies, tmp_path):
+    """An archive in which files overlap is refused before anything is unpacked."""
+    (tmp_path / "a.zip").write_bytes(overlapping(bytes(100), copies=copies))
+    with pytest.raises(SubmissionError, match="share the same bytes"):
+        unpack(tmp_path / "a.zip", tmp_path / "out", limits=HAND_IN)
+    assert files_below(tmp_path / "out") == []
