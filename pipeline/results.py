@@ -839,8 +839,8 @@ class Analysis:
 
     @property
     def chain(self) -> Chain | None:
-        """The identified plant."""
-        return self.fit.chain if self.fit else None
+        """The identified plant; None without a fit, or if the fit failed."""
+        return self.fit.chain if self.fit and self.fit.converged else None
 
     @property
     def steps(self) -> frozenset[str]:

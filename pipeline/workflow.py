@@ -19,6 +19,7 @@ from pipeline.identify.log import Log
 from pipeline.identify.remarks import gain_sign_warning, hand_remarks, reading_remarks
 from pipeline.identify.sound import identify_from_sound
 from pipeline.ingest.read import Ingested, read_data
+from pipeline.plant.linear.chain import Chain
 from pipeline.results import (
     Analysis,
     ChainFit,
@@ -152,23 +153,32 @@ def reference_design(submission: Submission, fit: ChainFit | None) -> FeedbackDe
     ------
     DataError : the carts are not identified well enough for a design.
     """
+    task = submission.design or Design(cart=submission.system.carts)
+    return design_feedback(_identified(fit), task)
+
+
+def _identified(fit: ChainFit | None) -> Chain:
+    """Return the fitted carts.
+
+    Raises
+    ------
+    DataError : there is no fit, or it failed.
+    """
     if fit is None:
         raise DataError(_WORDS.text("no_carts"))
     if not fit.converged:
-        raise DataError(f"the fit of the carts did not converge: {fit.message}")
-    task = submission.design or Design(cart=submission.system.carts)
-    return design_feedback(fit.chain, task)
+        raise DataError(_WORDS.text("no_carts_fit_failed", message=fit.message))
+    return fit.chain
 
 
 def _hardware(submission: Submission, analysis: Analysis, *, log: Log) -> list[HardwareCheck]:
     """Return how each recorded loop compares with a simulation of the fitted carts."""
-    fit = analysis.fit
     runs = {record.id: record for record in analysis.records if record.kind == "closed_loop"}
     if not runs:
         log.skip(Stage.HARDWARE_CHECK, _WORDS.text("no_loop"), missing=_WORDS.text("loop"))
         return []
-    if fit is None:
-        log.skip(Stage.HARDWARE_CHECK, _WORDS.text("no_carts"))
+    chain = log.attempt(Stage.HARDWARE_CHECK, partial(_identified, analysis.fit))
+    if chain is None:
         return []
     for one in analysis.left_out:
         if runs.pop(one.experiment, None):
@@ -179,7 +189,7 @@ def _hardware(submission: Submission, analysis: Analysis, *, log: Log) -> list[H
         compare_run = partial(
             check_hardware,
             runs[experiment.id],
-            fit.chain,
+            chain,
             controller=experiment.controller,
             controlled_cart=experiment.controlled_cart,
             input_limit=submission.design.input_limit if submission.design else None,

@@ -1,14 +1,24 @@
 """The whole workflow on the shipped examples, and on submissions that lack a part."""
 
+import io
+import json
 import math
 import shutil
 
+import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.io import loadmat
 
+from pipeline.errors import DataError
 from pipeline.estimation.chain.follow import follow
+from pipeline.exchange.saved import matlab_file
 from pipeline.json_files import json_text
+from pipeline.notebook import Lab
 from pipeline.plant.linear.presets import PRESETS
+from pipeline.report.draft.content import build_document
+from pipeline.report.render.html import render_html
+from pipeline.report.solution.write import build_solution
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse, reference_design
@@ -131,3 +141,45 @@ def test_the_design_can_be_computed_later(analyses):
     assert without.feedback is None
     assert not without.skipped
     assert_allclose(reference_design(submission, without.fit).gains, whole.gains, rtol=1e-12)
+
+
+def test_a_failed_fit_gives_no_numbers(tmp_path):
+    """If the fit fails, no result has its numbers: not JSON, report, solution, .mat or notebook."""
+    submission = _unrelated(tmp_path / "lab")
+    analysis = analyse(submission)
+    assert analysis.fit is not None
+    assert not analysis.fit.converged
+
+    results = json.loads(json_text(analysis))
+    assert results["chain"] is results["state_space"] is results["feedback"] is None
+    assert {row["final"] for row in results["parameters"]} == {None}
+    reasons = {skip["stage"]: skip["reason"] for skip in results["skipped"]}
+    assert reasons["final estimates"].startswith("the fit failed, so its numbers are not given: ")
+    assert reasons["state feedback"].startswith("the fit of the carts failed: ")
+    assert {check.kind for check in analysis.failed_checks} >= {"fit"}
+    assert not {check.kind for check in analysis.checks} & {"redundancy", "order", "physical"}
+    for document in (build_document(analysis), build_solution(analysis, rubric=None)):
+        page = render_html(document)
+        assert " data-copy=" not in page
+        assert "The identified chain" not in page
+        assert "No trustworthy model" in page
+    lab = Lab(results=analysis, document=build_document(analysis))
+    with pytest.raises(DataError, match="the fit failed, so its numbers are not given"):
+        _ = lab.system
+    assert not lab.parameters["final"].notna().any()
+    assert "A" not in loadmat(io.BytesIO(matlab_file(analysis)))
+
+
+def _unrelated(folder):
+    """Return a submission of two steps whose cart moves independently of the input."""
+    (folder / "data").mkdir(parents=True)
+    t, rng = np.arange(0.0, 6.0, 0.02), np.random.default_rng(1)
+    text = "version = 1\n[system]\ncarts = 1\n[design]\ncart = 1\n"
+    for i in (1, 2):
+        u = np.where((t > 1) & (t < 5), 1.0, 0.0)
+        x = np.sin(13 * t + i * t**1.3) + 0.02 * np.cumsum(rng.normal(size=t.size))
+        rows, name = np.column_stack([t, u, x]), f"data/step-{i}.csv"
+        np.savetxt(folder / name, rows, delimiter=",", header="time,u,x1", comments="", fmt="%.5f")
+        text += f'[[experiments]]\nid = "step-{i}"\nkind = "step"\nfile = "{name}"\n'
+    (folder / "submission.toml").write_text(text, encoding="utf-8")
+    return load_submission(folder)

@@ -27,6 +27,8 @@ def check_carts(fit: ChainFit | None, *, bench: Bench) -> list[Check]:
     if fit is None:
         message = "No model was identified. The list of what was skipped has the reasons."
         return [Check(kind="fit", part="identified", outcome="fail", message=message)]
+    if not fit.converged:
+        return _fit_checks(fit)
     chain = fit.chain
     values = {name: estimate.value for name, estimate in fit.parameters.items()}
     checks = [*_fit_checks(fit), _sign_check(fit, bench=bench)]

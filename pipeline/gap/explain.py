@@ -53,13 +53,12 @@ def investigate(analysis: Analysis, *, progress: Progress, budget: float | None 
     DataError : no record can be used.
     """
     records, notes = drop_left_out(analysis.records, left_out=analysis.left_out)
+    start = analysis.fit and analysis.fit.chain  # even a failed fit is near enough to start from
     progress("preparing the simulator")
     with follower_compiled():
         compile_simulator()
     compile_follower()
-    gap = explain_gap(
-        records, analysis.bench, chain=analysis.chain, budget=budget, progress=progress
-    )
+    gap = explain_gap(records, analysis.bench, chain=start, budget=budget, progress=progress)
     return replace(
         gap,
         title=analysis.title,

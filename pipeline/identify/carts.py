@@ -125,10 +125,12 @@ def identify(
 def compare_estimates(found: Identified, *, bench: Bench) -> tuple[ParameterRow, ...]:
     """Return the initial and final estimates side by side.
 
-    Estimates that the fit does not determine are skipped.
+    Estimates that the fit does not determine are skipped. A failed fit determines none.
     """
-    fit, final = found.fit, found.fit.parameters if found.fit else {}
-    if fit and not final:
+    fit, final = found.fit, found.fit.parameters if found.fit and found.fit.converged else {}
+    if fit and not fit.converged:
+        found.log.skip(Stage.FINAL_ESTIMATES, _WORDS.text("fit_failed", message=fit.message))
+    elif fit and not final:
         found.log.skip(Stage.NAMED_PARAMETERS, _WORDS.text("untied"))
     for name, estimate in final.items():
         if reason := why_open(name, estimate):

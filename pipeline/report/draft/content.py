@@ -128,8 +128,8 @@ def _model(page: Page) -> list[Block]:
         blocks.append(symbolic)
     if chain:
         blocks += [paragraph("With the identified numbers:"), numeric_transfer_functions(chain)]
-    if analysis.fit:
-        blocks.append(chain_table(page, analysis.fit.chain, std=analysis.fit.std))
+    if chain and analysis.fit:
+        blocks.append(chain_table(page, chain, std=analysis.fit.std))
     return blocks
 
 

@@ -56,7 +56,9 @@ def _origins(analysis: Analysis) -> Spans:
         _WORDS.text(
             "parameters",
             initial=_WORDS.text("initial_from", sources=listing(sources)) if sources else "",
-            final=_WORDS.text("final_from", fit=_WORDS.text(f"from_{fit.method}")) if fit else "",
+            final=_WORDS.text("final_from", fit=_WORDS.text(f"from_{fit.method}"))
+            if fit and fit.converged
+            else "",
         ).strip()
     )
 
@@ -199,7 +201,7 @@ def _parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:
 def _staged_differences(analysis: Analysis) -> Block | None:
     """Return how much the cart-by-cart fit differs from the joint fit."""
     fit = analysis.fit
-    if fit is None or fit.chain.n == 1:
+    if fit is None or not fit.converged or fit.chain.n == 1:
         return None
     changes = {
         name: abs(100 * (value / fit.parameters[name].value - 1))

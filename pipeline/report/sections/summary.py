@@ -62,9 +62,7 @@ def terminal_summary(analysis: Analysis) -> str:
         for tile in _numbers_board(analysis, error="share")
     ]
     only = f" {_WORDS.text('statistical_only')}" if any("±" in text for text in numbers) else ""
-    failed = analysis.fit is not None and not analysis.fit.converged
-    has = "The failed fit ended at" if failed else "It has"
-    it_has = [paragraph(f"{has} {'; '.join(numbers)}.{only}")] if numbers else []
+    it_has = [paragraph(f"It has {'; '.join(numbers)}.{only}")] if numbers else []
     findings = bullet_list(text for _, text in _findings(analysis))
     next_ = [paragraph(f"{_WORDS.text('next')}."), next_steps(analysis)]
     return plain_lines([_identified(analysis), *it_has, findings, *next_])

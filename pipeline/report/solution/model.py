@@ -79,12 +79,11 @@ def transfer_blocks(page: Page) -> list[Block]:
 def state_blocks(page: Page) -> list[Block]:
     """Return the steps, with numbers, from the table to A and B, and to masses and springs."""
     analysis = page.analysis
-    fit, springs = analysis.fit, analysis.bench.springs
-    if fit is None:
+    fit, chain, springs = analysis.fit, analysis.chain, analysis.bench.springs
+    if fit is None or chain is None:
         return []
-    chain = fit.chain
     n = chain.n
-    table = chain_table(page, fit.chain, std=fit.std)
+    table = chain_table(page, chain, std=fit.std)
     if not chain.is_tied or n > derivation.MOST_CARTS:
         return [paragraph(_WORDS.text("no_wall")), table]
     values = derivation.work_state_model(chain)
