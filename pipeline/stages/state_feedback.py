@@ -11,6 +11,7 @@ damping, and are varied. Among the candidates whose simulated step meets the goa
 consider those with the smallest inputs, and choose the fastest.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal
@@ -23,16 +24,19 @@ from pipeline.errors import DataError
 from pipeline.plant.limits import DAMPING_ERROR, MASS_SPRING_ERROR
 from pipeline.plant.linear import step_response
 from pipeline.plant.linear.chain import Chain, quadratic_factors
+from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.plant.loop.gains import lqr_gains, place_poles
 from pipeline.plant.loop.robustness import level_error_percent
 from pipeline.plant.loop.sampled_loop import (
+    RADIANS_PER_STEP,
     LoopSetup,
     StateFeedback,
     check_ticks,
     discretise,
+    parts_per_sample,
     simulate_loop,
 )
-from pipeline.plant.loop.sampled_plant import RADIANS_PER_SAMPLE, SampledPlant, energy_weights
+from pipeline.plant.loop.sampled_plant import SampledPlant, energy_weights
 from pipeline.results import FeedbackDesign
 from pipeline.submission import Design
 
@@ -43,6 +47,7 @@ _POINTS = 512  # points of a candidate's step; a power of two, because doubling 
 # Shares of the goal (settling time, overshoot) to aim at, the best first. The plant is known only
 # to a few percent, but should still meet the goal.
 _AIMS = ((0.8, 0.05), (0.8, 0.5), (1.0, 1.0))
+_HALVINGS = 6  # most halvings of a sample time that is too long
 _UNSEEN = 0.05  # percent; nobody notices a smaller overshoot
 
 _WEIGHTS = np.logspace(-3, 4, 25)  # weights of energies, from no visible feedback to a stiff loop
@@ -63,7 +68,8 @@ def design_feedback(chain: Chain, task: Design) -> FeedbackDesign:
     Raises
     ------
     DataError : there is no such cart or no step, a cart is out of reach, no design can be computed
-        for the chain, or the run takes too many ticks.
+        for the chain, every design overshoots more than the carts without feedback, or the run
+        takes too many ticks.
     """
     if not 1 <= task.cart <= chain.n:
         raise DataError(f"state feedback needs a cart from 1 to {chain.n}, found {task.cart}")
@@ -87,13 +93,46 @@ def design_feedback(chain: Chain, task: Design) -> FeedbackDesign:
             plant = SampledPlant.of(
                 chain, cart=task.cart, settling=task.settling_time, sample_time=task.sample_time
             )
-            return _design(plant, goal, method=task.method)
+            design = _design(plant, goal, method=task.method)
+            if chain.is_tied:
+                _refuse_more_overshoot(plant, goal, design)
+            return design
     except np.linalg.LinAlgError:
         raise DataError(
             "state feedback needs masses, damping coefficients and stiffnesses within some ten "
             f"orders of magnitude, found m {_range(chain.m)}, c {_range(chain.c)}, "
             f"k {_range(chain.k)}"
         ) from None
+
+
+def _refuse_more_overshoot(plant: SampledPlant, goal: "_Goal", design: FeedbackDesign) -> None:
+    """Raise DataError if the design overshoots more than a step of the input without feedback."""
+    slowest = float(np.abs(plant.chain.poles).min())
+    t = np.linspace(0.0, max(float(design.t[-1]), 2 * np.pi / slowest), _POINTS)
+    level = plant.chain.static_gains()[plant.cart - 1]
+    alone = simulate_linear(plant.chain, t=t, u=np.ones_like(t))[plant.cart - 1]
+    most = float(step_response.overshoot_percent(alone, before=0.0, level=level))
+    if design.overshoot_percent <= most:
+        return
+    for halvings in range(1, _HALVINGS + 1):
+        sample_time = plant.sample_time / 2**halvings
+        faster = SampledPlant.of(
+            plant.chain, cart=plant.cart, settling=goal.settling, sample_time=sample_time
+        )
+        better = _design(faster, goal, method=design.method)
+        if better.reachable:
+            advice = (
+                f"set sample_time to {sample_time:.3g} s, where the design overshoots by "
+                f"{better.overshoot_percent:.2g} %"
+            )
+            break
+    else:
+        advice = "no shorter sample time meets the goal, so relax the goal"
+    raise DataError(
+        f"state feedback needs to overshoot less than the {most:.3g} % of the carts without "
+        f"feedback, found {design.overshoot_percent:.3g} % at best, sampled every "
+        f"{plant.sample_time:.3g} s: {advice}"
+    )
 
 
 def _range(values: Array) -> str:
@@ -107,9 +146,12 @@ def _design(plant: SampledPlant, goal: "_Goal", *, method: Method) -> FeedbackDe
         candidates = _try_step(plant, lqr_gains(plant.phi, plant.gamma, costs), goal)
         best, met = _choose(plant, candidates, goal)
         if not met:  # the goal may be much faster than the plant
-            costs = energy_weights(plant, _HEAVY_WEIGHTS)
-            candidates = _try_step(plant, lqr_gains(plant.phi, plant.gamma, costs), goal)
-            best, met = _choose(plant, candidates, goal)
+            heavy = energy_weights(plant, _HEAVY_WEIGHTS)
+            # At slow sampling, the heaviest weights have no solution in double precision.
+            with suppress(np.linalg.LinAlgError):
+                candidates = _try_step(plant, lqr_gains(plant.phi, plant.gamma, heavy), goal)
+                best, met = _choose(plant, candidates, goal)
+                costs = heavy
     else:
         requested, costs = _pole_candidates(plant, goal), None
         z = np.exp(requested * plant.sample_time)
@@ -188,28 +230,34 @@ class _Candidates:
 
 
 def _try_step(plant: SampledPlant, gains: Array, goal: _Goal) -> _Candidates:
-    """Simulate the step of every candidate at once, exactly at the sampled points.
+    """Simulate the step of every candidate at once, exactly at the simulated points.
 
-    The points are close enough to show every peak. If the simulation therefore ends before the
-    goal's settling time, the settling time is estimated.
+    The points are close enough to show every peak, also between the ticks of a slow clock. If the
+    simulation therefore ends before the goal's settling time, the settling time is estimated.
     """
     loop = plant.phi - plant.gamma[:, None] * gains[:, None, :]
     fastest = np.abs(plant.chain.poles).max() + 4 / goal.settling
     # The step is simulated for three times the goal's settling time, if there are enough points for
     # this.
-    apart = min(3.0 * goal.settling / _POINTS, RADIANS_PER_SAMPLE / fastest)
+    apart = min(3.0 * goal.settling / _POINTS, RADIANS_PER_STEP / fastest)
     stride = max(1, round(apart / plant.sample_time))
+    parts = parts_per_sample(plant.chain, plant.sample_time)
     level = np.linalg.solve(np.eye(plant.gamma.size) - loop, plant.gamma[:, None])
     prefilter = 1 / level[:, plant.row]
     level = level * prefilter[:, None]
     # In each sample, the distance to the level is multiplied by `loop`. Each pass doubles the
     # points.
     to_go, ahead = -level, np.linalg.matrix_power(loop, stride)
-    while to_go.shape[-1] < _POINTS:
+    while to_go.shape[-1] * parts < _POINTS:
         to_go, ahead = np.concatenate([to_go, ahead @ to_go], axis=-1), ahead @ ahead
-    points = np.arange(_POINTS, dtype=np.float64)
-    t = plant.sample_time * (1 + stride * points)  # the first sample is the delay
-    y = 1 + to_go[:, plant.row]
+    points = np.arange(to_go.shape[-1], dtype=np.float64)[:, None] + np.arange(parts) / parts
+    t = plant.sample_time * (1 + stride * points.ravel())  # the first sample is the delay
+    # The effort is held from tick to tick, so it belongs to the distance at the last tick.
+    rows = [
+        phi[plant.row] - gamma[plant.row] * gains
+        for phi, gamma in (plant.after(part / parts) for part in range(parts))
+    ]
+    y = 1 + np.einsum("pci,cin->cnp", rows, to_go).reshape(len(gains), -1)
     # The input that holds the level is included, because a slow candidate may not be there yet.
     u = prefilter - np.einsum("ci,cin->cn", gains, np.append(to_go, 0 * level, axis=-1) + level)
     one = np.ones(len(gains))
@@ -282,7 +330,8 @@ def _finish(
     # design misses the goal, the result shows at most 20 times the goal's settling time.
     shown = 2.0 * min(max(goal.settling, settling), 10.0 * goal.settling)
     check_ticks(shown, T)
-    t = T * np.arange(np.ceil(shown / T) + 1, dtype=np.float64)
+    parts = parts_per_sample(chain, T)
+    t = T / parts * np.arange(parts * np.ceil(shown / T) + 1, dtype=np.float64)
     run = simulate_loop(
         chain,
         StateFeedback(gains=gains, prefilter=prefilter, model=chain),

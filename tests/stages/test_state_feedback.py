@@ -1,5 +1,7 @@
 """State-feedback gains agree with those of other programs, and designs meet their goals."""
 
+import re
+
 import control
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from pipeline.errors import DataError
 from pipeline.plant.limits import MASS_SPRING_ERROR
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.plant.linear.step_response import overshoot_percent, settling_time
 from pipeline.plant.loop.gains import lqr_gains, place_poles
 from pipeline.plant.loop.robustness import level_error_percent, stays_stable
@@ -372,3 +375,51 @@ def test_impossible_tasks_are_refused(chain, cart, reference, message):
     """A missing cart, a reference of zero, and a cart that the motor cannot reach are refused."""
     with pytest.raises(DataError, match=message):
         design(chain, cart=cart, reference=reference)
+
+
+# ------------------------------------------------------------------ slow sampling
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("sample_time", [0.05, 0.1, 0.2])
+@pytest.mark.parametrize("name", PRESETS)
+def test_the_step_is_right_between_the_ticks_of_a_slow_clock(name, sample_time, method):
+    """At slow sampling the simulated step, and its overshoot, include the motion between ticks."""
+    chain = PRESETS[name]
+    found = design(chain, cart=chain.n, sample_time=sample_time, method=method)
+
+    expected = simulate_linear(chain, t=found.t, u=found.u)
+
+    # The input is held, so both are exact; several hundred rounding errors add up.
+    assert_allclose(found.y, expected, atol=1e-8)
+    assert np.diff(found.t).max() * np.abs(chain.poles).max() <= 0.51
+    level = np.float64(1.0)
+    overshoot = overshoot_percent(expected[chain.n - 1], before=0.0, level=level)
+    assert_allclose(found.overshoot_percent, overshoot, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "sample_time", "method"),
+    [("throne-1dof", 0.5, "poles"), ("throne-2dof", 0.5, "poles")],
+)
+def test_a_design_worse_than_no_feedback_is_refused(name, sample_time, method):
+    """A clock so slow that feedback adds overshoot is refused, with a sample time that works."""
+    chain = PRESETS[name]
+    with pytest.raises(DataError, match="overshoot less than") as refused:
+        design(chain, cart=chain.n, sample_time=sample_time, method=method)
+
+    said = re.search(
+        r"less than the ([\d.]+) % .* found ([\d.]+) % at best, .* set sample_time to ([\d.]+) s, "
+        r"where the design overshoots by ([\d.]+) %",
+        str(refused.value),
+    )
+    assert said
+    alone, found, proposed, overshoot = map(float, said.groups())
+    t = np.linspace(0, 3, 3000)
+    step = simulate_linear(chain, t=t, u=np.ones_like(t))[chain.n - 1]
+    peak = overshoot_percent(step, before=0.0, level=chain.static_gains()[chain.n - 1])
+    assert_allclose(alone, peak, rtol=0.01)  # three digits, and 512 points
+    assert found > alone
+    better = design(chain, cart=chain.n, sample_time=proposed, method=method)
+    assert better.reachable
+    assert_allclose(better.overshoot_percent, overshoot, atol=0.06)

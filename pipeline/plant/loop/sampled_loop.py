@@ -39,6 +39,10 @@ from pipeline.plant.linear.chain import Chain
 # Share of the prediction error that corrects the velocity at a tick. One half keeps three quarters
 # of the encoder's rounding noise out of v, and corrects a wrong initial velocity in a few ticks.
 VELOCITY_CORRECTION = 0.5
+# The fastest mode may turn by this much (rad) from one simulated point to the next: about 12 points
+# per period.
+RADIANS_PER_STEP = 0.5
+_MOST_PARTS = 100  # of a sample; with more, the input acts on a motion that has long decayed
 MOST_TICKS = 200_000  # ticks per run: over three minutes at 1 kHz, simulated in some seconds
 
 
@@ -199,9 +203,23 @@ def simulate_loop(
             now[:n] = plant.state
 
     elapsed = (t - t[0]) / T
-    x = _hermite(elapsed, states[:, 0::2].T, T * states[:, 1::2].T)
+    parts = 1 if plant else parts_per_sample(chain, T, free=free)
+    between = np.empty((ticks.size, parts, n))
+    between[:, 0] = states
+    for part in range(1, parts):
+        phi, gamma = discretise(chain, T * part / parts, free=free)
+        between[:, part] = states @ phi.T + drive * efforts[:, None] * gamma
+    states = between.reshape(-1, n)
+    x = _hermite(parts * elapsed, states[:, 0::2].T, T / parts * states[:, 1::2].T)
     held = np.floor(elapsed + 0.5 * min(1.0, interval / T)).astype(int)
     return LoopRun(t=t, x=x + np.reshape(setup.rest, (-1, 1)), u=efforts[held])
+
+
+def parts_per_sample(chain: Chain, sample_time: float, *, free: Sequence[int] | None = None) -> int:
+    """Return in how many parts a sample must be divided to show the motion between the ticks."""
+    A, *_ = chain.state_space(free=free)
+    turn = float(np.abs(np.linalg.eigvals(A)).max()) * sample_time
+    return int(np.clip(np.ceil(turn / RADIANS_PER_STEP), 1, _MOST_PARTS))
 
 
 def check_ticks(duration: float, sample_time: float) -> None:

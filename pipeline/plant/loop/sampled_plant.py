@@ -7,9 +7,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.robustness import stays_stable
-from pipeline.plant.loop.sampled_loop import StateFeedback, discretise
-
-RADIANS_PER_SAMPLE = 0.5  # at most, for the fastest mode: about 12 samples per period
+from pipeline.plant.loop.sampled_loop import RADIANS_PER_STEP, StateFeedback, discretise
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,7 +32,7 @@ class SampledPlant:
         if sample_time is None:
             # The laboratory controller's sample time, or less if modes are fast, or if the loop
             # would settle in less than 25 samples.
-            sample_time = min(0.00884, RADIANS_PER_SAMPLE / speeds.max(), settling / 25)
+            sample_time = min(0.00884, RADIANS_PER_STEP / speeds.max(), settling / 25)
         tied = chain.k[0] > 0 or chain.k[-1] > 0
         stiffness = 1 / chain.static_gains()[0] if tied else chain.m.sum() * rate**2
         phi, gamma = discretise(chain, sample_time)
@@ -64,6 +62,12 @@ class SampledPlant:
         """Return Q of the cost in which the input's square has the weight 1/stiffness."""
         unit = np.tile([1.0, self.rate], self.chain.n)
         return self.stiffness * weights / np.outer(unit, unit)
+
+    def after(self, share: float) -> tuple[Array, Array]:
+        """Return phi and gamma, in scaled units, for a share of the sample time."""
+        phi, gamma = discretise(self.chain, share * self.sample_time)
+        unit = np.tile([1.0, self.rate], self.chain.n)
+        return phi * unit / unit[:, None], gamma * self.stiffness / unit
 
     def stays_stable(self, gains: Array) -> bool:
         """Whether the loop with these unscaled gains tolerates the usual errors of the chain."""
