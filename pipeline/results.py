@@ -314,13 +314,46 @@ class FrequencyResponse:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Coverage:
+    """Where measurements lie around the frequency of a resonance or null, rad/s.
+
+    Attributes
+    ----------
+    of : the name of the frequency, such as "omega_b".
+    half_width : ζω, half the width of its peak.
+    below, above : the nearest measured frequencies; None if there are none on that side. One within
+        `half_width` counts for both sides.
+    limit : the largest relative distance at which measurements still determine it.
+    """
+
+    of: str
+    omega: float
+    half_width: float
+    below: float | None
+    above: float | None
+    limit: float
+
+    @property
+    def distance(self) -> float:
+        """The relative distance to the farther of both neighbours; 1 if one is missing."""
+        if self.below is None or self.above is None:
+            return 1.0
+        return max(abs(self.below - self.omega), abs(self.above - self.omega)) / self.omega
+
+    @property
+    def extrapolated(self) -> bool:
+        """Whether no measurement is near enough, so that only the model gives the frequency."""
+        return self.distance > self.limit
+
+
+@dataclass(frozen=True, kw_only=True)
 class Estimate:
     """A number with its standard error and its source ("step", "log_decrement", …).
 
     `at_bound` is true if a fit ended at the limit of what is possible, such as zero damping. Then
     `value` is that limit and not a measurement, `std` is None, and no conclusion may be drawn from
     either. `experiments` are the recordings behind the number; for a fit see
-    `ChainFit.experiments`.
+    `ChainFit.experiments`. `coverage` shows what determines a fitted frequency or damping ratio.
     """
 
     value: float
@@ -328,6 +361,12 @@ class Estimate:
     source: str
     at_bound: bool = False
     experiments: tuple[str, ...] = ()
+    coverage: Coverage | None = None
+
+    @property
+    def extrapolated(self) -> bool:
+        """Whether only the model gives the number, because no measurement is near it."""
+        return self.coverage is not None and self.coverage.extrapolated
 
 
 @result(eq=False)
@@ -383,6 +422,10 @@ class ChainFit:
 
 # ------------------------------------------------------------------- comparing
 
+# What determines a fitted number: points of the response at its frequency, motion at its frequency
+# in the fitted recordings, a decay, other parameters that are determined themselves, or the model.
+DeterminedBy = Literal["points", "motion", "decay", "parameters", "model"]
+
 
 @result()
 class ParameterRow:
@@ -429,6 +472,11 @@ class ParameterRow:
         """`bode_fit`, `time_fit` or `log_decrement`."""
         return self.final and self.final.source
 
+    determined_by: DeterminedBy | None = written(
+        "what determines the final frequency or damping ratio; model: no measurement is near it",
+        older=None,
+        default=None,
+    )
     change_percent: float | None = written("change from the initial to the final estimate")
     change_sigmas: float | None = written("the change divided by the combined standard error")
     consistent: bool | None = written(
@@ -440,6 +488,11 @@ class ParameterRow:
         default=None,
     )
     note: str = written(default="")
+
+    @property
+    def extrapolated(self) -> bool:
+        """Whether only the model gives the final number, because no measurement is near it."""
+        return self.determined_by == "model"
 
 
 CheckKind = Literal[
@@ -461,6 +514,7 @@ CheckKind = Literal[
     "order",
     "repeats",
     "initial_final",
+    "covered",
     "step",
     "decay",
     "hardware",

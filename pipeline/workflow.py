@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import partial
 
 from pipeline.checks.carts import check_carts
-from pipeline.checks.estimates import check_decays, check_rows, check_steps
+from pipeline.checks.estimates import check_coverage, check_decays, check_rows, check_steps
 from pipeline.checks.loops import check_loops, design_margins, verify_design
 from pipeline.checks.recordings import check_recordings
 from pipeline.errors import DataError
@@ -66,6 +66,7 @@ def analyse(
         *check_recordings(data, left_out=left_out, sines=found.sines, late=late, bench=bench),
         *found.repeats.checks,
         *check_rows(rows),
+        *check_coverage(rows),
         *check_decays(found.decays, records=data.records, bench=bench),
         *check_steps(found.gains, decays=found.decays, bench=bench),
         *check_carts(found.fit, bench=bench),

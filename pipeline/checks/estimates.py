@@ -2,10 +2,13 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from pipeline.names import read_name
 from pipeline.results import (
     Check,
     CheckOutcome,
+    Coverage,
     LogDecrement,
     ParameterRow,
     Record,
@@ -14,7 +17,10 @@ from pipeline.results import (
 )
 from pipeline.set_up import Bench
 from pipeline.stages.compare import change_limit
-from pipeline.words.numbers import abridge
+from pipeline.words.numbers import abridge, listing, significant
+from pipeline.words.phrases import phrases
+
+_WORDS = phrases("checks")
 
 
 def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
@@ -50,6 +56,50 @@ def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
             )
         )
     return checks
+
+
+def check_coverage(rows: Sequence[ParameterRow]) -> list[Check]:
+    """Check that a measurement determines every resonance and null that is claimed."""
+    checks = []
+    for row in rows:
+        near = row.final.coverage if row.final else None
+        if near is None or near.of != row.name:
+            continue
+        found = sorted({w for w in (near.below, near.above) if w is not None})
+        nearest = found[int(np.argmin(np.abs(np.array(found) - near.omega)))] if found else 0.0
+        key = f"determined_by_{row.determined_by}"
+        message = _WORDS.text(
+            key if found else "extrapolated_from_nothing",
+            name=row.name,
+            zeta=read_name(row.name).damping,
+            omega=significant(near.omega, digits=3),
+            near=listing([significant(w, digits=3) for w in found]),
+            nearest=significant(nearest, digits=3),
+            wanted=wanted_dwells(near),
+        )
+        checks.append(
+            Check(
+                kind="covered",
+                parameter=row.name,
+                outcome=passed(not row.extrapolated),
+                value=near.distance,
+                limit=near.limit,
+                message=message,
+            )
+        )
+    return checks
+
+
+def wanted_dwells(coverage: Coverage) -> str:
+    """Return the frequencies of dwells that would determine a resonance or null, in words."""
+    # Without damping in the fit, 2 % on both sides.
+    apart = max(coverage.half_width, 0.02 * coverage.omega)
+    omegas = [coverage.omega + side * apart for side in (-1, 0, 1)]
+    by_unit = [
+        listing([significant(omega / scale, digits=3) for omega in omegas])
+        for scale in (1.0, 2 * np.pi)
+    ]
+    return f"{by_unit[0]} rad/s ({by_unit[1]} Hz)"
 
 
 def _advice(row: ParameterRow) -> str:

@@ -99,6 +99,9 @@ def identify(
         *((f"{p.experiment} (cart {p.cart})", p.note) for p in sines),
     ]
     log.warn(by_note(notes))
+    ended_early = {point.experiment for point in sines if not point.settled}
+    short = [r for r in used if r.id in ended_early and len(r.free) == bench.n]
+    runs = replace(runs, short=short)
     progress("frequency response")
     responses = _frequency_response(data, sines=sines, runs=runs, log=log)
     resonances = _resonances(responses, bench=bench, log=log)
@@ -268,9 +271,12 @@ def _sine_points(records: Sequence[Record], *, log: Log) -> list[SinePoint]:
 def _frequency_response(
     data: Ingested, *, sines: Sequence[SinePoint], runs: Runs, log: Log
 ) -> Sequence[FrequencyResponse]:
-    """Return the response from dwells; otherwise from the students' table or from other records."""
-    if sines:
-        return collect_dwells(sines)
+    """Return the response from dwells; otherwise from the students' table or from other records.
+
+    Before its steady state, a dwell has no amplitude ratio.
+    """
+    if steady := [point for point in sines if point.settled]:
+        return collect_dwells(steady)
     if data.tables:
         return data.tables
     if not any(record.kind == "sine" for record in runs.used):

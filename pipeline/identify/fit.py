@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.estimation.chain.follow import Followed, find_misread, follow, most_follow, near
 from pipeline.identify.log import Log
 from pipeline.names import own_zeta
@@ -14,6 +15,7 @@ from pipeline.set_up import Bench
 from pipeline.soundness.fault import RecordingFault
 from pipeline.soundness.other_readings import without_lone_factors
 from pipeline.stages.bode_fit import fit_bode
+from pipeline.stages.coverage import motion_measured, points_measured, with_coverage
 from pipeline.stages.sine import FEW_COUNTS
 from pipeline.stages.time_fit import fit_records
 from pipeline.words.phrases import phrases
@@ -48,11 +50,14 @@ class Runs:
     used : the records that identify the carts.
     left_out : records that are only compared with the fit.
     driven : the steps and sweeps among the used records, with all carts free.
+    short : the dwells among the used records that end before their steady state, with all carts
+        free. Only their whole records can be used.
     """
 
     used: Sequence[Record]
     left_out: Sequence[Record]
     driven: Sequence[Record]
+    short: Sequence[Record] = ()
 
 
 def fit_carts(
@@ -64,24 +69,26 @@ def fit_carts(
     log: Log,
 ) -> Fitted:
     """Return the Bode fit if the records follow it, or else the joint time-domain fit."""
-    if not _is_seen(bench.n, runs.used, responses):
+    if not _is_seen(bench.n, [*runs.used, *runs.left_out], responses):
         log.skip(Stage.FINAL_ESTIMATES, _WORDS.text("unseen_cart", cart=bench.n))
         return Fitted()
     has_points = any(response.source != "records" for response in responses)
     bode = _fit_points(responses, runs, initial, bench, log) if has_points else None
-    if not runs.driven and bode is None:
+    timed = [*runs.driven, *runs.short]
+    if not timed and bode is None:
         run = "step or sweep with all carts free" if bench.n > 1 else "step or sweep"
         reason = _WORDS.text("no_run_beside_bode" if has_points else "no_run_no_dwell", run=run)
         missing = f"a {run}" if has_points else _WORDS.text("dwells_or_run", run=run)
         log.skip(Stage.FINAL_ESTIMATES, reason, missing=missing)
     dwells = [record for record in runs.used if record.kind == "sine"]
-    if not runs.driven or (bode and not dwells):
+    if not timed or (bode and not dwells):
         return bode or Fitted()
     contrary = bode is not None and bool(_contrary_kinds(runs.used, bode))
-    if bode and bode.by_dwells and not contrary and not _is_doubted(bode, dwells):
+    beyond = bode is not None and _misses_transients(bode, runs, dwells)
+    doubted = contrary or beyond or (bode is not None and _is_doubted(bode, dwells))
+    if bode and bode.by_dwells and not doubted:
         return bode
-    to_records = partial(fit_records, runs.driven, bench=bench)
-    other = _held(log.attempt(Stage.FINAL_ESTIMATES, to_records), runs)
+    other = _fit_records(timed, runs, bench=bench, log=log)
     if bode is None or other is None:
         return bode or other or Fitted()
     if other.fit is None or not other.fit.converged:
@@ -93,13 +100,16 @@ def fit_carts(
             return Fitted(conflict=conflict)
     if contrary and _votes(mine) != _votes(theirs):
         better = _votes(mine) < _votes(theirs)
+    elif beyond:
+        better = other.fit.explains_data and not _extrapolates(other)
     else:  # if dwells follow the Bode fit, they must follow the other fit more closely
         better = not bode.by_dwells or _is_closer(other, bode, dwells)
     if not better:
         return bode
-    kinds = {run.kind for run in runs.driven if run.id in other.fit.experiments}
-    used = " and ".join(f"{kind}s" for kind in ("step", "sweep") if kind in kinds)
-    log.warn([_WORDS.text("fit_rests_on", kinds=used)])
+    kinds = {run.kind for run in timed if run.id in other.fit.experiments}
+    nouns = {"step": "steps", "sweep": "sweeps", "sine": "whole dwells"}
+    used = " and ".join(noun for kind, noun in nouns.items() if kind in kinds)
+    log.warn([_WORDS.text("fit_rests_on_whole" if beyond else "fit_rests_on", kinds=used)])
     return other
 
 
@@ -125,8 +135,31 @@ def _fit_points(
         initial={name: estimate.value for name, estimate in initial.items()},
         decays=_decay_dampings(initial, n=bench.n),
     )
-    bode = _held(log.attempt(Stage.BODE_FIT, to_points), runs)
+    bode = _held(log.attempt(Stage.BODE_FIT, to_points), runs, measured=points_measured(responses))
     return bode and replace(bode, by_dwells="sine" in _kinds_that_follow(runs.used, bode))
+
+
+def _fit_records(records: Sequence[Record], runs: Runs, *, bench: Bench, log: Log) -> Fitted | None:
+    """Return the fit to whole records in the time domain."""
+    fit = log.attempt(Stage.FINAL_ESTIMATES, partial(fit_records, records, bench=bench))
+    if fit is None:
+        return None
+    used = [record for record in records if record.id in fit.experiments]
+    return _held(fit, runs, measured=motion_measured(used))
+
+
+def _misses_transients(fitted: Fitted, runs: Runs, dwells: Sequence[Record]) -> bool:
+    """Whether the whole records of short dwells may tell more than the steady ones.
+
+    If many dwells are short, the steady state of others is not certain either.
+    """
+    return bool(runs.short) and (5 * len(runs.short) >= len(dwells) or _extrapolates(fitted))
+
+
+def _extrapolates(fitted: Fitted) -> bool:
+    """Whether a resonance or null of the fit has no measurement near it."""
+    assert fitted.fit is not None
+    return any(estimate.extrapolated for estimate in fitted.fit.parameters.values())
 
 
 def _is_doubted(fitted: Fitted, dwells: Sequence[Record]) -> bool:
@@ -151,10 +184,17 @@ def _is_closer(fitted: Fitted, other: Fitted, dwells: Sequence[Record]) -> bool:
     return fitted.fit.explains_data and lost[0] < lost[1]
 
 
-def _held(fit: ChainFit | None, runs: Runs) -> Fitted | None:
-    """Return a fit, and how all records follow it, whether used or not."""
+def _held(fit: ChainFit | None, runs: Runs, *, measured: Array) -> Fitted | None:
+    """Return a fit with its coverage, and how all records follow it, whether used or not.
+
+    Parameters
+    ----------
+    measured : frequencies, rad/s, at which the fit's data have a measurement.
+    """
+    if fit is None:
+        return None
     records = [*runs.used, *runs.left_out]
-    return Fitted(fit=fit, fits=follow(records, fit.chain)) if fit else None
+    return Fitted(fit=with_coverage(fit, measured), fits=follow(records, fit.chain))
 
 
 def _kinds_that_follow(records: Sequence[Record], fitted: Fitted) -> set[str]:

@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from pipeline.names import read_name
-from pipeline.results import Estimate, ParameterRow
+from pipeline.results import DeterminedBy, Estimate, ParameterRow
 from pipeline.set_up import Bench
 
 # In Throne's tables, the two estimates of gains and frequencies differ by up to 14 %. For one null,
@@ -69,10 +69,32 @@ def compare(
                 change_sigmas=sigmas,
                 consistent=consistent,
                 independent=independent,
+                determined_by=_determined_by(name, before, after, agree=bool(consistent)),
                 note=note,
             )
         )
     return tuple(rows)
+
+
+def _determined_by(
+    name: str, before: Estimate | None, after: Estimate | None, *, agree: bool
+) -> DeterminedBy | None:
+    """Return what determines a final frequency or damping ratio; None for other parameters.
+
+    A decay that agrees with an extrapolated number measures it.
+    """
+    read = read_name(name)
+    if after is None or not (read.is_frequency or read.is_ratio):
+        return None
+    near = after.coverage
+    if near is None:
+        return "decay" if after.source == "log_decrement" else None
+    if near.extrapolated:
+        measured = agree and before is not None and before.source == "log_decrement"
+        return "decay" if measured else "model"
+    if name not in (near.of, read_name(near.of).damping):
+        return "parameters"
+    return "points" if after.source == "bode_fit" else "motion"
 
 
 def why_open(name: str, final: Estimate) -> str:

@@ -56,8 +56,7 @@ def collect_dwells(points: Sequence[SinePoint]) -> tuple[FrequencyResponse, ...]
     """Collect dwells into one frequency response per cart; repeats become one point.
 
     Repeats are combined to their weighted mean. Its standard error grows if the repeats scatter by
-    more than their own errors allow. A dwell that did not settle is used with an added error of 5
-    %. A dwell with a `dwell_fault` is not used.
+    more than their own errors allow. A dwell with a `dwell_fault` is not used.
 
     Raises
     ------
@@ -83,16 +82,13 @@ def _collect_cart(points: Sequence[SinePoint], *, cart: int) -> FrequencyRespons
         groups[-1].append(point)
     rows = []
     for group in groups:
-        # The amplitude of a dwell that ends before its steady state is wrong by a few percent.
-        extra = np.array([0.0 if p.settled else 0.05 for p in group])
-        gain = np.array([p.gain for p in group])
         magnitude, magnitude_std = _weighted_mean(
-            gain, np.hypot([p.gain_std for p in group], extra * gain)
+            np.array([p.gain for p in group]), np.array([p.gain_std for p in group])
         )
         around = group[0].phase
         turn, phase_std = _weighted_mean(
             _wrapped(np.array([p.phase for p in group]) - around),
-            np.hypot([p.phase_std for p in group], extra),
+            np.array([p.phase_std for p in group]),
         )
         omega = float(np.mean([p.omega for p in group]))
         phase = float(_wrapped(np.array(around + turn)))
@@ -231,7 +227,7 @@ def find_resonances(responses: Sequence[FrequencyResponse], *, n: int) -> dict[s
     symbols = mode_suffixes(n)
     if len(modes) == n:
         found |= _estimates(omega_names(symbols), modes)
-    lowest = modes[0].omega if modes else None
+    lowest = modes[0].omega if len(modes) == n else None
     for cart, response in sorted(by_cart.items()):
         gain = _low_frequency_gain(response, resonance=lowest)
         found |= {gain_name(cart, n=n): gain} if gain else {}

@@ -121,20 +121,6 @@ def test_repeats_around_half_a_turn_do_not_cancel():
     assert_allclose(np.abs(got.phase), np.pi, rtol=1e-9)
 
 
-def test_an_unsettled_dwell_counts_little():
-    """A dwell that did not settle gets an error of 5 %.
-
-    Next to a settled dwell at the same frequency, it hardly counts.
-    """
-    (alone,) = collect_dwells([dwell(omega=5.0, gain=2.0, settled=False)])
-    (both,) = collect_dwells(
-        [dwell(omega=5.0, gain=2.2, settled=False), dwell(omega=5.0, gain=2.0)]
-    )
-
-    assert_allclose(alone.magnitude_std, np.hypot(0.001, 0.05 * 2.0), rtol=1e-9)
-    assert_allclose(both.magnitude, 2.0, atol=0.001)
-
-
 def test_dwells_without_an_input_are_refused():
     """A dwell without an input amplitude is refused, since a gain needs one."""
     silent = SinePoint(

@@ -212,15 +212,22 @@ def in_doubt(references: References, *, analysis: Analysis) -> References:
     """Return the references with bounds beyond which a number counts against the student.
 
     On a nonlinear bench, the bounds are widened. They are widened more for a final gain than for an
-    initial one, because a fit means little on such a bench.
+    initial one, because a fit means little on such a bench. On a linear bench, only the bounds of
+    extrapolated numbers are widened.
     """
-    if is_linear(analysis):
-        return references
 
     def factor(name: str, *, of_gains: float) -> float:
         if read_name(name).is_damping:
             return limits.BEYOND_BELIEF_DAMPING
         return of_gains if read_name(name).is_gain else limits.BEYOND_BELIEF
+
+    if is_linear(analysis):
+        beyond = {row.name for row in analysis.rows if row.extrapolated}
+        final = {
+            name: one.widened(factor(name, of_gains=1.0)) if name in beyond else one
+            for name, one in references.final.items()
+        }
+        return replace(references, final=final)
 
     def widened(table: Mapping[str, Reference], *, of_gains: float) -> dict[str, Reference]:
         return {

@@ -31,6 +31,7 @@ _WORST_FIRST = (
     "fit_converged",
     "physical",
     "vanishing",
+    "covered",
     "repeats",
     "initial_final",
     "hardware",

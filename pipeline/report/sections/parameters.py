@@ -82,9 +82,9 @@ def _parameter_row(row: ParameterRow, *, steps: Collection[str]) -> list[Cell]:
     return [
         cell(name_span(row.name)),
         cell(_unit(row)),
-        cell(_estimate(row.initial)),
+        cell(_of_column(row, "initial")),
         cell(source_text(row.initial, steps=steps), "quiet"),
-        cell(_estimate(row.final)),
+        cell(_of_column(row, "final")),
         cell(change),
         cell(f"{change_limit(row.name):.0f} %" if judged else NOTHING, "quiet"),
         _verdict(row.consistent),
@@ -117,11 +117,15 @@ def _unit(row: ParameterRow) -> str:
     return unit_text(clean(row.unit)) or "1"
 
 
-def _estimate(estimate: Estimate | None) -> str:
+def _of_column(row: ParameterRow, column: str) -> str:
+    """Return the initial or the final estimate of a row."""
+    estimate: Estimate | None = getattr(row, column)
     if estimate is None:
         return NOTHING
     if estimate.source == "assumed":  # a guess has few meaningful digits
         return significant(estimate.value, digits=2)
+    if column == "final" and row.extrapolated:  # its standard error assumes the right model
+        return f"{significant(estimate.value, digits=3)}, extrapolated"
     return with_error(estimate.value, estimate.std)
 
 
@@ -142,7 +146,7 @@ def reported_table(page: Page) -> Table:
             cell(name_span(row.name)),
             cell(column),
             cell(f"{yours:f}".replace("-", "−")),
-            cell(_estimate(getattr(row, column))),
+            cell(_of_column(row, column)),
             cell(_unit(row)),
             *_error_cells(row.name, yours, getattr(row, column)),
         ]

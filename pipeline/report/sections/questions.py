@@ -126,6 +126,7 @@ def _assumed(analysis: Analysis) -> Iterator[Asked]:
         and row.final is not None
         and row.final.source == "bode_fit"  # for other sources, the figure has no points
         and row.initial.source == "assumed"
+        and not row.extrapolated
         and abs(row.change_percent or 0.0) > DAMPING_LIMIT
     ]
     if not guessed:

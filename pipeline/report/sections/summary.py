@@ -11,7 +11,7 @@ from pipeline.report.sections.housekeeping import taken_text
 from pipeline.report.sections.loops import CLOSE
 from pipeline.report.sections.measurements import overview_blocks
 from pipeline.report.sections.page import Page
-from pipeline.results import Analysis, Estimate, HardwareCheck, ParameterRow
+from pipeline.results import Analysis, HardwareCheck, ParameterRow
 from pipeline.words.numbers import (
     NOTHING,
     count,
@@ -143,8 +143,7 @@ def _numbers_board(analysis: Analysis, *, error: str = "statistical") -> tuple[T
     """
     return tuple(
         _number_tile(
-            row.name,
-            row.final,
+            row,
             unit=unit_text(clean(row.unit)),
             is_sure=_is_explained(analysis),
             error=error,
@@ -159,13 +158,18 @@ def _is_explained(analysis: Analysis) -> bool:
     return analysis.fit is not None and analysis.fit.explains_data
 
 
-def _number_tile(name: str, final: Estimate, *, unit: str, is_sure: bool, error: str) -> Tile:
-    """Return a tile for a number, with its standard error.
+def _number_tile(row: ParameterRow, *, unit: str, is_sure: bool, error: str) -> Tile:
+    """Return a tile for a final number, with its standard error.
 
     An error below the accuracy of a calibration is stated in a note instead.
     """
+    final = row.final
+    assert final is not None
     share = (final.std or 0.0) / abs(final.value) if final.value else 1.0
-    if not is_sure:
+    if row.extrapolated:
+        value = significant(final.value, digits=3)
+        unit = f"{unit}, {_WORDS.text('extrapolated')}"
+    elif not is_sure:
         # The true error is unknown, so the value has only three digits.
         value = significant(final.value, digits=3)
     elif 0 < share < CALIBRATION:
@@ -175,7 +179,7 @@ def _number_tile(name: str, final: Estimate, *, unit: str, is_sure: bool, error:
     else:
         # If the error is 1 % or more, the value has about four digits when the error has two.
         value = with_error(final.value, final.std, digits=2 if share >= 0.01 else 1)
-    return Tile(label=spans(name_span(name)), value=spans(value), note=spans(unit))
+    return Tile(label=spans(name_span(row.name)), value=spans(value), note=spans(unit))
 
 
 def _is_told(name: Name) -> bool:
