@@ -321,8 +321,8 @@ class Coverage:
     ----------
     of : the name of the frequency, such as "omega_b".
     half_width : ζω, half the width of its peak.
-    below, above : the nearest measured frequencies; None if there are none on that side. One within
-        `half_width` counts for both sides.
+    below, above : the nearest measured frequency on each side, or None. One within `half_width`
+        counts for both sides.
     limit : the largest relative distance at which measurements still determine it.
     """
 
@@ -422,8 +422,8 @@ class ChainFit:
 
 # ------------------------------------------------------------------- comparing
 
-# What determines a fitted number: points of the response at its frequency, motion at its frequency
-# in the fitted recordings, a decay, other parameters that are determined themselves, or the model.
+# What determines a fitted number: points of the response or motion in the fitted recordings at its
+# frequency, a decay, other parameters with such measurements, or only the model.
 DeterminedBy = Literal["points", "motion", "decay", "parameters", "model"]
 
 
