@@ -60,7 +60,7 @@ def with_coverage(fit: ChainFit, measured: Array) -> ChainFit:
     """Return the fit; each frequency and damping ratio has its `Coverage`.
 
     Frequencies of carts held alone that are no null follow from all resonances and nulls, so they
-    have the worst coverage of these. A damping ratio from decays is measured and gets no `Coverage`.
+    have the worst coverage of these. A damping ratio from decays is measured and gets none.
 
     Parameters
     ----------
