@@ -24,7 +24,7 @@ _COUNTED = re.compile(r"\benc|counts?\b|commanded pos", re.IGNORECASE)
 # A unit as in "time [ms]", "x1 (cm)" or "x1_cm". The last form is not for every unit: "u_in" does
 # not mean inches.
 _UNIT = re.compile(
-    r"[\[(]\s*([^\])]+?)\s*[\])]\s*$|(?<=[a-z0-9])_(s|ms|us|m|cm|mm|V|mV|N|counts?|Hz|dB)$"
+    r"[\[(]\s*([^\s\[\]()](?:[^\[\]()]*[^\s\[\]()])?)\s*[\])]\s*$|(?<=[a-z0-9])_(s|ms|us|m|cm|mm|V|mV|N|counts?|Hz|dB)$"
 )
 
 # For each unit, the factor to a common unit of the same quantity.

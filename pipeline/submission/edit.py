@@ -75,7 +75,7 @@ def edit_submission(
         try:
             document = tomlkit.parse(text.replace("\r\n", "\n"))
             change(document)
-            new = re.sub(r"\n{3,}(?=\[\[experiments\]\])", "\n\n", tomlkit.dumps(document))
+            new = re.sub(r"(?<!\n)\n{3,}(?=\[\[experiments\]\])", "\n\n", tomlkit.dumps(document))
             new = new.rstrip() + "\n"
         except (TOMLKitError, RecursionError) as error:
             raise SubmissionError(f"{where}: cannot be edited by cartlab ({error})") from None

@@ -21,7 +21,7 @@ _LONGEST_LINE, _SHOWN = 300, 60  # characters of a line that are checked, and th
 # exponent; larger than that of any physical number, yet numbers can still be multiplied
 _LARGEST = 30
 _AT = re.compile(r" \(at line (\d+), column (\d+)\)$")
-_HEADER = re.compile(r"\s*(\[\[?)\s*([^\[\],]+?)\s*\]\]?\s*(?:#.*)?$")
+_HEADER = re.compile(r"\s*(\[\[?)\s*([^\[\],\s](?:[^\[\],]*[^\[\],\s])?)\s*\]\]?\s*(?:#.*)?$")
 _KEY = re.compile(r"\s*([A-Za-z0-9_.\"'-]+)\s*=")
 # A heading, even if a bracket of it is missing; not a row of numbers in a longer list.
 _HEADING = re.compile(
@@ -273,10 +273,15 @@ def _find_spoilt(lines: Sequence[str], line: int, slip: _Slip) -> tuple[int, int
         for n in range(line - 1, 0, -1):
             if lines[n - 1].count("[") > lines[n - 1].count("]"):
                 return n, line - 1
-    if _HEADING.match(lines[line - 1]):  # otherwise the previous table would get its keys
+    if _heading(lines[line - 1]):  # otherwise the previous table would get its keys
         after = (n for n in range(line, len(lines)) if lines[n].lstrip().startswith("["))
         return line, next(after, len(lines))
     return line, line
+
+
+def _heading(line: str) -> re.Match[str] | None:
+    """Return the heading in a line, even a spoilt one; a very long line is not one."""
+    return _HEADING.match(line) if len(line) <= _LONGEST_LINE else None
 
 
 def _spoilt_keys(lines: list[str], first: int, last: int) -> Iterator[Location]:
@@ -284,7 +289,7 @@ def _spoilt_keys(lines: list[str], first: int, last: int) -> Iterator[Location]:
 
     A line that begins with neither a heading nor a name belongs to the key above it.
     """
-    if heading := _HEADING.match(lines[first - 1]):
+    if heading := _heading(lines[first - 1]):
         yield tuple(re.split(r"[\s.]+", heading[1].strip(" \"'\r")))
         return
     places: list[tuple[Location, int]] = [((), 0)]

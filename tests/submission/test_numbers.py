@@ -10,11 +10,11 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from pipeline.bench.protocol.messages import Description, format_description, parse_description
+from pipeline.desk.student.folder_tasks import read_document
 from pipeline.desk.student.form import (
     Field,
     fill_experiment,
     fill_form,
-    read_document,
     write_fields,
 )
 from pipeline.desk.users import read_users

@@ -24,6 +24,9 @@ _MOST_BYTES = 200_000_000  # largest total size of all variables, decompressed
 _MOST_VARIABLES, _LONGEST_NAME = 1000, 64  # no workspace has more
 _MOST_DIMENSIONS = 32
 _MOST_PACKED = 1_100  # largest ratio of decompressed to compressed size
+_MOST_OBJECTS = 3_000  # names in the file and in its structs; the same object may have many
+# Filters of HDF5 by number; a checksum of four bytes may be added before or after compression.
+_DEFLATE, _CHECKSUM, _SIZE_OF_CHECKSUM = 1, 3, 4
 _MOST_ABSENT = 1_000_000  # bytes of zeros that MATLAB may leave out
 # Codes of version 5: types of elements, a flag, classes of variables, and storage types.
 _MATRIX, _COMPRESSED, _OPAQUE, _COMPLEX = 14, 15, 17, 0x800
@@ -246,9 +249,12 @@ def _v4_heading(raw: bytes, at: int) -> tuple[np.dtype, tuple[int, int], int, bo
 def _version_7_3(raw: bytes) -> Iterator[MatVariable]:
     import h5py
 
-    left = _MOST_BYTES
+    left, objects = _MOST_BYTES, _MOST_OBJECTS
     with h5py.File(BytesIO(raw), "r") as file:
         for name in map(str, file):
+            objects -= 1
+            if objects < 0:
+                raise ValueError(name)
             if name.startswith("#"):  # parts of MATLAB's cells and objects
                 continue
             is_link = not isinstance(file.get(name, getlink=True), h5py.HardLink)
@@ -264,7 +270,8 @@ def _version_7_3(raw: bytes) -> Iterator[MatVariable]:
                     for key in islice(item, _MOST_VARIABLES)
                     if isinstance(item.get(key, getlink=True), h5py.HardLink)
                 ]
-                parts = [item[key] for key in own]
+                objects -= len(own)
+                parts = [item[key] for key in own] if objects >= 0 else []
                 taken = sum(part.nbytes for part in parts if isinstance(part, h5py.Dataset))
                 yield _nothing(name, kind, size=(1, 1), bytes=taken)
                 continue
@@ -275,6 +282,8 @@ def _version_7_3(raw: bytes) -> Iterator[MatVariable]:
             left -= _bytes_to_read(item) if not kind else 0
             if left < 0 or item.is_virtual or item.external:  # the numbers are in another file
                 raise ValueError(name)
+            if not kind:
+                _check_chunks(item)
             if kind:
                 yield _nothing(name, kind, size=size, bytes=item.nbytes)
             else:
@@ -297,6 +306,31 @@ def _bytes_to_read(item: Any) -> int:
     if item.nbytes > max(_MOST_PACKED * item.id.get_storage_size(), _MOST_ABSENT):
         raise ValueError(item.nbytes)
     return max(item.nbytes, part)
+
+
+def _check_chunks(item: Any) -> None:
+    """Refuse a data set with a chunk that is larger than stated.
+
+    The HDF5 library decompresses a chunk whole, whatever its stated size: 12 MB can become 12 GB.
+
+    Raises
+    ------
+    ValueError : a chunk is too large, or is compressed twice.
+    """
+    made, stored = item.id.get_create_plist(), item.id
+    filters = [made.get_filter(i)[0] for i in range(made.get_nfilters())]
+    if _DEFLATE not in filters or not item.chunks:
+        return
+    at = filters.index(_DEFLATE)
+    if not set(filters[at + 1 :]) <= {_CHECKSUM}:
+        raise ValueError(filters)
+    most = math.prod(item.chunks) * item.dtype.itemsize + _SIZE_OF_CHECKSUM
+    for i in range(stored.get_num_chunks()):
+        skipped, packed = stored.read_direct_chunk(stored.get_chunk_info(i).chunk_offset)
+        if skipped & 1 << at:  # this chunk is not compressed
+            continue
+        if len(zlib.decompressobj().decompress(packed, most + 1)) > most:
+            raise ValueError(most)
 
 
 def _holds_numbers(dtype: np.dtype) -> bool:

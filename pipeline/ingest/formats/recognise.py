@@ -1,7 +1,11 @@
 """Recognise the format of a data file by its content and read its columns."""
 
 import hashlib
-from collections.abc import Collection
+import signal
+import sys
+import threading
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from pipeline.errors import SubmissionError, is_file_fault
@@ -36,6 +40,8 @@ _READERS = (
     (is_lvm, read_lvm),
     (is_tdms, read_tdms),
 )
+
+MOST_SECONDS = 30.0  # of processor time to read one file; the largest recording takes ten
 
 # First bytes of files that are submitted by mistake, and the advice to give.
 _STRANGERS = (
@@ -72,7 +78,45 @@ def read_table(
         if not is_file_fault(error):
             raise
         raise SubmissionError(f"{source}: cannot be read ({error.strerror})") from None
-    return parse_table(raw, source=source), hashlib.sha256(raw).hexdigest()
+    with _limited(source):
+        table = parse_table(raw, source=source)
+    return table, hashlib.sha256(raw).hexdigest()
+
+
+class _TooLong(BaseException):
+    """Reading a file took too long; no reader may catch it."""
+
+
+@contextmanager
+def _limited(source: str) -> Iterator[None]:
+    """Limit the processor time for reading one file, so that it costs only its own recording.
+
+    Processor time does not depend on the load of the computer. On Windows, and outside the main
+    thread, there is no such limit; there, the limit of the whole submission remains.
+
+    Raises
+    ------
+    SubmissionError : the limit is exceeded.
+    """
+    here = threading.current_thread() is threading.main_thread()
+    if sys.platform == "win32" or not here or signal.getitimer(signal.ITIMER_VIRTUAL)[0]:
+        yield
+        return
+
+    def stop(*_: object) -> None:
+        raise _TooLong
+
+    before = signal.signal(signal.SIGVTALRM, stop)
+    try:
+        try:
+            signal.setitimer(signal.ITIMER_VIRTUAL, MOST_SECONDS)
+            yield
+        finally:
+            signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+            signal.signal(signal.SIGVTALRM, before)
+    except _TooLong:
+        why = f"takes more than {MOST_SECONDS:g} s of processor time to read"
+        raise SubmissionError(f"{source}: {why}; save the recording as CSV") from None
 
 
 def is_recording(head: bytes) -> bool:

@@ -18,7 +18,9 @@ _SNIFFED_ROWS = 40
 _HEADING_WORDS = re.compile(
     r"encoder\s*\d+\s+(?:pos|vel|acc)\w*|commanded\s+\w+|control\s+effort|[^\s,;]+", re.IGNORECASE
 )
-_TIME_HEADING = re.compile(r"(?:^|[,;\t])\W*(?:sample\s+)?(?:t|time)(?![a-z])", re.IGNORECASE)
+_TIME_HEADING = re.compile(
+    r"(?:^|[,;\t])[^\w,;\t]*(?:sample\s+)?(?:t|time)(?![a-z])", re.IGNORECASE
+)
 _OPENING = re.compile(r"^[^\S\n]*(?:[A-Za-z]\w*\s*=\s*)?\[", re.MULTILINE)
 _LONGEST_HEADING = 100  # characters
 _LONGEST_UNIT = 8  # characters; enough for "counts" and "rad/s"

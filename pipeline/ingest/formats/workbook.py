@@ -22,7 +22,7 @@ _MOST_NAMED = 8
 _PARTS = (b"[Content_Types].xml", b"docProps/", b"xl/")  # one of these occurs early in the archive
 _DAY = 86_400.0  # s
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?")
-_UNIT_OF_HEADING = re.compile(r"\s*[\[(][^\])]*[\])]\s*$")
+_UNIT_OF_HEADING = re.compile(r"(?<!\s)\s*[\[(][^\[\]()]*[\])]\s*$")
 
 
 def is_workbook(raw: bytes) -> bool:

@@ -36,7 +36,8 @@ _NO_VALUE = "a formula without its value: open the file in a spreadsheet program
 _PERCENTS = {9, 10}
 _DATES = {14, 15, 16, 17, 22, *range(27, 37), *range(50, 59)}
 _TIMES = {18, 19, 20, 21, 45, 46, 47}
-_NO_CODE = re.compile(r'"[^"]*"|\\.|_.|\*.|\[(?![hms]+\])[^\]]*\]', re.IGNORECASE | re.DOTALL)
+_LONGEST_CODE = 255  # characters; Excel allows no longer number format
+_NO_CODE = re.compile(r'"[^"]*"|\\.|_.|\*.|\[(?![hms]{1,9}\])[^\[\]]*\]', re.IGNORECASE | re.DOTALL)
 
 
 class _Broken(Exception):
@@ -407,7 +408,7 @@ class _Sheet:
 
 def _classify_format(number: int, code: str) -> str:
     """Return what a number format stands for: "percent", "time", "date" or ""."""
-    bare = _NO_CODE.sub("", code).casefold()
+    bare = _NO_CODE.sub("", code[:_LONGEST_CODE]).casefold()
     if number in _PERCENTS or "%" in bare:
         return "percent"
     if bare == "general" or (code and not re.search(r"[ymdhs]", bare)):

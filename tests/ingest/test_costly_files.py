@@ -1,0 +1,131 @@
+"""A file that is made to cost hours or gigabytes costs only its own recording."""
+
+import re
+import shutil
+import time
+import zlib
+from io import BytesIO
+
+import h5py
+import numpy as np
+import pytest
+
+from pipeline.errors import SubmissionError
+from pipeline.ingest import columns
+from pipeline.ingest.formats import recognise, text, workbook
+from pipeline.ingest.formats.recognise import parse_table, read_table
+from pipeline.ingest.read import read_data
+from pipeline.resources import EXAMPLES
+from pipeline.submission import load_submission, toml_file
+from pipeline.submission.load import NAME
+
+
+def in_matlab(fill) -> bytes:
+    """Return a `.mat` file of version 7.3 whose content `fill` writes."""
+    buffer = BytesIO()
+    with h5py.File(buffer, "w", userblock_size=512) as file:
+        fill(file)
+    return b"MATLAB 7.3".ljust(512, b"\0") + buffer.getvalue()[512:]
+
+
+def a_signal(file: h5py.File, name: str, values: np.ndarray, **options: object) -> h5py.Dataset:
+    """Add a vector to a `.mat` file, as MATLAB writes it."""
+    signal = file.create_dataset(name, data=values[None, :], **options)
+    signal.attrs["MATLAB_class"] = np.bytes_("double")
+    return signal
+
+
+def inflating(file: h5py.File) -> None:
+    """Write one chunk that is 500 times larger than it says."""
+    signal = a_signal(file, "x1", np.zeros(100_000), chunks=(1, 100_000), compression="gzip")
+    packer = zlib.compressobj(9)
+    packed = b"".join(packer.compress(bytes(1 << 20)) for _ in range(400)) + packer.flush()
+    signal.id.write_direct_chunk((0, 0), packed)
+
+
+def with_many_names(file: h5py.File) -> None:
+    """Write structs with a million fields, which are all the same number."""
+    group = file.create_group("s0")
+    number = group.create_dataset("f0", data=np.zeros((1, 1)))
+    for i in range(1, 1000):
+        group[f"f{i}"] = number
+        file[f"s{i}"] = group
+
+
+@pytest.mark.parametrize("fill", [inflating, with_many_names])
+def test_a_bomb_costs_its_recording(fill, tmp_path):
+    """A `.mat` file that unpacks to gigabytes, or has a million names, is refused at once."""
+    shutil.copytree(EXAMPLES / "one-cart", tmp_path / "team")
+    toml = (tmp_path / "team" / NAME).read_text(encoding="utf-8")
+    (tmp_path / "team" / "data" / "bomb.mat").write_bytes(in_matlab(fill))
+    named = toml.replace("data/step-1.csv", "data/bomb.mat")
+    assert named != toml
+    (tmp_path / "team" / NAME).write_text(named, encoding="utf-8")
+    begin = time.process_time()
+    data = read_data(load_submission(tmp_path / "team"))
+    assert len(data.unreadable) == 1
+    assert "damaged" in next(iter(data.unreadable.values()))
+    assert time.process_time() - begin < 20  # s; it takes 2. The names alone took 400
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"compression": "gzip"},
+        {"compression": "gzip", "shuffle": True, "fletcher32": True},
+        {"compression": "lzf"},
+        {},
+    ],
+)
+def test_honest_chunks_are_read(options):
+    """Signals in chunks are read, however they are compressed."""
+    values = np.random.default_rng(1).normal(size=(2, 12_345))
+    chunks = {"chunks": (1, 1000)} if options else {}
+
+    def fill(file: h5py.File) -> None:
+        for name, signal in zip(("t", "x1"), values, strict=True):
+            a_signal(file, name, signal, **options, **chunks)
+
+    assert np.array_equal(parse_table(in_matlab(fill), source="a.mat").values, values)
+
+
+def test_the_time_to_read_one_file_is_limited(tmp_path, monkeypatch):
+    """A file that takes too long is refused by itself, and the next one is read."""
+    (tmp_path / "long.csv").write_text("time,x1\n" + "0.001,12\n" * 400_000, encoding="utf-8")
+    (tmp_path / "short.csv").write_text("time,x1\n0,1\n1,2\n", encoding="utf-8")
+    monkeypatch.setattr(recognise, "MOST_SECONDS", 0.02)  # s; the long file takes ten times that
+    with pytest.raises(SubmissionError, match=r"long\.csv: takes more than 0\.02 s of processor"):
+        read_table(tmp_path, "long.csv")
+    monkeypatch.undo()
+    assert read_table(tmp_path, "short.csv")[0].values.shape == (2, 2)
+    assert read_table(tmp_path, "long.csv")[0].values.shape == (2, 400_000)
+
+
+# The patterns that are applied to text of any length, and how.
+PATTERNS = {
+    f"{module.__name__}.{name}": pattern
+    for module in (text, workbook, columns, toml_file)
+    for name, pattern in vars(module).items()
+    if isinstance(pattern, re.Pattern) and name != "_HEADING"  # it is for lines of 300 characters
+}
+LONG = 50_000  # characters; a pattern that takes time with their square needs minutes
+
+
+@pytest.mark.parametrize("unit", [",", " ", "[", "(", "x", "1", "\n", "a=", "[ ", "t", "] #", ";"])
+@pytest.mark.parametrize("name", PATTERNS)
+def test_patterns_take_time_in_proportion_to_the_text(name, unit):
+    """No pattern that reads a student's text takes much longer for long repetitions."""
+    pattern, begin = PATTERNS[name], time.process_time()
+    find = pattern.search if name.endswith(("HEADING", "OPENING", "_UNIT")) else pattern.match
+    for start in ("", "x", "[", "a = "):
+        for end in ("", "!"):
+            find(start + unit * (LONG // len(unit)) + end)
+    assert time.process_time() - begin < 5  # s; each takes a few ms
+
+
+def test_a_line_of_commas_is_refused_at_once():
+    """A text of one long line of delimiters is refused, in time proportional to its length."""
+    begin = time.process_time()
+    with pytest.raises(SubmissionError, match="not a table"):
+        parse_table(b"x" + b"," * 1_000_000, source="a.csv")
+    assert time.process_time() - begin < 20  # s; it takes 1. With a square it took hours
