@@ -223,11 +223,13 @@ def _erase(grades: str, teams: list[str], assignment: str | None) -> None:
     The pages are written again without them. Earlier exports contain their names, so they are
     deleted.
     """
+    from pipeline.grading.intake.repairs import forget_repairs
     from pipeline.grading.publish.export import remove_exports
     from pipeline.words.numbers import count
 
     with _changing(grades, assignment) as book:
         gone = book.erase(teams)
+    forget_repairs(Path(grades), gone)
     say(f"erased: {', '.join(gone)}")
     if (folder := Path(grades)).is_dir() and (files := remove_exports(folder)):
         say(f"deleted {count(len(files), 'exported file')} that also contained them; export again")

@@ -98,6 +98,9 @@ class Grade(GradeTable):
     criteria: tuple[Criterion, ...] = ()
     flags: tuple[Flag, ...] = ()
     notes: tuple[str, ...] = ()
+    repaired: Annotated[
+        str, Field(description="who repaired submission.toml before grading, and why; or empty")
+    ] = ""
     units: Annotated[
         Units | None,
         Field(description="units of the numbers in the criteria; null if nothing was judged"),

@@ -59,6 +59,8 @@ class Grading(Member):
     figures : file name and SVG text of each figure in the feedback.
     detail : for developers: the traceback of an error in the grader, or "".
     is_disk_full : whether the disk was full; the gradebook does not store this.
+    original : text of `submission.toml` as handed in, if it has a mistake or was repaired; else "".
+        The gradebook does not store this.
     """
 
     status: Literal["graded", "failed"]
@@ -69,6 +71,7 @@ class Grading(Member):
     figures: tuple[tuple[str, str], ...] = ()
     detail: str = ""
     is_disk_full: bool = False
+    original: str = ""
 
     @property
     def member(self) -> Member:

@@ -1,6 +1,9 @@
 """The page of a team: its points with the evidence, and the decisions of a person."""
 
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
@@ -25,12 +28,21 @@ from pipeline.desk.grades.criteria import (
 )
 from pipeline.desk.grades.filters import Filter
 from pipeline.desk.grades.recordings import find_recordings
+from pipeline.desk.jobs import Busy
 from pipeline.desk.served_files import show_drawing
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, Grade
 from pipeline.grading.gradebook.history import event_words, to_the_second
 from pipeline.grading.gradebook.open_book import Conflict, Listing, TeamNow
 from pipeline.grading.gradebook.override import read_points
+from pipeline.grading.intake.repairs import (
+    Repair,
+    read_original,
+    read_repairs,
+    read_run,
+    save_repair,
+    text_key,
+)
 from pipeline.grading.judge.costs import find_remarks
 from pipeline.grading.publish.anonymous import anonymise, renamed_events
 from pipeline.grading.publish.class_page import feedback_link
@@ -64,6 +76,8 @@ def act(ask: Ask) -> Response:
         to = write_address(ask, after) if after else f"{ask.here}?{wanted.query}"
         return ask.back(to, f"{team.line.submission}: accepted.")
     criterion, seen = ask.text("criterion"), ask.text("seen")
+    if what == "repair":
+        return _repair(ask, shown, team, by=by)
     try:
         if what == "undo":
             book.undo(name, criterion, by=by, seen=seen)
@@ -82,6 +96,48 @@ def act(ask: Ask) -> Response:
     return ask.back(f"{to}#chosen", done, place=_POINTS)
 
 
+def _repair(ask: Ask, shown: Class, team: Listing, *, by: str) -> Response:
+    """Save a repaired `submission.toml` of a team, and grade the class again.
+
+    The text is not parsed here, but by the grading process, which has limits.
+    """
+    place, text = ask.place_or_404(), ask.text("text").replace("\r\n", "\n")
+    if not isinstance(place, Path) or shown.names is not None:
+        raise HTTPException(404, "this file cannot be repaired here")
+    repair = Repair(text=text, by=by, why=ask.text("why"))
+    try:
+        save_repair(place, team.submission, repair, of=ask.text("of_text"))
+    except ConfigError as error:
+        return _show_page(ask, wrong_repair=str(error), status=422)
+    message = "Saved. It counts when the class is graded again."
+    if run := read_run(place):
+        with suppress(Busy):  # another job is running in this folder
+            ask.start("regrade_class", title="Grading", **asdict(run), anonymous=False)
+            message = "Saved. The team is being graded again: load this page again in a moment."
+    return ask.back(write_address(ask, team.line.submission), message)
+
+
+def _show_repair(ask: Ask, shown: Class, team: Listing, *, wrong: str) -> dict[str, str] | None:
+    """Return what the form for the repair of `submission.toml` shows; None if it is not offered."""
+    place = ask.place_or_404()
+    if not isinstance(place, Path) or shown.names is not None:
+        return None
+    original = read_original(place, team.submission)
+    if original is None:
+        return None
+    key = text_key(original)
+    known = read_repairs(place, team.submission).get(key)
+    typed = {"text": ask.text("text"), "why": ask.text("why")} if wrong else {}
+    return {
+        "of_text": key,
+        "original": original if known else "",
+        "text": known.text if known else original,
+        "why": known.why if known else "",
+        "wrong": wrong,
+        **typed,
+    }
+
+
 def show_figure(ask: Ask) -> Response:
     """Show one of a team's figures."""
     team = find_team(read_class(ask), ask.query("of"))
@@ -93,7 +149,7 @@ def show_figure(ask: Ask) -> Response:
     return show_drawing(render_drawing(plain_svg(drawn[name])))
 
 
-def _show_page(ask: Ask, *, wrong: str = "", status: int = 200) -> Response:
+def _show_page(ask: Ask, *, wrong: str = "", wrong_repair: str = "", status: int = 200) -> Response:
     shown = read_class(ask)
     team = find_team(shown, ask.query("of"))
     book, name = open_book(ask), team.line.submission
@@ -123,6 +179,7 @@ def _show_page(ask: Ask, *, wrong: str = "", status: int = 200) -> Response:
         events=[(to_the_second(event.at), event_words(event)) for event in reversed(events)],
         news=list_news(ask, shown, since=shown.state[1]),
         signature=find_signature(ask),
+        repair=_show_repair(ask, shown, team, wrong=wrong_repair),
         requests=book.request_states(team.submission),
         recordings=find_recordings(ask, shown, now.entry),
         requests_at=f"{ask.here}again?{urlencode({'of': name})}",

@@ -17,10 +17,11 @@ from pipeline.grading.gradebook.class_lines import wrong_springs
 from pipeline.grading.gradings import Batch
 from pipeline.grading.intake.hand_ins import HandIn, find_hand_ins
 from pipeline.grading.intake.late_table import read_late_table, settle_lateness
+from pipeline.grading.intake.repairs import Run, save_run
 from pipeline.grading.publish.anonymous import STRANGER, hidden_reason, pseudonyms_in
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.rubric_file import load_rubric
+from pipeline.grading.rubric_file import find_rubric, load_rubric
 from pipeline.grading.similarity.prints import fingerprint
 from pipeline.lock import lock_or_refuse
 from pipeline.output import OWNERS_FOLDER, named_folder, own_folder
@@ -96,6 +97,7 @@ class Options:
         return Setup(
             rubric=rubric,
             scratch=scratch,
+            out=None if self.gradebook else scratch.parent,
             time_limit=self.time_limit,
             memory_limit=self.memory_limit,
             figures=self.figures,
@@ -157,6 +159,11 @@ def grade_class(
                 for name, reason in batch.failed
             ]
             total = len(hand_ins)
+            if options.gradebook is None:
+                late = str(options.lateness.resolve()) if options.lateness else ""
+                absolute = tuple(str(Path(path).resolve()) for path in paths)
+                rubric_path = str(find_rubric(rubric_file).resolve())
+                save_run(out, Run(paths=absolute, rubric=rubric_path, lateness=late))
             doubles = write_outputs(book, out, progress=lambda what: progress(total, total, what))
     return Summary(
         total=total,

@@ -4,7 +4,7 @@ import hashlib
 import json
 import queue
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -18,6 +18,7 @@ from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradings import Batch, Grading, Member
 from pipeline.grading.intake.files import digest
 from pipeline.grading.intake.hand_ins import HandIn
+from pipeline.grading.intake.repairs import FOLDER, Repair, keep_original, read_repairs
 from pipeline.grading.similarity.shared import find_shared, same_recordings, same_team, shared_flag
 from pipeline.processes import Ended, Failed, Supervisor
 from pipeline.resources import TEMPLATES
@@ -61,6 +62,8 @@ def grade_batch(
     for outcome in execute(new, setup) if new else ():
         book.put(outcome)
         rows[outcome.submission] = outcome.member
+        if setup.out and (outcome.original or (setup.out / FOLDER).is_dir()):
+            keep_original(setup.out, outcome.submission, outcome.original)
         if outcome.status == "failed" and not outcome.settled:
             unsettled.add(outcome.submission)
         if outcome.is_disk_full:
@@ -92,7 +95,8 @@ def _known_and_new(
     basis = code_version(), setup.rubric.model_dump_json(), setup.figures
     rows, new = {}, []
     for hand_in in hand_ins:
-        task = _task(hand_in, basis=basis)
+        repairs = read_repairs(setup.out, hand_in.id) if setup.out else {}
+        task = _task(hand_in, basis=basis, repairs=repairs)
         outcome = book.known(task.key, figures=False)
         if outcome is None and hand_in.problem:
             outcome = failed(task, hand_in.problem, out_of=setup.rubric.out_of)
@@ -223,13 +227,15 @@ def code_version() -> str:
     return total.hexdigest()
 
 
-def _task(hand_in: HandIn, *, basis: tuple[str, str, bool]) -> Task:
+def _task(hand_in: HandIn, *, basis: tuple[str, str, bool], repairs: Mapping[str, Repair]) -> Task:
     """Return the task that grades a hand-in.
 
     The task's key is a hash of everything that affects the outcome.
     """
     files = digest(hand_in.sources)
     plain = asdict(hand_in) | {"sources": files}
+    repaired = {key: asdict(repair) for key, repair in repairs.items()}
+    plain |= {"repairs": repaired} if repaired else {}
     everything = json.dumps([*basis, plain], sort_keys=True)
     whole = hashlib.sha256(everything.encode("utf-8", "surrogateescape")).hexdigest()
     return Task(
@@ -239,6 +245,7 @@ def _task(hand_in: HandIn, *, basis: tuple[str, str, bool]) -> Task:
         digest=files,
         owner=hand_in.owner,
         days_late=hand_in.days_late,
+        repairs=repaired,
     )
 
 

@@ -2,7 +2,7 @@
 
 import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ class Setup:
     scratch : folder for copies of the submissions during grading.
     time_limit : time limit for one submission, in s.
     memory_limit : memory limit for one submission, in bytes, added to what an idle process needs.
+    out : folder of the class, with repairs of submissions; None for a class in a database.
     """
 
     rubric: Rubric
@@ -29,6 +30,7 @@ class Setup:
     time_limit: float = 120.0
     memory_limit: int = 1_000_000_000
     figures: bool = False
+    out: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +42,7 @@ class Task:
     id, owner, days_late : as in `intake.hand_ins.HandIn`.
     key : hash of everything that affects the outcome; see `gradings.Member`.
     digest : expected hash of the submitted files; "" to skip this check.
+    repairs : see `intake.repairs.read_repairs`.
     """
 
     id: str
@@ -48,6 +51,7 @@ class Task:
     digest: str = ""
     owner: str = ""
     days_late: float = 0.0
+    repairs: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
 
 def failed(

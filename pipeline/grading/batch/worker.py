@@ -13,6 +13,7 @@ from pipeline.grading.batch.task import OUT_OF_MEMORY, Task, failed, plain_gradi
 from pipeline.grading.grade import grade_text
 from pipeline.grading.gradings import Grading
 from pipeline.grading.intake.files import Changed, open_submission
+from pipeline.grading.intake.repairs import Repair, text_key
 from pipeline.grading.judge.reweigh import findings_text
 from pipeline.grading.judge.run import Graded, grade_submission
 from pipeline.grading.rubric import Rubric
@@ -31,7 +32,7 @@ _ID = re.compile(r"""\s*id\s*=\s*["'“”„]?([^"'“”#]+)""")
 def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = False) -> Grading:
     """Open, analyse and grade one submission; if it fails, the outcome holds the reason."""
     authors: tuple[str, ...] = ()
-    reason = detail = ""
+    reason = detail = original = ""
     settled, no_room = True, False
     try:
         with tempfile.TemporaryDirectory(
@@ -39,14 +40,21 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
         ) as folder:
             sources = [Path(source) for source in task.sources]
             opened = open_submission(sources, Path(folder) / task.id, digest=task.digest)
+            original = _handed_in(opened)
+            repaired = _repair(opened, task, original)
             authors = named_authors(opened)
             submission = load_submission(opened)
+            original = original if submission.unread or repaired else ""
             authors = tuple(author.id for author in submission.authors)
             graded = grade_submission(
                 submission, rubric=rubric, name=task.id, days_late=task.days_late
             )
             grade = graded.grade
-            grade = grade.model_copy(update={"notes": (*grade.notes, *asked_note(opened))})
+            notes = [*grade.notes, *asked_note(opened)]
+            if repaired:
+                notes.append(f"{NAME} was repaired before grading: {repaired.why}")
+            by = f"by {repaired.by}: {repaired.why}" if repaired else ""
+            grade = grade.model_copy(update={"notes": tuple(notes), "repaired": by})
             records = graded.analysis.records if graded.analysis else ()
             drawn, detail = _figures(submission, graded, rubric) if figures else ((), "")
             return Grading(
@@ -63,6 +71,7 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
                 owner=task.owner,
                 settled=not detail,
                 detail=detail,
+                original=original,
             )
     except Changed:  # for example, because the folder is being synchronised
         reason, settled = "its files changed during the grading: grade it again", False
@@ -79,7 +88,25 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
     outcome = failed(
         task, reason, authors=authors, out_of=rubric.out_of, settled=settled, detail=detail
     )
-    return replace(outcome, is_disk_full=no_room)
+    return replace(outcome, is_disk_full=no_room, original=original)
+
+
+def _handed_in(folder: Path) -> str:
+    """Return the text of `submission.toml`; "" if it is too long or not text."""
+    try:
+        raw = (folder / NAME).read_bytes()
+        return raw.decode("utf-8-sig") if len(raw) <= MAX_TOML_BYTES else ""
+    except UnicodeDecodeError:
+        return ""
+
+
+def _repair(folder: Path, task: Task, text: str) -> Repair | None:
+    """Write the repair of a text, if there is one, into the private copy of a submission."""
+    if (found := task.repairs.get(text_key(text))) is None:
+        return None
+    repair = Repair(**found)
+    (folder / NAME).write_text(repair.text, encoding="utf-8", newline="\n")
+    return repair
 
 
 def named_authors(folder: Path) -> tuple[str, ...]:

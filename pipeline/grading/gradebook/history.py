@@ -19,6 +19,7 @@ from pipeline.grading.gradebook.schema import (
     submissions,
 )
 from pipeline.grading.words import on_one_line
+from pipeline.submission.load import NAME
 
 FAILED = "could not be graded: "  # precedes the reason in the text of an event
 
@@ -75,7 +76,9 @@ def _graded(connection: Connection, submission: int) -> Iterator[Event]:
     for row in connection.execute(mine.order_by(gradings.c.id)):
         text = FAILED + on_one_line(row.reason)
         if row.status != "failed":
-            text = ", ".join(flag.code for flag in read_grade(row.grade).flags)
+            grade = read_grade(row.grade)
+            said = [f"{NAME} repaired {grade.repaired}"] if grade.repaired else []
+            text = ", ".join([*said, *(flag.code for flag in grade.flags)])
         yield Event(at=row.at, what="graded", points=row.points, out_of=row.out_of, text=text)
 
 

@@ -1,0 +1,137 @@
+"""A TA repairs a team's `submission.toml` at the desk; the original is kept."""
+
+import json
+import zipfile
+from html import unescape
+from pathlib import Path
+
+import pytest
+
+from pipeline.desk.app import DeskServer
+from pipeline.grading.grade import Grade
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.intake.repairs import read_original, text_key
+from pipeline.simulated.submission import write_submission
+from tests.helpers.commandline import cartlab_here
+from tests.helpers.desks import Visitor
+from tests.helpers.waiting import until
+
+pytestmark = pytest.mark.usefixtures("all_work_here")
+TEAM = "/grades/0/team?of=team-07"
+WHY = "the decimal comma"
+
+
+@pytest.fixture
+def handed_in(tmp_path):
+    """Return a zip file of a submission with a mistake outside `[reported]`, and the right text."""
+    folder = tmp_path / "student" / "team-07"
+    write_submission(folder, "throne-1dof", seed=3, compact=True, reported=True)
+    right = (folder / "submission.toml").read_text("utf-8")
+    (folder / "submission.toml").write_text(right.replace("carts = 1", "carts = 1,0"), "utf-8")
+    path = tmp_path / "class" / "team-07.zip"
+    path.parent.mkdir()
+    pack(folder, path)
+    return folder, path, right
+
+
+def pack(folder: Path, path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        for file in sorted(folder.rglob("*")):
+            if file.is_file():
+                archive.write(file, file.relative_to(folder.parent).as_posix())
+
+
+def grade(path: Path, out: Path) -> Grade:
+    cartlab_here("grade", path.parent, "--rubric", "throne-1dof", "--out", out, "--jobs", "1")
+    return current(out)
+
+
+def current(out: Path) -> Grade:
+    with Gradebook(out) as book:
+        return book.entry("team-07").grade
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_a_repaired_file_is_graded_and_stays_repaired(handed_in, tmp_path):
+    """A repaired file is graded at once, and whenever the same file is graded again.
+
+    The history names the person and the reason. A later version of the file is graded as it is.
+    """
+    folder, path, right = handed_in
+    out, packed = tmp_path / "grades", path.read_bytes()
+    before = grade(path, out)
+    assert (before.status, before.points) == ("failed", 0)
+    original = read_original(out, "team-07")
+    assert original is not None
+    assert original == right.replace("carts = 1", "carts = 1,0")
+
+    with DeskServer() as server:
+        ta = Visitor.of(server.url)
+        ta.post("/open", folder=str(out))
+        page = unescape(ta.get(TEAM).text)
+        assert "Repair submission.toml" in page
+        assert "carts = 1,0" in page
+        sent = {"do": "repair", "by": "Ada", "of_text": text_key(original)}
+        assert ta.post(TEAM, **sent, text=right, why="").status == 422
+        assert ta.post(TEAM, **{**sent, "of_text": "other"}, text=right, why=WHY).status == 422
+        assert ta.post(TEAM, **sent, text=right.replace("\n", "\r\n"), why=WHY).status == 303
+        until(lambda: current(out).status == "graded")
+        page = unescape(ta.get(TEAM).text)
+        assert "This file was repaired here." in page
+        assert "carts = 1,0" in page  # the original is shown too
+
+    found = current(out)
+    assert (found.points, found.repaired) == (20, f"by Ada: {WHY}")
+    assert f"submission.toml was repaired before grading: {WHY}" in found.notes
+    said = cartlab_here("history", out, "team-07").stdout
+    assert f"submission.toml repaired by Ada: {WHY}" in said
+    assert path.read_bytes() == packed
+    assert read_original(out, "team-07") == original
+
+    (folder / "notes.md").write_text("Friction matters.\n", "utf-8")  # the same file, packed again
+    pack(folder, path)
+    assert grade(path, out).points == 20
+
+    toml = folder / "submission.toml"
+    toml.write_text(original.replace("carts", "carst"), "utf-8")
+    pack(folder, path)
+    again = grade(path, out)
+    assert (again.status, again.repaired) == ("failed", "")
+    toml.write_text(right, "utf-8")
+    pack(folder, path)
+    assert (grade(path, out).points, read_original(out, "team-07")) == (20, None)
+
+    cartlab_here("remove", out, "team-07", "--erase")
+    assert not (out / "repairs" / "team-07").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_a_file_without_mistakes_is_not_offered_for_repair(handed_in, tmp_path):
+    """A team's page offers the repair only if the file has a mistake, also in a number."""
+    folder, path, right = handed_in
+    out, toml = tmp_path / "grades", folder / "submission.toml"
+    for text, offered in ((right, False), (right.replace("K = ", 'K = "" # ', 1), True)):
+        toml.write_text(text, "utf-8")
+        pack(folder, path)
+        assert grade(path, out).status == "graded"
+        with DeskServer() as server:
+            ta = Visitor.of(server.url)
+            ta.post("/open", folder=str(out))
+            assert ("Repair submission.toml" in ta.get(TEAM).text) == offered
+
+
+def test_an_anonymous_class_shows_no_file(handed_in, tmp_path):
+    """If names are hidden, no file is shown or changed, because it contains them."""
+    _, path, right = handed_in
+    out = tmp_path / "grades"
+    cartlab_here("grade", path, "--rubric", "throne-1dof", "--out", out, "--anonymous")
+    document = json.loads(next((out / "feedback").glob("*/grade.json")).read_text("utf-8"))
+    address = f"/grades/0/team?of={document['submission']}"
+    with DeskServer() as server:
+        ta = Visitor.of(server.url)
+        ta.post("/open", folder=str(out))
+        assert "Repair submission.toml" not in ta.get(address).text
+        sent = {"do": "repair", "by": "Ada", "why": WHY, "text": right}
+        assert ta.post(address, **sent, of_text="x").status == 404

@@ -1,0 +1,74 @@
+"""A repaired `submission.toml` is graded in place of the text for which it was made."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.grading.batch.task import Task
+from pipeline.grading.batch.worker import grade_task
+from pipeline.grading.gradings import Grading
+from pipeline.grading.intake.repairs import (
+    Repair,
+    keep_original,
+    read_original,
+    read_repairs,
+    save_repair,
+    text_key,
+)
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.simulated.submission import write_submission
+
+BY_ADA = {"by": "Ada", "why": "the decimal comma"}
+
+
+def test_a_repair_counts_only_for_its_text(tmp_path):
+    """A repair is graded for the text it was made for; the handed-in file stays as it is.
+
+    For another text the repair is not used. A text with a mistake is returned, to be repaired.
+    """
+    folder, scratch = tmp_path / "team-07", tmp_path / "scratch"
+    scratch.mkdir()
+    write_submission(folder, "throne-1dof", seed=3, compact=True, reported=True)
+    toml = folder / "submission.toml"
+    right = toml.read_text("utf-8")
+    wrong = right.replace("carts = 1", "carts = 1,0").replace("\n", "\r\n")
+    rubric = load_rubric(Path("throne-1dof"))
+
+    def graded(text: str, **repairs: Repair) -> Grading:
+        toml.write_bytes(text.encode())
+        plain = {key: asdict(repair) for key, repair in repairs.items()}
+        task = Task(id="team-07", key="k", sources=(str(folder),), repairs=plain)
+        return grade_task(task, rubric=rubric, scratch=scratch)
+
+    failed = graded(wrong)
+    assert (failed.status, failed.original) == ("failed", wrong)
+    repairs = {text_key(wrong): Repair(text=right, **BY_ADA)}
+    repaired = graded(wrong, **repairs)
+    grade = json.loads(repaired.grade)
+    assert (grade["points"], grade["repaired"]) == (20, "by Ada: the decimal comma")
+    assert (repaired.original, toml.read_bytes().decode()) == (wrong, wrong)
+    other = graded(right.replace("carts = 1", "carst = 1"), **repairs)
+    assert other.status == "failed"
+    plain = graded(right, **repairs)
+    assert (json.loads(plain.grade)["repaired"], plain.original) == ("", "")
+    assert graded(right.replace("K = ", "K = 1,", 1)).original != ""
+
+
+def test_a_repair_is_saved_for_the_text_that_a_person_saw(tmp_path):
+    """A repair is saved only for the text that is current, and with a reason."""
+    keep_original(tmp_path, "team-07", "first\r\n")
+    assert read_original(tmp_path, "team-07") == "first\r\n"
+    repair, key = Repair(text="right", **BY_ADA), text_key("first\r\n")
+    save_repair(tmp_path, "team-07", repair, of=key)
+    assert read_repairs(tmp_path, "team-07") == {key: repair}
+    with pytest.raises(ConfigError, match="enter a reason"):
+        save_repair(tmp_path, "team-07", Repair(text="x", by="Ada", why=" "), of=key)
+    keep_original(tmp_path, "team-07", "second")
+    with pytest.raises(ConfigError, match="handed in again"):
+        save_repair(tmp_path, "team-07", repair, of=key)
+    assert read_repairs(tmp_path, "team-07") == {key: repair}  # kept for the first text
+    keep_original(tmp_path, "team-07", "")
+    assert read_original(tmp_path, "team-07") is None
