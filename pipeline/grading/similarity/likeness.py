@@ -1,15 +1,9 @@
-"""Measure how similar the noise of two recordings is, apart from what the whole class shares.
+"""Compare two recordings at a known time shift: which rows are equal, and how similar the noise is.
 
-A copy has the noise of its original, even if more noise was added. So if one noise is regressed on
-the other, at the same scale, the slope is one.
-
-Honest recordings also have something in common: the knocks and end stops of the bench are as sudden
-as noise and equal in every run, and an encoder rounds equal motions equally. All this occurs in the
-whole class. So the part that other teams' recordings explain is subtracted from both first. Slope
-and probability are computed from the remainder.
+A copy has the noise of its original. So if one noise is regressed on the other, at the same scale,
+the slope is one. This only suggests where to look for equal rows, which prove a copy.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,13 +12,6 @@ from pipeline.grading.similarity.prints import PASSED, STEPS_PER_SIGMA, Print
 
 LEAST_OVERLAP = 80  # smallest number of samples in which both recordings have noise
 LEAST_SLOPE = 0.5
-_LEAST_SIGMAS = 4.5
-_SPREAD = 2.5  # standard deviations by which the slope of a copy may differ from one
-# Each recording that is used to explain another one needs this many samples.
-_SAMPLES_EACH = 10
-# Share of a recording's power; without it, copies among the others would make the matrix singular.
-_RIDGE = 1e-6
-_LEAST_PART = 1e-9  # share of a recording's power that the others must leave unexplained
 # Smallest noise from which the scale between two recordings is estimated.
 _LEAST_NOISE = 0.5 * STEPS_PER_SIGMA
 # Residuals are stored as whole steps, so each may be wrong by half a step.
@@ -40,7 +27,7 @@ class Likeness:
     Attributes
     ----------
     times : start and end of the compared or equal part, in s, in each recording.
-    slope : slope of one noise on the other, after subtracting what the class explains.
+    slope : slope of one noise on the other.
     sigmas : agreement of the noise, in standard deviations above chance.
     equal_rows : number of consecutive rows that are equal up to a factor; 0 if not significant.
     different : number of different readings in these rows.
@@ -53,26 +40,13 @@ class Likeness:
     equal_rows: int = 0
     different: int = 0
 
-    @property
-    def is_sure(self) -> bool:
-        """Return whether neither chance nor the class can explain the similarity."""
-        return self.sigmas >= _LEAST_SIGMAS and self.slope >= LEAST_SLOPE
 
-    @property
-    def is_whole(self) -> bool:
-        """Return whether the similarity is certain and the slope is near one, as in a full copy."""
-        return self.is_sure and (1 - self.slope) * self.sigmas <= _SPREAD * self.slope
-
-
-def compare(
-    a: Print, b: Print, *, shift: int, others: Sequence[tuple[Print, int]] = ()
-) -> Likeness:
-    """Compare the noise of two recordings, after removing what other recordings explain.
+def compare(a: Print, b: Print, *, shift: int) -> Likeness:
+    """Compare the noise of two recordings.
 
     Parameters
     ----------
     shift : shift between the recordings: sample i of `a` corresponds to sample i + shift of `b`.
-    others : recordings of other teams, each with its own shift relative to `a`.
     """
     first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
     found = _between(a, b, shift=shift, first=first, last=last)
@@ -92,14 +66,6 @@ def compare(
         in_a[row] *= np.linalg.norm(in_b[row]) / max(np.linalg.norm(in_a[row]), 1e-30)
     x = np.stack([in_a, in_b], axis=1)
     left = x @ x.transpose(0, 2, 1)
-    if others:
-        for row in np.flatnonzero(n).tolist():
-            beside = [
-                _part(c, row, first + s, last + s) for c, s in others[: n[row] // _SAMPLES_EACH]
-            ]
-            rest = _unexplained_products(np.array([*x[row], *beside])[:, both[row]])
-            left[row] = rest * (n[row] / rest[1, 1] if rest[1, 1] > _LEAST_PART * n[row] else 0.0)
-            n[row] -= len(beside)
     # Signs may be reversed in a copy: of all carts together, and of the input.
     product = sum(abs(float(part[:, 0, 1].sum())) for part in np.split(left, [len(a.measured)]))
     of_a, of_b = np.diag(left.sum(axis=0)).tolist()
@@ -115,25 +81,6 @@ def _between(a: Print, b: Print, *, shift: int, first: int, last: int) -> Likene
         experiments=(a.experiment, b.experiment),
         times=(a.times(first, last), b.times(first + shift, last + shift)),
     )
-
-
-def _part(one: Print, row: int, first: int, last: int) -> np.ndarray:
-    """Return a row's noise between two samples; 0 outside the recording."""
-    part = np.zeros(last - first, dtype=np.float32)
-    start, stop = max(first, 0), min(last, one.noise.shape[1])
-    if start < stop:
-        part[start - first : stop - first] = one.noise[row, start:stop]
-    return part
-
-
-def _unexplained_products(x: np.ndarray) -> np.ndarray:
-    """Return the products (2, 2) of the first two rows, minus what the other rows explain."""
-    products = x.astype(np.float64) @ x.T
-    size = np.sqrt(np.maximum(np.diag(products), 1.0))
-    products /= np.outer(size, size)
-    of_others = products[2:, 2:] + _RIDGE * np.eye(len(x) - 2)
-    explained = products[:2, 2:] @ np.linalg.solve(of_others, products[2:, :2])
-    return (products[:2, :2] - explained) * np.outer(size[:2], size[:2])
 
 
 def equal_rows(a: Print, b: Print, *, shift: int) -> Likeness | None:
@@ -167,16 +114,3 @@ def equal_rows(a: Print, b: Print, *, shift: int) -> Likeness | None:
         equal_rows=stop - start,
         different=different,
     )
-
-
-def align(a: Print, b: Print) -> tuple[float, int]:
-    """Return the best agreement of the noise of two recordings, and the shift that gives it."""
-    from scipy.fft import next_fast_len
-
-    n = a.residual.shape[1] + b.residual.shape[1]
-    length = next_fast_len(n, real=True)
-    spectrum = np.conj(np.fft.rfft(a.noise, length)) * np.fft.rfft(b.noise, length)
-    products = np.abs(np.fft.irfft(spectrum.sum(axis=0), length))
-    shift = int(np.argmax(products))
-    alike = float(products[shift]) / max(float(np.linalg.norm(b.noise)), 1.0)
-    return alike, shift if shift < b.residual.shape[1] else shift - products.size

@@ -35,6 +35,12 @@ _KINK = 4.5
 _JUMP = 30.0  # standard deviations; only an input that jumps has a larger residual
 _NOTHING = 1e-7  # share of the travel; a smaller residual is a rounding error of the filter
 
+# Parts of the spectrum, in cycles per sample, and the largest ratio of power between them, in a
+# recording with interpolated samples. Linear interpolation gives 0.02, the moving average of five
+# samples 0.5.
+_LOWER, _UPPER, _INTERPOLATED = (0.12, 0.22), (0.35, 0.5), 0.06
+_START = 1024  # samples from which the spectrum is computed
+
 _LEAST_SWING = 0.25  # share of the largest swing; noise affects smaller ones
 # If a motion has at most this many turning points, these parts of each swing are used as anchors.
 _FEW_TURNS, _PARTS = 5, (0.5, 0.3, 0.7)
@@ -42,7 +48,7 @@ _MOST_ANCHORS = 12  # most anchors from the motion of one recording
 # Most anchors from the noise, and the fewest samples between two of them.
 _NOISE_ANCHORS, _APART = 12, 5
 _FEWEST_SAMPLES = 60
-_EVERY = 8  # the motion is stored at every 8th sample
+EVERY = 4  # the motion is stored at every 4th sample
 _MOST_SAMPLES = 8192  # samples stored of one recording; more do not make the comparison surer
 # Largest number of values stored for a submission: sixty recordings of four carts.
 _MOST_VALUES = 2_000_000
@@ -101,7 +107,7 @@ class Print:
 
     def spread(self, first: int, last: int) -> float:
         """Return the standard deviation of the motion between two samples; 0 if noise hides it."""
-        part = self.motion[first // _EVERY : last // _EVERY + 1]
+        part = self.motion[first // EVERY : last // EVERY + 1]
         noise = (STEPS_PER_SIGMA * self.step[0]) ** 2
         spread = float(np.mean((part - part.mean()) ** 2)) - (1 / PASSED - 1) * noise
         return spread**0.5 if spread > noise else 0.0
@@ -123,7 +129,8 @@ def fingerprint(records: Sequence[Record]) -> bytes:
             "start": one.start,
             "interval": one.interval,
             "anchors": one.anchors,
-            "motion": [float(f"{x:.3g}") for x in one.motion],
+            "motion": [float(f"{x:.4g}") for x in one.motion],
+            "every": EVERY,
         }
         for one in prints
     ]
@@ -138,7 +145,7 @@ def unpack(packed: bytes) -> tuple[Print, ...]:
     head, _, body = zlib.decompress(packed).partition(b"\0")
     prints, at = [], 0
     for entry in json.loads(head):
-        if "interval" not in entry:
+        if entry.get("every") != EVERY:
             return ()
         rows, columns = entry["shape"]
         residual = np.frombuffer(body, _STORED, rows * columns, at).reshape(rows, columns)
@@ -171,7 +178,10 @@ def _prints(record: Record, *, most: int) -> Iterator[Print]:
     signals = [record.position(cart) for cart in carts]
     if record.kind == "closed_loop":
         signals.append(np.zeros_like(record.t) if record.u is None else record.u)
-    y = np.array(signals)[:, : most + 2 * MARGIN]
+    t, y = _without_interpolated(record.t, np.array(signals))
+    if t.size < _FEWEST_SAMPLES + 2 * MARGIN:
+        return
+    y = y[:, : most + 2 * MARGIN]
     noise = np.array([np.convolve(row, _high_pass(), "valid") for row in y])
     sigma = np.array(
         [_sigma(one, travel=float(np.ptp(row))) for one, row in zip(noise, y, strict=True)]
@@ -192,10 +202,30 @@ def _prints(record: Record, *, most: int) -> Iterator[Print]:
             _motion_anchors(motion),
             *(_noise_anchors(x.sum(axis=0)) for x in parts if x.any()),
         ],
-        motion=motion[::_EVERY],
-        start=float(record.t[MARGIN]),
-        interval=record.sample_time,
+        motion=motion[::EVERY],
+        start=float(t[MARGIN]),
+        interval=float((t[-1] - t[0]) / (t.size - 1)),
     )
+
+
+def _without_interpolated(t: Array, y: Array) -> tuple[Array, Array]:
+    """Return times (n,) and signals (n_rows, n) without every other sample, if it was interpolated.
+
+    Interpolated samples contain no noise of their own, so that there is hardly any in the upper
+    half of the spectrum.
+    """
+    bend = np.diff(y, 2, axis=1)  # at samples 1, 2, ...
+    start = bend[:, :_START]
+    power = np.abs(np.fft.rfft(start * np.hanning(start.shape[1]), axis=1)) ** 2
+    frequency = np.linspace(0.0, 0.5, power.shape[1])
+    power = power / np.maximum(np.sin(np.pi * frequency) ** 4, 1e-12)  # undo the differences
+    upper = np.median(power[:, frequency > _UPPER[0]], axis=1)
+    lower = np.median(power[:, (frequency > _LOWER[0]) & (frequency < _LOWER[1])], axis=1)
+    if not np.all(upper <= _INTERPOLATED * lower):
+        return t, y
+    power = np.sum(bend**2, axis=0)
+    first = int(power[::2].sum() > power[1::2].sum())  # linear interpolation does not bend
+    return t[first::2], y[:, first::2]
 
 
 def _sigma(noise: Array, *, travel: float) -> float:

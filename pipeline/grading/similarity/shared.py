@@ -1,14 +1,14 @@
-"""Find recordings that two submissions share, by comparing their noise.
+"""Find recordings that two submissions share.
 
-Equal noise is evidence if it goes beyond what the class shares. But if other pairs of the class
-have partly equal noise, it proves nothing. Rows that are equal up to a factor are always evidence.
-In a class of fewer than five teams, only equal rows count.
+Two kinds of evidence count. Rows that are equal up to a factor prove that one recording is a copy.
+Without them, a pair of submissions is judged as a whole, by the noise of most of its recordings
+(see `noise`). In a class of fewer than five teams, only equal rows count.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from itertools import zip_longest
 from typing import Any
 
@@ -21,9 +21,16 @@ from pipeline.grading.similarity.likeness import (
     LEAST_OVERLAP,
     LEAST_SLOPE,
     Likeness,
-    align,
     compare,
     equal_rows,
+)
+from pipeline.grading.similarity.noise import (
+    Agreement,
+    Heard,
+    agreements,
+    copied,
+    padded_length,
+    usual,
 )
 from pipeline.grading.similarity.prints import PASSED, Print, unpack
 from pipeline.words.numbers import first_few
@@ -44,23 +51,16 @@ _MOST_ALIKE = 16
 # Comparisons of two submissions, as a multiple of their recordings of one kind. Two honest teams
 # with 20 recordings each need a tenth of this.
 _MOST_COMPARED = 10
-_COUNTS = 4.5  # sigmas that a recording needs to count together with others
-# Sigmas that a single recording needs. In a class of 200 (1e9 comparisons) chance reaches 6.1.
-_ALONE = 6.5
-# Sigmas that several recordings need together, as the root of the sum of their squares.
-_TOGETHER = 7.5
+_LEAST_ALIKE = 4.5  # sigmas at which two recordings are searched for equal rows
 # Suppose two honest runs have the same motion and encoder zero, and noise of 1/25 count. Then one
 # reading in 22 is rounded differently, so 22 equal readings have a probability of 1/e.
 _TO_A_ROUNDING = 22
-_MOST_ALIGNED = 60  # most recordings of other teams that are aligned with a recording
-_MOST_OTHERS = 24  # aligned recordings that are used to explain a recording
-_FEWEST_TEAMS = 3  # fewest teams from which these recordings must come
-# Share of the other teams that is left out, the most similar first, because they may have the same
-# copy.
-_COPIES = 1 / 3
-_MOST_IN_PART = 1  # pairs with partly equal noise that are tolerated: two knocks may coincide once
-# For each 10 pairs with fully equal noise, one more pair with partly equal noise is tolerated.
-_MATCHES_TO_IN_PART = 10
+_FEWEST_TEAMS = 3  # other teams that are needed to tell what a class shares
+_MOST_TEAMS = 8  # other teams that are asked
+# Up to this many pairs of submissions, the noise of all is compared; above, each submission is
+# compared with a few of the most similar.
+_MOST_PAIRS, _MOST_SIMILAR = 600, 3
+_SPECTRA_KEPT = 36  # submissions; 35 have 600 pairs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,10 +93,6 @@ class _Entry:
     print: Print
 
 
-# (likeness, owner, recording, shift)
-_Aligned = tuple[float, int, Print, int]
-
-
 def find_shared(
     batch: Sequence[Member],
     *,
@@ -121,25 +117,30 @@ def find_shared(
         *(Member(submission="", authors=(), fingerprints=packed) for packed in examples),
     ]
     groups = _by_group(owners)
-    matches: dict[tuple[int, int], list[Likeness]] = defaultdict(list)
+    equal: dict[tuple[int, int], list[Likeness]] = defaultdict(list)
+    total: dict[tuple[int, int], float] = defaultdict(float)
     for _, entries in sorted(groups.items()):
-        for pair, likeness in _matches(
-            entries, first_batch=len(batch), everyone=len(everyone), owners=owners
+        for pair, likeness in _equal(
+            entries, first_batch=len(batch), everyone=len(everyone), owners=owners, total=total
         ):
-            matches[pair].append(likeness)
-    matches = _proving(matches)
+            equal[pair].append(likeness)
     compared = sum(len(entries) ** 2 for entries in groups.values())
     given = {
         (a, one.experiments[0])
-        for (a, b), found in matches.items()
+        for (a, b), found in equal.items()
         if b >= len(everyone)
         for one in found
-        if one.equal_rows or one.sigmas >= _ALONE
     }
-    shared: dict[str, list[SharedRecord]] = defaultdict(list)
-    for pair, found in sorted(matches.items()):
+    proof: dict[tuple[int, int], list[Likeness]] = {}
+    for pair, found in equal.items():
         own = [one for one in found if given.isdisjoint(zip(pair, one.experiments, strict=True))]
-        for one in _decisive(own, compared=compared) if pair[1] < len(everyone) else ():
+        proof[pair] = _decisive(own, compared=compared) if pair[1] < len(everyone) else []
+    noise = _Noise(groups, everyone=everyone)
+    for pair in _worth_hearing(everyone, total, first_batch=len(batch)):
+        proof[pair] = [*proof.get(pair, ()), *noise.shared(pair, given, proof.get(pair, ()))]
+    shared: dict[str, list[SharedRecord]] = defaultdict(list)
+    for pair, found in sorted(proof.items()):
+        for one in found:
             for mine, other in ((0, 1), (1, 0)):
                 if pair[mine] < len(batch):
                     record = _record_of(one, mine, other, submission=names[pair[other]])
@@ -234,24 +235,6 @@ def same_recordings(a: Member, b: Member) -> bool:
     return bool(of_a and of_b) and (of_a <= of_b or of_b <= of_a)
 
 
-def _proving(
-    matches: Mapping[tuple[int, int], Sequence[Likeness]],
-) -> dict[tuple[int, int], list[Likeness]]:
-    """Return the matches that prove a copy, by pair of submissions.
-
-    If the noise of several pairs agrees only partly, the bench or its encoder causes the agreement.
-    Then full agreement of noise proves nothing either. Equal rows always prove a copy.
-    """
-    sure = [one for found in matches.values() for one in found if one.is_sure]
-    whole = sum(one.is_whole for one in sure)
-    if len(sure) - whole > max(_MOST_IN_PART, whole // _MATCHES_TO_IN_PART):
-        matches = {pair: [replace(o, slope=0.0) for o in found] for pair, found in matches.items()}
-    return {
-        pair: [one for one in found if one.equal_rows or one.is_whole]
-        for pair, found in matches.items()
-    }
-
-
 def _decisive(found: Sequence[Likeness], *, compared: int) -> list[Likeness]:
     """Return the matches of two submissions, one per recording, if together they prove a copy.
 
@@ -264,23 +247,127 @@ def _decisive(found: Sequence[Likeness], *, compared: int) -> list[Likeness]:
         a, b = one.experiments
         if all(a != c.experiments[0] and b != c.experiments[1] for c in chosen):
             chosen.append(one)
-    sigmas = [one.sigmas for one in chosen if one.is_whole]
-    noise = max(sigmas, default=0.0) >= _ALONE or np.linalg.norm(sigmas) >= _TOGETHER
-    equal = sum(one.different for one in chosen) >= _TO_A_ROUNDING * np.log(max(compared, 2))
-    return chosen if noise or equal else []
+    least = _TO_A_ROUNDING * np.log(max(compared, 2))
+    return chosen if sum(one.different for one in chosen) >= least else []
+
+
+# ------------------------------------------------------- noise of two submissions
+
+
+def _worth_hearing(
+    everyone: Sequence[Member], likeness: Mapping[tuple[int, int], float], *, first_batch: int
+) -> list[tuple[int, int]]:
+    """Return the pairs of submissions whose noise is compared; in a large class, the most similar.
+
+    Parameters
+    ----------
+    likeness : similarity of pairs in the first comparison.
+    """
+    n = len(everyone)
+    if n * (n - 1) <= 2 * _MOST_PAIRS:
+        pairs = [(a, b) for a in range(min(first_batch, n)) for b in range(a + 1, n)]
+        return [(a, b) for a, b in pairs if not same_team(everyone[a], everyone[b])]
+    kept: set[tuple[int, int]] = set()
+    taken: Counter[int] = Counter()
+    for pair, _ in sorted(likeness.items(), key=lambda one: (-one[1], one[0])):
+        if pair[1] < n and min(taken[pair[0]], taken[pair[1]]) < _MOST_SIMILAR:
+            kept.add(pair)
+            taken.update(pair)
+    return sorted(kept)
+
+
+class _Noise:
+    """The noise of a class's submissions, compared on demand."""
+
+    def __init__(self, groups: Mapping[str, Sequence[_Entry]], *, everyone: Sequence[Member]):
+        self._everyone = everyone
+        self._prints: dict[int, dict[str, list[Print]]] = defaultdict(lambda: defaultdict(list))
+        for group, found in groups.items():
+            for entry in found:
+                self._prints[entry.owner][group].append(entry.print)
+        self._lengths = {
+            group: padded_length([one.print for one in found]) for group, found in groups.items()
+        }
+        # Spectra take up to 5 MB for each submission.
+        self._of = lru_cache(maxsize=_SPECTRA_KEPT)(self._heard)
+        self._found: dict[tuple[int, int], list[Agreement]] = {}
+
+    def _heard(self, submission: int) -> dict[str, list[Heard]]:
+        return {
+            group: [Heard(print=one, length=self._lengths[group]) for one in prints]
+            for group, prints in self._prints[submission].items()
+        }
+
+    def shared(
+        self, pair: tuple[int, int], given: Container[tuple[int, str]], known: Iterable[Likeness]
+    ) -> list[Likeness]:
+        """Return the recordings that two submissions share according to their noise.
+
+        Parameters
+        ----------
+        given : submission and name of each recording that the lab gave out.
+        known : recordings with equal rows; they are not returned again.
+        """
+        found = [
+            one
+            for one in self._agreements(*pair)
+            if not any((pair[side], one.of(side)) in given for side in (0, 1))
+        ]
+        others = self._others(pair)
+        if len(others) < _FEWEST_TEAMS or not copied(found):
+            return []
+        a, b = (usual(self._seen_from(own, c) for c in others) for own in pair)
+        told = {one.experiments for one in known}
+        return [
+            one.likeness_of(sigmas)
+            for one, sigmas in copied(found, (a, b))
+            if (one.of(0), one.of(1)) not in told
+        ]
+
+    def _others(self, pair: tuple[int, int]) -> list[int]:
+        """Return submissions of other teams, spread evenly over the class."""
+        everyone = self._everyone
+        teams = [
+            c
+            for c in range(len(everyone))
+            if c in self._prints and not any(self._same_team(c, own) for own in pair)
+        ]
+        return teams[:: max(1, len(teams) // _MOST_TEAMS)]
+
+    def _seen_from(self, own: int, other: int) -> tuple[list[Agreement], int]:
+        """Return the agreements of two submissions, and which side the first one is."""
+        first, second = sorted((own, other))
+        return self._agreements(first, second), int(own != first)
+
+    def _same_team(self, a: int, b: int) -> bool:
+        return a == b or same_team(self._everyone[a], self._everyone[b])
+
+    def _agreements(self, a: int, b: int) -> list[Agreement]:
+        if (a, b) not in self._found:
+            self._found[a, b] = agreements(self._of(a), self._of(b))
+        return self._found[a, b]
 
 
 # ------------------------------------------------------------------- candidates
 
 
-def _matches(
-    entries: Sequence[_Entry], *, first_batch: int, everyone: int, owners: Sequence[Member]
+def _equal(
+    entries: Sequence[_Entry],
+    *,
+    first_batch: int,
+    everyone: int,
+    owners: Sequence[Member],
+    total: dict[tuple[int, int], float],
 ) -> Iterator[tuple[tuple[int, int], Likeness]]:
-    """Yield pairs of similar recordings from different teams, each with its two owners."""
+    """Yield pairs of recordings with equal rows from different teams, each with its two owners.
+
+    Parameters
+    ----------
+    total : the similarity of submissions, to which these recordings are added.
+    """
     best: dict[tuple[int, int], Likeness] = {}
-    alike: dict[tuple[int, int], float] = defaultdict(lambda: _COUNTS)  # best likeness so far
+    most: dict[tuple[int, int], float] = defaultdict(lambda: _LEAST_ALIKE)  # best similarity so far
     seen: set[tuple[int, int, int]] = set()
-    aligned: dict[int, list[_Aligned]] = {}
 
     @cache
     def same(a: int, b: int) -> bool:
@@ -291,7 +378,7 @@ def _matches(
     partner: dict[tuple[int, int], int] = {}
     compared: Counter[tuple[int, int]] = Counter()
     recordings = Counter(entry.owner for entry in entries)
-    for i, anchor_i, j, anchor_j in _candidates(entries, everyone=everyone):
+    for i, anchor_i, j, anchor_j, sigmas in _candidates(entries, everyone=everyone):
         a, b = entries[i], entries[j]
         if a.owner > b.owner:
             i, anchor_i, j, anchor_j, a, b = j, anchor_j, i, anchor_i, b, a
@@ -305,51 +392,22 @@ def _matches(
         compared[pair] += 1
         if compared[pair] > _MOST_COMPARED * (recordings[a.owner] + recordings[b.owner]):
             continue
+        total[pair] += sigmas**2
         likeness = compare(a.print, b.print, shift=shift)
-        if likeness.slope < LEAST_SLOPE or likeness.sigmas <= alike[i, j]:
+        if likeness.slope < LEAST_SLOPE or likeness.sigmas <= most[i, j]:
             continue
-        alike[i, j] = likeness.sigmas
-        equal = equal_rows(a.print, b.print, shift=shift)
-        if i not in aligned:
-            aligned[i] = _aligned(entries, i)
-        teams = {o for _, o, _, _ in aligned[i] if not any(same(o, own) for own in pair)}
-        if others := _others([one for one in aligned[i] if one[1] in teams]):
-            likeness = compare(a.print, b.print, shift=shift, others=others)
-        else:
-            likeness = replace(likeness, slope=0.0)
-        if equal:
-            likeness = replace(equal, slope=likeness.slope, sigmas=likeness.sigmas)
-        best[i, j] = likeness
-        if likeness.equal_rows or (likeness.is_whole and likeness.sigmas >= _ALONE):
+        most[i, j] = likeness.sigmas
+        if equal := equal_rows(a.print, b.print, shift=shift):
+            best[i, j] = replace(equal, slope=likeness.slope, sigmas=likeness.sigmas)
             partner[i, b.owner], partner[j, a.owner] = j, i
     for (i, j), likeness in sorted(best.items(), key=lambda one: one[0]):
         yield (entries[i].owner, entries[j].owner), likeness
 
 
-def _aligned(entries: Sequence[_Entry], i: int) -> list[_Aligned]:
-    """Return recordings of other submissions, aligned with recording i, the most similar first."""
-    rest = [one for one in entries if one.owner != entries[i].owner]
-    found = []
-    for one in rest[:: max(1, len(rest) // _MOST_ALIGNED)]:
-        alike, shift = align(entries[i].print, one.print)
-        found.append((alike, one.owner, one.print, shift))
-    return sorted(found, key=lambda one: -one[0])
-
-
-def _others(aligned: Sequence[_Aligned]) -> list[tuple[Print, int]]:
-    """Return recordings that show what a class shares, with their shifts; empty for a small class.
-
-    The most similar ones are left out, because their teams may have the same copy.
-    """
-    teams = list(dict.fromkeys(owner for _, owner, _, _ in aligned))
-    if len(teams) < _FEWEST_TEAMS:
-        return []
-    kept = teams[min(int(len(teams) * _COPIES), len(teams) - _FEWEST_TEAMS) :]
-    return [(one, shift) for _, owner, one, shift in aligned if owner in kept][:_MOST_OTHERS]
-
-
-def _candidates(entries: Sequence[_Entry], *, everyone: int) -> Iterator[tuple[int, int, int, int]]:
-    """Yield anchors with similar noise around them: (entry, anchor, other entry, other anchor).
+def _candidates(
+    entries: Sequence[_Entry], *, everyone: int
+) -> Iterator[tuple[int, int, int, int, float]]:
+    """Yield anchors with similar noise: (entry, anchor, other entry, other anchor, sigmas).
 
     Motion and noise have separate anchors, and each kind yields the most similar pairs first. All
     anchors are compared with the best anchors of each recording. An index would not be faster than
@@ -377,8 +435,8 @@ def _candidates(entries: Sequence[_Entry], *, everyone: int) -> Iterator[tuple[i
                 most = np.argsort(-alike[row, near[~given]], kind="stable")[:_MOST_ALIKE]
                 near = np.concatenate([near[given], near[~given][most]])
                 found += [(float(alike[row, c]), start + row, c) for c in near.tolist()]
-        for _, place, column in sorted(found, key=lambda one: (-one[0], one[1:])):
-            yield *places[place], *first[column]
+        for sigmas, place, column in sorted(found, key=lambda one: (-one[0], one[1:])):
+            yield *places[place], *first[column], sigmas
 
 
 def _windows(entries: Sequence[_Entry], places: Sequence[tuple[int, int]]) -> np.ndarray:
