@@ -202,15 +202,10 @@ def mixed(records, others, *, fade):
 
 WHOLE = {
     "noise 0.3": lambda own, _, rng: [disguised(r, rng, noise=0.3) for r in own],
-    "noise 1.5, cut": lambda own, _, rng: [
-        disguised(r, rng, noise=1.5, scale=0.9, keep=0.8) for r in own
-    ],
     "noise 1, cut, reversed": lambda own, _, rng: [
         disguised(r, rng, noise=1.0, scale=-2.54, keep=0.8) for r in own
     ],
-    "noise 3": lambda own, _, rng: [disguised(r, rng, noise=3.0) for r in own],
     "noise 1, smoothed": lambda own, _, rng: smoothed(own, rng, noise=1.0),
-    "noise 3, smoothed": lambda own, _, rng: smoothed(own, rng, noise=3.0),
     "noise 0.3, doubled": lambda own, _, rng: doubled([disguised(r, rng, noise=0.3) for r in own]),
     "blended": lambda own, other, _: mixed(own, other, fade=False),
     "cross-faded": lambda own, other, _: mixed(own, other, fade=True),
