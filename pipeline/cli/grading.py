@@ -76,7 +76,13 @@ def grade(
             check_stop()
             show(done, total, last)
 
-        done = grade_class(paths, rubric_file=rubric, out=out, options=options, progress=progress)
+        def tell(text: str) -> None:
+            check_stop()
+            say(text)
+
+        done = grade_class(
+            paths, rubric_file=rubric, out=out, options=options, progress=progress, say=tell
+        )
     _report_outcome(done, out=out, rubric=rubric)
     if done.failed:
         raise typer.Exit(1)

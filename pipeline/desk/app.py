@@ -9,6 +9,7 @@ from typing import Any, Self
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
+from starlette.convertors import IntegerConvertor, register_url_convertor
 from starlette.datastructures import FormData
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
@@ -86,7 +87,7 @@ async def _events(ask: Ask, place: Any) -> AsyncIterator[str]:
         if job.version != version:
             version, quiet = job.version, 0.0
             shown = await run_in_threadpool(lambda: ask.job) or job
-            message = " ".join(ask.user.without_folders(shown.message).split())
+            message = " ".join(shown.message.split())
             yield f"event: {'end' if job.over else 'stage'}\ndata: {message}\n\n"
         elif quiet > 5.0:  # s without an event; the line sent then keeps the connection open
             quiet = 0.0
@@ -98,6 +99,14 @@ async def _events(ask: Ask, place: Any) -> AsyncIterator[str]:
     yield "event: end\ndata: \n\n"
 
 
+class _Number(IntegerConvertor):
+    """A number in an address; one with more digits is no address of the desk."""
+
+    regex = "[0-9]{1,9}"
+
+
+register_url_convertor("nth", _Number())
+
 # Address, method, handler. Every change is a POST from a form that works without scripts. Handlers
 # of streams are coroutines, because a thread for each stream would soon leave no thread to answer
 # requests.
@@ -106,39 +115,39 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/open", "GET", show_folders),
     ("/open", "POST", open_place),
     ("/static/{name}", "GET", serve_static),
-    ("/student/{n:int}/", "GET", submission_page.show),
-    ("/student/{n:int}/files", "POST", submission_page.upload),
-    ("/student/{n:int}/fill", "POST", submission_page.fill),
-    ("/student/{n:int}/aside", "POST", submission_page.set_aside),
-    ("/student/{n:int}/save", "POST", submission_page.save),
-    ("/student/{n:int}/experiments/{index:int}", "POST", submission_page.save_experiment),
-    ("/student/{n:int}/answer-together", "POST", submission_page.answer_together),
-    ("/student/{n:int}/make-report", "POST", _start("make_report", "The report", then="#report")),
-    ("/student/{n:int}/make-gap", "POST", _start("make_gap", "The gap", then="#report")),
-    ("/student/{n:int}/gap/{name:path}", "GET", _serve("gap")),
-    ("/student/{n:int}/stop", "POST", _stop),
-    ("/student/{n:int}/events", "GET", _stream_events),
-    ("/student/{n:int}/report", "GET", report_page.show),
-    ("/student/{n:int}/report/{name:path}", "GET", _serve("report")),
-    ("/student/{n:int}/questions", "GET", report_page.show_questions),
-    ("/student/{n:int}/compare", "GET", plots_page.show),
-    ("/student/{n:int}/compare", "POST", plots_page.make),
-    ("/student/{n:int}/answer", "POST", report_page.answer),
-    ("/student/{n:int}/state-signs", "POST", report_page.state_signs),
-    ("/student/{n:int}/check", "GET", check_page.show),
-    ("/student/{n:int}/check", "POST", check_page.begin),
-    ("/student/{n:int}/hand-in", "GET", submission_page.show_hand_in),
-    ("/student/{n:int}/hand-in", "POST", submission_page.start_hand_in),
-    ("/student/{n:int}/hand-in.zip", "GET", submission_page.download_hand_in),
-    ("/bench/{n:int}/", "GET", bench_page.show),
-    ("/bench/{n:int}/plan", "POST", bench_page.plan),
-    ("/bench/{n:int}/acquire", "POST", bench_page.acquire),
-    ("/bench/{n:int}/explore", "POST", bench_page.explore),
-    ("/bench/{n:int}/add", "POST", bench_page.add),
-    ("/bench/{n:int}/weigh", "GET", bench_page.weigh),
-    ("/bench/{n:int}/exploration.html", "GET", bench_page.show_diary),
-    ("/bench/{n:int}/press", "POST", bench_page.press),
-    ("/bench/{n:int}/events", "GET", bench_page.stream),
+    ("/student/{n:nth}/", "GET", submission_page.show),
+    ("/student/{n:nth}/files", "POST", submission_page.upload),
+    ("/student/{n:nth}/fill", "POST", submission_page.fill),
+    ("/student/{n:nth}/aside", "POST", submission_page.set_aside),
+    ("/student/{n:nth}/save", "POST", submission_page.save),
+    ("/student/{n:nth}/experiments/{index:nth}", "POST", submission_page.save_experiment),
+    ("/student/{n:nth}/answer-together", "POST", submission_page.answer_together),
+    ("/student/{n:nth}/make-report", "POST", _start("make_report", "The report", then="#report")),
+    ("/student/{n:nth}/make-gap", "POST", _start("make_gap", "The gap", then="#report")),
+    ("/student/{n:nth}/gap/{name:path}", "GET", _serve("gap")),
+    ("/student/{n:nth}/stop", "POST", _stop),
+    ("/student/{n:nth}/events", "GET", _stream_events),
+    ("/student/{n:nth}/report", "GET", report_page.show),
+    ("/student/{n:nth}/report/{name:path}", "GET", _serve("report")),
+    ("/student/{n:nth}/questions", "GET", report_page.show_questions),
+    ("/student/{n:nth}/compare", "GET", plots_page.show),
+    ("/student/{n:nth}/compare", "POST", plots_page.make),
+    ("/student/{n:nth}/answer", "POST", report_page.answer),
+    ("/student/{n:nth}/state-signs", "POST", report_page.state_signs),
+    ("/student/{n:nth}/check", "GET", check_page.show),
+    ("/student/{n:nth}/check", "POST", check_page.begin),
+    ("/student/{n:nth}/hand-in", "GET", submission_page.show_hand_in),
+    ("/student/{n:nth}/hand-in", "POST", submission_page.start_hand_in),
+    ("/student/{n:nth}/hand-in.zip", "GET", submission_page.download_hand_in),
+    ("/bench/{n:nth}/", "GET", bench_page.show),
+    ("/bench/{n:nth}/plan", "POST", bench_page.plan),
+    ("/bench/{n:nth}/acquire", "POST", bench_page.acquire),
+    ("/bench/{n:nth}/explore", "POST", bench_page.explore),
+    ("/bench/{n:nth}/add", "POST", bench_page.add),
+    ("/bench/{n:nth}/weigh", "GET", bench_page.weigh),
+    ("/bench/{n:nth}/exploration.html", "GET", bench_page.show_diary),
+    ("/bench/{n:nth}/press", "POST", bench_page.press),
+    ("/bench/{n:nth}/events", "GET", bench_page.stream),
     ("/exercises/", "GET", exercise_pages.show),
     ("/exercises/picture.svg", "GET", exercise_pages.draw),
     ("/exercises/make", "POST", exercise_pages.make),
@@ -150,31 +159,31 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/rubric/save", "POST", rubric_editor.save),
     ("/rubric/preview", "POST", rubric_preview_page.preview),
     ("/rubric/preview.svg", "GET", rubric_preview_page.draw_preview),
-    ("/solution/{n:int}/", "GET", exercise_pages.show_solution),
-    ("/solution/{n:int}/make", "POST", _start("make_solution", "The solution")),
-    ("/solution/{n:int}/{name:path}", "GET", _serve("solution")),
-    ("/grades/{n:int}/", "GET", class_table.show),
-    ("/grades/{n:int}/events", "GET", _stream_events),
-    ("/grades/{n:int}/news", "GET", class_table.show_news),
-    ("/grades/{n:int}/distribution.svg", "GET", class_table.draw_distribution),
-    ("/grades/{n:int}/class.html", "GET", class_table.show_class_page),
-    ("/grades/{n:int}/feedback/{name:path}/feedback.html", "GET", class_table.show_feedback),
-    ("/grades/{n:int}/team", "GET", team_page.show),
-    ("/grades/{n:int}/team", "POST", team_page.act),
-    ("/grades/{n:int}/together", "GET", together.show),
-    ("/grades/{n:int}/together", "POST", together.apply),
-    ("/grades/{n:int}/figure", "GET", team_page.show_figure),
-    ("/grades/{n:int}/again", "GET", request_queue.show),
-    ("/grades/{n:int}/again", "POST", request_queue.act),
-    ("/grades/{n:int}/release", "POST", class_actions.release),
-    ("/feedback/{n:int}/", "GET", own_feedback.show),
-    ("/feedback/{n:int}/whole", "GET", own_feedback.show_whole),
-    ("/feedback/{n:int}/ask", "POST", own_feedback.send),
-    ("/grades/{n:int}/import", "POST", class_actions.take_table),
-    ("/grades/{n:int}/export", "POST", class_actions.export_class),
-    ("/grades/{n:int}/publish", "POST", _start("publish_grades", "Writing", then="#work")),
-    ("/grades/{n:int}/regrade", "POST", class_actions.regrade),
-    ("/grades/{n:int}/stop", "POST", _stop),
+    ("/solution/{n:nth}/", "GET", exercise_pages.show_solution),
+    ("/solution/{n:nth}/make", "POST", _start("make_solution", "The solution")),
+    ("/solution/{n:nth}/{name:path}", "GET", _serve("solution")),
+    ("/grades/{n:nth}/", "GET", class_table.show),
+    ("/grades/{n:nth}/events", "GET", _stream_events),
+    ("/grades/{n:nth}/news", "GET", class_table.show_news),
+    ("/grades/{n:nth}/distribution.svg", "GET", class_table.draw_distribution),
+    ("/grades/{n:nth}/class.html", "GET", class_table.show_class_page),
+    ("/grades/{n:nth}/feedback/{name:path}/feedback.html", "GET", class_table.show_feedback),
+    ("/grades/{n:nth}/team", "GET", team_page.show),
+    ("/grades/{n:nth}/team", "POST", team_page.act),
+    ("/grades/{n:nth}/together", "GET", together.show),
+    ("/grades/{n:nth}/together", "POST", together.apply),
+    ("/grades/{n:nth}/figure", "GET", team_page.show_figure),
+    ("/grades/{n:nth}/again", "GET", request_queue.show),
+    ("/grades/{n:nth}/again", "POST", request_queue.act),
+    ("/grades/{n:nth}/release", "POST", class_actions.release),
+    ("/feedback/{n:nth}/", "GET", own_feedback.show),
+    ("/feedback/{n:nth}/whole", "GET", own_feedback.show_whole),
+    ("/feedback/{n:nth}/ask", "POST", own_feedback.send),
+    ("/grades/{n:nth}/import", "POST", class_actions.take_table),
+    ("/grades/{n:nth}/export", "POST", class_actions.export_class),
+    ("/grades/{n:nth}/publish", "POST", _start("publish_grades", "Writing", then="#work")),
+    ("/grades/{n:nth}/regrade", "POST", class_actions.regrade),
+    ("/grades/{n:nth}/stop", "POST", _stop),
 )  # fmt: skip
 
 

@@ -255,7 +255,7 @@ class Ask:
             "here": self.here,
             "rooms": list_rooms(self.user, self.request.url.path, self.desk.books),
             "version": __version__,
-            "folder": folder,
+            "folder": folder if self.user.sees_places else folder and Path(folder.name),
             "job": self.job,
             # Reading the messages removes them, so that they are shown only once.
             "messages": lambda place="": self.desk.messages.pop(self._room(place), []),
@@ -263,7 +263,7 @@ class Ask:
         text = _environment().get_template(f"{template}.html.j2").render(everywhere | context)
         if prefix := self.request.scope.get("prefix"):
             text = _ADDRESS.sub(lambda found: f'{found[1]}="{escape(prefix)}/', text)
-        return HTMLResponse(self.user.without_folders(text), status_code=status)
+        return HTMLResponse(text, status_code=status)
 
     def go(self, to: str) -> Response:
         """Return an answer that makes htmx open another page.
@@ -311,4 +311,5 @@ def prepare_pages() -> None:
 
 def plain_error(ask: Ask, text: str, *, status: int) -> Response:
     """Return a page with an error message."""
-    return ask.page("wrong", status=status, title="That did not work", text=text)
+    shown = ask.user.name_places(text)
+    return ask.page("wrong", status=status, title="That did not work", text=shown)

@@ -160,7 +160,7 @@ def limit_bodies(app: ASGIApp, *, uploads: int) -> ASGIApp:
             return message
 
         sent = Headers(scope=scope).get("content-length", "0")
-        if not sent.isdecimal() or int(sent) > most:
+        if not sent.isdecimal() or len(sent) > 15 or int(sent) > most:
             await refuse(too_much, status=413)(scope, receive, send)
         else:
             await app(scope, count, send)

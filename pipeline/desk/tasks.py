@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import chdir
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -310,7 +311,12 @@ def do(task: tuple[str, Mapping[str, Any]], progress: Progress) -> Any:
     task : name and arguments of the task.
     """
     name, arguments = task
-    return TASKS[name](**arguments, progress=progress)
+    if not (folder := arguments.get("folder")):
+        return TASKS[name](**arguments, progress=progress)
+    # Messages then name files relative to this folder, so that they hold no path of a server.
+    with chdir(Path(folder).parent):
+        inside = Path(folder).name or "."
+        return TASKS[name](**{**arguments, "folder": inside}, progress=progress)
 
 
 def _describe(found: Found) -> dict[str, Any]:

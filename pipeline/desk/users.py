@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import urlsplit
 
-from markupsafe import escape
 from pydantic import Field, StringConstraints, ValidationError
 
 from pipeline.errors import ConfigError
@@ -90,17 +89,15 @@ class User:
         """Whether they may see the paths of folders on this computer."""
         return self.role not in ("student", "ta")
 
-    def without_folders(self, text: str) -> str:
-        """Return a text without the server's folders if they may not see these."""
+    def name_places(self, message: str) -> str:
+        """Return a message in which their places have only names if they may not see paths."""
         if self.sees_places:
-            return text
+            return message
         listed = (*self.folders, *self.gradebooks, *(own.gradebook for own in self.grades))
-        places = [place for place in listed if isinstance(place, Path)]
-        above = {str(root) for place in places for root in (place.parent, place.resolve().parent)}
-        for root in sorted(above, key=len, reverse=True):
-            for written in (root, str(escape(root))):
-                text = text.replace(f"{written}{os.sep}", "")
-        return text
+        for place in (*listed, *filter(None, (self.rubric,))):
+            for path in {place, place.resolve()} if isinstance(place, Path) else ():
+                message = message.replace(str(path), name_place(path))
+        return message
 
     @property
     def owns(self) -> bool:

@@ -6,14 +6,19 @@ import sys
 import time
 from contextlib import ExitStack
 from html import unescape
-from urllib.parse import urlencode, urlsplit
+from pathlib import Path
+from urllib.parse import quote, urlencode, urlsplit
 
 import psutil
 import pytest
+from starlette.datastructures import FormData
+from starlette.requests import Request
 
 from pipeline.desk.app import ROUTES, DeskServer
+from pipeline.desk.ask import Ask, Desk
 from pipeline.desk.doors import MOST_FORM
-from pipeline.desk.users import read_users
+from pipeline.desk.home import show_home
+from pipeline.desk.users import User, read_users
 from pipeline.errors import ConfigError
 from pipeline.resources import RUBRICS
 from pipeline.submission import load_submission
@@ -23,7 +28,7 @@ from tests.helpers.grades import write_class
 from tests.helpers.waiting import PATIENCE, until
 
 pytestmark = pytest.mark.usefixtures("all_work_here")
-PATHS = [re.sub(r"\{\w+:int\}", "0", re.sub(r"\{name(:path)?\}", "x.json", p)) for p, *_ in ROUTES]
+PATHS = [re.sub(r"\{\w+:nth\}", "0", re.sub(r"\{name(:path)?\}", "x.json", p)) for p, *_ in ROUTES]
 
 
 @pytest.fixture(scope="module")
@@ -472,3 +477,36 @@ def test_a_connection_without_the_secret_times_out(server):
         except ConnectionResetError:
             pass
     assert time.monotonic() - began >= 1
+
+
+@pytest.mark.parametrize("top", ["/", "/static", "/student", "/grades"])
+def test_pages_are_whole_wherever_the_data_lie(top):
+    """Folders with the names of the desk's own addresses leave all links of a page as they are."""
+    user = User(name="s", role="student", folders=[Path(top) / "team-a", Path(top) / "team-b"])
+    desk = Desk()
+    try:
+        scope = {"type": "http", "method": "GET", "path": "/", "headers": [], "query_string": b""}
+        request = Request({**scope, "path_params": {}})
+        page = show_home(Ask(desk=desk, user=user, request=request, form=FormData())).body.decode()
+    finally:
+        desk.close()
+    for address in ("/student/0/", "/student/1/", "/static/desk.css"):
+        assert f'="{address}' in page
+    assert f'"{top}"' not in page or top == "/"
+
+
+def test_a_message_names_places_only_by_their_names(tmp_path):
+    """A message for students and TAs holds no path of their folders; an instructor sees it."""
+    folder = tmp_path / "grades"
+    for role, shown in (("ta", "grades/gradebook.sqlite"), ("instructor", f"{folder}/gradebook")):
+        user = User(name="x", role=role, gradebooks=[folder])
+        assert shown in user.name_places(f"{folder}/gradebook.sqlite: is a link")
+
+
+def test_a_number_of_thousands_of_digits_is_no_address(lab):
+    """An address with a number that no list reaches is answered with 404, whatever its length."""
+    for digits in ("9", "9" * 9, "9" * 10, "1" * 4_300, "1" * 9_000, "٣"):
+        for name, path in (("s1", "/student/{}/"), ("t", "/grades/{}/"), ("s1", "/feedback/{}/")):
+            assert lab(name).get(quote(path.format(digits))).status == 404, digits[:12]
+        path = "/student/0/experiments/{}"
+        assert lab("s1").post(quote(path.format(digits)), remove="1").status in (303, 404, 409, 422)

@@ -4,8 +4,9 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -29,9 +30,25 @@ def _binaries() -> Path | None:
     return newest and newest.parent
 
 
+@dataclass(frozen=True)
+class Server:
+    """A server that runs: the URL of its database, and functions that stop and start it."""
+
+    url: str
+    stop: Callable[[], None]
+    start: Callable[[], None]
+
+
 @contextmanager
 def running() -> Iterator[str]:
     """Start a server and yield the URL of its database; remove the server afterwards."""
+    with running_server() as server:
+        yield server.url
+
+
+@contextmanager
+def running_server() -> Iterator[Server]:
+    """Start a server and yield it; remove it afterwards."""
     binaries = _binaries()
     assert binaries is not None
     # Pytest's folder cannot be used, since only its owner can enter it, and the server never runs
@@ -50,10 +67,19 @@ def running() -> Iterator[str]:
         run(binaries / "initdb", "-D", data, "-U", "cartlab", "-A", "trust", "-E", "UTF8", "-N")
         options = f"-c listen_addresses='' -c unix_socket_directories={folder}"
         log = ("-l", folder / "log")
-        run(binaries / "pg_ctl", "start", "-w", "-D", data, *log, "-o", options)
-        try:
-            yield f"postgresql://cartlab@/postgres?host={folder}"
-        finally:
+
+        def start() -> None:
+            run(binaries / "pg_ctl", "start", "-w", "-D", data, *log, "-o", options)
+
+        def stop() -> None:
             run(binaries / "pg_ctl", "stop", "-w", "-m", "immediate", "-D", data)
+
+        start()
+        try:
+            url = f"postgresql://cartlab@/postgres?host={folder}"
+            yield Server(url=url, stop=stop, start=start)
+        finally:
+            with suppress(subprocess.CalledProcessError):  # a test has stopped it
+                stop()
     finally:
         shutil.rmtree(folder)

@@ -32,6 +32,7 @@ from pipeline.submission.load import NAME
 from pipeline.words.numbers import count, listing
 
 _SCRATCH = re.compile(r"\.scratch(-\d+)?")
+_PATIENCE = 60.0  # s to wait for the gradebook's server; a restart takes a few
 _NAMED = 8  # most submissions named in one message
 
 
@@ -111,8 +112,13 @@ def grade_class(
     out: Path,
     options: Options,
     progress: Progress = silent,
+    say: Callable[[str], None] = lambda text: None,
 ) -> Summary:
     """Grade all submissions in `paths` and write the results into the folder `out`.
+
+    Parameters
+    ----------
+    say : function that shows a message, such as that the gradebook's server does not answer.
 
     Raises
     ------
@@ -132,7 +138,9 @@ def grade_class(
         found = find_hand_ins(paths, scratch=scratch, skip=[out], known=known, say=passed.append)
         hand_ins, unknown = settle_lateness(found, late=rubric.late, table=late_table)
         # The file name of the rubric identifies the assignment, because the title may change later.
-        with Gradebook(place, assignment=rubric_file.stem, create=True) as book:
+        with Gradebook(
+            place, assignment=rubric_file.stem, create=True, patience=_PATIENCE, waiting=say
+        ) as book:
             shown = _pseudonyms(book) if hidden else str
             batch = grade_batch(
                 hand_ins,

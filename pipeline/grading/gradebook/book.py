@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Self
 from sqlalchemy import Connection, Row, select
 
 from pipeline.errors import ConfigError
-from pipeline.grading.grade import read_grade
+from pipeline.grading.grade import Grade, read_grade
 from pipeline.grading.gradebook.changes import points_changes, rubric_changes
 from pipeline.grading.gradebook.class_lines import Line, class_frame
 from pipeline.grading.gradebook.erase import erase_rows
@@ -55,6 +55,7 @@ from pipeline.grading.gradebook.schema import (
 from pipeline.grading.gradings import Batch, Grading, Member, person
 from pipeline.grading.rubric import Rubric
 from pipeline.submission.complaints import nearest
+from pipeline.words.progress import silent
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -67,6 +68,7 @@ class Gradebook:
     ----------
     place : a folder, a SQLite file or any SQLAlchemy URL.
     assignment : name of the assignment whose class list is used; default: the one graded last.
+    patience, waiting : how long to wait for a lost server; see `Database`.
     now : function that returns the current time, which is stored with each entry.
 
     Raises
@@ -80,9 +82,11 @@ class Gradebook:
         *,
         assignment: str | None = None,
         create: bool = False,
+        patience: float = 0.0,
+        waiting: Callable[[str], None] = silent,
         now: Callable[[], datetime] = lambda: datetime.now(UTC),
     ) -> None:
-        self._database = Database(place, create=create)
+        self._database = Database(place, create=create, patience=patience, waiting=waiting)
         self._now = now
         self._assignment = assignment
 
@@ -103,8 +107,13 @@ class Gradebook:
 
         The figures of the grading are read only if `figures` is true.
         """
-        with self._database.reading() as connection:
-            return known_grading(connection, key, assignment=self._assignment or "", drawn=figures)
+
+        def read() -> Grading | None:
+            with self._database.reading() as connection:
+                mine = self._assignment or ""
+                return known_grading(connection, key, assignment=mine, drawn=figures)
+
+        return self._database.repeat(read)
 
     def put(self, grading: Grading) -> None:
         """Store a grading; it is on disk when this method returns.
@@ -113,15 +122,25 @@ class Gradebook:
         ------
         ValueError : `grading.grade` is not valid.
         """
-        grade = read_grade(grading.grade)
+        grade, at = read_grade(grading.grade), self._at()
+        self._database.repeat(lambda: self._put(grading, grade, at=at))
+
+    def _put(self, grading: Grading, grade: Grade, *, at: str) -> None:
         with self._database.writing() as connection:
+            # The answer to the first attempt may have been lost after the grading was stored.
+            mine = self._submission(connection, grading.submission)
+            stored = select(gradings.c.id).where(
+                gradings.c.key == grading.key, gradings.c.at == at, gradings.c.submission_id == mine
+            )
+            if connection.scalar(stored) is not None:
+                return
             number = add_row(
                 connection,
                 gradings,
                 {
                     **{name: getattr(grading, name) for name in GRADING},
-                    "submission_id": self._submission(connection, grading.submission),
-                    "at": self._at(),
+                    "submission_id": mine,
+                    "at": at,
                     "points": grade.points,
                     "out_of": grade.out_of,
                     "deducted": grade.deducted,
@@ -186,6 +205,9 @@ class Gradebook:
         ------
         KeyError : a grading of the batch is not in the gradebook.
         """
+        return self._database.repeat(lambda: self._finish(batch, rubric=rubric, shown=shown))
+
+    def _finish(self, batch: Batch, *, rubric: Rubric, shown: Callable[[str], str]) -> list[str]:
         listed, points, by_hand = [], {}, set()
         with self._database.writing() as connection:
             carry_over(connection, batch.moved, assignment=self._assignment or "")

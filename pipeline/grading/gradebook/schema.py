@@ -7,11 +7,12 @@ rows are about the same thing, the newest counts.
 import json
 import os
 import stat
+import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from sqlalchemy import (
     DDL,
@@ -40,19 +41,29 @@ from sqlalchemy import (
     make_url,
     select,
 )
-from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
+from sqlalchemy.exc import (
+    ArgumentError,
+    DBAPIError,
+    InterfaceError,
+    NoSuchModuleError,
+    OperationalError,
+    SQLAlchemyError,
+)
 from sqlalchemy.schema import CreateColumn
 
 from pipeline.errors import ConfigError
 from pipeline.output import OWNER_ONLY
 from pipeline.submission.complaints import quote
+from pipeline.words.progress import silent
+
+T = TypeVar("T")
 
 FILE = "gradebook.sqlite"
 _SUFFIXES = (".sqlite", ".sqlite3", ".db")  # suffixes of SQLite files; any other path is a folder
 _VERSION = "1"
 _TURN = 0x6361_7274  # number of PostgreSQL's advisory lock, chosen so that no other program uses it
 _PATIENCE = 60.0  # s to wait for a lock of another process; a commit takes milliseconds
-
+_PAUSE = 2.0  # s between two attempts to reach a server
 
 # Errors that SQLAlchemy and the drivers raise for an address that makes no sense.
 _SENSELESS = (ArgumentError, ValueError, TypeError)
@@ -274,6 +285,10 @@ for _table in metadata.sorted_tables:
             event.listen(_table, "after_create", DDL(_lock).execute_if(dialect=_dialect))
 
 
+class Lost(ConfigError):
+    """The server of the database does not answer, or its connection broke."""
+
+
 class Database:
     """A database with the tables of a gradebook; each context manager below is one transaction.
 
@@ -281,13 +296,23 @@ class Database:
     ----------
     place : a folder that holds `gradebook.sqlite`, an SQLite file, or any SQLAlchemy URL.
     create : whether to create missing tables; otherwise the gradebook must exist.
+    patience : time in s to wait for a server that stops answering, for example during a restart.
+    waiting : function that is called with a message while it waits.
 
     Raises
     ------
     ConfigError : the place cannot be reached, or contains no gradebook of this version.
     """
 
-    def __init__(self, place: str | Path, *, create: bool) -> None:
+    def __init__(
+        self,
+        place: str | Path,
+        *,
+        create: bool,
+        patience: float = 0.0,
+        waiting: Callable[[str], None] = silent,
+    ) -> None:
+        self._patience, self._waiting = 0.0, waiting  # a wrong address is reported at once
         self._engine = _engine(place, create=create)
         self._writer = self._engine.execution_options(writes=True)
         opened = self._writer if create else self._engine
@@ -304,6 +329,7 @@ class Database:
         if not whole:  # an older version wrote it, with fewer tables or columns
             with self.writing() as connection:
                 _create(connection)
+        self._patience = patience
 
     @property
     def name(self) -> str:
@@ -316,13 +342,13 @@ class Database:
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """Read in one transaction; keep it short, because writers wait for it."""
-        with self._translated(), self._engine.begin() as connection:
+        with self._transaction(self._engine) as connection:
             yield connection
 
     @contextmanager
     def writing(self) -> Iterator[Connection]:
         """Write all changes or none; at the end they are on disk."""
-        with self._translated(), self._writer.begin() as connection:
+        with self._transaction(self._writer) as connection:
             yield connection
 
     @contextmanager
@@ -358,13 +384,51 @@ class Database:
         """Close the connections."""
         self._engine.dispose()
 
+    def repeat(self, work: Callable[[], T]) -> T:
+        """Return the result of `work`, which is done again if the server is lost meanwhile.
+
+        `work` must do no harm if it is done again after it was done.
+        """
+        end = time.monotonic() + self._patience
+        while True:
+            try:
+                return work()
+            except Lost as error:
+                if time.monotonic() > end:
+                    raise
+                self._wait(error, end=end)
+
+    @contextmanager
+    def _transaction(self, engine: Engine) -> Iterator[Connection]:
+        """Open a transaction; wait for a server that does not answer."""
+        connection = self._connect(engine)
+        with self._translated(), connection, connection.begin():
+            yield connection
+
+    def _connect(self, engine: Engine) -> Connection:
+        def connect() -> Connection:
+            with self._translated():
+                return engine.connect()
+
+        return self.repeat(connect)
+
+    def _wait(self, error: "Lost", *, end: float) -> None:
+        left = max(end - time.monotonic(), 0.0)
+        self._waiting(f"{error}; trying again for {left:.0f} s")
+        time.sleep(min(_PAUSE, left))
+
     @contextmanager
     def _translated(self) -> Iterator[None]:
         try:
             yield
         except SQLAlchemyError as error:
             cause = str(getattr(error, "orig", None) or error).strip().splitlines()
-            raise ConfigError(f"{self.name}: {cause[0] if cause else error}") from error
+            is_lost = isinstance(error, OperationalError | InterfaceError) or (
+                isinstance(error, DBAPIError) and error.connection_invalidated
+            )
+            is_server = self._engine.url.get_backend_name() != "sqlite"
+            kind = Lost if is_lost and is_server else ConfigError
+            raise kind(f"{self.name}: {cause[0] if cause else error}") from error
 
 
 def _create(connection: Connection) -> None:
