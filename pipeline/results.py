@@ -510,6 +510,7 @@ CheckKind = Literal[
     "fit",
     "physical",
     "vanishing",
+    "springs",
     "redundancy",
     "order",
     "repeats",

@@ -18,6 +18,7 @@ from pipeline.identify.carts import compare_estimates
 from pipeline.identify.log import Log
 from pipeline.identify.remarks import gain_sign_warning, hand_remarks, reading_remarks
 from pipeline.identify.sound import identify_from_sound
+from pipeline.identify.springs import check_springs
 from pipeline.ingest.read import Ingested, read_data
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import (
@@ -69,8 +70,13 @@ def analyse(
         *check_coverage(rows),
         *check_decays(found.decays, records=data.records, bench=bench),
         *check_steps(found.gains, decays=found.decays, bench=bench),
-        *check_carts(found.fit, bench=bench),
+        *check_carts(found.fit, decays=found.decays, bench=bench),
     )
+    springs = check_springs(found.fit, responses=found.responses, gains=found.gains, bench=bench)
+    # A spring that the static gains show to be missing also vanishes from the fit.
+    named = {check.parameter for check in springs}
+    vanished = {c.id for c in checks if c.kind == "vanishing" and c.parameter in named}
+    checks = (*springs, *(check for check in checks if check.id not in vanished))
 
     analysis = Analysis(
         title=submission.title,

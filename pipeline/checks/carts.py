@@ -1,18 +1,19 @@
 """Checks of the fitted carts: whether the fit explains the data and the chain is possible."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
 
-from pipeline.names import gain_name, read_name, toml_flags
+from pipeline.names import gain_name, own_zeta, read_name, toml_flags
 from pipeline.plant.limits import HEAVY_DAMPING
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.laws import brackets
 from pipeline.plant.linear.recovery import recover_from_parameters
-from pipeline.results import EXPLAINED, ChainFit, Check, passed
+from pipeline.results import EXPLAINED, ChainFit, Check, LogDecrement, passed
 from pipeline.set_up import Bench
 from pipeline.stages.compare import SIGMA_LIMIT
+from pipeline.words.numbers import abridge
 
 _REDUNDANCY = 1e-9  # relative difference of one number computed in two ways, without rounding
 _BELOW_ZERO = 2.0  # standard errors by which a mass, damping or spring may be below zero
@@ -22,7 +23,9 @@ _BELOW_ZERO = 2.0  # standard errors by which a mass, damping or spring may be b
 NEGLIGIBLE = 0.02
 
 
-def check_carts(fit: ChainFit | None, *, bench: Bench) -> list[Check]:
+def check_carts(
+    fit: ChainFit | None, *, decays: Sequence[LogDecrement] = (), bench: Bench
+) -> list[Check]:
     """Check the fit, and whether the chain has the signs, redundancies and orders of real carts."""
     if fit is None:
         message = "No model was identified. The list of what was skipped has the reasons."
@@ -32,7 +35,7 @@ def check_carts(fit: ChainFit | None, *, bench: Bench) -> list[Check]:
     chain = fit.chain
     values = {name: estimate.value for name, estimate in fit.parameters.items()}
     checks = [*_fit_checks(fit), _sign_check(fit, bench=bench)]
-    checks += check_vanishing(fit, bench=bench)
+    checks += check_vanishing(fit, decays=decays, bench=bench)
     if chain.n in (2, 3) and "omega_a" in values and all(bench.springs[1:-1]):
         checks += _redundancy_checks(values)
     if chain.n >= 2 and "omega_a" in values:
@@ -42,11 +45,15 @@ def check_carts(fit: ChainFit | None, *, bench: Bench) -> list[Check]:
 
 
 def _fit_checks(fit: ChainFit) -> list[Check]:
-    found = (
-        "and the noise explain the data."
-        if fit.explains_data
-        else "leave a residual above the noise; look where model and measurement differ."
-    )
+    if not fit.converged:
+        found = "not judged, because the fit failed."
+    elif fit.explains_data:
+        found = "the linear carts and the noise explain the data."
+    else:
+        found = (
+            "the linear carts leave a residual above the noise; look where model and measurement "
+            "differ."
+        )
     return [
         Check(
             kind="fit",
@@ -57,9 +64,8 @@ def _fit_checks(fit: ChainFit) -> list[Check]:
         Check(
             kind="fit",
             part="explains_data",
-            outcome=passed(fit.explains_data),
-            message=f"χ² per degree of freedom is {fit.chi_square_per_dof:.3g}: "
-            f"the linear carts {found}",
+            outcome=passed(fit.explains_data) if fit.converged else "skip",
+            message=f"χ² per degree of freedom is {fit.chi_square_per_dof:.3g}: {found}",
             value=fit.chi_square_per_dof,
             limit=EXPLAINED,
         ),
@@ -99,7 +105,9 @@ def physical_values(chain: Chain, *, bench: Bench) -> dict[str, float]:
     return values | {f"k_{i}": float(k) for i, (k, there) in springs if there}
 
 
-def check_vanishing(fit: ChainFit, *, bench: Bench) -> list[Check]:
+def check_vanishing(
+    fit: ChainFit, *, decays: Sequence[LogDecrement] = (), bench: Bench
+) -> list[Check]:
     """Return a failed check for each mass, damping or spring that may not exist.
 
     A parameter may not exist if its value is zero within its standard error, or small compared with
@@ -130,7 +138,7 @@ def check_vanishing(fit: ChainFit, *, bench: Bench) -> list[Check]:
                 outcome="fail",
                 value=measured or 0.0,
                 limit=limit,
-                message=f"{found}. {_ask_if_there(name, bench=bench)}",
+                message=f"{found}. {_ask_if_there(name, decays=decays, bench=bench)}",
             )
         )
     return checks
@@ -147,11 +155,17 @@ def _larger_neighbour(name: str, values: Mapping[str, float]) -> str:
     return max((o for o in beside if values.get(o, 0.0) > 0), key=lambda o: values[o], default="")
 
 
-def _ask_if_there(name: str, *, bench: Bench) -> str:
+def _ask_if_there(name: str, *, decays: Sequence[LogDecrement], bench: Bench) -> str:
     """Return a question to the student about a vanishing parameter, with the line to change."""
     read, n = read_name(name), bench.n
     assert read.cart is not None
     i = read.cart
+    if read.symbol == "c" and (alike := [one for one in decays if one.cart == i]):
+        runs = abridge(list(dict.fromkeys(one.experiment for one in alike)))
+        return (
+            f"The fit does not determine this damping. Use that of {runs}: "
+            f"{own_zeta(i, n=n)} = {alike[0].zeta:.2g}."
+        )
     if read.symbol == "c":
         alone = f", carts = [{i}]" if n > 1 else ""
         return (

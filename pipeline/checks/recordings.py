@@ -17,12 +17,14 @@ from pipeline.soundness.stated import (
     OTHER_DWELL,
     find_loose_holds,
     find_other_scales,
+    find_other_steps,
     find_wrong_setups,
     swings,
     why_other_frequency,
 )
 from pipeline.words.numbers import abridge
 from pipeline.words.phrases import phrases
+from pipeline.words.text import capital
 
 _WORDS = phrases("checks")
 _SPELT_OUT = 3  # up to so many records are listed by name, even if they are a whole kind
@@ -92,6 +94,8 @@ def check_units(records: Sequence[Record], *, bench: Bench) -> list[Check]:
                 role=role,
             )
             checks.append(_unit_check(kind, message, n=len(headed)))
+        elif role == "position" and (other_step := find_other_steps(records, bench=bench)):
+            checks.append(_unit_check(kind, capital(other_step.reason), n=len(records)))
         elif role == "position" and fractions:
             runs = abridge(fractions)
             message = _WORDS.text("fractions", runs=runs, gain_unit=bench.units.gain)

@@ -42,13 +42,16 @@ def _springs(
     abouts = [" and ".join(names)] if n == 1 else names  # for one cart, only the sum is known
     values = physical_values(fit.chain, bench=system.bench) if fit else {}
     vanishing = {check.parameter for check in failed if check.kind == "vanishing"}
+    contrary = {check.parameter: check.message for check in failed if check.kind == "springs"}
     unit = system.bench.units.stiffness
     for i, (about, present) in enumerate(zip(abouts, springs, strict=True), start=1):
         name = f"k_{i}"
         value = values.get(name)
         std = fit.std.get(name) if fit and value is not None else None
         support: Support = "open"
-        if fit is None or not fit.converged:
+        if name in contrary:
+            support, reason = "contradicted", contrary[name]
+        elif fit is None or not fit.converged:
             reason = "no carts were identified"
         elif not present:
             support = "supported" if fit.explains_data else "open"

@@ -1,12 +1,12 @@
-"""Find the springs of a new submission from its steps; mark springs that are uncertain.
+"""Find the springs of a new submission from its steps, and check those that one states.
 
 Beyond cart 1, all springs carry the same static force. So the static gains give ratios of
 stiffnesses: k_(n+1) / k_n = K_(n-1) / K_n - 1. Without a spring at the far wall all carts move
 equally, and only the spring wall-1 can hold them.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +23,23 @@ from pipeline.ingest.fill import (
     unsure,
 )
 from pipeline.ingest.read import read_data
-from pipeline.results import Record, StepGain
+from pipeline.names import toml_flags
+from pipeline.results import EXPLAINED, ChainFit, Check, FrequencyResponse, Record, StepGain
+from pipeline.set_up import Bench
+from pipeline.stages.bode_fit import fit_bode
 from pipeline.stages.compare import SIGMA_LIMIT
 from pipeline.stages.step_gain import fit_step_gain
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME, spring_names
+from pipeline.words.numbers import significant
+from pipeline.words.phrases import phrases
+
+_WORDS = phrases("checks")
+# A missing spring leaves a χ² that is larger by this factor. Friction or a stiffening spring is not
+# explained by another linear spring.
+_MUCH_BETTER = 100.0
+# On a bench, a spring is at least a tenth as stiff as the one before it.
+_NO_SPRING = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,11 +127,108 @@ def decide_springs(records: Sequence[Record], *, n: int) -> Springs:
     low, high = np.median(ratios, axis=0)
     if low > NEGLIGIBLE:
         return Springs(present=every, why="static gains do not show it", open=(1,))
-    # On a bench, a spring is at least a tenth as stiff as the one before it.
-    if high < 0.1:
+    if high < _NO_SPRING:
         why = "static gains are equal, so no spring ties the last cart to the wall"
         return Springs(present=(*every[:-1], False), why=why, open=())
     return Springs(present=every, why="static gains are too uncertain", open=(1, n + 1))
+
+
+def check_springs(
+    fit: ChainFit | None,
+    *,
+    responses: Sequence[FrequencyResponse],
+    gains: Sequence[StepGain],
+    bench: Bench,
+) -> list[Check]:
+    """Return a failed check for each stated or missing wall spring that the data contradict.
+
+    The static gains show the last spring without any fit. If the carts do not explain the data, a
+    fit with all springs shows whether one is missing.
+    """
+    found = {check.parameter: check for check in _with_spring(fit, responses, bench=bench)}
+    for check in _by_gains(gains, bench=bench):
+        found.setdefault(check.parameter, check)
+    return list(found.values())
+
+
+def _by_gains(gains: Sequence[StepGain], *, bench: Bench) -> Iterator[Check]:
+    n = bench.n
+    by_run = {(gain.experiment, gain.cart): gain for gain in gains}
+    ratios = [
+        _ratio(before, gain)
+        for (run, cart), gain in by_run.items()
+        if cart == n and (before := by_run.get((run, n - 1)))
+    ]
+    if not ratios:
+        return
+    low, high = np.median(ratios, axis=0)
+    stated = bench.springs[-1]
+    if low <= _NO_SPRING < high or (high <= _NO_SPRING) is not stated:
+        return
+    if stated and low < -_NO_SPRING:
+        return
+    yield _spring_check(
+        n + 1,
+        bench=bench,
+        key="no_spring" if stated else "spring",
+        value=float((low + high) / 2),
+        limit=_NO_SPRING,
+    )
+
+
+def _with_spring(
+    fit: ChainFit | None, responses: Sequence[FrequencyResponse], *, bench: Bench
+) -> Iterator[Check]:
+    missing = [j for j in (1, bench.n + 1) if not bench.springs[j - 1]]
+    if fit is None or not fit.converged or fit.explains_data or not missing or not bench.tied:
+        return
+    if bench.n == 1 or not responses:  # of one cart, only the sum of the springs is known
+        return
+    every = replace(bench, springs=(True,) * (bench.n + 1))
+    try:
+        stated = fit
+        if fit.method != "bode_fit":
+            stated = fit_bode(responses, bench=bench, near=fit.chain)
+        other = fit_bode(responses, bench=every, near=fit.chain)
+    except DataError:
+        return
+    before, after = stated.chi_square_per_dof, other.chi_square_per_dof
+    if after > before / _MUCH_BETTER:
+        return
+    largest = float(np.max(other.chain.k))
+    for j in missing:
+        k = float(other.chain.k[j - 1])
+        if k > _NO_SPRING * largest and k > SIGMA_LIMIT * other.std.get(f"k_{j}", np.inf):
+            yield _spring_check(
+                j, bench=bench, key="better_with_spring", value=before, limit=max(after, EXPLAINED)
+            )
+
+
+def _numbered(bench: Bench) -> Iterator[tuple[int, bool]]:
+    return enumerate(bench.springs, start=1)
+
+
+def _spring_check(j: int, *, bench: Bench, key: str, value: float, limit: float) -> Check:
+    flags = [flag is not (i == j) for i, flag in _numbered(bench)]
+    message = _WORDS.text(
+        key,
+        spring=spring_names(bench.n)[j - 1],
+        before=f"K_{bench.n - 1}",
+        last=f"K_{bench.n}",
+        n=bench.n,
+        value=significant(value, digits=3),
+        percent=f"{100 * value:.0f}",
+        limit=significant(limit, digits=3),
+        springs=toml_flags(flags),
+    )
+    return Check(
+        kind="springs",
+        parameter=f"k_{j}",
+        outcome="fail",
+        value=value,
+        limit=limit,
+        message=message,
+    )
 
 
 def _stays_away(step: Record) -> bool:

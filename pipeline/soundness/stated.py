@@ -8,7 +8,7 @@ from pipeline.estimation.units_and_clocks import TIME_UNITS
 from pipeline.ingest.columns import conversion
 from pipeline.results import Record
 from pipeline.set_up import Bench
-from pipeline.soundness.fault import RecordingFault, say
+from pipeline.soundness.fault import SAME, RecordingFault, say
 
 OTHER_DWELL = 0.1  # relative; a dwell this far from its stated frequency is another dwell
 # Share of a held cart's swing. If a cart that should be free moves less, it is not free.
@@ -17,6 +17,7 @@ LEAST_SHARE = 0.2
 _HELD_FIRMLY = 0.05
 _LONGEST = 3.0  # metres; no bench has a longer track
 _LONGEST_WHOLE = 0.5  # metres; the limit if all readings are whole numbers, as counts are
+_ECP_STEP = 2.27e-5  # metres per count of the encoders of an ECP 210
 _LARGEST = 100.0  # volts; no amplifier at a bench gives as much
 
 
@@ -98,6 +99,31 @@ def find_other_scales(records: Sequence[Record], *, bench: Bench) -> list[Record
             RecordingFault(code="input_scale", run=run, details=details, value=largest, limit=limit)
         )
     return found
+
+
+def find_other_steps(records: Sequence[Record], *, bench: Bench) -> RecordingFault | None:
+    """Find positions whose encoder step is a power of ten times the known one of an ECP bench."""
+    metres = conversion(bench.units.position, "m")
+    if any(one.role == "position" for record in records for one in record.heading_units):
+        return None
+    steps = [float(step) * (metres or 0.0) for r in records for step in r.resolution]
+    seen = [step for step in steps if step > 0]
+    if not seen or 2 * len(seen) < len(steps):
+        return None
+    power = np.log10(float(np.median(seen)) / _ECP_STEP)
+    # Files round a step to two digits.
+    if round(power) == 0 or abs(power - round(power)) > np.log10(1 + SAME):
+        return None
+    scale = 10.0 ** round(power)
+    details = {
+        "step": f"{float(np.median(seen)) / (metres or 1.0):.3g}",
+        "known": f"{_ECP_STEP / (metres or 1.0):.3g}",
+        "unit": bench.units.position,
+        "scale": f"{scale:g}",
+    }
+    return RecordingFault(
+        code="other_step", run=records[0].id, details=details, value=scale, limit=1.0
+    )
 
 
 def _reached(reaches: Iterable[tuple[Record, float]]) -> tuple[float, str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.checks.carts import check_vanishing
+from pipeline.checks.carts import check_carts, check_vanishing
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.resources import EXAMPLES
@@ -15,6 +15,7 @@ from pipeline.results import ChainFit, Check
 from pipeline.set_up import Bench
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
+from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.examples import analysed
 from tests.helpers.places import REAL_DATA
 from tests.helpers.ucsd import write_two_cart_submission
@@ -77,6 +78,25 @@ def test_a_part_that_may_not_exist_fails_a_check(name, value, std, found):
     assert "?" in check.message
     lines = {"k": "springs = [false, true, true]", "c": 'kind = "decay"', "m": "carts = 1"}
     assert lines[symbol] in check.message
+
+
+def test_a_vanishing_damping_is_taken_from_a_decay_that_exists():
+    """The message never asks for a decay that the submission has."""
+    analysis = make_analysis(2)
+    plant = PRESETS["throne-2dof"]
+    fit = fitted(Chain(m=plant.m, c=np.array([plant.c[0], 1e-7]), k=plant.k), c_2=1e-7)
+    bench = Bench(springs=(False, True, True))
+    (check,) = check_vanishing(fit, decays=analysis.log_decrements, bench=bench)
+    assert check.parameter == "c_2"
+    assert "add one" not in check.message
+    assert all(d.experiment in check.message for d in analysis.log_decrements if d.cart == 2)
+
+
+def test_the_residual_of_a_failed_fit_is_not_judged():
+    """A fit that failed is not said to explain the data, whatever its χ²."""
+    fit = fitted(PRESETS["throne-2dof"], converged=False)
+    outcomes = {c.id: c.outcome for c in check_carts(fit, bench=Bench(springs=(True,) * 3))}
+    assert outcomes == {"fit.converged": "fail", "fit.explains_data": "skip"}
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))

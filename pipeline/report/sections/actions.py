@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 
-from pipeline.names import read_name
 from pipeline.report.document import Items, bullet_list
 from pipeline.report.sections.loops import CLOSE
 from pipeline.report.sections.parameters import reported_off
@@ -17,6 +16,7 @@ _MOST_TOLD = 3  # most messages shown for one group of checks
 # Groups of checks, the most serious first. Other groups come between these and `_LAST`.
 _WORST_FIRST = (
     "input_sign",
+    "springs",
     "data",
     "record",
     "position_unit",
@@ -134,8 +134,6 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
     asked = {_group(check) for check in analysis.failed_checks}
     if wrong := list(dict.fromkeys(reported_off(analysis))):
         yield say("next_reported", names=names_spans(wrong))
-    if _may_lack_springs(analysis):
-        yield say("next_springs")
     if short := sorted({point.experiment for point in analysis.sine_points if not point.settled}):
         yield say("next_short", runs=clean(listing(short)))
     doubted = {check.experiment for check in analysis.hardware if check.contradicted}
@@ -156,17 +154,6 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
             yield say("next_missing", missing=rich(clean(listing(list(missing)))))
     if design and not design.reachable:
         yield say("next_goal", message=clean(design.message))
-
-
-def _may_lack_springs(analysis: Analysis) -> bool:
-    """Return whether a spring may be missing from the model.
-
-    It may be so if a gain from steps disagrees with the fit and no decay shows dry friction.
-    """
-    fit, dry = analysis.fit, any(d.friction and d.friction.present for d in analysis.log_decrements)
-    off = any(row.consistent is False and read_name(row.name).is_gain for row in analysis.rows)
-    may_be_whole = fit is None or fit.explains_data or all(analysis.bench.springs)
-    return off and not dry and not may_be_whole
 
 
 def _nothing_left(analysis: Analysis) -> Spans:

@@ -30,8 +30,8 @@ _LISTED = 4  # most runs that a question lists
 
 
 Kind = Literal[
-    "sign", "damping", "damping_same", "signs_differ", "gain", "frequency", "response", "assumed",
-    "friction", "sticking", "misfit", "level", "overshoot", "hardware",
+    "sign", "springs", "damping", "damping_same", "signs_differ", "gain", "frequency", "response",
+    "assumed", "friction", "sticking", "misfit", "level", "overshoot", "hardware",
 ]  # fmt: skip
 
 
@@ -52,6 +52,10 @@ class Asked:
 
 def ask(analysis: Analysis) -> tuple[Asked, ...]:
     """Return the questions that the data raise, the most important first; none if all is well."""
+    # With wrong springs, every other difference has this cause.
+    set_up = (*_turned(analysis), *_springs(analysis))
+    if any(question.kind == "springs" for question in set_up):
+        return set_up
     rules = (
         _turned,
         _damping,
@@ -77,6 +81,12 @@ def _turned(analysis: Analysis) -> Iterator[Asked]:
     there = {"step": "steps", "sine": "frequency-response", "closed_loop": "hardware"}
     section = there.get(turned[0].kind, "discussion")
     yield Asked(kind="sign", id="sign", section=section, text=_WORDS.text("sign", runs=runs))
+
+
+def _springs(analysis: Analysis) -> Iterator[Asked]:
+    wrong = [check.message for check in analysis.failed_checks if check.kind == "springs"]
+    if wrong:
+        yield Asked(kind="springs", id="springs", section="parameters", text=" ".join(wrong))
 
 
 def _inconsistent_rows(analysis: Analysis) -> list[ParameterRow]:

@@ -106,7 +106,9 @@ def _identified(analysis: Analysis) -> Block:
             what=_WORDS.text(fit.method),
             points=str(fit.n_points),
             chi_square=significant(fit.chi_square_per_dof, digits=3),
-            quality=_WORDS.text("explained" if fit.explains_data else "unexplained"),
+            quality=_WORDS.text("explained" if fit.explains_data else "unexplained")
+            if fit.converged
+            else "",
             first=_first_estimates(analysis, fitted_to=fit.experiments),
             failed=failed,
         )
