@@ -108,7 +108,7 @@ def graded_class(place: str, size: Size, *, folder: Path, seed: int) -> list[Fil
             named = {"submission": name, "authors": (f"s-{name}",)}
             outcome = make_outcome(
                 graded.grade.model_copy(update=named),
-                findings=findings_text(graded.verdicts),
+                findings=findings_text(graded.judgements),
                 figures=figures,
                 fingerprints=prints,
             )

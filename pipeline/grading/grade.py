@@ -17,6 +17,7 @@ Code = Literal[
     "carts_swapped",
     "counts_for_length",
     "log10_for_ln",
+    "factor_of_ten",
     "no_fit_done",
     "final_off",
     "initial_off",

@@ -2,9 +2,9 @@
 
 from decimal import Decimal
 from fnmatch import fnmatchcase
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AwareDatetime, Field, create_model
+from pydantic import AwareDatetime, Field, create_model, model_serializer, model_validator
 
 from pipeline.grading.grade import CODES, Code
 from pipeline.names import parameter_names
@@ -63,18 +63,44 @@ class Late(TomlTable):
     most_percent: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 100.0
 
 
+class FlagCost(TomlTable):
+    """The least and the most that a mistake costs: shares of the criterion where it is charged.
+
+    In a rubric, a plain number is the least.
+    """
+
+    least: Share = 0.0
+    most: Share = 1.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_number(cls, typed: Any) -> Any:
+        is_number = isinstance(typed, int | float) and not isinstance(typed, bool)
+        return {"least": float(typed)} if is_number else typed
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if self.least > self.most:
+            raise ValueError("least is more than most")
+        return self
+
+    @model_serializer
+    def _as_typed(self) -> float | dict[str, float]:
+        return self.least if self.most == 1 else {"least": self.least, "most": self.most}
+
+
 class FlagCosts(
     create_model(
         "_Costs",
         __base__=TomlTable,
         **dict[str, Any](
-            (code, (Share, 0.5 if code == "wrong_state_space" else 0.0))
+            (code, (FlagCost, FlagCost(least=0.5 if code == "wrong_state_space" else 0.0)))
             for code in CODES
             if code != "shared_data"
         ),
     )
 ):
-    """The minimum cost of each flag, as a share of its criterion's points.
+    """The cost of each flag.
 
     By default most flags cost nothing, because the tolerances already judge each wrong number. But
     one wrong entry of A or B makes the whole model wrong, although it is a small share of the
@@ -84,9 +110,9 @@ class FlagCosts(
     the points by hand.
     """
 
-    def of(self, code: Code) -> float:
+    def of(self, code: Code) -> FlagCost:
         """Return the cost of the flag with a code."""
-        return getattr(self, code, 0.0)
+        return getattr(self, code, FlagCost())
 
 
 class _Criterion(TomlTable):
@@ -173,9 +199,16 @@ class Laws(_Criterion):
 
 
 class StateModel(_Graded):
-    """Compare each entry of A and B with the student's own final table, or with the reference."""
+    """Compare each entry of A and B with the student's own final table, or with the reference.
+
+    Attributes
+    ----------
+    states : the order of the states that the lab asks for; default: x1, v1, x2, v2, … Another order
+        costs nothing, but gets a remark.
+    """
 
     check: Literal["state_space"]
+    states: tuple[str, ...] = ()
 
 
 class Gains(_Criterion):

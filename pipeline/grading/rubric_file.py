@@ -14,7 +14,14 @@ from pydantic_core import ErrorDetails
 
 from pipeline.errors import ConfigError
 from pipeline.grading import rubric
-from pipeline.grading.rubric import InitialFinal, Parameters, RequiredPieces, Rubric, matching
+from pipeline.grading.rubric import (
+    InitialFinal,
+    Parameters,
+    RequiredPieces,
+    Rubric,
+    StateModel,
+    matching,
+)
 from pipeline.names import read_name
 from pipeline.resources import RUBRICS
 from pipeline.submission.complaints import (
@@ -298,6 +305,10 @@ def _contradictions(
         elif Decimal(str(points)) % Decimal(str(found.step)):
             message = f"{points:g} is not a multiple of step = {found.step:g}"
             yield ("criteria", i, "points"), message
+        states = [f"{x}{cart}" for cart in range(1, n + 1) for x in "xv"]
+        named = criterion.states if isinstance(criterion, StateModel) else ()
+        if named and sorted(named) != sorted(states):
+            yield ("criteria", i, "states"), f"needs each of {', '.join(states)} once"
         if isinstance(criterion, Parameters | InitialFinal):
             for pattern in criterion.parameters:
                 if not matching((pattern,), names):

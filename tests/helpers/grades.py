@@ -145,7 +145,7 @@ def write_class_of_two(folder: Path, *, anonymous: bool = False) -> None:
             graded = team.graded(days_late=days_late)
             named = {"submission": name, "authors": (f"s {name}",)}
             grade = graded.grade.model_copy(update=named)
-            book.put(make_outcome(grade, findings=findings_text(graded.verdicts)))
+            book.put(make_outcome(grade, findings=findings_text(graded.judgements)))
         book.finish(Batch(keys=("key of team-1", "key of team-2"), shared={}), rubric=rubric)
 
 

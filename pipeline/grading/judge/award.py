@@ -5,45 +5,57 @@ from fractions import Fraction
 
 from pipeline.grading import rubric as asked
 from pipeline.grading.grade import Criterion, Flag, Outcome
-from pipeline.grading.judge.costs import charge
-from pipeline.grading.judge.work import Verdict
+from pipeline.grading.judge.costs import assign, charge, unnamed
+from pipeline.grading.judge.work import Judgement, Verdict
 from pipeline.grading.references.tolerance import exact, to_step
 from pipeline.grading.rubric import Rubric
 
 
 def award(
     criteria: Sequence[asked.Criterion],
-    verdicts: Mapping[str, Verdict],
+    judgements: Mapping[str, Judgement],
     flags: Sequence[Flag],
     *,
     rubric: Rubric,
 ) -> tuple[Criterion, ...]:
-    """Return the result of each criterion of a rubric, given the verdicts and flags."""
-    done: dict[str, Criterion] = {}
+    """Return the result of each criterion of a rubric, given the judgements and flags.
+
+    A criterion that others require counts as passed if only mistakes that can be undone keep it
+    from earning points. So such a mistake costs nothing in the criteria that require it.
+    """
+    ready: dict[str, Criterion] = {}
+    judged: dict[str, Judgement] = {}
     for wanted in criteria:
-        waits_for = (done[p] for p in wanted.requires if p in done)
+        waits_for = (ready[p] for p in wanted.requires if p in ready)
         failed = next((p for p in waits_for if p.outcome in ("fail", "skip")), None)
-        verdict = _waiting(failed) if failed else verdicts[wanted.id]
-        verdict = charge(verdict, wanted, flags, rubric=rubric)
-        points = to_step((verdict.share or 0) * exact(wanted.points), rubric.step)
-        if (
-            wanted.check == "required" and verdict.share != 1
-        ):  # rounding never hides what is missing
-            points = max(Fraction(0), min(points, exact(wanted.points) - exact(rubric.step)))
-        outcome = _outcome(verdict.share, points, out_of=exact(wanted.points))
-        advised = outcome in ("partial", "fail") and not verdict.explained
-        more = f" {wanted.message}" if wanted.message and advised else ""
-        done[wanted.id] = Criterion(
-            id=wanted.id,
-            title=wanted.title,
-            outcome=outcome,
-            points=float(points),
-            out_of=wanted.points,
-            message=verdict.message + more,
-            expected=verdict.expected,
-            found=verdict.found,
-        )
-    return tuple(done.values())
+        one = Judgement.plain(_waiting(failed)) if failed else judgements[wanted.id]
+        judged[wanted.id] = one
+        verdict = charge(one, unnamed(one, wanted), wanted, flags, rubric=rubric)
+        ready[wanted.id] = _result(wanted, verdict, rubric)
+    charges = assign(criteria, judged, flags, rubric=rubric)
+    return tuple(
+        _result(one, charge(judged[one.id], charges[one.id], one, flags, rubric=rubric), rubric)
+        for one in criteria
+    )
+
+
+def _result(wanted: asked.Criterion, verdict: Verdict, rubric: Rubric) -> Criterion:
+    points = to_step((verdict.share or 0) * exact(wanted.points), rubric.step)
+    if wanted.check == "required" and verdict.share != 1:  # rounding never hides what is missing
+        points = max(Fraction(0), min(points, exact(wanted.points) - exact(rubric.step)))
+    outcome = _outcome(verdict.share, points, out_of=exact(wanted.points))
+    advised = outcome in ("partial", "fail") and not verdict.explained
+    more = f" {wanted.message}" if wanted.message and advised else ""
+    return Criterion(
+        id=wanted.id,
+        title=wanted.title,
+        outcome=outcome,
+        points=float(points),
+        out_of=wanted.points,
+        message=verdict.message + more,
+        expected=verdict.expected,
+        found=verdict.found,
+    )
 
 
 def _waiting(parent: Criterion) -> Verdict:

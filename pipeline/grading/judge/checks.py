@@ -1,7 +1,6 @@
 """The checks of a rubric: each one returns a share of the points and a message."""
 
 from collections.abc import Callable, Mapping
-from decimal import Decimal
 from fractions import Fraction
 from typing import Any
 
@@ -16,6 +15,7 @@ from pipeline.grading.judge.checks_loop import (
 from pipeline.grading.judge.earned import ALL, NONE, Deviation, earned, earned_by
 from pipeline.grading.judge.laws import MOST_WIDENING, judge_laws
 from pipeline.grading.judge.work import (
+    Judgement,
     Verdict,
     Work,
     lacking,
@@ -24,10 +24,10 @@ from pipeline.grading.judge.work import (
     share_sound,
     share_there,
 )
-from pipeline.grading.mistakes.impossible import not_positive
-from pipeline.grading.mistakes.state_model import model_harm
+from pipeline.grading.mistakes.state_model import model_harm, order_names
+from pipeline.grading.mistakes.undo import Number
 from pipeline.grading.references.reference import OFF_SCALE, Reference, is_linear, off_scale
-from pipeline.grading.references.tolerance import NO_CREDIT, as_typed, percent_off, rounding
+from pipeline.grading.references.tolerance import NO_CREDIT, as_typed
 from pipeline.grading.rubric import matching
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
@@ -39,6 +39,24 @@ _NAMED = 4  # largest number of parameters or laws in one message
 def judge(criterion: asked.Criterion, work: Work) -> Verdict:
     """Judge one criterion, without regard to the criteria that it requires; see `award.py`."""
     return _JUDGES[criterion.check](criterion, work)
+
+
+def judge_with_undoing(criterion: asked.Criterion, work: Work) -> Judgement:
+    """Judge one criterion as typed, and again with the mistakes of the student undone."""
+    typed, slips = judge(criterion, work), work.slips(criterion.check)
+    if not slips:
+        return Judgement.plain(typed)
+    undone = judge(criterion, work.leaving(()))
+    only = {
+        slip: typed if len(slips) == 1 else judge(criterion, work.leaving((slip,)))
+        for slip in slips
+    }
+    matters = {
+        slip: one
+        for slip, one in only.items()
+        if (one.share, one.models) != (undone.share, undone.models)
+    }
+    return Judgement(typed=typed, undone=undone, only=matters)
 
 
 # ------------------------------------------------------------------- pieces and data
@@ -81,10 +99,10 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
 
     A parameter that is not reported earns nothing.
     """
-    table: Mapping[str, Decimal] = getattr(work.reported, criterion.check)
+    table = work.numbers(criterion.check)
     known: Mapping[str, Reference] = getattr(work.references, criterion.check)
     names = matching(criterion.parameters, work.rubric.names)
-    impossible = not_positive(table)
+    impossible = [name for name, number in table.items() if number.value <= 0]
     judged = [n for n in names if n in known or n in impossible]
     guessed = [n for n in names if n not in known and n not in judged]
     needs = lacking(work) if criterion.check == "initial" else {}
@@ -112,7 +130,7 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
             deviations.append(_deviation(NO_CREDIT, name))
             continue
         error = (
-            percent_off(table[name], known[name], sigmas=criterion.sigmas)
+            table[name].percent_off(known[name], sigmas=criterion.sigmas)
             if name in known
             else NO_CREDIT
         )
@@ -120,7 +138,7 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
         if earned_by(criterion, deviations[-1]) < 1:
             wrong.add(name)
             there = f", but your recordings give {known[name].text}" if name in known else ""
-            off.append(f"{name}: you report {as_typed(table[name])}{there}")
+            off.append(f"{name}: you report {table[name].text}{there}")
     left = (
         f" Not judged: {first_few(guessed, _NAMED)}."
         if guessed and criterion.check == "final"
@@ -138,7 +156,7 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
         message=message + left + look,
         explained=bool(wrong or unproved) and wrong <= work.named[criterion.check],
         expected={n: known[n].value for n in judged if n in known},
-        found={n: float(table[n]) for n in judged if n in table},
+        found={n: float(table[n].value) for n in judged if n in table},
         agrees={n: n not in wrong for n in judged if n in table and n not in unproved},
     )
 
@@ -153,7 +171,7 @@ def _initial_final(criterion: asked.InitialFinal, work: Work) -> Verdict:
     Dampings that the recordings do not determine are left out, because students can only guess
     them.
     """
-    initial, final = work.reported.initial, work.reported.final
+    initial, final = work.numbers("initial"), work.numbers("final")
     names = matching(criterion.parameters, work.rubric.names)
     both = [
         n
@@ -168,31 +186,32 @@ def _initial_final(criterion: asked.InitialFinal, work: Work) -> Verdict:
     for name in both:
         deviations.append(_deviation(between(initial[name], final[name]), name))
         if earned_by(criterion, deviations[-1]) < 1:
-            apart.append(f"{name}: first {as_typed(initial[name])}, then {as_typed(final[name])}")
+            apart.append(f"{name}: first {initial[name].text}, then {final[name].text}")
     return Verdict(
         share=earned(criterion, deviations),
         models=(tuple(deviations),),
         message=f"{'; '.join(apart[:_NAMED])}." if apart else "Both estimates agree.",
-        expected={n: float(initial[n]) for n in both},
-        found={n: float(final[n]) for n in both},
+        expected={n: float(initial[n].value) for n in both},
+        found={n: float(final[n].value) for n in both},
     )
 
 
-def between(initial: Decimal, final: Decimal) -> Fraction:
-    """Return how far two typed numbers differ, in percent, beyond the rounding of each.
+def between(initial: Number, final: Number) -> Fraction:
+    """Return how far two reported numbers differ, in percent, beyond the rounding of each.
 
     Two negative numbers can agree; their wrong sign is reported by another check.
     """
-    if initial * final <= 0:
+    if initial.value * final.value <= 0:
         return NO_CREDIT
-    initial, final = abs(initial), abs(final)
-    reference = Reference.at(float(initial), std=float(rounding(initial)), source="initial")
-    return percent_off(final, reference, sigmas=1.0)
+    std = float(initial.rounding)
+    reference = Reference.at(float(abs(initial.value)), std=std, source="initial")
+    size = Number(typed=abs(final.typed), factor=abs(final.factor))
+    return size.percent_off(reference, sigmas=1.0)
 
 
 def _laws(criterion: asked.Laws, work: Work) -> Verdict:
     laws = judge_laws(
-        work.reported.final,
+        work.numbers("final"),
         n=work.rubric.system.carts,
         frequency_percent=criterion.frequency_percent,
         damping_percent=criterion.damping_percent,
@@ -202,11 +221,11 @@ def _laws(criterion: asked.Laws, work: Work) -> Verdict:
         why = next(filter(None, (work.because_unread("final", n) for n in missing)), "")
         return Verdict(share=None, message=f"Not checked: the final table is not complete.{why}")
     broken = [law for law in laws if law.widening > 0]
-    meanings = dict.fromkeys(law.meaning for law in broken)  # two laws may have the same meaning
+    said = dict.fromkeys(law.broken for law in broken)
     worst = max((law.widening for law in laws), default=Fraction(0))
     return Verdict(
         share=ALL - worst / MOST_WIDENING,
-        message=f"The table breaks these laws: {'; '.join(list(meanings)[:_NAMED])}."
+        message=f"{'; '.join(list(said)[:_NAMED])}."
         if broken
         else f"All {len(laws)} laws hold within the rounding.",
         expected={"laws": [law.name for law in laws]},
@@ -236,10 +255,14 @@ def _state_space(criterion: asked.StateModel, work: Work) -> Verdict:
     message = f"{named}." if off else "A and B follow from the table."
     springs = work.analysis.bench.springs
     n, tied = len(springs) - 1, springs[0] or springs[-1]
-    harm = model_harm(space, entries, models=work.state_models, n=n, tied=tied)
+    harm = model_harm(space, entries, models=work.state_models, n=n, tied=tied, order=work.order)
     most = limits.KEPT_IF_HARMFUL if harm else ALL
     if harm:
         message = f"{WORDS.text(f'model_{harm}')} {message}"
+    if (order := order_names(work.order)) != (
+        ", ".join(criterion.states) or order_names(range(2 * n))
+    ):
+        message = f"{message} {WORDS.text('other_order', order=order)}"
     return Verdict(
         share=min(earned(criterion, deviations), most),
         models=(deviations,),

@@ -13,6 +13,7 @@ from pipeline.grading.judge.earned import ALL, NONE, Deviation, earned, earned_b
 from pipeline.grading.judge.work import Verdict, Work
 from pipeline.grading.mistakes.controller import Controller, does, same_gains
 from pipeline.grading.mistakes.loop_numbers import LoopNumbers
+from pipeline.grading.mistakes.state_model import order_names
 from pipeline.grading.references.reference import OFF_SCALE, Reference, off_scale
 from pipeline.grading.references.tolerance import NO_CREDIT, as_typed, exact, percent_off, rounding
 from pipeline.grading.words import WORDS
@@ -79,7 +80,10 @@ def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
     best = _best(criterion, controller, gains, judged)
     if best is None:
         return Verdict(share=NONE, message="These gains cannot be simulated.")
-    numbers, most, only_on_paper = best.numbers, ALL, ""
+    numbers, most, only_on_paper, ordered = best.numbers, ALL, "", ""
+    if work.gains_order:
+        said = WORDS.text("other_order_of_gains", order=order_names(work.gains_order))
+        ordered = f" {said}"
     if runaway := controller.runaway(gains):
         if numbers.stable:
             only_on_paper = f" {WORDS.text('only_on_paper', does=does(numbers))}"
@@ -89,7 +93,7 @@ def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
         models=best.models,
         most=most,
         message=f"On your carts: {does(numbers)}; the goal is {goal.overshoot_percent:g} % and "
-        f"{goal.settling_time:g} s.{only_on_paper}",
+        f"{goal.settling_time:g} s.{only_on_paper}{ordered}",
         expected={
             "overshoot_percent": goal.overshoot_percent,
             "settling_time": goal.settling_time,

@@ -11,13 +11,12 @@ at once.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from decimal import Decimal
 from fractions import Fraction
 
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.grading.references.tolerance import rounding
+from pipeline.grading.mistakes.undo import Number
 from pipeline.names import parameter_names, read_name
 from pipeline.plant.linear.laws import orders
 from pipeline.plant.linear.recovery import recover_from_parameters
@@ -33,16 +32,17 @@ class Law:
 
     Attributes
     ----------
+    broken : a sentence that says what disagrees if the law does not hold.
     widening : the least widening for which the law holds, in tolerances; 0 if rounding is enough.
     """
 
     name: str
-    meaning: str
+    broken: str
     widening: Fraction
 
 
 def judge_laws(
-    final: Mapping[str, Decimal], *, n: int, frequency_percent: float, damping_percent: float
+    final: Mapping[str, Number], *, n: int, frequency_percent: float, damping_percent: float
 ) -> list[Law] | None:
     """Judge every law of a final table; return None if the table is incomplete.
 
@@ -54,7 +54,8 @@ def judge_laws(
     names = parameter_names(n)
     if any(name not in final for name in names):
         return None
-    half = {name: float(rounding(final[name])) for name in names}
+    half = {name: float(final[name].rounding) for name in names}
+    value = {name: float(final[name].value) for name in names}
     percent = {
         name: (damping_percent if read_name(name).is_damping else frequency_percent) / 100
         for name in names
@@ -62,51 +63,58 @@ def judge_laws(
 
     def box(step: int) -> dict[str, float]:
         share = step / _PER_TOLERANCE
-        return {x: max(half[x], share * percent[x] * abs(float(final[x]))) for x in names}
+        return {x: max(half[x], share * percent[x] * abs(value[x])) for x in names}
 
-    results, last = _evaluate(final, box(0), n=n), MOST_WIDENING * _PER_TOLERANCE
+    results, last = _evaluate(value, box(0), n=n), MOST_WIDENING * _PER_TOLERANCE
     needed = {name: 0 if holds else last for name, (_, holds) in results.items()}
     failing = {name for name, step in needed.items() if step}
     for step in range(1, last) if failing else ():
-        wider = _evaluate(final, box(step), n=n)
+        wider = _evaluate(value, box(step), n=n)
         met = {name for name in failing if wider[name][1]}
         needed |= dict.fromkeys(met, step)
         failing -= met
         if not failing:
             break
     return [
-        Law(name=name, meaning=meaning, widening=Fraction(needed[name], _PER_TOLERANCE))
-        for name, (meaning, _) in results.items()
+        Law(name=name, broken=broken, widening=Fraction(needed[name], _PER_TOLERANCE))
+        for name, (broken, _) in results.items()
     ]
 
 
 def _evaluate(
-    final: Mapping[str, Decimal], half: Mapping[str, float], *, n: int
+    value: Mapping[str, float], half: Mapping[str, float], *, n: int
 ) -> dict[str, tuple[str, bool]]:
-    """Return, for each law, its meaning in words and whether it holds in a box.
+    """Return, for each law, what disagrees if it is broken, and whether it holds in a box.
 
     Parameters
     ----------
     half : half the width of the box for each parameter.
     """
     results: dict[str, tuple[str, bool]] = {}
-    value = {name: float(typed) for name, typed in final.items()}
     for name in parameter_names(n):
-        results[f"positive.{name}"] = (f"{name} is positive", value[name] > 0)
+        results[f"positive.{name}"] = (f"{name} is not positive", value[name] > 0)
     for lesser, greater, reason in orders(parameter_names(n)):
         holds = value[lesser] - half[lesser] <= value[greater] + half[greater]
-        results[f"order.{lesser}.{greater}"] = (f"{lesser} ≤ {greater} ({reason})", holds)
+        said = (
+            f"{lesser} = {value[lesser]:.4g} is above {greater} = {value[greater]:.4g} ({reason})"
+        )
+        results[f"order.{lesser}.{greater}"] = (said, holds)
     if n not in _REDUNDANT:
         return results
     with np.errstate(all="ignore"):
         found = recover_from_parameters(_corners(value, half, n=n))
         for name, (one, other) in found.routes.items():
             holds = bool((one - other).min() <= 0 <= (one - other).max())
-            results[f"redundancy.{name}"] = ("two ways to the same number agree", holds)
+            said = (
+                "two ways through the transfer functions to one number give "
+                f"{_range(one)} and {_range(other)}"
+            )
+            results[f"redundancy.{name}"] = (said, holds)
         kappas = {"kappa" if n == 2 else f"kappa_{i}": x for i, x in enumerate(found.couplings, 2)}
         for name, number in {**kappas, "k_1": found.k[0], f"k_{n + 1}": found.k[n]}.items():
             what = "the coupling of two carts" if name in kappas else name
-            results[f"sign.{name}"] = (f"{what} is not negative", bool(number.max() >= 0))
+            said = f"the table gives a negative value for {what}"
+            results[f"sign.{name}"] = (said, bool(number.max() >= 0))
         for cart in range(1, n):
             omega = np.sqrt(found.stiffness_terms[cart - 1])
             zeta = found.damping_terms[cart - 1] / (2 * omega)
@@ -115,9 +123,17 @@ def _evaluate(
                 low = float(np.min(real, initial=np.inf))
                 high = float(np.max(real, initial=-np.inf))
                 holds = low <= value[name] + half[name] and high >= value[name] - half[name]
-                text = f"{name} is {low:.4g} to {high:.4g}, by the transfer functions"
+                text = (
+                    f"{name} is {value[name]:.4g}, but the other numbers of this table give "
+                    f"{low:.4g} to {high:.4g}"
+                )
                 results[f"recomputed.{name}"] = (text, holds)
     return results
+
+
+def _range(numbers: Array) -> str:
+    low, high = f"{np.min(numbers):.4g}", f"{np.max(numbers):.4g}"
+    return low if low == high else f"{low} to {high}"
 
 
 def _corners(value: Mapping[str, float], half: Mapping[str, float], *, n: int) -> dict[str, Array]:

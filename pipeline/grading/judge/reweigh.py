@@ -9,12 +9,14 @@ changes.
 import json
 from collections.abc import Mapping
 from fractions import Fraction
+from typing import Any
 
 from pipeline.grading import rubric as asked
 from pipeline.grading.grade import Grade
 from pipeline.grading.judge.award import award
 from pipeline.grading.judge.earned import Deviation, earned
-from pipeline.grading.judge.work import Verdict
+from pipeline.grading.judge.work import Judgement, Verdict
+from pipeline.grading.mistakes.undo import Slip
 from pipeline.grading.references.tolerance import late_deduction
 from pipeline.grading.rubric import Rubric
 
@@ -26,50 +28,67 @@ _OF_CRITERION = (
 )  # fmt: skip
 
 
-def findings_text(verdicts: Mapping[str, Verdict]) -> str:
-    """Return the verdicts on all criteria as JSON, without messages.
+def findings_text(judgements: Mapping[str, Judgement]) -> str:
+    """Return the judgements of all criteria as JSON, without messages.
 
-    The same verdicts give the same bytes.
+    The same judgements give the same bytes.
     """
-    plain = {
-        id_: {
-            "share": None if verdict.share is None else str(verdict.share),
-            "most": str(verdict.most),
-            "models": [[(str(d.error), d.by) for d in model] for model in verdict.models],
-        }
-        for id_, verdict in verdicts.items()
-    }
+    plain = {}
+    for id_, one in judgements.items():
+        plain[id_] = _plain(one.typed)
+        if one.only:
+            only = [[slip.code, slip.number, _plain(alone)] for slip, alone in one.only.items()]
+            plain[id_] |= {"undone": _plain(one.undone), "only": only}
     return json.dumps(plain, separators=(",", ":"))
 
 
-def read_findings(text: str) -> dict[str, Verdict]:
-    """Return the verdicts in a text from `findings_text`; their messages are empty."""
+def _plain(verdict: Verdict) -> dict[str, Any]:
     return {
-        id_: Verdict(
-            share=None if plain["share"] is None else Fraction(plain["share"]),
-            message="",
-            most=Fraction(plain["most"]),
-            models=tuple(
-                tuple(Deviation(error=Fraction(error), by=by) for error, by in model)
-                for model in plain["models"]
-            ),
+        "share": None if verdict.share is None else str(verdict.share),
+        "most": str(verdict.most),
+        "models": [[(str(d.error), d.by) for d in model] for model in verdict.models],
+    }
+
+
+def read_findings(text: str) -> dict[str, Judgement]:
+    """Return the judgements in a text from `findings_text`; their messages are empty."""
+    return {
+        id_: Judgement(
+            typed=_verdict(plain),
+            undone=_verdict(plain.get("undone", plain)),
+            only={
+                Slip(code=code, number=number): _verdict(alone)
+                for code, number, alone in plain.get("only", ())
+            },
         )
         for id_, plain in json.loads(text).items()
     }
 
 
-def reweigh(grade: Grade, findings: Mapping[str, Verdict], *, rubric: Rubric) -> Grade:
+def _verdict(plain: Mapping[str, Any]) -> Verdict:
+    return Verdict(
+        share=None if plain["share"] is None else Fraction(plain["share"]),
+        message="",
+        most=Fraction(plain["most"]),
+        models=tuple(
+            tuple(Deviation(error=Fraction(error), by=by) for error, by in model)
+            for model in plain["models"]
+        ),
+    )
+
+
+def reweigh(grade: Grade, findings: Mapping[str, Judgement], *, rubric: Rubric) -> Grade:
     """Return the grade that another rubric gives; points given by hand are not included.
 
     Outcomes and points are the same as if the recordings were graded again, but messages are empty.
-    Criteria without stored verdicts are left out.
+    Criteria without stored judgements are left out.
     """
     if grade.status == "failed":
         nothing = {"out_of": rubric.out_of, "points": 0.0, "deducted": 0.0, "overrides": ()}
         return grade.model_copy(update={**nothing, "criteria": ()})
     judged = [wanted for wanted in rubric.criteria if wanted.id in findings]
-    verdicts = {wanted.id: _weighed(wanted, findings[wanted.id]) for wanted in judged}
-    criteria = award(judged, verdicts, grade.flags, rubric=rubric)
+    judgements = {wanted.id: _weighed(wanted, findings[wanted.id]) for wanted in judged}
+    criteria = award(judged, judgements, grade.flags, rubric=rubric)
     points = sum((Fraction(str(c.points)) for c in criteria), Fraction(0))
     late = {"late": rubric.late, "step": rubric.step, "days_late": grade.days_late}
     deducted = late_deduction(points, **late)
@@ -83,12 +102,20 @@ def reweigh(grade: Grade, findings: Mapping[str, Verdict], *, rubric: Rubric) ->
     return grade.model_copy(update=changed)
 
 
-def _weighed(wanted: asked.Criterion, finding: Verdict) -> Verdict:
-    """Return a stored verdict with the share that the criterion's new tolerances give."""
-    if not finding.models:
-        return Verdict(share=finding.share, message="")
-    best = max(earned(wanted, model) for model in finding.models)
-    return Verdict(share=min(best, finding.most), message="")
+def _weighed(wanted: asked.Criterion, finding: Judgement) -> Judgement:
+    """Return a stored judgement with the shares that the criterion's new tolerances give."""
+
+    def weighed(verdict: Verdict) -> Verdict:
+        if not verdict.models:
+            return Verdict(share=verdict.share, message="")
+        best = max(earned(wanted, model) for model in verdict.models)
+        return Verdict(share=min(best, verdict.most), message="")
+
+    return Judgement(
+        typed=weighed(finding.typed),
+        undone=weighed(finding.undone),
+        only={slip: weighed(one) for slip, one in finding.only.items()},
+    )
 
 
 def needs_recordings(before: Rubric, now: Rubric) -> list[str]:

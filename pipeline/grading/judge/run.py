@@ -8,16 +8,18 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
 
+from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.grading.grade import CODES, Flag, Grade
 from pipeline.grading.judge.award import award
-from pipeline.grading.judge.checks import judge
-from pipeline.grading.judge.work import Verdict, Work, data_flag, missing_flag
+from pipeline.grading.judge.checks import judge_with_undoing
+from pipeline.grading.judge.work import Judgement, Work, data_flag, missing_flag
 from pipeline.grading.mistakes.controller import diagnose_controller, reported_controller
 from pipeline.grading.mistakes.no_fit import copied_final
 from pipeline.grading.mistakes.reduced import diagnose_reduced
-from pipeline.grading.mistakes.state_model import diagnose_state_space, state_models
+from pipeline.grading.mistakes.state_model import diagnose_state_space, find_order, state_models
 from pipeline.grading.mistakes.tables import diagnose_tables
+from pipeline.grading.mistakes.undo import swapped_order
 from pipeline.grading.references.reference import (
     in_doubt,
     in_scale,
@@ -46,18 +48,18 @@ from pipeline.workflow import analyse
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Graded:
-    """A grade, with its analysis and verdicts.
+    """A grade, with its analysis and the judgements of its criteria.
 
     Attributes
     ----------
     analysis : analysis of the student's recordings; None if the grading failed.
-    verdicts : verdict on each criterion, even if a criterion that it requires was not passed; empty
-        if the grading failed.
+    judgements : judgement of each criterion, even if a criterion that it requires was not passed;
+        empty if the grading failed.
     """
 
     grade: Grade
     analysis: Analysis | None
-    verdicts: Mapping[str, Verdict] = field(default_factory=dict)
+    judgements: Mapping[str, Judgement] = field(default_factory=dict)
 
 
 def grade_submission(
@@ -149,8 +151,8 @@ def grade_analysis(
     submission : submission with the rubric's system, from `under_rubric`.
     """
     work, flags, signed = prepare_work(submission, analysis, rubric=rubric)
-    verdicts = {criterion.id: judge(criterion, work) for criterion in rubric.criteria}
-    criteria = award(rubric.criteria, verdicts, flags, rubric=rubric)
+    judgements = {one.id: judge_with_undoing(one, work) for one in rubric.criteria}
+    criteria = award(rubric.criteria, judgements, flags, rubric=rubric)
     earned = sum((Fraction(str(c.points)) for c in criteria), Fraction(0))
     deducted = late_deduction(earned, late=rubric.late, step=rubric.step, days_late=days_late)
     grade = Grade(
@@ -166,7 +168,7 @@ def grade_analysis(
         units=analysis.bench.units,
         notes=signed,
     )
-    return Graded(grade=grade, analysis=analysis, verdicts=verdicts)
+    return Graded(grade=grade, analysis=analysis, judgements=judgements)
 
 
 def prepare_work(
@@ -180,8 +182,9 @@ def prepare_work(
     reported, signed = turned_round(submission.reported or Reported(), analysis.records)
     submission = submission.model_copy(update={"reported": reported})
     work, flags_so_far = _prepare(submission, analysis, rubric=rubric)
-    flags = sorted([*flags_so_far, *_flags(work)], key=lambda flag: CODES.index(flag.code))
-    return work, tuple(flags), signed
+    more, meant = _flags(work)
+    flags = sorted([*flags_so_far, *more], key=lambda flag: CODES.index(flag.code))
+    return replace(work, meant=meant), tuple(flags), signed
 
 
 def _prepare(
@@ -209,17 +212,28 @@ def _prepare(
     if chain is None and not diagnosis.possible:
         tables = []  # the typed table is impossible, but the student's model may be right
     digits = {n: float(rounding(typed) / abs(Fraction(typed))) for n, typed in positive.items()}
+    models = state_models(tables, rounding=digits, known=references.final, chain=chain, n=n)
+    usual, space = tuple(range(2 * n)), reported.state_space
+    order = find_order(space, models=models, n=n) if space and space.A else usual
+    controller, gains_order = reported_controller(
+        submission,
+        analysis,
+        chain=chain,
+        tables=tables,
+        orders=[order, *swapped_order(diagnosis.slipped["final"], n=n)],
+    )
     work = Work(
         submission=submission,
         analysis=analysis,
         rubric=rubric,
         references=references,
-        controller=reported_controller(submission, analysis, chain=chain, tables=tables),
-        state_models=state_models(
-            tables, rounding=digits, known=references.final, chain=chain, n=n
-        ),
+        controller=controller,
+        state_models=models,
         bad=find_bad_recordings(analysis),
         named=diagnosis.named,
+        slipped=diagnosis.slipped,
+        order=order,
+        gains_order=gains_order,
     )
     return work, diagnosis.flags
 
@@ -292,22 +306,26 @@ def _under_calibration(experiment: Experiment, system: System) -> Experiment:
 # ------------------------------------------------------------------------------- flags
 
 
-def _flags(work: Work) -> list[Flag]:
-    """Return the flags that do not concern the parameter tables.
+def _flags(work: Work) -> tuple[list[Flag], Array | None]:
+    """Return the flags that do not concern the parameter tables, and the gains that were meant.
 
     On a nonlinear bench, no single chain reproduces all recordings. Then only the zeros and ones of
     A and B are judged, and the controller is not.
     """
     flags, space, linear = [], work.reported.state_space, is_linear(work.analysis)
+    meant = None
     if space is not None and space.A:
         n = work.rubric.system.carts
         entries = [entry for entry in work.entries if linear or entry.kind == "exact"]
-        flags += diagnose_state_space(space, entries, models=work.state_models, n=n)
+        flags += diagnose_state_space(
+            space, entries, models=work.state_models, n=n, order=work.order
+        )
     if work.controller is not None and linear:
-        flags += diagnose_controller(work.controller)
+        of_loop, meant = diagnose_controller(work.controller)
+        flags += of_loop
     flags += diagnose_reduced(work.analysis)
     if work.missing:
         flags.append(missing_flag(work.missing, work.rubric))
     if work.bad:
         flags.append(data_flag(work.bad))
-    return flags
+    return flags, meant

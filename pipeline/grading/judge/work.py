@@ -1,16 +1,18 @@
 """The input to the checks, and their results (verdicts)."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from typing import Any
 
+from pipeline.arrays import Array
 from pipeline.grading.grade import Flag
 from pipeline.grading.judge.earned import ALL, NONE, Deviation, mean_share
 from pipeline.grading.mistakes.controller import Controller
 from pipeline.grading.mistakes.explain import Label
-from pipeline.grading.mistakes.state_model import MatrixEntry, StateMatrices, compare_entries
+from pipeline.grading.mistakes.state_model import MatrixEntry, Order, StateMatrices, compare_entries
+from pipeline.grading.mistakes.undo import Number, Slip, Slipped, all_slips, undo
 from pipeline.grading.references.readings import readings
 from pipeline.grading.references.reference import References
 from pipeline.grading.rubric import RequiredPieces, RequiredRuns, Rubric, matching
@@ -43,6 +45,17 @@ class Piece:
         return Fraction(min(self.there, self.needed), self.needed)
 
 
+# The checks whose result depends on numbers of the tables, or on the gains.
+_OF_TABLES: Mapping[str, tuple[Label, ...]] = {
+    "initial": ("initial",),
+    "final": ("final",),
+    "initial_final": ("initial", "final"),
+    "laws": ("final",),
+}
+_OF_LOOP = ("gains", "claims", "prefilter")
+_GAINS = Slip(code="wrong_gains")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Work:
     """Everything that a check may use.
@@ -54,6 +67,11 @@ class Work:
     state_models : acceptable values of [A B].
     bad : recordings with a problem, and the problem of each.
     named : for each table, the parameters whose errors a known mistake explains.
+    slipped : for each table, what mistakes did to its numbers.
+    meant : the gains that were meant, if a known mistake explains the reported ones, shape (2n,).
+    order : the order of the states in which A and B are meant.
+    gains_order : the order in which the gains are meant, if it is not x1, v1, x2, v2, …
+    left : the mistakes that are left in the numbers; None for all, so that numbers are as typed.
     """
 
     submission: Submission
@@ -64,6 +82,30 @@ class Work:
     state_models: Sequence[StateMatrices]
     bad: Mapping[str, str]
     named: Mapping[Label, frozenset[str]]
+    slipped: Mapping[Label, Sequence[Slipped]]
+    order: Order
+    gains_order: Order | None = None
+    meant: Array | None = None
+    left: Collection[Slip] | None = None
+
+    def numbers(self, label: Label) -> dict[str, Number]:
+        """Return the numbers of a table, as typed or with mistakes undone."""
+        changes = () if self.left is None else self.slipped[label]
+        return undo(getattr(self.reported, label), changes, left=self.left or ())
+
+    def slips(self, check: str) -> list[Slip]:
+        """Return the mistakes that may cost points in a check and can be undone."""
+        if check in _OF_LOOP:
+            return [_GAINS] if self.meant is not None else []
+        labels = _OF_TABLES.get(check, ())
+        return list(all_slips([one for label in labels for one in self.slipped[label]]))
+
+    def leaving(self, left: Collection[Slip]) -> "Work":
+        """Return the input with all mistakes undone, except those that are left."""
+        controller = self.controller
+        if controller is not None and self.meant is not None and _GAINS not in left:
+            controller = replace(controller, gains=self.meant)
+        return replace(self, left=left, controller=controller)
 
     @cached_property
     def pieces(self) -> list[Piece]:
@@ -81,9 +123,10 @@ class Work:
 
         Empty if A is not reported.
         """
-        space = self.reported.state_space
-        n = self.rubric.system.carts
-        return compare_entries(space, models=self.state_models, n=n) if space and space.A else []
+        space, n = self.reported.state_space, self.rubric.system.carts
+        if space is None or not space.A:
+            return []
+        return compare_entries(space, models=self.state_models, n=n, order=self.order)
 
     @property
     def reported(self) -> Reported:
@@ -124,6 +167,31 @@ class Verdict:
     models: tuple[tuple[Deviation, ...], ...] = ()
     most: Fraction = ALL
     agrees: Mapping[str, bool] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judgement:
+    """The verdicts on one criterion: as typed, and with mistakes undone.
+
+    Attributes
+    ----------
+    undone : the verdict with all mistakes undone.
+    only : for each mistake that matters here, the verdict with all other mistakes undone.
+    """
+
+    typed: Verdict
+    undone: Verdict
+    only: Mapping[Slip, Verdict] = field(default_factory=dict)
+
+    @property
+    def is_better_undone(self) -> bool:
+        """Whether undoing the mistakes earns more points than the numbers as typed."""
+        return (self.undone.share or NONE) > (self.typed.share or NONE)
+
+    @classmethod
+    def plain(cls, verdict: Verdict) -> "Judgement":
+        """Return a judgement in which no mistake can be undone."""
+        return cls(typed=verdict, undone=verdict)
 
 
 # --------------------------------------------------------------------- required items

@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
 
 import numpy as np
@@ -22,7 +22,11 @@ from pipeline.submission import Reported
 # (periods counted, true periods): one too many, or one too few.
 _COUNTS = [pair for k in range(1, 11) for pair in ((k + 1, k), (k, k + 1))]
 
+# (numerator, denominator) of a power of ten.
+_POWERS = [pair for p in (10, 100, 1000) for pair in ((p, 1), (1, p))]
+
 Numbers = Mapping[str, Reference]
+Kind = tuple[tuple[str, ...], tuple[int, int]]  # the keys of the advice, and the ratio
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,31 +38,61 @@ class Mistake:
     advice_keys : keys of the advice in `templates/words/grading.toml`.
     predicted : for each parameter, the bounds of the number that the mistake gives.
     tolerance : relative distance from these bounds within which a number still matches.
-    periods : the number of periods counted, and the true number.
+    ratio : the number of periods counted, and the true number; or a power of ten.
     whole : whether the mistake is credible only if all reported numbers are near its predictions.
     least : the mistake is credible only if at least this many numbers match.
     table_wide : whether the mistake also explains every other wrong number of the table.
     tries : number of variants tried; with more variants, a match by chance is more likely.
     beside : other parameters; the mistake is credible only if their numbers are right.
     from_time_records : whether the mistake is made when reading a decay or a step. A final table
-        contains such a mistake only if its numbers were copied from the initial table.
+        contains such a mistake only if the initial table contains it too.
+    sources : if carts are swapped, the parameter to which each number belongs.
+    base : the first of two combined mistakes.
     """
 
     codes: tuple[Code, ...]
     advice_keys: tuple[str, ...]
     predicted: dict[str, Reference]
     tolerance: float
-    periods: tuple[int, int] = (0, 0)
+    ratio: tuple[int, int] = (0, 0)
     whole: bool = False
     least: int = 1
     table_wide: bool = False
     tries: int = 1
     beside: frozenset[str] = frozenset()
     from_time_records: bool = False
+    sources: Mapping[str, str] = field(default_factory=dict)
+    base: "Mistake | None" = None
+
+    @property
+    def kind(self) -> Kind:
+        """What is the same for all variants of a mistake; they concern different numbers."""
+        return self.advice_keys, self.ratio
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the mistake is credible even if gains are in an impossible order."""
+        return self.whole or self.codes == ("factor_of_ten",)
+
+    def changes(self, name: str, known: Numbers) -> tuple[str, dict[Code, float]]:
+        """Return the parameter to which a number belongs, and the factor of each mistake.
+
+        Parameters
+        ----------
+        known : the numbers from the recordings.
+        """
+        source = self.sources.get(name, name)
+        right = known[source].value
+        total = self.predicted[name].value / right
+        if self.base is None:
+            return source, {self.codes[0]: total}
+        before = self.base.predicted.get(source)
+        first = before.value / right if before else 1.0
+        return source, {self.codes[0]: first, self.codes[-1]: total / first}
 
     def help(self, typed: Decimal, reference: Reference) -> str:
         """Return the advice about one number."""
-        counted, there = self.periods
+        counted, there = self.ratio
         recomputed = f"{reference.value:.4g}"
         values = {"reported": as_typed(typed), "recomputed": recomputed}
         return "".join(
@@ -70,7 +104,7 @@ class Mistake:
     ) -> "Mistake":
         """Return this mistake combined with a second one."""
         codes, advice_keys = (*self.codes, code), (*self.advice_keys, advice_key)
-        return replace(self, codes=codes, advice_keys=advice_keys, predicted=predicted)
+        return replace(self, codes=codes, advice_keys=advice_keys, predicted=predicted, base=self)
 
 
 def _may_be_log10(name: str, reference: Reference, reported: Reported) -> bool:
@@ -91,9 +125,10 @@ def known_mistakes(references: Numbers, analysis: Analysis, reported: Reported) 
     gains, omegas, zetas = of["gains"], of["own frequencies"], of["own dampings"]
     hertz = _by_factor(of, "frequencies", "all frequencies")
     scales = [*_by_factor(of, "gains", "sharp gains"), *_gain_mistakes(gains, analysis)]
-    log10 = _by_factor(of, "dampings")
+    log10 = _by_factor(of, "dampings", "every damping")
     miscounts = [*_miscounts(omegas, zetas, of["all dampings"]), *_by_factor(of, "sharp dampings")]
     found = [*hertz, *scales, *log10, *miscounts]
+    found += _powers_of_ten(of, {name: _count(name, analysis) for name in gains})
     found += [*_swaps(gains), *_swaps(omegas), *_swaps(zetas)]
     if {_damping(name) for name in omegas} == zetas.keys():
         found += _swaps(omegas, {n: _with_slack(r) for n, r in zetas.items()})
@@ -122,6 +157,7 @@ def _groups(references: Numbers, reported: Reported) -> dict[str, dict[str, Refe
         for n, r in references.items()
         if read[n].is_ratio and not read[n].is_by_eye and r.low > 0
     }
+    every = {n: r for n, r in references.items() if read[n].is_ratio and r.low > 0}
     gains = {n: r for n, r in references.items() if n in sure and read[n].is_gain}
     certain = {n: r for n, r in frequencies.items() if n in sure}
     own = {n: r for n, r in dampings.items() if n in sure}
@@ -135,6 +171,7 @@ def _groups(references: Numbers, reported: Reported) -> dict[str, dict[str, Refe
         "all dampings": dampings,
         "own dampings": own,
         "dampings": dampings if shows_log10 else {},  # including those with wide bounds
+        "every damping": every if shows_log10 and every.keys() > dampings.keys() else {},
         "sharp dampings": {n: r for n, r in own.items() if r.within(limits.SHARP)},
     }
 
@@ -171,6 +208,31 @@ def _times(references: Numbers, factor: float) -> dict[str, Reference]:
     return {name: reference.times(factor) for name, reference in references.items()}
 
 
+def _powers_of_ten(of: Mapping[str, Numbers], counts: Mapping[str, float]) -> Iterator[Mistake]:
+    """Yield the mistakes of a wrong decimal point or prefix of a unit, one for each number.
+
+    Parameters
+    ----------
+    counts : one encoder count in position units, for each gain. If counts differ from positions by
+        a power of ten, the mistake is one of counts.
+    """
+    for more, less in _POWERS:
+        factor = more / less
+        for name, right in {**of["gains"], **of["frequencies"], **of["all dampings"]}.items():
+            count = counts.get(name, 0.0)
+            if count and abs(math.log(factor * count)) < math.log1p(limits.UNMISTAKABLE):
+                continue
+            damping = read_name(name).is_damping
+            yield Mistake(
+                codes=("factor_of_ten",),
+                advice_keys=("power_more" if more > 1 else "power_less",),
+                predicted={name: right.times(factor)},
+                tolerance=limits.LOG10_DAMPING if damping else limits.UNMISTAKABLE,
+                ratio=(more, less),
+                tries=len(_POWERS),
+            )
+
+
 # -------------------------------------------------------------------- frequencies
 
 
@@ -187,7 +249,7 @@ def _miscounts(omegas: Numbers, zetas: Numbers, every_zeta: Numbers) -> Iterator
         both = Mistake(
             codes=("peak_count",),
             advice_keys=("miscount",),
-            periods=(counted, there),
+            ratio=(counted, there),
             predicted={**fast, **damped},
             tolerance=limits.COUNTED,
             whole=True,
@@ -341,7 +403,9 @@ def _swaps(references: Numbers, dampings: Numbers | None = None) -> Iterator[Mis
         moved = {name: other for name, other in source.items() if name != other}
         predicted = {name: references[other] for name, other in moved.items()}
         if dampings is not None:
-            predicted |= {_damping(n): dampings[_damping(other)] for n, other in moved.items()}
+            too = {_damping(name): _damping(other) for name, other in moved.items()}
+            moved |= too
+            predicted |= {name: dampings[other] for name, other in too.items()}
         yield Mistake(
             codes=("carts_swapped",),
             advice_keys=("swapped",),
@@ -349,6 +413,7 @@ def _swaps(references: Numbers, dampings: Numbers | None = None) -> Iterator[Mis
             tolerance=limits.DAMPING if read_name(next(iter(moved))).is_damping else limits.READ,
             whole=True,
             least=2,
+            sources=moved,
         )
 
 
@@ -364,4 +429,4 @@ def _swapped(mistakes: Sequence[Mistake], references: Numbers) -> Iterator[Mista
         for source in _permutations(list(references)):
             swapped = {name: mistake.predicted[other] for name, other in source.items()}
             both = mistake.together_with("carts_swapped", "and_swapped", swapped)
-            yield replace(both, whole=True, least=2, tries=1)
+            yield replace(both, whole=True, least=2, tries=1, sources=source)

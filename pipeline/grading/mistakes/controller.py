@@ -15,7 +15,7 @@ from pipeline.errors import DataError
 from pipeline.grading import limits
 from pipeline.grading.grade import Flag
 from pipeline.grading.mistakes.loop_numbers import LoopNumbers, loop_numbers
-from pipeline.grading.mistakes.state_model import own_chain
+from pipeline.grading.mistakes.state_model import Order, own_chain
 from pipeline.grading.references.reference import is_explained
 from pipeline.grading.references.tolerance import as_typed, rounding
 from pipeline.grading.words import WORDS
@@ -123,6 +123,17 @@ class Controller:
         ratio = None if settles is None else settles / float(self.settling)
         return ratio is not None and 1 / limits.CLAIM_SETTLING <= ratio <= limits.CLAIM_SETTLING
 
+    def confirms(self, gains: Array | None) -> bool:
+        """Return whether gains are those that ran; without a run, whether all numbers fit them."""
+        if gains is None:
+            return False
+        if self.ran is not None:
+            return same_gains(gains, self.ran)
+        return any(
+            self.meets(one) and self.prefilter_fits(one) and self.is_claimed(one)
+            for one in self.numbers(gains)
+        )
+
     def is_of_other_gains(self, numbers: LoopNumbers) -> bool:
         """Return whether the claimed settling time must belong to different gains.
 
@@ -153,20 +164,26 @@ def reported_controller(
     *,
     chain: Chain | None,
     tables: Sequence[Mapping[str, float]],
-) -> Controller | None:
-    """Return the controller of a submission; None if it is missing or cannot be judged.
+    orders: Sequence[Order] = (),
+) -> tuple[Controller | None, Order | None]:
+    """Return the controller of a submission, and the order in which its gains are meant.
+
+    The controller is None if it is missing or cannot be judged. The order is None if the gains are
+    in the order x1, v1, x2, v2, … Another order needs evidence: only in this order, the gains are
+    those that ran, or they meet the goal and fit the other reported numbers.
 
     Parameters
     ----------
     chain : the chain from the recordings; None if the carts were not identified.
     tables : the student's final table: as typed, and with known mistakes corrected.
+    orders : the orders of the states that the other reported numbers have.
     """
     feedback = submission.reported.feedback if submission.reported else None
     n = submission.system.carts
     own = [own_chain(values, n=n) for values in tables]
     models = [model for model in (chain, *own) if model is not None]
     if feedback is None or not models:
-        return None
+        return None, None
     ran = [
         e.controller.gains
         for e in submission.experiments
@@ -184,10 +201,37 @@ def reported_controller(
         own=any(model is not None for model in own),
         reference=chain,
     )
-    controller = replace(controller, doubt=_doubt(controller, submission, analysis))
-    if controller.gains is None or controller.reaches_goal(controller.gains):
+    order = None
+    for one in orders:
+        meant = _in_order(controller, one)
+        better = replace(
+            meant,
+            doubt=_doubt(meant, submission, analysis),
+            goal=_goal(meant, submission, analysis),
+        )
+        if better.confirms(better.gains) and not better.confirms(controller.gains):
+            controller, order = better, one
+            break
+    doubt = _doubt(controller, submission, analysis)
+    goal = _goal(controller, submission, analysis)
+    return replace(controller, doubt=doubt, goal=goal), order
+
+
+def _in_order(controller: Controller, order: Order) -> Controller:
+    """Return a controller whose gains are listed in an order of the states."""
+    gains = controller.gains
+    if gains is None or gains.size != len(order):
         return controller
-    return replace(controller, goal=_reachable(controller.goal, submission, analysis))
+    meant = np.empty_like(gains)
+    meant[list(order)] = gains
+    return replace(controller, gains=meant)
+
+
+def _goal(controller: Controller, submission: Submission, analysis: Analysis) -> Design:
+    """Return the design goal, or an easier one if neither gains nor reference design reach it."""
+    if controller.gains is None or controller.reaches_goal(controller.gains):
+        return controller.goal
+    return _reachable(controller.goal, submission, analysis)
 
 
 def _doubt(controller: Controller, submission: Submission, analysis: Analysis) -> float:
@@ -248,16 +292,18 @@ def _reachable(goal: Design, submission: Submission, analysis: Analysis) -> Desi
 # ------------------------------------------------------------------------- flags
 
 
-def diagnose_controller(controller: Controller) -> list[Flag]:
-    """Return the flags of the gains and of the prefilter.
+def diagnose_controller(controller: Controller) -> tuple[list[Flag], Array | None]:
+    """Return the flags of the gains and of the prefilter, and the gains that were meant.
+
+    These are None if the reported gains are right, or if no known mistake explains them.
 
     A prefilter is not flagged if it fits the gains that the student probably meant.
     """
     if controller.gains is None:
-        return []
+        return [], None
     numbers = controller.numbers(controller.gains)
     if not numbers:
-        return []
+        return [], None
     flags = []
     fits = any(controller.prefilter_fits(one) for one in numbers)
     meets = any(controller.meets(one) for one in numbers)
@@ -265,9 +311,9 @@ def diagnose_controller(controller: Controller) -> list[Flag]:
     # Gains that meet the goal and match the claims are those that the student meant.
     is_stated = controller.overshoot is not None or controller.settling is not None
     slip, intended = ("", None) if meets and is_stated and claimed else _slip(controller)
-    ran = controller.ran
+    ran, meant = controller.ran, None
     # If the bench ran with other gains, they show which of the reported numbers is wrong.
-    other_ran = ran is not None and not same_gains(ran, controller.gains)
+    other_ran, better = ran is not None and not same_gains(ran, controller.gains), False
     sharply = any(controller.prefilter_fits(one, sharp=True) for one in numbers)
     wrong = not meets or (slip and not (fits and claimed)) or (not claimed and not sharply)
     wrong = wrong or all(controller.is_of_other_gains(one) for one in numbers)
@@ -279,6 +325,7 @@ def diagnose_controller(controller: Controller) -> list[Flag]:
         wrong = wrong or (better and not (fits and claimed))
     if wrong:
         flags.append(_gains_flag(controller, numbers[0], slip=slip, other_ran=other_ran))
+        meant = intended if intended is not None else ran if better else None
         sources = [g for g in (intended, ran if other_ran else None) if g is not None]
         known = [one for gains in sources for one in controller.numbers(gains)]
         fits = fits or not known or any(controller.prefilter_fits(one) for one in known)
@@ -287,7 +334,7 @@ def diagnose_controller(controller: Controller) -> list[Flag]:
         # Without the student's own carts, a misfit may only be a difference between models.
         if controller.own or slip:
             flags.append(_prefilter_flag(controller, numbers[0], slip=slip))
-    return flags
+    return flags, meant
 
 
 def same_gains(a: Array, b: Array) -> bool:
@@ -311,18 +358,7 @@ def _slip(controller: Controller) -> tuple[str, Array | None]:
     gains = controller.gains
     assert gains is not None
     for text, meant in _undone(gains):
-        if controller.ran is not None:
-            if same_gains(meant, controller.ran):
-                return text, meant
-            continue
-        better = [
-            one
-            for one in controller.numbers(meant)
-            if controller.meets(one)
-            and controller.prefilter_fits(one)
-            and controller.is_claimed(one)
-        ]
-        if better:
+        if controller.confirms(meant):
             return text, meant
     return "", None
 

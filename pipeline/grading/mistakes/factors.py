@@ -21,6 +21,7 @@ Of = Literal[
     "gains",
     "sharp gains",  # those not made uncertain by friction
     "dampings",  # of all decays at once
+    "every damping",  # of all decays and resonances at once
     "sharp dampings",  # of one decay at a time, without friction
     "frequencies of rows",  # of a table that the students reduced themselves, compared with dwells
     "ratios of rows",
@@ -74,6 +75,18 @@ def _peaks(advice_key: str, factor: float, *, of: Of, whole: bool = False) -> Fa
     )
 
 
+def _log10(of: Of) -> Factor:
+    return Factor(
+        code="log10_for_ln",
+        advice_key="log10",
+        of=of,
+        factor=LOG10,
+        tolerance=limits.LOG10_DAMPING,
+        whole=True,
+        from_time_records=True,
+    )
+
+
 def _decrement(advice_key: str, factor: float) -> Factor:
     return Factor(
         code="peak_count",
@@ -101,15 +114,8 @@ FACTORS = (
     _peaks("input_peak_to_peak", 0.5, of="gains", whole=True),
     _peaks("peak_to_peak", 2.0, of="sharp gains"),
     _peaks("input_peak_to_peak", 0.5, of="sharp gains"),
-    Factor(
-        code="log10_for_ln",
-        advice_key="log10",
-        of="dampings",
-        factor=LOG10,
-        tolerance=limits.LOG10_DAMPING,
-        whole=True,
-        from_time_records=True,
-    ),
+    _log10("dampings"),
+    _log10("every damping"),
     # The decrement was taken over half a period, or over two. The frequency of the decay must be
     # right, and there must be no friction.
     _decrement("half_decrement", 0.5),

@@ -1,5 +1,6 @@
 """Judge the reported A and B: each entry against the student's own table or the recordings."""
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -47,12 +48,15 @@ class MatrixEntry:
 
     Attributes
     ----------
+    name : its name, with row and column as typed.
+    at : row and column in [A B] with the states in the order x1, v1, x2, v2, …
     right : the acceptable values, one per model.
     error : difference in percent, beyond the uncertainty of the models.
     bare : difference in percent, without allowance for the uncertainty.
     """
 
     name: str
+    at: tuple[int, int]
     kind: Kind
     typed: Decimal
     right: tuple[float, ...]
@@ -70,16 +74,68 @@ class MatrixEntry:
         return self.bare > limits.WRONG[self.kind]
 
 
+Order = tuple[int, ...]  # for each state as typed, its index in x1, v1, x2, v2, …
+
+
+def find_order(space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int) -> Order:
+    """Return the order of the states in which A and B are meant.
+
+    A row of A with a single 1 shows which state is the derivative of which, so only the order of
+    the carts is tried: the one with the fewest wrong entries is meant.
+    """
+    usual, velocity = tuple(range(2 * n)), {}
+    for i, row in enumerate(space.A):
+        ones = [j for j, a in enumerate(row) if abs(float(a) - 1) <= limits.EXACT]
+        if len(ones) == 1 and sum(abs(float(a)) > limits.EXACT for a in row) == 1:
+            velocity[i] = ones[0]
+    if len({*velocity, *velocity.values()}) != 2 * n or len(velocity) != n or not space.B:
+        return usual
+
+    def wrong(order: Order) -> int:
+        entries = compare_entries(space, models=models, n=n, order=order)
+        return sum(entry.wrong for entry in entries)
+
+    orders = [usual]
+    for carts in itertools.permutations(range(n)):
+        order = [0] * (2 * n)
+        for cart, (x, v) in zip(carts, velocity.items(), strict=True):
+            order[x], order[v] = 2 * cart, 2 * cart + 1
+        orders.append(tuple(order))
+    return min(orders, key=wrong)
+
+
+def order_names(order: Sequence[int]) -> str:
+    """Return the names of the states in an order: "x1, x2, v1, v2"."""
+    return ", ".join(f"{'xv'[i % 2]}{i // 2 + 1}" for i in order)
+
+
+def put_in_order(space: ReportedStateSpace, order: Order) -> ReportedStateSpace:
+    """Return A and B with the states in the order x1, v1, x2, v2, …"""
+    at = np.argsort(order).tolist()
+    return space.model_copy(
+        update={
+            "A": tuple(tuple(space.A[i][j] for j in at) for i in at) if space.A else (),
+            "B": tuple(space.B[i] for i in at) if space.B else (),
+        }
+    )
+
+
 def compare_entries(
-    space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int
+    space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int, order: Order = ()
 ) -> list[MatrixEntry]:
     """Compare every reported entry with the acceptable [A B].
 
     The nearest acceptable value counts. So an A that follows from the student's own wrong table is
     right.
+
+    Parameters
+    ----------
+    order : the order of the states, from `find_order`; by default x1, v1, x2, v2, …
     """
+    places = (*(order or range(2 * n)), 2 * n)
     kinds, entries = _kinds(n), []
-    for (i, j), number in _matrix(space, n).items():
+    for typed_at, number in _matrix(space, n).items():
+        i, j = places[typed_at[0]], places[typed_at[1]]
         known = [
             (float(model.right[i, j]), float(model.slack[i, j]))
             for model in models
@@ -90,7 +146,8 @@ def compare_entries(
         kind = kinds[i][j]
         entries.append(
             MatrixEntry(
-                name=_entry_name(i, j, n=n),
+                name=_entry_name(*typed_at, n=n),
+                at=(i, j),
                 kind=kind,
                 typed=number,
                 right=tuple(value for value, _ in known),
@@ -302,6 +359,7 @@ def model_harm(
     models: Sequence[StateMatrices],
     n: int,
     tied: bool,
+    order: Order = (),
 ) -> Harm | None:
     """Return how wrong entries make the model behave as no real bench can; None if they do not.
 
@@ -313,19 +371,18 @@ def model_harm(
     ----------
     tied : whether a spring ties the carts to a wall, so that they settle under a constant input.
     """
-    wrong = {entry.name for entry in entries if entry.wrong}
+    order = order or tuple(range(2 * n))
+    wrong = {entry.at: entry.typed for entry in entries if entry.wrong}
     whole = [one.right for one in models if np.all(np.isfinite(one.right))]
     if not wrong or not whole or not (space.A and space.B):
         return None
-    typed = _matrix(space, n)
     found = []
     for right in whole:
         reported = right.copy()
-        for at, number in typed.items():
-            if _entry_name(*at, n=n) in wrong:
-                reported[at] = float(number)
+        for at, number in wrong.items():
+            reported[at] = float(number)
         A, B = reported[:, :-1], reported[:, -1]
-        found.append("unstable" if _grows(A) else _backwards(A, B, n=n, tied=tied))
+        found.append("unstable" if _grows(A) else _backwards(A, B, order=order, tied=tied))
     return found[0] if all(found) else None
 
 
@@ -335,14 +392,12 @@ def _grows(A: Array) -> bool:
     return bool(found.real.max() > 1e-6 * float(np.abs(found).max()))
 
 
-def _backwards(A: Array, B: Array, *, n: int, tied: bool) -> Harm | None:
-    """Return `wrong_way` if a positive input drives or holds a cart on the negative side."""
-    orders = [np.arange(2 * n), *(np.argsort(order) for _, order in _reordered(n))]
-    meant = [A[np.ix_(o, o)] for o in orders]
-    # If the states are in the right order, each position is followed by its velocity.
-    kinematic = np.eye(2 * n)[1::2]
-    known = [i for i, one in enumerate(meant) if np.allclose(one[0::2], kinematic)] or [0]
-    ways = [_drives_back(meant[i], b, tied=tied) for i in known for b in (B[orders[i]], B)]
+def _backwards(A: Array, B: Array, *, order: Order, tied: bool) -> Harm | None:
+    """Return `wrong_way` if a positive input drives or holds a cart on the negative side.
+
+    A student may have changed the order of the states in A but not in B.
+    """
+    ways = [_drives_back(A, b, tied=tied) for b in (B, B[list(order)])]
     return "wrong_way" if all(ways) else None
 
 
@@ -364,6 +419,7 @@ def diagnose_state_space(
     *,
     models: Sequence[StateMatrices],
     n: int,
+    order: Order = (),
 ) -> list[Flag]:
     """Return a flag if entries are wrong, with the known mistake that explains all of them, if any.
 
@@ -371,7 +427,7 @@ def diagnose_state_space(
     judge single entries.
     """
     suspects = [entry for entry in entries if entry.suspect]
-    slip = _slip(space, models=models, n=n) if suspects else ""
+    slip = _slip(space, models=models, n=n, order=order) if suspects else ""
     wrong = suspects if slip else [entry for entry in entries if entry.wrong]
     if not wrong:
         return []
@@ -394,21 +450,17 @@ def diagnose_state_space(
     ]
 
 
-def _slip(space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int) -> str:
+def _slip(
+    space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int, order: Order
+) -> str:
     """Return, in words, the first mistake that leads to the reported [A B]; "" if none does."""
-    typed, kinds = _matrix(space, n), _kinds(n)
-    A = {at: number for at, number in typed.items() if at[1] < 2 * n}
-    B = {at: number for at, number in typed.items() if at[1] == 2 * n}
+    as_typed, kinds = _matrix(space, n), _kinds(n)
+    typed = _matrix(put_in_order(space, order), n) if order else as_typed
+    # A student may have changed the order of the states in A but not in B.
+    mixed = {at: (typed if at[1] < 2 * n else as_typed)[at] for at in typed}
     for model in (one.right for one in models if np.all(np.isfinite(one.right))):
-        for text, order in _reordered(n):
-            columns = [*order, 2 * n]
-            slipped = model[np.ix_(order, columns)]
-            of_states: list[list[Kind]] = [[kinds[i][j] for j in columns] for i in order]
-            # A student may have changed the order of the states in A but not in B.
-            if _met(typed, slipped, of_states) or (
-                _met(A, slipped, of_states) and _met(B, model, kinds)
-            ):
-                return text
+        if mixed != typed and _met(mixed, model, kinds):
+            return WORDS.text("order_of_A_only", order=order_names(order))
         for text, slipped in _changed(model, n):
             if _met(typed, slipped, kinds):
                 return text
@@ -423,14 +475,6 @@ def _met(
         _entry_error(number, float(slipped[i, j]), kinds[i][j]) <= limits.EXPLAINED[kinds[i][j]]
         for (i, j), number in typed.items()
     )
-
-
-def _reordered(n: int) -> Iterator[tuple[str, list[int]]]:
-    """Yield each wrong order of the states, in words and as a permutation."""
-    if n > 1:
-        yield WORDS.text("positions_first"), [*range(0, 2 * n, 2), *range(1, 2 * n, 2)]
-        back = [2 * i + part for i in reversed(range(n)) for part in (0, 1)]
-        yield WORDS.text("reverse_order"), back
 
 
 def _changed(model: Array, n: int) -> Iterator[tuple[str, Array]]:

@@ -68,11 +68,8 @@ def off_flag(
 
     worst = max(names, key=error)
     reference, typed = known[worst], table[worst]
-    ratio = float(typed) / reference.value if reference.value else 0.0
     looks = {"K": "look_gain", "omega": "look_frequency", "zeta": "look_damping"}
     look = looks.get(read_name(worst).symbol, "look")
-    if any(abs(ratio / 10.0**power - 1) < 0.05 for power in (-3, -2, -1, 1, 2, 3)):
-        look = "look_power"
     code: Code = "initial_off" if label == "initial" else "final_off"
     return Flag(
         code=code,

@@ -1,12 +1,12 @@
 """Name the mistake that gives a wrong number, if only one mistake does."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 
 from pipeline.grading import limits
 from pipeline.grading.grade import Code, Flag
-from pipeline.grading.mistakes.catalogue import Mistake, known_mistakes
+from pipeline.grading.mistakes.catalogue import Kind, Mistake, known_mistakes
 from pipeline.grading.mistakes.explain import ExplainedNumbers, Explanation, Label, Table, explain
 from pipeline.grading.mistakes.impossible import BrokenOrder, broken_orders, not_positive
 from pipeline.grading.mistakes.table_flags import (
@@ -19,6 +19,7 @@ from pipeline.grading.mistakes.table_flags import (
     specific_flags,
 )
 from pipeline.grading.mistakes.transient import transient_fits
+from pipeline.grading.mistakes.undo import Slip, Slipped, undo
 from pipeline.grading.references.reference import Reference, References, is_linear
 from pipeline.grading.references.tolerance import percent_off
 from pipeline.names import read_name
@@ -33,12 +34,14 @@ class Diagnosis:
     Attributes
     ----------
     named : for each table, the parameters whose errors a known mistake explains.
+    slipped : for each table, what mistakes did to its numbers.
     possible : whether the corrected final table can belong to real carts.
     """
 
     flags: tuple[Flag, ...]
     corrected: dict[str, float]
     named: dict[Label, frozenset[str]]
+    slipped: dict[Label, tuple[Slipped, ...]]
     possible: bool
 
 
@@ -52,19 +55,24 @@ def diagnose_tables(
     copied : final estimates equal to the initial ones, from `copied_final`.
     """
     tables: dict[Label, Table] = {"initial": reported.initial, "final": reported.final}
+    given = {"references": references, "analysis": analysis, "copied": copied}
+    first = _judge("initial", reported, **given)
+    before = frozenset(one.mistake.kind for one in first.explain().explained)
     judged: dict[Label, _Judged] = {
-        label: _judge(label, reported, references=references, analysis=analysis, copied=copied)
-        for label in tables
+        "initial": first,
+        "final": _judge("final", reported, **given, before=before),
     }
     found = _explain_both(judged)
     flags = [flag for one in judged.values() for flag in one.flags]
     left: dict[Label, list[str]] = {}
+    out_of_order: dict[Label, set[str]] = {}
     for label, one in judged.items():
         rest = [n for n in found[label].left if one.errors[n] > limit(n, label)]
         broken = one.broken_laws(set(rest))
         flags += [law.flag(tables[label], label) for law in broken]
         impossible = {name for law in broken for name in law.names}
         left[label] = [name for name in rest if name not in impossible]
+        out_of_order[label] = impossible
     if copied:
         flags.append(copied_flag(reported, copied, references))
     explained = [
@@ -91,14 +99,110 @@ def diagnose_tables(
     ]
     if apart:
         flags.append(disagreement_flag(reported, apart))
-    corrected = _corrected(reported.final, explained, references.final)
+    named_slips: dict[Label, list[Slipped]] = {
+        label: _named(
+            tables[label], [e for e in explained if e.table == label], known=one.all_known
+        )
+        for label, one in judged.items()
+    }
+    slipped: dict[Label, tuple[Slipped, ...]] = {
+        label: (
+            *named_slips[label],
+            *_unnamed(
+                one,
+                named_slips[label],
+                wide={
+                    n: e.mistake.codes[0] for e in explained if e.table == label for n in e.names
+                },
+                left=left[label],
+                out_of_order=out_of_order[label],
+                copied=copied if label == "final" else (),
+            ),
+        )
+        for label, one in judged.items()
+    }
+    corrected = {
+        name: float(number.value)
+        for name, number in undo(reported.final, named_slips["final"], left=()).items()
+        if number.value > 0
+    }
     corrected |= {name: references.final[name].value for name in left["final"]}
     named_in: dict[Label, frozenset[str]] = {
         label: frozenset(n for e in explained if e.table == label for n in e.names)
         for label in tables
     }
     possible = not broken_orders({n: Decimal(v) for n, v in corrected.items()}, initial=False)
-    return Diagnosis(flags=tuple(flags), corrected=corrected, named=named_in, possible=possible)
+    return Diagnosis(
+        flags=tuple(flags),
+        corrected=corrected,
+        named=named_in,
+        slipped=slipped,
+        possible=possible,
+    )
+
+
+def _named(
+    table: Table, explained: Sequence[ExplainedNumbers], *, known: Mapping[str, Reference]
+) -> list[Slipped]:
+    """Return what known mistakes did to the numbers of one table.
+
+    Carts that are swapped are put back only if all their numbers are reported.
+    """
+    found: dict[str, Slipped] = {}
+    for one in explained:
+        mistake = one.mistake
+        names = [n for n in one.names if n in mistake.predicted]
+        if mistake.sources:
+            names = [n for n in mistake.predicted if n in table]
+            if not {mistake.sources.get(n, n) for n in names} <= set(names):
+                continue
+        if any(name in found or table[name] <= 0 for name in names):
+            continue
+        for name in names:
+            source, factors = mistake.changes(name, known)
+            changed = {Slip(code=code): factor for code, factor in factors.items()}
+            found[name] = Slipped(name=name, source=source, factors=changed)
+    return list(found.values())
+
+
+def _unnamed(
+    judged: "_Judged",
+    named: Sequence[Slipped],
+    *,
+    wide: Mapping[str, Code],
+    left: Sequence[str],
+    out_of_order: Collection[str],
+    copied: Sequence[str],
+) -> list[Slipped]:
+    """Return the wrong or missing numbers of a table that no known mistake explains.
+
+    What follows from such a number is judged with the number from the recordings instead. This
+    needs a table of which most numbers are the student's own.
+
+    Parameters
+    ----------
+    wide : numbers that a mistake of the whole table explains, though it predicts them badly.
+    """
+    done, table, label = {one.name for one in named}, judged.table, judged.label
+    off: Code = "initial_off" if label == "initial" else "final_off"
+    codes: dict[str, Code] = {**wide, **dict.fromkeys(left, off)}
+    codes |= dict.fromkeys(out_of_order, "physically_impossible")
+    codes |= {n: "no_fit_done" for n in copied if judged.is_off(n)}
+    codes |= {n: "physically_impossible" for n in not_positive(table)}
+    codes |= {n: "missing" for n in judged.all_known if n not in table}
+    found = []
+    for name, code in codes.items():
+        right = judged.all_known.get(name)
+        if right is None or right.value <= 0 or name in done:
+            continue
+        if code == "physically_impossible" and table[name] < 0:
+            # A wrong sign can be undone.
+            found.append(Slipped(name=name, source=name, factors={Slip(code=code): -1.0}))
+            continue
+        slip = Slip(code=code, number=f"{label}.{name}")
+        found.append(Slipped(name=name, source=name, factors={slip: 1.0}, right=right))
+    replaced = sum(one.right is not None for one in found)
+    return found if 2 * replaced < len(judged.all_known) else []
 
 
 def _explain_both(judged: Mapping[Label, "_Judged"]) -> dict[Label, Explanation]:
@@ -121,6 +225,7 @@ class _Judged:
     known : the numbers from the recordings, by parameter.
     errors : the error, in percent, of each number that the recordings give and that has no flag
         yet.
+    all_known : the same, also for numbers that are missing or already have a flag.
     suspect : numbers that are wrong or doubtful enough to look for a known mistake.
     unordered : gains that may each be right, but whose order is impossible.
     laws : laws of order that the table breaks.
@@ -130,12 +235,21 @@ class _Judged:
     label: Label
     table: Table
     known: Mapping[str, Reference]
+    all_known: Mapping[str, Reference]
     errors: dict[str, float]
     suspect: frozenset[str]
     unordered: frozenset[str]
     mistakes: list[Mistake]
     laws: list[BrokenOrder]
     flags: list[Flag]
+
+    def is_off(self, name: str) -> bool:
+        """Return whether a reported number is wrong enough for a flag."""
+        known = self.all_known.get(name)
+        if known is None:
+            return False
+        error = percent_off(self.table[name], known, sigmas=limits.SIGMAS)
+        return error > limit(name, self.label)
 
     def broken_laws(self, off: set[str]) -> list[BrokenOrder]:
         """Return the broken laws of order for which wrong numbers are responsible.
@@ -170,8 +284,14 @@ def _judge(
     references: References,
     analysis: Analysis,
     copied: Sequence[str],
+    before: Collection[Kind] = (),
 ) -> _Judged:
-    """Compare one table with the recordings."""
+    """Compare one table with the recordings.
+
+    Parameters
+    ----------
+    before : the kinds of mistakes that were found in the initial table.
+    """
     table: Table = getattr(reported, label)
     known: dict[str, Reference] = getattr(references, label)
     impossible = not_positive(table)
@@ -195,16 +315,17 @@ def _judge(
         there = {name: reference for name, reference in known.items() if name in table}
         mistakes = known_mistakes(there, analysis, reported)
     if label == "final":
-        mistakes = [m for m in mistakes if _may_be_final(m, reported)]
+        mistakes = [m for m in mistakes if m.kind in before or _may_be_final(m, reported)]
         if len(suspect) >= min(2, analysis.bench.n):
             mistakes += transient_fits(analysis, table, known)
     # If gains are in an impossible order, this is reported rather than a guess at the mistake.
     if any(law.is_of_gains for law in laws):
-        mistakes = [m for m in mistakes if m.whole or not _is_of_gains(m)]
+        mistakes = [m for m in mistakes if m.is_plain or not _is_of_gains(m)]
     return _Judged(
         label=label,
         table=table,
         known={name: known[name] for name in errors},
+        all_known=known,
         errors=errors,
         suspect=frozenset(suspect),
         unordered=unordered,
@@ -246,25 +367,13 @@ def _near(a: Decimal, b: Decimal) -> bool:
 def _may_be_final(mistake: Mistake, reported: Reported) -> bool:
     """Return whether a mistake is possible in a final table.
 
-    Mistakes in reading decays and steps affect only copied numbers, because a fit does not use such
-    readings.
+    A fit does not use readings of decays and steps. So mistakes in such readings affect only copied
+    numbers, unless the initial table has the same mistake.
     """
     if not mistake.from_time_records:
         return True
     both = [n for n in mistake.predicted if n in reported.final and n in reported.initial]
     return all(reported.final[n] == reported.initial[n] for n in both)
-
-
-def _corrected(
-    final: Table, explained: Sequence[ExplainedNumbers], known: Mapping[str, Reference]
-) -> dict[str, float]:
-    """Return the final table with the known mistakes corrected."""
-    corrected = {name: float(typed) for name, typed in final.items() if typed > 0}
-    for one in explained:
-        inside = [n for n in one.names if n in one.mistake.predicted]
-        for name in inside if one.table == "final" else ():
-            corrected[name] *= known[name].value / one.mistake.predicted[name].value
-    return corrected
 
 
 def _disagreements(

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.grading.judge.laws import judge_laws
+from pipeline.grading.mistakes.undo import Number
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
 
@@ -25,7 +26,7 @@ TABLE_3 = {
 
 
 def broken(table: dict[str, str], *, n: int) -> set[str]:
-    typed = {name: Decimal(value) for name, value in table.items()}
+    typed = {name: Number(typed=Decimal(value)) for name, value in table.items()}
     laws = judge_laws(typed, n=n, frequency_percent=3.0, damping_percent=30.0)
     assert laws is not None
     return {law.name for law in laws if law.widening > 0}
@@ -71,7 +72,7 @@ def test_a_rounded_table_of_a_real_chain_obeys_every_law(n, data):
 
 def test_an_incomplete_table_is_not_judged():
     """A table that lacks a parameter is not judged."""
-    typed = {name: Decimal(value) for name, value in TABLE_2.items() if name != "K_1"}
+    typed = {name: Number(typed=Decimal(value)) for name, value in TABLE_2.items() if name != "K_1"}
     assert judge_laws(typed, n=2, frequency_percent=3.0, damping_percent=30.0) is None
 
 

@@ -77,7 +77,7 @@ def test_reweighed_points_are_those_of_grading_again(carts, data):
     """Under any changed rubric, points from stored findings equal those of a new grading."""
     team, before = _erring(carts), _graded(carts)
     now = data.draw(_changes(team.rubric))
-    kept = read_findings(findings_text(before.verdicts))
+    kept = read_findings(findings_text(before.judgements))
 
     weighed = reweigh(before.grade, kept, rubric=now)
 
@@ -96,7 +96,7 @@ def test_reweighed_points_are_those_of_grading_again(carts, data):
 def test_the_same_rubric_gives_the_same_points():
     """Points computed from stored findings equal those of the grading that stored the findings."""
     team, before = _erring(2), _graded(2)
-    weighed = reweigh(before.grade, before.verdicts, rubric=team.rubric)
+    weighed = reweigh(before.grade, before.judgements, rubric=team.rubric)
     assert weighed.points == before.grade.points
     assert {c.outcome for c in weighed.criteria} == {"pass", "partial", "fail"}
 
