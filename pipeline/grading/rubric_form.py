@@ -124,8 +124,12 @@ def rubric_form(rubric: Rubric) -> RubricForm:
         criteria=tuple(_criterion(i, own, rubric.names) for i, own in enumerate(rubric.criteria)),
         late={key: _field(("late", key), getattr(rubric.late, key)) for key in _LATE},
         costs={
-            code: _field(("flags", code), cost, unit="share")
-            for code, cost in rubric.flags.model_dump().items()
+            code: _field(
+                ("flags", code) if cost.most == 1 else ("flags", code, "least"),
+                cost.least,
+                unit="share",
+            )
+            for code, cost in rubric.flags
         },
         step=_field(("step",), rubric.step),
         see=RubricField(

@@ -44,7 +44,7 @@ def rubric_text(rubric: Rubric) -> str:
         "rubric.txt.j2",
         rubric=rubric,
         springs=[name for name, there in springs if there],
-        costs={code: cost for code, cost in rubric.flags.model_dump().items() if cost},
+        costs={code: cost for code, cost in rubric.flags if cost.least or cost.most < 1},
         nothing=rubric.required == Required(),
         named=named,
         dampings=dampings,

@@ -4,10 +4,11 @@ import json
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
 
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import CODES
-from pipeline.grading.rubric import FlagCosts
+from pipeline.grading.rubric import FlagCost, FlagCosts, Rubric
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.rubric_text import rubric_dict, rubric_text
 from pipeline.resources import RUBRICS
@@ -109,7 +110,7 @@ def test_a_pattern_is_written_out(tmp_path):
             "[required]",
             "[flags]\nmissing = 2\n[required]",
             9,
-            r"flags\.missing: expected at most 1",
+            r"flags\.missing\.least: expected at most 1",
         ),
         ('check = "final"', 'check = "finla"', 17, r"no such check 'finla'; did you mean 'final'"),
         ('"K_*"]\n\n[[r', '"K_9"]\n\n[[r', 9, r"required\.final: no parameter 'K_9'"),
@@ -184,7 +185,21 @@ def test_a_misspelt_rubric_gives_the_nearest_shipped_one():
 def test_every_flag_may_have_a_cost():
     """Every flag except the one for shared data may have a cost; a person decides on that one."""
     assert {*FlagCosts.model_fields} == {*CODES} - {"shared_data"}
-    assert all(load_rubric(path).flags.of("wrong_state_space") == 0.5 for path in SHIPPED)
+    assert all(load_rubric(path).flags.of("wrong_state_space").least == 0.5 for path in SHIPPED)
+
+
+def test_a_cost_may_have_a_least_and_a_most():
+    """A cost is a number, the least, or a table with the least and the most."""
+    plain = load_rubric(Path("throne-2dof")).model_dump(mode="json")
+    for cost, expected in (
+        (0.25, FlagCost(least=0.25, most=1.0)),
+        ({"least": 0.25, "most": 0.5}, FlagCost(least=0.25, most=0.5)),
+    ):
+        rubric = Rubric.model_validate({**plain, "flags": {"hz_for_rad_s": cost}})
+        assert rubric.flags.of("hz_for_rad_s") == expected
+        assert rubric.model_dump(mode="json")["flags"]["hz_for_rad_s"] == cost
+    with pytest.raises(ValidationError, match="least is more than most"):
+        FlagCost(least=0.5, most=0.25)
 
 
 def test_invalid_toml_is_named_with_its_line(tmp_path):

@@ -130,11 +130,10 @@ def charge(
             verdict = replace(typed, message=f"{typed.message} {said}")
     verdict = replace(verdict, share=share)
     slips = {slip.code for slip in (*charges.here, *charges.elsewhere)}
-    codes: set[Code] = {slip.code for slip in charges.here} | {
-        flag.code
-        for flag in flags
-        if flag.code not in slips and concerns(flag, criterion, names=rubric.names)
-    }
+    codes: set[Code] = {slip.code for slip in charges.here}
+    for flag in flags:
+        if flag.code not in slips and concerns(flag, criterion, names=rubric.names):
+            codes.add(flag.code)
     return _limit(verdict, codes, charges, rubric=rubric)
 
 

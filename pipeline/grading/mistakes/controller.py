@@ -169,8 +169,8 @@ def reported_controller(
     """Return the controller of a submission, and the order in which its gains are meant.
 
     The controller is None if it is missing or cannot be judged. The order is None if the gains are
-    in the order x1, v1, x2, v2, … Another order needs evidence: only in this order, the gains are
-    those that ran, or they meet the goal and fit the other reported numbers.
+    in the usual order (x1, v1, x2, v2 and so on). Another order needs evidence. Only in this order,
+    the gains are those that ran, or they meet the goal and fit the other reported numbers.
 
     Parameters
     ----------

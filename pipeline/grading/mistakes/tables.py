@@ -176,8 +176,8 @@ def _unnamed(
 ) -> list[Slipped]:
     """Return the wrong or missing numbers of a table that no known mistake explains.
 
-    What follows from such a number is judged with the number from the recordings instead. This
-    needs a table of which most numbers are the student's own.
+    Laws and the comparison of tables use the number from the recordings instead of such a number.
+    This needs a table of which most numbers are the student's own.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def _unnamed(
     found = []
     for name, code in codes.items():
         right = judged.all_known.get(name)
-        if right is None or right.value <= 0 or name in done:
+        if right is None or right.value <= 0 or name in done or table.get(name) == 0:
             continue
         if code == "physically_impossible" and table[name] < 0:
             # A wrong sign can be undone.

@@ -1,5 +1,6 @@
 """Harmful models and flagged mistakes cost points, and points are rounded to a step."""
 
+import itertools
 from dataclasses import replace
 from decimal import Decimal
 from fractions import Fraction
@@ -8,7 +9,12 @@ import numpy as np
 import pytest
 
 from pipeline.grading.grade import Criterion, Grade
-from pipeline.grading.mistakes.state_model import StateMatrices, compare_entries, model_harm
+from pipeline.grading.mistakes.state_model import (
+    StateMatrices,
+    compare_entries,
+    model_harm,
+    order_names,
+)
 from pipeline.grading.references.tolerance import exact, late_deduction, to_step
 from pipeline.grading.rubric import Late, Rubric
 from pipeline.plant.linear.presets import PRESETS
@@ -87,17 +93,45 @@ def test_a_harmful_model_keeps_a_quarter_at_most(slip, said):
 
 
 @pytest.mark.parametrize("carts", [2, 3])
-@pytest.mark.parametrize("first", ["positions", "last cart"])
-def test_another_order_of_the_states_is_not_harmful(carts, first):
-    """A model with reordered states loses points, but is not judged as harmful."""
-    one = student(carts)
+def test_states_may_have_any_order(carts):
+    """A right model with its states in any order earns all points; the message names the order."""
+    one, rng = student(carts), np.random.default_rng(carts)
     A, B = model(one)
-    both = [[*range(0, 2 * carts, 2), *range(1, 2 * carts, 2)]]
-    both += [[2 * i + part for i in reversed(range(carts)) for part in (0, 1)]]
-    order = both[first == "last cart"]
-    found = criterion(with_model(one, A[np.ix_(order, order)], B[order]).grade(), "state-model")
-    assert found.points < found.out_of
-    assert "a quarter" not in found.message
+    orders = list(itertools.permutations(range(2 * carts)))
+    some = [orders[i] for i in rng.choice(len(orders), 6, replace=False)]
+    for order in [(*range(0, 2 * carts, 2), *range(1, 2 * carts, 2)), *some]:
+        grade = with_model(one, A[np.ix_(order, order)], B[list(order)]).grade()
+        found = criterion(grade, "state-model")
+        assert found.points == found.out_of
+        assert grade.flags == ()
+        assert f"in the order {order_names(order)}, and" in found.message
+
+
+def test_a_wrong_entry_in_another_order_costs_the_same():
+    """A wrong sign costs the same in every order of the states."""
+    one = student(2)
+    A, B = model(one)
+    A[1, 1] *= -1
+    usual = criterion(with_model(one, A, B).grade(), "state-model")
+    order = [0, 2, 1, 3]
+    other = criterion(with_model(one, A[np.ix_(order, order)], B[order]).grade(), "state-model")
+    assert 0 < other.points == usual.points < usual.out_of
+    assert "A(3, 3)" in other.message
+
+
+def test_gains_may_have_the_order_of_the_states():
+    """Gains in the order of A's states earn all points; in another order than A they do not."""
+    one = student(2)
+    A, B = model(one)
+    order = [0, 2, 1, 3]
+    feedback = one.reported.feedback
+    assert feedback is not None
+    gains = tuple(feedback.gains[i] for i in order)
+    listed = one.reporting(feedback=feedback.model_copy(update={"gains": gains}))
+    grade = with_model(listed, A[np.ix_(order, order)], B[order]).grade()
+    assert grade.points == one.grade().points
+    assert "x1, x2, v1, v2" in criterion(grade, "feedback").message
+    assert criterion(listed.grade(), "feedback").points == 0
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))

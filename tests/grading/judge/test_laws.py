@@ -84,7 +84,8 @@ def test_a_larger_error_needs_wider_tolerances(n, name):
     table = PRESETS[f"throne-{n}dof"].parameters()
 
     def needed(factor: float) -> Fraction:
-        typed = {x: Decimal(f"{v * (factor if x == name else 1):.3g}") for x, v in table.items()}
+        rounded = {x: f"{v * (factor if x == name else 1):.3g}" for x, v in table.items()}
+        typed = {x: Number(typed=Decimal(v)) for x, v in rounded.items()}
         laws = judge_laws(typed, n=n, frequency_percent=3.0, damping_percent=30.0)
         assert laws is not None
         return max(law.widening for law in laws)
