@@ -10,7 +10,7 @@ from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.override import with_overrides
 from pipeline.grading.gradebook.rows import Entry
 from pipeline.grading.judge.reweigh import needs_recordings, read_findings, reweigh
-from pipeline.grading.judge.work import Verdict
+from pipeline.grading.judge.work import Judgement
 from pipeline.grading.rubric import Rubric
 from pipeline.words.progress import Progress, silent
 
@@ -120,14 +120,14 @@ def _bars(points: list[float], *, out_of: float) -> tuple[int, ...]:
     return tuple(map(int, counts))
 
 
-def _usable(text: str, before: Rubric, now: Rubric) -> Mapping[str, Verdict]:
+def _usable(text: str, before: Rubric, now: Rubric) -> Mapping[str, Judgement]:
     """Return the stored results of those criteria whose check is the same in both rubrics."""
     was = {criterion.id: criterion.check for criterion in before.criteria}
     same = {c.id for c in now.criteria if was.get(c.id) == c.check}
     return {id_: found for id_, found in read_findings(text or "{}").items() if id_ in same}
 
 
-def _compared(entry: Entry, found: Mapping[str, Verdict], rubric: Rubric) -> TeamChange:
+def _compared(entry: Entry, found: Mapping[str, Judgement], rubric: Rubric) -> TeamChange:
     weighed = reweigh(entry.grade, found, rubric=rubric)
     after = with_overrides(weighed, entry.overrides, rubric=rubric)
     had, has = _points(entry.grade), _points(after)

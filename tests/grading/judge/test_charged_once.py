@@ -211,8 +211,9 @@ def losses(honest: Student, one: Student) -> dict[str, float]:
     return {id_: had[id_] - has[id_] for id_ in had if had[id_] != has[id_]}
 
 
-# A number that is missing in two tables is two missing pieces, and each of them is asked for.
-ONCE = sorted(SLIPS.keys() - {"missing"})
+# A number that is missing in two tables is two missing pieces, and each of them is asked for. The
+# other two run through no table, so they have no second place to be charged.
+ONCE = sorted(SLIPS.keys() - {"missing", "initial_final_disagree", "data_problem"})
 
 
 @pytest.mark.slow
