@@ -569,8 +569,6 @@ class FeedbackDesign:
 
     Attributes
     ----------
-    requested_poles : the poles requested from pole placement; None with LQR.
-    Q (2n, 2n), R : the weights of LQR's cost, the sum of x'Q x + R u²; None with pole placement.
     t, y (n_carts, n), u : the simulated step.
     """
 
@@ -589,17 +587,29 @@ class FeedbackDesign:
         older=None,
         default=None,
     )
+    bench_margins: Margins | None = written(
+        "the same on cartlab's bench, whose observer has no model of the carts and assumes "
+        "constant velocities; null: that loop is unstable",
+        older=None,
+        default=None,
+    )
     reachable: bool = written("false if the goal cannot be met")
     message: str = written("what is reachable")
-    requested_poles: ComplexArray | None
-    Q: Array | None = None
-    R: float | None = None
+    requested_poles: ComplexArray | None = written(
+        "poles requested from pole placement as [re, im], rad/s; null with lqr", older=None
+    )
+    Q: Matrix | None = written(
+        "(2n, 2n) weights of the state in the cost, the sum of x'Q x + R u²; null with poles",
+        older=None,
+        default=None,
+    )
+    R: float | None = written("weight of the input in that cost", older=None, default=None)
     t: Array
     y: Array
     u: Array
 
-    def controller(self, chain: Chain) -> StateFeedback:
-        """Return the controller for the hardware; its observer uses the given chain."""
+    def controller(self, chain: Chain | None) -> StateFeedback:
+        """Return the controller; its observer predicts with the chain or, as the bench, without."""
         return StateFeedback(gains=self.gains, prefilter=self.prefilter, model=chain)
 
 

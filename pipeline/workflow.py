@@ -137,7 +137,9 @@ def _with_loops(
         feedback = log.attempt(Stage.STATE_FEEDBACK, design_loop)
     if feedback and fit:
         margins = log.attempt(Stage.MARGINS, partial(design_margins, fit.chain, feedback))
-        feedback = replace(feedback, margins=margins)
+        on_bench = partial(design_margins, fit.chain, feedback, on_bench=True)
+        bench_margins = margins and log.attempt(Stage.MARGINS, on_bench)
+        feedback = replace(feedback, margins=margins, bench_margins=bench_margins)
         checks.append(verify_design(fit.chain, feedback))
         if not any(check.kind == "input" for check in checks):
             log.warn(gain_sign_warning(analysis.records))

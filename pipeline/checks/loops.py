@@ -19,20 +19,24 @@ _SAME_LOOP = 1e-6
 _LAST_DIGIT = 12  # decimals; rounding beyond them depends on the linear algebra library
 
 
-def design_margins(chain: Chain, design: FeedbackDesign) -> Margins:
+def design_margins(chain: Chain, design: FeedbackDesign, *, on_bench: bool = False) -> Margins:
     """Return the margins of the designed loop, including its observer and delay.
+
+    The observer predicts with the chain or, `on_bench`, with constant velocities.
 
     Raises
     ------
     DataError : the loop is not stable, a mode of the carts is undamped, or the numbers of the chain
         differ by too many orders of magnitude.
     """
+    controller = design.controller(None if on_bench else chain)
     try:
-        found = stability_margins(chain, design.controller(chain), sample_time=design.sample_time)
+        found = stability_margins(chain, controller, sample_time=design.sample_time)
     except np.linalg.LinAlgError:
         raise DataError("no margins: the numbers of this loop differ too much in size") from None
     if found is None:
-        raise DataError("no margins: the loop is unstable")
+        where = "on cartlab's bench, whose observer has no model," if on_bench else ""
+        raise DataError(f"no margins: {'the loop ' + where if where else 'the loop'} is unstable")
     return found
 
 

@@ -52,7 +52,7 @@ def matlab_file(analysis: Analysis) -> bytes:
 
     - `parameters.initial.K_1`, `parameters.initial_std.K_1`, … and the same for `final`.
     - `A`, `B`, `C`, `D`, and `m`, `c`, `k` of the chain.
-    - `gains`, `prefilter`, `sample_time`, `margins`.
+    - `gains`, `prefilter`, `sample_time`, `margins`, and LQR's weights `Q` and `R`.
     - `frequency_response`. One structure per cart.
     - `records.ID` with `time`, `u`, `x1`, ….
     - `units`.
@@ -85,6 +85,8 @@ def matlab_file(analysis: Analysis) -> bytes:
             "prefilter": design.prefilter,
             "sample_time": design.sample_time,
         }
+        if design.Q is not None:
+            variables |= {"Q": design.Q, "R": design.R}
         if design.margins is not None:
             values = vars(design.margins).items()
             variables["margins"] = {k: np.nan if v is None else v for k, v in values}

@@ -1,7 +1,6 @@
 """In the worked reference, every printed formula is true, and the numbers are the model's."""
 
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import replace
 from decimal import Decimal
@@ -26,7 +25,7 @@ from pipeline.report.equations.algebra import evaluate, shown, shown_with, value
 from pipeline.report.equations.derivation import work_state_model
 from pipeline.report.render.html import render_html
 from pipeline.report.sections.questions import Asked, Kind, ask
-from pipeline.report.solution.design import matlab_code, work_design
+from pipeline.report.solution.design import work_design
 from pipeline.report.solution.expected import (
     check_carts,
     default_rubric,
@@ -297,26 +296,6 @@ def test_the_worked_gains_are_the_designed_ones(preset, method):
             - (R + worked.gamma @ P @ worked.gamma) * (np.outer(G, G))
         )
         assert_allclose(residual, 0.0, atol=1e-9 * np.abs(P).max())
-
-
-@pytest.mark.parametrize("method", ["lqr", "poles"])
-def test_no_line_of_matlab_is_wider_than_the_page(method):
-    """Lines of code have at most 72 characters; joined, they give the weights and poles."""
-    design = design_feedback(
-        PRESETS["throne-3dof"],
-        Design(cart=3, reference=1.0, overshoot_percent=10, settling_time=1.0, method=method),
-    )
-    code = matlab_code(design)
-    assert " ...\n" in code
-    assert max(map(len, code.splitlines())) <= 72
-    (listed,) = re.findall(r"Q = \[(.*?)\]|T\*\[(.*?)\]", code.replace(" ...\n", " "))
-    rows = [row.split() for row in "".join(listed).split(";")]
-    numbers = [[complex(number.replace("i", "j")) for number in row] for row in rows]
-    wanted = design.Q
-    if wanted is None:
-        assert design.requested_poles is not None
-        wanted = design.requested_poles[:, None]
-    assert_allclose(numbers, wanted, rtol=1e-9)
 
 
 def test_ackermann_is_exact_in_symbols():

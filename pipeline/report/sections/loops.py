@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from pipeline.arrays import ComplexArray
-from pipeline.report.document import Block, Table, paragraph
+from pipeline.arrays import Array, ComplexArray
+from pipeline.report.document import Block, Code, Table, paragraph
+from pipeline.report.equations.feedback import controller_equations, matlab_code, weights_formula
 from pipeline.report.figures.time import design_figure, hardware_figure
 from pipeline.report.sections.page import Page, remarks
 from pipeline.results import FeedbackDesign, HardwareCheck, Margins
@@ -18,9 +19,12 @@ CLOSE = 0.10
 
 
 def feedback_blocks(page: Page) -> list[Block]:
-    """Return gains, poles and the simulated step of the designed feedback."""
-    design = page.analysis.feedback
-    if design is None:
+    """Return gains, margins, poles and simulated step of the designed feedback.
+
+    Everything that is needed to compute them again is printed with all its digits.
+    """
+    design, chain = page.analysis.feedback, page.analysis.chain
+    if design is None or chain is None:
         return []
     settling = design.settling_time
     values = {
@@ -35,12 +39,23 @@ def feedback_blocks(page: Page) -> list[Block]:
     }
     method = _WORDS.text(f"method_{design.method}")
     figure = design_figure(design, units=page.units)
+    weights = [] if design.Q is None else _weights(design.Q)
     return [
         paragraph(_WORDS.text("feedback", method=method, message=clean(design.message))),
         _feedback_table(page, design),
+        *weights,
+        paragraph(_WORDS.text("controller", seconds=significant(design.sample_time, digits=5))),
+        controller_equations(),
+        *_margin_table(page, design),
         _pole_table(page, design),
         page.picture("feedback", figure, _WORDS, "design", **values),
+        paragraph(_WORDS.text("in_matlab")),
+        Code(matlab_code(chain, design)),
     ]
+
+
+def _weights(Q: Array) -> list[Block]:
+    return [paragraph(_WORDS.text("weights")), weights_formula(Q)]
 
 
 def _feedback_table(page: Page, design: FeedbackDesign) -> Table:
@@ -51,44 +66,50 @@ def _feedback_table(page: Page, design: FeedbackDesign) -> Table:
         of, unit = ("velocity", f"{drive} s") if i % 2 else ("position", drive)
         name = f"gain on the {of} of cart {i // 2 + 1}"
         rows.append((name, significant(value), f"{unit}/{position}"))
-    if design.Q is not None:
-        diagonal = ", ".join(significant(value, digits=3) for value in np.diag(design.Q))
-        rows += [
-            ("LQR weights of the state, Q (diagonal)", diagonal, ""),
-            ("LQR weight of the input, R", significant(design.R, digits=3), ""),
-        ]
+    if design.R is not None:
+        rows.append(("LQR weight of the input, R", significant(design.R), f"{position}/{drive}"))
     rows += [
         ("prefilter", significant(design.prefilter), f"{drive}/{position}"),
-        ("sample time", significant(design.sample_time), "s"),
+        ("sample time T", significant(design.sample_time, digits=5), "s"),
+        ("delay of the effort", "1", "sample"),
         ("overshoot", percent(design.overshoot_percent), ""),
         ("settling time, 2 %", significant(design.settling_time, digits=3), "s"),
         ("largest input", significant(design.peak_input, digits=3), drive),
-    ]
-    rows += [
-        (name, value, f"{unit} {at}".strip())
-        for name, value, unit, at in margin_rows(design.margins)
     ]
     rows = [(what, value, unit_text(unit)) for what, value, unit in rows]
     goal = f"{significant(design.reference)} {position}"
     return page.table(_WORDS, "feedback_table", rows, "ldl", cart=design.cart, goal=goal)
 
 
-def margin_rows(margins: Margins | None) -> list[tuple[str, str, str, str]]:
-    """Return name, value, unit and frequency of each margin; empty if margins are unknown."""
-    if margins is None:
+def _margin_table(page: Page, design: FeedbackDesign) -> list[Block]:
+    """Return the margins with the observer of the design, and with that of cartlab's bench."""
+    if design.margins is None:
         return []
+    rows = zip(margin_rows(design.margins), margin_rows(design.bench_margins), strict=True)
+    return [page.table(_WORDS, "margin_table", [(*own, bench[1]) for own, bench in rows], "lll")]
+
+
+def margin_rows(margins: Margins | None) -> list[tuple[str, str]]:
+    """Return the name and the text of each margin; without margins, the loop is unstable."""
+    if margins is None:
+        return [(f"{name} margin", "unstable") for name in ("gain", "phase", "modulus")]
     gain, phase = margins.gain, margins.phase_deg
-    turn = "" if phase is None else "of lead " if phase < 0 else "of lag "
-    degrees = significant(phase and abs(phase), digits=3)
+    factor = turn = "no limit"
+    if gain is not None:
+        decibel = f"{significant(20 * np.log10(gain), digits=3)} dB"
+        factor = f"{significant(gain, digits=3)} ({decibel}) {_at(margins.omega_gain)}"
+    if phase is not None:
+        side = "lead" if phase < 0 else "lag"
+        turn = f"{significant(abs(phase), digits=3)}° of {side} {_at(margins.omega_phase)}"
     return [
-        ("gain margin", significant(gain, digits=3), "", _at(margins.omega_gain)),
-        ("phase margin", degrees, "°", turn + _at(margins.omega_phase)),
-        ("modulus margin", significant(margins.modulus, digits=3), "", ""),
+        ("gain margin", factor),
+        ("phase margin", turn),
+        ("modulus margin", significant(margins.modulus, digits=3)),
     ]
 
 
 def _at(omega: float | None) -> str:
-    return "no limit" if omega is None else f"at {significant(omega, digits=3)} rad/s"
+    return f"at {significant(omega, digits=3)} rad/s"
 
 
 def _pole_table(page: Page, design: FeedbackDesign) -> Table:

@@ -1,8 +1,6 @@
 """Work out the controller: sampled plant, gains by Ackermann's formula or Riccati's equation."""
 
-import re
 from dataclasses import dataclass
-from textwrap import wrap
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
@@ -10,10 +8,10 @@ from scipy.linalg import solve_discrete_are
 from pipeline.arrays import Array, ComplexArray
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.sampled_loop import discretise
-from pipeline.report.document import Block, Code, bullet_list, paragraph
+from pipeline.report.document import Block, bullet_list, paragraph
 from pipeline.report.equations.algebra import value_term
+from pipeline.report.equations.feedback import weights_formula
 from pipeline.report.equations.model import formula, matlab_matrix, number_matrix
-from pipeline.report.sections.loops import margin_rows
 from pipeline.report.sections.page import Page
 from pipeline.results import FeedbackDesign
 from pipeline.words.math import Math, Term, fraction, matrix, parens, power, row, total
@@ -23,7 +21,6 @@ from pipeline.words.phrases import phrases
 _WORDS = phrases("solution")
 _INVERSE = row("−", "1")
 _PHI_T, _GAMMA_T = power("Φ", "T"), power("Γ", "T")
-_LONGEST_LINE = 72  # characters of code in a line of the PDF
 _WEIGHED = row("R", "+", _GAMMA_T, "P", "Γ")
 
 
@@ -140,10 +137,7 @@ def design_blocks(page: Page) -> list[Block]:
             )
         ),
         _pole_table(page, design, worked),
-        paragraph(_WORDS.text("in_matlab")),
-        Code(matlab_code(design)),
         paragraph(_simulated(design, drive=page.drive)),
-        *_margins(design),
         paragraph(_WORDS.text("not_unique")),
         bullet_list(
             _WORDS.spans(f"right_{what}", cart=str(design.cart))
@@ -164,19 +158,13 @@ def _simulated(design: FeedbackDesign, *, drive: str) -> str:
     )
 
 
-def _margins(design: FeedbackDesign) -> list[Block]:
-    rows = margin_rows(design.margins)
-    found = ", ".join(f"{name} {value}{unit} {at}".strip() for name, value, unit, at in rows)
-    return [paragraph(_WORDS.text("margins", margins=found))] if found else []
-
-
 def _regulator(design: FeedbackDesign, worked: WorkedDesign, *, tied: bool) -> list[Block]:
     assert design.Q is not None
     assert worked.P is not None
     weight = _WORDS.text("weight_tied" if tied else "weight_free")
     return [
         paragraph(_WORDS.text("regulator", weight=weight)),
-        _numbers("Q", design.Q, "Q"),
+        weights_formula(design.Q),
         formula(row("R", "≈", value_term(float(design.R or 1.0)))),
         paragraph(_WORDS.text("riccati")),
         formula(
@@ -239,44 +227,6 @@ def _polynomial(name: str, falling: Array) -> Math:
         number = [] if power_ == degree else [value_term(value)]
         terms.append(row(*number, *z))
     return row(name, parens("z"), "=", total(terms))
-
-
-def matlab_code(design: FeedbackDesign) -> str:
-    """Return MATLAB commands that give the same gains from A and B of the state model."""
-    c = f"c = zeros(1, {design.gains.size}); c({2 * design.cart - 1}) = 1;"
-    poles = design.poles if design.requested_poles is None else design.requested_poles
-    listed = "; ".join(
-        f"{p.real:.10g}{p.imag:+.10g}i" if p.imag else f"{p.real:.10g}" for p in poles
-    )
-    gains = (
-        [f"G = place(Phi, Gamma, exp(T*[{listed}]));"]
-        if design.Q is None
-        else [matlab_matrix("Q", design.Q), f"R = {design.R:.10g};", "G = dlqr(Phi, Gamma, Q, R);"]
-    )
-    lines = [
-        f"T = {design.sample_time:.10g};  sampled = c2d(ss(A, B, eye({design.gains.size}), 0), T);",
-        "Phi = sampled.A;  Gamma = sampled.B;",
-        *gains,
-        c,
-        f"prefilter = 1/(c/(eye({design.gains.size}) - Phi + Gamma*G)*Gamma)",
-    ]
-    return "\n".join(_broken(line) for line in lines)
-
-
-def _broken(statement: str) -> str:
-    """Return a statement in lines that fit on the page; "..." continues it in MATLAB.
-
-    A matrix breaks between its rows first.
-    """
-    if len(statement) <= _LONGEST_LINE:
-        return statement
-    rows = re.split(r"(?<=;) +", statement)
-    pieces = [
-        piece
-        for row_ in rows
-        for piece in wrap(row_, _LONGEST_LINE - 8, break_long_words=False, break_on_hyphens=False)
-    ]
-    return " ...\n    ".join(pieces)
 
 
 def _overshoot(zeta: float) -> float:
