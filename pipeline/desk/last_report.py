@@ -9,7 +9,7 @@ from typing import Any
 
 from pipeline.errors import SubmissionError
 from pipeline.submission.load import MAX_NOTES_BYTES, NAME, file_problem, list_experiments
-from pipeline.submission.toml_file import read_text
+from pipeline.submission.toml_file import find_deep_key, read_text
 
 # A file next to the report: its questions, assumptions, findings, and state of its sources.
 FINDINGS = "questions.json"
@@ -135,5 +135,6 @@ def _read_small(folder: Path, name: str) -> dict[str, Any]:
 def _read_document(folder: Path) -> dict[str, Any]:
     if file_problem(folder, NAME) is None:
         with suppress(ValueError, RecursionError):  # the page shows what is wrong
-            return tomllib.loads((folder / NAME).read_bytes().decode())
+            text = (folder / NAME).read_bytes().decode()
+            return {} if find_deep_key(text) else tomllib.loads(text)
     return {}

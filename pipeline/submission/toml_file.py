@@ -23,6 +23,8 @@ _LARGEST = 30
 _AT = re.compile(r" \(at line (\d+), column (\d+)\)$")
 _HEADER = re.compile(r"\s*(\[\[?)\s*([^\[\],\s](?:[^\[\],]*[^\[\],\s])?)\s*\]\]?\s*(?:#.*)?$")
 _KEY = re.compile(r"\s*([A-Za-z0-9_.\"'-]+)\s*=")
+_QUOTED = re.compile(r"\"[^\"\n]*\"|'[^'\n]*'")
+_KEYS = re.compile(rf"(?:[\w-]+|{_QUOTED.pattern})(?:[ \t]*\.[ \t]*(?:[\w-]+|{_QUOTED.pattern}))*")
 # A heading, even if a bracket of it is missing; not a row of numbers in a longer list.
 _HEADING = re.compile(
     r"\s*(?:\[+\s*|(?=[^=]*\]\s*(?:#.*)?$)|\W+(?=reported\b))([A-Za-z_\"'][^,=\[\]()]*)[^,=]*$"
@@ -153,10 +155,8 @@ def read_toml(
     root: type[BaseModel] = Submission,
 ) -> Toml:
     """Read the valid lines of typed TOML; a mistake in one line does not hide the others."""
-    for key in re.finditer(r"[\w\"'-]+(?:[ \t]*\.[ \t]*[\w\"'-]+)*", text):
-        if key.group().count(".") > 30:  # tomllib takes time with the square of a key's depth
-            line = text.count("\n", 0, key.start()) + 1
-            return Toml(document={}, text="", slips=(TomlSlip(line, "keys nest too deeply"),))
+    if line := find_deep_key(text):
+        return Toml(document={}, text="", slips=(TomlSlip(line, "keys nest too deeply"),))
     typed, slips = text.split("\n"), list[TomlSlip]()
     lines, emptied = list(typed), -1  # last line of the previous mistake
     for _ in range(30 if len(text) <= 50_000 else 1):  # a long text is read only once
@@ -232,6 +232,17 @@ def check_number(value: float | Decimal, at: Location) -> None:
         )
     if isinstance(number, Decimal) and len(number.as_tuple().digits) > 1_000:
         raise UnusableNumber(at, "expected a number of at most 1000 digits")
+
+
+def find_deep_key(text: str) -> int:
+    """Return the line of a key with more than thirty parts; 0 if there is none.
+
+    `tomllib` takes time with the square of the number of parts.
+    """
+    for key in _KEYS.finditer(text):
+        if key.group().count(".") > 30 and _QUOTED.sub("", key.group()).count(".") > 30:
+            return text.count("\n", 0, key.start()) + 1
+    return 0
 
 
 def _decimal(text: str) -> Decimal:

@@ -72,7 +72,13 @@ def wait_until_it_answers(port: int) -> None:
 
 def measure(port: int, process: int, attack: Callable[[], object], *, times: int) -> list[float]:
     """Run an attack `times` times at once; return how long each page of the other student took."""
-    most = 0
+    most, calm = 0, []
+    for _ in range(5):
+        begin = time.monotonic()
+        through_proxy(port, "bea").get("/student/0/")
+        calm.append(time.monotonic() - begin)
+    # The computer may be busy with other work: a page takes 0.1 to 0.2 s on an idle one.
+    busy = max(1.0, statistics.median(calm) / 0.2)
 
     def run() -> None:
         try:
@@ -93,8 +99,8 @@ def measure(port: int, process: int, attack: Callable[[], object], *, times: int
         f"median {statistics.median(took):.2f} s, most {max(took):.2f} s of {len(took)} pages, "
         f"{most / 1e6:.0f} MB\n"
     )
-    assert statistics.median(took) < 1.0
-    assert max(took) < 5.0
+    assert statistics.median(took) < 1.0 * busy
+    assert max(took) < 5.0 * busy
     assert most < 700e6  # the desk itself takes less than half of that
     return took
 

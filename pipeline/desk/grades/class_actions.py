@@ -90,12 +90,19 @@ def regrade(ask: Ask) -> Response:
     ask.start(
         "regrade_class",
         title="Grading",
-        paths=typed["paths"].splitlines(),
-        rubric=typed["rubric"],
-        lateness=typed["lateness"],
+        # The task works in another folder than the desk.
+        paths=[_find(path) for path in typed["paths"].splitlines()],
+        rubric=_find(typed["rubric"]),
+        lateness=_find(typed["lateness"]),
         anonymous=shown.rubric.anonymous,
     )
     return ask.back(ask.here + "#work")
+
+
+def _find(typed: str) -> str:
+    """Return the whole path of an existing file or folder; other text as it is."""
+    path = Path(typed)
+    return str(path.resolve()) if typed and path.exists() else typed
 
 
 def _store_upload(ask: Ask, name: str, path: Path) -> Path | None:

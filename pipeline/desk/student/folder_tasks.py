@@ -39,7 +39,7 @@ from pipeline.submission.load import (
     parse_submission,
     posix,
 )
-from pipeline.submission.toml_file import parse_toml
+from pipeline.submission.toml_file import find_deep_key, parse_toml
 from pipeline.words.progress import Progress, silent
 
 _DEEPEST = 50  # tables and lists inside each other that a form can show
@@ -48,6 +48,8 @@ _LARGEST = 10_000  # bits of a whole number that is shown in decimal digits
 
 def read_document(text: str, *, progress: Progress = silent) -> dict[str, Any]:
     """Return the tables of a file with numbers as typed text; {} if it is not valid TOML."""
+    if find_deep_key(text):
+        return {}
     try:
         return _plain(tomllib.loads(text, parse_float=str))  # type: ignore[arg-type]
     except (tomllib.TOMLDecodeError, RecursionError, ValueError):
