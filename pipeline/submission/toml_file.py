@@ -235,7 +235,7 @@ def check_number(value: float | Decimal, at: Location) -> None:
 
 
 def find_deep_key(text: str) -> int:
-    """Return the line of a key with more than thirty parts; 0 if there is none.
+    """Return the line of a key with more than thirty parts; 0 if no key has.
 
     `tomllib` takes time with the square of the number of parts.
     """

@@ -82,8 +82,8 @@ def students_see(folder: str, *, progress: Progress) -> str:
 def read_folder(folder: str, check: bool, *, progress: Progress) -> dict[str, Any]:
     """Return the state of a folder, as `Room` shows it.
 
-    The keys are the `text` of `submission.toml`, the `document` in it, and its `fault` (None if it
-    has none). `doubts` are marked in it; `keeps` says why the folder cannot be handed in. Questions
+    The keys are the `text` of `submission.toml`, the `document` in it, and its `fault` (None for a
+    valid file). `doubts` are marked in it; `keeps` says why the folder cannot be handed in. Questions
     without an answer are `unanswered`, and `checked` is the state of the check.
 
     Parameters

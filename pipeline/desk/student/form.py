@@ -442,18 +442,18 @@ def _make_item(field: Field) -> Any:
             return _make_numbers(field.value)
         case "columns":
             pairs = (line.partition("=")[::2] for line in field.value.splitlines())
-            return toml_item({role.strip(): _read_column(column) for role, column in pairs})
+            return toml_item(
+                {
+                    role.strip(): int(column) if column.strip().isdecimal() else column.strip()
+                    for role, column in pairs
+                }
+            )
         case "rows":
             rows = tomlkit.array()
             for line in field.value.splitlines():
                 rows.append(_make_numbers(line))
             return rows.multiline(True)
     return tomlkit.item(field.value)
-
-
-def _read_column(typed: str) -> int | str:
-    """Return the number or the name of a column."""
-    return int(typed) if re.fullmatch(r"\s*\d{1,9}\s*", typed) else typed.strip()
 
 
 def _make_number(text: str) -> Any:
