@@ -83,8 +83,8 @@ def read_folder(folder: str, check: bool, *, progress: Progress) -> dict[str, An
     """Return the state of a folder, as `Room` shows it.
 
     The keys are the `text` of `submission.toml`, the `document` in it, and its `fault` (None for a
-    valid file). `doubts` are marked in it; `keeps` says why the folder cannot be handed in. Questions
-    without an answer are `unanswered`, and `checked` is the state of the check.
+    valid file). `doubts` are marked in it; `keeps` says why the folder cannot be handed in.
+    Questions without an answer are `unanswered`, and `checked` is the state of the check.
 
     Parameters
     ----------
