@@ -51,7 +51,7 @@ class Task:
     digest: str = ""
     owner: str = ""
     days_late: float = 0.0
-    repairs: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    repairs: Mapping[str, Mapping[str, str]] = field(default_factory=dict, hash=False)
 
 
 def failed(
