@@ -13,12 +13,13 @@ import typer
 
 from pipeline.cli.common import AsJson, app, log_progress, say
 from pipeline.cli.stopping import ctrl_c_says
+from pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
 
     from pipeline.grading.batch.grade_class import Summary
-    from pipeline.grading.gradebook.book import Gradebook
+    from pipeline.grading.gradebook.open_book import OpenBook
 
 
 @app.command()
@@ -174,27 +175,96 @@ Lab = Annotated[
 @app.command()
 def override(
     grades: Grades,
-    team: Team,
+    by: Annotated[str, typer.Option(metavar="NAME", help="Who decides.")],
+    team: Annotated[
+        str, typer.Argument(metavar="[TEAM]", help="A submission, one of its authors, or anon-….")
+    ] = "",
     criterion: Annotated[
-        str, typer.Argument(metavar="CRITERION", help="Criterion id in the rubric.")
-    ],
+        str, typer.Argument(metavar="[CRITERION]", help="Criterion id in the rubric.")
+    ] = "",
     points: Annotated[
-        str, typer.Argument(metavar="POINTS", help="A number, or auto for the automatic points.")
+        str, typer.Argument(metavar="[POINTS]", help="A number, or auto for the automatic points.")
+    ] = "",
+    why: Annotated[str, typer.Option(help="The reason, which the student reads.")] = "",
+    table: Annotated[
+        Path | None,
+        typer.Option(
+            "--from", metavar="CSV", help="A table of points: submission, a column per criterion."
+        ),
+    ] = None,
+    assignment: Lab = None,
+) -> None:
+    """Give criteria points by hand; every later grading keeps them."""
+    from pipeline.grading.gradebook.override import read_points
+
+    if table is not None:
+        if team or criterion or points:
+            raise typer.BadParameter("give TEAM CRITERION POINTS, or --from, not both")
+        return _override_from(grades, table, why=why, by=by, assignment=assignment)
+    if not (team and criterion and points):
+        raise typer.BadParameter("give TEAM, CRITERION and POINTS; or a table with --from")
+    _change(grades, team, assignment, lambda book, name: book.override(
+        name, criterion, read_points(points), why=why, by=by))  # fmt: skip
+
+
+@app.command(context_settings={"ignore_unknown_options": True})  # -2 is a number, not an option
+def adjust(
+    grades: Grades,
+    team: Team,
+    points: Annotated[
+        str, typer.Argument(metavar="POINTS", help="Points to add, such as 1.5; -2 deducts two.")
     ],
     why: Annotated[str, typer.Option(help="The reason, which the student reads.")],
     by: Annotated[str, typer.Option(metavar="NAME", help="Who decides.")],
     assignment: Lab = None,
 ) -> None:
-    """Give a criterion points by hand; every later grading keeps them."""
+    """Change a team's total, for a bonus or a penalty; every later grading keeps it."""
     from pipeline.grading.gradebook.override import read_points
+
+    _change(grades, team, assignment, lambda book, name: book.adjust(
+        name, read_points(points) or 0.0, why=why, by=by))  # fmt: skip
+
+
+def _change(
+    grades: str,
+    team: str,
+    assignment: str | None,
+    change: "Callable[[OpenBook, str], object]",
+) -> None:
+    """Change the points of a team, which may be a pseudonym, and say its new total."""
     from pipeline.grading.publish.anonymous import meant
 
     with _changing(grades, assignment) as book:
         name = meant(book, team)
-        book.override(name, criterion, read_points(points), why=why, by=by)
+        change(book, name)
         grade = book.entry(name).grade
     shown = grade.submission if name == team else team
-    say(f"{shown}: {grade.points:g} of {grade.out_of:g} points")
+    still = f"; not final: {', '.join(grade.open)} still open" if grade.open else ""
+    say(f"{shown}: {grade.points:g} of {grade.out_of:g} points{still}")
+
+
+def _override_from(grades: str, table: Path, *, why: str, by: str, assignment: str | None) -> None:
+    """Change points from a table, either all of them or none."""
+    from dataclasses import replace
+
+    from pipeline.grading.gradebook.override import read_wishes
+    from pipeline.grading.publish.anonymous import meant
+    from pipeline.words.numbers import count
+
+    wishes = read_wishes(table, why=why)
+    with _changing(grades, assignment) as book:
+        named = []
+        for wish in wishes:
+            try:
+                name = book.entry(meant(book, wish.submission)).submission
+            except ConfigError as error:
+                raise ConfigError(f"{table.name} line {wish.line}: {error}") from None
+            named.append(replace(wish, submission=name))
+        done = book.change_all(named, by=by)
+        left = sum(bool(entry.grade.open) for entry in book.entries())
+    say(f"{count(done.teams, 'change')} of {count(len(wishes), 'cell')} in {table.name}")
+    if left:
+        say(f"not final: {count(left, 'submission')} with criteria that a person has to grade")
 
 
 @app.command()
@@ -216,11 +286,16 @@ def remove(
         return
     with _changing(grades, assignment) as book:
         names = {meant(book, team): team for team in teams}
-        by_hand = [team for name, team in names.items() if book.entry(name).overrides]
+        by_hand = [team for name, team in names.items() if _by_hand(book, name)]
         gone = [names.get(name, name) for name in book.remove(list(names))]
     say(f"no longer in the class: {', '.join(gone)}")
     if by_hand:
         say(f"their points given by hand no longer count: {', '.join(by_hand)}")
+
+
+def _by_hand(book: "OpenBook", name: str) -> bool:
+    entry = book.entry(name)
+    return bool(entry.overrides or entry.adjustments)
 
 
 def _erase(grades: str, teams: list[str], assignment: str | None) -> None:
@@ -243,14 +318,14 @@ def _erase(grades: str, teams: list[str], assignment: str | None) -> None:
 
 
 @contextmanager
-def _changing(grades: str, assignment: str | None) -> Iterator["Gradebook"]:
+def _changing(grades: str, assignment: str | None) -> Iterator["OpenBook"]:
     """Open a gradebook to change it; if it is in a folder, update the pages there afterwards."""
-    from pipeline.grading.gradebook.book import Gradebook
+    from pipeline.grading.gradebook.open_book import OpenBook
     from pipeline.grading.publish.outputs import write_outputs
     from pipeline.lock import lock_or_refuse
 
     folder = Path(grades)
-    with Gradebook(grades, assignment=assignment) as book:
+    with OpenBook(grades, assignment=assignment) as book:
         if not folder.is_dir():
             yield book
             return

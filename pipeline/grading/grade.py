@@ -77,6 +77,13 @@ class GradeOverride(GradeTable):
     why: str
 
 
+class Adjustment(GradeTable):
+    """A change of the total by a person; `points` of the grade already include it."""
+
+    points: Annotated[float, Field(description="points added; negative for a deduction")]
+    why: str
+
+
 class Grade(GradeTable):
     """The grade of one submission."""
 
@@ -111,6 +118,14 @@ class Grade(GradeTable):
         Field(description="springs that the recordings need and the rubric lacks"),
     ] = ()
     overrides: tuple[GradeOverride, ...] = ()
+    adjustments: Annotated[
+        tuple[Adjustment, ...],
+        Field(description="changes of the total by hand; the total never falls below 0"),
+    ] = ()
+    open: Annotated[
+        tuple[str, ...],
+        Field(description="criteria that a person has not graded yet; if any, points may rise"),
+    ] = ()
 
     @classmethod
     def failed(

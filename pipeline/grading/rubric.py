@@ -254,6 +254,12 @@ class Hardware(_Criterion):
     none_percent: Percent = 90.0
 
 
+class Manual(_Criterion):
+    """A criterion that a person grades, such as the discussion; the message says what is asked."""
+
+    check: Literal["manual"]
+
+
 Criterion = Annotated[
     RequiredPieces
     | DataQuality
@@ -264,7 +270,8 @@ Criterion = Annotated[
     | Gains
     | Claims
     | Prefilter
-    | Hardware,
+    | Hardware
+    | Manual,
     Field(discriminator="check"),
 ]
 

@@ -16,6 +16,7 @@ from pipeline.errors import ConfigError
 from pipeline.grading import rubric
 from pipeline.grading.rubric import (
     InitialFinal,
+    Manual,
     Parameters,
     RequiredPieces,
     Rubric,
@@ -288,12 +289,18 @@ def _contradictions(
         for pattern in getattr(found.required, table):
             if not matching((pattern,), names):
                 yield ("required", table), f"no parameter {pattern!r}{_nearest(pattern, names)}"
+    by_person = {criterion.id for criterion in found.criteria if isinstance(criterion, Manual)}
     seen: set[object] = set()
     known_ids = [id_ for id_ in ids if isinstance(id_, str)]
     for i, (id_, criterion) in enumerate(zip(ids, found.criteria, strict=True)):
         if id_ is not None and id_ in seen:
             yield ("criteria", i, "id"), f"{id_!r} was used before"
+        if isinstance(criterion, Manual) and criterion.requires:
+            yield ("criteria", i, "requires"), "has no effect, because a person grades this"
         for parent in criterion.requires:
+            if parent in by_person:
+                what = f"{parent!r} is graded by a person, later than this criterion"
+                yield ("criteria", i, "requires"), what
             if parent not in seen and (parent in ids or parent not in lost):
                 where = "comes later" if parent in ids else "is not a criterion"
                 known = "" if parent in ids else nearest(parent, known_ids)

@@ -17,13 +17,14 @@ from pipeline.desk.users import name_place
 from pipeline.grading.grade import CODES
 from pipeline.grading.gradebook.history import to_the_second
 from pipeline.grading.gradebook.open_book import Listing
+from pipeline.grading.gradebook.override import TOTAL
 from pipeline.grading.gradebook.request_book import RequestBook
 from pipeline.grading.publish.anonymous import STRANGER, anonymise
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.feedback import feedback_page
 from pipeline.grading.publish.outputs import doubles_of
 from pipeline.grading.similarity.clusters import find_clusters, renamed
-from pipeline.grading.words import WORDS, points_text
+from pipeline.grading.words import WORDS, points_text, signed_points
 from pipeline.report.figures.grading import distribution_figure
 from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import plain_svg, to_svg
@@ -154,6 +155,8 @@ def list_news(ask: Ask, shown: Class, *, since: int) -> dict[str, Any]:
             points = "as graded" if override.points is None else points_text(override.points)
             points = "a comment" if override.comment else points
             what = titles.get(override.criterion) or override.criterion
+            if override.criterion == TOTAL:
+                what, points = "total", signed_points(override.points or 0.0)
             at = to_the_second(override.at)
             text = f"{what}: {points}, by {override.by}: {override.why} ({at})"
             changes.append({"name": name, "text": text, "mine": name == about})

@@ -66,7 +66,7 @@ def list_items(grade: Grade, now: TeamNow) -> list[Item]:
     for asked in now.rubric.criteria:
         own = judged.get(asked.id)
         flagged = any(is_about(flag, asked, now.rubric) for flag in grade.flags)
-        earned = points_text(own.points) if own else NOTHING
+        earned = points_text(own.points) if own and own.id not in grade.open else NOTHING
         by_hand = asked.id in now.entry.overrides
         items.append(
             Item(
@@ -112,7 +112,7 @@ def describe_criterion(
     """
     own = next((c for c in grade.criteria if c.id == asked.id), None)
     by_hand = now.entry.overrides.get(asked.id) or now.entry.comments.get(asked.id)
-    points = points_text(own.points) if own else ""
+    points = points_text(own.points) if own and own.id not in grade.open else ""
     steps = list_steps(asked.points, now.rubric)
     chosen = typed.get("points") or points
     other = typed.get("other", "") or ("" if chosen in steps else chosen)

@@ -34,7 +34,7 @@ from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, Grade
 from pipeline.grading.gradebook.history import event_words, to_the_second
 from pipeline.grading.gradebook.open_book import Conflict, Listing, TeamNow
-from pipeline.grading.gradebook.override import read_points
+from pipeline.grading.gradebook.override import TOTAL, read_points
 from pipeline.grading.intake.repairs import (
     Repair,
     read_original,
@@ -47,12 +47,13 @@ from pipeline.grading.judge.costs import find_remarks
 from pipeline.grading.publish.anonymous import anonymise, renamed_events
 from pipeline.grading.publish.class_page import feedback_link
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.words import WORDS, points_text
+from pipeline.grading.words import WORDS, person_lines, points_text
 from pipeline.report.figures.svg import plain_svg
 from pipeline.report.render.html import render_drawing
 from pipeline.words.text import capital
 
 _POINTS = "points"  # part of the page where points are changed
+_TOTAL = "total"  # part of the page where the total is changed
 
 
 def show(ask: Ask) -> Response:
@@ -75,11 +76,14 @@ def act(ask: Ask) -> Response:
         after = wanted.beside(shown, team.line.submission)[1]
         to = write_address(ask, after) if after else f"{ask.here}?{wanted.query}"
         return ask.back(to, f"{team.line.submission}: accepted.")
-    criterion, seen = ask.text("criterion"), ask.text("seen")
+    criterion, seen = TOTAL if what == "adjust" else ask.text("criterion"), ask.text("seen")
     if what == "repair":
         return _repair(ask, shown, team, by=by)
     try:
-        if what == "undo":
+        if what == "adjust":
+            points = read_points(ask.text("points"))
+            book.change(name, TOTAL, points, why=ask.text("why"), by=by, seen=seen)
+        elif what == "undo" and criterion != TOTAL:
             book.undo(name, criterion, by=by, seen=seen)
         elif what == "change":
             points = read_points(ask.text("other") or ask.text("points"))
@@ -91,6 +95,8 @@ def act(ask: Ask) -> Response:
     except ConfigError as error:
         text = str(error).replace(" (--why)", "").replace(" (--by)", "")
         return _show_page(ask, wrong=text, status=422)
+    if what == "adjust":
+        return ask.back(f"{write_address(ask, team.line.submission)}#total", "Saved.", place=_TOTAL)
     to = write_address(ask, team.line.submission, criterion=criterion)
     done = "Undone." if what == "undo" else "Saved."
     return ask.back(f"{to}#chosen", done, place=_POINTS)
@@ -173,6 +179,8 @@ def _show_page(ask: Ask, *, wrong: str = "", wrong_repair: str = "", status: int
         feedback=ask.here + feedback_link(name),
         grade=grade,
         points=points_text,
+        person_lines=person_lines(grade),
+        total=_describe_total(ask, now, wrong=wrong),
         seen=now.seen,
         items=_link_items(ask, name, items, chosen),
         doubts=sum(item.doubt for item in items),
@@ -185,6 +193,17 @@ def _show_page(ask: Ask, *, wrong: str = "", wrong_repair: str = "", status: int
         requests_at=f"{ask.here}again?{urlencode({'of': name})}",
         **_show_chosen(ask, shown, grade, now, chosen=chosen, wrong=wrong),
     )
+
+
+def _describe_total(ask: Ask, now: TeamNow, *, wrong: str) -> dict[str, str]:
+    """Return what the form for an adjustment shows; a refused one is shown as it was typed."""
+    refused = bool(wrong) and ask.text("do") == "adjust"
+    return {
+        "version": now.versions[TOTAL],
+        "points": ask.text("points") if refused else "",
+        "why": ask.text("why") if refused else "",
+        "wrong": wrong if refused else "",
+    }
 
 
 def _find_chosen(ask: Ask, items: Sequence[Item], rubric: Rubric) -> Item:
@@ -224,8 +243,9 @@ def _show_chosen(
     if chosen.is_remark or asked is None:
         asked, one, flags = None, None, [flag for flag in grade.flags if flag.code == chosen.id]
     else:
-        typed = {key: ask.text(key) for key in ("points", "other", "why")} if wrong else {}
-        one = describe_criterion(asked, grade, now, typed={**typed, "wrong": wrong})
+        own = bool(wrong) and ask.text("do") != "adjust"
+        typed = {key: ask.text(key) for key in ("points", "other", "why")} if own else {}
+        one = describe_criterion(asked, grade, now, typed=typed | ({"wrong": wrong} if own else {}))
         flags = find_remarks(grade, asked, now.rubric)
     own = next((c for c in grade.criteria if asked and c.id == asked.id), None)
     figures = show_figures(drawn, asked, own, first=ask.query("figure")) if asked else []

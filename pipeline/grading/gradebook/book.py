@@ -5,6 +5,7 @@ class list. Grades contain no dates, but the gradebook does, and `cartlab histor
 """
 
 import json
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -19,7 +20,7 @@ from pipeline.grading.gradebook.changes import points_changes, rubric_changes
 from pipeline.grading.gradebook.class_lines import Line, class_frame
 from pipeline.grading.gradebook.erase import erase_rows
 from pipeline.grading.gradebook.history import Event, read_events
-from pipeline.grading.gradebook.override import HandPoints, WantedPoints
+from pipeline.grading.gradebook.override import TOTAL, HandPoints, WantedPoints
 from pipeline.grading.gradebook.rows import (
     GRADING,
     Entry,
@@ -216,7 +217,7 @@ class Gradebook:
                 shared = batch.shared.get(row.name)
                 entry = final_entry(connection, row, shared=shared, rubric=rubric)
                 points[row.name] = entry.grade.points
-                by_hand |= {row.name} if entry.overrides else set()
+                by_hand |= {row.name} if entry.overrides or entry.adjustments else set()
                 listed.append(
                     {
                         "position": position,
@@ -377,6 +378,18 @@ class Gradebook:
             asked = WantedPoints(submission=team, criterion=criterion, points=points, why=why)
             return self._give(connection, row, asked, by=by, rubric=read_rubric(last))
 
+    def adjust(self, team: str, points: float, *, why: str, by: str) -> HandPoints:
+        """Add points to a submission's total, also for later gradings; negative points deduct.
+
+        All adjustments of a submission are added up. The total never falls below 0.
+
+        Raises
+        ------
+        ConfigError : the submission does not exist, the points are no number or 0, or `why` or
+            `by` is empty.
+        """
+        return self.override(team, TOTAL, points, why=why, by=by)
+
     # ----------------------------------------------------------------------- helpers
 
     def _give(
@@ -388,10 +401,13 @@ class Gradebook:
         if not why or not by:
             raise ConfigError("an override needs a reason (--why) and a name (--by)")
         out_of = {c.id: c.points for c in rubric.criteria}
-        if criterion not in out_of:
+        if criterion == TOTAL:
+            if points is None or not math.isfinite(points) or points == 0:
+                raise ConfigError(f"expected points to add or deduct, such as -2, found {points}")
+        elif criterion not in out_of:
             hint = nearest(criterion, list(out_of))
             raise ConfigError(f"{criterion}: the rubric has no such criterion{hint}")
-        if points is not None and not 0 <= points <= out_of[criterion]:
+        elif points is not None and not 0 <= points <= out_of[criterion]:
             raise ConfigError(
                 f"{criterion}: expected 0 to {out_of[criterion]:g} points, found {points:g}"
             )

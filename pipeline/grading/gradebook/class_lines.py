@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING
 
 from typing_extensions import TypedDict  # pydantic needs this version before Python 3.12
 
-from pipeline.grading.grade import CODES, Code, Grade, GradeOverride, GradeTable, Outcome
+from pipeline.grading.grade import (
+    CODES,
+    Adjustment,
+    Code,
+    Grade,
+    GradeOverride,
+    GradeTable,
+    Outcome,
+)
 from pipeline.grading.rubric import Rubric
 
 if TYPE_CHECKING:
@@ -52,6 +60,8 @@ class Line(GradeTable):
     flags: tuple[Flagged, ...] = ()
     springs: tuple[str, ...] = ()
     overrides: tuple[GradeOverride, ...] = ()
+    adjustments: tuple[Adjustment, ...] = ()
+    open: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, grade: Grade) -> "Line":
@@ -79,8 +89,9 @@ class Line(GradeTable):
 
     @property
     def by_hand(self) -> tuple[str, ...]:
-        """The ids of the criteria with points given by hand."""
-        return tuple(given.criterion for given in self.overrides)
+        """The ids of the criteria with points given by hand, and `total` if that was adjusted."""
+        total = ("total",) if self.adjustments else ()
+        return (*(given.criterion for given in self.overrides), *total)
 
 
 def wrong_springs(graded: Iterable[tuple[str, ...]]) -> str:

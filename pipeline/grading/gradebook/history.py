@@ -5,10 +5,11 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Literal
 
-from sqlalchemy import Connection, and_, select
+from sqlalchemy import Connection, Row, and_, select
 
 from pipeline.grading.grade import read_grade
 from pipeline.grading.gradebook.changes import rubric_changes
+from pipeline.grading.gradebook.override import TOTAL
 from pipeline.grading.gradebook.requests import hide_people
 from pipeline.grading.gradebook.schema import (
     batches,
@@ -30,7 +31,8 @@ class Event:
 
     `graded` is a grading by the rubric alone. `listed` is a new or changed entry of a class list,
     with shared data and overrides. `removed` is the removal from the class list. `override` gives
-    points by hand, or removes them if `points` is None. `comment` leaves the automatic points.
+    points by hand, or removes them if `points` is None. `adjusted` adds points to the total; they
+    may be negative. `comment` leaves the automatic points.
     `asked`, `answered` and `reopened` belong to a student's request to review a criterion.
 
     Attributes
@@ -46,8 +48,9 @@ class Event:
 
     at: str
     what: Literal[
-        "graded", "listed", "removed", "override", "comment", "asked", "answered", "reopened"
-    ]
+        "graded", "listed", "removed", "override", "adjusted", "comment",
+        "asked", "answered", "reopened",
+    ]  # fmt: skip
     points: float | None
     out_of: float | None = None
     criterion: str = ""
@@ -87,12 +90,18 @@ def _overridden(connection: Connection, submission: int) -> Iterator[Event]:
     for row in connection.execute(mine.order_by(overrides.c.id)):
         yield Event(
             at=row.at,
-            what="comment" if row.comment else "override",
+            what=_kind(row),
             points=row.points,
-            criterion=row.criterion,
+            criterion="" if row.criterion == TOTAL else row.criterion,
             text=row.why,
             by=row.by,
         )
+
+
+def _kind(row: Row) -> Literal["adjusted", "comment", "override"]:
+    if row.criterion == TOTAL:
+        return "adjusted"
+    return "comment" if row.comment else "override"
 
 
 def _requested(connection: Connection, submission: int, *, named: bool) -> Iterator[Event]:
@@ -194,6 +203,8 @@ def event_words(event: Event) -> str:
     if event.what == "override":
         points = "automatic points again" if event.points is None else f"{event.points:g} by hand"
         return f"override  {event.criterion}: {points}, by {event.by}: {event.text}"
+    if event.what == "adjusted":
+        return f"adjusted  total {event.points:+g} points, by {event.by}: {event.text}"
     if event.what == "comment":
         return f"comment   {event.criterion}: by {event.by}: {event.text}"
     if event.what == "removed":

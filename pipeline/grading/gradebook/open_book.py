@@ -12,7 +12,7 @@ from pipeline.grading.grade import Flag, Grade
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import Line
 from pipeline.grading.gradebook.history import Event, read_events
-from pipeline.grading.gradebook.override import HandPoints, WantedPoints
+from pipeline.grading.gradebook.override import TOTAL, HandPoints, WantedPoints
 from pipeline.grading.gradebook.rows import (
     OVERRIDE,
     Entry,
@@ -85,8 +85,8 @@ class TeamNow:
 
     Attributes
     ----------
-    versions : version of the points, by criterion; a change must name the version on which it is
-        based.
+    versions : version of the points, by criterion and for `TOTAL`; a change must name the version
+        on which it is based.
     changed : criteria that have ever had points or a comment given by hand.
     seen : name of the person who marked the grading as reviewed, or "".
     """
@@ -220,7 +220,10 @@ class OpenBook(Gradebook):
             return TeamNow(
                 rubric=rubric,
                 entry=final_entry(connection, row, shared=read_flag(row.shared), rubric=rubric),
-                versions={c.id: name_version(row, newest.get(c.id)) for c in rubric.criteria},
+                versions={
+                    id_: name_version(row, newest.get(id_))
+                    for id_ in (*(c.id for c in rubric.criteria), TOTAL)
+                },
                 changed=frozenset(newest),
                 seen=mark.by if mark is not None and mark.seen else "",
                 events=read_events(connection, row.submission_id, named=not rubric.anonymous),
@@ -484,7 +487,7 @@ def is_unchanged(points: float | None, grade: Grade, criterion: str) -> bool:
 
     A page shows at most two decimals, so 1.33 leaves points of 4/3 as they are.
     """
-    now = points_of(grade, criterion)
+    now = None if criterion in grade.open else points_of(grade, criterion)
     return now is not None and points in (now, float(points_text(now)))
 
 

@@ -2,22 +2,24 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from pathlib import Path
 
 from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
-from pipeline.grading.grade import Criterion, Grade, GradeOverride
+from pipeline.grading.grade import Adjustment, Criterion, Grade, GradeOverride
 from pipeline.grading.gradings import go_with
-from pipeline.grading.references.tolerance import exact, late_deduction
+from pipeline.grading.references.tolerance import with_total
 from pipeline.grading.rubric import Rubric
 
+# The place of an adjustment in the gradebook. No criterion can have this id. All adjustments count;
+# of the points for a criterion only the newest do.
+TOTAL = "(total)"
 _HEADS = ("submission", "criterion", "points", "why")  # columns of a table of requested changes
 
 
 @dataclass(frozen=True, kw_only=True)
 class HandPoints:
-    """Points that a person gave to one criterion of one submission.
+    """Points that a person gave to one criterion of one submission, or added to its total.
 
     Attributes
     ----------
@@ -91,38 +93,54 @@ class WantedPoints:
         return replace(self, points=newest.points, comment=False)
 
 
-def read_wishes(path: Path) -> list[WantedPoints]:
-    """Read requested changes from a CSV file: columns submission, criterion, points and why.
+def read_wishes(path: Path, *, why: str = "") -> list[WantedPoints]:
+    """Read requested changes from a CSV file of one of two forms.
 
-    The word "auto" in the column of points stands for the automatic points.
+    Either each row is a change, with the columns submission, criterion, points and why; or each row
+    is a submission, with a column for each criterion, in which an empty cell changes nothing. The
+    column why is optional if `why` is given. The word "auto" stands for the automatic points.
+
+    Parameters
+    ----------
+    why : the reason for changes without a reason of their own.
 
     Raises
     ------
     ConfigError : the table is not valid; the message names the line.
     """
     table = read_table(path)
-    missing = [name for name in _HEADS if name not in table.columns]
+    by_row = {"criterion", "points"} <= set(table.columns)
+    needed = [name for name in (_HEADS if by_row else ("submission", "why"))
+              if name != "why" or not why]  # fmt: skip
+    missing = [name for name in needed if name not in table.columns]
     if missing or not table.columns.is_unique:
+        form = _HEADS if by_row else ("submission", "why", "one for each criterion")
         raise ConfigError(
-            f"{path.name}: needs the columns {', '.join(_HEADS)}, each once"
+            f"{path.name}: needs the columns {', '.join(form)}, each once"
             + (f"; it lacks {', '.join(missing)}" if missing else "")
         )
+    criteria = [name for name in table.columns if name and name not in _HEADS]
     wishes = []
     for line, row in table.iterrows():
-        submission, criterion, points, why = (str(row[name]).strip() for name in _HEADS)
-        try:
-            given = read_points(points)
-        except ConfigError as error:
-            raise ConfigError(f"{path.name} line {line}: {error}") from None
-        wishes.append(
-            WantedPoints(
-                submission=submission,
-                criterion=criterion,
-                points=given,
-                why=why,
-                line=int(str(line)),
+        cells = {str(name): str(cell).strip() for name, cell in row.items()}
+        asked = {name: cells[name] for name in criteria if cells[name]}
+        if by_row:
+            asked = {cells["criterion"]: cells["points"]}
+        for criterion, points in asked.items():
+            try:
+                given = read_points(points)
+            except ConfigError as error:
+                at = "" if by_row else f", column {criterion}"
+                raise ConfigError(f"{path.name} line {line}{at}: {error}") from None
+            wishes.append(
+                WantedPoints(
+                    submission=cells["submission"],
+                    criterion=criterion,
+                    points=given,
+                    why=cells.get("why") or why,
+                    line=int(str(line)),
+                )
             )
-        )
     return wishes
 
 
@@ -135,36 +153,40 @@ def with_comments(grade: Grade, comments: Mapping[str, HandPoints]) -> Grade:
     return grade.model_copy(update={"criteria": tuple(criteria)})
 
 
-def with_overrides(grade: Grade, overrides: Mapping[str, HandPoints], *, rubric: Rubric) -> Grade:
-    """Return the grade with points given by hand and the deduction for lateness.
+def with_overrides(
+    grade: Grade,
+    overrides: Mapping[str, HandPoints],
+    *,
+    rubric: Rubric,
+    adjustments: Iterable[HandPoints] = (),
+) -> Grade:
+    """Return the grade with points given by hand, adjustments and the deduction for lateness.
 
     If the submission could not be graded, it has no criteria; the criteria with points given
     by hand are added.
     """
     given = {key: o.points for key, o in overrides.items() if o.points is not None}
-    if not given:
+    added = tuple(Adjustment(points=a.points or 0.0, why=a.why) for a in adjustments)
+    if not given and not added:
         return grade
     judged = {criterion.id: criterion for criterion in grade.criteria}
     criteria = []
     for asked in rubric.criteria:
         own = judged.get(asked.id)
         if asked.id in given:
-            own = _by_hand(own or _unjudged(asked.id, asked.title, asked.points), given[asked.id],
-                           why=overrides[asked.id].why)  # fmt: skip
+            own = own or _unjudged(asked.id, asked.title, asked.points)
+            why, manual = overrides[asked.id].why, asked.check == "manual"
+            own = _by_hand(own, given[asked.id], why=why, manual=manual)
         if own is not None:
             criteria.append(own)
-    earned = sum((exact(criterion.points) for criterion in criteria), Fraction(0))
-    deducted = late_deduction(earned, late=rubric.late, step=rubric.step, days_late=grade.days_late)
     changed = {
-        "criteria": tuple(criteria),
-        "points": float(earned - deducted),
-        "deducted": float(deducted),
+        "adjustments": added,
         "overrides": tuple(
             GradeOverride(criterion=key, points=points, why=overrides[key].why)
             for key, points in sorted(given.items())
         ),
     }
-    return grade.model_copy(update=changed)
+    return with_total(grade.model_copy(update=changed), criteria, rubric=rubric)
 
 
 def _unjudged(id_: str, title: str, out_of: float) -> Criterion:
@@ -178,14 +200,16 @@ def _with_comment(criterion: Criterion, why: str) -> Criterion:
     return criterion.model_copy(update={"message": f"{criterion.message} {why}"})
 
 
-def _by_hand(criterion: Criterion, points: float, *, why: str) -> Criterion:
+def _by_hand(criterion: Criterion, points: float, *, why: str, manual: bool) -> Criterion:
     points = min(points, criterion.out_of)  # an earlier rubric may have given more points
-    if points == criterion.points:
+    if points == criterion.points and not manual:
         return _with_comment(criterion, why)
     changed = {
         "points": points,
         "outcome": "pass" if points >= criterion.out_of else "partial" if points > 0 else "fail",
-        "message": f"{criterion.message} Set by hand from {criterion.points:g} to {points:g} "
+        "message": why
+        if manual
+        else f"{criterion.message} Set by hand from {criterion.points:g} to {points:g} "
         f"of {criterion.out_of:g}: {why}",
     }
     return criterion.model_copy(update=changed)

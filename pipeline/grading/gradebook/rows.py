@@ -11,7 +11,7 @@ from sqlalchemy import ColumnElement, Connection, Row, Select, Table, func, inse
 
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, Grade, read_grade
-from pipeline.grading.gradebook.override import HandPoints, with_comments, with_overrides
+from pipeline.grading.gradebook.override import TOTAL, HandPoints, with_comments, with_overrides
 from pipeline.grading.gradebook.schema import (
     Database,
     batches,
@@ -49,6 +49,7 @@ class Entry:
         lateness.
     automatic : automatic points, by criterion.
     overrides : current points given by hand, by criterion.
+    adjustments : all changes of the total, oldest first.
     owner : account on the learning platform that submitted the files, or "".
     key : hash of everything that affects the grade.
     grading : number of the grading in the gradebook.
@@ -60,6 +61,7 @@ class Entry:
     automatic: Mapping[str, float]
     overrides: Mapping[str, HandPoints]
     comments: Mapping[str, HandPoints]
+    adjustments: tuple[HandPoints, ...]
     owner: str
     key: str
     grading: int
@@ -247,17 +249,22 @@ def as_it_counts(
     ----------
     ever : all overrides of the submission, in the order they were made.
     """
-    newest = {override.criterion: override for override in ever if override.concerns(row.authors)}
+    theirs = [override for override in ever if override.concerns(row.authors)]
+    adjustments = tuple(override for override in theirs if override.criterion == TOTAL)
+    newest = {override.criterion: override for override in theirs if override.criterion != TOTAL}
     given = {key: override for key, override in newest.items() if override.points is not None}
     comments = {key: override for key, override in newest.items() if override.comment}
     grade = read_grade(row.grade)
     grade = grade.with_flags(shared) if shared else grade
     return Entry(
         submission=row.name,
-        grade=with_overrides(with_comments(grade, comments), given, rubric=rubric),
+        grade=with_overrides(
+            with_comments(grade, comments), given, rubric=rubric, adjustments=adjustments
+        ),
         automatic={criterion.id: criterion.points for criterion in grade.criteria},
         overrides=given,
         comments=comments,
+        adjustments=adjustments,
         owner=row.owner,
         key=row.key,
         grading=row.id,

@@ -274,6 +274,10 @@ def _state_space(criterion: asked.StateModel, work: Work) -> Verdict:
     )
 
 
+def _manual(_criterion: asked.Manual, _work: Work) -> Verdict:
+    return Verdict(share=None, message="Graded by a person; not yet.")
+
+
 _JUDGES: Mapping[str, Callable[[Any, Work], Verdict]] = {
     "required": _required,
     "data": _data,
@@ -286,4 +290,5 @@ _JUDGES: Mapping[str, Callable[[Any, Work], Verdict]] = {
     "claims": judge_claims,
     "prefilter": judge_prefilter,
     "hardware": judge_hardware,
+    "manual": _manual,
 }

@@ -17,7 +17,7 @@ from pipeline.grading.judge.award import award
 from pipeline.grading.judge.earned import Deviation, earned
 from pipeline.grading.judge.work import Judgement, Verdict
 from pipeline.grading.mistakes.undo import Slip
-from pipeline.grading.references.tolerance import late_deduction
+from pipeline.grading.references.tolerance import with_total
 from pipeline.grading.rubric import Rubric
 
 # Keys of a rubric that change the errors themselves. If one changes, the recordings must be graded
@@ -85,21 +85,13 @@ def reweigh(grade: Grade, findings: Mapping[str, Judgement], *, rubric: Rubric) 
     """
     if grade.status == "failed":
         nothing = {"out_of": rubric.out_of, "points": 0.0, "deducted": 0.0, "overrides": ()}
-        return grade.model_copy(update={**nothing, "criteria": ()})
+        empty = {"criteria": (), "adjustments": (), "open": ()}
+        return grade.model_copy(update={**nothing, **empty})
     judged = [wanted for wanted in rubric.criteria if wanted.id in findings]
     judgements = {wanted.id: _weighed(wanted, findings[wanted.id]) for wanted in judged}
     criteria = award(judged, judgements, grade.flags, rubric=rubric)
-    points = sum((Fraction(str(c.points)) for c in criteria), Fraction(0))
-    late = {"late": rubric.late, "step": rubric.step, "days_late": grade.days_late}
-    deducted = late_deduction(points, **late)
-    changed = {
-        "criteria": criteria,
-        "points": float(points - deducted),
-        "deducted": float(deducted),
-        "out_of": rubric.out_of,
-        "overrides": (),
-    }
-    return grade.model_copy(update=changed)
+    automatic = grade.model_copy(update={"overrides": (), "adjustments": ()})
+    return with_total(automatic, criteria, rubric=rubric)
 
 
 def _weighed(wanted: asked.Criterion, finding: Judgement) -> Judgement:

@@ -29,7 +29,7 @@ from pipeline.grading.references.reference import (
 )
 from pipeline.grading.references.signs import turned_round
 from pipeline.grading.references.springs import with_all_springs
-from pipeline.grading.references.tolerance import late_deduction, rounding
+from pipeline.grading.references.tolerance import rounding, with_total
 from pipeline.grading.rubric import Rubric
 from pipeline.ingest.columns import conversion, is_count
 from pipeline.results import Analysis
@@ -153,21 +153,18 @@ def grade_analysis(
     work, flags, signed = prepare_work(submission, analysis, rubric=rubric)
     judgements = {one.id: judge_with_undoing(one, work) for one in rubric.criteria}
     criteria = award(rubric.criteria, judgements, flags, rubric=rubric)
-    earned = sum((Fraction(str(c.points)) for c in criteria), Fraction(0))
-    deducted = late_deduction(earned, late=rubric.late, step=rubric.step, days_late=days_late)
     grade = Grade(
         submission=name,
         authors=tuple(author.id for author in submission.authors),
         status="graded",
-        points=float(earned - deducted),
+        points=0.0,  # replaced below
         out_of=rubric.out_of,
         days_late=days_late,
-        deducted=float(deducted),
-        criteria=criteria,
         flags=flags,
         units=analysis.bench.units,
         notes=signed,
     )
+    grade = with_total(grade, criteria, rubric=rubric)
     return Graded(grade=grade, analysis=analysis, judgements=judgements)
 
 

@@ -1,6 +1,7 @@
 """The page of a class: distribution, difficulty, most common mistakes, and all grades."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -15,7 +16,7 @@ from pipeline.grading.references.tolerance import exact
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.clusters import Cluster
 from pipeline.grading.similarity.doubles import Double
-from pipeline.grading.words import WORDS, on_one_line, points_text
+from pipeline.grading.words import WORDS, on_one_line, points_text, signed_points
 from pipeline.report.document import (
     Block,
     Cell,
@@ -106,6 +107,11 @@ def _to_look_at(lines: Sequence[Line], doubles: Sequence[Double]) -> list[Block]
     blocks: list[Block] = []
     if asked := wrong_springs(line.springs for line in lines if line.status == "graded"):
         blocks.append(paragraph(capital(asked)))
+    if unfinished := [line for line in lines if line.open]:
+        waiting = Counter(id_ for line in unfinished for id_ in line.open)
+        told = listing([f"{id_} ({n})" for id_, n in waiting.items()])
+        n = counted(len(unfinished), "submission")
+        blocks.append(paragraph(WORDS.text("not_final", submissions=n, criteria=told)))
     if failed:
         reasons = bullet_list(
             spans(_link(line.submission), f": {clean(on_one_line(line.reason))}", _by_hand(line))
@@ -232,8 +238,16 @@ def _row(line: Line) -> list[Cell | str | Spans]:
         f"{math.floor(share)}",  # rounded down, so that only full points give 100
         f"{line.days_late:.3g}" if line.days_late else "0",
         cell("not graded", "bad") if failed else ", ".join(line.codes),
-        ", ".join(line.by_hand),
+        _hand_text(line),
     ]
+
+
+def _hand_text(line: Line) -> str:
+    """Return what a person has changed, and what a person still has to grade."""
+    given = [own.criterion for own in line.overrides]
+    given += [f"total {signed_points(one.points)} ({clean(one.why)})" for one in line.adjustments]
+    given += [f"{id_}: open" for id_ in line.open]
+    return ", ".join(given)
 
 
 def feedback_link(name: str) -> str:

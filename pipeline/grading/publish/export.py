@@ -27,13 +27,16 @@ from pipeline.grading.publish.platforms import FORMS, WORKSHEET
 from pipeline.grading.publish.roster import POINTS_POSSIBLE, Roster
 from pipeline.grading.publish.students import Remark, Student, students_of
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.words import on_one_line, points_text
+from pipeline.grading.words import on_one_line, person_lines, points_text
 from pipeline.output import csv_text, named_folder, own_folder, write_file
+from pipeline.words.numbers import first_few
 from pipeline.words.text import with_symbols
 
 # Canvas takes a column whose heading contains one of these words and "Score", "Points" or "Grade"
 # for its own, and skips it (`NON_ASSIGNMENT_COLUMN_HEADERS` of its importer).
 _IGNORED = re.compile(r"\b(?:current|final|override)\b", re.IGNORECASE)
+
+_NAMED = 8  # most submissions that a remark names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +73,14 @@ def export(
     title = title or rubric.title or "cartlab"
     entries = list(book.entries())
     students, remarks = students_of(entries, platform=platform, blank=roster is None)
+    if unfinished := [entry.submission for entry in entries if entry.grade.open]:
+        remarks.append(
+            Remark(
+                text=f"not final, exported with the points so far: {len(unfinished)} of "
+                f"{len(entries)} submissions have criteria that a person has not graded: "
+                f"{first_few(unfinished, _NAMED)}"
+            )
+        )
     if platform == "canvas" and (word := _IGNORED.search(title)):
         remarks.append(
             Remark(
@@ -181,10 +192,10 @@ def _comment(student: Student) -> str:
 def _comment_lines(grade: Grade, *, by_hand: Collection[str]) -> list[str]:
     """Return a line for each criterion with lost points or points given by hand, and for each flag.
 
-    The deduction for lateness comes last.
+    What changes the total comes last.
     """
     if grade.status == "failed" and not grade.criteria:
-        return [f"Could not be graded: {on_one_line(grade.reason)}"]
+        return [f"Could not be graded: {on_one_line(grade.reason)}", *person_lines(grade)]
     lost = [
         f"{c.title or c.id}: {points_text(c.points)} of {points_text(c.out_of)}. "
         f"{with_symbols(c.message)}"
@@ -192,7 +203,7 @@ def _comment_lines(grade: Grade, *, by_hand: Collection[str]) -> list[str]:
         if c.points < c.out_of or c.id in by_hand
     ]
     late = [f"Late: {points_text(grade.deducted)} points off."] if grade.deducted else []
-    return [*lost, *flag_messages(grade), *late]
+    return [*lost, *flag_messages(grade), *late, *person_lines(grade)]
 
 
 def _clock(days: float) -> str:
@@ -205,7 +216,9 @@ def _write_results(entries: Iterable[Entry], folder: Path, *, rubric: Rubric) ->
     for entry in entries:
         own = own_folder(folder, entry.submission)
         own.mkdir(parents=True, exist_ok=True)
-        text = results_text(entry.grade, rubric=rubric, by_hand=bool(entry.overrides))
+        text = results_text(
+            entry.grade, rubric=rubric, by_hand=bool(entry.overrides or entry.adjustments)
+        )
         write_file(own / "results.json", text)
         files.append(own / "results.json")
     return files

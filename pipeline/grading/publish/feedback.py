@@ -12,7 +12,7 @@ from pipeline import __version__
 from pipeline.grading.grade import Criterion, Flag, Grade, Outcome
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.shared import student_message
-from pipeline.grading.words import WORDS, points_text
+from pipeline.grading.words import WORDS, person_lines, points_text
 from pipeline.names import read_name
 from pipeline.report.document import (
     Block,
@@ -95,7 +95,8 @@ def _summary(grade: Grade) -> list[Block]:
         if others:
             why = paragraph(WORDS.spans(key, why=WORDS.text("failed_reasons")))
             blocks = [why, bullet_list(map(spans, (first, *others))), paragraph(then)]
-        return [Tiles((tile, by_hand) if overrides else (tile,)), *blocks, *_notes(grade)]
+        tiles = Tiles((tile, by_hand) if overrides else (tile,))
+        return [tiles, *_by_person(grade), *blocks, *_notes(grade)]
     passed = sum(c.outcome == "pass" for c in grade.criteria)
     tiles = [
         Tile(spans("Points"), spans(points)),
@@ -117,7 +118,12 @@ def _summary(grade: Grade) -> list[Block]:
         tiles.append(Tile(spans("Late"), spans(late), tone="bad" if grade.deducted else ""))
     if overrides:
         tiles.append(by_hand)
-    return [Tiles(tuple(tiles)), *_lost(grade), *_notes(grade)]
+    return [Tiles(tuple(tiles)), *_by_person(grade), *_lost(grade), *_notes(grade)]
+
+
+def _by_person(grade: Grade) -> list[Block]:
+    """Return the changes of the total with their reasons, and what a person still has to grade."""
+    return [paragraph(rich(sentence(line))) for line in person_lines(grade)]
 
 
 def counted_days(days: float) -> str:

@@ -14,7 +14,7 @@ from pipeline.grading.grade import CODES, Code, Criterion, Grade
 from pipeline.grading.judge.costs import find_remarks
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.shared import student_message
-from pipeline.grading.words import WORDS, points_text
+from pipeline.grading.words import WORDS, person_lines, points_text
 from pipeline.words.text import with_symbols
 
 # Flags whose text has no computed numbers.
@@ -35,7 +35,7 @@ def results_text(grade: Grade, *, rubric: Rubric, by_hand: bool = False) -> str:
             {
                 "score": judged.points,
                 "max_score": judged.out_of,
-                "status": "passed" if judged.outcome == "pass" else "failed",
+                **_status(judged, grade),
                 "name": judged.title or judged.id,
                 "number": str(number),
                 "output": _criterion_text(judged, grade, rubric, hidden=hidden),
@@ -67,9 +67,15 @@ def _grade_lines(grade: Grade, *, by_hand: bool, hidden: bool) -> list[str]:
     if hidden:
         lines += [] if failed else [WORDS.text("gradescope_hidden")]
     lines += flag_messages(grade, codes=_WITHOUT_NUMBERS if hidden else CODES)
-    if grade.deducted:
-        lines.append(f"Late: {points_text(grade.deducted)} points off.")
-    return lines
+    late = [f"Late: {points_text(grade.deducted)} points off."] if grade.deducted else []
+    return [*lines, *late, *person_lines(grade)]
+
+
+def _status(judged: Criterion, grade: Grade) -> dict[str, str]:
+    """Return the status of a criterion; without one, Gradescope compares its points."""
+    if judged.id in grade.open:
+        return {}
+    return {"status": "passed" if judged.outcome == "pass" else "failed"}
 
 
 def _criterion_text(judged: Criterion, grade: Grade, rubric: Rubric, *, hidden: bool) -> str:

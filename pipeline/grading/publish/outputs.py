@@ -30,7 +30,7 @@ _WHOLE = ""  # key of the class page in the table of hashes
 # File with a hash of the data of each page. A page is written again only if its hash has changed.
 _MADE = ".made.json"
 _BEFORE = ("submission", "authors", "status", "points", "out_of", "days_late", "deducted")
-_AFTER = ("remarks", "by_hand", "reason")
+_AFTER = ("remarks", "by_hand", "reason", "adjusted", "open")
 
 
 def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) -> list[Double]:
@@ -143,6 +143,8 @@ def grades_csv(lines: Sequence[Line], *, rubric: Rubric) -> str:
             " ".join(line.codes),
             " ".join(line.by_hand),
             on_one_line(line.reason),
+            sum(one.points for one in line.adjustments),
+            " ".join(line.open),
         )
         for line in lines
     ]

@@ -92,7 +92,7 @@ def preview_rubric(
     elsewhere = set(book.by_other_rubrics())
     teams, unknown, failed = [], [], 0
     for entry in book.entries():
-        if entry.grade.status == "failed" and not entry.overrides:
+        if entry.grade.status == "failed" and not (entry.overrides or entry.adjustments):
             failed += 1
             continue
         found = _usable(book.findings(entry), before, rubric)
@@ -129,7 +129,7 @@ def _usable(text: str, before: Rubric, now: Rubric) -> Mapping[str, Judgement]:
 
 def _compared(entry: Entry, found: Mapping[str, Judgement], rubric: Rubric) -> TeamChange:
     weighed = reweigh(entry.grade, found, rubric=rubric)
-    after = with_overrides(weighed, entry.overrides, rubric=rubric)
+    after = with_overrides(weighed, entry.overrides, rubric=rubric, adjustments=entry.adjustments)
     had, has = _points(entry.grade), _points(after)
     return TeamChange(
         submission=entry.submission,

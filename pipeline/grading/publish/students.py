@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from pipeline.grading.grade import Grade
+from pipeline.grading.gradebook.override import TOTAL
 from pipeline.grading.gradebook.rows import Entry
 from pipeline.grading.gradings import person
 from pipeline.grading.intake.lms_names import Platform, read_owner
@@ -137,9 +138,11 @@ def _students(entry: Entry, *, platform: Platform) -> list[Student]:
     """
     name, of, number = read_owner(entry.owner)
     number = number if of in ("", platform) else ""
-    given = [author for o in entry.overrides.values() for author in o.authors]
+    given = [
+        author for o in (*entry.overrides.values(), *entry.adjustments) for author in o.authors
+    ]
     authors = entry.grade.authors or tuple(dict.fromkeys(given)) or ("",)
-    by_hand = frozenset(entry.overrides)
+    by_hand = frozenset(entry.overrides) | ({TOTAL} if entry.adjustments else set())
     own = Student(id="", name=name, number=number, grade=entry.grade, by_hand=by_hand)
     if len(authors) == 1:
         return [replace(own, id=authors[0])]

@@ -4,13 +4,15 @@ The arithmetic is exact, so that a number exactly at a limit is judged correctly
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
 from functools import lru_cache
 from typing import TYPE_CHECKING, TypeVar
 
-from pipeline.grading.rubric import Late
+from pipeline.grading.grade import Criterion, Grade
+from pipeline.grading.rubric import Late, Rubric
 
 if TYPE_CHECKING:
     from pipeline.grading.references.reference import Reference
@@ -138,6 +140,26 @@ def credit(error: Fraction, *, full: float, none: float) -> Fraction:
 def to_step(points: Fraction, step: float) -> Fraction:
     """Round points to the rubric's step, halves up, with exact arithmetic."""
     return math.floor(points / exact(step) + Fraction(1, 2)) * exact(step)
+
+
+def with_total(grade: Grade, criteria: Sequence[Criterion], *, rubric: Rubric) -> Grade:
+    """Return the grade with these criteria, and the total that follows from them.
+
+    Lateness is deducted from the points earned. Then the adjustments of the grade are added; the
+    total never falls below 0.
+    """
+    earned = sum((exact(criterion.points) for criterion in criteria), Fraction(0))
+    deducted = late_deduction(earned, late=rubric.late, step=rubric.step, days_late=grade.days_late)
+    adjusted = sum((exact(one.points) for one in grade.adjustments), Fraction(0))
+    by_person = {asked.id for asked in rubric.criteria if asked.check == "manual"}
+    changed = {
+        "criteria": tuple(criteria),
+        "points": float(max(earned - deducted + adjusted, Fraction(0))),
+        "out_of": rubric.out_of,
+        "deducted": float(deducted),
+        "open": tuple(c.id for c in criteria if c.id in by_person and c.outcome == "skip"),
+    }
+    return grade.model_copy(update=changed)
 
 
 def late_deduction(earned: Fraction, *, late: Late, step: float, days_late: float) -> Fraction:
