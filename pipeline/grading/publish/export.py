@@ -192,7 +192,7 @@ def _comment(student: Student) -> str:
 def _comment_lines(grade: Grade, *, by_hand: Collection[str]) -> list[str]:
     """Return a line for each criterion with lost points or points given by hand, and for each flag.
 
-    What changes the total comes last.
+    The deduction for lateness and the changes of the total come last.
     """
     if grade.status == "failed" and not grade.criteria:
         return [f"Could not be graded: {on_one_line(grade.reason)}", *person_lines(grade)]

@@ -46,7 +46,7 @@ def _fill(place: str, *, folder: Path | None = None) -> None:
         book.release(by="Ada", released=True)
         book.ask(GONE, first.id, why="quagga: it is right", by="s-zebra")
         book.mark(GONE, by="Ada", seen=True)
-        book.override(GONE, gone.criteria[1].id, 1, why="quagga", by="Ada")
+        book.override(GONE, gone.criteria[1].id, 0.5, why="quagga", by="Ada")
         book.finish(Batch(keys=keys, shared=shared), rubric=two_cart_rubric())
         if folder:
             write_outputs(book, folder)
