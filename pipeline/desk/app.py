@@ -173,6 +173,7 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/grades/{n:nth}/together", "GET", together.show),
     ("/grades/{n:nth}/together", "POST", together.apply),
     ("/grades/{n:nth}/figure", "GET", team_page.show_figure),
+    ("/grades/{n:nth}/paper", "GET", team_page.send_paper),
     ("/grades/{n:nth}/again", "GET", request_queue.show),
     ("/grades/{n:nth}/again", "POST", request_queue.act),
     ("/grades/{n:nth}/release", "POST", class_actions.release),

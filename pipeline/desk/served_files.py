@@ -52,6 +52,14 @@ def serve_file(folder: Path, name: str) -> Response:
     return FileResponse(folder / name, media_type=kind, headers=headers)
 
 
+def send_paper(folder: Path, name: str) -> Response:
+    """Send a PDF from a submission's folder; the browser stores it, and runs nothing in it."""
+    headers = {"Content-Security-Policy": _INERT}
+    return FileResponse(
+        folder / name, media_type="application/pdf", headers=headers, filename=Path(name).name
+    )
+
+
 def show_own_page(text: str) -> Response:
     """Return a page that cartlab made."""
     headers = {"Content-Security-Policy": _allow_own_scripts(_OWN_PAGE)}

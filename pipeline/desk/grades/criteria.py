@@ -119,6 +119,7 @@ def describe_criterion(
     return {
         "id": asked.id,
         "title": capital(asked.title or asked.id),
+        "is_manual": asked.check == "manual",
         "points": points or NOTHING,
         "out_of": points_text(asked.points),
         "outcome": WORDS.text(f"outcome_{own.outcome}") if own else "not judged",

@@ -10,6 +10,7 @@ from urllib.parse import urlencode
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
+from pipeline.desk import served_files
 from pipeline.desk.ask import Ask
 from pipeline.desk.books import Class
 from pipeline.desk.grades.class_table import (
@@ -27,7 +28,7 @@ from pipeline.desk.grades.criteria import (
     show_figures,
 )
 from pipeline.desk.grades.filters import Filter
-from pipeline.desk.grades.recordings import find_recordings
+from pipeline.desk.grades.recordings import find_recordings, list_papers, show_notes
 from pipeline.desk.jobs import Busy
 from pipeline.desk.served_files import show_drawing
 from pipeline.errors import ConfigError
@@ -155,6 +156,17 @@ def show_figure(ask: Ask) -> Response:
     return show_drawing(render_drawing(plain_svg(drawn[name])))
 
 
+def send_paper(ask: Ask) -> Response:
+    """Send a PDF that a team submitted."""
+    shown = read_class(ask)
+    team = find_team(shown, ask.query("of"))
+    folder = find_recordings(ask, shown, open_book(ask).entry(team.submission))
+    name = ask.query("file")
+    if folder is None or name not in list_papers(folder):
+        raise HTTPException(404, "there is no such file")
+    return served_files.send_paper(folder, name)
+
+
 def _show_page(ask: Ask, *, wrong: str = "", wrong_repair: str = "", status: int = 200) -> Response:
     shown = read_class(ask)
     team = find_team(shown, ask.query("of"))
@@ -168,6 +180,7 @@ def _show_page(ask: Ask, *, wrong: str = "", wrong_repair: str = "", status: int
     before, after = wanted.beside(shown, name)
     items = list_items(grade, now)
     chosen = _find_chosen(ask, items, now.rubric)
+    folder = find_recordings(ask, shown, now.entry)
     return ask.page(
         "team",
         status=status,
@@ -189,7 +202,12 @@ def _show_page(ask: Ask, *, wrong: str = "", wrong_repair: str = "", status: int
         signature=find_signature(ask),
         repair=_show_repair(ask, shown, team, wrong=wrong_repair),
         requests=book.request_states(team.submission),
-        recordings=find_recordings(ask, shown, now.entry),
+        recordings=folder,
+        notes=show_notes(folder) if folder else "",
+        papers=[
+            (paper, f"{ask.here}paper?{urlencode({'of': name, 'file': paper})}")
+            for paper in (list_papers(folder) if folder else ())
+        ],
         requests_at=f"{ask.here}again?{urlencode({'of': name})}",
         **_show_chosen(ask, shown, grade, now, chosen=chosen, wrong=wrong),
     )
