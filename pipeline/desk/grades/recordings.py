@@ -1,6 +1,6 @@
 """Find the recordings of a graded team on this computer, because a gradebook stores no folder.
 
-What the team wrote is read from the same folder: its notes, and the PDF files that it submitted.
+The notes and the PDF files of the team are read from the same folder.
 """
 
 from collections.abc import Iterator
