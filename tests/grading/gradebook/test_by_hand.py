@@ -74,7 +74,7 @@ def test_a_manual_criterion_is_open_until_a_person_grades_it(honest, tmp_path):
 def test_another_rubric_leaves_a_manual_criterion_open(honest):
     """The preview of other points keeps the criterion open, and gives it no points."""
     rubric, graded = honest
-    found = read_findings(findings_text(graded.verdicts))
+    found = read_findings(findings_text(graded.judgements))
     again = reweigh(graded.grade, found, rubric=rubric)
     assert (again.points, again.open) == (graded.grade.points, ("discussion",))
 
