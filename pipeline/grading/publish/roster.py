@@ -200,18 +200,19 @@ class Roster:
         return remarks
 
     def _kept(self, grades: "pd.Series") -> list[Remark]:
-        """Return a remark on grades in the table for which cartlab has none.
+        """Return a remark on grades that only the table has.
 
         Parameters
         ----------
         grades : the column of grades, without the rows that cartlab filled in.
         """
-        kept = grades[grades.str.strip().ne("") & ~self._of_all()[grades.index]]
-        if kept.empty:
+        of_all = self._of_all()
+        kept = {at: text for at, text in grades.items() if text.strip() and not of_all[at]}
+        if not kept:
             return []
         column = next((name for name, role in self._roles() if role in _NAMES), None)
         called = self.table.iloc[:, 0] if column is None else self.table[column]
-        named = first_few([f"{called[at]} ({grade})" for at, grade in kept.items()], 8)
+        named = first_few([f"{called[at]} ({text})" for at, text in kept.items()], 8)
         return [Remark(text=f"no grade from cartlab, so {self.file} keeps its own: {named}")]
 
     def _roles(self) -> Iterable[tuple[Any, Any]]:
@@ -297,18 +298,17 @@ def _moodle_headings(table: "pd.DataFrame") -> dict[str, str]:
     if not any(cells):
         return {}
     roles: dict[str, int] = {}
-    numbers = (i for i, column in enumerate(cells) if _participants(column))
-    if (first := next(numbers, None)) is not None:
-        for i in range(first + 2, len(cells)):
-            grades, most = cells[i - 1], cells[i]
-            same = len(set(most)) == 1 and _number(most[0]) is not None
-            if same and all(not text or _number(text) is not None for text in grades):
-                roles |= {"Identifier": first, "Grade": i - 1, _MAXIMUM: i}
-        last = len(cells) - 1
-        if last > roles.get(_MAXIMUM, last) and "-" not in cells[last]:
-            roles["Feedback comments"] = last
+    first = next((i for i, column in enumerate(cells) if _participants(column)), len(cells))
+    for i in range(first + 2, len(cells)):
+        grades, most = cells[i - 1], cells[i]
+        same = len(set(most)) == 1 and _number(most[0]) is not None
+        if same and all(not text or _number(text) is not None for text in grades):
+            roles |= {"Identifier": first, "Grade": i - 1, _MAXIMUM: i}
     if roles and roles["Grade"] > first + 1:
         roles["Full name"] = first + 1
+    last = len(cells) - 1
+    if last > roles.get(_MAXIMUM, last) and "-" not in cells[last]:
+        roles["Feedback comments"] = last
     end = roles.get("Grade", len(cells))
     for i, column in enumerate(cells[:end]):
         given = [text for text in column if text]
