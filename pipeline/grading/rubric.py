@@ -1,15 +1,25 @@
 """The rubric: required items, criteria with points and tolerances, late policy."""
 
+import re
+from datetime import datetime
 from decimal import Decimal
 from fnmatch import fnmatchcase
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AwareDatetime, Field, create_model, model_serializer, model_validator
+from pydantic import (
+    AwareDatetime,
+    BeforeValidator,
+    Field,
+    create_model,
+    model_serializer,
+    model_validator,
+)
 
 from pipeline.grading.grade import CODES, Code
 from pipeline.names import parameter_names
 from pipeline.results import Kind
 from pipeline.submission import Design, Students, System
+from pipeline.submission.complaints import quote
 from pipeline.submission.models import TomlTable
 
 Points = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
@@ -46,18 +56,36 @@ class Required(TomlTable):
     feedback: tuple[Literal["gains", "prefilter", "overshoot_percent", "settling_time"], ...] = ()
 
 
+def _read_due(typed: object) -> object:
+    """Return a deadline as a datetime, also if its date and offset are in quotation marks."""
+    found = str(typed)
+    if isinstance(typed, str):
+        # Python before 3.14 reads no space before the offset.
+        text = re.sub(r"\s+(?=[+-]\d\d:?\d\d$|Z$)", "", typed.strip())
+        try:
+            typed = datetime.fromisoformat(text) if "T" in text or " " in text else None
+        except ValueError:
+            typed = None
+    if isinstance(typed, datetime) and typed.tzinfo is not None:
+        return typed
+    raise ValueError(
+        "expected date, time and offset from UTC, such as 2026-11-29T23:59:00+01:00, "
+        f"found {quote(found)}"
+    )
+
+
 class Late(TomlTable):
     """The deduction for late work.
 
     Attributes
     ----------
-    due : the deadline; it applies if the platform gives submission times.
+    due : the deadline, with its offset from UTC; it applies if the platform gives submission times.
     percent_per_day : the deduction for each day begun after the days of grace, in percent of the
         earned points.
     most_percent : the largest deduction, in percent of the earned points.
     """
 
-    due: AwareDatetime | None = None
+    due: Annotated[AwareDatetime, BeforeValidator(_read_due)] | None = None
     percent_per_day: Percent = 0.0
     grace_days: Annotated[float, Field(ge=0, le=365, allow_inf_nan=False)] = 0.0
     most_percent: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 100.0

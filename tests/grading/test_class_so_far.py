@@ -96,6 +96,25 @@ def pages(out: Path) -> dict[str, bytes]:
     return {name: (out / name).read_bytes() for name in ("grades.csv", "class.html")}
 
 
+@pytest.mark.parametrize("loss", ["missing", "emptied", "another"])
+def test_feedback_without_its_gradebook_is_not_replaced(school, tmp_path, loss):
+    """If the gradebook beside feedback is lost, grading is refused and nothing changes."""
+    out = tmp_path / "out"
+    grade(school, out=out)
+    give(out, "team-2", 0.25)
+    before, book = pages(out), out / "gradebook.sqlite"
+    book.unlink()
+    if loss == "emptied":
+        book.touch()
+    elif loss == "another":
+        Gradebook(out, assignment="throne-1dof", create=True).close()
+    with pytest.raises(ConfigError, match=r"holds feedback .* Restore the gradebook"):
+        grade(school, out=out)
+    assert pages(out) == before
+    shutil.rmtree(out / "feedback")  # one of the choices in the message
+    grade(school, out=out)
+
+
 def test_a_late_submission_graded_alone_keeps_the_class(school, tmp_path):
     """A late submission graded alone gives the same class as grading all submissions together.
 

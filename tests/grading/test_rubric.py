@@ -1,6 +1,7 @@
 """The shipped rubrics are valid; every mistake in a rubric is named with its line."""
 
 import json
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,16 @@ from pipeline.grading.rubric_text import rubric_dict, rubric_text
 from pipeline.resources import RUBRICS
 
 SHIPPED = sorted(RUBRICS.glob("*.toml"))
+DUE = [
+    ("2026-11-29T23:59:00+01:00", "2026-11-29T23:59:00+01:00"),
+    ('"2026-11-29T23:59:00+01:00"', "2026-11-29T23:59:00+01:00"),
+    ('"2026-11-29 23:59 -08:00"', "2026-11-29T23:59:00-08:00"),
+    ('"2026-11-29 23:59Z"', "2026-11-29T23:59:00+00:00"),
+    ("2026-11-29T23:59:00", None),
+    ("2026-11-29", None),
+    ('"2026-11-29"', None),
+    ('"Sunday"', None),
+]
 GOOD = """\
 version = 1
 
@@ -206,3 +217,17 @@ def test_invalid_toml_is_named_with_its_line(tmp_path):
     """If a rubric is not valid TOML, the error gives the parser's line."""
     with pytest.raises(ConfigError, match=r"line 2: the value after = is missing; found title ="):
         load_rubric(write(tmp_path, "version = 1\ntitle = \n"))
+
+
+@pytest.mark.parametrize(("typed", "due"), DUE)
+def test_a_deadline_needs_date_time_and_offset(tmp_path, typed, due):
+    """A deadline may be in quotation marks; a message shows how to write a missing offset."""
+    file = tmp_path / "r.toml"
+    file.write_text(f"{GOOD}\n[late]\ndue = {typed}\n", encoding="utf-8")
+    if due is None:
+        with pytest.raises(ConfigError, match=r"late\.due: expected .* such as 2026-.*found"):
+            load_rubric(file)
+        return
+    rubric = load_rubric(file)
+    assert rubric.late.due == datetime.fromisoformat(due)
+    assert Rubric.model_validate_json(rubric.model_dump_json()) == rubric

@@ -132,6 +132,7 @@ def grade_class(
     _refuse_submission(named_folder(out))
     if options.gradebook is None:
         _refuse_another_class(out, assignment=rubric_file.stem)
+    _refuse_lost_gradebook(place, out=out, assignment=rubric_file.stem)
     with lock_or_refuse(out, private=True), scratch_in(out) as scratch:
         known = _listed_names(place, assignment=rubric_file.stem)
         passed: list[str] = []
@@ -206,6 +207,24 @@ def _refuse_another_class(out: Path, *, assignment: str) -> None:
             f"another class. To continue this class, name the rubric {before}.toml; else choose "
             "another --out"
         )
+
+
+def _refuse_lost_gradebook(place: str | Path, *, out: Path, assignment: str) -> None:
+    """Raise a ConfigError if `out` holds feedback whose gradebook is missing or empty.
+
+    Otherwise the feedback would be replaced without the points given by hand.
+    """
+    if not any(out.glob("feedback/*/grade.json")):
+        return
+    try:
+        with Gradebook(place, assignment=assignment) as book:
+            book.assignment  # noqa: B018  # raises an error if there is no class list
+    except ConfigError as error:
+        raise ConfigError(
+            f"{out}: holds feedback of an earlier grading, but its gradebook, with all changes by "
+            f"hand, is not there ({error}). Restore the gradebook from a backup; or choose another "
+            "--out; or, to begin without the changes by hand, delete the folder feedback first"
+        ) from None
 
 
 def _pseudonyms(book: Gradebook) -> Callable[[str], str]:

@@ -20,7 +20,7 @@ from pipeline.grading.gradebook.changes import points_changes, rubric_changes
 from pipeline.grading.gradebook.class_lines import Line, class_frame
 from pipeline.grading.gradebook.erase import erase_rows
 from pipeline.grading.gradebook.history import Event, read_events
-from pipeline.grading.gradebook.override import TOTAL, HandPoints, WantedPoints
+from pipeline.grading.gradebook.override import TOTAL, HandPoints, WantedPoints, check_step
 from pipeline.grading.gradebook.rows import (
     GRADING,
     Entry,
@@ -60,6 +60,8 @@ from pipeline.words.progress import silent
 
 if TYPE_CHECKING:
     import pandas as pd
+
+_SUGGESTED = 4  # names of submissions in one suggestion
 
 
 class Gradebook:
@@ -411,6 +413,13 @@ class Gradebook:
             raise ConfigError(
                 f"{criterion}: expected 0 to {out_of[criterion]:g} points, found {points:g}"
             )
+        before = select(overrides.c.id).filter_by(
+            submission_id=row.submission_id, criterion=criterion, points=points
+        )
+        new = connection.execute(before).first() is None
+        if criterion != TOTAL and points is not None and new:
+            # Points that were given once may be restored after a change of the rubric's step.
+            check_step(points, out_of=out_of[criterion], step=rubric.step)
         given = HandPoints(
             criterion=criterion,
             points=points,
@@ -448,7 +457,7 @@ class Gradebook:
         rows = connection.execute(names).all()
         found = [row.position for row in _named(team, rows)]
         if len(found) != 1:
-            hint = f"no such submission{nearest(team, [row.name for row in rows])}"
+            hint = f"no such submission{_similar(team, [row.name for row in rows])}"
             raise ConfigError(
                 f"{team}: {'is in several submissions: give the name of one' if found else hint}"
             )
@@ -478,6 +487,12 @@ class Gradebook:
         if self._assignment is not None:
             newest = newest.where(batches.c.assignment == self._assignment)
         return connection.execute(newest).one_or_none()
+
+
+def _similar(team: str, names: Sequence[str]) -> str:
+    """Return "; did you mean …?" with all names that end with the typed one, or the nearest."""
+    ends = [repr(name) for name in names if person(name).endswith(person(team))]
+    return f"; did you mean {' or '.join(ends[:_SUGGESTED])}?" if ends else nearest(team, names)
 
 
 def _named(team: str, rows: Sequence[Row]) -> list[Row]:

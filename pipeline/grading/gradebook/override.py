@@ -2,13 +2,14 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from math import floor
 from pathlib import Path
 
 from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
 from pipeline.grading.grade import Adjustment, Criterion, Grade, GradeOverride
 from pipeline.grading.gradings import go_with
-from pipeline.grading.references.tolerance import with_total
+from pipeline.grading.references.tolerance import exact, with_total
 from pipeline.grading.rubric import Rubric
 
 # The place of an adjustment in the gradebook. No criterion can have this id. All adjustments count;
@@ -55,6 +56,24 @@ def read_points(text: str) -> float | None:
         return float(text.replace(",", "."))
     except ValueError:
         raise ConfigError(f"{text}: expected a number of points, or auto") from None
+
+
+def check_step(points: float, *, out_of: float, step: float) -> None:
+    """Refuse points that are not a multiple of the rubric's step; all points are always allowed.
+
+    Raises
+    ------
+    ConfigError : the message names the nearest points that are allowed.
+    """
+    steps = exact(points) / exact(step)
+    if steps.denominator == 1 or points == out_of:
+        return
+    below = floor(steps) * exact(step)
+    above = min(below + exact(step), exact(out_of))
+    raise ConfigError(
+        f"{points:g} points are not a multiple of the rubric's step, {step:g}: "
+        f"give {float(below):g} or {float(above):g}"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -206,8 +206,8 @@ class Roster:
         ----------
         grades : the column of grades, without the rows that cartlab filled in.
         """
-        of_all = self._of_all()
-        kept = {at: text for at, text in grades.items() if text.strip() and not of_all[at]}
+        of_all = set(self.table.index[self._of_all()])
+        kept = {at: text for at, text in grades.items() if text.strip() and at not in of_all}
         if not kept:
             return []
         column = next((name for name, role in self._roles() if role in _NAMES), None)

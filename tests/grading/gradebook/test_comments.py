@@ -73,17 +73,6 @@ def test_points_by_hand_stay_by_hand_with_a_comment(book, say):
     assert pieces(book).points == 0.0
 
 
-@pytest.mark.parametrize("typed", [1 / 3, 0.33])
-def test_points_as_shown_are_unchanged(book, typed):
-    """Points of 1/3 are shown as 0.33; a comment saved with either number leaves them at 1/3."""
-    change(book, 1 / 3, why="half of it")
-    change(book, typed)
-    assert pieces(book).points == 1 / 3
-    assert book.entry("team-1").overrides["pieces"].points == 1 / 3
-    change(book, 0.3)
-    assert pieces(book).points == 0.3
-
-
 def test_undo_brings_back_the_earlier_comment(book):
     """Undo removes a comment; if it had replaced an earlier comment, the earlier one returns."""
 

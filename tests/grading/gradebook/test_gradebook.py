@@ -290,6 +290,7 @@ def test_an_override_never_exceeds_the_points_of_the_rubric(open_book):
         (("team-1", "pieces", -0.1), "x", "pieces: expected 0 to 1 points"),
         (("team-1", "pieces", float("nan")), "x", "pieces: expected 0 to 1 points, found nan"),
         (("team-1", "pieces", 1.0), " ", "needs a reason"),
+        (("team-1", "pieces", 0.3), "x", r"step, 0\.25: give 0\.25 or 0\.5"),
     ],
 )
 def test_an_override_that_makes_no_sense_is_refused(open_book, arguments, why, message):
@@ -301,6 +302,28 @@ def test_an_override_that_makes_no_sense_is_refused(open_book, arguments, why, m
         book.override(*arguments, why=why, by="Ada")
 
     assert [event.what for event in book.history("team-1")[1]] == ["graded", "listed"]
+
+
+def test_a_name_that_several_submissions_end_with_suggests_them(open_book):
+    """A team that is in two sections is suggested with both."""
+    book = open_book()
+    finish(book, *(make_outcome(make_grade(f"{at}-Team-13")) for at in ("mon", "tue")))
+    with pytest.raises(ConfigError, match=r"did you mean 'mon-Team-13' or 'tue-Team-13'\?"):
+        book.override("team-13", "pieces", 1.0, why="x", by="Ada")
+
+
+def test_points_between_two_steps_can_be_restored(open_book):
+    """Points that were given before the step of the rubric changed can be given again."""
+    book = open_book()
+    fine = RUBRIC.model_copy(update={"step": 0.1})
+    outcome = make_outcome(make_grade("team-1"))
+    book.put(outcome)
+    book.finish(Batch(keys=(outcome.key,), shared={}), rubric=fine)
+    book.override("team-1", "pieces", 0.3, why="x", by="Ada")
+    book.finish(Batch(keys=(outcome.key,), shared={}), rubric=RUBRIC)
+    book.override("team-1", "pieces", 1.0, why="x", by="Ada")
+    book.override("team-1", "pieces", 0.3, why="x", by="Ada")
+    assert book.entry("team-1").overrides["pieces"].points == 0.3
 
 
 def test_a_team_is_found_by_its_members(open_book):
