@@ -48,6 +48,20 @@ class Member:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Example:
+    """A submission that the lab gave out with an assignment; everybody may have its data.
+
+    Attributes
+    ----------
+    fingerprints : noise patterns of its recordings.
+    numbers : name and value of each number that it reports.
+    """
+
+    fingerprints: bytes = field(repr=False)
+    numbers: frozenset[tuple[str, float]] = frozenset()
+
+
+@dataclass(frozen=True, kw_only=True)
 class Grading(Member):
     """The result of grading one submission, before it is compared with the others.
 
@@ -102,7 +116,7 @@ class Batch:
     Attributes
     ----------
     keys : keys of the gradings, in the order of the submission ids.
-    shared : flag for recordings that another submission also contains, by submission.
+    shared : flag for recordings or tables that another submission also contains, by submission.
     failed : name and reason for each submission that could not be graded.
     unsettled : failed submissions that the next run grades again.
     disk_full : submissions that failed because the disk was full.

@@ -121,8 +121,8 @@ def test_the_class_says_who_shares_recordings(ta):
     page = ta.get(ROOM).text
     line = re.search(r'href="[^"]*\?flag=shared_data#class">(.*?)</a>.*?count">(\d+)<', page)
     assert line
-    assert line.groups() == ("A recording that another submission also contains", "2")
-    assert page.count("<td>a recording that another submission also contains") == 2
+    assert line.groups() == ("Recordings or numbers that another submission also contains", "2")
+    assert page.count("<td>recordings or numbers that another submission also contains") == 2
     assert "<td>shared_data" not in page
 
 

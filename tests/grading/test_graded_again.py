@@ -12,6 +12,7 @@ from pipeline.grading.batch.runner import code_version, grade_batch
 from pipeline.grading.batch.task import Setup, Task
 from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradings import Example
 from pipeline.grading.intake.files import digest, packed, unpacked
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.grading.rubric_file import load_rubric
@@ -104,7 +105,8 @@ def test_another_version_of_numpy_grades_everything_again(monkeypatch):
 
 def test_a_handed_out_recording_is_not_flagged(school, tmp_path):
     """A recording that was handed out to everybody is not flagged in two submissions."""
-    given = fingerprint(read_data(load_submission(school / "team-0")).records)
+    records = read_data(load_submission(school / "team-0")).records
+    given = Example(fingerprints=fingerprint(records))
     shared = []
     for examples in ((), (given,)):
         with Gradebook(tmp_path, create=True) as book:

@@ -14,7 +14,7 @@ from pipeline.grading.batch.runner import Executor, Progress, grade_batch, run_h
 from pipeline.grading.batch.task import Setup
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import wrong_springs
-from pipeline.grading.gradings import Batch
+from pipeline.grading.gradings import Batch, Example
 from pipeline.grading.intake.hand_ins import HandIn, find_hand_ins
 from pipeline.grading.intake.late_table import read_late_table, settle_lateness
 from pipeline.grading.intake.repairs import Run, save_run
@@ -26,7 +26,8 @@ from pipeline.grading.similarity.prints import fingerprint
 from pipeline.lock import lock_or_refuse
 from pipeline.output import OWNERS_FOLDER, named_folder, own_folder
 from pipeline.resources import EXAMPLES
-from pipeline.submission import load_submission
+from pipeline.results import Record
+from pipeline.submission import Reported, Submission, load_submission
 from pipeline.submission.complaints import quote
 from pipeline.submission.load import NAME
 from pipeline.words.numbers import count, listing
@@ -61,7 +62,7 @@ class Summary:
     def counted(self) -> str:
         """The counts in words, such as `12 of 13 graded`."""
         shared = (
-            f", {self.sharing} with recordings that another submission also contains"
+            f", {self.sharing} with recordings or numbers that another submission also contains"
             if self.sharing
             else ""
         )
@@ -148,7 +149,7 @@ def grade_class(
                 setup=options.setup(rubric, scratch=scratch),
                 book=book,
                 execute=_executor(options),
-                examples=lambda: list(_example_prints(rubric, folder=rubric_file.parent)),
+                examples=lambda: list(_examples(rubric, folder=rubric_file.parent)),
                 progress=_without_names(progress, hand_ins) if hidden else progress,
             )
             now = rubric.model_copy(update={"anonymous": hidden})
@@ -329,8 +330,8 @@ def _executor(options: Options) -> Executor:
     return run_on(options.cluster)
 
 
-def _example_prints(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:
-    """Yield the fingerprints of example recordings, which several teams may submit.
+def _examples(rubric: Rubric, *, folder: Path) -> Iterator[Example]:
+    """Yield the examples, whose recordings and numbers several teams may submit.
 
     These are the rubric's examples, and cartlab's examples with the same number of carts.
 
@@ -342,17 +343,25 @@ def _example_prints(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:
 
     for example in rubric.examples:
         try:
-            data = read_data(load_submission(folder / example))
+            submission = load_submission(folder / example)
+            data = read_data(submission)
         except PipelineError as error:
             raise ConfigError(f"the rubric's example {example}: {error}") from None
         for run, reason in data.unreadable.items():
             raise ConfigError(f"the rubric's example {example}: {run}: {reason}")
-        yield fingerprint(data.records)
+        yield _example(submission, data.records)
     for shipped in sorted(EXAMPLES.iterdir()):
         if (shipped / "submission.toml").is_file():
             submission = load_submission(shipped)
             if submission.system.carts == rubric.system.carts:
-                yield fingerprint(read_data(submission).records)
+                yield _example(submission, read_data(submission).records)
+
+
+def _example(submission: Submission, records: Sequence[Record]) -> Example:
+    reported = submission.reported or Reported()
+    tables = reported.initial, reported.final
+    numbers = {(name, abs(float(n))) for table in tables for name, n in table.items()}
+    return Example(fingerprints=fingerprint(records), numbers=frozenset(numbers))
 
 
 @contextmanager

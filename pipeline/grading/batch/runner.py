@@ -13,13 +13,21 @@ import pipeline
 from pipeline.errors import ConfigError
 from pipeline.grading.batch.so_far import class_so_far
 from pipeline.grading.batch.task import OUT_OF_MEMORY, Setup, Task, failed, read_grading
-from pipeline.grading.grade import Flag
+from pipeline.grading.grade import Flag, read_grade
 from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.gradings import Batch, Grading, Member
+from pipeline.grading.gradings import Batch, Example, Grading, Member
 from pipeline.grading.intake.files import digest
 from pipeline.grading.intake.hand_ins import HandIn
 from pipeline.grading.intake.repairs import FOLDER, Repair, keep_original, read_repairs
-from pipeline.grading.similarity.shared import find_shared, same_recordings, same_team, shared_flag
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.similarity.flag import shared_flag
+from pipeline.grading.similarity.shared import find_shared, same_recordings, same_team
+from pipeline.grading.similarity.tables import (
+    Key,
+    TypedNumber,
+    find_shared_tables,
+    typed_numbers,
+)
 from pipeline.processes import Ended, Failed, Supervisor
 from pipeline.resources import TEMPLATES
 
@@ -37,7 +45,7 @@ def grade_batch(
     setup: Setup,
     book: Gradebook,
     execute: Executor,
-    examples: Callable[[], Iterable[bytes]] = tuple,
+    examples: Callable[[], Iterable[Example]] = tuple,
     progress: Progress = silent,
 ) -> Batch:
     """Grade the submissions that are new to the gradebook, and store each outcome at once.
@@ -50,8 +58,8 @@ def grade_batch(
     Parameters
     ----------
     execute : function that runs the tasks: `run_here(jobs=…)` or `cluster.run_on(address)`.
-    examples : function that returns the fingerprints of recordings handed out with the assignment;
-        it is called only if submissions share recordings.
+    examples : function that returns the examples handed out with the assignment; it is called only
+        if submissions share something.
     progress : function that is called with the number of submissions done, the total, and the last
         submission or step.
     """
@@ -75,7 +83,7 @@ def grade_batch(
     in_order = [rows[name] for name in sorted(rows)]
     return Batch(
         keys=tuple(row.key for row in in_order),
-        shared=_shared(in_order, book, examples=examples),
+        shared=_shared(in_order, book, rubric=setup.rubric, examples=examples),
         failed=tuple((row.submission, row.reason) for row in in_order if row.reason),
         unsettled=frozenset(unsettled),
         disk_full=frozenset(no_room),
@@ -250,11 +258,15 @@ def _task(hand_in: HandIn, *, basis: tuple[str, str, bool], repairs: Mapping[str
 
 
 def _shared(
-    rows: Sequence[Member], book: Gradebook, *, examples: Callable[[], Iterable[bytes]]
+    rows: Sequence[Member],
+    book: Gradebook,
+    *,
+    rubric: Rubric,
+    examples: Callable[[], Iterable[Example]],
 ) -> dict[str, Flag]:
-    """Return a flag for each submission in `rows` that shares recordings with another submission.
+    """Return a flag for each submission that shares recordings or tables with another one.
 
-    The other submission may be in an earlier batch.
+    The other submission may be in an earlier batch if it shares recordings.
     """
     batch = [row for row in rows if row.fingerprints]
     names = {prints.submission: prints for prints in batch}
@@ -268,10 +280,23 @@ def _shared(
         and (prints.authors, prints.fingerprints) not in here
         and not _is_earlier_version(prints, names.get(prints.submission))
     ]
+    reported = {row.submission: _typed_numbers(row, book, rubric=rubric) for row in rows}
     found = find_shared(batch, earlier=earlier)
-    if found and (handed_out := tuple(examples())):
-        found = find_shared(batch, earlier=earlier, examples=handed_out)
-    return {submission: shared_flag(records) for submission, records in found.items()}
+    tables = find_shared_tables(rows, reported)
+    if (found or tables) and (handed_out := tuple(examples())):
+        given = [one.fingerprints for one in handed_out]
+        found = find_shared(batch, earlier=earlier, examples=given)
+        numbers = frozenset[tuple[str, float]]().union(*(one.numbers for one in handed_out))
+        tables = find_shared_tables(rows, reported, given=numbers)
+    return {
+        name: shared_flag(found.get(name, ()), tables.get(name, ()))
+        for name in sorted({*found, *tables})
+    }
+
+
+def _typed_numbers(row: Member, book: Gradebook, *, rubric: Rubric) -> dict[Key, TypedNumber]:
+    known = book.known(row.key, figures=False)
+    return typed_numbers(read_grade(known.grade), rubric=rubric) if known else {}
 
 
 def _is_earlier_version(earlier: Member, now: Member | None) -> bool:

@@ -6,12 +6,13 @@ from base64 import b32encode
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 from pipeline.grading.grade import Flag, Grade
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import Line
 from pipeline.grading.gradebook.history import FAILED, Event
-from pipeline.grading.similarity.shared import shared_message
+from pipeline.grading.similarity.flag import shared_message
 from pipeline.output import csv_text
 
 KEY_FILE = "anonymous-key.csv"
@@ -88,15 +89,17 @@ def hidden_reason(reason: str, submission: str, own: str) -> str:
 def _hidden(flag: Flag, names: Mapping[str, str]) -> Flag:
     """Return a flag for shared data with pseudonyms instead of names."""
     others = list(dict.fromkeys(names.get(o, STRANGER) for o in flag.evidence["submissions"]))
-    recordings = [
-        {**recording, "submission": names.get(recording["submission"], STRANGER)}
-        for recording in flag.evidence["recordings"]
-    ]
+    evidence: dict[str, Any] = {"submissions": others}
+    for kind in ("recordings", "tables"):
+        evidence[kind] = [
+            {**one, "submission": names.get(one["submission"], STRANGER)}
+            for one in flag.evidence.get(kind, ())
+        ]
     return Flag(
         code=flag.code,
         parameters=flag.parameters,
-        message=shared_message(recordings, others),
-        evidence={"submissions": others, "recordings": recordings},
+        message=shared_message(evidence),
+        evidence=evidence,
     )
 
 

@@ -65,7 +65,7 @@ def class_page(
             ],
         ),
         ("mistakes", "Most common mistakes", lambda page: _mistakes(page, lines)),
-        ("shared", "Shared recordings", lambda page: _shared(page, lines, clusters)),
+        ("shared", "Shared recordings and numbers", lambda page: _shared(page, lines, clusters)),
         ("criteria", "Criteria", lambda page: _criteria(page, graded, rubric)),
         ("class", "Everybody", lambda page: _everybody(page, lines)),
     ]
@@ -201,7 +201,7 @@ def _mistakes(page: PageBuilder, lines: Sequence[Line]) -> list[Block]:
 
 
 def _shared(page: PageBuilder, lines: Sequence[Line], clusters: Sequence[Cluster]) -> list[Block]:
-    """Return the table of shared recordings, grouped by clusters of submissions."""
+    """Return the table of what is shared, grouped by clusters of submissions."""
     if not clusters:
         return []
     here = {line.submission for line in lines}

@@ -11,7 +11,7 @@ from typing import Any
 from pipeline import __version__
 from pipeline.grading.grade import Criterion, Flag, Grade, Outcome
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.similarity.shared import student_message
+from pipeline.grading.similarity.flag import student_message
 from pipeline.grading.words import WORDS, person_lines, points_text
 from pipeline.names import read_name
 from pipeline.report.document import (

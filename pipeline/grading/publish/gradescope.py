@@ -13,7 +13,7 @@ from collections.abc import Collection
 from pipeline.grading.grade import CODES, Code, Criterion, Grade
 from pipeline.grading.judge.costs import find_remarks
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.similarity.shared import student_message
+from pipeline.grading.similarity.flag import student_message
 from pipeline.grading.words import WORDS, person_lines, points_text
 from pipeline.words.text import with_symbols
 

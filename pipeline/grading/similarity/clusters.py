@@ -1,4 +1,4 @@
-"""Group the submissions of a class that share recordings."""
+"""Group the submissions of a class that share recordings or tables of numbers."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,11 +12,11 @@ from pipeline.grading.grade import Flag
 
 @dataclass(frozen=True, kw_only=True)
 class Cluster:
-    """Submissions that are connected by shared recordings.
+    """Submissions that are connected by shared recordings or tables.
 
     Attributes
     ----------
-    recordings : each shared recording, as a list of (submission, experiment).
+    recordings : each shared recording or table, as a list of (submission, experiment or table).
     """
 
     recordings: tuple[tuple[tuple[str, str], ...], ...]
@@ -27,7 +27,7 @@ class Cluster:
         return tuple(sorted({name for recording in self.recordings for name, _ in recording}))
 
     def by_submissions(self) -> dict[tuple[str, ...], list[str]]:
-        """Return the shared recordings in words, by the submissions that contain them."""
+        """Return what is shared in words, by the submissions that contain them."""
         found: dict[tuple[str, ...], list[str]] = defaultdict(list)
         for recording in self.recordings:
             (_, first), *_ = recording
@@ -48,6 +48,11 @@ def find_clusters(flags: Mapping[str, Flag]) -> list[Cluster]:
         ((name, mine["experiment"]), (mine["submission"], mine["other_experiment"]))
         for name, flag in flags.items()
         for mine in flag.evidence["recordings"]
+    ]
+    pairs += [
+        ((name, f"reported.{mine['table']}"), (mine["submission"], f"reported.{mine['table']}"))
+        for name, flag in flags.items()
+        for mine in flag.evidence.get("tables", ())
     ]
     recordings: dict[str, list[tuple[tuple[str, str], ...]]] = defaultdict(list)
     for recording in _joined(pairs):

@@ -7,14 +7,12 @@ Without them, a pair of submissions is judged as a whole, by the noise of most o
 
 from collections import Counter, defaultdict
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from itertools import zip_longest
-from typing import Any
 
 import numpy as np
 
-from pipeline.grading.grade import Flag
 from pipeline.grading.gradings import Member
 from pipeline.grading.intake.lms_names import same_number
 from pipeline.grading.similarity.likeness import (
@@ -33,7 +31,6 @@ from pipeline.grading.similarity.noise import (
     usual,
 )
 from pipeline.grading.similarity.prints import PASSED, Print, unpack
-from pipeline.words.numbers import first_few
 
 _WIDTH = 512  # samples around an anchor that the first comparison uses
 _BEFORE = 128  # number of these samples that precede the anchor
@@ -174,46 +171,6 @@ def _record_of(one: Likeness, mine: int, other: int, *, submission: str) -> Shar
         time=one.times[mine],
         other_time=one.times[other],
     )
-
-
-def shared_flag(records: Sequence[SharedRecord]) -> Flag:
-    """Return the flag of one submission for its shared recordings."""
-    recordings = [asdict(record) for record in records]
-    others = list(dict.fromkeys(record.submission for record in records))
-    return Flag(
-        code="shared_data",
-        parameters=tuple(dict.fromkeys(record.experiment for record in records)),
-        message=shared_message(recordings, others),
-        evidence={"submissions": others, "recordings": recordings},
-    )
-
-
-def shared_message(recordings: Sequence[Mapping[str, Any]], others: Iterable[str]) -> str:
-    """Return the sentence about recordings in other submissions, with the best evidence.
-
-    Parameters
-    ----------
-    recordings : the recordings in the evidence of a flag; some from an older gradebook have no
-        times.
-    """
-    experiments = list(dict.fromkeys(one["experiment"] for one in recordings))
-    are = "is" if len(experiments) == 1 else "are"
-    best = max(recordings, key=lambda one: (one.get("equal_rows", 0), one["sigmas"]))
-    when = " from {:g} s to {:g} s".format(*best["time"]) if "time" in best else ""
-    rows = best.get("equal_rows", 0)
-    same = f"{rows} consecutive rows are equal" if rows else "the noise is the same"
-    return (
-        f"{first_few(experiments, 4)} {are} also in {', '.join(others)}: "
-        f"{same},{when} in {best['experiment']}. "
-        "This does not show whose recording it is; if it was shared for a reason, say so."
-    )
-
-
-def student_message(flag: Flag) -> str:
-    """Return the message of a flag as students see it, without the name of another submission."""
-    if flag.code != "shared_data":
-        return flag.message
-    return shared_message(flag.evidence["recordings"], ["another submission"])
 
 
 def same_team(a: Member, b: Member) -> bool:

@@ -9,8 +9,9 @@ import pytest
 
 from pipeline.grading.gradings import Member
 from pipeline.grading.similarity import shared
+from pipeline.grading.similarity.flag import shared_flag
 from pipeline.grading.similarity.prints import fingerprint, unpack
-from pipeline.grading.similarity.shared import find_shared, same_recordings, shared_flag
+from pipeline.grading.similarity.shared import find_shared, same_recordings
 from pipeline.ingest.read import read_data
 from pipeline.simulated.bench import COUNT
 from pipeline.simulated.hidden import preset_bench

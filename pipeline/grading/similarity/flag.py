@@ -1,0 +1,86 @@
+"""The flag of a submission that shares recordings or tables of numbers with another one."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+from pipeline.grading.grade import Flag
+from pipeline.grading.similarity.shared import SharedRecord
+from pipeline.grading.similarity.tables import SharedTable
+from pipeline.words.numbers import first_few, listing
+
+
+def shared_flag(records: Sequence[SharedRecord], tables: Sequence[SharedTable] = ()) -> Flag:
+    """Return the flag of one submission for its shared recordings and tables."""
+    found = [*records, *tables]
+    evidence = {
+        "submissions": _submissions(map(asdict, found)),
+        "recordings": [asdict(record) for record in records],
+        "tables": [asdict(table) for table in tables],
+    }
+    what = [record.experiment for record in records] + [table.table for table in tables]
+    return Flag(
+        code="shared_data",
+        parameters=tuple(dict.fromkeys(what)),
+        message=shared_message(evidence),
+        evidence=evidence,
+    )
+
+
+def shared_message(evidence: Mapping[str, Any], *, other: str = "") -> str:
+    """Return the sentences about what other submissions contain too, with the best evidence.
+
+    Parameters
+    ----------
+    evidence : evidence of a flag; an older gradebook has no tables and no times in it.
+    other : words for every other submission; "" to name them.
+    """
+    recordings, tables = evidence["recordings"], evidence.get("tables", ())
+    said = []
+    if recordings:
+        said.append(_recordings_message(recordings, other=other))
+    if tables:
+        said.append(_tables_message(tables, other=other))
+    whose = (
+        "whose recording it is; if it was" if recordings else "whose numbers they are; if they were"
+    )
+    return f"{' '.join(said)} This does not show {whose} shared for a reason, say so."
+
+
+def _recordings_message(recordings: Sequence[Mapping[str, Any]], *, other: str) -> str:
+    experiments = list(dict.fromkeys(one["experiment"] for one in recordings))
+    are = "is" if len(experiments) == 1 else "are"
+    best = max(recordings, key=lambda one: (one.get("equal_rows", 0), one["sigmas"]))
+    when = " from {:g} s to {:g} s".format(*best["time"]) if "time" in best else ""
+    rows = best.get("equal_rows", 0)
+    same = f"{rows} consecutive rows are equal" if rows else "the noise is the same"
+    others = other or ", ".join(_submissions(recordings))
+    return (
+        f"{first_few(experiments, 4)} {are} also in {others}: "
+        f"{same},{when} in {best['experiment']}."
+    )
+
+
+def _tables_message(tables: Sequence[Mapping[str, Any]], *, other: str) -> str:
+    """Return the sentence about shared tables, with the counts of the most similar submission."""
+    names = list(dict.fromkeys(one["table"] for one in tables))
+    by = {name: [t for t in tables if t["submission"] == name] for name in _submissions(tables)}
+    equal, of = max(
+        (sum(t["equal"] for t in own), sum(t["of"] for t in own)) for own in by.values()
+    )
+    report = "tables report" if len(names) > 1 else "table reports"
+    others = other or ", ".join(by)
+    agree = f"all {of} are equal" if equal == of else f"{equal} of {of} are equal"
+    return f"The {listing(names)} {report} the same numbers as {others}: {agree}."
+
+
+def _submissions(found: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Return the other submissions, each once."""
+    return list(dict.fromkeys(one["submission"] for one in found))
+
+
+def student_message(flag: Flag) -> str:
+    """Return the message of a flag as students see it, without the name of another submission."""
+    if flag.code != "shared_data":
+        return flag.message
+    return shared_message(flag.evidence, other="another submission")
