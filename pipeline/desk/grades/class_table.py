@@ -24,6 +24,7 @@ from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.feedback import feedback_page
 from pipeline.grading.publish.outputs import doubles_of
 from pipeline.grading.similarity.clusters import find_clusters, renamed
+from pipeline.grading.similarity.distant import find_distant, recomputed_numbers
 from pipeline.grading.words import WORDS, points_text, signed_points
 from pipeline.report.figures.grading import distribution_figure
 from pipeline.report.figures.style import drawing
@@ -203,8 +204,19 @@ def show_class_page(ask: Ask) -> Response:
             gradings={name: one.grading for name, one in own.items()},
             names=shown.names,
         )
-        lines = [team.line for team in teams]
-        return class_page(lines, rubric=shown.rubric, doubles=doubles, clusters=clusters)
+        names = {team.submission: team.line.submission for team in teams}
+        numbers = {
+            names[entry.submission]: recomputed_numbers(entry.grade, rubric=shown.rubric)
+            for entry in book.entries()
+            if entry.submission in names
+        }
+        return class_page(
+            [team.line for team in teams],
+            rubric=shown.rubric,
+            doubles=doubles,
+            clusters=clusters,
+            distant=find_distant(numbers),
+        )
 
     return show_own_page(ask.desk.books.drawn(ask.place_or_404(), "class", draw))
 

@@ -15,6 +15,7 @@ from pipeline.grading.gradebook.class_lines import Line, class_frame, wrong_spri
 from pipeline.grading.references.tolerance import exact
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.clusters import Cluster
+from pipeline.grading.similarity.distant import Distant
 from pipeline.grading.similarity.doubles import Double
 from pipeline.grading.words import WORDS, on_one_line, points_text, signed_points
 from pipeline.report.document import (
@@ -49,6 +50,7 @@ def class_page(
     rubric: Rubric,
     doubles: Sequence[Double] = (),
     clusters: Sequence[Cluster] = (),
+    distant: Sequence[Distant] = (),
 ) -> str:
     """Return `class.html`; the same class gives the same bytes."""
     frame = class_frame(lines, rubric=rubric)
@@ -61,7 +63,7 @@ def class_page(
             lambda page: [
                 *_board(lines, points, rubric),
                 *_points(page, points, rubric),
-                *_to_look_at(lines, doubles),
+                *_to_look_at(lines, doubles, distant),
             ],
         ),
         ("mistakes", "Most common mistakes", lambda page: _mistakes(page, lines)),
@@ -101,8 +103,10 @@ def _board(lines: Sequence[Line], points: "pd.Series", rubric: Rubric) -> list[B
     return [Tiles(tuple(tiles))]
 
 
-def _to_look_at(lines: Sequence[Line], doubles: Sequence[Double]) -> list[Block]:
-    """Return what the instructor should look at: springs, failures, authors in several teams."""
+def _to_look_at(
+    lines: Sequence[Line], doubles: Sequence[Double], distant: Sequence[Distant]
+) -> list[Block]:
+    """Return what to look at: springs, failures, authors in several teams, unusual carts."""
     failed = [line for line in lines if line.status == "failed"]
     blocks: list[Block] = []
     if asked := wrong_springs(line.springs for line in lines if line.status == "graded"):
@@ -124,6 +128,9 @@ def _to_look_at(lines: Sequence[Line], doubles: Sequence[Double]) -> list[Block]
     if doubles:
         several = bullet_list(spans(f"{double}.") for double in doubles)
         blocks += [paragraph(WORDS.text("doubles")), several]
+    if distant:
+        others = bullet_list(spans(_link(one.submission), f": {one}.") for one in distant)
+        blocks += [paragraph(WORDS.text("distant")), others]
     return blocks
 
 

@@ -18,6 +18,7 @@ from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.feedback import feedback_page
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.clusters import find_clusters, renamed
+from pipeline.grading.similarity.distant import Quantity, find_distant, recomputed_numbers
 from pipeline.grading.similarity.doubles import Double, find_doubles, with_recordings
 from pipeline.grading.words import on_one_line
 from pipeline.output import csv_text, own_folder, write_file
@@ -51,12 +52,14 @@ def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) ->
     gradings: dict[str, int] = {}
     authors: dict[str, tuple[str, ...]] = {}
     shared: dict[str, Flag] = {}
+    numbers: dict[str, dict[Quantity, float]] = {}
     for entry in book.entries():
         shared |= dict(
             (entry.submission, flag) for flag in entry.grade.flags if flag.code == "shared_data"
         )
         grade = anonymise(entry.grade, names) if names is not None else entry.grade
         lines.append(Line.of(grade))
+        numbers[grade.submission] = recomputed_numbers(grade, rubric=rubric)
         gradings[entry.submission], authors[entry.submission] = entry.grading, entry.grade.authors
         now_of[grade.submission] = _digest(layout, entry.key, repr(grade))
         own = own_folder(folder, _checked(grade.submission))
@@ -83,9 +86,11 @@ def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) ->
     clusters = find_clusters(shared)
     if names is not None:
         clusters = renamed(clusters, names, other=STRANGER)
-    now_of[_WHOLE] = _digest(layout, repr((lines, doubles, clusters)), *now_of.values())
+    distant = find_distant(numbers)
+    whole = lines, doubles, clusters, distant
+    now_of[_WHOLE] = _digest(layout, repr(whole), *now_of.values())
     if made_of.get(_WHOLE) != now_of[_WHOLE] or not (out / _CLASS).is_file():
-        page = class_page(lines, rubric=rubric, doubles=doubles, clusters=clusters)
+        page = class_page(lines, rubric=rubric, doubles=doubles, clusters=clusters, distant=distant)
         write_file(out / _CLASS, page)
     write_file(
         folder / _MADE, json.dumps(now_of, indent=0, ensure_ascii=False, sort_keys=True) + "\n"
