@@ -511,6 +511,7 @@ CheckKind = Literal[
     "physical",
     "vanishing",
     "springs",
+    "groups",
     "redundancy",
     "order",
     "repeats",
@@ -521,6 +522,19 @@ CheckKind = Literal[
     "hardware",
     "feedback",
 ]
+
+# Kinds of check of the set-up, the most serious first
+_CAUSES: tuple[CheckKind, ...] = (
+    "input",
+    "springs",
+    "position_unit",
+    "input_unit",
+    "position_scale",
+    "input_scale",
+    "groups",
+    "setup",
+    "held",
+)
 
 
 @result()
@@ -721,6 +735,15 @@ class LeftOut:
 
 
 @result()
+class RecordingGroup:
+    """Recordings that one set of carts explains, and the numbers that other groups contradict."""
+
+    experiments: tuple[str, ...] = written()
+    values: dict[str, float] = written("m_1, k_2, omega_1, …")
+    std: dict[str, float] = written("standard errors")
+
+
+@result()
 class Assumption:
     """A statement about the bench that every number depends on, and whether the data support it."""
 
@@ -894,6 +917,7 @@ class Analysis:
     discussion: str | None
     left_out: tuple[LeftOut, ...] = ()
     late_channels: tuple[LateChannel, ...] = ()
+    groups: tuple[RecordingGroup, ...] = ()
     reported: Mapping[str, Mapping[str, Decimal]] = field(default_factory=dict)
 
     @property
@@ -916,3 +940,12 @@ class Analysis:
     def failed_checks(self) -> tuple[Check, ...]:
         """The checks that failed: each is a reason to doubt the numbers."""
         return tuple(check for check in self.checks if check.outcome == "fail")
+
+    @property
+    def causes(self) -> tuple[Check, ...]:
+        """The failed checks of the set-up, the most serious first.
+
+        If the set-up is wrong, right carts do not explain the recordings.
+        """
+        failed = [check for check in self.failed_checks if check.kind in _CAUSES]
+        return tuple(sorted(failed, key=lambda check: _CAUSES.index(check.kind)))

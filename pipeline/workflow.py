@@ -15,6 +15,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.interventions import find_interventions
 from pipeline.identify.assumptions import list_assumptions
 from pipeline.identify.carts import compare_estimates
+from pipeline.identify.groups import check_groups, find_groups
 from pipeline.identify.log import Log
 from pipeline.identify.remarks import gain_sign_warning, hand_remarks, reading_remarks
 from pipeline.identify.sound import identify_from_sound
@@ -76,7 +77,13 @@ def analyse(
     # A spring that the static gains show to be missing also vanishes from the fit.
     named = {check.parameter for check in springs}
     vanished = {c.id for c in checks if c.kind == "vanishing" and c.parameter in named}
-    checks = (*springs, *(check for check in checks if check.id not in vanished))
+    used = sound_ones(data.records, left_out)
+    groups = () if springs else find_groups(found, records=used, rows=rows, bench=bench)
+    checks = (
+        *springs,
+        *check_groups(groups),
+        *(check for check in checks if check.id not in vanished),
+    )
 
     analysis = Analysis(
         title=submission.title,
@@ -101,6 +108,7 @@ def analyse(
         unexplained={name: one.share for name, one in found.fitted.fits.items()},
         discussion=submission.discussion,
         left_out=tuple(left_out),
+        groups=groups,
         late_channels=late,
         reported=submission.typed,
         assumptions=list_assumptions(submission, data=data, fit=found.fit, checks=checks),

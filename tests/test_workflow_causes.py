@@ -1,6 +1,9 @@
 """The first cause that a report names: wrong springs and units before anything that follows."""
 
 import re
+import shutil
+from dataclasses import replace
+from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
@@ -73,3 +76,24 @@ def test_a_unit_wrong_by_a_power_of_ten_is_the_first_cause(tmp_path, scale):
     assert analysis.failed_checks[0].id == "position_unit"
     assert f"{scale:g} times a count" in terminal_summary(analysis)
     assert "unit of the positions" in first_step(analysis)
+
+
+@pytest.mark.parametrize("heavy", ["s[tw]", "decay-1", "none"])
+def test_recordings_of_heavier_carts_are_named(tmp_path, heavy):
+    """Steps, or decays, made with 1.5 times the first mass are a group with their own numbers."""
+    light = bench_of((0.06, 0.08, 0.05))
+    masses = np.array([1.5, 1.0]) * light.chain.m
+    write_submission(tmp_path / "lab", light, seed=3)
+    other = SimulatedBench(chain=replace(light.chain, m=masses))
+    write_submission(tmp_path / "other", other, seed=3)
+    for path in (tmp_path / "other" / "data").glob(f"{heavy}*.csv"):
+        shutil.copy(path, tmp_path / "lab" / "data" / path.name)
+    analysis = analyse(load_submission(tmp_path / "lab"), design=False)
+    assert [check.kind for check in analysis.causes] == ([] if heavy == "none" else ["groups"])
+    if heavy != "none":
+        first, second = analysis.groups
+        assert all(fnmatch(name, f"{heavy}*") for name in second.experiments)
+        (name,) = first.values
+        # A mass 1.5 times as large lowers the cart's frequency by the square root of 1.5.
+        ratio = 1.5 if name == "m_1" else 1.5**-0.5
+        assert second.values[name] / first.values[name] == pytest.approx(ratio, rel=0.02)

@@ -33,8 +33,6 @@ def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
         False: ("fail", "disagree"),
         None: ("skip", "are too uncertain to compare"),
     }
-    gains = [row.consistent for row in rows if read_name(row.name).is_gain]
-    springs_agree = all(gains) and bool(gains)
     checks = []
     for row in rows:
         if row.change_percent is None or (row.consistent is None and row.change_sigmas is None):
@@ -44,9 +42,7 @@ def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
         sigmas = (
             "" if row.change_sigmas is None else f", or {row.change_sigmas:.1f} standard errors"
         )
-        advice = ""
-        if outcome == "fail":
-            advice = _other_masses(row) if springs_agree else _advice(row)
+        advice = _advice(row) if outcome == "fail" else ""
         same = "" if row.independent is not False else " Both use the same recordings."
         checks.append(
             Check(
@@ -104,14 +100,6 @@ def wanted_dwells(coverage: Coverage) -> str:
         for scale in (1.0, 2 * np.pi)
     ]
     return f"{by_unit[0]} rad/s ({by_unit[1]} Hz)"
-
-
-def _other_masses(row: ParameterRow) -> str:
-    """Return advice on a number that differs although all static gains, and so springs, agree."""
-    if not read_name(row.name).is_frequency or row.initial is None:
-        return _advice(row)
-    runs = abridge(row.initial.experiments)
-    return f" The static gains agree, so the springs do. Were there other masses in {runs}?"
 
 
 def _advice(row: ParameterRow) -> str:

@@ -59,11 +59,14 @@ def investigate(analysis: Analysis, *, progress: Progress, budget: float | None 
         compile_simulator()
     compile_follower()
     gap = explain_gap(records, analysis.bench, chain=start, budget=budget, progress=progress)
+    used = {*gap.training, *gap.held_out}
     return replace(
         gap,
         title=analysis.title,
         provenance=analysis.provenance,
         left_out=analysis.left_out,
+        groups=analysis.groups,
+        causes=tuple(c for c in analysis.causes if not c.run or c.run in used),
         notes=(*notes, *gap.notes),
     )
 

@@ -11,7 +11,14 @@ from pipeline.errors import ConfigError
 from pipeline.json_files import Number, computed, read_json, result, written
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects import AugmentedChain, Effect, find_effect
-from pipeline.results import ChainWithUnits, Intervention, LeftOut, Provenance
+from pipeline.results import (
+    ChainWithUnits,
+    Check,
+    Intervention,
+    LeftOut,
+    Provenance,
+    RecordingGroup,
+)
 from pipeline.set_up import Bench, Units
 from pipeline.submission.complaints import first_refusal, quote
 
@@ -271,6 +278,17 @@ class Gap:
         "another search may find more",
         older=True,
         default=True,
+    )
+    causes: tuple[Check, ...] = written(
+        "failed checks of the set-up, which may cause the gap, the most serious first; effects "
+        "count only once the set-up is right",
+        older=(),
+        default=(),
+    )
+    groups: tuple[RecordingGroup, ...] = written(
+        "groups of recordings that want different carts, the largest first",
+        older=(),
+        default=(),
     )
     effects: tuple[FoundEffect, ...] = written(
         "verdict `ambiguous`: the rivals of the last effect explain as much. Verdict `partial`: "

@@ -44,6 +44,10 @@ def list_effects(
             for key, h in same_size.items()
             if key != chosen.key and (rest < key or not key & chosen.key)
         ]
+        # Each effect is listed once, with the best hypothesis in which it takes this one's place.
+        by_name: dict[tuple[str, int], Hypothesis] = {}
+        for h in sorted(rivals, key=lambda h: h.bic):
+            by_name.setdefault(_stand_in(added, h.key - rest), h)
         # If the cost has many narrow minima, its curvature does not give the standard error.
         rugged = term.effect.contact and final.chi > AT_FLOOR
         known = None if std is None or rugged else std[structure.span(index)]
@@ -59,8 +63,8 @@ def list_effects(
                 nrmse_before=before.error,
                 nrmse_after=after.error,
                 rivals=tuple(
-                    _rival(_stand_in(added, h.key - rest), h, weight[h.key] / total)
-                    for h in sorted(rivals, key=lambda h: h.bic)[:_MOST_RIVALS]
+                    _rival(key, h, weight[h.key] / total)
+                    for key, h in list(by_name.items())[:_MOST_RIVALS]
                 ),
             )
         )

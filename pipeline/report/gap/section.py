@@ -43,7 +43,7 @@ _MOST_RUNS = 4
 def gap_in_short(gap: Gap) -> list[Block]:
     """Return the verdict as one paragraph with a link to its section."""
     name = listing([effect_name(found.effect, found.where) for found in gap.effects])
-    names = f" ({name})" if name and gap.verdict in ("named", "partial") else ""
+    names = f" ({name})" if name and gap.verdict in ("named", "partial") and not gap.causes else ""
     sentence = WORDS.spans(
         "in_short" if gap.effects else "in_short_linear",
         verdict=f"{verdict_title(gap)}{names}",

@@ -82,7 +82,7 @@ def build_gap_document(gap: Gap, analysis: Analysis, *, progress: Progress = sil
     for i, found in enumerate(gap.effects):
         name = effect_name(found.effect, found.where)
         title = name
-        if gap.verdict == "unexplained":
+        if gap.verdict == "unexplained" or gap.causes:
             title = WORDS.text("suspect", name=name)
         elif gap.verdict == "ambiguous" and found is contenders(gap)[0]:
             title = WORDS.text("one_explanation", name=name)

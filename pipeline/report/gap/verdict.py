@@ -12,7 +12,7 @@ from pipeline.report.document import Block, Tile, Tiles, Tone, bullet_list, para
 from pipeline.words.numbers import count, listing, significant, unit_text, with_error
 from pipeline.words.phrases import phrases
 from pipeline.words.spans import Spans, spans
-from pipeline.words.text import capital, clean
+from pipeline.words.text import capital, clean, rich
 
 WORDS = phrases("gap")
 
@@ -30,7 +30,9 @@ def whole_model(gap: Gap) -> str:
 
 
 def verdict_title(gap: Gap) -> str:
-    """Return the verdict in a few words."""
+    """Return the verdict in a few words; a set-up in doubt comes before any other cause."""
+    if gap.causes and gap.verdict != "none":
+        return WORDS.text("title_causes")
     undecided = gap.verdict == "unexplained" and not gap.complete
     return WORDS.text("title_undecided" if undecided else f"title_{gap.verdict}")
 
@@ -59,7 +61,14 @@ def _tile(key: str, error: float, **values: str) -> Tile:
 
 
 def verdict_blocks(gap: Gap) -> list[Block]:
-    """Return what explains the gap and how well; for `ambiguous`, both explanations."""
+    """Return what explains the gap and how well; for `ambiguous`, both explanations.
+
+    Doubts about the set-up come first, because a wrong set-up looks like missing physics.
+    """
+    causes: list[Block] = []
+    if gap.causes:
+        told = " ".join(dict.fromkeys(clean(check.message) for check in gap.causes))
+        causes = [paragraph(WORDS.spans("causes", messages=rich(told)))]
     so_far = [] if gap.complete else [paragraph(WORDS.spans("so_far"))]
     match gap.verdict:
         case "none":
@@ -72,7 +81,7 @@ def verdict_blocks(gap: Gap) -> list[Block]:
             blocks = _ambiguous(gap)
         case "unexplained":
             blocks = [_unexplained(gap)]
-    return [*so_far, *blocks]
+    return [*causes, *so_far, *blocks]
 
 
 def scope_blocks(gap: Gap, *, position: str, drive: str) -> list[Block]:

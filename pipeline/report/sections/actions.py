@@ -23,6 +23,7 @@ _WORST_FIRST = (
     "input_unit",
     "position_scale",
     "input_scale",
+    "groups",
     "setup",
     "held",
     "dwells",
