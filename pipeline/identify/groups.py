@@ -18,7 +18,7 @@ from pipeline.words.phrases import phrases
 
 _WORDS = phrases("checks")
 # Share of a recording's power that the chain of its group may leave. A chain fitted to one step is
-# slightly off; a mass that is 10 % off leaves more.
+# slightly off, but much less than one with a mass that is 10 % off.
 _OWN = 0.01
 _DIFFERENT = 0.05  # relative difference of a mass or spring that matters
 _MOST_SEEDS = 8  # recordings from which a group is started
@@ -34,16 +34,16 @@ def find_groups(
     """Return the groups of recordings that want different carts, the largest first.
 
     There are groups only if the carts of each group explain its recordings down to the noise, and
-    no set of carts explains them all. Hidden physics leaves more. If the driven recordings follow
-    a fit that explains its data, only the decays are compared with it.
+    no set of carts explains them all. With hidden physics, a residual remains. If the
+    driven recordings follow a fit that explains its data, only the decays are compared with it.
     """
     fit = found.fit
-    explained = fit is not None and fit.converged and fit.explains_data
+    explained = fit if fit and fit.converged and fit.explains_data else None
     fits = found.fitted.fits
     if explained and all(fits[r.id].belongs for r in records if r.id in fits):
-        return _against_decays(fit, found=found, rows=rows)
+        return _against_decays(explained, found=found, rows=rows)
     driven = [r for r in records if is_driven(r) and len(r.free) == len(r.carts) == bench.n]
-    start = fit.chain if fit and explained else None
+    start = explained and explained.chain
     groups: list[tuple[list[Record], ChainFit]] = []
     rest = driven
     while len(rest) > (1 - _ENOUGH) * len(driven):
