@@ -67,9 +67,8 @@ def design_feedback(chain: Chain, task: Design) -> FeedbackDesign:
 
     Raises
     ------
-    DataError : there is no such cart or no step, a cart is out of reach, no design can be computed
-        for the chain, every design overshoots more than the carts without feedback, or the run
-        takes too many ticks.
+    DataError : there is no such cart or step, a cart is out of reach, no design can be computed,
+        every design overshoots more than no feedback, or the run takes too many ticks.
     """
     if not 1 <= task.cart <= chain.n:
         raise DataError(f"state feedback needs a cart from 1 to {chain.n}, found {task.cart}")

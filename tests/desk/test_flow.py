@@ -2,6 +2,7 @@
 
 import asyncio
 import tomllib
+from typing import Any
 
 import pytest
 import tomlkit
@@ -32,7 +33,7 @@ class Requests:
         """Send a request; return the status of its answer."""
         parts, status = list(body), [0]
 
-        async def receive():
+        async def receive() -> Any:
             return parts.pop(0) if parts else await asyncio.Event().wait()
 
         async def send(message) -> None:

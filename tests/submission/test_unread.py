@@ -13,10 +13,12 @@ from pipeline.submission.edit import edit_submission
 from pipeline.workflow import analyse
 from tests.helpers.commandline import cartlab_here
 
-TEXT = """\
+HEAD = """\
 version = 1
 [system]
 carts = 2
+"""
+TABLES = """\
 [reported.initial]
 K_1 = 25.6
 omega_a = 10.0
@@ -31,6 +33,7 @@ B = [0, 3196.70, 0, 0]
 gains = [1, 2, 3, 4]
 prefilter = 2.5
 """
+TEXT = HEAD + TABLES
 ROWS = TEXT.replace("[[0, 1", "[\n  [0, 1").replace("], [", "],\n  [").replace("-6]]", "-6]\n]")
 
 
