@@ -1,6 +1,7 @@
 """The desk as a web application: the table of its addresses, and the server that answers them."""
 
 import asyncio
+import re
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from inspect import iscoroutinefunction
@@ -75,6 +76,9 @@ def _stop(ask: Ask) -> Response:
     return ask.back(ask.here + ("#work" if ask.here.startswith("/grades/") else "#report"))
 
 
+_BLANKS = re.compile(r"\s+")  # a line break would end the event
+
+
 async def _stream_events(ask: Ask) -> Response:
     """Return a stream of events that report the work in the place that the URL names."""
     return StreamingResponse(_events(ask, ask.place_or_404()), media_type="text/event-stream")
@@ -87,7 +91,7 @@ async def _events(ask: Ask, place: Any) -> AsyncIterator[str]:
         if job.version != version:
             version, quiet = job.version, 0.0
             shown = await run_in_threadpool(lambda: ask.job) or job
-            message = " ".join(shown.message.split())
+            message = _BLANKS.sub(" ", shown.message).strip()
             yield f"event: {'end' if job.over else 'stage'}\ndata: {message}\n\n"
         elif quiet > 5.0:  # s without an event; the line sent then keeps the connection open
             quiet = 0.0

@@ -290,10 +290,10 @@ def _contradictions(
             if not matching((pattern,), names):
                 yield ("required", table), f"no parameter {pattern!r}{_nearest(pattern, names)}"
     by_person = {criterion.id for criterion in found.criteria if isinstance(criterion, Manual)}
-    seen: set[object] = set()
+    seen: set[str] = set()
     known_ids = [id_ for id_ in ids if isinstance(id_, str)]
     for i, (id_, criterion) in enumerate(zip(ids, found.criteria, strict=True)):
-        if id_ is not None and id_ in seen:
+        if isinstance(id_, str) and id_ in seen:
             yield ("criteria", i, "id"), f"{id_!r} was used before"
         if isinstance(criterion, Manual) and criterion.requires:
             yield ("criteria", i, "requires"), "has no effect, because a person grades this"
@@ -305,7 +305,8 @@ def _contradictions(
                 where = "comes later" if parent in ids else "is not a criterion"
                 known = "" if parent in ids else nearest(parent, known_ids)
                 yield ("criteria", i, "requires"), f"{parent!r} {where}{known}"
-        seen.add(id_)
+        if isinstance(id_, str):
+            seen.add(id_)
         points = criterion.points
         if points != round(points, 2):
             yield ("criteria", i, "points"), f"{points:g}: points have at most two decimals"

@@ -49,7 +49,7 @@ def test_a_damping_fitted_as_zero_is_judged_by_the_decays():
     """
     team = make_team(30)
     assert team.analysis.chain is not None
-    wrong = team.reporting(final={"zeta": Decimal("0.031")}).grade()
+    wrong = team.reporting(final={"zeta": Decimal("0.021")}).grade()
     assert [flag.code for flag in wrong.flags] == ["final_off"]
     assert wrong.flags[0].evidence["recomputed"] == pytest.approx(0.00316, rel=0.1)
 

@@ -490,12 +490,12 @@ def test_any_part_may_be_missing(part, tmp_path):
     page, _ = render(replace(analysis, **{part: empty}), tmp_path, pdf=False)
     assert "Summary" in page.text
     assert "Provenance" in page.text
-    assert not re.search(r"\b(None|nan|inf)\b", page.text)
+    text = page.text.replace("norm(feedback(1, L), inf)", "")  # MATLAB's name of a norm
+    assert not re.search(r"\b(None|nan|inf)\b", text)
 
 
 @pytest.mark.parametrize(
-    "part",
-    ["log_decrements", "step_gains", "sine_points", "frequency_responses", "feedback", "hardware"],
+    "part", ["log_decrements", "step_gains", "sine_points", "frequency_responses", "hardware"]
 )
 def test_results_of_a_single_stage_give_a_report(part, tmp_path):
     """The results of a single stage, with their recordings, give a page and a PDF."""
@@ -709,28 +709,6 @@ def test_estimates_too_uncertain_to_compare_are_both_given():
     text = terminal_summary(replace(analysis, rows=(open_, *others)))
     assert "K (initial 29.00 ± 0.10, final 35.0 ± 3.5)" in text
     assert "Too uncertain" not in terminal_summary(analysis)
-
-
-def test_steps_that_contradict_the_fit_ask_about_the_springs():
-    """If steps contradict a fit with few springs, the summary says to check the springs.
-
-    It does not say so if all springs are declared or if the fit is good.
-    """
-    analysis = make_analysis(2)
-    assert analysis.fit is not None
-    smooth = tuple(replace(decay, friction=None) for decay in analysis.log_decrements)
-    rows = tuple(replace(row, consistent=not row.name.startswith("K")) for row in analysis.rows)
-    poor = replace(analysis.fit, chi_square_per_dof=1e6)
-    asked = replace(
-        analysis,
-        bench=Bench(springs=(True, True, False)),
-        rows=rows,
-        fit=poor,
-        log_decrements=smooth,
-    )
-    assert "Check springs" in terminal_summary(asked)
-    for other in ({"bench": Bench(springs=(True, True, True))}, {"fit": analysis.fit}):
-        assert "Check springs" not in terminal_summary(replace(asked, **other))
 
 
 def test_a_wrong_sign_is_named_first():

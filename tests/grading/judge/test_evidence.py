@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.grading.grade import Criterion, Grade
 from pipeline.grading.judge.run import grade_submission
-from pipeline.grading.rubric import Rubric
+from pipeline.grading.rubric import FlagCost, Rubric
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
@@ -27,7 +27,7 @@ def folder(tmp_path_factory):
 def rubric(data_problem: float) -> Rubric:
     """Return the shipped rubric, with another least cost of a bad recording."""
     shipped = load_rubric(Path("throne-2dof"))
-    flags = shipped.flags.model_copy(update={"data_problem": data_problem})
+    flags = shipped.flags.model_copy(update={"data_problem": FlagCost(least=data_problem)})
     return shipped.model_copy(update={"flags": flags, "step": 0.01})
 
 
