@@ -310,9 +310,10 @@ def _erase(grades: str, teams: list[str], assignment: str | None) -> None:
 
     with _changing(grades, assignment) as book:
         gone = book.erase(teams)
-    forget_repairs(Path(grades), gone)
+    folder = Path(grades).parent if Path(grades).is_file() else Path(grades)
+    forget_repairs(folder, gone)
     say(f"erased: {', '.join(gone)}")
-    if (folder := Path(grades)).is_dir() and (files := remove_exports(folder)):
+    if folder.is_dir() and (files := remove_exports(folder)):
         say(f"deleted {count(len(files), 'exported file')} that also contained them; export again")
     say("not erased: the submitted folders, backups, and files that you copied elsewhere")
 

@@ -281,6 +281,21 @@ def regrade_class(
     return "; ".join([done.counted, *(() if anonymous else done.remarks)])
 
 
+def render_notes(folder: str, *, progress: Progress) -> str:
+    """Return a team's `notes.md` as HTML; "" without notes. No text in it is markup."""
+    from pipeline.report.document import paragraph
+    from pipeline.report.render.html import render_blocks
+    from pipeline.report.sections.notes import even_headings, note_blocks
+    from pipeline.submission.load import load_notes
+
+    progress("reading the notes")
+    try:
+        blocks = even_headings(note_blocks(load_notes(Path(folder)) or ""))
+    except SubmissionError as error:
+        blocks = (paragraph(f"The notes cannot be shown: {error}"),)
+    return str(render_blocks(blocks))
+
+
 def preview_rubric(folder: str, text: str, *, progress: Progress) -> dict[str, Any]:
     """Return the points of a graded class under a different rubric; see `RubricPreview`."""
     from pipeline.grading.gradebook.book import Gradebook
@@ -298,7 +313,7 @@ TASKS: Mapping[str, Callable[..., Any]] = {
         *FOLDER_TASKS, describe_file, list_files, list_not_read, fill_tables, make_report, make_gap,
         check_numbers, propose_recordings, weigh_recording, publish_grades, regrade_class,
         preview_rubric, check_exercise, draw_effect, make_exercises, make_solution,
-        describe_exercise, make_plots,
+        describe_exercise, make_plots, render_notes,
     )
 }  # fmt: skip
 

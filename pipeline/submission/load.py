@@ -190,7 +190,7 @@ def _check(document: dict[str, Any], *, folder: Path, where: str) -> Submission:
         for experiment in submission.experiments
     )
     return submission.model_copy(
-        update={"experiments": experiments, "folder": folder, "discussion": _notes(folder)}
+        update={"experiments": experiments, "folder": folder, "discussion": load_notes(folder)}
     )
 
 
@@ -282,7 +282,7 @@ def _plain(value: object, at: tuple[int | str, ...], unusable: list[UnusableNumb
     return float(value) if isinstance(value, Decimal) else value
 
 
-def _notes(folder: Path) -> str | None:
+def load_notes(folder: Path) -> str | None:
     """Return the text of `notes.md`, shortened and without comments; None if nothing is left."""
     path, where = folder / "notes.md", f"{folder.resolve().name}/notes.md"
     if not path.exists() and not path.is_symlink():

@@ -95,8 +95,10 @@ def _limit_strangers() -> type[asyncio.Protocol]:
                 oldest.abort()
 
         def on_response_complete(self) -> None:
-            forget(self.transport)
-            if not self.transport.is_closing():
+            admitted = self.transport not in strangers
+            if admitted:
+                forget(self.transport)
+            if admitted and not self.transport.is_closing():
                 loop = asyncio.get_running_loop()
                 between[self.transport] = loop.call_later(_STRANGER_STAYS, self.transport.abort)
             super().on_response_complete()

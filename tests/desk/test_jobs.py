@@ -10,6 +10,7 @@ import psutil
 import pytest
 
 from pipeline.desk.app import DeskServer
+from pipeline.desk.flow import AT_ONCE
 from pipeline.desk.jobs import _SHORT_WORKERS, _WAITING, Busy, Jobs, WorkerPool
 from pipeline.processes import Failed, LineProcess
 from tests.helpers.desks import Visitor, a_submission, some_files, wrongs
@@ -53,18 +54,18 @@ def test_a_slow_folder_delays_no_other_folder(tmp_path):
 
 
 @pytest.mark.usefixtures("work_here")
-def test_a_stop_is_answered_while_all_threads_are_busy(tmp_path):
-    """Even if all threads are busy, a request to stop the bench is answered at once."""
+def test_a_stop_is_answered_while_all_turns_are_taken(tmp_path):
+    """Even if all turns of a person are taken, a request to stop the bench is answered at once."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
         visitor, workers = Visitor.of(server.url), server._desk.workers
         processes = [workers._free.get() for _ in range(_SHORT_WORKERS)]
         path = "/exercises/picture.svg?preset=throne-2dof&hide=nothing"
-        threads = [threading.Thread(target=visitor.get, args=(path,)) for _ in range(45)]
+        threads = [threading.Thread(target=visitor.get, args=(path,)) for _ in range(20)]
         for thread in threads:
             thread.start()
         try:
-            until(lambda: sum("AnyIO worker" in t.name for t in threading.enumerate()) >= 40)
+            until(lambda: sum("AnyIO worker" in t.name for t in threading.enumerate()) >= AT_ONCE)
             assert visitor.post("/student/0/stop").status == 303
         finally:
             for process in processes:

@@ -11,14 +11,10 @@ from markupsafe import Markup
 
 from pipeline.desk.ask import Ask
 from pipeline.desk.books import Class
-from pipeline.desk.last_report import PLOTS, PLOTS_OF, read_notes
-from pipeline.errors import SubmissionError
+from pipeline.desk.last_report import PLOTS, PLOTS_OF
 from pipeline.grading.gradebook.rows import Entry
 from pipeline.grading.intake.files import digest
 from pipeline.output import LOCK
-from pipeline.report.document import paragraph
-from pipeline.report.render.html import render_blocks
-from pipeline.report.sections.notes import even_headings, note_blocks
 from pipeline.submission.load import NAME, file_problem
 
 # Files that making the plots adds to a folder.
@@ -26,20 +22,16 @@ _ADDED = (PLOTS, PLOTS_OF, f"{Path(PLOTS).parent.name}/{LOCK}")
 _MOST_PAPERS = 20  # PDF files listed
 
 
-def show_notes(folder: Path) -> Markup:
-    """Return a team's `notes.md` as HTML; "" without notes. No text in it is markup."""
-    try:
-        blocks = even_headings(note_blocks(read_notes(folder)))
-    except SubmissionError as error:
-        blocks = (paragraph(f"The notes cannot be shown: {error}"),)
-    return render_blocks(blocks)
+def show_notes(ask: Ask, folder: Path) -> Markup:
+    """Return a team's notes as HTML. A worker makes it, because the desk parses no such file."""
+    return Markup(ask.desk.workers.do("render_notes", folder=str(folder)))
 
 
 def list_papers(folder: Path) -> list[str]:
     """Return the PDF files in a submission's folder, by their paths in it."""
     files = (file for file in folder.rglob("*") if file.suffix.lower() == ".pdf")
-    names = (file.relative_to(folder).as_posix() for file in files)
-    return sorted(islice((n for n in names if file_problem(folder, n) is None), _MOST_PAPERS))
+    names = sorted(file.relative_to(folder).as_posix() for file in files)
+    return list(islice((n for n in names if file_problem(folder, n) is None), _MOST_PAPERS))
 
 
 def find_recordings(ask: Ask, shown: Class, entry: Entry) -> Path | None:

@@ -203,7 +203,7 @@ def _show_page(ask: Ask, *, wrong: str = "", wrong_repair: str = "", status: int
         repair=_show_repair(ask, shown, team, wrong=wrong_repair),
         requests=book.request_states(team.submission),
         recordings=folder,
-        notes=show_notes(folder) if folder else "",
+        notes=show_notes(ask, folder) if folder else "",
         papers=[
             (paper, f"{ask.here}paper?{urlencode({'of': name, 'file': paper})}")
             for paper in (list_papers(folder) if folder else ())

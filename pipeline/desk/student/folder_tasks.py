@@ -46,7 +46,7 @@ _DEEPEST = 50  # tables and lists inside each other that a form can show
 _LARGEST = 10_000  # bits of a whole number that is shown in decimal digits
 
 
-def read_document(text: str, *, progress: Progress = silent) -> dict[str, Any]:
+def read_document(text: str, *, folder: str = "", progress: Progress = silent) -> dict[str, Any]:
     """Return the tables of a file with numbers as typed text; {} if it is not valid TOML."""
     if find_deep_key(text):
         return {}

@@ -164,7 +164,7 @@ def _read_shown(ask: Ask) -> dict[str, Any]:
     text = ask.desk.shown(ask.text("seen"), to=ask.user.name)
     if text is None:
         return _do(ask, "read_folder", check=False)["document"]
-    return ask.desk.workers.do("read_document", text=text)
+    return _do(ask, "read_document", text=text)
 
 
 def _list_authors(room: Room) -> list[str]:

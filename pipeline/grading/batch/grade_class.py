@@ -14,6 +14,7 @@ from pipeline.grading.batch.runner import Executor, Progress, grade_batch, run_h
 from pipeline.grading.batch.task import Setup
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import wrong_springs
+from pipeline.grading.gradebook.schema import Lost
 from pipeline.grading.gradings import Batch, Example
 from pipeline.grading.intake.hand_ins import HandIn, find_hand_ins
 from pipeline.grading.intake.late_table import read_late_table, settle_lateness
@@ -220,6 +221,8 @@ def _refuse_lost_gradebook(place: str | Path, *, out: Path, assignment: str) -> 
     try:
         with Gradebook(place, assignment=assignment) as book:
             book.assignment  # noqa: B018  # raises an error if there is no class list
+    except Lost:
+        raise  # the server does not answer now
     except ConfigError as error:
         raise ConfigError(
             f"{out}: holds feedback of an earlier grading, but its gradebook, with all changes by "

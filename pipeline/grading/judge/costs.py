@@ -121,7 +121,9 @@ def charge(
     typed, undone = judgement.typed, judgement.undone
     verdict, share = typed, typed.share
     if judgement.only and judgement.is_better_undone:
-        share = max((undone.share or NONE) - sum(charges.here.values(), NONE), NONE)
+        # The losses of several mistakes overlap, so together they cost no more than as typed.
+        left = (undone.share or NONE) - sum(charges.here.values(), NONE)
+        share = max(left, typed.share or NONE)
         said = _say_elsewhere(charges.elsewhere)
         if charges.elsewhere and not charges.here:
             right = WORDS.text("otherwise_right") if undone.share == 1 else undone.message

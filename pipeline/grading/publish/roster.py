@@ -58,8 +58,9 @@ class Roster:
         """
         table = read_table(path)
         known = any(columns <= set(table.columns) for columns in FORMS[platform].own)
-        headings = {} if known or platform != "moodle" else _moodle_headings(table)
-        if not (known or headings):
+        headings = _moodle_headings(table) if platform == "moodle" else {}
+        headings = {name: own for name, own in headings.items() if name not in table}
+        if not known and not headings:
             wanted = ", or ".join(" and ".join(sorted(columns)) for columns in FORMS[platform].own)
             raise ConfigError(
                 f"{path.name}: is not {platform.capitalize()}'s table; "
@@ -127,13 +128,23 @@ class Roster:
                 found.setdefault(at, []).append(student)
         settled = {at: one_of(several) for at, several in found.items()}
         filled = {at: student for at, student in settled.items() if not student.undecided}
+        points = titles[next(iter(columns))]
+        before = table[points].copy()
         for at, student in filled.items():
             for title, value in columns.items():
                 if student.points or not table.loc[at, titles[title]].strip():
                     table.loc[at, titles[title]] = value(student)
         graded = [at for at, student in filled.items() if student.points]
-        remarks = self._remarks(students, matched, found, settled)
-        remarks += self._kept(table[titles[next(iter(columns))]].drop(index=graded))
+        replaced = {
+            at: f"{old} → {table.loc[at, points]}"
+            for at, old in before[graded].items()
+            if old.strip()
+            and old.strip() != table.loc[at, points]
+            and _number(old) != _number(table.loc[at, points])
+        }
+        remarks = self._name_rows(f"replaced in {self.file}", replaced)
+        remarks += self._remarks(students, matched, found, settled)
+        remarks += self._kept(table[points].drop(index=graded))
         return csv_text([*table.columns], table.itertuples(index=False)), remarks
 
     def _remarks(
@@ -208,12 +219,16 @@ class Roster:
         """
         of_all = set(self.table.index[self._of_all()])
         kept = {at: text for at, text in grades.items() if text.strip() and at not in of_all}
-        if not kept:
+        return self._name_rows(f"no grade from cartlab, so {self.file} keeps its own", kept)
+
+    def _name_rows(self, what: str, grades: Mapping[Any, str]) -> list[Remark]:
+        """Return a remark on grades in the table, with the names in their rows."""
+        if not grades:
             return []
         column = next((name for name, role in self._roles() if role in _NAMES), None)
         called = self.table.iloc[:, 0] if column is None else self.table[column]
-        named = first_few([f"{called[at]} ({text})" for at, text in kept.items()], 8)
-        return [Remark(text=f"no grade from cartlab, so {self.file} keeps its own: {named}")]
+        named = first_few([f"{called[at]} ({text})" for at, text in grades.items()], 8)
+        return [Remark(text=f"{what}: {named}")]
 
     def _roles(self) -> Iterable[tuple[Any, Any]]:
         """Yield each column and its heading in English, as far as known."""
@@ -300,11 +315,10 @@ def _moodle_headings(table: "pd.DataFrame") -> dict[str, str]:
     roles: dict[str, int] = {}
     first = next((i for i, column in enumerate(cells) if _participants(column)), len(cells))
     for i in range(first + 2, len(cells)):
-        grades, most = cells[i - 1], cells[i]
-        same = len(set(most)) == 1 and _number(most[0]) is not None
-        if same and all(not text or _number(text) is not None for text in grades):
+        most = {_number(text) for text in cells[i]}
+        if i - 1 > first + 1 and len(most) == 1 and None not in most:
             roles |= {"Identifier": first, "Grade": i - 1, _MAXIMUM: i}
-    if roles and roles["Grade"] > first + 1:
+    if roles:
         roles["Full name"] = first + 1
     last = len(cells) - 1
     if last > roles.get(_MAXIMUM, last) and "-" not in cells[last]:

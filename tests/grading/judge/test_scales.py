@@ -69,7 +69,8 @@ def test_a_stated_length_of_a_count_makes_the_gain_known(in_counts):
     outcomes = {c.id: c.outcome for c in grade(in_counts, per_count=COUNT).criteria}
     assert outcomes["initial-gains"] == outcomes["final-gains"] == "pass"
     off = {c.id: c.outcome for c in grade(in_counts, per_count=2 * COUNT).criteria}
-    assert off["initial-gains"] == off["final-gains"] == "fail"
+    # A factor of two in both tables is one mistake, which is charged once.
+    assert (off["initial-gains"], off["final-gains"]) == ("pass", "fail")
 
 
 def test_an_input_in_a_wrong_unit_is_flagged(tmp_path):

@@ -172,6 +172,7 @@ def test_a_canvas_roster_is_filled_in(tmp_path):
         tmp_path, HALF, FULL, BROKEN, platform="canvas", title="Lab 3", roster=roster
     )
     assert canvas_import(rows) == {"Lab 3 (77)": {"1024": "10", "7": "20", "8": "20", "9": "5"}}
+    assert remarks[1] == "replaced in roster.csv: Doe, Jane (3 → 10)"
     assert remarks[-2:] == (
         "not in roster.csv, so not exported: roeric",
         "no grade from cartlab, so roster.csv keeps its own: Zed, Al (5)",
@@ -290,7 +291,7 @@ def test_a_worksheet_in_any_language_is_filled_in(tmp_path, language, students):
     """A worksheet is recognised by its structure: points and comment are in the right columns."""
     head, participant, status, yes = WORKSHEETS[language]
     sep = ";" if ";" in head else ","
-    people = [(1024, "Jane Doe", ""), (5, "Bo Lee", ""), (6, "Al Zed", "12,50")][:students]
+    people = [(1024, "Jane Doe", ""), (5, "Bo Lee", ""), (6, "Al Zed", "krank")][:students]
     lines = [
         sep.join(
             [participant.format(number), name, f"u{number}@x.edu", status, f'"{grade}"', '"20,00"',
@@ -301,7 +302,7 @@ def test_a_worksheet_in_any_language_is_filled_in(tmp_path, language, students):
     roster = "\n".join([head, *lines])
     rows, _ = write(tmp_path, HALF, platform="moodle", roster=roster)
     assert rows[0] == next(csv.reader([head], delimiter=sep))
-    assert [row[4] for row in rows[1:]] == ["10", "", "12,50"][:students]
+    assert [row[4] for row in rows[1:]] == ["10", "", "krank"][:students]
     assert rows[1][5:9] == ["20,00", yes, "-", "-"]
     assert "Hz" in rows[1][9]
 
@@ -318,9 +319,10 @@ def test_a_gradebook_of_moodle_in_another_language_is_filled_in(tmp_path):
     assert rows[0][5] == "Lab 3 (Real)"
 
 
-def test_a_worksheet_with_another_maximum_is_refused(tmp_path):
+@pytest.mark.parametrize("heading", ["Maximum Grade", "Maximum grade"])
+def test_a_worksheet_with_another_maximum_is_refused(tmp_path, heading):
     """A Moodle worksheet with a different maximum is refused, since Moodle would keep its own."""
-    roster = "Identifier,Full name,Grade,Maximum Grade\nParticipant 1024,Jane Doe,,{}\n"
+    roster = f"Identifier,Full name,Status,Grade,{heading}\nParticipant 1024,Jane Doe,-,,{{}}\n"
     write(tmp_path, HALF, platform="moodle", roster=roster.format('"20,00"'))
     with pytest.raises(ConfigError, match=r"maximum grade 18\.00, the rubric 20"):
         write(tmp_path, HALF, platform="moodle", roster=roster.format("18.00"))
