@@ -110,7 +110,7 @@ def test_students_see_nothing_before_the_release(lab):
         assert lab(name).post(ROOM + "release", do="release").status == 403
     assert "cannot read their feedback yet" in lab("Ada").get(ROOM).text
     lab("prof").post(ROOM + "release", do="release")
-    assert "17 of 20 points" in student.get(HERE).text
+    assert "16.99 of 20 points" in student.get(HERE).text
     whole = student.get(HERE + "whole")
     assert "omega_1" in whole.text or "is off" in whole.text
     assert "default-src 'none'" in whole.headers["content-security-policy"]
