@@ -4,6 +4,7 @@ Everywhere else, the numbers are judged with the mistake undone. The rubric stat
 most that a mistake costs, as shares of the criterion where it is charged.
 """
 
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -122,7 +123,11 @@ def charge(
     verdict, share = typed, typed.share
     if judgement.only and judgement.is_better_undone:
         # The losses of several mistakes overlap, so together they cost no more than as typed.
-        left = (undone.share or NONE) - sum(charges.here.values(), NONE)
+        lost: dict[Code, Fraction] = defaultdict(Fraction)
+        for slip, loss in charges.here.items():
+            lost[slip.code] += loss
+        lost = {code: min(loss, exact(rubric.flags.of(code).most)) for code, loss in lost.items()}
+        left = (undone.share or NONE) - sum(lost.values(), NONE)
         share = max(left, typed.share or NONE)
         said = _say_elsewhere(charges.elsewhere)
         if charges.elsewhere and not charges.here:
@@ -132,9 +137,11 @@ def charge(
             verdict = replace(typed, message=f"{typed.message} {said}")
     verdict = replace(verdict, share=share)
     slips = {slip.code for slip in (*charges.here, *charges.elsewhere)}
-    codes: set[Code] = {slip.code for slip in charges.here}
+    # The least cost of a missing item is charged where the items are counted.
+    codes: set[Code] = {slip.code for slip in charges.here if slip.code != "missing"}
     for flag in flags:
-        if flag.code not in slips and concerns(flag, criterion, names=rubric.names):
+        charged = flag.code in slips and flag.code != "missing"
+        if not charged and concerns(flag, criterion, names=rubric.names):
             codes.add(flag.code)
     return _limit(verdict, codes, charges, rubric=rubric)
 

@@ -129,4 +129,7 @@ def needs_recordings(before: Rubric, now: Rubric) -> list[str]:
             # Not every criterion has every one of these keys.
             if getattr(was, key, None) != getattr(criterion, key, None):
                 found.append(f"criteria.{criterion.id}.{key}")
+    # A criterion about some experiments takes them from the other criterion about required items.
+    gone = old.keys() - {criterion.id for criterion in now.criteria}
+    found += [f"criteria.{id_}" for id_ in sorted(gone) if getattr(old[id_], "experiments", ())]
     return found
