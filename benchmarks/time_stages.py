@@ -120,8 +120,7 @@ def friction(seeds: int) -> Table:
                 d=d,
                 noise=rng.choice([0.0, 0.2, 0.5]),
             )
-            test = fit_log_decrement(run, cart=1).friction
-            present.append(test is not None and test.present)
+            present.append(fit_log_decrement(run, cart=1).law.is_friction)
         rows.append([f"{d}", share(sum(present), seeds)])
     return Table(
         title="Is dry friction reported only if it is there?",

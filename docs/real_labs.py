@@ -181,7 +181,7 @@ def rows(analysis: Analysis, gap: Gap) -> Iterator[str]:
         chain, units = gap.chain, gap.chain.units
         yield f"- mass: {with_unit(chain.m[0], gap.chain_std['m_1'], units.m)}"
         yield f"- damping: {with_unit(chain.c[0], gap.chain_std['c_1'], units.c)}"
-    rubbed = [d for d in analysis.log_decrements if d.friction and d.friction.present]
+    rubbed = [d for d in analysis.log_decrements if d.law.is_friction]
     for cart in sorted({d.cart for d in rubbed}):
         own = [d for d in rubbed if d.cart == cart]
         decays = f"{len(own)} decay{'s' * (len(own) > 1)}"
@@ -218,8 +218,7 @@ def _apparent(decay: LogDecrement) -> float:
 
 
 def _viscous(decay: LogDecrement) -> float:
-    assert decay.friction is not None
-    return decay.friction.zeta
+    return decay.law.zeta
 
 
 def draw_limit_cycle() -> None:

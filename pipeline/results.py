@@ -187,17 +187,48 @@ class SinePoint:
     n_points: int
 
 
-@result(eq=False)
-class FrictionTest:
-    """The F-test for dry friction in a decay: is viscous damping alone enough?"""
+DecayCause = Literal[
+    "exponential",
+    "dry_friction",
+    "quadratic_drag",
+    "frequency_shift",
+    "second_mode",
+    "drift",
+    "unknown",
+]
 
-    present: bool = written("whether the statistic is above its threshold")
-    f_statistic: Number = written("F-statistic of one further parameter, the friction")
-    threshold: Number = written()
-    drop: Number = written("d = F/k, half the width of the friction band, position units")
-    drop_std: Number = written()
-    zeta: Number = written("damping ratio without the effect of the friction")
+
+@result(eq=False)
+class DecayLaw:
+    """The law that a free decay follows, and the linear damping and frequency that it implies."""
+
+    name: DecayCause = written(
+        "exponential (within the noise), or why the decay is not: the reason that explains what an "
+        "exponential leaves, or unknown if no reason does"
+    )
+    statistic: Number = written("what an exponential leaves, relative to the noise (F-statistic)")
+    limit: Number = written("what the statistic reaches by chance in one of 10,000 decays")
+    size: Number = written(
+        "dry_friction: d = F/k, half the width of the friction band, position units; "
+        "quadratic_drag: beta of the deceleration beta |v| v, per position unit; frequency_shift: "
+        "relative change of the frequency at the largest swing; second_mode: its frequency, rad/s; "
+        "drift: how far the rest point leaves a straight line, position units; otherwise null"
+    )
+    size_std: Number = written()
+    omega_n: Number = written("rad/s, for small oscillations without the cause")
+    omega_n_std: Number = written()
+    zeta: Number = written("damping ratio, for small oscillations without the cause")
     zeta_std: Number = written()
+
+    @property
+    def is_exponential(self) -> bool:
+        """Whether an exponential leaves only noise."""
+        return self.name == "exponential"
+
+    @property
+    def is_friction(self) -> bool:
+        """Whether dry friction explains what an exponential leaves."""
+        return self.name == "dry_friction"
 
 
 @result(eq=False)
@@ -227,15 +258,18 @@ class LogDecrement:
     )
     delta: Number = written("logarithmic decrement per full cycle")
     delta_std: Number = written()
-    omega_n: Number = written("rad/s, from the fit of a decaying sinusoid; the better estimate")
-    omega_n_std: Number = written()
-    zeta: Number = written("damping ratio from that fit; dry friction makes it wrong")
+    omega_n: Number = written(
+        "rad/s, from the fit of the law; of a decaying sinusoid if the law is dry friction, which "
+        "makes it wrong, or unknown"
+    )
+    omega_n_std: Number = written("including what the fit leaves beyond the noise")
+    zeta: Number = written("damping ratio from that fit")
     zeta_std: Number = written()
     omega_n_peaks: Number = written("rad/s, from the extrema")
     omega_n_peaks_std: float
     zeta_peaks: Number = written("damping ratio from the logarithmic decrement")
     zeta_peaks_std: Number = written()
-    friction: FrictionTest | None = written()
+    law: DecayLaw = written()
     note: str = written("what a reader must know, or empty", default="")
     peak_t: Array
     peak_y: Array

@@ -17,6 +17,7 @@ from pipeline.results import (
 )
 from pipeline.set_up import Bench
 from pipeline.stages.compare import change_limit
+from pipeline.words.decays import say_law
 from pipeline.words.numbers import abridge, listing, significant
 from pipeline.words.phrases import phrases
 
@@ -140,32 +141,23 @@ def _advice(row: ParameterRow) -> str:
 def check_decays(
     decays: Sequence[LogDecrement], *, records: Sequence[Record] = (), bench: Bench
 ) -> list[Check]:
-    """Check for every decay whether viscous damping alone explains it."""
+    """Check for every decay whether it is exponential within the noise."""
     checks, kinds = [], {record.id: record.kind for record in records}
     for decay in decays:
-        if (test := decay.friction) is None:
-            continue
-        found = (
-            "is not exponential: dry friction can hold the cart within "
-            f"±{test.drop:.3g} {bench.units.position} of its rest position. The envelope's ζ = "
-            f"{decay.zeta:.3g} is biased; with the friction in the fit, ζ = {test.zeta:.3g}."
-            if test.present
-            else "is exponential within the noise "
-            f"(F = {test.f_statistic:.1f}; above {test.threshold:.1f} would mean dry friction)."
-        )
         what = f"the decay of cart {decay.cart}"
         if kinds.get(decay.experiment) == "step":
             what = f"the ringing of cart {decay.cart} after the step"
+        said = say_law(decay, unit=bench.units.position)
         checks.append(
             Check(
                 kind="decay",
                 run=decay.experiment,
                 cart=decay.cart,
                 part=str(decay.number or ""),
-                outcome=passed(not test.present),
-                value=test.f_statistic,
-                limit=test.threshold,
-                message=f"{decay.name}: {what} {found}",
+                outcome=passed(decay.law.is_exponential),
+                value=decay.law.statistic,
+                limit=decay.law.limit,
+                message=f"{decay.name}: {what} {said}",
             )
         )
     return checks
@@ -182,7 +174,7 @@ def check_steps(
     """
     rubs: dict[int, list[str]] = {}
     for decay in decays:
-        if decay.friction and decay.friction.present:
+        if decay.law.is_friction:
             rubs.setdefault(decay.cart, []).append(decay.experiment)
     for step in steps:
         if step.interval:

@@ -11,8 +11,8 @@ from pipeline.json_files import keys, plain
 from pipeline.results import (
     Analysis,
     Check,
+    DecayLaw,
     FrequencyResponse,
-    FrictionTest,
     LogDecrement,
     ParameterRow,
     Record,
@@ -39,13 +39,13 @@ def checks(analysis: Analysis) -> "pd.DataFrame":
 
 
 def decays(analysis: Analysis) -> "pd.DataFrame":
-    """Return the decays, one row each; results of the friction test are in columns `friction_…`."""
+    """Return the decays, one row each; the law that each follows is in columns `law_…`."""
     rows = [
-        row | {f"friction_{key}": value for key, value in (row["friction"] or {}).items()}
+        row | {f"law_{key}": value for key, value in row["law"].items()}
         for row in _rows(analysis.log_decrements)
     ]
-    own = [key for key in keys(LogDecrement) if key not in ("friction", "note")]
-    columns = [*own, *(f"friction_{key}" for key in keys(FrictionTest)), "note"]
+    own = [key for key in keys(LogDecrement) if key not in ("law", "note")]
+    columns = [*own, *(f"law_{key}" for key in keys(DecayLaw)), "note"]
     return _frame(rows, columns, analysis=analysis)
 
 

@@ -92,9 +92,9 @@ def identify(
     gains = _step_gains(runs, bench=bench, log=log)
     progress("sine dwells: steady state")
     sines = _sine_points(used, log=log)
-    # A note is dropped if a check of the same decay or step says the same thing in full.
+    # A note is dropped if a check of the same step says the same thing in full.
     notes = [
-        *((f"{d.name} (cart {d.cart})", d.note) for d in decays if not _sticks(d)),
+        *((f"{d.name} (cart {d.cart})", d.note) for d in decays),
         *((f"{g.experiment} (cart {g.cart})", g.note) for g in gains if not g.interval),
         *((f"{p.experiment} (cart {p.cart})", p.note) for p in sines),
     ]
@@ -217,10 +217,6 @@ def _decays_between(pieces: Sequence[Record], *, cart: int) -> list[LogDecrement
     if len(decays) == 1:
         return decays
     return [replace(decay, number=i) for i, decay in enumerate(decays, start=1)]
-
-
-def _sticks(decay: LogDecrement) -> bool:
-    return decay.friction is not None and decay.friction.present
 
 
 def _skip_without(

@@ -128,10 +128,9 @@ def _readings(
             )
         )
         slack = SIGMAS * decay.zeta_std
-        # With dry friction, damping grows as the swing gets smaller, so the interval covers all
-        # amplitudes.
-        sticks = decay.friction is not None and decay.friction.present
-        ratios = [decay.zeta, *(decay.zeta_at_amplitude[1].tolist() if sticks else ())]
+        # If the damping depends on the swing, the interval covers all amplitudes.
+        seen = () if decay.law.is_exponential else decay.zeta_at_amplitude[1].tolist()
+        ratios = [decay.zeta, *seen]
         found.setdefault(own_zeta(decay.cart, n=carts), []).append(
             _Reading(
                 run=decay.experiment,

@@ -1,4 +1,4 @@
-"""Free decay of one cart: logarithmic decrement, exponential fit, dry friction."""
+"""Free decay of one cart: logarithmic decrement, exponential fit, and why it may not be one."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.decay.free_decay import FreeDecay, find_decay, fit_decay
 from pipeline.estimation.noise import grain
-from pipeline.results import LogDecrement, Record
+from pipeline.results import DecayLaw, LogDecrement, Record
 
 _PEAKS_FOR_REGRESSION = 4  # enough for two amplitudes
 
@@ -46,8 +46,9 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
 
     The decay is searched for, because a hold, a hand or a driven part may precede it. There are two
     estimates: the classical one from the peaks, and an exponential sinusoid with a drifting rest
-    point, fitted to every sample. Dry friction is tested for. The method is valid for one free cart
-    on at least one spring and damping ratios up to about 0.6.
+    point, fitted to every sample. If the exponential leaves more than noise, the law that explains
+    the rest gives damping and frequency, unless it is dry friction. The method is valid for one
+    free cart on at least one spring and damping ratios up to about 0.6.
 
     Raises
     ------
@@ -57,19 +58,19 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
     t, y = record.t, record.position(cart)
     size = grain(t, y, step=record.encoder_step(cart))
     floor = size / np.sqrt(12)
+    step = record.encoder_step(cart)
     stretch, run = find_decay(record, cart=cart, size=size)
-    decay = fit_decay(t, y, stretch=stretch, run=run, floor=floor)
+    decay = fit_decay(t, y, stretch=stretch, run=run, floor=floor, step=step)
     fit, pole = decay.fit, complex(decay.fit.poles[0])
-    omega_n, zeta = abs(pole), -pole.real / abs(pole)
-    unexplained = fit.rms / float(np.ptp(y[decay.first : decay.stop]))
+    law, fitted = _law(decay), _fitted(decay)
+    unexplained = decay.rms(t, y) / float(np.ptp(y[decay.first : decay.stop]))
     # A fit with a larger residual belongs to another kind of motion. Real carts with dry friction
     # leave 1.3 to 2.1 % (ten runs).
-    if not (0 < zeta < 1 and pole.imag > 0 and unexplained < 0.08):
+    if not (0 < fitted.zeta < 1 and pole.imag > 0 and unexplained < 0.08):
         raise DataError(
             f"{record.id}: log decrement needs a decaying oscillation of cart {cart}, found "
-            f"zeta = {zeta:.3g} with {100 * unexplained:.0f} % of the motion unexplained"
+            f"{_motion(fitted.zeta)} with {100 * unexplained:.0f} % of it unexplained"
         )
-    zeta_std, omega_n_std = _pole_errors(pole, fit.covariance[2:, 2:])
     peaks = _peaks(t, y, decay, floor=floor)
     (zeta_peaks, zeta_peaks_std), (omega_n_peaks, omega_n_peaks_std) = peaks.zeta, peaks.omega_n
     end = t[decay.stop - 1]
@@ -90,29 +91,97 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
         zeta_peaks_std=zeta_peaks_std,
         omega_n_peaks=omega_n_peaks,
         omega_n_peaks_std=omega_n_peaks_std,
-        zeta=zeta,
-        zeta_std=zeta_std,
-        omega_n=omega_n,
-        omega_n_std=omega_n_std,
+        zeta=fitted.zeta,
+        zeta_std=fitted.zeta_std,
+        omega_n=fitted.omega_n,
+        omega_n_std=fitted.omega_n_std,
         fit_t=fit_t,
-        fit_y=fit(fit_t),
+        fit_y=decay.model(fit_t),
         envelope_upper=middle + envelope,
         envelope_lower=middle - envelope,
-        friction=decay.friction.test if decay.friction else None,
+        law=law,
         zeta_at_amplitude=_zeta_at_amplitude(peaks.amplitude),
-        note=_note(record, decay, zeta=zeta, n_peaks=peaks.t.size),
+        note=_note(record, decay, n_peaks=peaks.t.size),
     )
 
 
-def _pole_errors(pole: complex, covariance: Array) -> tuple[float, float]:
-    """Return the standard errors of zeta and omega_n.
+@dataclass(frozen=True, kw_only=True)
+class _Fitted:
+    """Damping ratio and natural frequency (rad/s) with their standard errors."""
 
-    `covariance` (2, 2) belongs to decay rate and damped frequency.
+    zeta: float
+    zeta_std: float
+    omega_n: float
+    omega_n_std: float
+
+
+def _fitted(decay: FreeDecay) -> _Fitted:
+    """Return the numbers of the law, or of the exponential if the law is dry friction or unknown.
+
+    With dry friction no damping ratio holds for small swings, so the number is the usual one.
     """
+    law = decay.explained.law if decay.explained else None
+    return _of_exponential(decay) if law is None or law.name == "dry_friction" else _of_law(decay)
+
+
+def _of_exponential(decay: FreeDecay) -> _Fitted:
+    """Return the numbers of the exponential fit.
+
+    Unlike noise, what the fit leaves beyond the noise does not average out, so it counts in full.
+    """
+    pole, explained = complex(decay.fit.poles[0]), decay.explained
+    covariance = decay.fit.covariance[2:, 2:]
+    if explained and (left := explained.left[0]):
+        covariance = covariance * max(1.0, (explained.density + left) / decay.fit.variance)
     per_zeta = np.array([pole.imag**2, pole.real * pole.imag]) / abs(pole) ** 3
     per_omega = np.array([-pole.real, pole.imag]) / abs(pole)
     zeta_std, omega_n_std = (np.sqrt(per @ covariance @ per) for per in (per_zeta, per_omega))
-    return float(zeta_std), float(omega_n_std)
+    return _Fitted(
+        zeta=-pole.real / abs(pole),
+        zeta_std=float(zeta_std),
+        omega_n=abs(pole),
+        omega_n_std=float(omega_n_std),
+    )
+
+
+def _of_law(decay: FreeDecay) -> _Fitted:
+    """Return the numbers that the law implies; a damping ratio is at least zero."""
+    explained = decay.explained
+    if explained is None or explained.law is None:
+        return _of_exponential(decay)
+    zeta, omega_n, _ = explained.law.values
+    zeta_std, omega_n_std, _ = explained.errors
+    return _Fitted(
+        zeta=max(float(zeta), 0.0),
+        zeta_std=float(zeta_std),
+        omega_n=float(omega_n),
+        omega_n_std=float(omega_n_std),
+    )
+
+
+def _law(decay: FreeDecay) -> DecayLaw:
+    """Return the result of the test, and what the law implies."""
+    explained, implied = decay.explained, _of_law(decay)
+    assert explained is not None, "the last fit is always tested"
+    size = (float("nan"),) * 2
+    if explained.law:
+        size = float(explained.law.values[2]), float(explained.errors[2])
+    return DecayLaw(
+        name=explained.name,
+        statistic=explained.departure.statistic,
+        limit=explained.departure.limit,
+        size=size[0],
+        size_std=size[1],
+        zeta=implied.zeta,
+        zeta_std=implied.zeta_std,
+        omega_n=implied.omega_n,
+        omega_n_std=implied.omega_n_std,
+    )
+
+
+def _motion(zeta: float) -> str:
+    """Return the motion that a damping ratio means."""
+    return f"one with zeta = {zeta:.3g}" if zeta > 0 else "a motion that does not decay,"
 
 
 # -------------------------------------------------------------------- the peaks
@@ -204,7 +273,7 @@ def _zeta_at_amplitude(amplitude: Array) -> Array:
 # ------------------------------------------------------------------------ notes
 
 
-def _note(record: Record, decay: FreeDecay, *, zeta: float, n_peaks: int) -> str:
+def _note(record: Record, decay: FreeDecay, *, n_peaks: int) -> str:
     notes = []
     level = decay.stretch.level
     if level and record.u is not None and abs(level) > 0.02 * float(np.max(np.abs(record.u))):
@@ -213,17 +282,5 @@ def _note(record: Record, decay: FreeDecay, *, zeta: float, n_peaks: int) -> str
         notes.append(
             f"{n_peaks} turning points are too few for a logarithmic decrement; the value is that "
             "of the exponential fit"
-        )
-    test = decay.friction.test if decay.friction else None
-    if test and test.present:
-        notes.append(
-            "the decay is not exponential: dry friction stops the cart within "
-            f"{test.drop:.3g} of its rest point. Without the friction, zeta would be "
-            f"{test.zeta:.3g}; the fitted {zeta:.3g} holds for these amplitudes only"
-        )
-    # It is worth a note if the damping of large amplitudes is larger by 5 %.
-    elif test and test.f_statistic > test.threshold and test.zeta > 1.05 * zeta:
-        notes.append(
-            "the decay is not exponential: the damping grows with the amplitude, and zeta is a mean"
         )
     return "; ".join(notes)

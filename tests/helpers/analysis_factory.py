@@ -16,10 +16,10 @@ from pipeline.results import (
     Analysis,
     ChainFit,
     Check,
+    DecayLaw,
     Estimate,
     FeedbackDesign,
     FrequencyResponse,
-    FrictionTest,
     HardwareCheck,
     LogDecrement,
     ParameterRow,
@@ -115,12 +115,14 @@ def _decay(chain: Chain, cart: int, repeat: int, rng: np.random.Generator):
     fit_t = t[t >= release]
     envelope = 2.5 * np.exp(-zeta * omega * (fit_t - release)) / np.sqrt(1 - zeta**2)
     amplitude = 2.5 * np.exp(-zeta * omega * (peak_t[1:-1] - release))
-    friction = FrictionTest(
-        f_statistic=24.0 if repeat else 1.4,
-        threshold=10.8,
-        present=bool(repeat),
-        drop=0.004 if repeat else 0.0,
-        drop_std=0.0004,
+    law = DecayLaw(
+        name="dry_friction" if repeat else "exponential",
+        statistic=24.0 if repeat else 1.4,
+        limit=4.1,
+        size=0.004 if repeat else float("nan"),
+        size_std=0.0004 if repeat else float("nan"),
+        omega_n=omega,
+        omega_n_std=0.002 * omega,
         zeta=zeta * 0.9,
         zeta_std=0.002 * zeta,
     )
@@ -146,9 +148,9 @@ def _decay(chain: Chain, cart: int, repeat: int, rng: np.random.Generator):
         fit_y=wave(fit_t - release),
         envelope_upper=envelope,
         envelope_lower=-envelope,
-        friction=friction,
+        law=law,
         zeta_at_amplitude=np.vstack([amplitude, zeta * (1 + 0.03 / amplitude)]),
-        note="dry friction: zeta grows as the amplitude falls" if repeat else "",
+        note="",
     )
 
 

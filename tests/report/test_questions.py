@@ -32,7 +32,10 @@ def well(carts: int = 2) -> Analysis:
     """Return an analysis in which all results agree."""
     analysis = make_analysis(carts)
     rows = tuple(replace(row, consistent=True, change_percent=1.0) for row in analysis.rows)
-    decays = tuple(replace(decay, friction=None) for decay in analysis.log_decrements)
+    decays = tuple(
+        replace(decay, law=replace(decay.law, name="exponential"))
+        for decay in analysis.log_decrements
+    )
     hardware = tuple(
         replace(
             check,

@@ -95,7 +95,7 @@ def test_a_run_with_a_large_error_is_not_odd():
 
 
 def damped(run: str, zeta: float, *, std: float = 1e-4) -> LogDecrement:
-    return replace(decay(run, 20.0), zeta=zeta, zeta_std=std, friction=None)
+    return replace(decay(run, 20.0), zeta=zeta, zeta_std=std)
 
 
 def test_dampings_of_repeats_are_compared():

@@ -34,7 +34,7 @@ def test_single_carts_have_their_frequencies_and_friction(two_carts):
     for i in range(1, 6):
         assert 23.2 <= alone[f"alone-1-{i}"].omega_n <= 23.7
         assert 15.6 <= alone[f"alone-2-{i}"].omega_n <= 15.9
-        assert alone[f"alone-2-{i}"].friction.present
+        assert alone[f"alone-2-{i}"].law.is_friction
 
 
 def test_a_wrongly_logged_input_is_found(two_carts):

@@ -7,8 +7,9 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.estimation.decay.dry_friction import FrictionFit, fit_friction
+from pipeline.estimation.decay.laws import Explained, explain_decay
 from pipeline.estimation.decay.ringing import Ringing, fit_ringing
+from pipeline.estimation.noise import MEDIAN_TO_SIGMA
 from pipeline.estimation.peaks import extrema, plateaus
 from pipeline.results import Record
 
@@ -25,7 +26,7 @@ _MIN_SAMPLES = 12
 # amplitude is added while only the smaller swings were fitted, or if the residual exceeds the noise
 # anyway.
 _BACK_SIGMAS = 4.0
-_BACK_SHARES = (0.05, 0.0, 0.0)
+_BACK_SHARES = (0.05, 0.0, 0.0, 0.0)
 _REAL_SHARE = 0.15
 _RELEASE_MARGIN = 1 / 40  # share of a period, in which the fingers leave the cart
 
@@ -44,24 +45,32 @@ class Stretch:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FreeDecay:
-    """Samples [first, stop) of one free decay, its turning points, and the two fits to it."""
+    """Samples [first, stop) of one free decay, its turning points, and the fits to it.
+
+    `fit` is the exponential fit, and `explained` the test of it, None if it was not tested.
+    """
 
     stretch: Stretch
     first: int
     stop: int
     turning: list[int]
     fit: Ringing
-    friction: FrictionFit | None
+    explained: Explained | None
 
     @property
     def model(self) -> Callable[[Array], Array]:
-        """The better of the two fits, as a function of time."""
-        return self.friction.model if self.friction and self.friction.test.present else self.fit
+        """The law that the decay follows, as a function of time, or the exponential fit."""
+        law = self.explained.law if self.explained else None
+        return law.model if law else self.fit
+
+    def residual(self, t: Array, y: Array) -> Array:
+        """Return what the model leaves of the decay; `t` and `y` cover the record."""
+        window = slice(self.first, self.stop)
+        return y[window] - self.model(t[window])
 
     def rms(self, t: Array, y: Array) -> float:
         """Return the root-mean-square residual over the decay; `t` and `y` cover the record."""
-        window = slice(self.first, self.stop)
-        return float(np.sqrt(np.mean((y[window] - self.model(t[window])) ** 2)))
+        return float(np.sqrt(np.mean(self.residual(t, y) ** 2)))
 
 
 def find_decay(record: Record, *, cart: int, size: float) -> tuple[Stretch, list[int]]:
@@ -142,7 +151,9 @@ def _score(y: Array, run: list[int]) -> float:
     return travelled if len(run) > 2 else 1e-3 * travelled
 
 
-def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: float) -> FreeDecay:
+def fit_decay(
+    t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: float, step: float
+) -> FreeDecay:
     """Fit the free decay from its release to its last turning point.
 
     The later swings are fitted first. The fit is then extended back over the earlier ones as long
@@ -153,6 +164,7 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
     ----------
     run : the turning points.
     floor : the smallest significant residual (root mean square).
+    step : the encoder step.
     """
     interval = float(np.median(np.diff(t[run])))
     stop = run[-1] + 1
@@ -161,23 +173,25 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
         stop = int(np.searchsorted(t[: stretch.stop], t[run[-1]] + 2 * interval))
     pole = complex(-np.log(_ratio(y, run)) / interval, np.pi / interval)
 
-    def fit_from(first: int, *, near: complex = pole, last: bool = False) -> FreeDecay:
-        """Fit with dry friction only if the viscous fit's residual exceeds the noise."""
+    def fit_from(
+        first: int, *, near: complex = pole, last: bool = False, rough: bool = False
+    ) -> FreeDecay:
+        """Test the exponential only if its residual exceeds the noise, unless it is `rough`."""
         own = slice(first, stop)
         fit = fit_ringing(t[own], y[own], poles=np.array([near]), drift=True)
-        friction = None
-        if last or fit.rms > _ADEQUATE * floor:
-            friction = fit_friction(
+        explained = None
+        if last or (not rough and fit.rms > _ADEQUATE * floor):
+            explained = explain_decay(
                 t[own],
                 y[own],
-                viscous=fit,
-                turning=float(t[run[0]]),
+                fit,
+                step=step,
+                turning=t[run],
                 falling=bool(y[run[1]] < y[run[0]]),
-                floor=floor,
             )
         turning = [i for i in run if i > first]
         return FreeDecay(
-            stretch=stretch, first=first, stop=stop, turning=turning, fit=fit, friction=friction
+            stretch=stretch, first=first, stop=stop, turning=turning, fit=fit, explained=explained
         )
 
     enough = max(stop - _MIN_SAMPLES, stretch.first)
@@ -194,7 +208,8 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
         first = _carried_back(t, y, decay, latest=latest, share=share, floor=floor)
         if first == decay.first:
             break
-        decay = fit_from(first, near=complex(decay.fit.poles[0]))
+        rough = share > 0 and decay.explained is None
+        decay = fit_from(first, near=complex(decay.fit.poles[0]), rough=rough)
     first = decay.first
     if first > stretch.first:
         margin = t[first] + _RELEASE_MARGIN * 2 * interval
@@ -208,7 +223,9 @@ def _carried_back(
     """Return the first sample from which the decay's model holds, at most `latest`."""
     head = slice(decay.stretch.first, latest)
     size = abs(decay.fit.amplitudes[0]) * decay.fit.growth(t[head])[0]
-    tolerance = _BACK_SIGMAS * max(decay.rms(t, y), floor) + share * size
+    # The median ignores a hold that the fit includes by mistake.
+    spread = MEDIAN_TO_SIGMA * float(np.median(np.abs(decay.residual(t, y))))
+    tolerance = _BACK_SIGMAS * max(spread, floor) + share * size
     bad = np.flatnonzero(np.abs(y[head] - decay.model(t[head])) > tolerance)
     return head.start + (int(bad[-1]) + 1 if bad.size else 0)
 

@@ -22,6 +22,7 @@ class Ringing:
     amplitudes : complex amplitudes (n_modes,) at `t0`.
     covariance : covariance of (level, slope, decay rates, frequencies), for a residual that may be
         correlated. The row of the slope is zero if no slope was fitted.
+    variance : variance of the residual near the frequencies, which the covariance assumes.
     rms : root mean square of the residual.
     converged : False if the fit ran out of steps.
     """
@@ -32,6 +33,7 @@ class Ringing:
     poles: ComplexArray
     amplitudes: ComplexArray
     covariance: Array
+    variance: float
     rms: float
     converged: bool
 
@@ -64,11 +66,11 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
     # The decay rate at the start is at least this share of the frequency.
     fit = fit_separable(
         y,
-        lambda p: _Waves.at(tau, p, level=level),
+        lambda p: Waves.at(tau, p, level=level),
         start=np.append(np.maximum(-poles.real / scale, 1e-6), poles.imag / scale),
         max_evaluations=_MAX_EVALUATIONS,
     )
-    linear, residual, waves = fit.linear, fit.residual, _Waves.at(tau, fit.p, level=level)
+    linear, residual, waves = fit.linear, fit.residual, Waves.at(tau, fit.p, level=level)
     X = waves.columns
     full = np.column_stack([X[:, :k], waves.derivatives(linear) / scale, X[:, k:]])
     kept = [0, 1] if drift else [0]
@@ -88,21 +90,22 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
         poles=scale * (-fit.p[:n_modes] + 1j * fit.p[n_modes:]),
         amplitudes=linear[k : k + n_modes] - 1j * linear[k + n_modes :],
         covariance=covariance,
+        variance=variance,
         rms=float(np.sqrt(np.mean(residual**2))),
         converged=fit.converged,
     )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Waves:
-    """Damped waves (n_modes, n) at dimensionless times `tau`, with a level (and drift)."""
+class Waves:
+    """Damped waves (n_modes, n) at times `tau`, with a level (and drift)."""
 
     tau: Array
     level: Array
     waves: ComplexArray
 
     @classmethod
-    def at(cls, tau: Array, p: Array, *, level: Array) -> "_Waves":
+    def at(cls, tau: Array, p: Array, *, level: Array) -> "Waves":
         """Return the waves with decay rates and frequencies p (2 n_modes,)."""
         decay, frequency = p.reshape(2, -1, 1)
         growth = np.minimum(-decay * tau, _MOST_GROWTH)
@@ -110,9 +113,11 @@ class _Waves:
 
     @property
     def columns(self) -> Array:
+        """The factors of level, cosines and sines, (n, n_linear)."""
         return np.concatenate([self.level, self.waves.real, self.waves.imag]).T
 
     def derivatives(self, linear: Array) -> Array:
+        """Return dy/dp (n, 2 n_modes)."""
         cosine, sine = linear[len(self.level) :].reshape(2, -1, 1)
         turned = -self.tau * (cosine - 1j * sine) * self.waves
         return np.concatenate([turned.real, turned.imag]).T

@@ -79,6 +79,14 @@ def fit_separable(
     return SeparableFit(p=p, linear=best.linear, residual=best.residual, converged=status in _FOUND)
 
 
+def inverse_normal(model: SeparableModel, linear: Array) -> Array:
+    """Return the inverse of J'J: the covariance of (p, linear) for white noise of variance 1."""
+    full = np.column_stack([model.derivatives(linear), model.columns])
+    size = np.maximum(np.linalg.norm(full, axis=0), np.finfo(float).tiny)
+    inverse = np.linalg.pinv(np.linalg.qr(full / size, mode="r")) / size[:, None]
+    return inverse @ inverse.T
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Point:
     """The model at some p (n_p,) with its best linear unknowns; `basis` spans the columns."""

@@ -13,8 +13,6 @@ def readings(name: str, analysis: Analysis) -> list[float]:
     """Return all values that students may read off for a cart's own gain, frequency or damping.
 
     The damping of a decay is read twice: with dry friction subtracted, and without subtracting it.
-    This is done even if friction is not certain, because with little damping even a trace of it
-    matters.
     """
     read = read_name(name)
     if read.is_by_eye:
@@ -32,8 +30,7 @@ def readings(name: str, analysis: Analysis) -> list[float]:
         if decay.cart == cart and read.is_frequency:
             readings.append(decay.omega_n)
         if decay.cart == cart and read.is_ratio:
-            without = decay.friction.zeta if decay.friction else decay.zeta
-            readings += [zeta for zeta in (decay.zeta, without) if zeta > 0]
+            readings += [zeta for zeta in (decay.zeta, decay.law.zeta) if zeta > 0]
     return readings
 
 

@@ -8,7 +8,8 @@ from pipeline.report.figures.bode import bode_figure, overview_figure
 from pipeline.report.figures.colours import CARTS
 from pipeline.report.figures.time import damping_figure, decay_figure, sine_figure, step_figure
 from pipeline.report.sections.page import Page, left_out
-from pipeline.results import FrequencyResponse, LogDecrement
+from pipeline.results import FrequencyResponse
+from pipeline.words.decays import name_law
 from pipeline.words.numbers import count, listing, percent, significant, with_error
 from pipeline.words.phrases import phrases
 from pipeline.words.spans import spans
@@ -117,13 +118,14 @@ def decay_blocks(page: Page) -> list[Block]:
         if not drawn:
             continue
         records, first = [page.records[decay.experiment] for decay in drawn], drawn[0]
-        sticks = [clean(d.name) for d in drawn if _is_dry(d)]
+        others = [d for d in drawn if not d.law.is_exponential]
+        laws = [f"{clean(d.name)} ({name_law(d, unit=page.position)})" for d in others]
         said = {
             "cart": cart,
             "zeta": with_error(first.zeta, first.zeta_std),
             "run": clean(first.name),
             "freed": _WORDS.text("let_go" if records[0].kind == "decay" else "stepped"),
-            "sticking": _WORDS.text("decay_sticking", sticking=listing(sticks)) if sticks else "",
+            "others": _WORDS.text("decay_others", others=listing(laws)) if laws else "",
             "more": left_out(len(of_cart) - len(drawn)),
             "records": count(len(drawn), "record"),
             "swing": significant(float(np.ptp(first.peak_y)), digits=2),
@@ -132,28 +134,20 @@ def decay_blocks(page: Page) -> list[Block]:
         figure = decay_figure(drawn, records=records, position_unit=page.position)
         blocks.append(page.picture(f"decay-cart-{cart}", figure, _WORDS, "decay", **said))
     # A decay with only one amplitude shows no change of damping.
-    if rubbing := [d for d in decays if _is_dry(d) and d.zeta_at_amplitude.shape[1] > 1]:
-        figure = damping_figure(rubbing, position_unit=page.position)
-        runs = listing(list(dict.fromkeys(clean(d.name) for d in rubbing)))
+    changing = [d for d in decays if not d.law.is_exponential]
+    if changing := [d for d in changing if d.zeta_at_amplitude.shape[1] > 1]:
+        figure = damping_figure(changing, position_unit=page.position)
+        runs = listing(list(dict.fromkeys(clean(d.name) for d in changing)))
         blocks.append(page.picture("damping", figure, _WORDS, "damping", runs=runs))
     return blocks
 
 
-def _is_dry(decay: LogDecrement) -> bool:
-    return decay.friction is not None and decay.friction.present
-
-
 def _decay_table(page: Page) -> Table:
-    """Return frequency and damping of every decay, by two methods, and the test for friction."""
+    """Return frequency and damping of every decay, by two methods, and the law that it follows."""
     rows = []
     for decay in page.analysis.log_decrements:
-        friction = decay.friction
-        if friction is None:
-            verdict = cell("not tested", "quiet")
-        elif friction.present:
-            verdict = cell(with_error(friction.drop, friction.drop_std), "bad")
-        else:
-            verdict = cell("none seen", "good")
+        law = name_law(decay, unit=page.position)
+        verdict = cell(law, "good" if decay.law.is_exponential else "bad")
         estimates = (
             (decay.omega_n, decay.omega_n_std),
             (decay.zeta, decay.zeta_std),
@@ -162,7 +156,7 @@ def _decay_table(page: Page) -> Table:
         numbers = [with_error(*estimate) for estimate in estimates]
         extrema = str(decay.peak_t.size)
         rows.append((clean(decay.name), str(decay.cart), *numbers, extrema, verdict))
-    return page.table(_WORDS, "decay_table", rows, "lcdddcr", position=page.position)
+    return page.table(_WORDS, "decay_table", rows, "lcdddcl", position=page.position)
 
 
 def step_blocks(page: Page) -> list[Block]:

@@ -154,11 +154,11 @@ def _assumed(analysis: Analysis) -> Iterator[Asked]:
 
 
 def _friction(analysis: Analysis) -> Iterator[Asked]:
-    sticking = [d for d in analysis.log_decrements if d.friction and d.friction.present]
+    sticking = [d for d in analysis.log_decrements if d.law.is_friction]
     for cart in sorted({decay.cart for decay in sticking}):
         decay = max(
             (d for d in sticking if d.cart == cart),
-            key=lambda d: d.friction.f_statistic if d.friction else 0.0,
+            key=lambda d: d.law.statistic,
         )
         seen, rise = decay.zeta_at_amplitude, ""
         if seen.shape[1] > 1:

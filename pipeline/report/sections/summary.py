@@ -299,7 +299,7 @@ def _checks(analysis: Analysis) -> tuple[bool, Spans] | None:
 
 def _friction(analysis: Analysis) -> tuple[bool, Spans] | None:
     """Return, as a finding, the decays and the steps whose ringing shows dry friction."""
-    shown = [d for d in analysis.log_decrements if d.friction and d.friction.present]
+    shown = [d for d in analysis.log_decrements if d.law.is_friction]
     if not shown:
         return None
     places = []

@@ -1,0 +1,481 @@
+"""Test whether a decay is exponential, and find the law that it follows if it is not.
+
+What the exponential leaves is compared with the noise of the recording itself: with the spectrum of
+what remains after a flexible change of envelope, phase and rest point. If more is left than noise,
+the known reasons compete by their BIC, with the effective number of samples.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+from scipy.special import fdtri
+
+from pipeline.arrays import Array, ComplexArray
+from pipeline.estimation.decay.dry_friction import Swings
+from pipeline.estimation.decay.modulated import (
+    DECAY,
+    DRAG,
+    FREQUENCY,
+    SHIFT,
+    Modulated,
+)
+from pipeline.estimation.decay.ringing import Ringing, Waves
+from pipeline.estimation.decay.separable import SeparableModel, fit_separable, inverse_normal
+from pipeline.results import DecayCause
+
+_CHANCE = 1e-4  # share of exponential decays that fail the test
+_UNKNOWNS = 6  # of an exponential decay with a drift
+_PER_PERIOD = 16  # samples per period that are enough to tell the laws apart
+_ORDERS = 3, 8  # least and most order of the flexible change; in between, one for each period
+_SAME = 1e-3  # share of a column outside the others, below which it adds nothing
+_SECOND = 0.3, 3.0  # frequencies where a second mode may be, relative to that of the first
+_LINE = 25.0  # power of a line above the noise that chance does not reach
+_BINS = 24  # frequencies near that of the decay that give the noise
+_MARGIN = 6.0  # BIC by which the best law must be better than the next
+_MOST_LEFT = 0.5  # share of what the exponential leaves that a law may leave
+_MAX_EVALUATIONS = 200
+_SIGMAS = 3.0  # a damping ratio below zero by more is none
+_LEAST_ROUNDING = 0.1  # share of the rounding error that any fit leaves
+_LEAST_RATE = 0.1  # smaller decay rate of two modes, in the larger
+_MORE_UNKNOWNS = 3  # that a law may have than the decay has swings
+_MOST_SHIFT = 0.3  # relative shift of frequency up to which the series holds
+_APART = 0.5  # distance of two modes, in the larger decay rate
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Departure:
+    """What an exponential leaves of a decay, relative to the noise.
+
+    Attributes
+    ----------
+    statistic : F-statistic of the flexible change, or that of another mode if it says more.
+    limit : what the statistic exceeds by chance in one of 10,000 exponential decays.
+    columns : number of columns of the flexible change.
+    left : residual (n,) of the exponential fit.
+    noise : residual (n,) of the flexible change.
+    """
+
+    statistic: float
+    limit: float
+    columns: int
+    left: Array
+    noise: Array
+
+    @property
+    def present(self) -> bool:
+        """Whether more is left than noise."""
+        return self.statistic > self.limit
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LawFit:
+    """A law fitted to a decay.
+
+    Attributes
+    ----------
+    p : nonlinear unknowns, a start for another fit of the same law.
+    values : damping ratio, natural frequency and size of the cause.
+    unit : their standard errors for noise of unit density.
+    unknowns : number of unknowns, linear ones included.
+    """
+
+    name: DecayCause
+    p: Array
+    values: Array
+    unit: Array
+    unknowns: int
+    residual: Array
+    model: Callable[[Array], Array]
+
+    @property
+    def squares(self) -> float:
+        """The sum of squares of the residual."""
+        return float(self.residual @ self.residual)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Explained:
+    """A decay's test, and the law that it follows.
+
+    Attributes
+    ----------
+    name : "exponential", the law's name, or "unknown".
+    law : the law if it is neither exponential nor unknown.
+    density : density of the noise at the decay's frequency.
+    left : sum of squares that is not noise, left by the exponential and by the law.
+    """
+
+    name: DecayCause
+    departure: Departure
+    law: LawFit | None
+    density: float
+    left: tuple[float, float]
+
+    @property
+    def errors(self) -> Array:
+        """Standard errors of the law's damping ratio, natural frequency and size.
+
+        Unlike noise, what the law leaves beyond the noise does not average out, so it counts in
+        full.
+        """
+        assert self.law is not None
+        return self.law.unit * np.sqrt(self.density + self.left[1])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Candidate:
+    """A law to try.
+
+    Attributes
+    ----------
+    model : the model at times t and unknowns p.
+    pole : which of p are the decay rate and the damped frequency.
+    size : the size of the cause as weights of (p, linear), and whether the numbers make sense.
+    """
+
+    name: DecayCause
+    model: Callable[[Array, Array], SeparableModel]
+    starts: Sequence[Array]
+    scale: Array
+    pole: Callable[[Array, Array], tuple[int, int]]
+    size: Callable[[Array, Array, Array], tuple[Array, bool]]
+
+    def fit(self, t: Array, y: Array, *, starts: Sequence[Array] | None = None) -> LawFit | None:
+        """Return the best fit from some starts, None if there is none."""
+        found = [self._fit_from(t, y, start) for start in starts or self.starts]
+        return min(filter(None, found), key=lambda law: law.squares, default=None)
+
+    def _fit_from(self, t: Array, y: Array, start: Array) -> LawFit | None:
+        fit = fit_separable(
+            y,
+            partial(self.model, t),
+            start=start,
+            max_evaluations=_MAX_EVALUATIONS,
+            scale=self.scale,
+        )
+        p, linear, at = fit.p, fit.linear, self.pole(fit.p, fit.linear)
+        decay, omega_d = p[list(at)]
+        weights, sound = self.size(t, p, linear)
+        if not (fit.converged and omega_d > 0 and sound):
+            return None
+        omega_n, n = float(np.hypot(decay, omega_d)), p.size + linear.size
+        gradient = np.zeros((3, n))
+        gradient[0, list(at)] = np.array([omega_d**2, -decay * omega_d]) / omega_n**3
+        gradient[1, list(at)] = decay / omega_n, omega_d / omega_n
+        gradient[2] = weights
+        covariance = inverse_normal(self.model(t, p), linear)
+        size = float(gradient[2] @ np.concatenate([p, linear]))
+        return LawFit(
+            name=self.name,
+            p=p,
+            values=np.array([decay / omega_n, omega_n, size]),
+            unit=np.sqrt(np.einsum("ij,jk,ik->i", gradient, covariance, gradient)),
+            unknowns=n,
+            residual=fit.residual,
+            model=lambda at: self.model(at, p).columns @ linear,
+        )
+
+
+# -------------------------------------------------------------------- the test
+
+
+def find_departure(t: Array, y: Array, fit: Ringing, *, step: float) -> Departure:
+    """Test whether an exponential leaves more of the decay `y` than noise.
+
+    `step` is the encoder step.
+    """
+    tau, residual, pole = t - t[0], y - fit(t), complex(fit.poles[0])
+    n, angle = t.size, pole.imag * float(t[-1] - t[0]) / (t.size - 1)
+    orders = int(np.clip(angle * n / (2 * np.pi), *_ORDERS))
+    slow = legvander(2 * tau / tau[-1] - 1, orders).T
+    turning, decaying = np.exp(1j * pole.imag * tau), np.exp(pole.real * tau)
+    own = _columns(slow[:2], slow[:2] * decaying * turning)
+    flexible = _columns(
+        slow[2:4], slow * turning, slow[2:4] * decaying * turning, turning[None] ** 2,
+        turning[None] ** 3,
+    )  # fmt: skip
+    basis = np.linalg.qr(own)[0]
+    left = residual - basis @ (basis.T @ residual)
+    flexible /= np.linalg.norm(flexible, axis=0)
+    flexible -= basis @ (basis.T @ flexible)
+    added, sizes, _ = np.linalg.svd(flexible, full_matrices=False)
+    added = added[:, sizes > _SAME]
+    along = added.T @ left
+    noise = left - added @ along
+    density = noise_density(noise, angle=angle, step=step, unknowns=_UNKNOWNS + along.size)
+    freedom = min(2.0 * _BINS, max(n - _UNKNOWNS - along.size, 2.0))
+    limit = float(fdtri(along.size, freedom, 1 - _CHANCE))
+    return Departure(
+        statistic=max(
+            float(along @ along) / along.size / density,
+            limit / _LINE * _highest_line(noise, angle=angle),
+        ),
+        limit=limit,
+        columns=along.size,
+        left=left,
+        noise=noise,
+    )
+
+
+def _highest_line(residual: Array, *, angle: float) -> float:
+    """Return the highest power of another mode, relative to the usual power at its frequency."""
+    n = residual.size
+    window = np.hanning(n)
+    power = np.abs(np.fft.rfft(residual * window)) ** 2 / (window @ window)
+    first, last = (int(share * angle * n / (2 * np.pi)) for share in _SECOND)
+    near = power[max(first, 2) : min(last, n // 2) + 1]
+    usual = float(np.median(near)) / np.log(2) if near.size >= _BINS else 0.0
+    return float(np.max(near)) / usual if usual > 0 else 0.0
+
+
+def _columns(*parts: Array | ComplexArray) -> Array:
+    """Return real columns (n, …) of real and complex rows."""
+    real = [
+        half
+        for part in parts
+        for half in ((part.real, part.imag) if np.iscomplexobj(part) else (part,))
+    ]
+    return np.concatenate(real).T
+
+
+def noise_density(residual: Array, *, angle: float, step: float, unknowns: int) -> float:
+    """Return the variance of the noise near a frequency of `angle` rad per sample.
+
+    It is the mean of the spectrum at the nearest frequencies, but for those that a fit to the decay
+    and its harmonics follows, and at least that of white noise or of the rounding.
+    """
+    n = residual.size
+    freedom = max(n - unknowns, 1)
+    white = max(float(residual @ residual) / freedom, step**2 / 12)
+    power = np.abs(np.fft.rfft(residual)) ** 2 / n
+    bins = np.arange(1, power.size - 1)
+    at = angle * n / (2 * np.pi)
+    apart = np.min(np.abs(bins - at * np.arange(4.0)[:, None]), axis=0)
+    usable = bins[apart > _ORDERS[1] / 2 + 1]
+    nearest = usable[np.argsort(np.abs(usable - at), kind="stable")[:_BINS]]
+    return max(white, float(np.mean(power[nearest]))) if nearest.size == _BINS else white
+
+
+def thinned(t: Array, y: Array, *, omega: float) -> tuple[Array, Array]:
+    """Return means of neighbouring samples, as many as a decay at `omega` rad/s allows.
+
+    A constant sine keeps its frequency and damping, and its amplitude changes by one factor.
+    Samples at uneven times are returned as they are.
+    """
+    intervals = np.diff(t)
+    usual = float(np.median(intervals))
+    size = int(2 * np.pi / omega / usual / _PER_PERIOD)
+    if size < 2 or np.max(np.abs(intervals - usual)) > 0.5 * usual:
+        return t, y
+    n = t.size // size * size
+    t_mean, y_mean = (values[:n].reshape(-1, size).mean(axis=1) for values in (t, y))
+    return t_mean, y_mean
+
+
+# ------------------------------------------------------------- the competition
+
+
+def explain_decay(
+    t: Array, y: Array, fit: Ringing, *, step: float, turning: Array, falling: bool
+) -> Explained:
+    """Test whether a decay is exponential, and find the law that it follows if it is not.
+
+    Parameters
+    ----------
+    t, y : times and readings (n,) of one free decay.
+    fit : the exponential fit to the same samples.
+    step : the encoder step.
+    turning : times of the turning points.
+    falling : whether y decreases after the first turning point.
+    """
+    omega = float(fit.poles[0].imag)
+    coarse_t, coarse_y = thinned(t, y, omega=omega)
+    n, size = coarse_t.size, t.size // coarse_t.size
+    angle = omega * float(coarse_t[-1] - coarse_t[0]) / (n - 1)
+    density_of = partial(noise_density, angle=angle, step=step / np.sqrt(size))
+    departure = find_departure(coarse_t, coarse_y, fit, step=step / np.sqrt(size))
+    noise, columns = departure.noise, departure.columns + _UNKNOWNS
+    density = density_of(noise, unknowns=columns)
+    if not departure.present:
+        return Explained(
+            name="exponential",
+            departure=departure,
+            law=None,
+            density=size * density,
+            left=(0.0, 0.0),
+        )
+    tried = _candidates(coarse_t, coarse_y, fit, turning=turning, falling=falling, end=float(t[-1]))
+    swings = n * angle / np.pi
+    fits = [
+        (law, one)
+        for one in tried
+        # Each swing gives one number: its amplitude, its time or its middle. Dry friction also
+        # shows within a swing.
+        if (law := one.fit(coarse_t, coarse_y))
+        and (law.name == "dry_friction" or law.unknowns <= swings + _MORE_UNKNOWNS)
+    ]
+    for law, _ in fits:  # a law may leave less than the flexible change
+        other = density_of(law.residual, unknowns=law.unknowns)
+        if other < density:
+            noise, columns, density = law.residual, law.unknowns, other
+    n_eff = max(float(noise @ noise) / density, 2.0)
+    # Rounding leaves this much even if the fit follows it.
+    least = n * (step**2 / size / 12) * _LEAST_ROUNDING
+
+    def bic(squares: float, unknowns: int) -> float:
+        return n_eff * float(np.log(max(squares, least) / n)) + unknowns * float(np.log(n_eff))
+
+    def excess(squares: float) -> float:
+        """Return what is left beyond the noise, zero if it is within chance."""
+        more = squares - float(noise @ noise)
+        return more if more > departure.limit * departure.columns * density else 0.0
+
+    left = float(departure.left @ departure.left)
+    bics: dict[str, float] = {"exponential": bic(left, _UNKNOWNS)}
+    best: tuple[LawFit, _Candidate] | None = None
+    for law, tried_one in fits:
+        own = bic(law.squares, law.unknowns)
+        if own < bics.get(law.name, np.inf):
+            bics[law.name] = own
+            if own <= min(bics.values()):
+                best = law, tried_one
+    name: DecayCause = "unknown"
+    full, over = None, excess(left)
+    if best and _is_clear(best[0], bics, density=density):
+        law, tried_one = best
+        if excess(law.squares) <= _MOST_LEFT * over:
+            full = tried_one.fit(t, y, starts=[law.p])
+            name, over = (law.name, excess(law.squares)) if full else (name, over)
+    return Explained(
+        name=name,
+        departure=departure,
+        law=full,
+        density=size * density,
+        left=(size * excess(left), size * over),
+    )
+
+
+def _is_clear(law: LawFit, bics: Mapping[str, float], *, density: float) -> bool:
+    """Return whether the best law has a damping, and is clearly better than all others."""
+    others = [bic for name, bic in bics.items() if name != law.name]
+    undamped = law.values[0] < -_SIGMAS * law.unit[0] * np.sqrt(density)
+    return not undamped and bics[law.name] + _MARGIN < min(others)
+
+
+def _candidates(
+    t: Array, y: Array, fit: Ringing, *, turning: Array, falling: bool, end: float
+) -> Iterator[_Candidate]:
+    """Yield all laws that may explain why a decay is not exponential."""
+    pole = complex(fit.poles[0])
+    decay, omega, start = -pole.real, pole.imag, float(t[0])
+    length = float(t[-1] - t[0])
+
+    def modulated(
+        name: DecayCause,
+        free: Sequence[int],
+        p: Sequence[float],
+        size: Callable[[Array, Array, Array], tuple[Array, bool]],
+        *,
+        power: int = 0,
+        kept: bool = False,
+        bends: int = 1,
+    ) -> _Candidate:
+        return _Candidate(
+            name=name,
+            model=lambda t, p: Modulated.at(
+                t - start, p, free=free, power=power, kept=kept, bends=bends, length=length
+            ),
+            starts=[np.array(p)],
+            scale=np.full(len(free), abs(pole)),
+            pole=lambda p, linear: (0, 1),
+            size=size,
+        )
+
+    # A cart that friction has stopped stays where it is.
+    stops = [np.inf, turning.size - 1.0] if end > turning[-1] + np.pi / omega else [np.inf]
+    for cycles in stops:
+        yield _Candidate(
+            name="dry_friction",
+            model=partial(Swings.at, direction=-1.0 if falling else 1.0, cycles=cycles),
+            starts=[np.array([turning[0], decay * share, omega]) for share in (1.0, 0.3)],
+            scale=np.array([1 / omega, abs(pole), abs(pole)]),
+            pole=lambda p, linear: (1, 2),
+            size=lambda t, p, linear: (np.eye(7)[6], linear[3] > 0),
+        )
+    drag = [0.5 * decay, omega, 0.5 * decay]
+    yield modulated("quadratic_drag", [DECAY, FREQUENCY, DRAG], drag, _drag_size)
+    yield modulated("quadratic_drag", [DECAY, FREQUENCY, DRAG], drag, _drag_size, power=2)
+    shift = [decay, omega, 0.0]
+    yield modulated("frequency_shift", [DECAY, FREQUENCY, SHIFT], shift, _shift_size)
+    yield modulated(
+        "frequency_shift", [DECAY, FREQUENCY, SHIFT], shift, _shift_size, power=3, kept=True
+    )
+    for bends in (3, 6):
+        if 2 * np.pi * bends <= omega * length:  # a drift is slower than the oscillation
+            yield modulated("drift", [DECAY, FREQUENCY], [decay, omega], _bend_size, bends=bends)
+    others = _other_frequencies(t, y - fit(t), pole)
+    yield _Candidate(
+        name="second_mode",
+        model=lambda t, p: Waves.at(t - start, p, level=np.array([np.ones_like(t), t - start])),
+        starts=[np.array([decay, decay, omega, other]) for other in others],
+        scale=np.full(4, abs(pole)),
+        pole=_main_mode,
+        size=_second_size,
+    )
+
+
+def _drag_size(t: Array, p: Array, linear: Array) -> tuple[Array, bool]:
+    """Return the weights of the drag coefficient beta."""
+    amplitude = float(np.hypot(*linear[2:4]))
+    return np.eye(p.size + linear.size)[2] * 3 * np.pi / (4 * p[1] * amplitude), p[2] > 0
+
+
+def _shift_size(t: Array, p: Array, linear: Array) -> tuple[Array, bool]:
+    """Return the weights of the relative change of frequency at the largest amplitude."""
+    weights = np.zeros(p.size + linear.size)
+    weights[2] = 1 / p[1]
+    # The changes of the waveform are of second order in the shift.
+    amplitude, *others = np.hypot(*linear[2:].reshape(-1, 2).T)
+    shift = abs(p[2] / p[1])
+    return weights, shift < _MOST_SHIFT and max(others, default=0.0) < shift * amplitude / 2
+
+
+def _bend_size(t: Array, p: Array, linear: Array) -> tuple[Array, bool]:
+    """Return the weights of the rest point's largest distance from a line from start to end."""
+    share, bends = np.linspace(0, 1, 51)[:, None], np.arange(2, linear.size - 2)
+    shapes = share**bends - share
+    weights = np.zeros(p.size + linear.size)
+    distance = shapes @ linear[2 : linear.size - 2]
+    weights[p.size + bends] = shapes[int(np.argmax(np.abs(distance)))]
+    return weights, True
+
+
+def _main_mode(p: Array, linear: Array) -> tuple[int, int]:
+    """Return where decay rate and frequency of the mode with the larger amplitude are."""
+    return (0, 2) if np.hypot(*linear[[2, 4]]) >= np.hypot(*linear[[3, 5]]) else (1, 3)
+
+
+def _second_size(t: Array, p: Array, linear: Array) -> tuple[Array, bool]:
+    """Return the weights of the smaller mode's frequency; the modes must be apart."""
+    rates, frequencies = p.reshape(2, 2)
+    apart = abs(frequencies[1] - frequencies[0]) > _APART * np.max(np.abs(rates))
+    turns = float(np.min(frequencies)) * (t[-1] - t[0]) > 2 * np.pi
+    decays = float(np.min(rates)) > _LEAST_RATE * float(np.max(rates))
+    return np.eye(10)[3 if _main_mode(p, linear) == (0, 2) else 2], apart and turns and decays
+
+
+def _other_frequencies(t: Array, residual: Array, pole: complex) -> Iterator[float]:
+    """Yield frequencies to start from: the peak of the residual, and both sides of the first."""
+    length, padded = float(t[-1] - t[0]), 4 * t.size
+    omega = 2 * np.pi / length * (t.size - 1) / padded * np.arange(padded // 2 + 1)
+    power = np.abs(np.fft.rfft(residual * np.hanning(t.size), padded))
+    near = (omega > max(_SECOND[0] * pole.imag, np.pi / length)) & (omega < _SECOND[1] * pole.imag)
+    peak = float(omega[near][np.argmax(power[near])])
+    beside = np.pi / length
+    if abs(peak - pole.imag) > beside:
+        yield peak
+    yield pole.imag + beside
+    yield pole.imag - beside
