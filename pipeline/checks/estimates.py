@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.checks.decays import say_law
 from pipeline.names import read_name
 from pipeline.results import (
     Check,
@@ -17,7 +18,6 @@ from pipeline.results import (
 )
 from pipeline.set_up import Bench
 from pipeline.stages.compare import change_limit
-from pipeline.words.decays import say_law
 from pipeline.words.numbers import abridge, listing, significant
 from pipeline.words.phrases import phrases
 

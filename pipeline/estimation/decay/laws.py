@@ -10,10 +10,16 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
-from scipy.special import fdtri
 
-from pipeline.arrays import Array, ComplexArray
+from pipeline.arrays import Array
+from pipeline.estimation.decay.departure import (
+    SECOND,
+    UNKNOWNS,
+    Departure,
+    find_departure,
+    noise_density,
+    thinned,
+)
 from pipeline.estimation.decay.dry_friction import Swings
 from pipeline.estimation.decay.modulated import (
     DECAY,
@@ -26,14 +32,6 @@ from pipeline.estimation.decay.ringing import Ringing, Waves
 from pipeline.estimation.decay.separable import SeparableModel, fit_separable, inverse_normal
 from pipeline.results import DecayCause
 
-_CHANCE = 1e-4  # share of exponential decays that fail the test
-_UNKNOWNS = 6  # of an exponential decay with a drift
-_PER_PERIOD = 16  # samples per period that are enough to tell the laws apart
-_ORDERS = 3, 8  # least and most order of the flexible change; in between, one for each period
-_SAME = 1e-3  # share of a column outside the others, below which it adds nothing
-_SECOND = 0.3, 3.0  # frequencies where a second mode may be, relative to that of the first
-_LINE = 25.0  # power of a line above the noise that chance does not reach
-_BINS = 24  # frequencies near that of the decay that give the noise
 _MARGIN = 6.0  # BIC by which the best law must be better than the next
 _MOST_LEFT = 0.5  # share of what the exponential leaves that a law may leave
 _MAX_EVALUATIONS = 200
@@ -43,31 +41,6 @@ _LEAST_RATE = 0.1  # smaller decay rate of two modes, in the larger
 _MORE_UNKNOWNS = 3  # that a law may have than the decay has swings
 _MOST_SHIFT = 0.3  # relative shift of frequency up to which the series holds
 _APART = 0.5  # distance of two modes, in the larger decay rate
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Departure:
-    """What an exponential leaves of a decay, relative to the noise.
-
-    Attributes
-    ----------
-    statistic : F-statistic of the flexible change, or that of another mode if it says more.
-    limit : what the statistic exceeds by chance in one of 10,000 exponential decays.
-    columns : number of columns of the flexible change.
-    left : residual (n,) of the exponential fit.
-    noise : residual (n,) of the flexible change.
-    """
-
-    statistic: float
-    limit: float
-    columns: int
-    left: Array
-    noise: Array
-
-    @property
-    def present(self) -> bool:
-        """Whether more is left than noise."""
-        return self.statistic > self.limit
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -179,102 +152,6 @@ class _Candidate:
         )
 
 
-# -------------------------------------------------------------------- the test
-
-
-def find_departure(t: Array, y: Array, fit: Ringing, *, step: float) -> Departure:
-    """Test whether an exponential leaves more of the decay `y` than noise.
-
-    `step` is the encoder step.
-    """
-    tau, residual, pole = t - t[0], y - fit(t), complex(fit.poles[0])
-    n, angle = t.size, pole.imag * float(t[-1] - t[0]) / (t.size - 1)
-    orders = int(np.clip(angle * n / (2 * np.pi), *_ORDERS))
-    slow = legvander(2 * tau / tau[-1] - 1, orders).T
-    turning, decaying = np.exp(1j * pole.imag * tau), np.exp(pole.real * tau)
-    own = _columns(slow[:2], slow[:2] * decaying * turning)
-    flexible = _columns(
-        slow[2:4], slow * turning, slow[2:4] * decaying * turning, turning[None] ** 2,
-        turning[None] ** 3,
-    )  # fmt: skip
-    basis = np.linalg.qr(own)[0]
-    left = residual - basis @ (basis.T @ residual)
-    flexible /= np.linalg.norm(flexible, axis=0)
-    flexible -= basis @ (basis.T @ flexible)
-    added, sizes, _ = np.linalg.svd(flexible, full_matrices=False)
-    added = added[:, sizes > _SAME]
-    along = added.T @ left
-    noise = left - added @ along
-    density = noise_density(noise, angle=angle, step=step, unknowns=_UNKNOWNS + along.size)
-    freedom = min(2.0 * _BINS, max(n - _UNKNOWNS - along.size, 2.0))
-    limit = float(fdtri(along.size, freedom, 1 - _CHANCE))
-    return Departure(
-        statistic=max(
-            float(along @ along) / along.size / density,
-            limit / _LINE * _highest_line(noise, angle=angle),
-        ),
-        limit=limit,
-        columns=along.size,
-        left=left,
-        noise=noise,
-    )
-
-
-def _highest_line(residual: Array, *, angle: float) -> float:
-    """Return the highest power of another mode, relative to the usual power at its frequency."""
-    n = residual.size
-    window = np.hanning(n)
-    power = np.abs(np.fft.rfft(residual * window)) ** 2 / (window @ window)
-    first, last = (int(share * angle * n / (2 * np.pi)) for share in _SECOND)
-    near = power[max(first, 2) : min(last, n // 2) + 1]
-    usual = float(np.median(near)) / np.log(2) if near.size >= _BINS else 0.0
-    return float(np.max(near)) / usual if usual > 0 else 0.0
-
-
-def _columns(*parts: Array | ComplexArray) -> Array:
-    """Return real columns (n, …) of real and complex rows."""
-    real = [
-        half
-        for part in parts
-        for half in ((part.real, part.imag) if np.iscomplexobj(part) else (part,))
-    ]
-    return np.concatenate(real).T
-
-
-def noise_density(residual: Array, *, angle: float, step: float, unknowns: int) -> float:
-    """Return the variance of the noise near a frequency of `angle` rad per sample.
-
-    It is the mean of the spectrum at the nearest frequencies, but for those that a fit to the decay
-    and its harmonics follows, and at least that of white noise or of the rounding.
-    """
-    n = residual.size
-    freedom = max(n - unknowns, 1)
-    white = max(float(residual @ residual) / freedom, step**2 / 12)
-    power = np.abs(np.fft.rfft(residual)) ** 2 / n
-    bins = np.arange(1, power.size - 1)
-    at = angle * n / (2 * np.pi)
-    apart = np.min(np.abs(bins - at * np.arange(4.0)[:, None]), axis=0)
-    usable = bins[apart > _ORDERS[1] / 2 + 1]
-    nearest = usable[np.argsort(np.abs(usable - at), kind="stable")[:_BINS]]
-    return max(white, float(np.mean(power[nearest]))) if nearest.size == _BINS else white
-
-
-def thinned(t: Array, y: Array, *, omega: float) -> tuple[Array, Array]:
-    """Return means of neighbouring samples, as many as a decay at `omega` rad/s allows.
-
-    A constant sine keeps its frequency and damping, and its amplitude changes by one factor.
-    Samples at uneven times are returned as they are.
-    """
-    intervals = np.diff(t)
-    usual = float(np.median(intervals))
-    size = int(2 * np.pi / omega / usual / _PER_PERIOD)
-    if size < 2 or np.max(np.abs(intervals - usual)) > 0.5 * usual:
-        return t, y
-    n = t.size // size * size
-    t_mean, y_mean = (values[:n].reshape(-1, size).mean(axis=1) for values in (t, y))
-    return t_mean, y_mean
-
-
 # ------------------------------------------------------------- the competition
 
 
@@ -297,7 +174,7 @@ def explain_decay(
     angle = omega * float(coarse_t[-1] - coarse_t[0]) / (n - 1)
     density_of = partial(noise_density, angle=angle, step=step / np.sqrt(size))
     departure = find_departure(coarse_t, coarse_y, fit, step=step / np.sqrt(size))
-    noise, columns = departure.noise, departure.columns + _UNKNOWNS
+    noise, columns = departure.noise, departure.columns + UNKNOWNS
     density = density_of(noise, unknowns=columns)
     if not departure.present:
         return Explained(
@@ -334,7 +211,7 @@ def explain_decay(
         return more if more > departure.limit * departure.columns * density else 0.0
 
     left = float(departure.left @ departure.left)
-    bics: dict[str, float] = {"exponential": bic(left, _UNKNOWNS)}
+    bics: dict[str, float] = {"exponential": bic(left, UNKNOWNS)}
     best: tuple[LawFit, _Candidate] | None = None
     for law, tried_one in fits:
         own = bic(law.squares, law.unknowns)
@@ -472,7 +349,7 @@ def _other_frequencies(t: Array, residual: Array, pole: complex) -> Iterator[flo
     length, padded = float(t[-1] - t[0]), 4 * t.size
     omega = 2 * np.pi / length * (t.size - 1) / padded * np.arange(padded // 2 + 1)
     power = np.abs(np.fft.rfft(residual * np.hanning(t.size), padded))
-    near = (omega > max(_SECOND[0] * pole.imag, np.pi / length)) & (omega < _SECOND[1] * pole.imag)
+    near = (omega > max(SECOND[0] * pole.imag, np.pi / length)) & (omega < SECOND[1] * pole.imag)
     peak = float(omega[near][np.argmax(power[near])])
     beside = np.pi / length
     if abs(peak - pole.imag) > beside:
