@@ -99,12 +99,8 @@ def _highest_line(residual: Array, *, angle: float) -> float:
 
 def _columns(*parts: Array | ComplexArray) -> Array:
     """Return real columns (n, …) of real and complex rows."""
-    real = [
-        half
-        for part in parts
-        for half in ((part.real, part.imag) if np.iscomplexobj(part) else (part,))
-    ]
-    return np.concatenate(real).T
+    halves = [np.concatenate([p.real, p.imag]) if np.iscomplexobj(p) else p.real for p in parts]
+    return np.concatenate(halves).T
 
 
 def noise_density(residual: Array, *, angle: float, step: float, unknowns: int) -> float:
