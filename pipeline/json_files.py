@@ -225,7 +225,7 @@ def file_model(cls: type, part: tuple[str, ...] = ()) -> type[BaseModel]:
         f"{own.name}_": (
             _file_type(own.hint, own.part),
             Field(
-                default=... if own.older is MISSING else own.older,
+                default=... if own.older is MISSING else _as_written(own.older),
                 alias=own.key,
                 description=own.description or None,
             ),
@@ -235,6 +235,13 @@ def file_model(cls: type, part: tuple[str, ...] = ()) -> type[BaseModel]:
     name = cls.__name__ + ("Part" if part else "")
     settings = ConfigDict(frozen=True, allow_inf_nan=False)
     return create_model(name, __config__=settings, __doc__=about, **found)
+
+
+def _as_written(value: Any) -> Any:
+    """Return a value as the file's model holds it."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return file_model(type(value)).model_validate(plain(value))
+    return value
 
 
 def _file_type(hint: Any, part: tuple[str, ...]) -> Any:

@@ -231,6 +231,20 @@ class DecayLaw:
         return self.name == "dry_friction"
 
 
+# Earlier versions tested for dry friction alone.
+_LAW_UNTOLD = DecayLaw(
+    name="unknown",
+    statistic=np.nan,
+    limit=np.nan,
+    size=np.nan,
+    size_std=np.nan,
+    omega_n=np.nan,
+    omega_n_std=np.nan,
+    zeta=np.nan,
+    zeta_std=np.nan,
+)
+
+
 @result(eq=False)
 class LogDecrement:
     """Free decay of one cart: peaks, envelope, natural frequency and damping ratio.
@@ -269,7 +283,7 @@ class LogDecrement:
     omega_n_peaks_std: float
     zeta_peaks: Number = written("damping ratio from the logarithmic decrement")
     zeta_peaks_std: Number = written()
-    law: DecayLaw = written()
+    law: DecayLaw = written(older=_LAW_UNTOLD)
     note: str = written("what a reader must know, or empty", default="")
     peak_t: Array
     peak_y: Array

@@ -46,8 +46,8 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
 
     The decay is searched for, because a hold, a hand or a driven part may precede it. There are two
     estimates: the classical one from the peaks, and an exponential sinusoid with a drifting rest
-    point, fitted to every sample. If the exponential leaves more than noise, the law that explains
-    the rest gives damping and frequency, unless it is dry friction. The method is valid for one
+    point, fitted to every sample. If its residual exceeds the noise, damping and frequency are
+    those of the law that the decay follows, unless it is dry friction. The method is valid for one
     free cart on at least one spring and damping ratios up to about 0.6.
 
     Raises

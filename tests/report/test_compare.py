@@ -168,3 +168,14 @@ def test_compare_prints_a_change_in_one_line_on_stderr(tmp_path):
     (line,) = [text for text in done.stderr.splitlines() if text.startswith("since the earlier")]
     assert "1 final estimate moved, K most (+11.1 %" in line
     assert 'id="changes"' in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_draft_of_an_earlier_version_has_no_law_of_a_decay(tmp_path):
+    """A decay without the law that it follows, as version 0.2.0 wrote it, can be compared."""
+    analysis = analysed("one-cart")
+    earlier = json.loads(json_text(analysis))
+    for decay in earlier["log_decrements"]:
+        del decay["law"]
+    path = tmp_path / "earlier.json"
+    path.write_text(json.dumps(earlier), encoding="utf-8")
+    assert not compare_drafts(read_results(path), analysis).numbers

@@ -1,7 +1,7 @@
 """Test whether a free decay is exponential within the noise of its own recording.
 
-What the exponential leaves is compared with the spectrum of what remains after a flexible change of
-envelope, phase and rest point.
+The residual of the exponential is compared with the spectrum of the noise. The noise is the residual
+of a flexible change of envelope, phase and rest point.
 """
 
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ class Departure:
 
 
 def find_departure(t: Array, y: Array, fit: Ringing, *, step: float) -> Departure:
-    """Test whether an exponential leaves more of the decay `y` than noise.
+    """Test whether the residual of an exponential exceeds the noise of the decay `y`.
 
     `step` is the encoder step.
     """

@@ -174,9 +174,14 @@ def fit_decay(
     pole = complex(-np.log(_ratio(y, run)) / interval, np.pi / interval)
 
     def fit_from(
-        first: int, *, near: complex = pole, last: bool = False, rough: bool = False
+        first: int, *, after: FreeDecay | None = None, last: bool = False, rough: bool = False
     ) -> FreeDecay:
-        """Test the exponential only if its residual exceeds the noise, unless it is `rough`."""
+        """Fit on from the fit `after`, whose law is kept until all compete again in the `last` fit.
+
+        The exponential is tested only if its residual exceeds the noise, unless it is `rough`.
+        """
+        near = complex(after.fit.poles[0]) if after else pole
+        known = after.explained.law if after and after.explained and not last else None
         own = slice(first, stop)
         fit = fit_ringing(t[own], y[own], poles=np.array([near]), drift=True)
         explained = None
@@ -188,6 +193,7 @@ def fit_decay(
                 step=step,
                 turning=t[run],
                 falling=bool(y[run[1]] < y[run[0]]),
+                only=known.name if known else None,
             )
         turning = [i for i in run if i > first]
         return FreeDecay(
@@ -209,12 +215,12 @@ def fit_decay(
         if first == decay.first:
             break
         rough = share > 0 and decay.explained is None
-        decay = fit_from(first, near=complex(decay.fit.poles[0]), rough=rough)
+        decay = fit_from(first, after=decay, rough=rough)
     first = decay.first
     if first > stretch.first:
         margin = t[first] + _RELEASE_MARGIN * 2 * interval
         first = min(int(np.searchsorted(t, margin)), latest)
-    return fit_from(first, near=complex(decay.fit.poles[0]), last=True)
+    return fit_from(first, after=decay, last=True)
 
 
 def _carried_back(

@@ -1,7 +1,7 @@
 """Test whether a decay is exponential, and find the law that it follows if it is not.
 
-What the exponential leaves is compared with the noise of the recording itself: with the spectrum of
-what remains after a flexible change of envelope, phase and rest point. If more is left than noise,
+The residual of the exponential is compared with the noise of the recording itself. The noise is the
+residual of a flexible change of envelope, phase and rest point. If more is left than noise,
 the known reasons compete by their BIC, with the effective number of samples.
 """
 
@@ -29,13 +29,20 @@ from pipeline.estimation.decay.modulated import (
     Modulated,
 )
 from pipeline.estimation.decay.ringing import Ringing, Waves
-from pipeline.estimation.decay.separable import SeparableModel, fit_separable, inverse_normal
+from pipeline.estimation.decay.separable import (
+    PRECISION,
+    SeparableModel,
+    fit_separable,
+    inverse_normal,
+    squares_at,
+)
 from pipeline.results import DecayCause
 
 _MARGIN = 6.0  # BIC by which the best law must be better than the next
 _MOST_LEFT = 0.5  # share of what the exponential leaves that a law may leave
-_MAX_EVALUATIONS = 200
-_SIGMAS = 3.0  # a damping ratio below zero by more is none
+_MAX_EVALUATIONS = 100
+_ROUGH = 1e-4  # relative tolerance of the squares in the competition
+_SIGMAS = 3.0  # a damping ratio further below zero is impossible
 _LEAST_ROUNDING = 0.1  # share of the rounding error that any fit leaves
 _LEAST_RATE = 0.1  # smaller decay rate of two modes, in the larger
 _MORE_UNKNOWNS = 3  # that a law may have than the decay has swings
@@ -116,18 +123,20 @@ class _Candidate:
     pole: Callable[[Array, Array], tuple[int, int]]
     size: Callable[[Array, Array, Array], tuple[Array, bool]]
 
-    def fit(self, t: Array, y: Array, *, starts: Sequence[Array] | None = None) -> LawFit | None:
-        """Return the best fit from some starts, None if there is none."""
-        found = [self._fit_from(t, y, start) for start in starts or self.starts]
-        return min(filter(None, found), key=lambda law: law.squares, default=None)
+    def fit(self, t: Array, y: Array) -> LawFit | None:
+        """Return a rough fit from the best start, None if it makes no sense."""
+        start = min(self.starts, key=lambda p: squares_at(y, self.model(t, p)))
+        return self.fit_from(start, t, y, precision=_ROUGH)
 
-    def _fit_from(self, t: Array, y: Array, start: Array) -> LawFit | None:
+    def fit_from(self, start: Array, t: Array, y: Array, *, precision: float) -> LawFit | None:
+        """Return the fit from a start, None if it makes no sense."""
         fit = fit_separable(
             y,
             partial(self.model, t),
             start=start,
             max_evaluations=_MAX_EVALUATIONS,
             scale=self.scale,
+            precision=precision,
         )
         p, linear, at = fit.p, fit.linear, self.pole(fit.p, fit.linear)
         decay, omega_d = p[list(at)]
@@ -156,7 +165,14 @@ class _Candidate:
 
 
 def explain_decay(
-    t: Array, y: Array, fit: Ringing, *, step: float, turning: Array, falling: bool
+    t: Array,
+    y: Array,
+    fit: Ringing,
+    *,
+    step: float,
+    turning: Array,
+    falling: bool,
+    only: DecayCause | None = None,
 ) -> Explained:
     """Test whether a decay is exponential, and find the law that it follows if it is not.
 
@@ -167,6 +183,7 @@ def explain_decay(
     step : the encoder step.
     turning : times of the turning points.
     falling : whether y decreases after the first turning point.
+    only : the only law to try; by default all compete.
     """
     omega = float(fit.poles[0].imag)
     coarse_t, coarse_y = thinned(t, y, omega=omega)
@@ -191,10 +208,11 @@ def explain_decay(
         for one in tried
         # Each swing gives one number: its amplitude, its time or its middle. Dry friction also
         # shows within a swing.
-        if (law := one.fit(coarse_t, coarse_y))
+        if only in (None, one.name)
+        and (law := one.fit(coarse_t, coarse_y))
         and (law.name == "dry_friction" or law.unknowns <= swings + _MORE_UNKNOWNS)
     ]
-    for law, _ in fits:  # a law may leave less than the flexible change
+    for law, _ in fits:  # the residual of a law may be smaller than that of the flexible change
         other = density_of(law.residual, unknowns=law.unknowns)
         if other < density:
             noise, columns, density = law.residual, law.unknowns, other
@@ -224,7 +242,7 @@ def explain_decay(
     if best and _is_clear(best[0], bics, density=density):
         law, tried_one = best
         if excess(law.squares) <= _MOST_LEFT * over:
-            full = tried_one.fit(t, y, starts=[law.p])
+            full = tried_one.fit_from(law.p, t, y, precision=PRECISION)
             name, over = (law.name, excess(law.squares)) if full else (name, over)
     return Explained(
         name=name,

@@ -13,7 +13,7 @@ from scipy.optimize import leastsq
 from pipeline.arrays import Array
 from pipeline.estimation.minimise import evaluated_once
 
-_PRECISION = 1e-8  # relative tolerance of the sum of squares, of p, and of the slope
+PRECISION = 1e-8  # relative tolerance of the sum of squares, of p, and of the slope
 _FOUND = (1, 2, 3, 4)  # MINPACK's codes for convergence
 
 
@@ -50,10 +50,12 @@ def fit_separable(
     start: Array,
     max_evaluations: int,
     scale: Array | float = 1.0,
+    precision: float = PRECISION,
 ) -> SeparableFit:
     """Fit a model with nonlinear unknowns p to y (n,), starting from `start` (n_p,).
 
-    `scale` is the typical size of p.
+    `scale` is the typical size of p, `precision` the relative tolerance of the sum of squares, of p
+    and of the slope.
     """
 
     def jacobian(point: _Point) -> Array:
@@ -69,14 +71,20 @@ def fit_separable(
             start,
             Dfun=lambda p: jacobian(at(p)),
             full_output=True,
-            ftol=_PRECISION,
-            xtol=_PRECISION,
-            gtol=_PRECISION,
+            ftol=precision,
+            xtol=precision,
+            gtol=precision,
             maxfev=max_evaluations,
             diag=np.broadcast_to(1 / np.asarray(scale, dtype=np.float64), start.shape),
         )
     best = at(p)
     return SeparableFit(p=p, linear=best.linear, residual=best.residual, converged=status in _FOUND)
+
+
+def squares_at(y: Array, model: SeparableModel) -> float:
+    """Return the least sum of squares that a model leaves of y (n,)."""
+    residual = _solved(y, model).residual
+    return float(residual @ residual)
 
 
 def inverse_normal(model: SeparableModel, linear: Array) -> Array:
