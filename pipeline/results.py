@@ -209,10 +209,8 @@ class DecayLaw:
     statistic: Number = written("what an exponential leaves, relative to the noise (F-statistic)")
     limit: Number = written("what the statistic reaches by chance in one of 10,000 decays")
     size: Number = written(
-        "dry_friction: d = F/k, half the width of the friction band, position units; "
-        "quadratic_drag: beta of the deceleration beta |v| v, per position unit; frequency_shift: "
-        "relative change of the frequency at the largest swing; second_mode: its frequency, rad/s; "
-        "drift: how far the rest point leaves a straight line, position units; otherwise null"
+        "d = F/k of friction, beta of a drag beta |v| v, relative shift at the largest swing, "
+        "second damped frequency in rad/s, or largest drift off a line"
     )
     size_std: Number = written()
     omega_n: Number = written("rad/s, for small oscillations without the cause")

@@ -1,7 +1,7 @@
 """Test whether a free decay is exponential within the noise of its own recording.
 
-The residual of the exponential is compared with the spectrum of the noise. The noise is the residual
-of a flexible change of envelope, phase and rest point.
+The residual of the exponential is compared with the spectrum of the noise. The noise is the
+residual of a flexible change of envelope, phase and rest point.
 """
 
 from dataclasses import dataclass

@@ -46,6 +46,8 @@ _SIGMAS = 3.0  # a damping ratio further below zero is impossible
 _LEAST_ROUNDING = 0.1  # share of the rounding error that any fit leaves
 _LEAST_RATE = 0.1  # smaller decay rate of two modes, in the larger
 _MORE_UNKNOWNS = 3  # that a law may have than the decay has swings
+# Errors relative to the next power of a shift, from simulated springs and pendulums.
+_NEGLECTED = np.array([0.5, 0.1, 1.0])  # of damping ratio, frequency and shift
 _MOST_SHIFT = 0.3  # relative shift of frequency up to which the series holds
 _APART = 0.5  # distance of two modes, in the larger decay rate
 
@@ -99,10 +101,13 @@ class Explained:
         """Standard errors of the law's damping ratio, natural frequency and size.
 
         Unlike noise, what the law leaves beyond the noise does not average out, so it counts in
-        full.
+        full. The averages behind a shift of frequency neglect its next power.
         """
         assert self.law is not None
-        return self.law.unit * np.sqrt(self.density + self.left[1])
+        zeta, omega_n, size = self.law.values
+        shift = abs(size) if self.law.name == "frequency_shift" else 0.0
+        neglected = _NEGLECTED * np.array([zeta * shift, omega_n * shift**2, shift**2])
+        return np.hypot(self.law.unit * np.sqrt(self.density + self.left[1]), neglected)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
