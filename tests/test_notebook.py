@@ -103,7 +103,7 @@ def test_tables_have_the_names_of_the_results(lab):
     assert lab.parameters.loc["omega_a", "final"] == results["parameters"][2]["final"]
     assert (lab.checks["outcome"] == "pass").all()
     assert list(lab.decays["experiment"]) == ["decay-1a", "decay-1b", "decay-2a", "decay-2b"]
-    assert not lab.decays["friction_present"].any()
+    assert (lab.decays["law_name"] == "exponential").all()
     assert len(lab.steps) == len(results["step_gains"])
     assert lab.steps.attrs["units"]["gain"] == "cm/V"
     assert len(lab.dwells) == len(lab.results.sine_points)

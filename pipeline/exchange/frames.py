@@ -122,7 +122,7 @@ def _units(columns: Sequence[str], *, analysis: Analysis) -> dict[str, str]:
         "rad/s": ("omega", "omega_n", "omega_n_peaks"),
         "rad": ("phase",),
         "s": ("steady_from",),
-        of.position: ("amplitude", "rest_shift", "friction_drop"),
+        of.position: ("amplitude", "rest_shift"),
         of.input: ("input_amplitude",),
         of.gain: ("gain", "magnitude", "interval_low", "interval_high"),
     }
