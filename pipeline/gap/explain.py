@@ -16,7 +16,7 @@ from pipeline.gap.follow.track import compile_follower
 from pipeline.gap.search.deadline import Deadline
 from pipeline.gap.search.hypothesis import Study
 from pipeline.gap.search.search import Search
-from pipeline.gap.types import FoundEffect, Gap
+from pipeline.gap.types import Cause, FoundEffect, Gap
 from pipeline.gap.verdict.account import (
     chain_covariance,
     chain_std,
@@ -66,7 +66,11 @@ def investigate(analysis: Analysis, *, progress: Progress, budget: float | None 
         provenance=analysis.provenance,
         left_out=analysis.left_out,
         groups=analysis.groups,
-        causes=tuple(c for c in analysis.causes if not c.run or c.run in used),
+        causes=tuple(
+            Cause(id=c.id, value=c.value, limit=c.limit, message=c.message)
+            for c in analysis.causes
+            if not c.run or c.run in used
+        ),
         notes=(*notes, *gap.notes),
     )
 

@@ -13,7 +13,6 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects import AugmentedChain, Effect, find_effect
 from pipeline.results import (
     ChainWithUnits,
-    Check,
     Intervention,
     LeftOut,
     Provenance,
@@ -221,6 +220,17 @@ class Prediction:
     positions: Array
 
 
+@result()
+class Cause:
+    """A failed check of the set-up, such as its springs or units, that comes before any effect."""
+
+    id: str = written()
+    outcome: Literal["fail"] = written(default="fail")
+    value: float | None = written(default=None)
+    limit: float | None = written(default=None)
+    message: str = written()
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Proposal:
     """The recording that best distinguishes the contenders.
@@ -279,7 +289,7 @@ class Gap:
         older=True,
         default=True,
     )
-    causes: tuple[Check, ...] = written(
+    causes: tuple[Cause, ...] = written(
         "failed checks of the set-up, which may cause the gap, the most serious first; effects "
         "count only once the set-up is right",
         older=(),

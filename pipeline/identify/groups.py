@@ -77,16 +77,17 @@ def _against_decays(
 ) -> tuple[RecordingGroup, ...]:
     """Return the fitted recordings and the decays, if these want other masses.
 
-    The springs are the same if all static gains agree. A decay with dry friction proves nothing.
+    The springs are the same if all static gains agree. Other decays than exponential ones
+    prove nothing.
     """
     gains = [row.consistent for row in rows if read_name(row.name).is_gain]
-    sticking = {d.experiment for d in found.decays if d.friction and d.friction.present}
+    bent = {d.experiment for d in found.decays if not d.law.is_exponential}
     pairs = {
         row.name: (row.initial, row.final)
         for row in rows
         if row.consistent is False and read_name(row.name).is_frequency
         if row.initial and row.initial.source == "log_decrement" and row.final
-        if not sticking & set(row.initial.experiments)
+        if not bent & set(row.initial.experiments)
     }
     if not pairs or not all(gains):
         return ()

@@ -13,27 +13,27 @@ from pipeline.submission.edit import edit_submission
 from pipeline.workflow import analyse
 from tests.helpers.commandline import cartlab_here
 
-HEAD = """\
-version = 1
-[system]
-carts = 2
-"""
-TABLES = """\
-[reported.initial]
-K_1 = 25.6
-omega_a = 10.0
-[reported.final]
-K_1 = 24.3
-omega_a = 10.1
-zeta_a = 0.1
-[reported.state_space]
-A = [[0, 1, 0, 0], [-1, -2, 3, 0], [0, 0, 0, 1], [4, 0, -5, -6]]
-B = [0, 3196.70, 0, 0]
-[reported.feedback]
-gains = [1, 2, 3, 4]
-prefilter = 2.5
-"""
-TEXT = HEAD + TABLES
+TEXT = "\n".join(
+    (
+        "version = 1",
+        "[system]",
+        "carts = 2",
+        "[reported.initial]",
+        "K_1 = 25.6",
+        "omega_a = 10.0",
+        "[reported.final]",
+        "K_1 = 24.3",
+        "omega_a = 10.1",
+        "zeta_a = 0.1",
+        "[reported.state_space]",
+        "A = [[0, 1, 0, 0], [-1, -2, 3, 0], [0, 0, 0, 1], [4, 0, -5, -6]]",
+        "B = [0, 3196.70, 0, 0]",
+        "[reported.feedback]",
+        "gains = [1, 2, 3, 4]",
+        "prefilter = 2.5",
+        "",
+    )
+)
 ROWS = TEXT.replace("[[0, 1", "[\n  [0, 1").replace("], [", "],\n  [").replace("-6]]", "-6]\n]")
 
 
