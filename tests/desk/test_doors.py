@@ -18,7 +18,7 @@ from pipeline.desk.app import ROUTES, DeskServer
 from pipeline.desk.ask import Ask, Desk
 from pipeline.desk.doors import MOST_FORM
 from pipeline.desk.home import show_home
-from pipeline.desk.users import User, read_users
+from pipeline.desk.users import Role, User, read_users
 from pipeline.errors import ConfigError
 from pipeline.resources import RUBRICS
 from pipeline.submission import load_submission
@@ -487,7 +487,8 @@ def test_pages_are_whole_wherever_the_data_lie(top):
     try:
         scope = {"type": "http", "method": "GET", "path": "/", "headers": [], "query_string": b""}
         request = Request({**scope, "path_params": {}})
-        page = show_home(Ask(desk=desk, user=user, request=request, form=FormData())).body.decode()
+        home = show_home(Ask(desk=desk, user=user, request=request, form=FormData()))
+        page = bytes(home.body).decode()
     finally:
         desk.close()
     for address in ("/student/0/", "/student/1/", "/static/desk.css"):
@@ -498,7 +499,10 @@ def test_pages_are_whole_wherever_the_data_lie(top):
 def test_a_message_names_places_only_by_their_names(tmp_path):
     """A message for students and TAs holds no path of their folders; an instructor sees it."""
     folder = tmp_path / "grades"
-    for role, shown in (("ta", "grades/gradebook.sqlite"), ("instructor", f"{folder}/gradebook")):
+    of_role: dict[Role, str] = {
+        "ta": "grades/gradebook.sqlite", "instructor": f"{folder}/gradebook"
+    }  # fmt: skip
+    for role, shown in of_role.items():
         user = User(name="x", role=role, gradebooks=[folder])
         assert shown in user.name_places(f"{folder}/gradebook.sqlite: is a link")
 
