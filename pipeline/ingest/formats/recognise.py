@@ -109,7 +109,8 @@ def _limited(source: str) -> Iterator[None]:
     before = signal.signal(signal.SIGVTALRM, stop)
     try:
         try:
-            signal.setitimer(signal.ITIMER_VIRTUAL, MOST_SECONDS)
+            # Again every second: Python drops an exception in a callback of its garbage collector.
+            signal.setitimer(signal.ITIMER_VIRTUAL, MOST_SECONDS, 1.0)
             yield
         finally:
             signal.setitimer(signal.ITIMER_VIRTUAL, 0)
