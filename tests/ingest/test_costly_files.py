@@ -97,9 +97,7 @@ def test_the_time_to_read_one_file_is_limited(tmp_path, monkeypatch):
     monkeypatch.setattr(recognise, "MOST_SECONDS", 0.02)  # s; the long file takes ten times that
     gc.disable()  # an exception in one of its callbacks would be dropped, and be raised a second on
     try:
-        with pytest.raises(
-            SubmissionError, match=r"long\.csv: takes more than 0\.02 s"
-        ):
+        with pytest.raises(SubmissionError, match=r"long\.csv: takes more than 0\.02 s"):
             read_table(tmp_path, "long.csv")
     finally:
         gc.enable()
