@@ -52,7 +52,7 @@ def answer_until_killed(place: str, first: int, pipe: int) -> None:
                     book.reopen("team", "laws", by="Ada", seen=done.version)
             book.ask("team", "laws", why=f"reason {number}", by="s1")
             asked = book.queue().waiting
-        points = number % 10 / 10
+        points = number % 4 / 4  # multiples of the step, and less than all of the points
         book.answer("team", "laws", points, text=f"{number}", by="Ada", seen=asked[0].version)
         os.write(pipe, f"{number}\n".encode())
         number += 1

@@ -51,7 +51,7 @@ def test_the_grading_pages_are_accessible(show, tmp_path):
         assert fits(window)
         # Tab reaches the same fields without the letter keys.
         window.get_by_label("Another number of points").fill("99")
-        window.get_by_label("Reason").fill("far too many")
+        window.get_by_label("Reason, which the team reads").fill("far too many")
         with window.expect_navigation():
             window.get_by_role("button", name="Save").click()
         expect(window.locator("#chosen").get_by_role("alert")).to_be_visible()
@@ -177,7 +177,7 @@ def test_two_tas_see_each_others_changes(show):
             for name, window in windows.items():
                 number = {"Ada": "1", "Bob": "2"}[name]
                 window.get_by_label("Another number of points").fill(number)
-                window.get_by_label("Reason").fill(f"as {name} sees it")
+                window.get_by_label("Reason, which the team reads").fill(f"as {name} sees it")
             ada, bob = windows.values()
             for window in (ada, bob):
                 if window is bob:

@@ -181,7 +181,7 @@ def test_a_rubric_is_edited_by_keyboard(show, tmp_path, monkeypatch):
         with window.expect_navigation():
             window.keyboard.press("Enter")
         result = window.locator(".now .result")
-        expect(result).to_have_text("20 points in 13 criteria; fits submissions with 1 cart")
+        expect(result).to_have_text("20 points in 14 criteria; fits submissions with 1 cart")
         window.get_by_label("Save as").fill(str(path))
         text = window.locator("#text")
         good = text.input_value()
