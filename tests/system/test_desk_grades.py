@@ -131,7 +131,7 @@ def test_a_class_is_graded_by_keys(show, tmp_path):
         expect(window.get_by_role("button", name="Redo")).to_be_visible()
         press(window, "u")
         expect(window.get_by_role("button", name="Undo")).to_be_visible()
-        while "Everything the lab asks for" not in title.inner_text():
+        while "Everything else that the lab asks for" not in title.inner_text():
             press(window, "k")
         window.keyboard.press("u")
         expect(window.get_by_text("Nothing was changed by hand here.")).to_be_in_viewport()
