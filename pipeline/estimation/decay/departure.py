@@ -29,7 +29,8 @@ class Departure:
 
     Attributes
     ----------
-    statistic : F-statistic of the flexible change, or that of another mode if it says more.
+    statistic : F-statistic of the flexible change, or that of dry friction or another mode if it
+        says more.
     limit : what the statistic exceeds by chance in one of 10,000 exponential decays.
     columns : number of columns of the flexible change.
     left : residual (n,) of the exponential fit.
@@ -48,10 +49,11 @@ class Departure:
         return self.statistic > self.limit
 
 
-def find_departure(t: Array, y: Array, fit: Ringing, *, step: float) -> Departure:
+def find_departure(t: Array, y: Array, fit: Ringing, *, step: float, friction: Array) -> Departure:
     """Test whether the residual of an exponential exceeds the noise of the decay `y`.
 
-    `step` is the encoder step.
+    `step` is the encoder step. `friction` (n,) is what a little dry friction adds to the decay;
+    this one column shows less friction than the many of the flexible change.
     """
     tau, residual, pole = t - t[0], y - fit(t), complex(fit.poles[0])
     n, angle = t.size, pole.imag * float(t[-1] - t[0]) / (t.size - 1)
@@ -74,9 +76,12 @@ def find_departure(t: Array, y: Array, fit: Ringing, *, step: float) -> Departur
     density = noise_density(noise, angle=angle, step=step, unknowns=UNKNOWNS + along.size)
     freedom = min(2.0 * _BINS, max(n - UNKNOWNS - along.size, 2.0))
     limit = float(fdtri(along.size, freedom, 1 - _CHANCE))
+    friction = friction - basis @ (basis.T @ friction)
+    rubbed = float(friction @ left) ** 2 / float(friction @ friction) / density
     return Departure(
         statistic=max(
             float(along @ along) / along.size / density,
+            limit / float(fdtri(1, freedom, 1 - _CHANCE)) * rubbed,
             limit / _LINE * _highest_line(noise, angle=angle),
         ),
         limit=limit,

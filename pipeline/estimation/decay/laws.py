@@ -195,7 +195,15 @@ def explain_decay(
     n, size = coarse_t.size, t.size // coarse_t.size
     angle = omega * float(coarse_t[-1] - coarse_t[0]) / (n - 1)
     density_of = partial(noise_density, angle=angle, step=step / np.sqrt(size))
-    departure = find_departure(coarse_t, coarse_y, fit, step=step / np.sqrt(size))
+    swings_at = partial(Swings.at, direction=-1.0 if falling else 1.0)
+    around = np.array([turning[0], -fit.poles[0].real, omega])
+    departure = find_departure(
+        coarse_t,
+        coarse_y,
+        fit,
+        step=step / np.sqrt(size),
+        friction=swings_at(coarse_t, around, cycles=np.inf).columns[:, 3],
+    )
     noise, columns = departure.noise, departure.columns + UNKNOWNS
     density = density_of(noise, unknowns=columns)
     if not departure.present:
