@@ -22,7 +22,7 @@ from pipeline.bench.live.observer import Anomalies
 from pipeline.bench.protocol.messages import Reading
 from pipeline.errors import ConfigError
 from pipeline.experiments.plan import PlanLimits
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.acquisitions import Notes, host, sine, write_work

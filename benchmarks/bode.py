@@ -23,9 +23,8 @@ from benchmarks.identification import (
 from benchmarks.page import Table, installed, missing, share, significant, spread
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.simulate import simulate_linear
 from pipeline.results import ChainFit, FrequencyResponse, Record
 from pipeline.set_up import Bench
 from pipeline.stages.time_fit import fit_records

@@ -12,9 +12,9 @@ import numpy as np
 
 from pipeline.ingest.read import read_data
 from pipeline.output import write_file
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.nonlinear.effects import CATALOGUE, Effect, EffectTerm
+from pipeline.plant.catalogue import CATALOGUE
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.effect import Effect, EffectTerm
 from pipeline.simulated.bench import SimulatedBench
 from pipeline.simulated.emulator.carts import TRUE_PERIOD
 from pipeline.simulated.hidden import default_values, prepare_bench

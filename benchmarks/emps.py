@@ -11,8 +11,8 @@ from pipeline.gap.data.sides import prepare
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
 from pipeline.gap.follow.track import compile_follower
-from pipeline.plant.nonlinear.augmented import compile_simulator
-from pipeline.plant.nonlinear.effects.base import AugmentedChain
+from pipeline.plant.augmented import compile_simulator
+from pipeline.plant.effect import AugmentedChain
 from pipeline.results import Record
 from pipeline.set_up import Bench, Units
 from tests.helpers.places import REAL_DATA

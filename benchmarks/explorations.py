@@ -26,7 +26,7 @@ from pipeline.experiments.exploring.error_goal import ErrorGoal
 from pipeline.experiments.exploring.exploration import Exploration
 from pipeline.experiments.plan_words import session_time
 from pipeline.experiments.propose import extend_plan, propose_plan
-from pipeline.plant.nonlinear.effects import find_effect
+from pipeline.plant.catalogue import find_effect
 from pipeline.submission import load_submission
 from tests.helpers.virtual import LimitPassed, VirtualBench, VirtualSession
 

@@ -3,10 +3,9 @@
 import numpy as np
 
 from benchmarks.page import Table, significant
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.step_response import overshoot_percent, settling_time
-from pipeline.plant.loop.sampled_loop import StateFeedback, loop_matrix, simulate_loop
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.sampled_loop import StateFeedback, loop_matrix, simulate_loop
+from pipeline.plant.simulate import overshoot_percent, settling_time
 from pipeline.results import FeedbackDesign
 from pipeline.stages.state_feedback import Method, design_feedback
 from pipeline.submission import Design

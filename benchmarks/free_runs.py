@@ -14,7 +14,7 @@ from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
 from pipeline.gap.fit.structure import Candidate, Structure
 from pipeline.gap.fit.structure import GapModel as FitModel
 from pipeline.gap.types import Gap
-from pipeline.plant.nonlinear.effects.base import AugmentedChain
+from pipeline.plant.effect import AugmentedChain
 from pipeline.results import Record
 
 OURS, LINEAR_CART = "cartlab", "linear"

@@ -11,7 +11,7 @@ from benchmarks.free_runs import left_out, percent
 from benchmarks.page import Table
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.types import Gap
-from pipeline.plant.nonlinear.effects import CATALOGUE, find_effect
+from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.results import Record
 from pipeline.set_up import Bench, Units
 from tests.helpers.places import REAL_DATA

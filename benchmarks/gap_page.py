@@ -35,8 +35,8 @@ from pipeline.gap.search.whole import fit_whole
 from pipeline.gap.types import Gap, Trace
 from pipeline.gap.verdict.account import make_traces
 from pipeline.output import write_file
-from pipeline.plant.nonlinear.effects import CATALOGUE
-from pipeline.plant.nonlinear.effects.base import AugmentedChain
+from pipeline.plant.catalogue import CATALOGUE
+from pipeline.plant.effect import AugmentedChain
 from pipeline.report.figures.gap import before_after_figure
 from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import plain_svg, to_svg

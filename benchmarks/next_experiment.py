@@ -28,9 +28,8 @@ from pipeline.experiments.next_recordings import choose_next
 from pipeline.experiments.plan import Plan, Recording
 from pipeline.experiments.propose import FURTHEST, propose_plan, renamed, rounded, rounded_down
 from pipeline.output import write_file
-from pipeline.plant.linear.chain import Array, Chain
-from pipeline.plant.linear.dwells import SETTLED, SETTLED_DWELL, settling_wait, steady_time
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS, Array, Chain
+from pipeline.plant.simulate import SETTLED, SETTLED_DWELL, settling_wait, steady_time
 from pipeline.report.figures.style import drawing, legend_above, small_multiples
 from pipeline.report.figures.svg import plain_svg, to_svg
 from pipeline.results import Analysis

@@ -5,7 +5,7 @@ import time
 import numpy as np
 
 from benchmarks.page import Table, share, spread
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS
 from pipeline.set_up import Bench
 from pipeline.stages.time_fit import fit_records
 from tests.helpers.time_records import random_chain, step_record

@@ -4,8 +4,8 @@ import numpy as np
 
 from benchmarks.page import Table, share
 from pipeline.arrays import Array
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Kind, Record
 from pipeline.stages.log_decrement import fit_log_decrement
 from pipeline.stages.sine import fit_sine

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from pipeline.output import write_file
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.nonlinear.effects import CATALOGUE, Effect
+from pipeline.plant.catalogue import CATALOGUE
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.effect import Effect
 from pipeline.report.effects.catalogue import parameter_text
 from pipeline.report.effects.gallery import BENCH, effect_picture, hiding_option
 from pipeline.report.figures.style import drawing

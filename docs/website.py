@@ -13,7 +13,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
-from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.plant.catalogue import CATALOGUE
 from pipeline.words.math import to_mathml, to_tex
 
 ROOT = Path(__file__).parents[1]

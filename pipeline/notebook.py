@@ -13,9 +13,9 @@ from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.self_check.check import check_numbers
 from pipeline.grading.self_check.log import CheckAnswer
 from pipeline.grading.self_check.words import answer_lines
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.loop.margins import closed_loop
-from pipeline.plant.nonlinear.motion import EquationsOfMotion
+from pipeline.plant.chain import Chain
+from pipeline.plant.margins import closed_loop
+from pipeline.plant.motion import EquationsOfMotion
 from pipeline.report.document import Block, Document, Heading
 from pipeline.report.draft.content import build_document
 from pipeline.report.gap.beside import with_gap

@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 from pipeline import __version__
 from pipeline.arrays import Array, ComplexArray, freeze
 from pipeline.json_files import Matrix, Number, Numbers, Sha256, computed, result, written
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.loop.margins import Margins
-from pipeline.plant.loop.sampled_loop import StateFeedback
+from pipeline.plant.chain import Chain
+from pipeline.plant.margins import Margins
+from pipeline.plant.sampled_loop import StateFeedback
 from pipeline.set_up import Bench, Units
 
 Kind = Literal["decay", "step", "sine", "sweep", "closed_loop", "bode"]

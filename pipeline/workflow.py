@@ -21,15 +21,8 @@ from pipeline.identify.remarks import gain_sign_warning, hand_remarks, reading_r
 from pipeline.identify.sound import identify_from_sound
 from pipeline.identify.springs import check_springs
 from pipeline.ingest.read import Ingested, read_data
-from pipeline.plant.linear.chain import Chain
-from pipeline.results import (
-    Analysis,
-    ChainFit,
-    FeedbackDesign,
-    HardwareCheck,
-    Intervention,
-    Stage,
-)
+from pipeline.plant.chain import Chain
+from pipeline.results import Analysis, ChainFit, FeedbackDesign, HardwareCheck, Intervention, Stage
 from pipeline.soundness.fault import sound_ones
 from pipeline.soundness.late_channels import find_late_channels
 from pipeline.stages.hardware_check import check_hardware

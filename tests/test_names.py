@@ -3,8 +3,8 @@
 import pytest
 
 from pipeline.names import gain_name, own_omega, own_zeta, parameter_names, read_name
-from pipeline.plant.linear.laws import brackets, orders
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.identities import brackets, orders
 from pipeline.set_up import PAPER_UNITS
 
 

@@ -8,7 +8,7 @@ import psutil
 import pytest
 
 from pipeline.errors import DataError
-from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.plant.catalogue import CATALOGUE
 from pipeline.second_process import SecondProcess
 from pipeline.words.progress import silent
 

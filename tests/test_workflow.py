@@ -15,7 +15,7 @@ from pipeline.estimation.chain.follow import follow
 from pipeline.exchange.saved import matlab_file
 from pipeline.json_files import json_text
 from pipeline.notebook import Lab
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS
 from pipeline.report.draft.content import build_document
 from pipeline.report.render.html import render_html
 from pipeline.report.solution.write import build_solution

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.names import toml_flags
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.report.sections.questions import ask
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.results import Analysis

@@ -8,9 +8,8 @@ import pytest
 
 from pipeline.json_files import json_text
 from pipeline.names import read_name
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.simulate import simulate_linear
 from pipeline.report.sections.questions import ask
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.results import Analysis

@@ -11,8 +11,8 @@ import pytest
 
 from pipeline.arrays import Array
 from pipeline.json_files import json_text
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import Chain
+from pipeline.plant.simulate import simulate_linear
 from pipeline.report.draft.content import build_document
 from pipeline.report.sections.page import Page
 from pipeline.report.sections.parameters import parameter_table

@@ -6,14 +6,14 @@ from pathlib import Path
 
 from docs.codegen.laws import columns_source, laws_source, terms_source
 from pipeline.output import write_file
-from pipeline.plant import nonlinear
-from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.plant import simulator
+from pipeline.plant.catalogue import CATALOGUE
 
-ROOM = Path(nonlinear.__file__).parent
+ROOM = Path(simulator.__file__).parent
 MADE = {
     "columns.py": columns_source,
-    "simulator/laws.py": laws_source,
-    "simulator/terms.py": terms_source,
+    "laws.py": laws_source,
+    "terms.py": terms_source,
 }
 
 

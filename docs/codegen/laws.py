@@ -11,14 +11,8 @@ from typing import Any
 import sympy
 from sympy.printing.pycode import PythonCodePrinter
 
-from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
-from pipeline.plant.nonlinear.effects.law import (
-    ContactLaw,
-    ForceLaw,
-    FrictionLaw,
-    HysteresisLaw,
-    InputLaw,
-)
+from pipeline.plant.effect import Effect, EffectParameter
+from pipeline.plant.law import ContactLaw, ForceLaw, FrictionLaw, HysteresisLaw, InputLaw
 
 Expr = Any  # sympy's own annotations are partial
 
@@ -167,8 +161,8 @@ def laws_source(catalogue: Sequence[Effect]) -> str:
     out = [
         _HEAD.format("The laws of the effects, for the compiled simulators."),
         "from math import cos, exp, inf, pi, sin\n",
-        "from pipeline.plant.nonlinear.columns import Cart, Drive, Spring",
-        "from pipeline.plant.nonlinear.simulator.compiler import inlined, jit\n",
+        "from pipeline.plant.simulator.columns import Cart, Drive, Spring",
+        "from pipeline.plant.simulator.compiler import inlined, jit\n",
     ]
     for place, on_motor, arguments, where in _SIMULATED:
         out += _forces(catalogue, place, on_motor, arguments, where)
@@ -187,7 +181,7 @@ def terms_source(catalogue: Sequence[Effect]) -> str:
     out = [
         _HEAD.format("The laws of the effects in the coordinates of a fit, with derivatives."),
         "from enum import IntEnum\nfrom math import cos, exp, pi, sin\n",
-        "from pipeline.plant.nonlinear.simulator.compiler import jit\n",
+        "from pipeline.plant.simulator.compiler import jit\n",
         *_followed(catalogue),
     ]
     return "\n".join(out) + "\n"

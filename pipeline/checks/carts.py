@@ -6,10 +6,9 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.names import gain_name, own_zeta, read_name, toml_flags
+from pipeline.plant.chain import Chain
+from pipeline.plant.identities import brackets, recover_from_parameters
 from pipeline.plant.limits import HEAVY_DAMPING
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.laws import brackets
-from pipeline.plant.linear.recovery import recover_from_parameters
 from pipeline.results import EXPLAINED, ChainFit, Check, LogDecrement, passed
 from pipeline.set_up import Bench
 from pipeline.stages.compare import SIGMA_LIMIT

@@ -8,9 +8,9 @@ from scipy.linalg import solve_discrete_are
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.loop.margins import Margins, stability_margins
-from pipeline.plant.loop.sampled_loop import discretise
+from pipeline.plant.chain import Chain
+from pipeline.plant.margins import Margins, stability_margins
+from pipeline.plant.sampled_loop import discretise
 from pipeline.results import Check, CheckOutcome, FeedbackDesign, HardwareCheck
 
 # Largest difference between the polynomials of two loops that count as the same. Rounding leaves

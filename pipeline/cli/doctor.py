@@ -97,7 +97,7 @@ def examine() -> Health:
     needed, extras = _packages()
     folder, fresh = "", False
     if not any(one.problem for one in needed if one.name in ("numba", "numpy")):
-        from pipeline.plant.nonlinear.simulator import compiler
+        from pipeline.plant.simulator import compiler
 
         folder, fresh = str(compiler.kept_in(compiler.ROOM) or ""), compiler.is_compiled()
     return Health(

@@ -46,7 +46,7 @@ def effects(
     as_json: AsJson = False,
 ) -> None:
     """List the effects beyond the linear chain: law, fingerprint, deciding experiment."""
-    from pipeline.plant.nonlinear.effects import CATALOGUE, find_effect
+    from pipeline.plant.catalogue import CATALOGUE, find_effect
     from pipeline.report.effects.catalogue import catalogue_data, catalogue_text
 
     chosen = [find_effect(name)] if name else CATALOGUE

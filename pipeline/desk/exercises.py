@@ -13,7 +13,8 @@ from typing import Any
 
 from pipeline.errors import ConfigError
 from pipeline.output import new_folder, own_folder
-from pipeline.plant.nonlinear.effects import EffectParameter, find_effect
+from pipeline.plant.catalogue import find_effect
+from pipeline.plant.effect import EffectParameter
 from pipeline.simulated.bench import SimulatedBench
 from pipeline.simulated.hidden import default_values, prepare_bench, usual_term
 from pipeline.submission import load_submission

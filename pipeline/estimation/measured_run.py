@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.noise import local_noise
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import Chain
+from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Record
 
 _STILL = 0.02  # share of a signal's range by which it may vary and count as constant

@@ -11,7 +11,7 @@ from pipeline.experiments.information import Knowledge
 from pipeline.experiments.multisine import optimal_tones
 from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.experiments.propose import FURTHEST, rounded, rounded_down
-from pipeline.plant.linear.dwells import SETTLED, SETTLED_DWELL, dwell_frequencies, settling_wait
+from pipeline.plant.simulate import SETTLED, SETTLED_DWELL, dwell_frequencies, settling_wait
 
 _PERIODS = 2  # periods of a multisine in a record
 _BAND = (0.4, 1.6)  # lowest and highest frequency, as multiples of the first and the last resonance

@@ -21,22 +21,15 @@ from pipeline.arrays import Array
 from pipeline.errors import DataError, PipelineError
 from pipeline.experiments.information import sampled_input
 from pipeline.experiments.plan import PlanLimits, Recording
-from pipeline.experiments.propose import (
-    FURTHEST,
-    current_plan,
-    let_go,
-    rounded,
-    rounded_down,
-)
+from pipeline.experiments.propose import FURTHEST, current_plan, let_go, rounded, rounded_down
 from pipeline.gap.limits import CLOSE_BIC, THINNING
 from pipeline.gap.types import Gap, Prediction, Proposal
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.dwells import SETTLED, settling_wait
-from pipeline.plant.linear.simulate import simulate_linear
-from pipeline.plant.nonlinear.augmented import rest_positions, simulate_augmented
-from pipeline.plant.nonlinear.effects.base import AugmentedChain, EffectTerm
-from pipeline.plant.nonlinear.simulator import sensitivity
-from pipeline.plant.nonlinear.simulator.kernel import StartState, describe_run, simulate
+from pipeline.plant.augmented import rest_positions, simulate_augmented
+from pipeline.plant.chain import Chain
+from pipeline.plant.effect import AugmentedChain, EffectTerm
+from pipeline.plant.simulate import SETTLED, settling_wait, simulate_linear
+from pipeline.plant.simulator import sensitivity
+from pipeline.plant.simulator.kernel import StartState, describe_run, simulate
 from pipeline.submission import Submission
 
 Kind = Literal["step", "sweep"]

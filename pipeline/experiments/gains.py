@@ -1,7 +1,7 @@
 """The controller of a recording, in the units that the bench uses, checked for safety.
 
 The bench computes in duty counts and encoder counts, once per period, by the laws in
-`plant.loop.sampled_loop`. State feedback assumes constant velocity between samples and one period
+`plant.sampled_loop`. State feedback assumes constant velocity between samples and one period
 of delay; PID has no delay. A design may assume a different sample time and predict with a model. So
 the loop is simulated as the bench will run it, before any gain is sent.
 """
@@ -17,10 +17,10 @@ from pipeline.bench.protocol.messages import FULL_SCALE, Description, PidGains, 
 from pipeline.errors import DataError
 from pipeline.experiments.plan import PidLoop, PlanLimits, Recording, StateLoop
 from pipeline.identify.remarks import is_reversed
-from pipeline.plant.linear import step_response
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.loop.robustness import stays_stable
-from pipeline.plant.loop.sampled_loop import (
+from pipeline.plant import simulate
+from pipeline.plant.chain import Chain
+from pipeline.plant.feedback import stays_stable
+from pipeline.plant.sampled_loop import (
     Controller,
     LoopSetup,
     Pid,
@@ -240,8 +240,8 @@ class _Trial:
         if goal is None or design is None:
             return
         y, judged = x[cart - 1], {"before": 0.0, "level": np.float64(reference)}
-        overshoot = float(step_response.overshoot_percent(y, **judged))
-        settling = float(step_response.settling_time(t, y, **judged))
+        overshoot = float(simulate.overshoot_percent(y, **judged))
+        settling = float(simulate.settling_time(t, y, **judged))
         # An overshoot of two counts cannot be distinguished from the encoder's flicker.
         unseen = 100 * 2 * self.scales.position / abs(reference)
         # If the design itself misses its goal, the report already says so.

@@ -9,8 +9,8 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import ConfigError, DataError
 from pipeline.experiments.information import Knowledge
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.loop.sampled_loop import LoopSetup, simulate_loop
+from pipeline.plant.chain import Chain
+from pipeline.plant.sampled_loop import LoopSetup, simulate_loop
 from pipeline.results import FeedbackDesign
 from pipeline.submission.complaints import nearest
 

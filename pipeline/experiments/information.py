@@ -35,9 +35,8 @@ from pipeline.estimation.colour import score_covariance
 from pipeline.estimation.noise import noise_beyond_rounding
 from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.experiments.propose import identified_chain
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.dwells import SETTLED_DWELL, settling_wait
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import Chain
+from pipeline.plant.simulate import SETTLED_DWELL, settling_wait, simulate_linear
 from pipeline.results import Analysis, ChainFit, FrequencyResponse, Record, SinePoint
 
 

@@ -18,8 +18,8 @@ from pipeline.experiments.gains import propose_pid
 from pipeline.experiments.plan import Plan, PlanLimits, Recording, StateLoop
 from pipeline.experiments.plan_file import add_recordings, load_plan, plan_path, renamed
 from pipeline.ingest.read import DUTY_COUNT
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.dwells import (
+from pipeline.plant.chain import Chain
+from pipeline.plant.simulate import (
     SETTLED,
     SETTLED_DWELL,
     dwell_frequencies,

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipeline.plant.nonlinear.simulator.compiler import is_compiled, kept_in
+from pipeline.plant.simulator.compiler import is_compiled, kept_in
 from pipeline.threads import with_one_thread
 
 _ROOM = Path(__file__).parent / "follow"

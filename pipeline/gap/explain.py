@@ -32,10 +32,10 @@ from pipeline.gap.verdict.left_force import left_forces
 from pipeline.gap.verdict.residual_map import map_residual
 from pipeline.gap.verdict.where import choose_experiment, find_windows
 from pipeline.gap.workers import two_workers
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.augmented import compile_simulator
-from pipeline.plant.nonlinear.effects import CATALOGUE
-from pipeline.plant.nonlinear.effects.base import Effect, EffectTerm
+from pipeline.plant.augmented import compile_simulator
+from pipeline.plant.catalogue import CATALOGUE
+from pipeline.plant.chain import Chain
+from pipeline.plant.effect import Effect, EffectTerm
 from pipeline.results import Analysis, Record
 from pipeline.set_up import Bench
 from pipeline.words.phrases import phrases

@@ -10,7 +10,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.measured_run import measured_run
 from pipeline.gap.data.runs import GapRun
 from pipeline.gap.data.sides import prepare
-from pipeline.plant.nonlinear.effects import AugmentedChain
+from pipeline.plant.effect import AugmentedChain
 from pipeline.results import HardwareCheck, Record
 
 
@@ -37,7 +37,7 @@ def replay_driven(
     checks : the linear model's result under the same input, one for each cart.
     """
     # imported here, because the linear report never needs this compiled code
-    from pipeline.plant.nonlinear.augmented import rest_positions, simulate_augmented
+    from pipeline.plant.augmented import rest_positions, simulate_augmented
 
     if record.u is None:
         return []

@@ -9,15 +9,10 @@ from pydantic import ValidationError
 from pipeline.arrays import Array
 from pipeline.errors import ConfigError
 from pipeline.json_files import Number, computed, read_json, result, written
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.effects import AugmentedChain, Effect, find_effect
-from pipeline.results import (
-    ChainWithUnits,
-    Intervention,
-    LeftOut,
-    Provenance,
-    RecordingGroup,
-)
+from pipeline.plant.catalogue import find_effect
+from pipeline.plant.chain import Chain
+from pipeline.plant.effect import AugmentedChain, Effect
+from pipeline.results import ChainWithUnits, Intervention, LeftOut, Provenance, RecordingGroup
 from pipeline.set_up import Bench, Units
 from pipeline.submission.complaints import first_refusal, quote
 

@@ -8,7 +8,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.chain.follow import follow, is_driven
 from pipeline.identify.carts import Identified
 from pipeline.names import read_name
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.results import ChainFit, Check, ParameterRow, Record, RecordingGroup
 from pipeline.set_up import Bench
 from pipeline.stages.compare import SIGMA_LIMIT

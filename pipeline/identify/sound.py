@@ -9,7 +9,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.chain.follow import Followed, follow, most_follow
 from pipeline.identify.carts import Identified, identify
 from pipeline.ingest.read import Ingested
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.results import Intervention, LeftOut
 from pipeline.set_up import Bench
 from pipeline.soundness.against_carts import find_faults, find_impossible_gains, standing_still

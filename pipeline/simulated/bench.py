@@ -7,11 +7,11 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import ConfigError
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.simulate import propagate, simulate_linear
-from pipeline.plant.loop.sampled_loop import LoopSetup, StateFeedback, simulate_loop
-from pipeline.plant.nonlinear.effects import AugmentedChain, EffectTerm
-from pipeline.plant.nonlinear.tables import Cart
+from pipeline.plant.chain import Chain
+from pipeline.plant.effect import AugmentedChain, EffectTerm
+from pipeline.plant.sampled_loop import LoopSetup, StateFeedback, simulate_loop
+from pipeline.plant.simulate import propagate, simulate_linear
+from pipeline.plant.simulator.tables import Cart
 from pipeline.results import Kind
 
 # The servo loop and the encoder of the ECP 210.
@@ -129,7 +129,7 @@ class SimulatedBench:
         """
         if not self.effects:
             return
-        from pipeline.plant.nonlinear.augmented import SteppedBench
+        from pipeline.plant.augmented import SteppedBench
 
         model = AugmentedChain(chain=self.chain, terms=self.effects)
         step = SteppedBench(model, x0=np.zeros(self.chain.n)).shortest_step
@@ -153,7 +153,7 @@ class SimulatedBench:
         if run.controller is not None and run.reference is not None:
             plant = None
             if self.effects:
-                from pipeline.plant.nonlinear.augmented import SteppedBench
+                from pipeline.plant.augmented import SteppedBench
 
                 plant = SteppedBench(model, free=run.free)
             loop = simulate_loop(
@@ -176,7 +176,7 @@ class SimulatedBench:
         if self.effects and run.hand is not None:
             return TrueMotion(u=run.u, x=_release_with_effects(model, run, run.hand))
         if self.effects:
-            from pipeline.plant.nonlinear.augmented import simulate_augmented
+            from pipeline.plant.augmented import simulate_augmented
 
             return TrueMotion(u=run.u, x=simulate_augmented(model, run.t, run.u, free=run.free))
         if run.hand is not None:
@@ -227,7 +227,7 @@ def _release_with_effects(model: AugmentedChain, run: BenchRun, hand: ReleasingH
     The hand pulls the cart out before the recording starts, which sets the state of friction and of
     hidden masses. The cart then follows the hand's tremor, and is released as in the linear chain.
     """
-    from pipeline.plant.nonlinear.augmented import SteppedBench
+    from pipeline.plant.augmented import SteppedBench
 
     hand = before_stop(hand, model)
     bench, t, cart = SteppedBench(model, free=run.free), run.t, hand.cart

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.names import read_name
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.results import FeedbackDesign
 from pipeline.submission.toml_file import Value
 from pipeline.submission.toml_section import TypedNumber

@@ -10,16 +10,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import ConfigError
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
-from pipeline.plant.nonlinear.effects import (
-    Effect,
-    EffectParameter,
-    EffectTerm,
-    find_effect,
-)
-from pipeline.plant.nonlinear.effects.base import PlaceScales, chain_scales
+from pipeline.plant.catalogue import find_effect
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.effect import Effect, EffectParameter, EffectTerm, PlaceScales, chain_scales
+from pipeline.plant.simulate import simulate_linear
 from pipeline.simulated.bench import COUNT, SAMPLE_TIME, SimulatedBench
 from pipeline.submission.complaints import nearest, quote
 from pipeline.submission.toml_file import read_text

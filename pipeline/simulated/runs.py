@@ -5,17 +5,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.plant.linear.chain import Chain, quadratic_factors
-from pipeline.plant.linear.dwells import (
+from pipeline.plant.chain import Chain, quadratic_factors
+from pipeline.plant.sampled_loop import StateFeedback
+from pipeline.plant.simulate import (
     SETTLED,
     SETTLED_DWELL,
     dwell_frequencies,
     reach,
     settling_wait,
+    simulate_linear,
     steady_time,
 )
-from pipeline.plant.linear.simulate import simulate_linear
-from pipeline.plant.loop.sampled_loop import StateFeedback
 from pipeline.simulated.bench import BenchRun, ReleasingHand, SimulatedBench
 
 INPUT_DECIMALS = 5  # the input is set in steps of 10 µV, so that the log holds the applied input

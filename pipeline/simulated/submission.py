@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.loop.sampled_loop import StateFeedback
+from pipeline.plant.chain import Chain
+from pipeline.plant.sampled_loop import StateFeedback
 from pipeline.results import FeedbackDesign
 from pipeline.simulated import claims, runs
 from pipeline.simulated.bench import BenchRun, SimulatedBench, TrueMotion

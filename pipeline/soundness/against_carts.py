@@ -22,8 +22,8 @@ from pipeline.estimation.chain.follow import (
 )
 from pipeline.estimation.chain.time_search import FOLLOWED
 from pipeline.estimation.units_and_clocks import FASTEST, TIME_FACTORS
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import Chain
+from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Record, StepGain
 from pipeline.soundness.fault import SAME, SIGMAS, RecordingFault
 from pipeline.soundness.other_readings import find_other_readings

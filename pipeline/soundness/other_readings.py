@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.estimation.chain.follow import Followed, Misread, find_misread
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.results import Record
 from pipeline.soundness.fault import SAME, SAME_SIZE, WITNESSES, RecordingFault
 

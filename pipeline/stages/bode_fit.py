@@ -22,8 +22,8 @@ from pipeline.estimation.chain.parametrisation import (
 from pipeline.estimation.chain.staged_fit import LogMagnitude, StagedFit, fit_stage_by_stage
 from pipeline.estimation.minimise import minimise
 from pipeline.names import own_zeta, read_name
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.recovery import recover_chain
+from pipeline.plant.chain import Chain
+from pipeline.plant.identities import recover_chain
 from pipeline.results import EXPLAINED, ChainFit, Estimate, FrequencyResponse
 from pipeline.set_up import Bench
 

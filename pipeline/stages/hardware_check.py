@@ -14,10 +14,9 @@ from pipeline import submission
 from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.measured_run import MeasuredRun, measured_run
-from pipeline.plant.linear import step_response
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.loop import sampled_loop
-from pipeline.plant.loop.sampled_loop import Controller, LoopRun, Pid, StateFeedback
+from pipeline.plant import sampled_loop, simulate
+from pipeline.plant.chain import Chain
+from pipeline.plant.sampled_loop import Controller, LoopRun, Pid, StateFeedback
 from pipeline.results import HardwareCheck, Record
 
 # A factor on the input of up to 1.5 is an error of the model, not of the log. Another sign or scale
@@ -392,9 +391,9 @@ def _judge(run: MeasuredRun, y: Array, *, row: int, window: slice | None, noise:
     # A step below 5 % of the cart's largest motion has no meaningful overshoot.
     if abs(level - before) <= max(noise, 0.05 * np.max(np.abs(y - before))):
         return _Step(level=float(level))
-    settling = float(step_response.settling_time(t, after, before=before, level=level, noise=noise))
+    settling = float(simulate.settling_time(t, after, before=before, level=level, noise=noise))
     return _Step(
-        overshoot=float(step_response.overshoot_percent(after, before=before, level=level)),
+        overshoot=float(simulate.overshoot_percent(after, before=before, level=level)),
         settling=None if np.isnan(settling) else settling,
         level=float(level),
     )

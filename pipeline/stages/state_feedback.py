@@ -1,7 +1,7 @@
 """Design state feedback with a prefilter, so that one cart follows a step.
 
 The design is for sampled control, and its model includes the computer's one-sample delay: the gains
-multiply the state predicted for the moment at which the effort acts (`plant.loop.sampled_loop`). So
+multiply the state predicted for the moment at which the effort acts (`plant.sampled_loop`). So
 with 2n gains, the loop has the poles of Phi - Gamma G, and one at z = 0 for the delay.
 
 Method "lqr" weights energy against the input, alpha times the potential and beta times the kinetic
@@ -21,13 +21,17 @@ from scipy.optimize import linear_sum_assignment
 
 from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
+from pipeline.plant import simulate
+from pipeline.plant.chain import Chain, quadratic_factors
+from pipeline.plant.feedback import (
+    SampledPlant,
+    energy_weights,
+    level_error_percent,
+    lqr_gains,
+    place_poles,
+)
 from pipeline.plant.limits import DAMPING_ERROR, MASS_SPRING_ERROR
-from pipeline.plant.linear import step_response
-from pipeline.plant.linear.chain import Chain, quadratic_factors
-from pipeline.plant.linear.simulate import simulate_linear
-from pipeline.plant.loop.gains import lqr_gains, place_poles
-from pipeline.plant.loop.robustness import level_error_percent
-from pipeline.plant.loop.sampled_loop import (
+from pipeline.plant.sampled_loop import (
     RADIANS_PER_STEP,
     LoopSetup,
     StateFeedback,
@@ -36,7 +40,7 @@ from pipeline.plant.loop.sampled_loop import (
     parts_per_sample,
     simulate_loop,
 )
-from pipeline.plant.loop.sampled_plant import SampledPlant, energy_weights
+from pipeline.plant.simulate import simulate_linear
 from pipeline.results import FeedbackDesign
 from pipeline.submission import Design
 
@@ -110,7 +114,7 @@ def _refuse_more_overshoot(plant: SampledPlant, goal: "_Goal", design: FeedbackD
     t = np.linspace(0.0, max(float(design.t[-1]), 2 * np.pi / slowest), _POINTS)
     level = plant.chain.static_gains()[plant.cart - 1]
     alone = simulate_linear(plant.chain, t=t, u=np.ones_like(t))[plant.cart - 1]
-    most = float(step_response.overshoot_percent(alone, before=0.0, level=level))
+    most = float(simulate.overshoot_percent(alone, before=0.0, level=level))
     if design.overshoot_percent <= most:
         return
     for halvings in range(1, _HALVINGS + 1):
@@ -260,13 +264,13 @@ def _try_step(plant: SampledPlant, gains: Array, goal: _Goal) -> _Candidates:
     # The input that holds the level is included, because a slow candidate may not be there yet.
     u = prefilter - np.einsum("ci,cin->cn", gains, np.append(to_go, 0 * level, axis=-1) + level)
     one = np.ones(len(gains))
-    settling = t[0] + step_response.settling_time(t, y, before=0.0, level=one)
+    settling = t[0] + simulate.settling_time(t, y, before=0.0, level=one)
     radius = np.abs(np.linalg.eigvals(loop)).max(-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         slowest = -4 * plant.sample_time / np.log(radius)
     return _Candidates(
         gains=gains,
-        overshoot=step_response.overshoot_percent(y, before=0.0, level=one),
+        overshoot=simulate.overshoot_percent(y, before=0.0, level=one),
         settling=np.where(np.isnan(settling), np.where(radius < 1, slowest, np.inf), settling),
         peak=np.abs(u).max(-1) * plant.stiffness * abs(goal.reference),
         level_error=level_error_percent(plant.chain, plant.to_units(gains), cart=plant.cart),
@@ -340,8 +344,8 @@ def _finish(
     )
     y = run.x[plant.cart - 1]
     judged = {"before": 0.0, "level": np.float64(goal.reference)}
-    overshoot = float(step_response.overshoot_percent(y, **judged))
-    settling = float(step_response.settling_time(t, y, **judged))
+    overshoot = float(simulate.overshoot_percent(y, **judged))
+    settling = float(simulate.settling_time(t, y, **judged))
     met = overshoot <= goal.overshoot + _UNSEEN and settling <= goal.settling + T / 2
     design = FeedbackDesign(
         cart=plant.cart,

@@ -25,7 +25,7 @@ from pipeline.estimation.chain.time_search import Attempt, condense, descend, lo
 from pipeline.estimation.chain.time_window import FitWindow, open_window
 from pipeline.estimation.colour import long_run_variance, score_covariance
 from pipeline.names import read_name
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.results import ChainFit, Estimate, Record
 from pipeline.set_up import Bench
 

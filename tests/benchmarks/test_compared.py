@@ -21,7 +21,7 @@ from benchmarks.bode_tools import (
 )
 from benchmarks.gap_tools import Bench, is_named
 from benchmarks.identification import measure
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS
 from tests.truth.cases import COUNT, further_records, make_case
 
 OMEGA = 2 * np.pi * np.geomspace(0.3, 7.0, 30)

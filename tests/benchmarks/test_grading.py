@@ -8,7 +8,7 @@ import pytest
 from benchmarks import grading, grading_notebooks, lab_reference, report
 from benchmarks.grading_batch import Cost
 from pipeline.ingest.read import read_data
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS
 from pipeline.submission import load_submission
 
 

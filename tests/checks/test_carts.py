@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.checks.carts import check_carts, check_vanishing
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS, Chain
 from pipeline.resources import EXAMPLES
 from pipeline.results import ChainFit, Check
 from pipeline.set_up import Bench

@@ -9,10 +9,9 @@ from numpy.testing import assert_allclose
 
 from pipeline.checks.loops import design_margins, verify_design
 from pipeline.errors import DataError
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.loop.margins import closed_loop, stability_margins
-from pipeline.plant.loop.sampled_loop import StateFeedback, broken_loop
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.margins import closed_loop, stability_margins
+from pipeline.plant.sampled_loop import StateFeedback, broken_loop
 from pipeline.results import FeedbackDesign
 from pipeline.stages.state_feedback import Method, design_feedback
 from pipeline.submission import Design

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from pipeline.cli import app
 from pipeline.desk.app import DeskServer
 from pipeline.desk.exercises import check_exercise
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.plant.catalogue import CATALOGUE
+from pipeline.plant.chain import PRESETS
 from tests.helpers.desks import Visitor, a_submission
 from tests.helpers.waiting import until
 

@@ -13,8 +13,7 @@ from pipeline.estimation.chain.parametrisation import (
     named_estimates,
     physical_start,
 )
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS, Chain
 from pipeline.set_up import Bench
 
 

@@ -25,10 +25,10 @@ from pipeline.gap.explain import investigate
 from pipeline.gap.types import Contender, Gap, Trace, read_gap
 from pipeline.ingest.read import read_data
 from pipeline.json_files import json_text
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.augmented import simulate_augmented
-from pipeline.plant.nonlinear.effects import find_effect
-from pipeline.plant.nonlinear.effects.base import AugmentedChain
+from pipeline.plant.augmented import simulate_augmented
+from pipeline.plant.catalogue import find_effect
+from pipeline.plant.chain import Chain
+from pipeline.plant.effect import AugmentedChain
 from pipeline.report.gap.story import build_gap_document
 from pipeline.report.render.html import render_html
 from pipeline.resources import EXAMPLES

@@ -17,14 +17,8 @@ from pipeline.experiments.gains import (
     propose_pid,
 )
 from pipeline.experiments.plan import PidLoop, PlanLimits, Recording, StateLoop
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.loop.sampled_loop import (
-    LoopSetup,
-    Pid,
-    StateFeedback,
-    discretise,
-    simulate_loop,
-)
+from pipeline.plant.chain import Chain
+from pipeline.plant.sampled_loop import LoopSetup, Pid, StateFeedback, discretise, simulate_loop
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, FeedbackDesign
 from pipeline.simulated.emulator.core import ReferenceCore

@@ -21,20 +21,16 @@ from pipeline.errors import ConfigError, DataError
 from pipeline.experiments.candidates import propose_candidates
 from pipeline.experiments.goal import Goal, choose, find_goal
 from pipeline.experiments.information import Knowledge
-from pipeline.experiments.multisine import (
-    low_peak_phases,
-    optimal_tones,
-    schroeder_phases,
-)
+from pipeline.experiments.multisine import low_peak_phases, optimal_tones, schroeder_phases
 from pipeline.experiments.next_recordings import STATISTICAL, _doubt, choose_next, why_useless
 from pipeline.experiments.plan import Plan, PlanLimits, Recording
 from pipeline.experiments.plan_file import load_plan
 from pipeline.experiments.propose import extend_plan, propose_plan, renamed
 from pipeline.experiments.weigh import weigh
+from pipeline.plant.chain import PRESETS
 from pipeline.plant.limits import CALIBRATION
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
-from pipeline.plant.loop.sampled_loop import LoopSetup, simulate_loop
+from pipeline.plant.sampled_loop import LoopSetup, simulate_loop
+from pipeline.plant.simulate import simulate_linear
 from pipeline.resources import EXAMPLES
 from pipeline.simulated.emulator.core import ReferenceCore
 from pipeline.simulated.hidden import prepare_bench

@@ -16,10 +16,8 @@ from pipeline.experiments.by_hand import add_recording
 from pipeline.experiments.plan import PidLoop, Plan, PlanLimits, Recording, StateLoop
 from pipeline.experiments.plan_file import load_plan, plan_path, plan_text, save_plan
 from pipeline.experiments.propose import AIM, extend_plan, let_go, make_plan, propose_plan
-from pipeline.plant.linear.chain import quadratic_factors
-from pipeline.plant.linear.dwells import SETTLED_DWELL, settling_wait
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import PRESETS, quadratic_factors
+from pipeline.plant.simulate import SETTLED_DWELL, settling_wait, simulate_linear
 from pipeline.resources import EXAMPLES
 from pipeline.submission import (
     Design,

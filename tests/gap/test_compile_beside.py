@@ -13,7 +13,7 @@ from tests.helpers.places import ROOT
 
 SCRIPT = """
 from pipeline.gap import compile_beside as beside
-from pipeline.plant.nonlinear.simulator.compiler import is_compiled
+from pipeline.plant.simulator.compiler import is_compiled
 
 print(is_compiled(beside._ROOM, function="follow_run"))
 with beside.follower_compiled():

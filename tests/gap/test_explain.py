@@ -17,9 +17,10 @@ from pipeline.gap.fit.structure import Structure
 from pipeline.gap.types import Gap
 from pipeline.gap.verdict.account import repeatability
 from pipeline.json_files import plain
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.augmented import simulate_augmented
-from pipeline.plant.nonlinear.effects import CATALOGUE, AugmentedChain, find_effect
+from pipeline.plant.augmented import simulate_augmented
+from pipeline.plant.catalogue import CATALOGUE, find_effect
+from pipeline.plant.chain import Chain
+from pipeline.plant.effect import AugmentedChain
 from pipeline.results import Record
 from pipeline.set_up import Bench
 from tests.helpers.effects import make_term

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import pipeline.gap
-from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.plant.catalogue import CATALOGUE
 
 MODULES = sorted(Path(pipeline.gap.__path__[0]).rglob("*.py"))
 NAMES = {name for effect in CATALOGUE for name in (effect.key, effect.family) if name}

@@ -14,7 +14,7 @@ from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.mistakes.state_model import own_chain
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission

@@ -13,7 +13,7 @@ import pytest
 
 from pipeline.grading.judge.run import grade_analysis, under_rubric
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.results import Analysis
 from pipeline.submission import Reported, ReportedStateSpace, Submission, load_submission
 from pipeline.workflow import analyse

@@ -9,9 +9,8 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.names import read_name
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.simulate import simulate_linear
 from pipeline.results import (
     Analysis,
     ChainFit,

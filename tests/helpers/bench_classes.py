@@ -7,8 +7,8 @@ from itertools import product
 
 import numpy as np
 
-from pipeline.plant.loop.sampled_loop import StateFeedback
-from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.plant.catalogue import CATALOGUE
+from pipeline.plant.sampled_loop import StateFeedback
 from pipeline.results import Record
 from pipeline.simulated import claims, runs
 from pipeline.simulated.bench import COUNT, BenchRun, SimulatedBench, TrueMotion

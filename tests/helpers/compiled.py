@@ -39,7 +39,7 @@ def compile_all() -> None:
     import numpy as np
 
     from pipeline.gap.compile_beside import follower_compiled
-    from pipeline.plant.nonlinear.augmented import compile_simulator
+    from pipeline.plant.augmented import compile_simulator
     from tests.truth.bench import simulate_truth
 
     with follower_compiled():

@@ -2,9 +2,8 @@
 
 from collections.abc import Mapping
 
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.effects import Effect, EffectTerm
-from pipeline.plant.nonlinear.effects.base import chain_scales
+from pipeline.plant.chain import Chain
+from pipeline.plant.effect import Effect, EffectTerm, chain_scales
 
 SIZES = {
     "coulomb_friction": {"force": 0.001},

@@ -19,8 +19,8 @@ from pipeline.grading.gradings import Batch, Grading
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.recovery import transfer_functions
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.identities import transfer_functions
 from pipeline.report.figures.grading import reported_bode_figure
 from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import to_svg

@@ -21,8 +21,9 @@ from pipeline.grading.references.springs import with_all_springs
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.names import read_name
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.effects import EffectTerm, find_effect
+from pipeline.plant.catalogue import find_effect
+from pipeline.plant.chain import Chain
+from pipeline.plant.effect import EffectTerm
 from pipeline.simulated.bench import SimulatedBench
 from pipeline.simulated.hidden import preset_bench
 from pipeline.simulated.submission import write_submission

@@ -15,8 +15,9 @@ from pipeline.grading.judge.run import grade_analysis, under_rubric
 from pipeline.grading.mistakes.state_model import own_chain
 from pipeline.grading.references.springs import with_all_springs
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.effects import CATALOGUE, Effect, EffectTerm
+from pipeline.plant.catalogue import CATALOGUE
+from pipeline.plant.chain import Chain
+from pipeline.plant.effect import Effect, EffectTerm
 from pipeline.results import Analysis, Estimate
 from pipeline.simulated.bench import SimulatedBench
 from pipeline.simulated.hidden import default_values, preset_bench

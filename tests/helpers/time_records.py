@@ -3,8 +3,8 @@
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import Chain
+from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Hold, Kind, Record
 
 COUNT = 0.00227  # cm, an ECP 210 encoder count

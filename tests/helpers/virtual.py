@@ -26,7 +26,7 @@ from pipeline.experiments.plan_file import load_plan, plan_path, save_plan
 from pipeline.experiments.plan_words import session_time
 from pipeline.experiments.propose import propose_plan
 from pipeline.output import write_file
-from pipeline.plant.nonlinear.augmented import simulate_augmented
+from pipeline.plant.augmented import simulate_augmented
 from pipeline.simulated.bench import SimulatedBench
 from pipeline.simulated.emulator.carts import _NOISE, TRUE_PERIOD, VirtualCarts, input_per_count
 from pipeline.simulated.emulator.core import ReferenceCore

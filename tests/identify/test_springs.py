@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.identify.springs import decide_springs, fill
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import Chain
+from pipeline.plant.simulate import simulate_linear
 from pipeline.resources import EXAMPLES
 from pipeline.results import Record
 from pipeline.submission import load_submission

@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pipeline.checks.recordings import check_signs, check_units
 from pipeline.errors import SubmissionError
 from pipeline.ingest.read import DUTY_COUNT, Ingested, read_data
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.simulate import simulate_linear
 from pipeline.submission import load_submission
 
 N = 600

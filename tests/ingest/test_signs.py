@@ -12,8 +12,8 @@ from pipeline.arrays import Array
 from pipeline.checks.recordings import check_signs
 from pipeline.ingest.input_sign import find_signs
 from pipeline.ingest.read import read_data
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.simulate import simulate_linear
 from pipeline.report.sections.questions import ask
 from pipeline.results import Record
 from pipeline.simulated.hidden import prepare_bench

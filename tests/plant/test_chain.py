@@ -11,9 +11,8 @@ from numpy.testing import assert_allclose
 
 from pipeline.errors import DataError
 from pipeline.names import read_name
-from pipeline.plant.linear.chain import Chain, parameter_names, quadratic_factors
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.recovery import recover_chain, recover_from_parameters
+from pipeline.plant.chain import PRESETS, Chain, parameter_names, quadratic_factors
+from pipeline.plant.identities import recover_chain, recover_from_parameters
 from pipeline.set_up import PAPER_UNITS
 
 # The paper's final estimates. No real chain agrees with Table 3.

@@ -10,20 +10,20 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.plant.nonlinear.simulator import compiler
+from pipeline.plant.simulator import compiler
 from tests.helpers.places import ROOT
 
-SIMULATOR = Path("pipeline/plant/nonlinear/simulator")
+SIMULATOR = Path("pipeline/plant/simulator")
 CALLER = """
-from pipeline.plant.nonlinear.simulator.compiler import jit
-from pipeline.plant.nonlinear.simulator.called import inner
+from pipeline.plant.simulator.compiler import jit
+from pipeline.plant.simulator.called import inner
 
 @jit
 def outer(x):
     return inner(x) + 1
 """
 CALLED = """
-from pipeline.plant.nonlinear.simulator.compiler import inlined
+from pipeline.plant.simulator.compiler import inlined
 
 @inlined
 def inner(x):
@@ -44,7 +44,7 @@ def package(tmp_path):
 
 def _outer(package: Path, **environment: str) -> tuple[str, str]:
     """Return the result of `outer(10)` in a new process, and its stderr."""
-    script = "from pipeline.plant.nonlinear.simulator.caller import outer; print(outer(10))"
+    script = "from pipeline.plant.simulator.caller import outer; print(outer(10))"
     environment = {**os.environ, "PYTHONPATH": str(package), **environment}
     environment.pop("NUMBA_CACHE_DIR", None)
     command = [sys.executable, "-B", "-c", script]
@@ -100,7 +100,7 @@ def test_the_folders_name_covers_each_file_that_a_compiled_function_uses():
         if not re.search(r"simulator\.compiler import (inlined|jit)", text):
             continue
         rooms.add(path.parent.name)
-        covered = {*compiler.shared_files(), *path.parent.glob("*.py"), types_only}
+        covered = {*compiler.ROOM.glob("*.py"), *path.parent.glob("*.py"), types_only}
         nodes = [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.ImportFrom)]
         for name in (f"{node.module}" for node in nodes):
             if name.startswith("pipeline."):

@@ -6,17 +6,10 @@ import numpy as np
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.nonlinear.augmented import simulate_augmented
-from pipeline.plant.nonlinear.effects import (
-    CATALOGUE,
-    AugmentedChain,
-    Effect,
-    EffectTerm,
-    find_effect,
-)
-from pipeline.plant.nonlinear.effects.base import chain_scales
+from pipeline.plant.augmented import simulate_augmented
+from pipeline.plant.catalogue import CATALOGUE, find_effect
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.effect import AugmentedChain, Effect, EffectTerm, chain_scales
 from pipeline.words.math import to_tex
 from tests.helpers.effects import SIZES, make_term
 

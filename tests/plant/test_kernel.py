@@ -9,14 +9,14 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.arrays import Array
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
-from pipeline.plant.nonlinear.augmented import compile_simulator
-from pipeline.plant.nonlinear.effects import AugmentedChain, find_effect
-from pipeline.plant.nonlinear.simulator import contacts, kernel, laws, sensitivity, state, step
-from pipeline.plant.nonlinear.simulator.kernel import StartState, describe_run
-from pipeline.plant.nonlinear.tables import Cart, Tables, linear_tables
+from pipeline.plant.augmented import compile_simulator
+from pipeline.plant.catalogue import find_effect
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.effect import AugmentedChain
+from pipeline.plant.simulate import simulate_linear
+from pipeline.plant.simulator import contacts, kernel, laws, sensitivity, state, step
+from pipeline.plant.simulator.kernel import StartState, describe_run
+from pipeline.plant.simulator.tables import Cart, Tables, linear_tables
 from tests.helpers.effects import SIZES, make_term
 from tests.truth.bench import Hidden, simulate_truth
 
@@ -260,11 +260,11 @@ def test_a_hidden_mass_starts_at_the_given_position():
 
 _NOTHING_LEFT = """
 import numpy as np
-from pipeline.plant.nonlinear.simulator import contacts, kernel, laws, sensitivity, step
-from pipeline.plant.nonlinear.augmented import SteppedBench, compile_simulator
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.nonlinear.effects import AugmentedChain
-from pipeline.plant.nonlinear.tables import linear_tables
+from pipeline.plant.simulator import contacts, kernel, laws, sensitivity, step
+from pipeline.plant.augmented import SteppedBench, compile_simulator
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.effect import AugmentedChain
+from pipeline.plant.simulator.tables import linear_tables
 
 files = [vars(module) for module in (contacts, kernel, laws, sensitivity, step)]
 stats = [one.stats for file in files for one in file.values() if hasattr(one, "stats")]

@@ -13,17 +13,11 @@ from numpy.testing import assert_allclose
 
 from docs.codegen.__main__ import MADE, ROOM
 from docs.codegen.laws import columns_source, laws_source, terms_source
-from pipeline.plant.nonlinear.effects import CATALOGUE, Effect, find_effect
-from pipeline.plant.nonlinear.effects.law import (
-    ContactLaw,
-    ForceLaw,
-    FrictionLaw,
-    HysteresisLaw,
-    InputLaw,
-    evaluate,
-)
-from pipeline.plant.nonlinear.simulator import laws, terms
-from pipeline.plant.nonlinear.tables import TABLES
+from pipeline.plant.catalogue import CATALOGUE, find_effect
+from pipeline.plant.effect import Effect
+from pipeline.plant.law import ContactLaw, ForceLaw, FrictionLaw, HysteresisLaw, InputLaw, evaluate
+from pipeline.plant.simulator import laws, terms
+from pipeline.plant.simulator.tables import TABLES
 from pipeline.words.math import to_tex
 from tests.helpers.effects import SIZES
 
@@ -215,7 +209,7 @@ def test_a_new_effect_needs_only_its_own_file(tmp_path, monkeypatch):
     """For a new law, the columns, force, derivatives and terms of the fit are all generated."""
     catalogue = (*CATALOGUE, CUBIC_DRAG, WEAK_ZONE)
     load(columns_source(catalogue), "new_columns", tmp_path)
-    source = laws_source(catalogue).replace("pipeline.plant.nonlinear.columns", "new_columns")
+    source = laws_source(catalogue).replace("pipeline.plant.simulator.columns", "new_columns")
     new = load(source, "new_laws", tmp_path)
     followed = load(terms_source(catalogue), "new_terms", tmp_path)
     columns = sys.modules["new_columns"]

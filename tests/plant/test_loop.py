@@ -6,10 +6,8 @@ from numpy.testing import assert_allclose
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
-from pipeline.plant.loop.sampled_loop import (
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.sampled_loop import (
     LoopSetup,
     Pid,
     StateFeedback,
@@ -18,6 +16,7 @@ from pipeline.plant.loop.sampled_loop import (
     replay,
     simulate_loop,
 )
+from pipeline.plant.simulate import simulate_linear
 
 T = 0.00884  # s
 TWO = PRESETS["throne-2dof"]

@@ -8,11 +8,11 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 from pipeline.errors import DataError
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.nonlinear.augmented import simulate_augmented
-from pipeline.plant.nonlinear.effects import CATALOGUE, AugmentedChain, find_effect
-from pipeline.plant.nonlinear.effects.base import Effect, chain_scales
-from pipeline.plant.nonlinear.motion import STOP_TIME, EquationsOfMotion
+from pipeline.plant.augmented import simulate_augmented
+from pipeline.plant.catalogue import CATALOGUE, find_effect
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.effect import AugmentedChain, Effect, chain_scales
+from pipeline.plant.motion import STOP_TIME, EquationsOfMotion
 from tests.helpers.effects import make_term
 
 CHAIN = PRESETS["throne-2dof"]

@@ -11,9 +11,9 @@ from numpy.testing import assert_allclose
 
 import pipeline
 from docs.codegen.__main__ import MADE
-from pipeline.plant.nonlinear.effects import CATALOGUE
-from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
-from pipeline.plant.nonlinear.effects.law import ForceLaw, FrictionLaw, HysteresisLaw
+from pipeline.plant.catalogue import CATALOGUE
+from pipeline.plant.effect import Effect, EffectParameter
+from pipeline.plant.law import ForceLaw, FrictionLaw, HysteresisLaw
 
 ROOM = Path(pipeline.__file__).parent
 CUBIC_DRAG = Effect(
@@ -63,8 +63,8 @@ def test_columns_force_and_derivatives_are_generated(made):
     row = np.zeros((1, len(columns)))
     row[0, columns["CUBIC_DRAG_COEFFICIENT"]] = 2.0
 
-    force = function_of("cart_force", made["simulator/laws.py"], Cart=Cart)
-    slopes = function_of("cart_slopes", made["simulator/laws.py"], Cart=Cart)
+    force = function_of("cart_force", made["laws.py"], Cart=Cart)
+    slopes = function_of("cart_slopes", made["laws.py"], Cart=Cart)
 
     assert_allclose(force(row, 0, 0.3, 0.5, 0.0), -2.0 * 0.5**3)
     assert_allclose(slopes(row, 0, 0.3, 0.5, 0.0), (0.0, -6.0 * 0.5**2))
@@ -72,7 +72,7 @@ def test_columns_force_and_derivatives_are_generated(made):
 
 def test_the_fit_gets_the_new_law(made):
     """The fit gets the new law and its derivatives, also with respect to its coefficient."""
-    source = made["simulator/terms.py"]
+    source = made["terms.py"]
     kinds = kinds_of(source, "Kind")
     terms = function_of("terms", source, Kind=type("Kind", (), kinds))
     out = np.zeros(11)
@@ -103,7 +103,6 @@ def test_only_its_own_file_names_an_effect(effect):
         for path in (ROOM / room).rglob("*.py")
         if re.search(rf"\b({effect.key}|{effect.key.upper()}\w*)\b", path.read_text("utf-8"))
     }
-    allowed = {f"plant/nonlinear/{name}" for name in MADE} | {"gap/follow/score.py"}
+    allowed = {f"plant/simulator/{name}" for name in MADE} | {"gap/follow/score.py"}
     allowed |= {"gap/follow/choose.py"}  # keeps one of two dry frictions
-    named = {name for name in files if not name.startswith("plant/nonlinear/effects/")}
-    assert named <= allowed
+    assert files - {"plant/catalogue.py"} <= allowed

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.nonlinear.effects import AugmentedChain, find_effect
-from pipeline.plant.nonlinear.simulator.kernel import StartState, describe_run
-from pipeline.plant.nonlinear.simulator.kernel import simulate as simulate_run
-from pipeline.plant.nonlinear.simulator.sensitivity import (
+from pipeline.plant.catalogue import find_effect
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.effect import AugmentedChain
+from pipeline.plant.simulator.kernel import StartState, describe_run
+from pipeline.plant.simulator.kernel import simulate as simulate_run
+from pipeline.plant.simulator.sensitivity import (
     BY_DAMPING,
     BY_FRICTION,
     BY_MASS,
@@ -15,7 +16,7 @@ from pipeline.plant.nonlinear.simulator.sensitivity import (
     BY_STIFFNESS,
     BY_VELOCITY,
 )
-from pipeline.plant.nonlinear.tables import Cart, Spring, Tables
+from pipeline.plant.simulator.tables import Cart, Spring, Tables
 from tests.helpers.effects import SIZES, make_term
 
 # The effects are small, so that a difference neither adds nor removes a contact or jump.

@@ -7,9 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import propagate, simulate_linear
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.simulate import propagate, simulate_linear
 
 THREE = PRESETS["throne-3dof"]
 SAMPLE_TIME = 0.00884

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.plant.linear.step_response import overshoot_percent, settling_time
+from pipeline.plant.simulate import overshoot_percent, settling_time
 
 T = np.linspace(0.0, 4.0, 40001)
 

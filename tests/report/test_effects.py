@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from pipeline.plant.nonlinear.effects import CATALOGUE, find_effect
+from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.report.effects.catalogue import catalogue_data, catalogue_text
 from pipeline.report.effects.gallery import build_gallery, render_effects
 from tests.helpers.commandline import cartlab_here

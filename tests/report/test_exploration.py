@@ -9,8 +9,9 @@ import numpy as np
 from numpy.testing import assert_allclose
 
 from pipeline.experiments.exploring.turn_words import name_model
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.nonlinear.effects import AugmentedChain, EffectTerm, find_effect
+from pipeline.plant.catalogue import find_effect
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.effect import AugmentedChain, EffectTerm
 from pipeline.report.exploration.diary import Turn, WeighedExplanation, write_diary
 from pipeline.report.gap.story import deciding_trace
 from tests.helpers.analysis_factory import make_analysis

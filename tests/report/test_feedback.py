@@ -14,8 +14,7 @@ from numpy.testing import assert_allclose
 from pipeline.checks.loops import design_margins
 from pipeline.identify.log import Log
 from pipeline.json_files import json_text
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS, Chain
 from pipeline.report.document import Table
 from pipeline.report.render.html import render_fragment
 from pipeline.report.sections.loops import feedback_blocks, margin_rows

@@ -18,7 +18,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 from numpy.testing import assert_array_equal
 
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.report.document import Picture
 from pipeline.report.figures.bode import bode_figure, overview_figure, plot_phase
 from pipeline.report.figures.colours import CARTS, MEASURED, QUIET

@@ -36,16 +36,11 @@ from pipeline.gap.types import (
 )
 from pipeline.gap.verdict.residual_force import residual_forces
 from pipeline.json_files import json_text
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.nonlinear.augmented import simulate_augmented
-from pipeline.plant.nonlinear.effects import (
-    CATALOGUE,
-    AugmentedChain,
-    EffectTerm,
-    find_effect,
-)
-from pipeline.plant.nonlinear.effects.base import chain_scales, input_steps
-from pipeline.plant.nonlinear.simulator.laws import arriving
+from pipeline.plant.augmented import simulate_augmented
+from pipeline.plant.catalogue import CATALOGUE, find_effect
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.effect import AugmentedChain, EffectTerm, chain_scales, input_steps
+from pipeline.plant.simulator.laws import arriving
 from pipeline.report.document import Formula
 from pipeline.report.draft.content import build_document
 from pipeline.report.equations.effects import augmented_equations, in_order, law

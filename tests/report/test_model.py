@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS, Chain
 from pipeline.report.equations.model import (
     equations_of_motion,
     numeric_state_space,

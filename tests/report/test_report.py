@@ -17,7 +17,7 @@ import pypdf
 import pytest
 
 from pipeline.checks.recordings import check_files, check_left_out
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.report.document import (
     Block,
     Document,

@@ -17,8 +17,7 @@ from sympy.parsing.sympy_parser import parse_expr
 
 from pipeline.errors import ConfigError
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS, Chain
 from pipeline.report.document import Formula
 from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, shown, shown_with, value_term, work_out

@@ -8,11 +8,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.errors import ConfigError, DataError
-from pipeline.plant.linear.chain import Chain, parameter_names, quadratic_factors
-from pipeline.plant.linear.dwells import dwell_frequencies
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.recovery import recover_from_parameters
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import PRESETS, Chain, parameter_names, quadratic_factors
+from pipeline.plant.identities import recover_from_parameters
+from pipeline.plant.simulate import dwell_frequencies, simulate_linear
 from pipeline.resources import EXAMPLES
 from pipeline.simulated.bench import COUNT, SAMPLE_TIME, BenchRun, ReleasingHand, SimulatedBench
 from pipeline.simulated.examples import CATALOGUE, write_examples

@@ -16,15 +16,11 @@ from pipeline.errors import ConfigError, DataError
 from pipeline.gap.types import Gap
 from pipeline.ingest.read import read_data
 from pipeline.json_files import plain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.loop.sampled_loop import StateFeedback
-from pipeline.plant.nonlinear.augmented import SteppedBench, rest_positions, simulate_augmented
-from pipeline.plant.nonlinear.effects import (
-    CATALOGUE,
-    AugmentedChain,
-    EffectTerm,
-    find_effect,
-)
+from pipeline.plant.augmented import SteppedBench, rest_positions, simulate_augmented
+from pipeline.plant.catalogue import CATALOGUE, find_effect
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.effect import AugmentedChain, EffectTerm
+from pipeline.plant.sampled_loop import StateFeedback
 from pipeline.set_up import Bench
 from pipeline.simulated.bench import COUNT, SAMPLE_TIME, BenchRun, ReleasingHand, SimulatedBench
 from pipeline.simulated.hidden import prepare_bench, preset_bench, usual_term

@@ -12,17 +12,14 @@ from pipeline.checks.recordings import check_channels
 from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.ingest.read import read_data
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import propagate, simulate_linear
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.simulate import propagate, simulate_linear
 from pipeline.resources import RUBRICS
 from pipeline.results import Kind, Record
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.simulated.submission import write_submission
 from pipeline.soundness.bad_recordings import find_bad_recordings
-from pipeline.soundness.late_channels import (
-    find_late_channels,
-    late_experiments,
-)
+from pipeline.soundness.late_channels import find_late_channels, late_experiments
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.ucsd import write_two_cart_submission

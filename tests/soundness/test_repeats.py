@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.ingest.read import read_data
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS, Chain
 from pipeline.soundness.repeats import find_outlier_repeats
 from pipeline.submission import load_submission
 from tests.helpers.time_records import decay_record, step_record

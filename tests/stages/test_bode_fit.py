@@ -12,8 +12,7 @@ from scipy.stats import binom
 from benchmarks.identification import PAPER_STARTS, measure, quality
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS, Chain
 from pipeline.results import Estimate, FrequencyResponse
 from pipeline.set_up import Bench
 from pipeline.stages.bode_fit import fit_bode

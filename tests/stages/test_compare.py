@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.checks.carts import check_carts
 from pipeline.checks.estimates import check_rows
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS, Chain
 from pipeline.results import ChainFit, Estimate
 from pipeline.set_up import Bench
 from pipeline.stages.compare import DAMPING_LIMIT, GAIN_AND_FREQUENCY_LIMIT, compare

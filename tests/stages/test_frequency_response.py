@@ -6,9 +6,8 @@ from numpy.testing import assert_allclose
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.simulate import simulate_linear
 from pipeline.results import FrequencyResponse, Hold, Kind, Record, SinePoint
 from pipeline.stages.frequency_response import (
     collect_dwells,

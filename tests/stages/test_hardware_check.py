@@ -14,16 +14,9 @@ from pipeline import submission
 from pipeline.arrays import Array
 from pipeline.checks.loops import check_loops
 from pipeline.errors import DataError
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
-from pipeline.plant.loop.sampled_loop import (
-    Controller,
-    LoopSetup,
-    Pid,
-    StateFeedback,
-    simulate_loop,
-)
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.sampled_loop import Controller, LoopSetup, Pid, StateFeedback, simulate_loop
+from pipeline.plant.simulate import simulate_linear
 from pipeline.results import FeedbackDesign, HardwareCheck, Kind, Record
 from pipeline.stages.hardware_check import check_hardware
 from pipeline.stages.state_feedback import design_feedback

@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 from pipeline.errors import DataError
 from pipeline.estimation.decay.ringing import Ringing
 from pipeline.ingest.read import read_data
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Kind, Record
 from pipeline.stages.log_decrement import fit_log_decrement
 from pipeline.submission import load_submission

@@ -7,8 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.errors import DataError
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Record
 from pipeline.stages.sine import Dwell, fit_sine
 

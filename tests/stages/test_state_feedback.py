@@ -12,20 +12,17 @@ from scipy.optimize import linear_sum_assignment
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.feedback import level_error_percent, lqr_gains, place_poles, stays_stable
 from pipeline.plant.limits import MASS_SPRING_ERROR
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
-from pipeline.plant.linear.step_response import overshoot_percent, settling_time
-from pipeline.plant.loop.gains import lqr_gains, place_poles
-from pipeline.plant.loop.robustness import level_error_percent, stays_stable
-from pipeline.plant.loop.sampled_loop import (
+from pipeline.plant.sampled_loop import (
     LoopSetup,
     StateFeedback,
     discretise,
     loop_matrix,
     simulate_loop,
 )
+from pipeline.plant.simulate import overshoot_percent, settling_time, simulate_linear
 from pipeline.results import FeedbackDesign
 from pipeline.stages.state_feedback import Method, design_feedback
 from pipeline.submission import Design

@@ -8,9 +8,8 @@ from numpy.testing import assert_allclose
 
 from pipeline.errors import DataError
 from pipeline.ingest.read import read_data
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Record
 from pipeline.stages.step_gain import fit_step_gain
 from pipeline.submission import load_submission

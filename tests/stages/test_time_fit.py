@@ -13,9 +13,8 @@ from pipeline.estimation.chain.time_search import search
 from pipeline.estimation.chain.time_window import compare, open_window, usable_segment, weighed
 from pipeline.estimation.colour import long_run_variance, score_covariance
 from pipeline.ingest.read import read_data
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.simulate import simulate_linear
 from pipeline.results import ChainFit, Record
 from pipeline.set_up import Bench
 from pipeline.stages.time_fit import fit_records

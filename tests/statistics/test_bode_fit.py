@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.identification import converged_share, quality
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS
 
 
 @pytest.mark.slow

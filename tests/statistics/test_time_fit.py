@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS
 from pipeline.set_up import Bench
 from pipeline.stages.time_fit import fit_records
 from tests.helpers.time_records import random_chain, step_record

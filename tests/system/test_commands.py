@@ -43,7 +43,7 @@ def test_help_imports_nothing_heavy():
 @pytest.mark.parametrize(
     ("module", "unneeded"),
     [
-        ("report.draft.write", ("pipeline.plant.nonlinear.effects", "scipy.ndimage", "control")),
+        ("report.draft.write", ("pipeline.plant.catalogue", "scipy.ndimage", "control")),
         ("grading.batch.grade_class", ("pipeline.workflow", "scipy.linalg", "pandas")),
     ],
 )

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pypdf import PdfReader
 from pypdf.generic import DictionaryObject
 
-from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.plant.catalogue import CATALOGUE
 from pipeline.report.draft.make import make_draft
 from pipeline.report.draft.write import write_draft
 from pipeline.report.effects.gallery import render_effects

@@ -3,7 +3,7 @@
 import pytest
 
 from docs.effects_page import IMAGES, effects_page
-from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.plant.catalogue import CATALOGUE
 from tests.helpers.places import ROOT
 
 

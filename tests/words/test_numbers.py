@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.plant.loop.margins import Margins
+from pipeline.plant.margins import Margins
 from pipeline.report.sections.loops import margin_rows
 from pipeline.words.numbers import listing, percent, significant, with_error, with_errors
 

@@ -15,8 +15,8 @@ from pipeline.desk.served_files import show_drawing
 from pipeline.desk.typed import read_path, read_whole_number
 from pipeline.errors import ConfigError
 from pipeline.output import new_folder
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.plant.catalogue import CATALOGUE
+from pipeline.plant.chain import PRESETS
 from pipeline.report.effects.catalogue import catalogue_data
 from pipeline.submission.load import NAME, file_problem
 from pipeline.words.math import to_text

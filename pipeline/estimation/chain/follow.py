@@ -18,7 +18,7 @@ from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.estimation.chain.time_search import FOLLOWED
 from pipeline.estimation.chain.time_window import FitWindow, compare, open_window
 from pipeline.estimation.units_and_clocks import FASTEST, LENGTH_SCALES, TIME_FACTORS
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.results import Record
 from pipeline.set_up import Bench
 

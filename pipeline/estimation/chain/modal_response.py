@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.arrays import Array, ComplexArray
 from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.estimation.modulating import is_even
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 
 # Below this |lambda dt| the derivative of expm1(z)/z is computed from its series. Rounding would
 # cause an error of 1e-16/|z|; the error of the series is z²/8.

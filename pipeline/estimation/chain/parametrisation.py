@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.names import read_name
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.results import Estimate
 from pipeline.set_up import Bench
 

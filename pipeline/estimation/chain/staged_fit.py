@@ -14,8 +14,8 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.estimation.minimise import minimise
 from pipeline.names import NULLS, gain_name, mode_suffixes, mode_zeta, own_omega, own_zeta
-from pipeline.plant.linear.chain import Chain, quadratic_factors
-from pipeline.plant.linear.recovery import recover_chain
+from pipeline.plant.chain import Chain, quadratic_factors
+from pipeline.plant.identities import recover_chain
 
 _FARTHEST = 50.0  # bound of a logarithm, so that a step that goes astray does not overflow
 _ZETA_RANGE = (0.01, 1.0)  # damping ratios allowed at the start; others do not converge

@@ -13,7 +13,7 @@ from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.estimation.chain.time_start import WIDTHS, even_chains, regress_chain
 from pipeline.estimation.chain.time_window import FitWindow, Misfit, compare
 from pipeline.estimation.minimise import minimise
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.results import EXPLAINED
 
 # Share of a record's power (about its mean) that a chain may leave unexplained. Carts with dry

@@ -19,7 +19,7 @@ from pipeline.arrays import Array
 from pipeline.estimation.chain.parametrisation import even_chain, physical_start
 from pipeline.estimation.chain.time_window import FitWindow
 from pipeline.estimation.modulating import bump, bump_integral
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.set_up import Bench
 
 WIDTHS = (0.15, 0.3, 0.6, 1.2)  # s; a bump should last about one period of the carts

@@ -9,7 +9,7 @@ from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
 from pipeline.estimation.chain.modal_response import Modes, drive_modes
 from pipeline.estimation.noise import local_noise, noise_beyond_rounding, rounding_left
-from pipeline.plant.linear.simulate import OVERSAMPLING, interpolate_band_limited
+from pipeline.plant.simulate import OVERSAMPLING, interpolate_band_limited
 from pipeline.results import Kind, Record
 
 # A free decay is used after its largest swing has fallen to this share, because the hand or stop

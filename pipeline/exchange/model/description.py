@@ -12,10 +12,10 @@ import numpy as np
 
 from pipeline.errors import DataError
 from pipeline.exchange.model.syntax import substitute
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.augmented import SteppedBench, rest_positions
-from pipeline.plant.nonlinear.effects.base import AugmentedChain, EffectTerm, input_steps
-from pipeline.plant.nonlinear.effects.law import (
+from pipeline.plant.augmented import SteppedBench, rest_positions
+from pipeline.plant.chain import Chain
+from pipeline.plant.effect import AugmentedChain, EffectTerm, input_steps
+from pipeline.plant.law import (
     BuiltLaw,
     ContactLaw,
     ForceLaw,
@@ -24,7 +24,7 @@ from pipeline.plant.nonlinear.effects.law import (
     InputLaw,
     names_in,
 )
-from pipeline.plant.nonlinear.simulator.laws import settling
+from pipeline.plant.simulator.laws import settling
 from pipeline.set_up import Units
 
 _PHASE = 0.05  # rad of the fastest oscillation per step, for an error of 1e-4 in its period

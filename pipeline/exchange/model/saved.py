@@ -8,7 +8,7 @@ from pipeline.exchange.model.description import describe
 from pipeline.exchange.model.fmu import fmu
 from pipeline.exchange.model.sources import c_sources, matlab_source
 from pipeline.output import write_file
-from pipeline.plant.nonlinear.effects.base import AugmentedChain
+from pipeline.plant.effect import AugmentedChain
 from pipeline.results import Analysis
 
 FILES = ("model.fmu", "model.c", "model.h", "model.m")

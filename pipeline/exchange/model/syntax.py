@@ -1,6 +1,6 @@
 """Translate expressions from Python's syntax to C and to MATLAB.
 
-The laws of the effects are such expressions (`plant.nonlinear.effects.law`). Here their symbols are
+The laws of the effects are such expressions (`plant.law`). Here their symbols are
 names of the model: `p.NAME` is a parameter, `x.BODY` a position, `v.BODY` a velocity and `z.NAME` a
 bristle of dry friction. All other names are local variables.
 """

@@ -4,7 +4,7 @@ import numpy as np
 
 from pipeline.gap.limits import NOTHING
 from pipeline.gap.types import Gap
-from pipeline.plant.nonlinear.effects.base import AugmentedChain
+from pipeline.plant.effect import AugmentedChain
 from pipeline.report.exploration.diary import WeighedExplanation
 from pipeline.report.gap.verdict import effect_name
 from pipeline.results import Analysis

@@ -10,8 +10,8 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.estimation.noise import difference_noise
 from pipeline.estimation.peaks import extrema
-from pipeline.plant.linear.simulate import interpolate_band_limited
-from pipeline.plant.nonlinear.simulator.kernel import Excitation, describe_run
+from pipeline.plant.simulate import interpolate_band_limited
+from pipeline.plant.simulator.kernel import Excitation, describe_run
 from pipeline.results import Record
 
 _STILL = 2.6  # encoder steps, peak to peak; a smaller range counts as rest

@@ -15,7 +15,7 @@ from pipeline.gap.fit.levenberg_marquardt import Fitting, GapFit, Mapper, fit_mo
 from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
 from pipeline.gap.fit.restart import restart_runs
 from pipeline.gap.fit.structure import Structure
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 
 
 def first_chain(runs: Sequence[GapRun], *, springs: Sequence[bool]) -> Chain:

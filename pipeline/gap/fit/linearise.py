@@ -21,8 +21,8 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.gap.data.runs import GapRun
 from pipeline.gap.fit.structure import GapModel, Structure
-from pipeline.plant.nonlinear.simulator import sensitivity
-from pipeline.plant.nonlinear.simulator.kernel import StartState, simulate
+from pipeline.plant.simulator import sensitivity
+from pipeline.plant.simulator.kernel import StartState, simulate
 
 _START_STEP = 1e-3  # step for numerical derivatives, relative to swing or friction
 _HOME = 0.1  # weight of the priors on starts that the data do not determine
@@ -79,7 +79,7 @@ def _simulate_variants(
     """Return readings (b, rows, samples) of one run for b models and starts, without zeros.
 
     Also return the derivatives (lanes, rows, samples) for the first model. Each of the `lanes`
-    names a kind of variable from `pipeline.plant.nonlinear.simulator.sensitivity` and a cart or
+    names a kind of variable from `pipeline.plant.simulator.sensitivity` and a cart or
     spring, from 0.
     """
     variants = [(model.tables, start) for model, start in zip(models, starts, strict=True)]

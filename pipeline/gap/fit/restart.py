@@ -9,8 +9,8 @@ from pipeline.arrays import Array
 from pipeline.gap.data.runs import GapRun
 from pipeline.gap.fit.levenberg_marquardt import Fitting, GapFit, Mapper, evaluate, fit_model
 from pipeline.gap.fit.linearise import Nuisance, residual_points
-from pipeline.plant.nonlinear.simulator.laws import dropping, settling, sliding
-from pipeline.plant.nonlinear.tables import Drive, Tables
+from pipeline.plant.simulator.laws import dropping, settling, sliding
+from pipeline.plant.simulator.tables import Drive, Tables
 
 _BAD_RUN, _BAD_SHARE = 1.5, 2.0  # limits of a run's chi-square: absolute, and times the median
 _RESTARTS = ((0.8, 1.0), (-0.8, 1.0), (1.6, 1.0), (-1.6, 1.0), (0.0, 0.94), (0.0, 1.06))

@@ -8,15 +8,9 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.gap.data.runs import GapRun
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.effects.base import (
-    AugmentedChain,
-    Effect,
-    EffectTerm,
-    PlaceScales,
-    chain_scales,
-)
-from pipeline.plant.nonlinear.tables import Cart, Tables
+from pipeline.plant.chain import Chain
+from pipeline.plant.effect import AugmentedChain, Effect, EffectTerm, PlaceScales, chain_scales
+from pipeline.plant.simulator.tables import Cart, Tables
 
 _SMALLEST = 1e-7  # share of a parameter's scale; a smaller effect counts as absent
 

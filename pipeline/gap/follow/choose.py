@@ -16,9 +16,9 @@ from pipeline.gap.follow.drop import criterion, drop_needless, is_better, is_rou
 from pipeline.gap.follow.fit import Follow, Records
 from pipeline.gap.follow.laws import FollowedBench, LawSet, TrialLaw, smooth_laws
 from pipeline.gap.follow.score import backlash_laws, score, shaped_trials
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.effects import CATALOGUE
-from pipeline.plant.nonlinear.simulator.terms import Kind
+from pipeline.plant.catalogue import CATALOGUE
+from pipeline.plant.chain import Chain
+from pipeline.plant.simulator.terms import Kind
 from pipeline.words.progress import Progress, silent
 
 CLOSE, LOOSE, FREE = 0.5, 0.1, 0.0  # gains: share of the error that corrects the model

@@ -4,7 +4,7 @@ import numpy as np
 
 from pipeline.gap import limits
 from pipeline.gap.follow.fit import Follow, Records
-from pipeline.plant.nonlinear.simulator.terms import Kind
+from pipeline.plant.simulator.terms import Kind
 
 _RIDGE = 1e-10  # share of the diagonal that is added to it
 _CONTACTS = {Kind.BACKLASH}

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.arrays import Array
-from pipeline.plant.nonlinear.simulator.compiler import inlined
-from pipeline.plant.nonlinear.simulator.state import tie
-from pipeline.plant.nonlinear.simulator.terms import (
+from pipeline.plant.simulator.compiler import inlined
+from pipeline.plant.simulator.state import tie
+from pipeline.plant.simulator.terms import (
     FRICTION,
     HYSTERESIS,
     ON_SPRING,

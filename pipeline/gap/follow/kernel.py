@@ -26,9 +26,9 @@ from pipeline.gap.follow.forces import (
     reach,
     settle_friction,
 )
-from pipeline.plant.nonlinear.simulator.compiler import jit
-from pipeline.plant.nonlinear.simulator.state import tie
-from pipeline.plant.nonlinear.simulator.terms import Kind
+from pipeline.plant.simulator.compiler import jit
+from pipeline.plant.simulator.state import tie
+from pipeline.plant.simulator.terms import Kind
 
 _LEAST_SHARE = 0.02  # share of cart 1's mass that remains at least when the motor is separated
 _BLOWN_UP = 1e6  # position at which the simulation has diverged

@@ -9,11 +9,11 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.gap.follow import forces
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.effects import CATALOGUE
-from pipeline.plant.nonlinear.effects.law import ForceLaw, FrictionLaw
-from pipeline.plant.nonlinear.simulator.terms import COEFFICIENTS, Kind
-from pipeline.plant.nonlinear.tables import TABLES, Drive
+from pipeline.plant.catalogue import CATALOGUE
+from pipeline.plant.chain import Chain
+from pipeline.plant.law import ForceLaw, FrictionLaw
+from pipeline.plant.simulator.tables import TABLES, Drive
+from pipeline.plant.simulator.terms import COEFFICIENTS, Kind
 
 _CHAIN = (0.005, 20.0)  # limits of masses and springs, times the largest first estimate
 _REACH = 0.3  # largest relative step of a mass or spring

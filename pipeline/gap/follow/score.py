@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.gap.follow.fit import Follow, Records
 from pipeline.gap.follow.laws import COEFFICIENTS, POSITIVE, TrialLaw
-from pipeline.plant.nonlinear.simulator.terms import Kind
+from pipeline.plant.simulator.terms import Kind
 
 
 @dataclass(frozen=True, kw_only=True)

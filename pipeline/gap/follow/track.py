@@ -9,8 +9,8 @@ from pipeline.arrays import Array
 from pipeline.gap.data.runs import GapRun
 from pipeline.gap.follow import forces, kernel
 from pipeline.gap.follow.laws import DEAD_ZONE, LIMIT, FollowedBench, LawSet
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.simulator.terms import Kind
+from pipeline.plant.chain import Chain
+from pipeline.plant.simulator.terms import Kind
 
 _LONGEST = 2.5e-3  # s; longest step for a bench of carts
 _FREELY = 0.4  # factor on the longest step for a small gain, where step errors add up

@@ -14,7 +14,7 @@ from pipeline.gap.fit.baseline import fit_nuisance
 from pipeline.gap.fit.levenberg_marquardt import Fitting, GapFit, Mapper, fit_model
 from pipeline.gap.fit.linearise import simulate_run
 from pipeline.gap.fit.structure import GapModel
-from pipeline.plant.nonlinear.effects.base import Effect
+from pipeline.plant.effect import Effect
 from pipeline.words.progress import Progress, silent
 
 _BOUND_MARGIN = 0.01  # in logarithms, or in multiples of the scale

@@ -13,7 +13,7 @@ from pipeline.arrays import Array
 from pipeline.gap import limits
 from pipeline.gap.data.runs import GapRun
 from pipeline.gap.fit.linearise import Nuisance
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 
 
 @dataclass(frozen=True, kw_only=True)

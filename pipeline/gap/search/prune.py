@@ -10,7 +10,7 @@ from pipeline.gap.limits import SURE
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge, lowers_error, worth_it
 from pipeline.gap.search.translate import make_candidate
 from pipeline.gap.search.whole import finish, fit_on
-from pipeline.plant.nonlinear.effects import find_effect
+from pipeline.plant.catalogue import find_effect
 
 _FEW = 4  # effects to try at a time; certainty is only a rough guide to which are needed
 

@@ -9,9 +9,9 @@ from pipeline.gap.data.runs import GapRun
 from pipeline.gap.fit.structure import Candidate, GapModel, Structure, bench_scales
 from pipeline.gap.follow.fit import Follow
 from pipeline.gap.follow.laws import Column, column_set
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.effects.base import Effect
-from pipeline.plant.nonlinear.tables import Cart, Drive, Spring
+from pipeline.plant.chain import Chain
+from pipeline.plant.effect import Effect
+from pipeline.plant.simulator.tables import Cart, Drive, Spring
 
 _TABLE = {"cart": Cart, "spring": Spring, "input": Drive}
 

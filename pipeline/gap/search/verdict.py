@@ -6,7 +6,7 @@ from pipeline.gap import limits
 from pipeline.gap.search.hypothesis import Hypothesis, Study, evidence, lowers_error
 from pipeline.gap.search.prune import steps_to
 from pipeline.gap.types import Verdict
-from pipeline.plant.nonlinear.effects import find_effect
+from pipeline.plant.catalogue import find_effect
 
 
 def reach_verdict(

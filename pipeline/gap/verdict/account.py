@@ -12,8 +12,8 @@ from pipeline.gap.fit.linearise import Nuisance, simulate_run
 from pipeline.gap.limits import AT_FLOOR
 from pipeline.gap.search.hypothesis import Hypothesis, Study
 from pipeline.gap.types import Contender, FoundEffect, NamedValue, RecordGap, Rival, Trace
-from pipeline.plant.nonlinear.effects import find_effect
-from pipeline.plant.nonlinear.effects.base import EffectTerm
+from pipeline.plant.catalogue import find_effect
+from pipeline.plant.effect import EffectTerm
 from pipeline.set_up import Units
 
 _MOST_RIVALS = 4  # rivals to list

@@ -13,8 +13,8 @@ from pipeline.arrays import Array
 from pipeline.estimation.modulating import bump_integral, window_weights
 from pipeline.estimation.noise import high_frequency_noise
 from pipeline.gap.types import Gap, Trace
-from pipeline.plant.nonlinear.effects.base import AugmentedChain
-from pipeline.plant.nonlinear.simulator.laws import arriving
+from pipeline.plant.effect import AugmentedChain
+from pipeline.plant.simulator.laws import arriving
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -10,7 +10,7 @@ from pipeline.gap.fit.levenberg_marquardt import GapFit
 from pipeline.gap.fit.linearise import simulate_run
 from pipeline.gap.search.hypothesis import Hypothesis
 from pipeline.gap.types import GapWindow, Verdict
-from pipeline.plant.nonlinear.effects import find_effect
+from pipeline.plant.catalogue import find_effect
 from pipeline.words.phrases import phrases
 
 # For each behaviour of the cart: the key of the sentence on the recording that shows more of it.

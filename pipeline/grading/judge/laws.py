@@ -18,8 +18,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.grading.mistakes.undo import Number
 from pipeline.names import parameter_names, read_name
-from pipeline.plant.linear.laws import orders
-from pipeline.plant.linear.recovery import recover_from_parameters
+from pipeline.plant.identities import orders, recover_from_parameters
 
 MOST_WIDENING = 4  # tolerances; a law that needs this much widening earns no points
 _PER_TOLERANCE = 2  # steps of widening per tolerance

@@ -20,9 +20,9 @@ from pipeline.grading.references.reference import is_explained
 from pipeline.grading.references.tolerance import as_typed, rounding
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
+from pipeline.plant.chain import Chain
+from pipeline.plant.feedback import level_error_percent, static_levels
 from pipeline.plant.limits import MASS_SPRING_ERROR
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.loop.robustness import level_error_percent, static_levels
 from pipeline.results import Analysis
 from pipeline.submission import Design, StateFeedbackController, Submission
 from pipeline.workflow import reference_design

@@ -8,8 +8,8 @@ from pipeline.grading.grade import Flag
 from pipeline.grading.references.tolerance import as_typed, rounding
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
+from pipeline.plant.identities import orders
 from pipeline.plant.limits import HEAVY_DAMPING
-from pipeline.plant.linear.laws import orders
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.arrays import Array, ComplexArray
-from pipeline.plant.linear import step_response
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.loop.sampled_loop import discretise
+from pipeline.plant import simulate
+from pipeline.plant.chain import Chain
+from pipeline.plant.sampled_loop import discretise
 
 _SAMPLE_TIME = 0.00884  # s; that of the ECP controller, for a design that states none
 _HORIZON = 6.0  # simulated time, as a multiple of the required settling time
@@ -67,8 +67,8 @@ def loop_numbers(
     if stable and np.abs(y).max() < _BLOWN_UP:
         t = T * np.maximum(1.0 + stride * (np.arange(y.size) - 1.0), 0.0)
         judged = {"before": 0.0, "level": np.float64(1.0)}
-        overshoot = float(step_response.overshoot_percent(y, **judged))
-        settles = float(step_response.settling_time(t, y, **judged))
+        overshoot = float(simulate.overshoot_percent(y, **judged))
+        settles = float(simulate.settling_time(t, y, **judged))
     return LoopNumbers(
         stable=stable,
         poles=poles,

@@ -17,8 +17,8 @@ from pipeline.grading.references.reference import Reference
 from pipeline.grading.references.tolerance import percent_off
 from pipeline.grading.words import WORDS
 from pipeline.names import parameter_names, read_name
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.recovery import recover_from_parameters
+from pipeline.plant.chain import Chain
+from pipeline.plant.identities import recover_from_parameters
 from pipeline.submission import ReportedStateSpace
 
 Kind = Literal["exact", "stiffness", "damping"]

@@ -7,7 +7,7 @@ from typing import Any
 from pipeline.arrays import Array
 from pipeline.grading.grade import Criterion
 from pipeline.names import gain_name, own_omega, own_zeta, read_name
-from pipeline.plant.linear.recovery import transfer_functions
+from pipeline.plant.identities import transfer_functions
 from pipeline.report.figures.grading import (
     reported_bode_figure,
     reported_decay_figure,

@@ -9,7 +9,7 @@ from pipeline.estimation.chain.time_search import FOLLOWED
 from pipeline.grading import limits
 from pipeline.grading.references.readings import readings
 from pipeline.names import read_name
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.results import Analysis, Estimate, ParameterRow
 from pipeline.stages.compare import GAIN_AND_FREQUENCY_LIMIT
 

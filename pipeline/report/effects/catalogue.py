@@ -4,7 +4,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any
 
-from pipeline.plant.nonlinear.effects import Effect, EffectParameter
+from pipeline.plant.effect import Effect, EffectParameter
 from pipeline.words.math import to_tex, to_text
 from pipeline.words.numbers import unit_text
 

@@ -8,9 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipeline.arrays import Array
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.augmented import rest_positions, simulate_augmented
-from pipeline.plant.nonlinear.effects import AugmentedChain, Effect, EffectTerm
+from pipeline.plant.augmented import rest_positions, simulate_augmented
+from pipeline.plant.chain import Chain
+from pipeline.plant.effect import AugmentedChain, Effect, EffectTerm
 from pipeline.report.effects.catalogue import INPUT, POSITION
 from pipeline.report.figures.colours import MODEL, QUIET, SECOND, SECOND_LINE
 from pipeline.report.figures.style import legend_above, panels, position_label

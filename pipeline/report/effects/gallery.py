@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.nonlinear.effects import Effect, EffectTerm
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.effect import Effect, EffectTerm
 from pipeline.report.document import Block, Code, Document, Picture, bullet_list, paragraph
 from pipeline.report.effects.catalogue import INPUT, POSITION, parameter_text
 from pipeline.report.effects.figures import effect_figure, scales_readings

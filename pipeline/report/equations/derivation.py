@@ -14,7 +14,7 @@ R.
 from collections.abc import Sequence
 from itertools import product
 
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.report.equations.algebra import Equation, work_out
 
 MOST_CARTS = 4  # The polynomials of longer chains have no letters.

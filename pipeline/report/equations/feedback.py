@@ -6,8 +6,8 @@ from textwrap import wrap
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.loop.sampled_loop import VELOCITY_CORRECTION
+from pipeline.plant.chain import Chain
+from pipeline.plant.sampled_loop import VELOCITY_CORRECTION
 from pipeline.report.document import Formula
 from pipeline.report.equations.model import formula, matlab_matrix, number_matrix
 from pipeline.results import FeedbackDesign

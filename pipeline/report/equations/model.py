@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.arrays import Array, ComplexArray
-from pipeline.plant.linear.chain import Chain, quadratic_factors
+from pipeline.plant.chain import Chain, quadratic_factors
 from pipeline.report.document import Formula
 from pipeline.report.equations.algebra import shown
 from pipeline.report.equations.derivation import neighbours, of_cart, springs_at

@@ -10,7 +10,7 @@ from matplotlib.ticker import MultipleLocator
 
 from pipeline.arrays import Array
 from pipeline.names import mode_suffixes
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.report.figures.colours import CARTS, MEASURED, MODEL, QUIET
 from pipeline.report.figures.style import legend_above, log_frequency_axis, panels, plot_line
 from pipeline.report.figures.svg import attach_data

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from pipeline.arrays import Array
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.report.figures.bode import bode_panels
 from pipeline.report.figures.colours import MEASURED, MODEL, SECOND, SECOND_LINE, SHADE, THIRD
 from pipeline.report.figures.style import legend_above, panels, plot_line, shorten

@@ -8,7 +8,7 @@ from pipeline.arrays import Array
 from pipeline.estimation.interventions import without_releases
 from pipeline.gap.types import FoundEffect, Gap, RecordGap, Trace
 from pipeline.gap.verdict.residual_force import ResidualForce, residual_forces
-from pipeline.plant.nonlinear.effects.base import AugmentedChain
+from pipeline.plant.effect import AugmentedChain
 from pipeline.report.document import Block, Document, bullet_list, paragraph
 from pipeline.report.equations.effects import augmented_equations, in_order, law
 from pipeline.report.figures.gap import (

@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.gap.limits import AS_REPEATS, AT_FLOOR, NOTHING
 from pipeline.gap.types import FoundEffect, Gap, NamedValue, RecordGap, Rival
-from pipeline.plant.nonlinear.effects.base import Effect
+from pipeline.plant.effect import Effect
 from pipeline.report.document import Block, Tile, Tiles, Tone, bullet_list, paragraph, plain_lines
 from pipeline.words.numbers import count, listing, significant, unit_text, with_error
 from pipeline.words.phrases import phrases

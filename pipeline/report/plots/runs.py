@@ -17,7 +17,7 @@ from pipeline.estimation.measured_run import released_run
 from pipeline.gap.data.runs import GapRun
 from pipeline.gap.replay import Replay, prepare_run, replay_driven, replay_fitted
 from pipeline.gap.types import Gap
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.results import Analysis, HardwareCheck, Kind, Record
 from pipeline.stages.hardware_check import check_hardware
 from pipeline.words.phrases import phrases
@@ -81,7 +81,7 @@ def compare_runs(
     if gap is not None and not gap.model.terms:
         gap = None
     if gap is not None:
-        from pipeline.plant.nonlinear.augmented import compile_simulator
+        from pipeline.plant.augmented import compile_simulator
 
         progress("preparing the simulator")
         compile_simulator()

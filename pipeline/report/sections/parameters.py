@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping, Sequence
 from decimal import Decimal
 
 from pipeline.names import read_name
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.report.document import Block, Cell, Heading, Table, bullet_list, cell, paragraph
 from pipeline.report.sections.page import Page
 from pipeline.results import Analysis, Estimate, ParameterRow

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.linalg import solve_discrete_are
 
 from pipeline.arrays import Array, ComplexArray
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.loop.sampled_loop import discretise
+from pipeline.plant.chain import Chain
+from pipeline.plant.sampled_loop import discretise
 from pipeline.report.document import Block, bullet_list, paragraph
 from pipeline.report.equations.algebra import value_term
 from pipeline.report.equations.feedback import weights_formula

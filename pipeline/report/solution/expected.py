@@ -13,7 +13,7 @@ from pipeline.grading.rubric import Rubric, matching
 from pipeline.grading.rubric_file import shipped_rubric
 from pipeline.json_files import Matrix, computed, json_text, result, written
 from pipeline.names import read_name
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 from pipeline.report.document import Block, Cell, bullet_list, cell, paragraph
 from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, work_out

@@ -26,7 +26,7 @@ from pipeline.bench.protocol.messages import (
     format_reading,
 )
 from pipeline.bench.protocol.waves import nearest_count, target_at
-from pipeline.plant.loop.sampled_loop import VELOCITY_CORRECTION
+from pipeline.plant.sampled_loop import VELOCITY_CORRECTION
 
 
 class Core(Protocol):
@@ -169,7 +169,7 @@ class _OpenLoop:
 
 
 class _Pid:
-    """The PID law of `pipeline.plant.loop.sampled_loop`, which acts in the same tick."""
+    """The PID law of `pipeline.plant.sampled_loop`, which acts in the same tick."""
 
     def __init__(self, gains: PidGains, *, row: int, period: float) -> None:
         self._gains, self._row, self._period = gains, row, period
@@ -184,7 +184,7 @@ class _Pid:
 
 
 class _StateFeedback:
-    """The state feedback of `pipeline.plant.loop.sampled_loop` without a model, one tick later."""
+    """The state feedback of `pipeline.plant.sampled_loop` without a model, one tick later."""
 
     def __init__(self, gains: StateGains, *, period: float) -> None:
         self._gains, self._period = gains, period

@@ -31,7 +31,7 @@ from pipeline.experiments.gains import CountScales
 from pipeline.experiments.plan import Plan, PlanLimits, Recording, StateLoop
 from pipeline.experiments.plan_file import load_plan
 from pipeline.ingest.read import read_data
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS
 from pipeline.submission import StateFeedbackController, System, load_submission
 from pipeline.workflow import analyse
 from tests.helpers.acquisitions import LIMITS, Notes, host, sine, until_bytes, write_work

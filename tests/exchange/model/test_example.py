@@ -10,7 +10,7 @@ import pytest
 
 from docs.friction_compensation import main
 from pipeline.exchange.model.saved import save_model
-from pipeline.plant.nonlinear.effects import AugmentedChain
+from pipeline.plant.effect import AugmentedChain
 from pipeline.simulated.emulator.server import EmulatorOptions, Server
 from pipeline.simulated.hidden import prepare_bench
 from tests.helpers.commandline import cartlab_here

@@ -26,11 +26,11 @@ from pipeline.exchange.model import fmu as fmu_module
 from pipeline.exchange.model.description import describe
 from pipeline.exchange.model.fmu import fmu
 from pipeline.exchange.model.sources import matlab_source
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.nonlinear.augmented import simulate_augmented
-from pipeline.plant.nonlinear.effects import CATALOGUE, AugmentedChain, find_effect
-from pipeline.plant.nonlinear.effects.base import Effect
-from pipeline.plant.nonlinear.motion import EquationsOfMotion
+from pipeline.plant.augmented import simulate_augmented
+from pipeline.plant.catalogue import CATALOGUE, find_effect
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.effect import AugmentedChain, Effect
+from pipeline.plant.motion import EquationsOfMotion
 from pipeline.set_up import PAPER_UNITS
 from tests.helpers.effects import SIZES, make_term
 from tests.helpers.exported import OCTAVE, CompiledModel, no_compiler, no_octave

@@ -10,8 +10,9 @@ from fmpy.validation import validate_fmu
 from pipeline.exchange.model.description import describe
 from pipeline.exchange.model.saved import FILES, clear_model, save_model
 from pipeline.exchange.model.sources import c_sources
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.nonlinear.effects import AugmentedChain, find_effect
+from pipeline.plant.catalogue import find_effect
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.effect import AugmentedChain
 from pipeline.results import Analysis
 from pipeline.set_up import Units
 from tests.helpers.effects import SIZES, make_term

@@ -9,9 +9,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.exchange.model.syntax import in_c, in_matlab, substitute
-from pipeline.plant.nonlinear.effects import CATALOGUE
-from pipeline.plant.nonlinear.effects.base import Effect
-from pipeline.plant.nonlinear.effects.law import BuiltLaw
+from pipeline.plant.catalogue import CATALOGUE
+from pipeline.plant.effect import Effect
+from pipeline.plant.law import BuiltLaw
 from tests.helpers.exported import COMPILER, OCTAVE, no_compiler, no_octave
 from tests.plant.test_new_effect import CUBIC_DRAG
 

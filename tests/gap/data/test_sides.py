@@ -11,8 +11,7 @@ from pipeline.gap.data.sides import prepare
 from pipeline.gap.explain import investigate
 from pipeline.gap.types import read_gap
 from pipeline.json_files import json_text
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS, Chain
 from pipeline.results import Intervention, LeftOut
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse

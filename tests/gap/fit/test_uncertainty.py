@@ -13,8 +13,8 @@ from pipeline.gap.fit.levenberg_marquardt import Fitting, evaluate, fit_model
 from pipeline.gap.fit.structure import Structure
 from pipeline.gap.fit.uncertainty import covariance
 from pipeline.gap.search.translate import make_candidate
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.effects import find_effect
+from pipeline.plant.catalogue import find_effect
+from pipeline.plant.chain import Chain
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse

@@ -9,8 +9,8 @@ from pipeline.gap.data.runs import make_run
 from pipeline.gap.follow import forces
 from pipeline.gap.follow.laws import DRY, FollowedBench, LawSet, TrialLaw
 from pipeline.gap.follow.track import Own, errors_of, make_track
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.simulator.terms import Kind
+from pipeline.plant.chain import Chain
+from pipeline.plant.simulator.terms import Kind
 from tests.truth.cases import make_case
 
 # Sizes relative to the largest input, the largest position, cart 1's mass and spring 2.

@@ -7,7 +7,7 @@ from pipeline.gap.data.sides import split
 from pipeline.gap.fit.baseline import fit_baseline
 from pipeline.gap.fit.levenberg_marquardt import GapFit
 from pipeline.gap.search.hypothesis import Study
-from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.plant.catalogue import CATALOGUE
 from tests.truth.bench import Hidden
 from tests.truth.cases import make_case
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.gap.search.hypothesis import Hypothesis, Study, worth_it
-from pipeline.plant.nonlinear.effects import find_effect
+from pipeline.plant.catalogue import find_effect
 from tests.gap.search.begun import CUBIC, DELAY
 
 

@@ -9,7 +9,7 @@ from pipeline.gap.search.hypothesis import judge
 from pipeline.gap.search.prune import SURE, prune, significance
 from pipeline.gap.search.translate import make_candidate
 from pipeline.gap.search.whole import fit_whole
-from pipeline.plant.nonlinear.effects import find_effect
+from pipeline.plant.catalogue import find_effect
 from tests.gap.search.begun import COULOMB, DAHL, DELAY, begun
 from tests.truth.bench import Hidden
 

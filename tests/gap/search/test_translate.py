@@ -7,9 +7,9 @@ from pipeline.gap.data.runs import make_run
 from pipeline.gap.fit.structure import Structure
 from pipeline.gap.follow.laws import COLUMNS, DRIVE_COLUMNS, FollowedBench, column_set, smooth_laws
 from pipeline.gap.search.translate import filled, make_candidate, values_of
-from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.nonlinear.effects import CATALOGUE
-from pipeline.plant.nonlinear.simulator.terms import Kind
+from pipeline.plant.catalogue import CATALOGUE
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.simulator.terms import Kind
 from tests.truth.cases import make_case
 
 ALL = frozenset().union(*(filled(effect) for effect in CATALOGUE))

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from pipeline.gap.search.verdict import reach_verdict
-from pipeline.plant.nonlinear.effects import find_effect
+from pipeline.plant.catalogue import find_effect
 
 FLOOR = 0.01
 COULOMB, SECOND = ("coulomb_friction", 1), ("coulomb_friction", 2)

@@ -12,8 +12,8 @@ from pipeline.gap.fit.baseline import fit_baseline, fit_nuisance
 from pipeline.gap.types import Residual
 from pipeline.gap.verdict.left_force import left_forces
 from pipeline.gap.verdict.residual_map import map_residual
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.plant.catalogue import CATALOGUE
+from pipeline.plant.chain import Chain
 from pipeline.results import Kind, Record
 from pipeline.set_up import Bench
 

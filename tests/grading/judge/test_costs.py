@@ -17,7 +17,7 @@ from pipeline.grading.mistakes.state_model import (
 )
 from pipeline.grading.references.tolerance import exact, late_deduction, to_step
 from pipeline.grading.rubric import Late, Rubric
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS
 from pipeline.submission import ReportedStateSpace
 from tests.helpers.grading_students import Student, student, typed
 

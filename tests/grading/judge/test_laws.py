@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from pipeline.grading.judge.laws import judge_laws
 from pipeline.grading.mistakes.undo import Number
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS, Chain
 
 TABLE_2 = {
     "K_1": "24.3", "K_2": "16.4", "omega_a": "10.1", "omega_b": "37.3", "zeta_a": "0.11",

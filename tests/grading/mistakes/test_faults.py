@@ -15,7 +15,7 @@ from pipeline.arrays import Array
 from pipeline.estimation.chain.follow import find_misread, follow
 from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS
 from pipeline.results import Analysis
 from pipeline.simulated.hidden import preset_bench
 from pipeline.simulated.submission import write_submission

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.grading.mistakes.loop_numbers import loop_numbers
-from pipeline.plant.linear.chain import Chain
+from pipeline.plant.chain import Chain
 
 CHAIN = Chain(m=np.array([1.0]), c=np.array([0.2]), k=np.array([4.0, 0.0]))
 OMEGA, ZETA = 6.0, 0.6

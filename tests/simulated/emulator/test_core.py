@@ -16,8 +16,8 @@ from pipeline.bench.protocol.messages import (
     parse_reading,
 )
 from pipeline.bench.protocol.waves import target_at
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.loop.sampled_loop import LoopSetup, Pid, StateFeedback, simulate_loop
+from pipeline.plant.chain import Chain
+from pipeline.plant.sampled_loop import LoopSetup, Pid, StateFeedback, simulate_loop
 from pipeline.simulated.emulator.core import ReferenceCore
 
 PERIOD = 1e-3

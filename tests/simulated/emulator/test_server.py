@@ -23,7 +23,7 @@ from pipeline.bench.protocol.messages import (
     parse_reading,
 )
 from pipeline.errors import ConfigError
-from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.chain import PRESETS
 from pipeline.results import Record
 from pipeline.simulated.emulator.carts import TRUE_PERIOD, VirtualCarts
 from pipeline.simulated.emulator.faults import Faults, read_fault

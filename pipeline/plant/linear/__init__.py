@@ -1,1 +1,0 @@
-"""The chain of carts: equations, maps to and from named parameters, exact simulation."""

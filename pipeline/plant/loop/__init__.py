@@ -1,1 +1,0 @@
-"""The chain under sampled feedback: gains, simulation, margins, robustness."""

@@ -1,1 +1,0 @@
-"""The chain with effects: catalogue, tables, simulation."""
