@@ -7,7 +7,11 @@ import pytest
 from pipeline.grading.gradings import Member
 from pipeline.grading.similarity.prints import fingerprint
 from pipeline.grading.similarity.shared import find_shared
+from pipeline.ingest.read import read_data
 from pipeline.simulated.bench import COUNT
+from pipeline.simulated.hidden import prepare_bench
+from pipeline.simulated.submission import write_submission
+from pipeline.submission import load_submission
 from tests.helpers.bench_classes import BENCHES, USUAL_NOISE, move_class, read_class
 
 COPIED = ("decay-1a", "step-2", "sine-04", "sweep")
@@ -54,3 +58,19 @@ def test_copies_are_found_and_honest_teams_are_not_flagged(number, bench):
         assert len(found["1"]) >= len(COPIED) - 1
         assert all(r.experiment == f"{r.other_experiment} mine" for r in found["1"])
         assert all(r.equal_rows > 0 for r in found["1"])
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_teams_on_different_benches_are_not_flagged(tmp_path):
+    """The rounding of a steady sine repeats itself on other benches too, and nobody is flagged."""
+    class_ = []
+    for seed, effect in (
+        (930, "coulomb_friction:cart=1"), (931, "backlash"), (934, "actuator_lag"),
+        (937, "saturation"), (938, "dead_zone"),
+    ):  # fmt: skip
+        folder = tmp_path / str(seed)
+        bench = prepare_bench(preset="throne-3dof", hide=(effect,))
+        write_submission(folder, bench, seed=seed)
+        class_.append(member(str(seed), read_data(load_submission(folder)).records))
+    assert find_shared(class_) == {}

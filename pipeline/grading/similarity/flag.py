@@ -50,10 +50,18 @@ def shared_message(evidence: Mapping[str, Any], *, other: str = "") -> str:
 def _recordings_message(recordings: Sequence[Mapping[str, Any]], *, other: str) -> str:
     experiments = list(dict.fromkeys(one["experiment"] for one in recordings))
     are = "is" if len(experiments) == 1 else "are"
-    best = max(recordings, key=lambda one: (one.get("equal_rows", 0), one["sigmas"]))
+    best = max(
+        recordings,
+        key=lambda one: (one.get("equal_rows", 0), one.get("delay") is not None, one["sigmas"]),
+    )
     when = " from {:g} s to {:g} s".format(*best["time"]) if "time" in best else ""
     rows = best.get("equal_rows", 0)
-    same = f"{rows} consecutive rows are equal" if rows else "the noise is the same"
+    if rows:
+        same = f"{rows} consecutive rows are equal"
+    elif best.get("delay") is not None:
+        same = "the cart was released at the same instant, to a hundredth of a sample"
+    else:
+        same = "the noise is the same"
     others = other or ", ".join(_submissions(recordings))
     return (
         f"{first_few(experiments, 4)} {are} also in {others}: "

@@ -31,6 +31,7 @@ class Likeness:
     sigmas : agreement of the noise, in standard deviations above chance.
     equal_rows : number of consecutive rows that are equal up to a factor; 0 if not significant.
     different : number of different readings in these rows.
+    delay : samples between two decays that are one motion, None if this is not known.
     """
 
     experiments: tuple[str, str]
@@ -39,6 +40,7 @@ class Likeness:
     sigmas: float = 0.0
     equal_rows: int = 0
     different: int = 0
+    delay: float | None = None
 
 
 def compare(a: Print, b: Print, *, shift: int) -> Likeness:

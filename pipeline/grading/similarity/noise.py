@@ -1,8 +1,9 @@
 """Compare the noise of two submissions, all recordings together.
 
 The noise of one recording may agree by chance, or because the bench knocks and its encoder rounds
-in the same way in every run. Only two things cannot agree by honest work: the noise of most of the
-recordings, beyond what other teams share with them, and what a hand did in the decays.
+in the same way in every run. So the noise of most recordings counts together, beyond what other
+teams share with them, and no further than to one in a thousand. The rest of the proof is what a
+hand did in the decays: their noise, and the instants of their releases (see `releases`).
 
 Noise is whitened, so that a filter, a scale or further noise in a copy only weakens the agreement.
 It is compared in three bands, because smoothing may reverse the sign of one of them. A single line
@@ -10,7 +11,7 @@ of its spectrum, such as the rounding of a steady sine, counts no more than a li
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,6 +20,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.grading.similarity.likeness import Likeness
 from pipeline.grading.similarity.prints import EVERY, Print
+from pipeline.grading.similarity.releases import Delay, is_decay
 
 _BANDS = ((0.2, 0.3), (0.3, 0.4), (0.4, 0.5))  # cycles per sample, above the fingerprint's corner
 _BANDWIDTH = 0.2  # of each band, as a share of the Nyquist frequency
@@ -33,13 +35,10 @@ _LEAST_SPREAD = 1.5  # sigmas; in honest pairs the recordings spread by this muc
 _PEAKS = 3  # time shifts that the motion of two recordings may suggest
 _MOST_EACH = 12  # recordings of one kind of a submission that are compared
 _FEWEST = 6  # recordings of two submissions that are enough to compare
-LEAST_T = 4.5  # honest pairs reach 4.2, copies with a count of noise 8 to 25
-_LEAST_MEDIAN = 1.0  # sigmas that half of the recordings must exceed
-_LEAST_BY_HAND = 6.0  # sigmas of all decays together
-_SAME_SCALE = 0.02  # relative difference of a decay's scale from that of the other recordings
-_FEWEST_MOTION = 8  # stored values of two motions that are enough to compare
-_ALIKE = 0.9  # squared correlation of motions from which a scale is taken
-_SAME_MOTION = 0.98  # correlation of two decays that count as one
+_LEAST_SIGMAS = 1.0  # of a recording that is named
+# Knocks agree in honest recordings too, so noise alone proves no more than this.
+_LEAST_CHANCE, _LEAST_CHANCE_OF_DECAYS = 1e-3, 1e-6
+_FALSE = 1e-3  # share of honest classes in which a pair is accused
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -90,29 +89,19 @@ class Agreement:
     Attributes
     ----------
     sigmas : (3,) agreement of the noise in each band; negative if it is reversed.
-    shift, motion_shift : sample i of the first corresponds to sample i + shift of the second, by
-        noise and by motion.
+    shift : sample i of the first corresponds to sample i + shift of the second.
+    delay : the same for two decays that are one motion, to a part of a sample.
     """
 
     prints: tuple[Print, Print]
     sigmas: Array
     shift: int
-    motion_shift: int
+    delay: Delay | None = None
 
     @property
     def is_decay(self) -> bool:
         """Whether a hand released the cart."""
-        return _is_decay(self.prints[0].group)
-
-    @property
-    def scale(self) -> float:
-        """Scale of the second motion on the first."""
-        return self._fit[0]
-
-    @property
-    def correlation(self) -> float:
-        """Correlation of the two motions."""
-        return self._fit[1]
+        return is_decay(self.prints[0].group)
 
     def likeness_of(self, sigmas: float) -> Likeness:
         """Return the agreement as a similarity of two recordings."""
@@ -123,22 +112,13 @@ class Agreement:
             experiments=(a.experiment, b.experiment),
             times=(a.times(first, last), b.times(first + self.shift, last + self.shift)),
             sigmas=sigmas,
+            delay=None if self.delay is None else self.delay.samples,
         )
 
-    def is_motion(self, scale: float) -> bool:
-        """Return whether the second motion is the first one, at a known scale."""
-        off = abs(self.scale - scale)
-        return abs(self.correlation) > _SAME_MOTION and off < _SAME_SCALE * abs(scale)
-
-    def likeness(self, scale: float) -> float:
-        """Return how likely it is that two recordings correspond; for decays, see `is_motion`."""
-        same = self.is_decay and self.is_motion(scale)
-        return float(self.sigmas @ self.sigmas) + 2 * _ANYWHERE * same
-
-    @cached_property
-    def _fit(self) -> tuple[float, float]:
-        a, b = (one.motion for one in self.prints)
-        return _same_motion(a, b, shift=self.motion_shift)
+    @property
+    def likeness(self) -> float:
+        """How likely it is that the two recordings correspond."""
+        return float(self.sigmas @ self.sigmas) + 2 * _ANYWHERE * (self.delay is not None)
 
     def of(self, side: int) -> str:
         """Return the name of one of the recordings."""
@@ -157,42 +137,32 @@ def padded_length(prints: Sequence[Print]) -> int:
 
 
 def agreements(
-    a: Mapping[str, Sequence[Heard]], b: Mapping[str, Sequence[Heard]]
+    a: Mapping[str, Sequence[Heard]], b: Mapping[str, Sequence[Heard]], delays: Iterable[Delay]
 ) -> list[Agreement]:
     """Return the recordings of two submissions that correspond, each at most once.
 
-    Decays come last, because their motion is judged by the scale of the other recordings.
+    Parameters
+    ----------
+    delays : the decays of the two that are one motion.
     """
+    released = {tuple(map(id, one.prints)): one for one in delays}
     found: list[Agreement] = []
-    scale = 0.0
-    for group in sorted(a.keys() & b.keys(), key=lambda group: (_is_decay(group), group)):
-        if _is_decay(group) and not scale:
-            scale = _common_scale(found)
+    for group in sorted(a.keys() & b.keys()):
         pairs = [
-            max(_compared(one, other), key=lambda pair: pair.likeness(scale))
+            _compared(one, other, released.get((id(one.print), id(other.print))))
             for one in a[group][:_MOST_EACH]
             for other in b[group][:_MOST_EACH]
         ]
         used: set[int] = set()
-        for pair in sorted(pairs, key=lambda pair: -pair.likeness(scale)):
+        for pair in sorted(pairs, key=lambda pair: -pair.likeness):
             if used.isdisjoint(map(id, pair.prints)):
                 used.update(map(id, pair.prints))
                 found.append(pair)
     return found
 
 
-def _is_decay(group: str) -> bool:
-    return group.startswith("decay")
-
-
-def _common_scale(found: Sequence[Agreement]) -> float:
-    """Return the signed scale of most recordings of two submissions; 0 if they differ."""
-    scales = [one.scale for one in found if one.correlation**2 > _ALIKE and not one.is_decay]
-    return float(np.median(scales)) if scales else 0.0
-
-
-def _compared(a: Heard, b: Heard) -> Iterator[Agreement]:
-    """Compare two recordings at each time shift that their motion suggests, or their noise."""
+def _compared(a: Heard, b: Heard, delay: Delay | None) -> Agreement:
+    """Compare two recordings at the time shift that their motion suggests best, or their noise."""
     from scipy.fft import irfft
 
     spectrum = np.sum(np.conj(a.spectra) * b.spectra, axis=1)
@@ -203,18 +173,21 @@ def _compared(a: Heard, b: Heard) -> Iterator[Agreement]:
     overlap = np.minimum(a.n, b.n - shifts) - np.maximum(0, -shifts)
     sigmas = products[:, shifts] * np.sqrt(_BANDWIDTH / (overlap * a.spectra.shape[1]))
     total = np.sum(sigmas * sigmas, axis=0)
-    for motion_shift in _motion_shifts(a.print.motion, b.print.motion):
-        likely = [0, b.n - a.n, motion_shift - 1, motion_shift, motion_shift + 1]
-        likely = [shift - shifts[0] for shift in likely if shifts[0] <= shift <= shifts[-1]]
-        at = max(likely, key=lambda at: total[at], default=int(np.argmax(total)))
-        if not _is_decay(a.print.group) and total.max() > total[at] + _ANYWHERE:
-            at = int(np.argmax(total))
-        yield Agreement(
-            prints=(a.print, b.print),
-            sigmas=np.clip(sigmas[:, at].astype(float), -_MOST, _MOST),
-            shift=int(shifts[at]),
-            motion_shift=motion_shift,
-        )
+    if delay is None:
+        near = [s + k for s in _motion_shifts(a.print.motion, b.print.motion) for k in (-1, 0, 1)]
+    else:
+        near = [round(delay.samples)]
+    likely = [0, b.n - a.n, *near]
+    likely = [shift - shifts[0] for shift in likely if shifts[0] <= shift <= shifts[-1]]
+    at = max(likely, key=lambda at: total[at], default=int(np.argmax(total)))
+    if not is_decay(a.print.group) and total.max() > total[at] + _ANYWHERE:
+        at = int(np.argmax(total))
+    return Agreement(
+        prints=(a.print, b.print),
+        sigmas=np.clip(sigmas[:, at].astype(float), -_MOST, _MOST),
+        shift=int(shifts[at]),
+        delay=delay,
+    )
 
 
 def _motion_shifts(a: Array, b: Array) -> list[int]:
@@ -249,27 +222,6 @@ def _motion_shifts(a: Array, b: Array) -> list[int]:
     return found or [int(EVERY * shifts[np.argmax(alike)])]
 
 
-def _same_motion(a: Array, b: Array, *, shift: int) -> tuple[float, float]:
-    """Return the scale and the correlation of the second motion, stored coarsely, on the first."""
-    whole, part = divmod(shift, EVERY)
-    at = np.arange(a.size) + whole
-    inside = (at >= 1) & (at < b.size - 2)
-    if np.count_nonzero(inside) < _FEWEST_MOTION:
-        return 0.0, 0.0
-    at, r = at[inside], part / EVERY
-    # Cubic interpolation through four stored values (Lagrange).
-    x = a[inside]
-    y = (
-        b[at - 1] * (-r * (r - 1) * (r - 2) / 6)
-        + b[at] * ((r + 1) * (r - 1) * (r - 2) / 2)
-        + b[at + 1] * (-(r + 1) * r * (r - 2) / 2)
-        + b[at + 2] * ((r + 1) * r * (r - 1) / 6)
-    )
-    x, y = x - x.mean(), y - y.mean()
-    xx, xy, yy = float(x @ x), float(x @ y), float(y @ y)
-    return (xy / xx, xy / np.sqrt(xx * yy)) if xx * yy > 0 else (0.0, 0.0)
-
-
 def usual(pairs: Iterable[tuple[Sequence[Agreement], int]]) -> dict[str, Array]:
     """Return the agreement (3,) of a submission's recordings with those of most other teams.
 
@@ -285,13 +237,19 @@ def usual(pairs: Iterable[tuple[Sequence[Agreement], int]]) -> dict[str, Array]:
 
 
 def copied(
-    found: Sequence[Agreement], common: tuple[Mapping[str, Array], Mapping[str, Array]] = ({}, {})
+    found: Sequence[Agreement],
+    common: tuple[Mapping[str, Array], Mapping[str, Array]] = ({}, {}),
+    *,
+    releases: float,
+    pairs: int,
 ) -> list[tuple[Agreement, float]]:
     """Return the recordings that are copies, each with its sigmas; empty without proof.
 
     Parameters
     ----------
     common : what the recordings of both submissions share with most other teams; see `usual`.
+    releases : how probable it is that honest releases agree as well; see `releases.chance`.
+    pairs : number of pairs of submissions in which chance could have made a match.
     """
     if len(found) < _FEWEST:
         return []
@@ -301,28 +259,32 @@ def copied(
                        for one in found])  # fmt: skip
     own = raw - np.clip(shared, np.minimum(raw, 0.0), np.maximum(raw, 0.0))
     sigmas = own @ signs
-    if t_value(sigmas) < LEAST_T or np.median(sigmas) < _LEAST_MEDIAN:
-        return []
     decays = np.array([one.is_decay for one in found])
-    if not _by_one_hand([one for one in found if one.is_decay], sigmas[decays], found):
+    chance = (
+        max(_chance(sigmas[~decays]), _LEAST_CHANCE)
+        * max(_chance(sigmas[decays]), _LEAST_CHANCE_OF_DECAYS)
+        * releases
+    )
+    if not decays.any() or pairs * _of_product(chance) > _FALSE:
         return []
-    return [(one, float(s)) for one, s in zip(found, sigmas, strict=True) if s >= _LEAST_MEDIAN]
+    return [
+        (one, float(s))
+        for one, s in zip(found, sigmas, strict=True)
+        if s >= _LEAST_SIGMAS or one.delay
+    ]
 
 
-def t_value(sigmas: Array) -> float:
-    """Return how far the mean of the recordings' agreement lies above zero."""
-    return float(sigmas.mean() * np.sqrt(sigmas.size) / max(_LEAST_SPREAD, sigmas.std(ddof=1)))
+def _chance(sigmas: Array) -> float:
+    """Return how probable it is that honest noise agrees as well on average."""
+    from scipy.special import ndtr
+
+    if sigmas.size == 0:
+        return 1.0
+    spread = max(_LEAST_SPREAD, float(sigmas.std(ddof=1)) if sigmas.size > 1 else 0.0)
+    return float(ndtr(-sigmas.mean() * np.sqrt(sigmas.size) / spread))
 
 
-def _by_one_hand(decays: Sequence[Agreement], sigmas: Array, found: Sequence[Agreement]) -> bool:
-    """Return whether one hand made both sets of decays, which no bench can repeat.
-
-    Either their noise agrees, or most of them have the same motion at the scale of the other
-    recordings: two hands do not pull a cart equally far.
-    """
-    if not decays:
-        return False
-    if sigmas.sum() >= _LEAST_BY_HAND * np.sqrt(len(decays)):
-        return True
-    scale = _common_scale(found)
-    return 2 * sum(one.is_motion(scale) for one in decays) > len(decays)
+def _of_product(product: float) -> float:
+    """Return how probable a product of three independent probabilities is that is no larger."""
+    log = -np.log(max(product, 1e-300))
+    return product * float(1 + log + log**2 / 2)

@@ -2,13 +2,14 @@
 
 Two kinds of evidence count. Rows that are equal up to a factor prove that one recording is a copy.
 Without them, a pair of submissions is judged as a whole, by the noise of most of its recordings
-(see `noise`). In a class of fewer than five teams, only equal rows count.
+and the releases of its decays (see `noise`). In a class of fewer than five teams, only equal rows
+count.
 """
 
 from collections import Counter, defaultdict
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from itertools import zip_longest
 
 import numpy as np
@@ -31,6 +32,7 @@ from pipeline.grading.similarity.noise import (
     usual,
 )
 from pipeline.grading.similarity.prints import PASSED, Print, unpack
+from pipeline.grading.similarity.releases import Releases, chance, is_decay, usual_parts
 
 _WIDTH = 512  # samples around an anchor that the first comparison uses
 _BEFORE = 128  # number of these samples that precede the anchor
@@ -54,10 +56,10 @@ _LEAST_ALIKE = 4.5  # sigmas at which two recordings are searched for equal rows
 _TO_A_ROUNDING = 22
 _FEWEST_TEAMS = 3  # other teams that are needed to tell what a class shares
 _MOST_TEAMS = 8  # other teams that are asked
-# Up to this many pairs of submissions, the noise of all is compared; above, each submission is
-# compared with a few of the most similar.
-_MOST_PAIRS, _MOST_SIMILAR = 600, 3
-_SPECTRA_KEPT = 36  # submissions; 35 have 600 pairs
+# The noise of a submission is compared with that of a few others whose recordings are the most
+# similar, and of those whose releases agree this well.
+_MOST_SIMILAR, _RELEASED_ALIKE = 3, 0.05
+_SPECTRA_KEPT = 36  # submissions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +72,7 @@ class SharedRecord:
     sigmas : agreement of the noise, in standard deviations above chance.
     equal_rows : number of consecutive rows that are equal up to one factor per column; 0 if this is
         not the evidence.
+    delay : samples between two decays that are one motion, None if this is not the evidence.
     time, other_time : start and end of the equal part, in s, in both recordings.
     """
 
@@ -78,6 +81,7 @@ class SharedRecord:
     other_experiment: str
     sigmas: float
     equal_rows: int
+    delay: float | None
     time: tuple[float, float]
     other_time: tuple[float, float]
 
@@ -132,9 +136,9 @@ def find_shared(
     for pair, found in equal.items():
         own = [one for one in found if given.isdisjoint(zip(pair, one.experiments, strict=True))]
         proof[pair] = _decisive(own, compared=compared) if pair[1] < len(everyone) else []
-    noise = _Noise(groups, everyone=everyone)
-    for pair in _worth_hearing(everyone, total, first_batch=len(batch)):
-        proof[pair] = [*proof.get(pair, ()), *noise.shared(pair, given, proof.get(pair, ()))]
+    pairs = _Pairs(groups, everyone=everyone, first_batch=len(batch))
+    for pair in pairs.worth_hearing(total):
+        proof[pair] = [*proof.get(pair, ()), *pairs.shared(pair, given, proof.get(pair, ()))]
     shared: dict[str, list[SharedRecord]] = defaultdict(list)
     for pair, found in sorted(proof.items()):
         for one in found:
@@ -168,6 +172,7 @@ def _record_of(one: Likeness, mine: int, other: int, *, submission: str) -> Shar
         other_experiment=one.experiments[other],
         sigmas=round(one.sigmas, 1),
         equal_rows=one.equal_rows,
+        delay=None if one.delay is None else round(one.delay if mine == 0 else -one.delay, 3),
         time=one.times[mine],
         other_time=one.times[other],
     )
@@ -208,35 +213,19 @@ def _decisive(found: Sequence[Likeness], *, compared: int) -> list[Likeness]:
     return chosen if sum(one.different for one in chosen) >= least else []
 
 
-# ------------------------------------------------------- noise of two submissions
+# ------------------------------------------------------- pairs of submissions
 
 
-def _worth_hearing(
-    everyone: Sequence[Member], likeness: Mapping[tuple[int, int], float], *, first_batch: int
-) -> list[tuple[int, int]]:
-    """Return the pairs of submissions whose noise is compared; in a large class, the most similar.
+class _Pairs:
+    """Noise and releases of a class's submissions; noise is compared on demand."""
 
-    Parameters
-    ----------
-    likeness : similarity of pairs in the first comparison.
-    """
-    n = len(everyone)
-    if n * (n - 1) <= 2 * _MOST_PAIRS:
-        pairs = [(a, b) for a in range(min(first_batch, n)) for b in range(a + 1, n)]
-        return [(a, b) for a, b in pairs if not same_team(everyone[a], everyone[b])]
-    kept: set[tuple[int, int]] = set()
-    taken: Counter[int] = Counter()
-    for pair, _ in sorted(likeness.items(), key=lambda one: (-one[1], one[0])):
-        if pair[1] < n and min(taken[pair[0]], taken[pair[1]]) < _MOST_SIMILAR:
-            kept.add(pair)
-            taken.update(pair)
-    return sorted(kept)
-
-
-class _Noise:
-    """The noise of a class's submissions, compared on demand."""
-
-    def __init__(self, groups: Mapping[str, Sequence[_Entry]], *, everyone: Sequence[Member]):
+    def __init__(
+        self,
+        groups: Mapping[str, Sequence[_Entry]],
+        *,
+        everyone: Sequence[Member],
+        first_batch: int,
+    ):
         self._everyone = everyone
         self._prints: dict[int, dict[str, list[Print]]] = defaultdict(lambda: defaultdict(list))
         for group, found in groups.items():
@@ -248,6 +237,14 @@ class _Noise:
         # Spectra take up to 5 MB for each submission.
         self._of = lru_cache(maxsize=_SPECTRA_KEPT)(self._heard)
         self._found: dict[tuple[int, int], list[Agreement]] = {}
+        releases = {a: Releases(self._prints[a]) for a in range(len(everyone))}
+        self._delays = {
+            (a, b): releases[a].delays_to(releases[b])
+            for a in range(first_batch)
+            for b in range(a + 1, len(everyone))
+            if not self._same_team(a, b)
+        }
+        self._usual = usual_parts([one for found in self._delays.values() for one in found])
 
     def _heard(self, submission: int) -> dict[str, list[Heard]]:
         return {
@@ -255,10 +252,37 @@ class _Noise:
             for group, prints in self._prints[submission].items()
         }
 
+    def worth_hearing(self, likeness: Mapping[tuple[int, int], float]) -> list[tuple[int, int]]:
+        """Return the pairs of submissions whose noise is compared.
+
+        Parameters
+        ----------
+        likeness : similarity of pairs in the first comparison.
+        """
+        kept = {pair for pair in self._delays if self._chance(pair) < _RELEASED_ALIKE}
+        taken: Counter[int] = Counter()
+        for pair, _ in sorted(likeness.items(), key=lambda one: (-one[1], one[0])):
+            if pair in self._delays and min(taken[one] for one in pair) < _MOST_SIMILAR:
+                kept.add(pair)
+                taken.update(pair)
+        return sorted(kept)
+
+    def _chance(self, pair: tuple[int, int], given: Container[tuple[int, str]] = ()) -> float:
+        """Return how probable it is that honest releases agree as well; see `releases.chance`."""
+        found = [
+            one
+            for one in self._delays.get(pair, ())
+            if not any((o, p.experiment) in given for o, p in zip(pair, one.prints, strict=True))
+        ]
+        a, b = (self._prints[one] for one in pair)
+        of = sum(min(len(a[group]), len(b[group])) for group in a.keys() & b.keys()
+                 if is_decay(group))  # fmt: skip
+        return chance(found, of=of, usual=self._usual)
+
     def shared(
         self, pair: tuple[int, int], given: Container[tuple[int, str]], known: Iterable[Likeness]
     ) -> list[Likeness]:
-        """Return the recordings that two submissions share according to their noise.
+        """Return the recordings that two submissions share according to noise and releases.
 
         Parameters
         ----------
@@ -271,13 +295,14 @@ class _Noise:
             if not any((pair[side], one.of(side)) in given for side in (0, 1))
         ]
         others = self._others(pair)
-        if len(others) < _FEWEST_TEAMS or not copied(found):
+        proof = partial(copied, found, releases=self._chance(pair, given), pairs=len(self._delays))
+        if len(others) < _FEWEST_TEAMS or not proof():
             return []
         a, b = (usual(self._seen_from(own, c) for c in others) for own in pair)
         told = {one.experiments for one in known}
         return [
             one.likeness_of(sigmas)
-            for one, sigmas in copied(found, (a, b))
+            for one, sigmas in proof((a, b))
             if (one.of(0), one.of(1)) not in told
         ]
 
@@ -301,7 +326,8 @@ class _Noise:
 
     def _agreements(self, a: int, b: int) -> list[Agreement]:
         if (a, b) not in self._found:
-            self._found[a, b] = agreements(self._of(a), self._of(b))
+            delays = self._delays.get((a, b), ())
+            self._found[a, b] = agreements(self._of(a), self._of(b), delays)
         return self._found[a, b]
 
 

@@ -148,7 +148,7 @@ def test_two_copies_of_a_table_of_few_numbers_prove_little():
 def record(submission):
     return SharedRecord(
         experiment="step-1", submission=submission, other_experiment="step-2", sigmas=9.0,
-        equal_rows=800, time=(0.0, 4.0), other_time=(0.0, 4.0),
+        equal_rows=800, delay=None, time=(0.0, 4.0), other_time=(0.0, 4.0),
     )  # fmt: skip
 
 
