@@ -2,7 +2,7 @@
 
     python -m tests.references save FOLDER       in the old checkout: some minutes
     python -m tests.references compare FOLDER    in the new one; lists each fact that differs
-    python -m tests.references accept            write the sample of the tests anew
+    python -m tests.references accept            write the sample of the tests again
 
 Recordings are simulated once, by `save`, so that a change of the simulator shows only where it is
 tested. Name beginnings of cases (`report`, `gap/cubic`) to run only those.

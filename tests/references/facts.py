@@ -1,7 +1,7 @@
 """Turn output files into facts, and compare the facts of two versions of the program.
 
 A fact is a number, a word or a truth value with a path, such as `grade/team-3/points`. Sentences
-are no facts: they may be worded anew at any time.
+are no facts: they may be worded differently at any time.
 """
 
 import csv

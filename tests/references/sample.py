@@ -39,7 +39,7 @@ def read_sample() -> Facts:
 
 
 def accept() -> None:
-    """Write the committed facts anew."""
+    """Write the committed facts again."""
     facts = facts_of(sample) | facts_of(gap_sample)
     text = json.dumps(facts, ensure_ascii=False, indent=0, separators=(",", ":"), sort_keys=True)
     SAMPLE.write_text(
