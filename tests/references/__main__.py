@@ -33,7 +33,7 @@ def main() -> int:
     parser.add_argument("--within", type=float, default=_WITHIN, help="allowed change, as a share")
     asked = parser.parse_args()
     if asked.what == "accept":
-        accept()
+        sys.stdout.write(f"wrote {accept()}\n")
         return 0
     if asked.folder is None:
         parser.error("needs a folder")

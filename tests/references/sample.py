@@ -38,8 +38,8 @@ def read_sample() -> Facts:
     return json.loads(SAMPLE.read_text(encoding="utf-8"))
 
 
-def accept() -> None:
-    """Write the committed facts again."""
+def accept() -> Path:
+    """Write the committed facts again; return their file."""
     facts = facts_of(sample) | facts_of(gap_sample)
     text = json.dumps(facts, ensure_ascii=False, indent=0, separators=(",", ":"), sort_keys=True)
     SAMPLE.write_text(
@@ -47,3 +47,4 @@ def accept() -> None:
         encoding="utf-8",
         newline="\n",
     )
+    return SAMPLE
