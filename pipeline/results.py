@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from pipeline import __version__
 from pipeline.arrays import Array, ComplexArray, freeze
 from pipeline.json_files import Matrix, Number, Numbers, Sha256, computed, result, written
+from pipeline.names import read_name
 from pipeline.plant.chain import Chain
 from pipeline.plant.margins import Margins
 from pipeline.plant.sampled_loop import StateFeedback
@@ -569,7 +570,8 @@ CheckKind = Literal[
     "feedback",
 ]
 
-# Kinds of check of the set-up, the most serious first
+# Kinds of check of the set-up, the most serious first (see docs/decisions.md). Of the vanishing
+# parameters, only springs count.
 _CAUSES: tuple[CheckKind, ...] = (
     "input",
     "springs",
@@ -580,6 +582,7 @@ _CAUSES: tuple[CheckKind, ...] = (
     "groups",
     "setup",
     "held",
+    "vanishing",
 )
 
 
@@ -610,6 +613,18 @@ class Check:
     value: float | None = written(default=None)
     limit: float | None = written(default=None)
     message: str = written()
+
+    @property
+    def is_cause(self) -> bool:
+        """Whether its failure is a mistake in the set-up, which right carts cannot explain."""
+        if self.kind == "vanishing":
+            return read_name(self.parameter).symbol == "k"
+        return self.kind in _CAUSES
+
+    @property
+    def excess(self) -> float:
+        """The ratio of the value to its limit; 0 if it is unknown."""
+        return abs(self.value / self.limit) if self.value is not None and self.limit else 0.0
 
     @property
     def about(self) -> str:
@@ -991,7 +1006,17 @@ class Analysis:
     def causes(self) -> tuple[Check, ...]:
         """The failed checks of the set-up, the most serious first.
 
-        If the set-up is wrong, right carts do not explain the recordings.
+        If the set-up is wrong, right carts do not explain the recordings. Among checks of one kind,
+        the one that exceeds its limit most comes first.
         """
-        failed = [check for check in self.failed_checks if check.kind in _CAUSES]
-        return tuple(sorted(failed, key=lambda check: _CAUSES.index(check.kind)))
+        failed = [check for check in self.failed_checks if check.is_cause]
+        return tuple(sorted(failed, key=lambda one: (_CAUSES.index(one.kind), -one.excess)))
+
+    @property
+    def lacks_springs(self) -> bool:
+        """Whether the recordings show a spring that is stated to be missing."""
+        return any(
+            not self.bench.springs[(read_name(check.parameter).cart or 1) - 1]
+            for check in self.failed_checks
+            if check.kind == "springs"
+        )

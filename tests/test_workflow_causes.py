@@ -2,21 +2,27 @@
 
 import re
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from fnmatch import fnmatch
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pipeline.gap.explain import investigate
 from pipeline.names import toml_flags
-from pipeline.plant.chain import Chain
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.report.gap.verdict import terminal_verdict
 from pipeline.report.sections.questions import ask
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.results import Analysis
 from pipeline.simulated.bench import SimulatedBench
 from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
+from pipeline.submission.load import spring_names
+from pipeline.words.progress import silent
 from pipeline.workflow import analyse
 
 
@@ -29,9 +35,13 @@ def bench_of(k: tuple[float, ...]) -> SimulatedBench:
 def stated(folder: Path, k: tuple[float, ...], springs: str) -> Analysis:
     """Analyse recordings of a bench whose springs are stated as given."""
     write_submission(folder, bench_of(k), seed=3, compact=True)
+    return restated(folder, "springs = .*", f"springs = {springs}")
+
+
+def restated(folder: Path, old: str, new: str) -> Analysis:
+    """Analyse a submission after a change of its `submission.toml`."""
     path = folder / "submission.toml"
-    text = re.sub(r"springs = .*", f"springs = {springs}", path.read_text(encoding="utf-8"))
-    path.write_text(text, encoding="utf-8")
+    path.write_text(re.sub(old, new, path.read_text(encoding="utf-8")), encoding="utf-8")
     return analyse(load_submission(folder), design=False)
 
 
@@ -40,25 +50,92 @@ def first_step(analysis: Analysis) -> str:
     return terminal_summary(analysis).partition("What to do next.")[2].strip().split("\n")[0]
 
 
-@pytest.mark.parametrize(
-    ("k", "springs", "name"),
-    [
-        ((0.06, 0.08, 0.05), "[true, true, false]", "2-wall"),
-        ((0.06, 0.08, 0.05), "[false, true, true]", "wall-1"),
-        ((0.06, 0.08, 0.0), "[true, true, true]", "2-wall"),
-        ((0.05, 0.09, 0.08, 0.06), "[true, true, true, false]", "3-wall"),
-        ((0.05, 0.09, 0.08, 0.0), "[true, true, true, true]", "3-wall"),
-    ],
-)
-def test_a_wrong_spring_is_the_first_cause(tmp_path, k, springs, name):
-    """The summary and the questions name a spring too many or too few before its consequences."""
-    analysis = stated(tmp_path / "lab", k, springs)
+_TWO, _THREE = (0.06, 0.08, 0.05), (0.05, 0.09, 0.08, 0.06)
+_QUICK = [  # two springs at a wall, none between, or one of them, or too many
+    (_TWO, (False, True, True)),
+    (_TWO, (True, False, True)),
+    (_TWO, (False, False, False)),
+    ((0.0, *_TWO[1:]), (True, True, False)),
+    ((*_TWO[:-1], 0.0), (True, True, True)),
+    (_THREE, (True, False, False, True)),
+    ((0.0, *_THREE[1:]), (False, True, True, False)),
+    ((*_THREE[:-1], 0.0), (True, True, True, True)),
+]
+
+
+def wrong_springs() -> Iterator[tuple[tuple[float, ...], tuple[bool, ...]]]:
+    """Yield stiffnesses of carts tied to a wall, and springs of which one or more are wrong."""
+    for k in (_TWO, _THREE):
+        for first, last in [(True, True), (False, True), (True, False)]:
+            own = (k[0] * first, *k[1:-1], k[-1] * last)
+            for springs in product((False, True), repeat=len(k)):
+                wrong = sum(a is not b for a, b in zip(map(bool, own), springs, strict=True))
+                if 0 < wrong <= 4 - len(k) + 1 and (own, springs) not in _QUICK:
+                    yield own, springs
+
+
+def assert_springs_come_first(
+    folder: Path, k: tuple[float, ...], springs: tuple[bool, ...]
+) -> None:
+    """Assert that summary, causes, questions and assumptions name the wrong springs."""
+    analysis = stated(folder, k, toml_flags(springs))
+    right = [stiffness > 0 for stiffness in k]
     told = first_step(analysis)
-    assert f"spring {name}" in told
-    assert f"springs = {toml_flags(map(bool, k))}" in told
+    assert f"springs = {toml_flags(right)}" in told
+    wrong = [j for j, flag in enumerate(springs) if flag is not right[j]]
+    names = spring_names(len(k) - 1)
+    assert all(names[j] in told for j in wrong)
+    assert {cause.parameter for cause in analysis.causes} == {f"k_{j + 1}" for j in wrong}
+    assert analysis.lacks_springs is any(right[j] for j in wrong)
     assert all(question.kind in ("springs", "assumed") for question in ask(analysis))
-    spring = next(a for a in analysis.assumptions if a.about == name)
-    assert spring.support == "contradicted"
+    contradicted = {one.about for one in analysis.assumptions if one.support == "contradicted"}
+    assert contradicted == {names[j] for j in wrong}
+
+
+@pytest.mark.parametrize(("k", "springs"), _QUICK, ids=str)
+def test_a_wrong_spring_is_the_first_cause(tmp_path, k, springs):
+    """Springs too many or too few are named, with the right line, before their consequences."""
+    assert_springs_come_first(tmp_path / "lab", k, springs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("k", "springs"), list(wrong_springs()), ids=str)
+def test_all_wrong_springs_are_the_first_cause(tmp_path, k, springs):
+    """The same for all choices of springs that are nearly right."""
+    assert_springs_come_first(tmp_path / "lab", k, springs)
+
+
+def test_one_cart_without_its_spring_is_the_first_cause(tmp_path):
+    """One cart that comes back has a spring, and the line to write says so."""
+    write_submission(
+        tmp_path / "lab", SimulatedBench(chain=PRESETS["throne-1dof"]), seed=3, compact=True
+    )
+    told = first_step(restated(tmp_path / "lab", "springs = .*", "springs = [false, false]"))
+    assert "springs = [true, true]" in told
+
+
+def test_the_gap_of_carts_that_lack_a_spring_accuses_nothing(tmp_path):
+    """Without a spring that the recordings show, the gap names it, and no effect."""
+    analysis = stated(tmp_path / "lab", (0.0, 0.08, 0.05), "[false, true, false]")
+    gap = investigate(analysis, progress=silent)
+    (cause,) = gap.causes
+    assert cause.id == "springs.k_3"
+    assert cause.message in first_step(analysis)
+    assert (gap.verdict, gap.effects, gap.suspects) == ("unexplained", (), ())
+    assert (gap.residual, gap.contenders, gap.next_experiment) == ((), (), "")
+    told = terminal_verdict(gap)
+    assert cause.message in told
+    assert "No missing physics is suspected" in told
+
+
+def scaled(folder: Path, column: str, scale: float) -> None:
+    """Multiply the columns whose names match in all files by `scale`."""
+    for path in (folder / "data").glob("*.csv"):
+        lines = path.read_text(encoding="utf-8").splitlines()
+        at = [i for i, name in enumerate(lines[0].split(",")) if re.fullmatch(column, name)]
+        rows = np.genfromtxt(lines[1:], delimiter=",")
+        rows[:, at] *= scale
+        np.savetxt(path, rows, delimiter=",", header=lines[0], comments="", fmt="%.8g")
 
 
 @pytest.mark.parametrize("scale", [10.0, 0.01])
@@ -66,16 +143,33 @@ def test_a_unit_wrong_by_a_power_of_ten_is_the_first_cause(tmp_path, scale):
     """Positions in mm or m that are stated in cm show it by the size of their encoder steps."""
     folder = tmp_path / "lab"
     write_submission(folder, bench_of((0.06, 0.08, 0.05)), seed=3, compact=True)
-    for path in (folder / "data").glob("*.csv"):
-        lines = path.read_text(encoding="utf-8").splitlines()
-        at = [i for i, name in enumerate(lines[0].split(",")) if re.fullmatch(r"x\d", name)]
-        rows = np.genfromtxt(lines[1:], delimiter=",")
-        rows[:, at] *= scale
-        np.savetxt(path, rows, delimiter=",", header=lines[0], comments="", fmt="%.8g")
+    scaled(folder, r"x\d", scale)
     analysis = analyse(load_submission(folder), design=False)
     assert analysis.failed_checks[0].id == "position_unit"
     assert f"{scale:g} times a count" in terminal_summary(analysis)
     assert "unit of the positions" in first_step(analysis)
+
+
+@pytest.mark.parametrize(
+    ("scale", "unit", "why"),
+    [
+        (1e3, "V", "at most 10 V"),
+        (1.0, "mV", "smallest step of a converter"),
+        (1e3, "N", ""),
+        (1.0, "V", ""),
+        (1e3, "mV", ""),
+    ],
+)
+@pytest.mark.parametrize("preset", ["throne-1dof", "throne-2dof"])
+def test_an_input_that_no_converter_gives_is_asked_about(tmp_path, preset, scale, unit, why):
+    """Millivolts stated as volts, and volts as millivolts, are seen by what converters can give."""
+    folder = tmp_path / "lab"
+    write_submission(folder, SimulatedBench(chain=PRESETS[preset]), seed=3, compact=True)
+    scaled(folder, "input|u", scale)
+    analysis = restated(folder, r'input = \{ unit = "V"', f'input = {{ unit = "{unit}"')
+    asked = [check.kind for check in analysis.causes]
+    assert asked == (["input_scale"] if why else [])
+    assert why in first_step(analysis)
 
 
 @pytest.mark.parametrize("heavy", ["s[tw]", "decay-1", "none"])

@@ -48,6 +48,9 @@ def investigate(analysis: Analysis, *, progress: Progress, budget: float | None 
     Recordings that the identification left out are not used here either. `budget` is a time limit
     in s, not counting compilation; if it is reached, the result is the best answer so far.
 
+    Without a spring that the recordings show, no effect is searched for, because every effect would
+    only take the place of the spring.
+
     Raises
     ------
     DataError : no record can be used.
@@ -58,7 +61,12 @@ def investigate(analysis: Analysis, *, progress: Progress, budget: float | None 
     with follower_compiled():
         compile_simulator()
     compile_follower()
-    gap = explain_gap(records, analysis.bench, chain=start, budget=budget, progress=progress)
+    explain = partial(explain_gap, records, analysis.bench, chain=start, progress=progress)
+    if analysis.lacks_springs:
+        gap = explain(catalogue=(), budget=budget)
+        gap = replace(gap, residual=(), contenders=(), next_experiment="")
+    else:
+        gap = explain(budget=budget)
     used = {*gap.training, *gap.held_out}
     return replace(
         gap,

@@ -5,13 +5,13 @@ stiffnesses: k_(n+1) / k_n = K_(n-1) / K_n - 1. Without a spring at the far wall
 equally, and only the spring wall-1 can hold them.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from pipeline.checks.carts import NEGLIGIBLE
+from pipeline.checks.carts import NEGLIGIBLE, check_vanishing
 from pipeline.errors import DataError, SubmissionError
 from pipeline.ingest.fill import (
     Found,
@@ -31,7 +31,7 @@ from pipeline.stages.compare import SIGMA_LIMIT
 from pipeline.stages.step_gain import fit_step_gain
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME, spring_names
-from pipeline.words.numbers import significant
+from pipeline.words.numbers import listing, significant
 from pipeline.words.phrases import phrases
 
 _WORDS = phrases("checks")
@@ -57,6 +57,26 @@ class Springs:
     present: tuple[bool, ...]
     why: str
     open: tuple[int, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _BetterSprings:
+    """Springs that explain the frequency response much better than those stated.
+
+    Attributes
+    ----------
+    before, after : χ² per degree of freedom with the stated springs and with these. `before` is
+        None if no carts with the stated springs fit.
+    """
+
+    springs: tuple[bool, ...]
+    before: float | None
+    after: float
+
+    @property
+    def limit(self) -> float:
+        """χ² per degree of freedom that the stated springs exceed by far."""
+        return max(self.after, EXPLAINED)
 
 
 def fill(folder: Path) -> Filled:
@@ -140,18 +160,64 @@ def check_springs(
     gains: Sequence[StepGain],
     bench: Bench,
 ) -> list[Check]:
-    """Return a failed check for each stated or missing wall spring that the data contradict.
+    """Return a failed check for each stated or missing spring that the data contradict.
 
-    The static gains show the last spring without any fit. If the carts do not explain the data, a
-    fit with all springs shows whether one is missing.
+    The static gains show the last spring without any fit. If no carts with the stated springs
+    explain the data, a fit with all springs shows which are missing.
     """
-    found = {check.parameter: check for check in _with_spring(fit, responses, bench=bench)}
-    for check in _by_gains(gains, bench=bench):
-        found.setdefault(check.parameter, check)
-    return list(found.values())
+    n, stated = bench.n, bench.springs
+    last = _last_by_gains(gains, bench=bench)
+    better = _better_springs(fit, responses, bench=bench)
+    right = better.springs if better else stated
+    if last and right[-1] is stated[-1]:
+        right = (*right[:-1], not right[-1])
+    names, wrong = spring_names(n), [j for j in range(n + 1) if right[j] is not stated[j]]
+    checks = []
+    for j in wrong[:1] if n == 1 else wrong:  # of one cart, only the sum of the springs is known
+        if better and better.springs[j] is not stated[j]:
+            alone = "_alone" if better.before is None else ""
+            key, value, limit = f"better_springs{alone}", better.before, better.limit
+        else:
+            assert last is not None
+            key, value, limit = "no_spring" if stated[j] else "spring", last, _NO_SPRING
+        message = _WORDS.text(
+            key,
+            spring=names[j],
+            named=_named(right, bench=bench),
+            before=f"K_{n - 1}",
+            last=f"K_{n}",
+            n=n,
+            value=significant(value or 0.0, digits=3),
+            percent=f"{100 * (value or 0.0):.0f}",
+            after=significant(better.after if better else 0.0, digits=3),
+            springs=toml_flags(right),
+        )
+        check = Check(
+            kind="springs",
+            parameter=f"k_{j + 1}",
+            outcome="fail",
+            value=value,
+            limit=limit,
+            message=message,
+        )
+        checks.append(check)
+    return checks
 
 
-def _by_gains(gains: Sequence[StepGain], *, bench: Bench) -> Iterator[Check]:
+def _named(right: Sequence[bool], *, bench: Bench) -> str:
+    """Return the change from the stated springs to the right ones, in words."""
+    names = spring_names(bench.n)
+    pairs = list(zip(names, right, bench.springs, strict=True))
+    if bench.n == 1:
+        return "a spring"
+    more = [name for name, is_there, stated in pairs if is_there and not stated]
+    fewer = [name for name, is_there, stated in pairs if stated and not is_there]
+    said = f"{'a spring' if len(more) == 1 else 'springs'} {listing(more)}"
+    return f"{said} but no spring {listing(fewer)}" if fewer else said
+
+
+def _last_by_gains(gains: Sequence[StepGain], *, bench: Bench) -> float | None:
+    """Return k_(n+1) / k_n by the steps if it contradicts the last stated spring, or else None."""
     n = bench.n
     by_run = {(gain.experiment, gain.cart): gain for gain in gains}
     ratios = [
@@ -160,75 +226,60 @@ def _by_gains(gains: Sequence[StepGain], *, bench: Bench) -> Iterator[Check]:
         if cart == n and (before := by_run.get((run, n - 1)))
     ]
     if not ratios:
-        return
+        return None
     low, high = np.median(ratios, axis=0)
     stated = bench.springs[-1]
     if low <= _NO_SPRING < high or (high <= _NO_SPRING) is not stated:
-        return
+        return None
     if stated and low < -_NO_SPRING:
-        return
-    yield _spring_check(
-        n + 1,
-        bench=bench,
-        key="no_spring" if stated else "spring",
-        value=float((low + high) / 2),
-        limit=_NO_SPRING,
-    )
+        return None
+    return float((low + high) / 2)
 
 
-def _with_spring(
+def _better_springs(
     fit: ChainFit | None, responses: Sequence[FrequencyResponse], *, bench: Bench
-) -> Iterator[Check]:
-    missing = [j for j in (1, bench.n + 1) if not bench.springs[j - 1]]
-    if fit is None or not fit.converged or fit.explains_data or not missing or not bench.tied:
-        return
-    if bench.n == 1 or not responses:  # of one cart, only the sum of the springs is known
-        return
-    every = replace(bench, springs=(True,) * (bench.n + 1))
+) -> _BetterSprings | None:
+    """Return springs with which the carts explain the frequency response much better."""
+    n, stated = bench.n, bench.springs
+    if all(stated) or (n == 1 and any(stated)) or not responses:
+        return None
+    if fit and fit.converged and fit.explains_data:
+        return None
+    every = replace(bench, springs=(True,) * (n + 1))
     try:
-        stated = fit
-        if fit.method != "bode_fit":
-            stated = fit_bode(responses, bench=bench, near=fit.chain)
-        other = fit_bode(responses, bench=every, near=fit.chain)
+        other = fit_bode(responses, bench=every)
     except DataError:
-        return
-    before, after = stated.chi_square_per_dof, other.chi_square_per_dof
-    if after > before / _MUCH_BETTER:
-        return
-    largest = float(np.max(other.chain.k))
-    for j in missing:
-        k = float(other.chain.k[j - 1])
-        if k > _NO_SPRING * largest and k > SIGMA_LIMIT * other.std.get(f"k_{j}", np.inf):
-            yield _spring_check(
-                j, bench=bench, key="better_with_spring", value=before, limit=max(after, EXPLAINED)
-            )
-
-
-def _numbered(bench: Bench) -> Iterator[tuple[int, bool]]:
-    return enumerate(bench.springs, start=1)
-
-
-def _spring_check(j: int, *, bench: Bench, key: str, value: float, limit: float) -> Check:
-    flags = [flag is not (i == j) for i, flag in _numbered(bench)]
-    message = _WORDS.text(
-        key,
-        spring=spring_names(bench.n)[j - 1],
-        before=f"K_{bench.n - 1}",
-        last=f"K_{bench.n}",
-        n=bench.n,
-        value=significant(value, digits=3),
-        percent=f"{100 * value:.0f}",
-        limit=significant(limit, digits=3),
-        springs=toml_flags(flags),
+        return None
+    before = _misfit(fit, responses, bench=bench)
+    if not other.converged or (before and other.chi_square_per_dof > before / _MUCH_BETTER):
+        return None
+    k, std, largest = other.chain.k, other.std, float(np.max(other.chain.k))
+    found = [
+        bool(k[j] > _NO_SPRING * largest and k[j] > SIGMA_LIMIT * std.get(f"k_{j + 1}", np.inf))
+        for j in range(n + 1)
+    ]
+    if n == 1:
+        found = [found[0], found[0]]
+    if not any(there and not was for there, was in zip(found, stated, strict=True)):
+        return None
+    gone = {check.parameter for check in check_vanishing(other, bench=every)}
+    springs = tuple(
+        there or (was and f"k_{j}" not in gone)
+        for j, (there, was) in enumerate(zip(found, stated, strict=True), start=1)
     )
-    return Check(
-        kind="springs",
-        parameter=f"k_{j}",
-        outcome="fail",
-        value=value,
-        limit=limit,
-        message=message,
-    )
+    return _BetterSprings(springs=springs, before=before, after=other.chi_square_per_dof)
+
+
+def _misfit(
+    fit: ChainFit | None, responses: Sequence[FrequencyResponse], *, bench: Bench
+) -> float | None:
+    """Return χ² per degree of freedom with the stated springs; None if no such carts fit."""
+    if fit and fit.method == "bode_fit":
+        return fit.chi_square_per_dof
+    try:
+        return fit_bode(responses, bench=bench, near=fit and fit.chain).chi_square_per_dof
+    except DataError:
+        return None
 
 
 def _stays_away(step: Record) -> bool:

@@ -19,6 +19,9 @@ _LONGEST = 3.0  # metres; no bench has a longer track
 _LONGEST_WHOLE = 0.5  # metres; the limit if all readings are whole numbers, as counts are
 _ECP_STEP = 2.27e-5  # metres per count of the encoders of an ECP 210
 _LARGEST = 100.0  # volts; no amplifier at a bench gives as much
+_ECP_LARGEST = 10.5  # volts; the converter of an ECP 210 gives 10, and files round
+# Volts. A converter of 16 bits and ± 10 V has steps of 0.3 mV.
+_LEAST = 1e-3
 
 
 def swings(record: Record) -> tuple[float, dict[int, float]]:
@@ -71,7 +74,7 @@ def find_loose_holds(records: Sequence[Record]) -> list[RecordingFault]:
 
 
 def find_other_scales(records: Sequence[Record], *, bench: Bench) -> list[RecordingFault]:
-    """Find positions or inputs that are larger than on any bench, and so must be in another unit.
+    """Find positions or inputs of a size that no bench has, and so must be in another unit.
 
     Examples are counts in place of a length, and millivolts in place of volts. A fit to such
     records looks as good as a fit to right ones; only the gains are wrong.
@@ -88,42 +91,63 @@ def find_other_scales(records: Sequence[Record], *, bench: Bench) -> list[Record
                 code="position_scale", run=run, details=details, value=travel, limit=limit
             )
         )
-    unit, volts = bench.units.input, conversion(bench.units.input, "V")
     # Under feedback, a bench may log another signal as its input.
-    driven = [(r, r.u) for r in records if r.u is not None and r.kind != "closed_loop"]
-    largest, run = _reached((r, float(np.abs(u).max())) for r, u in driven)
-    if volts and largest * volts > _LARGEST:
-        details = {"reach": f"{largest:.4g}", "unit": unit, "quoted": repr(unit)}
-        limit = _LARGEST / volts
+    opened = [(r, r.u) for r in records if r.u is not None and r.kind != "closed_loop"]
+    driven = [(r, float(np.abs(u).max())) for r, u in opened if np.any(u)]
+    largest, run = _reached(driven)
+    unit, volts = bench.units.input, conversion(bench.units.input, "V")
+    headed = any(one.role == "input" for record in records for one in record.heading_units)
+    if not (volts and driven):
+        return found
+    most, why = _LARGEST, "input_scale_large"
+    if not headed and _is_ecp(records, bench=bench):
+        most, why = _ECP_LARGEST, "input_scale_ecp"
+    beyond = largest * volts / most
+    if not headed and max(size for _, size in driven) * volts < _LEAST:
+        beyond, why = _LEAST / (largest * volts), "input_scale_small"
+    if beyond > 1.0:
+        details = {"reach": f"{largest:.4g}", "unit": unit, "why": say(why)}
         found.append(
-            RecordingFault(code="input_scale", run=run, details=details, value=largest, limit=limit)
+            RecordingFault(code="input_scale", run=run, details=details, value=beyond, limit=1.0)
         )
     return found
 
 
 def find_other_steps(records: Sequence[Record], *, bench: Bench) -> RecordingFault | None:
     """Find positions whose encoder step is a power of ten times the known one of an ECP bench."""
-    metres = conversion(bench.units.position, "m")
     if any(one.role == "position" for record in records for one in record.heading_units):
         return None
-    steps = [float(step) * (metres or 0.0) for r in records for step in r.resolution]
-    seen = [step for step in steps if step > 0]
-    if not seen or 2 * len(seen) < len(steps):
+    step = _encoder_step(records)
+    metres = conversion(bench.units.position, "m") or 0.0
+    if not _is_ecp(records, bench=bench) or (scale := _ecp_scale(step * metres)) == 1.0:
         return None
-    power = np.log10(float(np.median(seen)) / _ECP_STEP)
-    # Files round a step to two digits.
-    if round(power) == 0 or abs(power - round(power)) > np.log10(1 + SAME):
-        return None
-    scale = 10.0 ** round(power)
     details = {
-        "step": f"{float(np.median(seen)) / (metres or 1.0):.3g}",
-        "known": f"{_ECP_STEP / (metres or 1.0):.3g}",
+        "step": f"{step:.3g}",
+        "known": f"{_ECP_STEP / metres:.3g}",
         "unit": bench.units.position,
         "scale": f"{scale:g}",
     }
     return RecordingFault(
         code="other_step", run=records[0].id, details=details, value=scale, limit=1.0
     )
+
+
+def _is_ecp(records: Sequence[Record], *, bench: Bench) -> bool:
+    """Whether the encoder step is that of an ECP 210, in this unit or a power of ten of it."""
+    step = _encoder_step(records) * (conversion(bench.units.position, "m") or 0.0)
+    # Files round a step to two digits.
+    return step > 0 and abs(np.log10(step / _ECP_STEP / _ecp_scale(step))) <= np.log10(1 + SAME)
+
+
+def _ecp_scale(step: float) -> float:
+    return float(10.0 ** round(np.log10(step / _ECP_STEP)))
+
+
+def _encoder_step(records: Sequence[Record]) -> float:
+    """Return the median encoder step; 0 if most channels do not show one."""
+    steps = [float(step) for record in records for step in record.resolution]
+    seen = [step for step in steps if step > 0]
+    return float(np.median(seen)) if seen and 2 * len(seen) >= len(steps) else 0.0
 
 
 def _reached(reaches: Iterable[tuple[Record, float]]) -> tuple[float, str]:

@@ -34,6 +34,7 @@ from pipeline.report.gap.verdict import (
     contenders,
     effect_name,
     error_board,
+    is_set_up_alone,
     kept_together,
     next_block,
     place_name,
@@ -424,6 +425,8 @@ def _method(gap: Gap) -> list[Block]:
     )
     if gap.verdict == "none":
         method = WORDS.spans("method_none")
+    elif is_set_up_alone(gap):
+        method = WORDS.spans("method_linear")
     else:
         method = WORDS.spans("method" if gap.complete else "method_so_far")
     return [paragraph(method), runs, *remarks(list(gap.notes))]

@@ -37,6 +37,11 @@ def verdict_title(gap: Gap) -> str:
     return WORDS.text("title_undecided" if undecided else f"title_{gap.verdict}")
 
 
+def is_set_up_alone(gap: Gap) -> bool:
+    """Return whether only the set-up is in doubt, and no effect is suspected."""
+    return bool(gap.causes) and not (gap.effects or gap.suspects)
+
+
 def error_board(gap: Gap) -> Tiles:
     """Return the errors on held-out runs: before, after, and from noise alone.
 
@@ -68,7 +73,8 @@ def verdict_blocks(gap: Gap) -> list[Block]:
     causes: list[Block] = []
     if gap.causes:
         told = " ".join(dict.fromkeys(clean(check.message) for check in gap.causes))
-        causes = [paragraph(WORDS.spans("causes", messages=rich(told)))]
+        key = "causes_none" if gap.verdict == "none" else "causes"
+        causes = [paragraph(WORDS.spans(key, messages=rich(told)))]
     so_far = [] if gap.complete else [paragraph(WORDS.spans("so_far"))]
     match gap.verdict:
         case "none":
@@ -173,6 +179,8 @@ def _explanation(effect: Effect, where: Mapping[str, int], error: float, sizes: 
 
 def _unexplained(gap: Gap) -> Block:
     values = {"noise": _noise(gap), "suspicion": _suspicion(gap), **shares(gap)}
+    if is_set_up_alone(gap):
+        return paragraph(WORDS.spans("unsuspected", **values))
     if not gap.effects:
         key = "unexplained" if gap.complete else "undecided"
         if gap.final < NOTHING * gap.noise_floor:

@@ -57,7 +57,7 @@ def _failed(analysis: Analysis) -> Iterator[Spans]:
     for check in analysis.failed_checks:
         groups.setdefault(_group(check), []).append(check)
     for group in sorted(groups, key=_place):
-        checks = sorted(groups[group], key=_excess, reverse=True)
+        checks = sorted(groups[group], key=lambda check: check.excess, reverse=True)
         shown = checks[: 1 if group in _ALIKE else _MOST_TOLD]
         shown = () if group in _TOLD_ELSEWHERE else shown
         messages = dict.fromkeys(_sentence(clean(check.message)) for check in shown)
@@ -85,13 +85,6 @@ def _place(group: str) -> tuple[int, int]:
         if group in groups:
             return part, groups.index(group)
     return 1, 0
-
-
-def _excess(check: Check) -> float:
-    """Return the ratio of a check's value to its limit; 0 if the ratio is unknown."""
-    if check.value is None or not check.limit:
-        return 0.0
-    return abs(check.value / check.limit)
 
 
 def _action(group: str, checks: Sequence[Check], analysis: Analysis) -> Spans:

@@ -86,7 +86,9 @@ def _turned(analysis: Analysis) -> Iterator[Asked]:
 def _springs(analysis: Analysis) -> Iterator[Asked]:
     wrong = [check.message for check in analysis.failed_checks if check.kind == "springs"]
     if wrong:
-        yield Asked(kind="springs", id="springs", section="parameters", text=" ".join(wrong))
+        yield Asked(
+            kind="springs", id="springs", section="parameters", text=" ".join(dict.fromkeys(wrong))
+        )
 
 
 def _inconsistent_rows(analysis: Analysis) -> list[ParameterRow]:
