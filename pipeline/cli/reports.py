@@ -234,10 +234,11 @@ def check(
     from pipeline.grading.self_check.check import check_numbers
     from pipeline.grading.self_check.log import answer_line
     from pipeline.grading.self_check.words import answer_lines
+    from pipeline.submission import load_submission
 
     asked = load_rubric(rubric) if rubric else None
     with progress_line() as progress:
-        answer = check_numbers(_load(folder), rubric=asked, progress=progress)
+        answer = check_numbers(load_submission(folder), rubric=asked, progress=progress)
     typer.echo(answer_line(answer) if as_json else "\n".join(answer_lines(answer)), nl=not as_json)
     if answer.disagree:
         raise typer.Exit(1)

@@ -1,7 +1,6 @@
 """Read a rubric; each mistake in it is reported in one line with file, line, key and suggestion."""
 
-import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from decimal import Decimal
@@ -35,7 +34,7 @@ from pipeline.submission.complaints import (
     without_tag,
 )
 from pipeline.submission.load import spring_names
-from pipeline.submission.toml_file import Toml, at_line, key_lines, read_text, read_toml
+from pipeline.submission.toml_file import TomlSlip, at_line, key_lines, read_text, read_toml
 
 _MAX_BYTES = 1_000_000
 _CHECKS: dict[str, type[BaseModel]] = {
@@ -46,7 +45,6 @@ _CHECKS: dict[str, type[BaseModel]] = {
 _OF_CRITERIA = tuple(rubric.DataQuality.model_fields)  # keys that every criterion has
 # Valid values that replace wrong or missing ones, so that further mistakes can be found.
 _HARMLESS: dict[str | int, Any] = {"version": 1, "points": 1.0, "id": "criterion", "kind": "step"}
-_ID = re.compile(r"^\s*id\s*=\s*[\"']([^\"']*)", re.MULTILINE)
 
 
 def load_rubric(path: Path) -> Rubric:
@@ -110,35 +108,25 @@ def parse_rubric(text: str, *, where: str) -> Rubric:
 
     Raises
     ------
-    InvalidRubric : the rubric has mistakes; all of them are listed.
+    InvalidRubric : the rubric has mistakes. If it is not TOML, the first is listed; else all are.
     """
-    read = read_toml(text, root=Rubric)
-    problems = [(slip.line, slip.what) for slip in read.slips]
-    if read.document or not problems:
-        lost = set(_ID.findall(text)) if problems else set()
-        found = _validate(_tuples(read.document), lost=lost)
-        if not problems and not found.complaints and found.rubric is not None:
-            return found.rubric
-        problems += [
-            (line, one.what)
-            for one in found.complaints
-            if not ((line := _line_of(read.text, one.at)) and _is_of_slip(one, line, read))
-        ]
+    try:
+        document = _tuples(read_toml(text, root=Rubric))
+    except TomlSlip as slip:
+        raise InvalidRubric(where, [(slip.line, str(slip))]) from None
+    found = _validate(document)
+    if not found.complaints and found.rubric is not None:
+        return found.rubric
+    problems = [(_line_of(text, one.at), one.what) for one in found.complaints]
     raise InvalidRubric(where, sorted(problems))
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Complaint:
-    """A problem, and its place in the document.
-
-    Attributes
-    ----------
-    missing : whether the problem is a missing key.
-    """
+    """A problem, and its place in the document."""
 
     at: Location
     what: str
-    missing: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,24 +135,8 @@ class _Validated:
     complaints: Sequence[_Complaint]
 
 
-def _is_of_slip(complaint: _Complaint, line: int, read: Toml) -> bool:
-    """Return whether a key seems missing only because its line is not valid TOML."""
-    if not complaint.missing:
-        return False
-    lines = read.text.split("\n")
-    headings = [n for n, typed in enumerate(lines, start=1) if typed.lstrip().startswith("[")]
-    end = next((n for n in headings if n > line), len(lines) + 1)
-    # If the invalid line is a heading, the whole table seems missing.
-    return any(len(complaint.at) == 1 or line <= slip.line < end for slip in read.slips)
-
-
-def _validate(document: dict, *, lost: Collection[str]) -> _Validated:
-    """Check a document and report all problems, even those that an earlier one would hide.
-
-    Parameters
-    ----------
-    lost : ids of criteria that may be in lines that are not valid TOML.
-    """
+def _validate(document: dict) -> _Validated:
+    """Check a document and report all problems, even those that an earlier one would hide."""
     complaints: list[_Complaint] = []
     criteria = document.get("criteria")
     if isinstance(criteria, tuple):
@@ -179,7 +151,7 @@ def _validate(document: dict, *, lost: Collection[str]) -> _Validated:
         ids = [one.get("id") if isinstance(one, dict) else None for one in own]
         complaints += [
             _Complaint(at=at, what=f"{dotted(at, document)}: {what}")
-            for at, what in _contradictions(rubric, ids, lost=lost)
+            for at, what in _contradictions(rubric, ids)
         ]
     return _Validated(rubric=rubric, complaints=complaints)
 
@@ -210,8 +182,7 @@ def _with_check(own: Any, i: int, document: dict, complaints: list[_Complaint]) 
         what = "unknown key; did you mean 'check'?"
     else:
         typed, what = "", f"is required and missing{nearest('', tuple(_CHECKS))}"
-    missing = not meant and "check" not in own
-    complaints.append(_Complaint(at=at, what=f"{dotted(at, document)}: {what}", missing=missing))
+    complaints.append(_Complaint(at=at, what=f"{dotted(at, document)}: {what}"))
     left = {key: value for key, value in own.items() if key not in meant}
     close = get_close_matches(str(typed), list(_CHECKS), n=1)
     if not close:  # no known check is similar, so only the common keys can be checked
@@ -224,7 +195,6 @@ def _complaint(error: ErrorDetails, document: dict) -> _Complaint:
     return _Complaint(
         at=without_tag(error["loc"], document),
         what=explain(error, document, root=Rubric),
-        missing=error["type"] == "missing",
     )
 
 
@@ -255,15 +225,12 @@ def _tuples(value: Any) -> Any:
 # ------------------------------------------------- contradictions between the tables
 
 
-def _contradictions(
-    found: Rubric, ids: Sequence[object], *, lost: Collection[str]
-) -> Iterator[tuple[Location, str]]:
+def _contradictions(found: Rubric, ids: Sequence[object]) -> Iterator[tuple[Location, str]]:
     """Yield place and problem of each contradiction between tables.
 
     Parameters
     ----------
     ids : the ids of the criteria as typed.
-    lost : ids of criteria that may be in lines that are not valid TOML.
     """
     n, names = found.system.carts, found.names
     if not found.criteria:
@@ -301,7 +268,7 @@ def _contradictions(
             if parent in by_person:
                 what = f"{parent!r} is graded by a person, later than this criterion"
                 yield ("criteria", i, "requires"), what
-            if parent not in seen and (parent in ids or parent not in lost):
+            if parent not in seen:
                 where = "comes later" if parent in ids else "is not a criterion"
                 known = "" if parent in ids else nearest(parent, known_ids)
                 yield ("criteria", i, "requires"), f"{parent!r} {where}{known}"

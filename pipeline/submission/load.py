@@ -37,18 +37,20 @@ from pipeline.submission.models import (
     Unread,
 )
 from pipeline.submission.toml_file import (
+    MOST_SPOILT,
+    ReadApart,
+    TomlSlip,
     UnusableNumber,
     at_line,
     backslash_words,
     check_number,
-    key_lines,
+    mend_number,
     parse_toml,
+    read_apart,
     read_text,
-    read_toml,
 )
 
 NAME = "submission.toml"
-_MOST_ROUNDS = 30  # most times that a file is checked again without what cannot be read
 MAX_TOML_BYTES = 1_000_000  # a tenth is enough for the experiments of a full class section
 MAX_NOTES_BYTES = 1_000_000
 MAX_DATA_BYTES = 100_000_000  # over half an hour at 1 kHz
@@ -82,9 +84,7 @@ def load_submission(path: Path) -> Submission:
     try:
         return parse_submission(text, folder=folder, where=where)
     except SubmissionError:
-        if (submission := _without_unread(text, folder=folder, where=where)) is None:
-            raise
-        return submission
+        return _without_unread(text, folder=folder, where=where)
 
 
 class InvalidSubmission(SubmissionError):
@@ -121,47 +121,49 @@ def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submissio
     return _check(document, folder=folder, where=where)
 
 
-def _without_unread(text: str, *, folder: Path, where: str) -> Submission | None:
+def _without_unread(text: str, *, folder: Path, where: str) -> Submission:
     """Return a submission without the parts of `[reported]` that cannot be read.
 
-    None if something else cannot be read either.
+    Raises
+    ------
+    SubmissionError : something else cannot be read.
     """
-    read, unread = read_toml(text, as_typed=True), dict[tuple[str, ...], Unread]()
-    document, lines = read.document, dict[Location, int]()
-    for number, at in key_lines(read.text):
-        lines.setdefault(at, number)
+    try:
+        read = read_apart(text, "reported")
+    except TomlSlip as slip:
+        raise SubmissionError(at_line(where, slip.line, str(slip))) from None
+    document, unread = read.document, dict[Location, Unread]()
 
-    def leave_out(problems: Sequence[tuple[Location, str]]) -> bool:
-        """Leave out the number or table of each problem; return whether all are in `[reported]`."""
+    def leave_out(at: Location, line: int, what: str) -> None:
+        """Leave out a number or table of `[reported]`."""
         nonlocal document
-        for at, message in problems:
-            part = tuple(map(str, at[: 3 if len(at) > 2 else 2]))
-            if part[:1] != ("reported",):
-                return False
-            document = _without(document, part)
-            unread.setdefault(part, Unread(at=part, message=message))
-        return True
+        part = tuple(map(str, at[: 3 if len(at) > 2 else 2]))
+        document = _without(document, part)
+        unread.setdefault(part, Unread(at=part, message=at_line(NAME, line, what)))
+        if len(unread) > MOST_SPOILT:
+            raise SubmissionError(f"{where}: [reported] has more than {MOST_SPOILT} mistakes")
 
-    slips = [
-        (at, at_line(NAME, slip.line, slip.what))
-        for slip in read.slips
-        for at in slip.spoilt or [()]
-    ]
-    if not leave_out(slips):
-        return None
-    for _ in range(_MOST_ROUNDS):  # a round finds the first problems of one kind
+    for spoilt in read.spoilt:
+        leave_out(*spoilt)
+    while True:  # a round finds the first problems of one kind, and leaves at least one part out
         try:
             submission = _check(document, folder=folder, where=where)
             return submission.model_copy(update={"unread": tuple(unread.values())})
         except InvalidSubmission as wrong:
-            told = wrong.problems
-            if not leave_out(
-                [(at, at_line(NAME, lines.get((*at[:3],), 0), what)) for at, what in told]
-            ):
-                return None
-        except SubmissionError:
-            return None
-    return None
+            before = len(unread)
+            if any(tuple(at[:1]) != ("reported",) for at, _ in wrong.problems):
+                raise
+            for at, what in wrong.problems:
+                leave_out(at, read.line(at), what + _write(read, at))
+            if len(unread) == before:
+                raise
+
+
+def _write(read: ReadApart, at: Location) -> str:
+    """Return "; write …" for a number that was typed as text; "" for anything else."""
+    typed = read.statements.get(tuple(at))
+    mended = mend_number(typed.text) if typed and re.search("[\"']", typed.text) else ""
+    return f"; write {mended}" if mended else ""
 
 
 def _without(document: dict[str, Any], at: Sequence[str]) -> dict[str, Any]:
@@ -405,17 +407,27 @@ def _reported_problems(submission: Submission) -> Iterator[tuple[Location, str]]
                 yield ("reported", table, name), f"unknown parameter{nearest(name, names)}"
     if (space := reported.state_space) is not None:
         if space.A and (len(space.A) != 2 * n or any(len(row) != 2 * n for row in space.A)):
-            yield ("reported", "state_space", "A"), f"expected {2 * n} rows of {2 * n} numbers"
+            hint = _decimals(max(map(len, space.A)), n)
+            yield (
+                ("reported", "state_space", "A"),
+                f"expected {2 * n} rows of {2 * n} numbers{hint}",
+            )
         if space.B and len(space.B) != 2 * n:
             yield (
                 ("reported", "state_space", "B"),
-                f"expected {2 * n} numbers, found {len(space.B)}",
+                f"expected {2 * n} numbers, found {len(space.B)}{_decimals(len(space.B), n)}",
             )
-    if reported.feedback is not None and len(reported.feedback.gains) not in (0, 2 * n):
+    found = len(reported.feedback.gains) if reported.feedback else 0
+    if found not in (0, 2 * n):
         yield (
             ("reported", "feedback", "gains"),
-            f"expected {2 * n} gains, found {len(reported.feedback.gains)}",
+            f"expected {2 * n} gains, found {found}{_decimals(found, n)}",
         )
+
+
+def _decimals(found: int, n: int) -> str:
+    """Return a hint at decimal commas if a list of `n` carts has twice as many numbers."""
+    return "; write decimals with a point, 1.5 and not 1,5" if found == 4 * n else ""
 
 
 # ------------------------------------------------------------------------- files

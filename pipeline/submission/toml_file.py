@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -27,9 +28,21 @@ _QUOTED = re.compile(r"\"(?:\\.|[^\"\\\n])*\"|'[^'\n]*'")
 _KEYS = re.compile(rf"(?:[\w-]+|{_QUOTED.pattern})(?:[ \t]*\.[ \t]*(?:[\w-]+|{_QUOTED.pattern}))*")
 # A heading, even if a bracket of it is missing; not a row of numbers in a longer list.
 _HEADING = re.compile(
-    r"\s*(?:\[+\s*|(?=[^=]*\]\s*(?:#.*)?$)|\W+(?=reported\b))([A-Za-z_\"'][^,=\[\]()]*)[^,=]*$"
+    r"\s*(?:\[+\s*|(?=[^=]*\]\s*(?:#.*)?$)|\W+(?=(?:reported|system|design|experiments)\b))([A-Za-z_\"'][^,=\[\]()]*)[^,=]*$"
 )
-_NAME = re.compile(r"\s*([^\W\d][\w.-]*)")  # the name at the beginning of a line
+# The name at the beginning of a line, and = if it is there.
+_NAME = re.compile(r"\s*[\"']?([^\W\d][\w.-]*)[\"']?(?:[^\W\d]|[ \t])*([=:]?)")
+_QUOTES = "\"'“”„‟«»‘’‚"
+# A name and one number in any form that people type; a unit that changes its size is not allowed.
+_ONE_NUMBER = re.compile(
+    rf"\s*(?P<key>[^\s=:]+(?:[ ][^\W\d]\w*)?)(?:\s*[=:]\s*|\s+)[{_QUOTES}]*\s*(?P<sign>[-+−–—]?)\s*"
+    r"(?P<number>\d+(?:[.,]\d*)?|[.,]\d+)"
+    r"(?:(?:[eE]|\s*[*·x×]\s*10\^?)(?P<exponent>[-+−–—]?\d+))?\.?"
+    rf"[{_QUOTES}]*\s*(?:(?!m?Hz|°|deg)[A-Za-zµ][^#]*|(?:±|\+/-)[^#]*)?(?:#.*)?"
+)
+MOST_SPOILT = 200  # statements and tables; a file with more mistakes is refused
+_NOT_VALID = "not valid TOML"
+_DASHES = str.maketrans("−–—", "---")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,34 +97,17 @@ def _too_large(where: str, size: int, limit: int) -> str:
     return f"{where}: {size:,} bytes, the limit is {limit:,}"
 
 
-class TomlSlip(NamedTuple):
-    """A mistake in a TOML text.
+class TomlSlip(Exception):
+    """A mistake in a TOML text; its text says what is wrong, and what to write instead.
 
     Attributes
     ----------
     line : number of the line that is not readable; 0 means the whole text.
-    what : what is wrong, and what to write instead.
-    spoilt : the keys and tables that cannot be read because of it; empty if this is not known.
     """
 
-    line: int
-    what: str
-    spoilt: tuple[Location, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class Toml:
-    """The readable part of a TOML text, and its mistakes (slips).
-
-    Attributes
-    ----------
-    document : the content of the readable lines.
-    text : the readable lines, each in its place; all other lines are empty.
-    """
-
-    document: dict[str, Any]
-    text: str
-    slips: tuple[TomlSlip, ...] = ()
+    def __init__(self, line: int, what: str) -> None:
+        super().__init__(what)
+        self.line = line
 
 
 def parse_toml(
@@ -134,13 +130,13 @@ def parse_toml(
 
     Raises
     ------
-    PipelineError : of class `error`. Each line of the message names the place of a mistake, and
-        says what to write instead.
+    PipelineError : of class `error`. The message names the place of the first mistake, and says
+        what to write instead.
     """
-    read = read_toml(text, as_typed=as_typed, root=root)
-    if read.slips:
-        raise error("\n".join(at_line(where, slip.line, slip.what) for slip in read.slips))
-    return read.document
+    try:
+        return read_toml(text, as_typed=as_typed, root=root)
+    except TomlSlip as slip:
+        raise error(at_line(where, slip.line, str(slip))) from None
 
 
 def at_line(where: str, line: int, what: str) -> str:
@@ -149,52 +145,205 @@ def at_line(where: str, line: int, what: str) -> str:
 
 
 def read_toml(
-    text: str,
-    *,
-    as_typed: bool = False,
-    root: type[BaseModel] = Submission,
-) -> Toml:
-    """Read the valid lines of typed TOML; a mistake in one line does not hide the others."""
+    text: str, *, as_typed: bool = False, root: type[BaseModel] = Submission
+) -> dict[str, Any]:
+    """Return the document of a TOML text; see `parse_toml`.
+
+    Raises
+    ------
+    TomlSlip : the first mistake.
+    """
+    document = _parse(text, root=root)
+    return document if as_typed else _with_floats(document, ())
+
+
+def _parse(text: str, *, root: type[BaseModel], numbers: bool = False) -> dict[str, Any]:
+    """Return a document with decimals in place of floats.
+
+    Parameters
+    ----------
+    numbers : whether every value of the text must be a number or a list of numbers.
+
+    Raises
+    ------
+    TomlSlip : the first mistake.
+    """
     if line := find_deep_key(text):
-        return Toml(document={}, text="", slips=(TomlSlip(line, "keys nest too deeply"),))
-    typed, slips = text.split("\n"), list[TomlSlip]()
-    lines, emptied = list(typed), -1  # last line of the previous mistake
-    for _ in range(30 if len(text) <= 50_000 else 1):  # a long text is read only once
+        raise TomlSlip(line, "keys nest too deeply")
+    try:
+        return tomllib.loads(text, parse_float=_decimal)
+    except tomllib.TOMLDecodeError as wrong:
+        message = " ".join(str(wrong).split())
+        at = _AT.search(message)
+        lines = text.split("\n")
+        line = int(at[1]) if at else 1 if numbers else len(lines)
+        shown = lines[line - 1].strip()
+        slip = _find_slip(shown, _AT.sub("", message))
+        words = _explain_slip(slip, shown, root, numbers=numbers)
+        shown = shown if shown.isprintable() and len(shown) <= _SHOWN else quote(shown)
+        raise TomlSlip(line, f"{words}; found {shown or 'the end'}") from None
+    except RecursionError:
+        raise TomlSlip(0, "lists or tables nest too deeply") from None
+    except ValueError:  # an integer of thousands of digits
+        raise TomlSlip(_long_number(text), "a number has too many digits") from None
+
+
+@dataclass(kw_only=True)
+class Statement:
+    """A key with its value, as typed in one or more lines of a file.
+
+    Attributes
+    ----------
+    line : number of the first line.
+    table, at : keys of the table above, and of the statement itself.
+    """
+
+    line: int
+    table: Location
+    at: Location
+    lines: list[str]
+
+    @property
+    def text(self) -> str:
+        """All lines of the statement."""
+        return "\n".join(self.lines)
+
+
+class Spoilt(NamedTuple):
+    """A statement or a table that cannot be read, with its line and what is wrong."""
+
+    at: Location
+    line: int
+    what: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadApart:
+    """The result of `read_apart`; `statements` are those of the table, by their keys."""
+
+    document: dict[str, Any]
+    statements: Mapping[Location, Statement]
+    spoilt: Sequence[Spoilt]
+
+    def line(self, at: Location) -> int:
+        """Return the line of a key or of its table; 0 if it is not in the table."""
+        found = (self.statements.get((*at[:n],)) for n in range(min(len(at), 3), 0, -1))
+        return next((one.line for one in found if one), 0)
+
+
+def read_apart(text: str, table: str, *, root: type[BaseModel] = Submission) -> ReadApart:
+    """Read typed TOML; a mistake in a statement of one table costs only this statement.
+
+    All values of the table must be numbers or lists of numbers.
+
+    Raises
+    ------
+    TomlSlip : the first mistake outside the table.
+    """
+    others, statements, spoilt = _take_out(text.replace("\r\n", "\n"), table)
+    document, first = _parse("\n".join(others), root=root), dict[Location, Statement]()
+    for one in statements:
+        if len(spoilt) > MOST_SPOILT:
+            raise TomlSlip(0, f"[{table}] has more than {MOST_SPOILT} mistakes")
+        earlier = first.setdefault(one.at, one)
         try:
-            document = tomllib.loads("\n".join(lines), parse_float=_decimal)
-            if not as_typed:
-                document = _with_floats(document, (), slips)
-            return Toml(document=document, text="\n".join(lines), slips=tuple(slips))
-        except tomllib.TOMLDecodeError as wrong:
-            message = " ".join(str(wrong).split())
-            at = _AT.search(message)
-            line = int(at[1]) if at else len(lines)
-            shown = typed[line - 1].strip()
-            slip = _find_slip(shown, _AT.sub("", message))
-            # The rest of a list or text with a bad first line is not a second mistake.
-            begins = re.match(r"\s*(#|\[|[\w\"'.-]+\s*=)", typed[line - 1])
-            told = line != emptied + 1 or begins
-            first, emptied = _find_spoilt(lines, line, slip)
-            if told:
-                spoilt = tuple(_spoilt_keys(typed, first, emptied))
-                numbers = root is Submission and spoilt[0][:1] == ("reported",)
-                words = _explain_slip(slip, shown, root, numbers=numbers)
-                shown = shown if shown.isprintable() and len(shown) <= _SHOWN else quote(shown)
-                slips.append(TomlSlip(line, f"{words}; found {shown or 'the end'}", spoilt))
-            if not any(map(str.strip, lines[first - 1 : emptied])):
-                break
-            lines[first - 1 : emptied] = [""] * (emptied + 1 - first)
-        except RecursionError:
-            slips.append(TomlSlip(0, "lists or tables nest too deeply"))
-            break
-        except ValueError:  # an integer of thousands of digits
-            line = _long_number("\n".join(lines))
-            spoilt = tuple(_spoilt_keys(typed, line, line)) if line else ()
-            slips.append(TomlSlip(line, "a number has too many digits", spoilt))
-            if not line:
-                break
-            lines[line - 1] = ""
-    return Toml(document={}, text="", slips=tuple(slips))
+            if not one.lines:  # a heading
+                continue
+            value = _parse(one.text, root=root, numbers=True)
+            if not _merge(document, one.table, value):
+                key = ".".join(map(str, one.at[len(one.table) :]))
+                raise TomlSlip(1, f"{key} already has a value in line {earlier.line}; keep one")
+        except TomlSlip as slip:
+            spoilt.append(Spoilt(one.at, one.line + max(slip.line, 1) - 1, str(slip)))
+    return ReadApart(document=document, statements=first, spoilt=spoilt)
+
+
+def _take_out(text: str, table: str) -> tuple[list[str], list[Statement], list[Spoilt]]:
+    """Return the lines without a table, the statements of the table, and its bad headings.
+
+    The statements below a bad heading are left out.
+    """
+    lines = text.split("\n")
+    others, found, spoilt = list(lines), list[Statement](), list[Spoilt]()
+    above: Location = ()
+    is_lost, one, depth = False, None, 0  # depth of the lists that are open
+    for number, line in enumerate(lines, start=1):
+        if _heading(line):
+            above, is_lost = _table_of(line)
+            one = None
+            if above[:1] == (table,):
+                others[number - 1] = ""
+                found.append(Statement(line=number, table=above, at=above, lines=[]))
+                if is_lost:
+                    what = "a table starts with [name] on a line of its own"
+                    spoilt.append(Spoilt(above, number, f"{what}; found {line.strip()}"))
+            continue
+        name = _NAME.match(line[:_LONGEST_LINE])
+        if name and (name[2] or one is None or depth <= 0):
+            at = (*above, *name[1].split("."))
+            one, depth = Statement(line=number, table=above, at=at, lines=[]), 0
+            if at[0] != table:
+                one = None
+            elif not is_lost:
+                found.append(one)
+        if one is not None or above[:1] == (table,):
+            others[number - 1] = ""
+        if one is not None:
+            one.lines.append(line)
+            depth += line.count("[") - line.count("]")
+        elif others[number - 1] != line and line.strip() and not line.lstrip().startswith("#"):
+            spoilt.append(Spoilt(above, number, f"expected name = number; found {quote(line)}"))
+    return others, found, spoilt
+
+
+def _heading(line: str) -> re.Match[str] | None:
+    """Return the heading in a line, even a spoilt one; a very long line is not one."""
+    return _HEADING.match(line) if len(line) <= _LONGEST_LINE else None
+
+
+def _table_of(heading: str) -> tuple[Location, bool]:
+    """Return the keys in a heading, and whether it is spoilt."""
+    found: list[str] = []
+    try:
+        here: Any = tomllib.loads(heading)
+        while isinstance(here, dict) and here:
+            key, here = next(iter(here.items()))
+            found.append(key)
+        if here == {}:
+            return tuple(found), False
+    except (tomllib.TOMLDecodeError, RecursionError):
+        pass
+    typed = _HEADING.match(heading) or _HEADER.match(heading)
+    return tuple(re.split(r"[\s.]+", typed[1].strip(" \"'\r"))) if typed else (), True
+
+
+def _merge(into: dict[str, Any], table: Location, new: Mapping[str, Any]) -> bool:
+    """Add values to a table of a document; return False if a value was there already."""
+    for key in table:
+        into = into.setdefault(str(key), {})
+        if not isinstance(into, dict):
+            return False
+    for key, value in new.items():
+        if key not in into:
+            into[key] = value
+        elif not (isinstance(value, dict) and _merge(into, (key,), value)):
+            return False
+    return True
+
+
+def mend_number(line: str) -> str:
+    """Return a line with a name and one number as TOML; "" if its meaning is not certain."""
+    typed = _ONE_NUMBER.fullmatch(line[:_LONGEST_LINE].strip())
+    if not typed:
+        return ""
+    key = unicodedata.normalize("NFKC", typed["key"].strip(_QUOTES)).replace(" ", "_")
+    for letter, name in (("ω", "omega_"), ("ζ", "zeta_")):
+        key = re.sub(f"{letter}_?", name, key)
+    whole, point, rest = typed["number"].replace(",", ".").partition(".")
+    digits = (whole.lstrip("0") or "0") + (f".{rest or 0}" if point else "")
+    exponent = f"e{typed['exponent']}" if typed["exponent"] else ""
+    number = (typed["sign"] + digits + exponent).translate(_DASHES)
+    return f"{key} = {number}" if re.fullmatch(r"[\w-]+", key, re.ASCII) else ""
 
 
 class UnusableNumber(Exception):
@@ -253,22 +402,18 @@ def _decimal(text: str) -> Decimal:
         return Decimal((0, (1,), 10 * _LARGEST))
 
 
-def _with_floats(value: Any, at: tuple[int | str, ...], slips: list[TomlSlip]) -> Any:
-    """Return a document with floats in place of decimals.
-
-    A number that is too large is added to `slips` and becomes 1.
-    """
+def _with_floats(value: Any, at: tuple[int | str, ...]) -> Any:
+    """Return a document with floats in place of decimals."""
     if isinstance(value, dict):
-        return {key: _with_floats(item, (*at, key), slips) for key, item in value.items()}
+        return {key: _with_floats(item, (*at, key)) for key, item in value.items()}
     if isinstance(value, list):
-        return [_with_floats(item, (*at, i), slips) for i, item in enumerate(value)]
+        return [_with_floats(item, (*at, i)) for i, item in enumerate(value)]
     if isinstance(value, bool) or not isinstance(value, int | Decimal):
         return value
     try:
         check_number(value, at)
     except UnusableNumber as unusable:
-        slips.append(TomlSlip(0, f"{dotted(unusable.at, {})}: {unusable}"))
-        return 1
+        raise TomlSlip(0, f"{dotted(unusable.at, {})}: {unusable}") from None
     return float(value) if isinstance(value, Decimal) else value
 
 
@@ -276,43 +421,6 @@ def _long_number(text: str) -> int:
     """Return the line of the first whole number that is too long to read; 0 if all are short."""
     found = re.search(r"(?<![\w.])[-+]?\d[\d_]{4299,}", text)  # Python reads at most 4,300 digits
     return text.count("\n", 0, found.start()) + 1 if found else 0
-
-
-def _find_spoilt(lines: Sequence[str], line: int, slip: _Slip) -> tuple[int, int]:
-    """Return the first and last line that a slip at `line` makes unreadable."""
-    if slip.code == "unclosed_list":
-        for n in range(line - 1, 0, -1):
-            if lines[n - 1].count("[") > lines[n - 1].count("]"):
-                return n, line - 1
-    if _heading(lines[line - 1]):  # otherwise the previous table would get its keys
-        after = (n for n in range(line, len(lines)) if lines[n].lstrip().startswith("["))
-        return line, next(after, len(lines))
-    return line, line
-
-
-def _heading(line: str) -> re.Match[str] | None:
-    """Return the heading in a line, even a spoilt one; a very long line is not one."""
-    return _HEADING.match(line) if len(line) <= _LONGEST_LINE else None
-
-
-def _spoilt_keys(lines: list[str], first: int, last: int) -> Iterator[Location]:
-    """Yield the table or the keys in some lines.
-
-    A line that begins with neither a heading nor a name belongs to the key above it.
-    """
-    if heading := _heading(lines[first - 1]):
-        yield tuple(re.split(r"[\s.]+", heading[1].strip(" \"'\r")))
-        return
-    places: list[tuple[Location, int]] = [((), 0)]
-    places += [(at, number) for number, at in key_lines("\n".join(lines[:last]))]
-    above = [(at, number) for at, number in places if number <= first]
-    name = _NAME.match(lines[first - 1])
-    if name and above[-1][1] < first:
-        headings = (at for at, n in reversed(above) if not n or _HEADER.match(lines[n - 1]))
-        yield (*next(headings), *name[1].split("."))
-    else:
-        yield above[-1][0]
-    yield from (at for at, number in places if number > first)
 
 
 def key_lines(text: str) -> Iterator[tuple[int, tuple[int | str, ...]]]:
@@ -338,7 +446,7 @@ def _find_slip(line: str, message: str) -> _Slip:
             return slip
         if slip.line and re.search(slip.line, line[:_LONGEST_LINE]):
             return slip
-    return _Slip(words=f"not valid TOML: {message}")
+    return _Slip(words=f"{_NOT_VALID}: {message}")
 
 
 def _explain_slip(slip: _Slip, line: str, root: type[BaseModel], *, numbers: bool) -> str:
@@ -352,15 +460,22 @@ def _explain_slip(slip: _Slip, line: str, root: type[BaseModel], *, numbers: boo
     key = line.partition("=")[0].strip()
     if slip.code == "unquoted_text" and (numbers or takes_numbers(key, root)):
         return f"{key} takes a number, written in digits"
+    words = slip.words
+    if numbers and not slip.code and not slip.mends and slip.words.startswith(_NOT_VALID):
+        words = f"{key} takes a number, such as 10.1, or a list of numbers"
     new = line
     for pattern, put in slip.mends:
         new = re.sub(pattern, put, new)
+    if numbers and "[" not in line:
+        new = mend_number(line)
     try:
+        if numbers and any(isinstance(value, str) for value in tomllib.loads(new).values()):
+            return words
         tomllib.loads(new)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError):
-        return slip.words
+        return words
     mended = new != line and new.isprintable() and len(new) <= _SHOWN
-    return f"{slip.words}: write {new}" if mended else slip.words
+    return f"{words}: write {new}" if mended else words
 
 
 @cache

@@ -158,26 +158,12 @@ def test_every_mistake_has_its_own_line(tmp_path):
     assert lines == [1, 12, 16]
 
 
-def test_a_slip_in_a_line_hides_no_other_mistake(tmp_path):
-    """If one line is not TOML, all other mistakes of the rubric are reported too."""
-    text = GOOD.replace("version = 1", "vresion = 1").replace("points = 2", "points = two")
-    text = text.replace('kind = "step"', "kind = stpe").replace('unit = "V"', 'unti = "V"')
-    text = text.replace('check = "state_space"', 'chek = "state_spaec"\nfull_percent = 30')
-    text = text.replace('requires = ["gains"]', 'requires = ["gians"]')
-    text += '\n[[criteria]]\nid = "model"\npoints = -1\ncheck = "data"\nparameters = ["K_*"]\n'
-    with pytest.raises(ConfigError) as caught:
-        load_rubric(write(tmp_path, text))
-    lines = [int(line.split()[2].rstrip(":")) for line in str(caught.value).splitlines()]
-    assert lines == [1, 6, 12, 16, 23, 24, 25, 28, 29, 31], str(caught.value)
-
-
-def test_a_table_without_its_bracket_is_one_mistake(tmp_path):
-    """A heading without its bracket is one mistake; keys below it are not called missing."""
-    text = GOOD.replace("[[criteria]]", "[[criteria]", 1).replace("[required]", "[required")
-    with pytest.raises(ConfigError) as caught:
-        load_rubric(write(tmp_path, text))
-    said = str(caught.value).splitlines()
-    assert [int(line.split()[2].rstrip(":")) for line in said] == [8, 14]
+def test_a_line_that_is_not_toml_is_reported_alone(tmp_path):
+    """If a line is not TOML, only the first such line is reported; the rest cannot be judged."""
+    text = GOOD.replace("[[criteria]]", "[[criteria]", 1).replace("points = 2", "points = two")
+    with pytest.raises(ConfigError, match=r"lab\.toml line 14: a table starts with") as caught:
+        load_rubric(write(tmp_path, text.replace("version", "vresion")))
+    assert len(str(caught.value).splitlines()) == 1
 
 
 def test_a_criterion_may_only_require_an_earlier_one(tmp_path):

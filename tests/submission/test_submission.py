@@ -211,25 +211,13 @@ def test_an_unknown_table_does_not_hide_other_mistakes(folder):
         assert words in said
 
 
-def test_each_wrong_line_is_reported(folder):
-    """Each line that is not TOML is reported once, with its number."""
+def test_the_first_wrong_line_is_reported(folder):
+    """Of the lines that are not TOML, the first is reported, with its number."""
     text = "version = 1\ntitle = “a”\n[system\ncarts = 2\n[design]\ncart = 1,5\nx = [1, two,\n 3]\n"
     (folder / "submission.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(SubmissionError) as told:
+    with pytest.raises(SubmissionError, match=r" line 2: these are curly quotes") as told:
         load_submission(folder)
-    lines = [line.split(" line ")[1].split(":")[0] for line in str(told.value).split("\n")]
-    assert lines == ["2", "3", "6", "7"]
-
-
-def test_a_list_that_is_not_closed_is_one_mistake(folder):
-    """A list that is not closed is one mistake; the keys after it are read as they are."""
-    text = "version = 1\ntitle = [1,\n 2\n[system]\ncarts = 1\n[design]\ncart = 1,5\n"
-    (folder / "submission.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(SubmissionError) as told:
-        load_submission(folder)
-    first, second = str(told.value).split("\n")
-    assert "not closed" in first
-    assert " line 7: a decimal comma" in second
+    assert len(str(told.value).split("\n")) == 1
 
 
 @pytest.mark.parametrize("carts", [1, 2, 3, 4])

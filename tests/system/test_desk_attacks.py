@@ -72,13 +72,7 @@ def wait_until_it_answers(port: int) -> None:
 
 def measure(port: int, process: int, attack: Callable[[], object], *, times: int) -> list[float]:
     """Run an attack `times` times at once; return how long each page of the other student took."""
-    most, calm = 0, []
-    for _ in range(5):
-        begin = time.monotonic()
-        through_proxy(port, "bea").get("/student/0/")
-        calm.append(time.monotonic() - begin)
-    # The computer may be busy with other work: a page takes 0.1 to 0.2 s on an idle one.
-    busy = max(1.0, statistics.median(calm) / 0.2)
+    most = 0
 
     def run() -> None:
         try:
@@ -97,10 +91,12 @@ def measure(port: int, process: int, attack: Callable[[], object], *, times: int
         time.sleep(0.2)
     sys.stdout.write(
         f"median {statistics.median(took):.2f} s, most {max(took):.2f} s of {len(took)} pages, "
-        f"{most / 1e6:.0f} MB\n"
+        f"{most / 1e6:.0f} MB, load average {psutil.getloadavg()[0]:.1f}\n"
     )
-    assert statistics.median(took) < 1.0 * busy
-    assert max(took) < 5.0 * busy
+    # An idle computer answers within 1 s (median) and 5 s (most). The bars leave room for other
+    # work on it; without the limits of the desk, a page took 98 s.
+    assert statistics.median(took) < 5.0
+    assert max(took) < 30.0
     assert most < 700e6  # the desk itself takes less than half of that
     return took
 

@@ -53,6 +53,7 @@ def describe(folder: Path) -> dict[str, Any]:
         "rows": _describe_rows(current, answers, submission) if current and submission else [],
         "agree": [number_words(number) for number in current.agree] if current else [],
         "not_checked": [number_words(number) for number in current.not_checked] if current else [],
+        "unread": list(current.unread) if current else [],
         "doubtful": list(current.doubtful) if current else [],
         "asked": asked_words(len(answers)) if answers else "",
     }

@@ -39,7 +39,7 @@ from pipeline.submission.load import (
     parse_submission,
     posix,
 )
-from pipeline.submission.toml_file import find_deep_key, parse_toml
+from pipeline.submission.toml_file import TomlSlip, find_deep_key, read_apart
 from pipeline.words.progress import Progress, silent
 
 _DEEPEST = 50  # tables and lists inside each other that a form can show
@@ -72,8 +72,8 @@ def _plain(value: Any, depth: int = 0) -> Any:
 def students_see(folder: str, *, progress: Progress) -> str:
     """Return what `[students] see` of `submission.toml` states; "" if it states nothing."""
     try:
-        document = parse_toml(submission_text(Path(folder)), where=NAME, error=SubmissionError)
-    except (SubmissionError, OSError):  # the page says what is wrong
+        document = read_apart(submission_text(Path(folder)), "reported").document
+    except (SubmissionError, TomlSlip, OSError):  # the page says what is wrong
         return ""
     students = document.get("students")
     return str(students.get("see", "")) if isinstance(students, dict) else ""

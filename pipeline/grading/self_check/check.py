@@ -62,7 +62,7 @@ def check_numbers(
     SubmissionError : nothing is reported, no recording can be read, or the file of earlier answers
         was changed.
     """
-    if not _list_reported(submission.reported or Reported()):
+    if not _list_reported(submission.reported or Reported()) and not submission.unread:
         raise SubmissionError(
             "no number is reported yet: enter what you found under [reported.initial] or "
             "[reported.final] of submission.toml, then check again"
@@ -145,6 +145,7 @@ def next_answer(
         disagree=found.disagree,
         agree=found.agree,
         not_checked=found.not_checked,
+        unread=tuple(part.message for part in found.work.submission.unread),
         doubtful=tuple(found.work.bad),
         hints=tuple(find_hint(number, found.work, found.flags) for number in hinted),
     )

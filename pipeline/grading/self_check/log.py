@@ -60,6 +60,10 @@ class CheckAnswer(GradeTable):
     not_checked: Annotated[
         tuple[str, ...], Field(description="reported, but not decided by any recording")
     ]
+    unread: Annotated[
+        tuple[str, ...],
+        Field(description="why a number or table cannot be read, and what to write instead"),
+    ] = ()
     doubtful: Annotated[
         tuple[str, ...], Field(description="recordings with something wrong in them")
     ]

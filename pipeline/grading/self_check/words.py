@@ -38,7 +38,7 @@ def result_words(answer: CheckAnswer) -> str:
     """Return the result of a check as a sentence."""
     wrong, checked = len(answer.disagree), len(answer.disagree) + len(answer.agree)
     if not checked:
-        return WORDS.text("nothing_checked")
+        return WORDS.text("nothing_read" if answer.unread else "nothing_checked")
     if wrong == 1:
         return WORDS.text("disagree_one", all=checked)
     return WORDS.text("disagree", some=wrong, all=checked) if wrong else WORDS.text(
@@ -94,6 +94,9 @@ def answer_lines(answer: CheckAnswer) -> Iterator[str]:
     yield from (f"  {number}" for number in left)
     if answer.not_checked:
         yield WORDS.text("not_checked", numbers=", ".join(answer.not_checked))
+    if answer.unread:
+        yield WORDS.text("unread")
+        yield from (f"  {message}" for message in answer.unread)
     if answer.doubtful:
         yield WORDS.text("doubtful", runs=", ".join(answer.doubtful))
     if left:
