@@ -66,8 +66,14 @@ def analyse(
         *check_steps(found.gains, decays=found.decays, bench=bench),
         *check_carts(found.fit, decays=found.decays, bench=bench),
     )
-    springs = check_springs(found.fit, responses=found.responses, gains=found.gains, bench=bench)
     used = sound_ones(data.records, left_out)
+    springs = check_springs(
+        found.fit,
+        responses=found.responses,
+        gains=found.gains,
+        records=used,
+        bench=bench,
+    )
     groups = () if springs else find_groups(found, records=used, rows=rows, bench=bench)
     checks = (
         *springs,

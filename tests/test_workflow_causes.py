@@ -19,6 +19,7 @@ from pipeline.report.sections.questions import ask
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.results import Analysis
 from pipeline.simulated.bench import SimulatedBench
+from pipeline.simulated.hidden import prepare_bench
 from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
 from pipeline.submission.load import spring_names
@@ -112,6 +113,15 @@ def test_one_cart_without_its_spring_is_the_first_cause(tmp_path):
     )
     told = first_step(restated(tmp_path / "lab", "springs = .*", "springs = [false, false]"))
     assert "springs = [true, true]" in told
+
+
+def test_untied_carts_that_come_to_rest_have_a_spring(tmp_path):
+    """If no linear carts fit, because of saturation, the steps still show a spring to a wall."""
+    bench = prepare_bench(preset="throne-2dof", hide=["saturation"])
+    write_submission(tmp_path / "lab", bench, seed=507)
+    analysis = restated(tmp_path / "lab", "springs = .*", "springs = [false, true, false]")
+    assert "a spring ties them to a wall" in first_step(analysis)
+    assert analysis.lacks_springs
 
 
 def test_the_gap_of_carts_that_lack_a_spring_accuses_nothing(tmp_path):

@@ -58,6 +58,11 @@ class Springs:
     why: str
     open: tuple[int, ...]
 
+    @property
+    def is_certain(self) -> bool:
+        """Whether at least one of the walls is decided."""
+        return len(self.open) < 2
+
 
 @dataclass(frozen=True, kw_only=True)
 class _BetterSprings:
@@ -158,12 +163,14 @@ def check_springs(
     *,
     responses: Sequence[FrequencyResponse],
     gains: Sequence[StepGain],
+    records: Sequence[Record],
     bench: Bench,
 ) -> list[Check]:
     """Return a failed check for each stated or missing spring that the data contradict.
 
     The static gains show the last spring without any fit. If no carts with the stated springs
-    explain the data, a fit with all springs shows which are missing.
+    explain the data, a fit with all springs shows which are missing. If that fit fails too, carts
+    that come to rest after a step still need a spring to a wall.
     """
     n, stated = bench.n, bench.springs
     last = _last_by_gains(gains, bench=bench)
@@ -201,6 +208,12 @@ def check_springs(
             message=message,
         )
         checks.append(check)
+    if checks or bench.tied or (fit and fit.converged):
+        return checks
+    by_steps = decide_springs(records, n=n)
+    if by_steps.is_certain and (by_steps.present[0] or by_steps.present[-1]):
+        message = _WORDS.text("tied", last=names[-1])
+        checks = [Check(kind="springs", parameter=f"k_{n + 1}", outcome="fail", message=message)]
     return checks
 
 
