@@ -61,6 +61,11 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
     step = record.encoder_step(cart)
     stretch, run = find_decay(record, cart=cart, size=size)
     decay = fit_decay(t, y, stretch=stretch, run=run, floor=floor, step=step)
+    if decay.explained is None:
+        raise DataError(
+            f"{record.id}: log decrement needs a decaying oscillation of cart {cart}, found a "
+            "motion that does not swing regularly"
+        )
     fit, pole = decay.fit, complex(decay.fit.poles[0])
     law, fitted = _law(decay), _fitted(decay)
     unexplained = decay.rms(t, y) / float(np.ptp(y[decay.first : decay.stop]))
@@ -162,7 +167,7 @@ def _of_law(decay: FreeDecay) -> _Fitted:
 def _law(decay: FreeDecay) -> DecayLaw:
     """Return the result of the test, and what the law implies."""
     explained, implied = decay.explained, _of_law(decay)
-    assert explained is not None, "the last fit is always tested"
+    assert explained is not None, "a decay that swings is tested"
     size = (float("nan"),) * 2
     if explained.law:
         size = float(explained.law.values[2]), float(explained.errors[2])

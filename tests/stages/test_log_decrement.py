@@ -521,3 +521,17 @@ def test_a_fit_of_spikes_is_finite_before_its_start():
     )
     assert np.isfinite(fit(np.linspace(0.0, 2.0, 50))).all()
     assert fit.growth(np.array([1.25]))[0] == pytest.approx(1.0)
+
+
+def test_a_random_walk_is_a_decay_or_refused():
+    """Readings that drift at random never stop the program, although no law fits them."""
+    t, refused = np.arange(600) / 113.1, 0
+    for seed in range(30):
+        steps = np.random.default_rng(seed).normal(0, 10, t.size)
+        y = COUNT * np.round(np.cumsum(steps))
+        walk = record(t, y)
+        try:
+            fit_log_decrement(walk, cart=1)
+        except DataError:
+            refused += 1
+    assert refused > 15

@@ -185,7 +185,9 @@ def fit_decay(
         own = slice(first, stop)
         fit = fit_ringing(t[own], y[own], poles=np.array([near]), drift=True)
         explained = None
-        if last or (not rough and fit.rms > _ADEQUATE * floor):
+        # A fit that does not turn within the record follows noise.
+        turns = fit.poles[0].imag * float(t[own][-1] - t[own][0]) > np.pi
+        if turns and (last or (not rough and fit.rms > _ADEQUATE * floor)):
             explained = explain_decay(
                 t[own],
                 y[own],
