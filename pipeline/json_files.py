@@ -1,75 +1,67 @@
 """Write types to JSON files and read them back.
 
-A result type marks its fields with `written` and derived values with `computed`. The functions
-`json_text`, `json_schema` and `read_json` follow these marks. The keys have the order of the class
-body.
+A result type marks its fields with `written` and derived values with `computed`. The keys have the
+order of the class body. Pydantic checks a file, builds its values and describes it in a JSON
+Schema.
 """
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import Field as StoredField
 from functools import cache
-from inspect import getdoc
-from itertools import count
-from types import GenericAlias, NoneType, UnionType
-from typing import (
-    Annotated,
-    Any,
-    NamedTuple,
-    TypeVar,
-    Union,
-    dataclass_transform,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from inspect import getdoc, getmembers_static
+from typing import Annotated, Any, NamedTuple, TypeVar, cast, dataclass_transform, get_type_hints
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, TypeAdapter, create_model
+from pydantic.fields import FieldInfo
+from pydantic_core import CoreSchema, core_schema
 
 from pipeline.arrays import Array, ComplexArray
 
 T = TypeVar("T")
-F = TypeVar("F", bound=Callable[..., Any])
-_ORDER = count()
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _SIGNIFICANT = 10  # significant digits; further ones depend on processor and library versions
+
+
+# ------------------------------------------------------------------ types in the file
+
+
+class InFile(NamedTuple):
+    """An annotation: the type that a value has in the file, and how to read it from there."""
+
+    type: Any
+    read: Callable[[Any], Any]
+
+    def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(
+            self.read, handler.generate_schema(self.type), serialization=_AS_WRITTEN
+        )
+
+
+def _array(values: Any) -> Array:
+    return np.array(values, dtype=np.float64)
+
+
+def _complex(pairs: Any) -> ComplexArray:
+    return _array(pairs).reshape(-1, 2).view(np.complex128)[:, 0]
+
+
+Number = Annotated[float, InFile(float | None, lambda x: math.nan if x is None else x)]
+Numbers = Annotated[Array, InFile(tuple[float | None, ...], _array)]  # null if not finite
+FiniteNumbers = Annotated[Array, InFile(tuple[float, ...], _array)]
+Matrix = Annotated[Array, InFile(tuple[tuple[float, ...], ...], _array)]
+Poles = Annotated[ComplexArray, InFile(tuple[tuple[float | None, float | None], ...], _complex)]
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 # --------------------------------------------------------------------- marking a type
 
 
-class InFile(NamedTuple):
-    """An annotation with the type that a value has in the file."""
-
-    type: Any
-
-
-Number = Annotated[float, InFile(float | None)]  # null if it is not finite
-Numbers = Annotated[Array, InFile(tuple[float | None, ...])]  # each null if not finite
-Sha256 = Annotated[str, InFile(Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")])]
-Matrix = Annotated[Array, InFile(tuple[tuple[float, ...], ...])]
-
-
-class _Mark(NamedTuple):
-    """How a member is written to the file; `order` is its position in the class body."""
-
-    order: int
-    description: str
-    key: str
-    part: tuple[str, ...]
-    older: Any
-
-
 def written(
-    description: str = "",
-    *,
-    key: str = "",
-    part: tuple[str, ...] = (),
-    older: Any = MISSING,
-    default: Any = MISSING,
-    default_factory: Any = MISSING,
+    description: str = "", *, key: str = "", default: Any = MISSING, default_factory: Any = MISSING
 ) -> Any:
     """Return a field of a `result` that is written to its file.
 
@@ -77,80 +69,63 @@ def written(
     ----------
     description : text for the JSON Schema.
     key : the key in the file. By default the field's name.
-    part : the keys to write if the field holds a `result`, in this order; all by default.
-    older : the value to assume for a file of an earlier version, which lacks the key.
-    default, default_factory : as for a dataclass field.
+    default : as for a dataclass field; also for a file of an earlier version, without the key.
+    default_factory : as for a dataclass field; the file must have the key.
     """
-    mark = _Mark(next(_ORDER), description, key, part, older)
+    mark = _mark(description, key=key, default=default)
     return field(default=default, default_factory=default_factory, metadata={"written": mark})
 
 
-def computed(
-    *, key: str = "", part: tuple[str, ...] = (), older: Any = MISSING
-) -> Callable[[F], F]:
-    """Mark a property as written to the file; its docstring is the description."""
+def computed(*, key: str = "", default: Any = MISSING) -> type[property]:
+    """Make a method a property that is written to the file; its docstring is the description."""
 
-    def mark(function: F) -> F:
+    def mark(function: Callable[[Any], Any]) -> property:
         description = (getdoc(function) or "").removesuffix(".")
-        vars(function)["written"] = _Mark(next(_ORDER), description, key, part, older)
-        return function
+        vars(function)["written"] = _mark(description, key=key, default=default)
+        return property(function)
 
-    return mark
+    return cast(type[property], mark)  # type checkers treat it as `@property`
+
+
+def _mark(description: str, *, key: str, default: Any) -> FieldInfo:
+    """Return how pydantic checks and describes a member."""
+    value = ... if default is MISSING else plain(default)
+    return Field(value, alias=key or None, description=description or None, validate_default=True)
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(written, field))
 def result(*, eq: bool = True) -> Callable[[type[T]], type[T]]:
-    """Make a class a frozen dataclass; pass `eq=False` if it holds arrays."""
-    return dataclass(frozen=True, kw_only=True, eq=eq)
+    """Make a class a frozen dataclass with a file; pass `eq=False` if it holds arrays.
+
+    A type whose fields differ from its written members needs a class method `from_written`, which
+    takes all written members.
+    """
+
+    def make(cls: type[T]) -> type[T]:
+        marks = dict(_marks(cls))
+        for name, value in vars(cls).items():
+            if isinstance(value, StoredField):
+                mark = value.metadata.get("written")
+            else:
+                mark = getattr(getattr(value, "fget", None), "written", None)
+            if mark is not None:
+                marks[name] = mark
+        added = {"__written__": marks, "__get_pydantic_core_schema__": classmethod(_result_schema)}
+        for name, value in added.items():
+            setattr(cls, name, value)
+        return dataclass(frozen=True, kw_only=True, eq=eq)(cls)
+
+    return make
 
 
-@dataclass(frozen=True, kw_only=True)
-class WrittenMember:
-    """One member that is written to a type's file; `stored` is false for a property."""
-
-    name: str
-    key: str
-    hint: Any
-    description: str
-    part: tuple[str, ...]
-    older: Any
-    stored: bool
-
-
-@cache
-def members(cls: type, part: tuple[str, ...] = ()) -> tuple[WrittenMember, ...]:
-    """Return the written members of a type in file order; `part` selects some by their keys."""
-    hints = get_type_hints(cls, include_extras=True)
-    marks = {
-        own.name: (own.metadata["written"], hints[own.name])
-        for own in fields(cls)
-        if "written" in own.metadata
-    }
-    stored = set(marks)
-    for base in cls.__mro__:
-        for name, value in vars(base).items():
-            function = getattr(value, "fget", None)
-            mark = getattr(function, "written", None)
-            if function and mark:
-                marks[name] = (mark, get_type_hints(function, include_extras=True)["return"])
-    found = {
-        mark.key or name: WrittenMember(
-            name=name,
-            key=mark.key or name,
-            hint=hint,
-            description=mark.description,
-            part=mark.part,
-            older=mark.older,
-            stored=name in stored,
-        )
-        for name, (mark, hint) in sorted(marks.items(), key=lambda item: item[1][0].order)
-    }
-    return tuple(found[key] for key in part or found)
+def _marks(cls: type) -> dict[str, FieldInfo]:
+    """Return the marks of a type's written members by name, in file order."""
+    return getattr(cls, "__written__", {})
 
 
 def keys(cls: type) -> list[str]:
     """Return the keys that a type writes to its file."""
-    return [member.key for member in members(cls)]
+    return [mark.alias or name for name, mark in _marks(cls).items()]
 
 
 # --------------------------------------------------------------------------- writing
@@ -161,23 +136,20 @@ def json_text(value: Any) -> str:
     return json.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def plain(value: Any, *, digits: int = _SIGNIFICANT, part: tuple[str, ...] = ()) -> Any:
+def plain(value: Any, *, digits: int = _SIGNIFICANT) -> Any:
     """Return a value as plain JSON types: floats rounded to `digits`, NaN and infinity as None.
 
-    A `result` becomes a dict of its written members, or only of the keys in `part`. A pydantic
-    model becomes a dict of its fields.
+    A `result` becomes a dict of its written members, a pydantic model a dict of its fields.
     """
     match value:
         case None | bool() | str() | int():
             return value
         case dict():
-            return {key: plain(item, digits=digits, part=part) for key, item in value.items()}
+            return {key: plain(item, digits=digits) for key, item in value.items()}
         case list() | tuple():
-            return [plain(item, digits=digits, part=part) for item in value]
-        case np.ndarray():
+            return [plain(item, digits=digits) for item in value]
+        case np.ndarray() | np.bool_() | np.integer():
             return plain(value.tolist(), digits=digits)
-        case np.bool_() | np.integer():
-            return value.item()
         case complex():
             return plain([value.real, value.imag], digits=digits)
         case BaseModel():
@@ -185,33 +157,39 @@ def plain(value: Any, *, digits: int = _SIGNIFICANT, part: tuple[str, ...] = ())
         case _ if hasattr(value, "written_as"):  # written as the name of the object
             return getattr(value, value.written_as)
         case _ if is_dataclass(value):
-            return {
-                own.key: plain(getattr(value, own.name), digits=digits, part=own.part)
-                for own in members(type(value), part)
-            }
+            marks = _marks(type(value)).items()
+            return {m.alias or own: plain(getattr(value, own), digits=digits) for own, m in marks}
         case _ if math.isfinite(value):
             return float(f"{value:.{digits}g}") + 0.0  # + 0.0 turns -0.0 into 0.0
         case _:
             return None
 
 
-# ------------------------------------------------------------------------ the schema
+_AS_WRITTEN = core_schema.plain_serializer_function_ser_schema(plain)
+
+
+# --------------------------------------------------------------- reading and the schema
+
+
+def read_json(cls: type[T], text: str | bytes) -> T:
+    """Return the value that a file of type `cls` holds; unwritten fields get their defaults.
+
+    Raises
+    ------
+    ValueError : the file does not fit the type (pydantic's `ValidationError`).
+    """
+    return TypeAdapter(cls).validate_json(text)
 
 
 def json_schema(cls: type, *, title: str) -> dict[str, Any]:
     """Return the JSON Schema of a type's files, with its definitions in alphabetical order."""
     schema = file_model(cls).model_json_schema(by_alias=True, mode="serialization")
-    definitions = schema.pop("$defs", {})
-    return {
-        "$schema": DIALECT,
-        **schema,
-        "title": title,
-        "$defs": dict(sorted(definitions.items())),
-    }
+    definitions = dict(sorted(schema.pop("$defs", {}).items()))
+    return {"$schema": DIALECT, **schema, "title": title, "$defs": definitions}
 
 
 @cache
-def file_model(cls: type, part: tuple[str, ...] = ()) -> type[BaseModel]:
+def file_model(cls: type) -> type[BaseModel]:
     """Return the pydantic model that checks a type's file.
 
     Unknown keys are allowed, because later versions may add some. The model's fields are named
@@ -219,94 +197,33 @@ def file_model(cls: type, part: tuple[str, ...] = ()) -> type[BaseModel]:
     """
     if issubclass(cls, BaseModel):
         return cls
+    hints = get_type_hints(cls, include_extras=True)
+    for name, own in getmembers_static(cls, lambda own: isinstance(own, property)):
+        hints[name] = get_type_hints(own.fget, include_extras=True).get("return")
+    found: dict[str, Any] = {f"{name}_": (hints[name], m) for name, m in _marks(cls).items()}
     # Only the docstring's text before `Attributes` describes the written fields.
     about = (getdoc(cls) or "").partition("\n\nAttributes\n")[0]
-    found: dict[str, Any] = {
-        f"{own.name}_": (
-            _file_type(own.hint, own.part),
-            Field(
-                default=... if own.older is MISSING else _as_written(own.older),
-                alias=own.key,
-                description=own.description or None,
-            ),
-        )
-        for own in members(cls, part)
-    }
-    name = cls.__name__ + ("Part" if part else "")
-    settings = ConfigDict(frozen=True, allow_inf_nan=False)
-    return create_model(name, __config__=settings, __doc__=about, **found)
+    settings = ConfigDict(
+        frozen=True, allow_inf_nan=False, alias_generator=lambda name: name.removesuffix("_")
+    )
+    return create_model(cls.__name__, __config__=settings, __doc__=about, **found)
 
 
-def _as_written(value: Any) -> Any:
-    """Return a value as the file's model holds it."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return file_model(type(value)).model_validate(plain(value))
-    return value
+def _result_schema(cls: type, _: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    """Return how pydantic checks, builds and writes a `result`."""
+    own = fields(cls)  # pyright: ignore[reportArgumentType]
+    make = getattr(cls, "from_written", None)
+    needed = {one.name for one in own if one.default is one.default_factory is MISSING}
+    names = [name for name in _marks(cls) if make or name in {one.name for one in own}]
 
+    def read(value: Any, check: core_schema.ValidatorFunctionWrapHandler) -> Any:
+        if isinstance(value, cls):
+            return value
+        model = check(value)
+        if not make and not needed <= set(names):
+            return model  # the file has not all that the type needs
+        return (make or cls)(**{name: getattr(model, f"{name}_") for name in names})
 
-def _file_type(hint: Any, part: tuple[str, ...]) -> Any:
-    """Return the type that a value of type `hint` has in the file."""
-    origin, args = get_origin(hint), get_args(hint)
-    if origin is Annotated:
-        return args[1].type
-    if hint == Array:
-        return tuple[float, ...]
-    if hint == ComplexArray:
-        return tuple[tuple[float | None, float | None], ...]
-    if origin in (Union, UnionType):
-        return Union[tuple(_file_type(one, part) for one in args)]  # noqa: UP007
-    if origin in (tuple, dict):
-        inner = tuple(one if one is ... else _file_type(one, part) for one in args)
-        return GenericAlias(origin, inner)
-    if isinstance(hint, type) and hasattr(hint, "written_as"):
-        return str
-    if isinstance(hint, type) and is_dataclass(hint):
-        return file_model(hint, part)
-    return hint
-
-
-# ---------------------------------------------------------------------- reading back
-
-Readers = Mapping[type, Callable[[str], Any]]
-
-
-def read_json(cls: type[T], text: str | bytes, *, readers: Readers | None = None) -> T:
-    """Return the value that a file of type `cls` holds; unwritten fields get their defaults.
-
-    `readers` maps each type that is written as a name to the function that finds the object by
-    name. A type whose fields differ from its written members needs a class method `from_written`,
-    which takes all written members.
-
-    Raises
-    ------
-    ValueError : the file does not fit the type (pydantic's `ValidationError`), or it holds null
-        where a number is needed.
-    """
-    return _build(cls, file_model(cls).model_validate_json(text), readers or {})
-
-
-def _build(hint: Any, value: Any, readers: Readers) -> Any:
-    """Return the value of type `hint` for the checked content of a file."""
-    origin, args = get_origin(hint), get_args(hint)
-    if origin is Annotated:
-        return _build(args[0], value, readers)
-    if origin in (Union, UnionType):
-        (one, *others) = [one for one in args if one is not NoneType]
-        return value if value is None or others else _build(one, value, readers)
-    if value is None:
-        raise ValueError("null where a number is needed")
-    if hint == Array:
-        return np.array(value, dtype=np.float64)
-    if origin is tuple:
-        return tuple(_build(args[0], one, readers) for one in value)
-    if origin is dict:
-        return {key: _build(args[1], one, readers) for key, one in value.items()}
-    if isinstance(value, BaseModel):
-        make = getattr(hint, "from_written", None)
-        own = {
-            one.name: _build(one.hint, getattr(value, f"{one.name}_"), readers)
-            for one in members(hint)
-            if make or one.stored
-        }
-        return (make or hint)(**own)
-    return readers[hint](value) if hint in readers else value
+    return core_schema.no_info_wrap_validator_function(
+        read, handler.generate_schema(file_model(cls)), serialization=_AS_WRITTEN
+    )

@@ -25,8 +25,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import __version__
-from pipeline.arrays import Array, ComplexArray, freeze
-from pipeline.json_files import Matrix, Number, Numbers, Sha256, computed, result, written
+from pipeline.arrays import Array, freeze
+from pipeline.json_files import (
+    FiniteNumbers,
+    Matrix,
+    Number,
+    Numbers,
+    Poles,
+    Sha256,
+    computed,
+    result,
+    written,
+)
 from pipeline.names import read_name
 from pipeline.plant.chain import Chain
 from pipeline.plant.margins import Margins
@@ -156,13 +166,11 @@ class SinePoint:
     cart: int = written()
     omega: float = written("rad/s; fitted where the submission did not state it")
 
-    @property
     @computed()
     def gain(self) -> float:
         """Amplitude ratio, position unit per input unit."""
         return self.amplitude / self.input_amplitude
 
-    @property
     @computed()
     def gain_std(self) -> float:
         """Standard error of the amplitude ratio, combined from the errors of both amplitudes."""
@@ -263,11 +271,10 @@ class LogDecrement:
     cart: int = written()
     number: int | None = written(
         "number of this decay in the recording, from 1; null: the only one",
-        older=None,
         default=None,
     )
     release: float = written(
-        "s, start of the free decay; before it, the cart may be held or moved", older=0.0
+        "s, start of the free decay; before it, the cart may be held or moved", default=0.0
     )
     delta: Number = written("logarithmic decrement per full cycle")
     delta_std: Number = written()
@@ -282,7 +289,7 @@ class LogDecrement:
     omega_n_peaks_std: float
     zeta_peaks: Number = written("damping ratio from the logarithmic decrement")
     zeta_peaks_std: Number = written()
-    law: DecayLaw = written(older=_LAW_UNTOLD)
+    law: DecayLaw = written(default=_LAW_UNTOLD)
     note: str = written("what a reader must know, or empty", default="")
     peak_t: Array
     peak_y: Array
@@ -341,8 +348,8 @@ class FrequencyResponse:
     """X_cart/U of one cart at the measured frequencies, never interpolated; arrays (n_w,)."""
 
     cart: int = written()
-    omega: Array = written("rad/s, ascending")
-    magnitude: Array = written("position unit per input unit")
+    omega: FiniteNumbers = written("rad/s, ascending")
+    magnitude: FiniteNumbers = written("position unit per input unit")
     magnitude_std: Numbers = written()
     phase: Numbers | None = written("rad; null for a table of amplitude ratios")
     phase_std: Numbers | None = written()
@@ -483,37 +490,31 @@ class ParameterRow:
     initial: Estimate | None
     final: Estimate | None
 
-    @property
     @computed(key="initial")
     def initial_value(self) -> float | None:
         """The estimate from the first stages."""
         return self.initial and self.initial.value
 
-    @property
     @computed()
     def initial_std(self) -> float | None:
         """The standard error, in the unit of the parameter."""
         return self.initial and self.initial.std
 
-    @property
     @computed()
     def initial_from(self) -> str | None:
         """`step`, `log_decrement`, `frequency_response` or `assumed`."""
         return self.initial and self.initial.source
 
-    @property
     @computed(key="final")
     def final_value(self) -> float | None:
         """The estimate from the fit of all carts at once."""
         return self.final and self.final.value
 
-    @property
     @computed()
     def final_std(self) -> float | None:
         """The standard error, in the unit of the parameter."""
         return self.final and self.final.std
 
-    @property
     @computed()
     def final_from(self) -> str | None:
         """`bode_fit`, `time_fit` or `log_decrement`."""
@@ -521,7 +522,6 @@ class ParameterRow:
 
     determined_by: DeterminedBy | None = written(
         "what determines the final frequency or damping ratio; model: no measurement is near it",
-        older=None,
         default=None,
     )
     change_percent: float | None = written("change from the initial to the final estimate")
@@ -531,7 +531,6 @@ class ParameterRow:
     )
     independent: bool | None = written(
         "false: both estimates use the same recordings; null: there is only one",
-        older=None,
         default=None,
     )
     note: str = written(default="")
@@ -598,7 +597,6 @@ class Check:
         "in_ab" for the order of a frequency, or the number of a recording's decay.
     """
 
-    @property
     @computed()
     def id(self) -> str:
         """The kind of check and what it is about: "decay.run-1.cart_1"."""
@@ -650,35 +648,32 @@ class FeedbackDesign:
     cart: int = written()
     method: Literal["poles", "lqr"] = written()
     reference: float = written("size of the step, in position units")
-    gains: Array = written("(2n)")
+    gains: FiniteNumbers = written("(2n)")
     prefilter: Number = written("1 / DC gain of the loop for the chosen cart")
-    poles: ComplexArray = written("closed-loop poles as [re, im]: log z / sample_time, in rad/s")
+    poles: Poles = written("closed-loop poles as [re, im]: log z / sample_time, in rad/s")
     sample_time: float = written("s; the delay of one sample is part of the model")
     overshoot_percent: Number = written("overshoot of the simulated step")
     settling_time: float | None = written("s, to within 2 %")
     peak_input: Number = written()
     margins: Margins | None = written(
         "margins of the loop with its observer and delay, opened at the motor",
-        older=None,
         default=None,
     )
     bench_margins: Margins | None = written(
         "the same on cartlab's bench, whose observer has no model of the carts and assumes "
         "constant velocities; null: that loop is unstable",
-        older=None,
         default=None,
     )
     reachable: bool = written("false if the goal cannot be met")
     message: str = written("what is reachable")
-    requested_poles: ComplexArray | None = written(
-        "poles requested from pole placement as [re, im], rad/s; null with lqr", older=None
+    requested_poles: Poles | None = written(
+        "poles requested from pole placement as [re, im], rad/s; null with lqr", default=None
     )
     Q: Matrix | None = written(
         "(2n, 2n) weights of the state in the cost, the sum of x'Q x + R u²; null with poles",
-        older=None,
         default=None,
     )
-    R: float | None = written("weight of the input in that cost", older=None, default=None)
+    R: float | None = written("weight of the input in that cost", default=None)
     t: Array
     y: Array
     u: Array
@@ -766,7 +761,6 @@ class Skipped:
     `reason` then says why.
     """
 
-    @property
     @computed(key="stage")
     def name(self) -> str:
         """The stage, with its recording and cart: "step gain, run-1, cart 1", "reading run-1"."""
@@ -791,7 +785,7 @@ class LeftOut:
     reason: str = written("in words that follow the recording's name")
     is_wrong: bool = written(
         "true: the recording is wrong; false: it only differs from its repeats",
-        older=False,
+        default=False,
     )
 
 
@@ -853,7 +847,7 @@ class Submitted:
 class Provenance:
     """The program version and the data files behind a result file."""
 
-    version: str = written("of cartlab", default=__version__)
+    version: str = written("of cartlab", default_factory=lambda: __version__)
     files: dict[str, Sha256] = written("SHA-256 of every data file")
 
 
@@ -907,13 +901,12 @@ class Analysis:
     reported : the students' own numbers, initial and final, with the digits as typed.
     """
 
-    schema: Literal["cartlab-results/1"] = written(default="cartlab-results/1")
+    schema: Literal["cartlab-results/1"] = written(default_factory=lambda: "cartlab-results/1")
     title: str
     section: str
     authors: tuple[tuple[str, str], ...]
     bench: Bench
 
-    @property
     @computed()
     def submission(self) -> Submitted:
         """The title, the authors and the bench."""
@@ -931,13 +924,11 @@ class Analysis:
     tables: tuple[FrequencyResponse, ...] = ()
     rows: tuple[ParameterRow, ...] = written(key="parameters")
 
-    @property
     @computed(key="chain")
     def chain_with_units(self) -> ChainWithUnits | None:
         """The fitted carts and springs."""
         return self.chain and ChainWithUnits.of(self.chain, self.bench.units)
 
-    @property
     @computed()
     def state_space(self) -> StateSpaceMatrices | None:
         """The state model of the chain."""
@@ -954,7 +945,6 @@ class Analysis:
     feedback: FeedbackDesign | None = written()
     hardware: tuple[HardwareCheck, ...]
 
-    @property
     @computed(key="hardware")
     def hardware_by_cart(self) -> tuple[HardwareCheck, ...]:
         """One entry per run and cart: the simulated loop, and the plant on the measured input."""
@@ -968,7 +958,7 @@ class Analysis:
         return tuple(found[key] for key in sorted(found))
 
     assumptions: tuple[Assumption, ...] = written(
-        "springs, units, scales, sign, free carts", older=(), default=()
+        "springs, units, scales, sign, free carts", default=()
     )
     skipped: tuple[Skipped, ...] = written()
     warnings: tuple[str, ...] = written()
@@ -981,7 +971,6 @@ class Analysis:
     groups: tuple[RecordingGroup, ...] = ()
     reported: Mapping[str, Mapping[str, Decimal]] = field(default_factory=dict)
 
-    @property
     @computed()
     def provenance(self) -> Provenance:
         """The program version and the data files behind these results."""

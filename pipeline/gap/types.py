@@ -9,7 +9,6 @@ from pydantic import ValidationError
 from pipeline.arrays import Array
 from pipeline.errors import ConfigError
 from pipeline.json_files import Number, computed, read_json, result, written
-from pipeline.plant.catalogue import find_effect
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import AugmentedChain, Effect
 from pipeline.results import ChainWithUnits, Intervention, LeftOut, Provenance, RecordingGroup
@@ -148,7 +147,6 @@ class FormulaTerm:
 class ForceFormula:
     """The shortest formula for the unexplained force, by regression over a library of terms."""
 
-    @property
     @computed()
     def text(self) -> str:
         """The sum of the terms as text, such as "-0.0021 sqrt|v| sign v"."""
@@ -161,7 +159,7 @@ class ForceFormula:
     terms: tuple[FormulaTerm, ...] = written()
     explains: float = written("share of the squared force that the formula explains")
     in_catalogue: Literal[False] = written(
-        "the formula describes the data; it is not an effect", older=False, default=False
+        "the formula describes the data; it is not an effect", default=False
     )
 
 
@@ -276,23 +274,20 @@ class Gap:
     proposal : the next recording; None if no candidate was evaluated.
     """
 
-    schema: Literal["cartlab-gap/1"] = written(default="cartlab-gap/1")
+    schema: Literal["cartlab-gap/1"] = written(default_factory=lambda: "cartlab-gap/1")
     verdict: Verdict = written()
     complete: bool = written(
         "false if the time limit ended the search; this is then the best answer so far, and "
         "another search may find more",
-        older=True,
         default=True,
     )
     causes: tuple[Cause, ...] = written(
         "failed checks of the set-up, which may cause the gap, the most serious first; effects "
         "count only once the set-up is right",
-        older=(),
         default=(),
     )
     groups: tuple[RecordingGroup, ...] = written(
         "groups of recordings that want different carts, the largest first",
-        older=(),
         default=(),
     )
     effects: tuple[FoundEffect, ...] = written(
@@ -308,7 +303,6 @@ class Gap:
     final: float
     noise_floor: float
 
-    @property
     @computed(key="gap")
     def errors(self) -> GapErrors:
         """Relative errors, pooled over the held-out runs."""
@@ -317,35 +311,30 @@ class Gap:
     repeatability: float | None = written("relative difference of runs with the same input")
     by_record: tuple[RecordGap, ...] = written()
     free_run: tuple[FreeRun, ...] = written(
-        "error of one simulation over each whole run", older=(), default=()
+        "error of one simulation over each whole run", default=()
     )
     where: tuple[GapWindow, ...] = written("where the linear model fails most")
     left: tuple[GapWindow, ...] = written(
         "where the final model fails most, if the verdict is `partial` or `unexplained`",
-        older=(),
         default=(),
     )
     residual: tuple[Residual, ...] = written(
         "the unexplained force on each cart, if the error is too large for a name",
-        older=(),
         default=(),
     )
     next_experiment: str = written()
 
-    @property
-    @computed(older=None)
+    @computed(default=None)
     def next_recording(self) -> dict[str, Any] | None:
         """The recording that best distinguishes the contenders, as a table of plan.toml."""
         return self.proposal and self.proposal.recording
 
-    @property
-    @computed(older=None)
+    @computed(default=None)
     def next_limits(self) -> dict[str, float] | None:
         """The limits of plan.toml for which the recording was chosen."""
         return self.proposal and self.proposal.limits
 
-    @property
-    @computed(older=None)
+    @computed(default=None)
     def separation(self) -> float | None:
         """Root mean square difference of the two contenders after refits, in units of the noise."""
         return self.proposal and self.proposal.separation
@@ -354,11 +343,10 @@ class Gap:
     held_out: tuple[str, ...] = written("ids of the runs")
     left_out: tuple[LeftOut, ...] = written(
         "recordings that the identification did not use; no figure here includes them",
-        older=(),
         default=(),
     )
     interventions: tuple[Intervention, ...] = written(
-        "times at which a hand moved a cart, excluded from fits and errors", older=(), default=()
+        "times at which a hand moved a cart, excluded from fits and errors", default=()
     )
     spread: dict[int, float] = written(
         "relative spread of the dry friction from run to run, by cart",
@@ -366,13 +354,11 @@ class Gap:
         default_factory=dict,
     )
 
-    @property
     @computed()
     def units(self) -> Units:
         """The submission's units."""
         return self.bench.units
 
-    @property
     @computed(key="linear")
     def linear_chain(self) -> Chain:
         """The linear chain that fits best."""
@@ -383,24 +369,20 @@ class Gap:
     contenders: tuple[Contender, ...] = written(
         "models that may be true, the chosen one first, then the likeliest; empty if only noise is "
         "left",
-        older=(),
         default=(),
     )
     notes: tuple[str, ...] = written("notes for the reader", default=())
 
-    @property
     @computed()
     def submission(self) -> GapSubmission:
         """The submission."""
         return GapSubmission(title=self.title, carts=self.bench.n)
 
-    @property
     @computed()
     def springs(self) -> tuple[bool, ...]:
         """Whether each spring exists: wall-1, 1-2, …, n-wall."""
         return self.bench.springs
 
-    @property
     @computed()
     def chain(self) -> ChainWithUnits:
         """The chain of the final model."""
@@ -409,7 +391,7 @@ class Gap:
     chain_std: dict[str, Number] = written(
         "standard errors of the chain's m_1, c_1, k_1, …", default_factory=dict
     )
-    provenance: Provenance = written(default=Provenance(files={}))
+    provenance: Provenance = written(default_factory=lambda: Provenance(files={}))
     title: str = ""
     bench: Bench
     traces: tuple[Trace, ...]
@@ -463,7 +445,7 @@ def read_gap(text: str) -> Gap:
     ConfigError : the text is not a `gap.json`, or the catalogue lacks effects of its model.
     """
     try:
-        return read_json(Gap, text, readers={Effect: find_effect})
+        return read_json(Gap, text)
     except ValidationError as error:
         raise ConfigError(f"not what cartlab gap writes: {first_refusal(error)}") from None
     except (ValueError, KeyError, TypeError) as error:  # for example null for a number

@@ -19,7 +19,7 @@ import numpy as np
 
 from pipeline.arrays import Array, ComplexArray, frozen_array
 from pipeline.errors import DataError
-from pipeline.json_files import result, written
+from pipeline.json_files import FiniteNumbers, result, written
 from pipeline.names import parameter_names
 
 if TYPE_CHECKING:
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 class Chain:
     """Masses, dampings and stiffnesses of a chain, in input units because the input gain is 1."""
 
-    m: Array = written("masses (n), cart 1 first, input unit s² per position unit; all > 0")
-    c: Array = written(
+    m: FiniteNumbers = written("masses (n), cart 1 first, input unit s² per position unit; all > 0")
+    c: FiniteNumbers = written(
         "viscous damping coefficients (n), cart 1 first, input unit s per position unit"
     )
-    k: Array = written(
+    k: FiniteNumbers = written(
         "stiffnesses (n + 1) wall-1, 1-2, …, n-wall, input unit per position unit; 0 for no "
         "spring; (sum, 0) for one cart on two springs, because only their sum can be identified"
     )

@@ -6,6 +6,7 @@ from enum import IntEnum
 from typing import ClassVar, Literal
 
 import numpy as np
+from pydantic_core import CoreSchema, core_schema
 
 from pipeline.arrays import Array
 from pipeline.json_files import computed, result, written
@@ -148,6 +149,13 @@ class Effect:
     same_below: float = np.inf
     genuine: Callable[[Mapping[str, float]], bool] = always
 
+    @classmethod
+    def __get_pydantic_core_schema__(cls, *_: object) -> CoreSchema:
+        """Return how pydantic reads an effect: a file names it."""
+        from pipeline.plant.catalogue import find_effect  # the catalogue imports this file
+
+        return core_schema.no_info_after_validator_function(find_effect, core_schema.str_schema())
+
     @property
     def names(self) -> tuple[str, ...]:
         """The parameters' names, in order."""
@@ -288,13 +296,11 @@ class EffectTerm:
     place: int
     values: tuple[float, ...]
 
-    @property
     @computed()
     def where(self) -> dict[str, int]:
         """The place: {"cart": 1} or {"spring": 2}; empty for the input."""
         return self.effect.where(self.place)
 
-    @property
     @computed()
     def parameters(self) -> dict[str, float]:
         """The values by name."""
@@ -319,7 +325,7 @@ class AugmentedChain:
     """The linear chain and the effects that act on it."""
 
     chain: Chain = written()
-    terms: tuple[EffectTerm, ...] = written(key="effects", default=())
+    terms: tuple[EffectTerm, ...] = written(key="effects", default_factory=tuple)
 
     def tables(self) -> Tables:
         """Return the simulator's tables."""

@@ -1,6 +1,7 @@
 """What a rubric expects: every number with its tolerance, and the reason for the tolerance."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import fields
 from typing import Literal
 
 import numpy as np
@@ -11,14 +12,25 @@ from pipeline.grading import rubric as asked
 from pipeline.grading.references.reference import in_doubt, recompute
 from pipeline.grading.rubric import Rubric, matching
 from pipeline.grading.rubric_file import shipped_rubric
-from pipeline.json_files import Matrix, computed, json_text, result, written
+from pipeline.json_files import (
+    FiniteNumbers,
+    Matrix,
+    Number,
+    Poles,
+    computed,
+    json_text,
+    result,
+    written,
+)
 from pipeline.names import read_name
 from pipeline.plant.chain import Chain
+from pipeline.plant.margins import Margins
 from pipeline.report.document import Block, Cell, bullet_list, cell, paragraph
 from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, work_out
 from pipeline.report.sections.page import Page
-from pipeline.results import Analysis, Check, FeedbackDesign, Provenance, Submitted
+from pipeline.results import Analysis, FeedbackDesign, Provenance
+from pipeline.set_up import Units
 from pipeline.submission import InputScale, System
 from pipeline.words.numbers import NOTHING, count, percent, significant, unit_text
 from pipeline.words.phrases import phrases
@@ -40,7 +52,6 @@ class Expected:
     low: float | None = written("lowest value for full points, in its unit")
     high: float | None = written("highest value for full points, in its unit")
 
-    @property
     @computed()
     def tolerance(self) -> float | None:
         """Half the width of the range."""
@@ -60,26 +71,57 @@ class ExpectedModel:
     B_tolerance: Matrix = written()
 
 
+@result()
+class ReferenceBench:
+    """The title and the bench of the reference submission."""
+
+    title: str = written()
+    carts: int = written()
+    springs: tuple[bool, ...] = written("wall-1, 1-2, …, n-wall")
+    units: Units = written()
+
+
+@result(eq=False)
+class ReferenceDesign:
+    """The designed state feedback u = prefilter r - gains [x1, v1, x2, v2, …]."""
+
+    cart: int = written()
+    method: Literal["poles", "lqr"] = written()
+    sample_time: float = written("s; the delay of one sample is part of the model")
+    gains: FiniteNumbers = written("(2n)")
+    prefilter: Number = written("1 / DC gain of the loop for the chosen cart")
+    poles: Poles = written("closed-loop poles as [re, im]: log z / sample_time, in rad/s")
+    overshoot_percent: Number = written("overshoot of the simulated step")
+    settling_time: float | None = written("s, to within 2 %")
+    peak_input: Number = written()
+    margins: Margins | None = written(
+        "margins of the loop with its observer and delay, opened at the motor", default=None
+    )
+
+
+@result()
+class Doubt:
+    """A check that failed."""
+
+    id: str = written()
+    message: str = written()
+
+
 @result(eq=False)
 class Solution:
     """The content of `solution.json`: what a rubric expects, with tolerances."""
 
-    schema: Literal["cartlab-solution/1"] = written(default="cartlab-solution/1")
-    submission: Submitted = written(part=("title", "carts", "springs", "units"))
+    schema: Literal["cartlab-solution/1"] = written(default_factory=lambda: "cartlab-solution/1")
+    submission: ReferenceBench = written()
     rubric: str = written("title of the rubric that sets the accepted ranges")
     parameters: tuple[Expected, ...] = written()
     state_space: ExpectedModel | None = written()
-    feedback: FeedbackDesign | None = written(
-        "the reference design; gains are not unique, so others may be right too",
-        part=(
-            "cart", "method", "sample_time", "gains", "prefilter", "poles", "overshoot_percent",
-            "settling_time", "peak_input", "margins",
-        ),
-    )  # fmt: skip
-    doubts: tuple[Check, ...] = written(
+    feedback: ReferenceDesign | None = written(
+        "the reference design; gains are not unique, so others may be right too"
+    )
+    doubts: tuple[Doubt, ...] = written(
         "the checks that failed: explain them before you use these numbers as a reference",
-        part=("id", "message"),
-        older=(),
+        default=(),
     )
     provenance: Provenance = written()
 
@@ -266,12 +308,24 @@ def solution_text(analysis: Analysis, *, rubric: Rubric | None = None) -> str:
     rubric = rubric or default_rubric(analysis)
     parameters = expected_parameters(analysis, rubric)
     solution = Solution(
-        submission=analysis.submission,
+        submission=ReferenceBench(
+            title=analysis.title,
+            carts=analysis.bench.n,
+            springs=analysis.bench.springs,
+            units=analysis.bench.units,
+        ),
         rubric=rubric.title,
         parameters=parameters,
         state_space=analysis.chain and expected_model(analysis.chain, _tolerances(parameters)),
-        feedback=analysis.feedback,
-        doubts=analysis.failed_checks,
+        feedback=analysis.feedback and _reference(analysis.feedback),
+        doubts=tuple(Doubt(id=c.id, message=c.message) for c in analysis.failed_checks),
         provenance=analysis.provenance,
     )
     return json_text(solution)
+
+
+def _reference(design: FeedbackDesign) -> ReferenceDesign:
+    """Return what a reference says of a design."""
+    return ReferenceDesign(
+        **{own.name: getattr(design, own.name) for own in fields(ReferenceDesign)}
+    )
