@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import jsonschema
 import numpy as np
@@ -22,7 +23,7 @@ from tests.report.test_gap import make_gap
 DOCS = ROOT / "docs"
 
 
-def exact(schema):
+def exact(schema: Any) -> Any:
     """Return a schema that demands exactly the keys that it describes."""
     if isinstance(schema, list):
         return [exact(one) for one in schema]
