@@ -79,6 +79,11 @@ def _tables_message(tables: Sequence[Mapping[str, Any]], *, other: str) -> str:
     report = "tables report" if len(names) > 1 else "table reports"
     others = other or ", ".join(by)
     agree = f"all {of} are equal" if equal == of else f"{equal} of {of} are equal"
+    if all(one.get("one_program") for one in tables):
+        agree += (
+            ". Two teams that used one faulty program would report this too, because their "
+            "recordings agree that closely"
+        )
     return f"The {listing(names)} {report} the same numbers as {others}: {agree}."
 
 

@@ -3,7 +3,7 @@
 Honest teams on one bench report nearly equal numbers, so right answers prove nothing. Equal errors
 do: a table is a copy if nearly all of its numbers are equal, and enough of them are wrong by a few
 units of their last digit. The spread of the errors in the class tells how probable this is by
-chance.
+chance. If the recordings agree within these digits, one faulty program explains the table too.
 """
 
 import math
@@ -74,12 +74,15 @@ class SharedTable:
     ----------
     table : initial or final.
     equal, of : how many numbers are equal, of those that both submissions report.
+    one_program : whether two honest teams would report the same if they used one faulty program,
+        because their recordings agree within the digits that they report.
     """
 
     table: str
     submission: str
     equal: int
     of: int
+    one_program: bool
 
 
 def _shortest(value: float) -> Decimal:
@@ -143,9 +146,21 @@ def find_shared_tables(
             }
             if sum(decades.values()) < _LEAST_DECADES or same_team(teams[a], teams[b]):
                 continue
+            apart = {
+                (key[1], own[key].value)
+                for key in own.keys() & numbers[b].keys()
+                if abs(own[key].recomputed - numbers[b][key].recomputed) > own[key].step
+            }
+            beyond = sum(size for number, size in decades.items() if number in apart)
             for mine, other in ((a, b), (b, a)):
                 found[teams[mine].submission] += [
-                    SharedTable(table=t, submission=teams[other].submission, equal=n, of=of)
+                    SharedTable(
+                        table=t,
+                        submission=teams[other].submission,
+                        equal=n,
+                        of=of,
+                        one_program=beyond < _LEAST_DECADES,
+                    )
                     for t, (n, of) in sorted(same.items(), reverse=True)  # initial, then final
                 ]
     return {name: tuple(tables) for name, tables in sorted(found.items())}

@@ -29,22 +29,25 @@ def rounded(value, digits):
     return float(f"{value:.{digits - 1}e}")
 
 
-def team(seed, *, digits=3, bench=0.0, careless=1.0, factor=1.0):
+def team(seed, *, digits=3, bench=0.0, repeats=0.001, careless=1.0, factor=1.0, program=None):
     """Return what an honest team reports, and what its recordings give.
 
     Parameters
     ----------
+    repeats : relative spread of the runs on one bench.
+    program : seed of the errors, if a program makes them.
     bench : relative spread of the benches; all numbers of a kind change together.
     careless : size of the errors, as a multiple of the usual size.
     factor : a slip that all frequencies have.
     """
     rng = np.random.default_rng(seed)
+    errors = rng if program is None else np.random.default_rng(program)
     found = {}
     other = {kind: 1 + bench * rng.standard_normal() for kind in ("K", "o", "z")}
     for table in TABLES:
         for name, true in TRUE.items():
-            run = true * other[name[0]] * (1 + 0.001 * rng.standard_normal())
-            error = careless * (0.05 if name[0] == "z" else 0.01) * rng.standard_normal()
+            run = true * other[name[0]] * (1 + repeats * rng.standard_normal())
+            error = careless * (0.05 if name[0] == "z" else 0.01) * errors.standard_normal()
             typed = run * (1 + error) * (factor if name[0] == "o" else 1)
             found[table, name] = TypedNumber(value=rounded(typed, digits), recomputed=run)
     return found
@@ -106,6 +109,33 @@ def test_numbers_from_equal_recordings_accuse_nobody():
     assert shared([one, dict(one), *(team(seed) for seed in range(2, 12))]) == {}
 
 
+@pytest.mark.parametrize("digits", [3, 4])
+def test_one_faulty_program_is_a_possible_reason_for_equal_tables(digits):
+    """Teams that share a program, on a bench repeatable to 0.01 %, are asked and not accused."""
+    asked = 0
+    for seed in range(60):
+        pair = [
+            team(s, digits=digits, repeats=1e-4, program=7000 + seed) for s in (seed, 100 + seed)
+        ]
+        found = shared([*pair, *(team(200 + 20 * seed + k, digits=digits) for k in range(10))])
+        assert all(one.one_program for tables in found.values() for one in tables)
+        if found:
+            asked += 1
+            assert "one faulty program" in shared_flag([], found["t000"]).message
+    assert asked or digits > 3
+
+
+@pytest.mark.parametrize(("digits", "repeats"), [(3, 0.01), (4, 0.001)])
+def test_no_program_explains_equal_numbers_of_recordings_that_differ(digits, repeats):
+    """If the recordings differ by more than the last digit, a copied table is said to be one."""
+    numbers = [team(seed, digits=digits, repeats=repeats) for seed in range(10)]
+    numbers[3] = copied(numbers[3], numbers[1])
+    found = shared(numbers)
+    assert set(found) == {"t001", "t003"}
+    assert not any(one.one_program for one in found["t003"])
+    assert "program" not in shared_flag([], found["t003"]).message
+
+
 def test_the_same_slip_accuses_nobody():
     """Two teams that report Hz for rad/s have the same large error, not the same source."""
     slips = [team(seed, careless=0.0, factor=1 / (2 * np.pi)) for seed in (1, 2)]
@@ -155,7 +185,7 @@ def record(submission):
 @pytest.mark.parametrize("with_recording", [False, True])
 def test_the_flag_reads_well_and_students_learn_no_name(with_recording):
     """The message tells recordings and tables apart; a student's message names no team."""
-    numbers = [team(seed) for seed in range(10)]
+    numbers = [team(seed, repeats=0.01) for seed in range(10)]
     numbers[3] = copied(numbers[3], numbers[1])
     found = shared(numbers)
     flag = shared_flag([record("t001")] if with_recording else [], found["t003"])
