@@ -264,6 +264,18 @@ def test_dry_friction_and_viscous_damping_are_separated(d, zeta):
     assert local[1, local[0].argmin()] > local[1, local[0].argmax()]
 
 
+@pytest.mark.parametrize("d", [0.08, 0.11, 0.15])
+def test_friction_that_stops_the_cart_is_measured(d):
+    """If friction stops the cart after a few swings, friction and damping are still right."""
+    run = released(zeta=0.05, d=d, duration=5.0, noise=COUNT, rng=np.random.default_rng(8))
+    law = fit_log_decrement(run, cart=1).law
+    assert law.is_friction
+    # 3 standard errors of the noise, which is 0.5 to 4 % of d
+    assert abs(law.size - d) < 3 * law.size_std
+    assert_allclose(law.size, d, rtol=0.03)
+    assert_allclose(law.zeta, 0.05, rtol=0.05)
+
+
 # ------------------------------------------------------------------- other laws
 
 
@@ -304,6 +316,16 @@ def test_a_second_mode_is_named_and_left_out(share, other):
     assert_allclose(got.omega_n, 15.0, rtol=2e-3)
     assert_allclose(got.zeta, 0.012, rtol=0.06)
     assert (got.law.zeta, got.law.omega_n) == (got.zeta, got.omega_n)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5])
+@pytest.mark.parametrize("other", [11.0, 12.0, 19.0, 20.0])
+def test_a_second_mode_needs_few_periods(share, other):
+    """The modes beat so fast that only three periods decay; no other law may claim them."""
+    law = fit_log_decrement(beating(share, seed=7, other=other), cart=1).law
+    assert law.name == "second_mode"
+    assert_allclose(law.size, other, rtol=5e-3)
+    assert_allclose([law.zeta, law.omega_n], [0.012, 15.0], rtol=0.06)
 
 
 @pytest.mark.parametrize("drag", [0.01, 0.05, 0.3])

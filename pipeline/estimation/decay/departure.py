@@ -77,11 +77,12 @@ def find_departure(t: Array, y: Array, fit: Ringing, *, step: float, friction: A
     freedom = min(2.0 * _BINS, max(n - UNKNOWNS - along.size, 2.0))
     limit = float(fdtri(along.size, freedom, 1 - _CHANCE))
     friction = friction - basis @ (basis.T @ friction)
-    rubbed = float(friction @ left) ** 2 / float(friction @ friction) / density
+    # Friction only ever brakes, so chance has twice its share on this side.
+    rubbed = max(float(friction @ left), 0.0) ** 2 / float(friction @ friction) / density
     return Departure(
         statistic=max(
             float(along @ along) / along.size / density,
-            limit / float(fdtri(1, freedom, 1 - _CHANCE)) * rubbed,
+            limit / float(fdtri(1, freedom, 1 - 2 * _CHANCE)) * rubbed,
             limit / _LINE * _highest_line(noise, angle=angle),
         ),
         limit=limit,

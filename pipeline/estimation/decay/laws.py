@@ -39,13 +39,17 @@ from pipeline.estimation.decay.separable import (
 from pipeline.results import DecayCause
 
 _MARGIN = 6.0  # BIC by which the best law must be better than the next
-_MOST_LEFT = 0.5  # share of what the exponential leaves that a law may leave
+# Share of what the exponential leaves that a law may leave. On real carts, dry friction leaves 0.03
+# to 0.38; a wrong law may leave 0.23.
+_MOST_LEFT, _MOST_LEFT_BY_FRICTION = 0.2, 0.5
+# Unknowns that a law may have beyond the number of swings, unless it leaves only noise.
+_MORE_UNKNOWNS = 3
+_FEWEST_SWINGS = 4  # with fewer, most laws leave only noise
 _MAX_EVALUATIONS = 100
 _ROUGH = 1e-4  # relative tolerance of the squares in the competition
 _SIGMAS = 3.0  # a damping ratio further below zero is impossible
 _LEAST_ROUNDING = 0.1  # share of the rounding error that any fit leaves
 _LEAST_RATE = 0.1  # smaller decay rate of two modes, in the larger
-_MORE_UNKNOWNS = 3  # that a law may have than the decay has swings
 # Errors relative to the next power of a shift, from simulated springs and pendulums.
 _NEGLECTED = np.array([0.5, 0.1, 1.0])  # of damping ratio, frequency and shift
 _MOST_SHIFT = 0.3  # relative shift of frequency up to which the series holds
@@ -215,15 +219,10 @@ def explain_decay(
             left=(0.0, 0.0),
         )
     tried = _candidates(coarse_t, coarse_y, fit, turning=turning, falling=falling, end=float(t[-1]))
-    swings = n * angle / np.pi
     fits = [
         (law, one)
         for one in tried
-        # Each swing gives one number: its amplitude, its time or its middle. Dry friction also
-        # shows within a swing.
-        if only in (None, one.name)
-        and (law := one.fit(coarse_t, coarse_y))
-        and (law.name == "dry_friction" or law.unknowns <= swings + _MORE_UNKNOWNS)
+        if only in (None, one.name) and (law := one.fit(coarse_t, coarse_y))
     ]
     for law, _ in fits:  # the residual of a law may be smaller than that of the flexible change
         other = density_of(law.residual, unknowns=law.unknowns)
@@ -241,10 +240,23 @@ def explain_decay(
         more = squares - float(noise @ noise)
         return more if more > departure.limit * departure.columns * density else 0.0
 
+    def is_determined(law: LawFit) -> bool:
+        """Return whether the swings determine the law, or it leaves only noise.
+
+        Each swing gives one number: its amplitude, its time or its middle. Dry friction also shows
+        within a swing.
+        """
+        swings = n * angle / np.pi
+        few = law.unknowns <= swings + _MORE_UNKNOWNS
+        exact = swings >= _FEWEST_SWINGS and not excess(law.squares)
+        return few or exact or law.name == "dry_friction"
+
     left = float(departure.left @ departure.left)
     bics: dict[str, float] = {"exponential": bic(left, UNKNOWNS)}
     best: tuple[LawFit, _Candidate] | None = None
     for law, tried_one in fits:
+        if not is_determined(law):
+            continue
         own = bic(law.squares, law.unknowns)
         if own < bics.get(law.name, np.inf):
             bics[law.name] = own
@@ -254,7 +266,8 @@ def explain_decay(
     full, over = None, excess(left)
     if best and _is_clear(best[0], bics, density=density):
         law, tried_one = best
-        if excess(law.squares) <= _MOST_LEFT * over:
+        most = _MOST_LEFT_BY_FRICTION if law.name == "dry_friction" else _MOST_LEFT
+        if excess(law.squares) <= most * over:
             full = tried_one.fit_from(law.p, t, y, precision=PRECISION)
             name, over = (law.name, excess(law.squares)) if full else (name, over)
     return Explained(
@@ -302,9 +315,9 @@ def _candidates(
             size=size,
         )
 
-    # A cart that friction has stopped stays where it is.
-    stops = [np.inf, turning.size - 1.0] if end > turning[-1] + np.pi / omega else [np.inf]
-    for cycles in stops:
+    # A cart that friction has stopped stays where it is: where it last turned, or one swing later.
+    stopped = end > turning[-1] + np.pi / omega
+    for cycles in [np.inf, *(turning.size - np.array([1.0, 0.0]) if stopped else [])]:
         yield _Candidate(
             name="dry_friction",
             model=partial(Swings.at, direction=-1.0 if falling else 1.0, cycles=cycles),
