@@ -21,13 +21,7 @@ from pipeline.estimation.decay.departure import (
     thinned,
 )
 from pipeline.estimation.decay.dry_friction import Swings
-from pipeline.estimation.decay.modulated import (
-    DECAY,
-    DRAG,
-    FREQUENCY,
-    SHIFT,
-    Modulated,
-)
+from pipeline.estimation.decay.modulated import DECAY, DRAG, FREQUENCY, SHIFT, Modulated
 from pipeline.estimation.decay.ringing import Ringing, Waves
 from pipeline.estimation.decay.separable import (
     PRECISION,
