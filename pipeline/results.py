@@ -4,8 +4,18 @@ Units throughout: the submission's own position unit (say cm) and input unit (sa
 radians. Time is the last axis. Carts and springs count from 1. A standard error ("std") is one
 sigma; `None` means it could not be determined.
 
-The file starts with a recording and the results of single recordings. Fields marked `written` are
-in the JSON file of their type, in this order (`json_files.py`). Other packages have further types:
+Fields marked `written` are in the JSON file of their type, in this order (`json_files.py`). The
+sections of this file:
+
+- Recordings: `Record`, `Intervention`, `SinePoint`, `DecayLaw`, `LogDecrement`, `StepGain`.
+- Carts: `FrequencyResponse`, `Estimate` with its `Coverage`, `ChainFit`.
+- Comparisons: `ParameterRow` (initial against final), `Check`.
+- Control: `FeedbackDesign`, `HardwareCheck`.
+- Remarks: `Skipped`, `LeftOut`, `RecordingGroup`, `Assumption`, `LateChannel`.
+- Tables that only `results.json` has: `Submitted`, `Provenance`, `ChainWithUnits`, ….
+- All together: `Analysis`.
+
+Other packages have further types:
 
 - `Ingested` (`ingest/read.py`). The data read.
 - `Identified` and `Fitted` (`identify/`). Results of the stages up to the fit.
@@ -61,7 +71,7 @@ EXPLAINED = 2.0
 SIGNAL = 3.0  # standard errors; a smaller magnitude may be noise alone
 
 
-# --------------------------------------- a recording, and results of single recordings
+# --------------------------------------------------------------------------------------- recordings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -340,7 +350,7 @@ class StepGain:
     edges: tuple[StepEdge, ...]
 
 
-# ----------------------------------------------------- frequency-domain stages
+# -------------------------------------------------------------------------------------------- carts
 
 
 @result(eq=False)
@@ -474,7 +484,7 @@ class ChainFit:
         return self.chi_square_per_dof <= EXPLAINED
 
 
-# ------------------------------------------------------------------- comparing
+# -------------------------------------------------------------------------------------- comparisons
 
 # What determines a fitted number: points of the response or motion in the fitted recordings at its
 # frequency, a decay, other parameters with such measurements, or only the model.
@@ -633,7 +643,7 @@ class Check:
         return ".".join(filter(None, (self.run, cart, self.parameter, self.part)))
 
 
-# --------------------------------------------------------------------- control
+# ------------------------------------------------------------------------------------------ control
 
 
 @result(eq=False)
@@ -732,7 +742,7 @@ class HardwareCheck:
     set_point: Array | None = None
 
 
-# -------------------------------------------------------------------- together
+# ------------------------------------------------------------------------------------------ remarks
 
 
 class Stage(StrEnum):
@@ -831,6 +841,9 @@ class LateChannel:
     experiments: tuple[str, ...]
 
 
+# --------------------------------------------------------------------------- tables of results.json
+
+
 @result()
 class Submitted:
     """The title, the authors and the bench of a submission."""
@@ -881,6 +894,9 @@ class StateSpaceMatrices:
     B: Matrix = written()
     C: Matrix = written()
     D: Matrix = written()
+
+
+# ------------------------------------------------------------------------------------- all together
 
 
 @result(eq=False)
