@@ -172,7 +172,7 @@ Lab = Annotated[
 ]
 
 
-@app.command()
+@app.command(context_settings={"ignore_unknown_options": True})  # -1 is a number, not an option
 def override(
     grades: Grades,
     by: Annotated[str, typer.Option(metavar="NAME", help="Who decides.")],
@@ -207,7 +207,7 @@ def override(
         name, criterion, read_points(points), why=why, by=by))  # fmt: skip
 
 
-@app.command(context_settings={"ignore_unknown_options": True})  # -2 is a number, not an option
+@app.command(context_settings={"ignore_unknown_options": True})
 def adjust(
     grades: Grades,
     team: Team,

@@ -253,13 +253,19 @@ def regrade_class(
     paths: Sequence[str],
     rubric: str,
     lateness: str,
-    anonymous: bool,
+    options: Mapping[str, Any],
     *,
     progress: Progress,
 ) -> str:
-    """Grade a class into a folder; for an anonymous class, progress messages name no team."""
+    """Grade a class into a folder; for an anonymous class, progress messages name no team.
+
+    Parameters
+    ----------
+    options : see `intake.repairs.Run`.
+    """
     from pipeline.grading.batch.grade_class import Options, grade_class
 
+    anonymous = options.get("anonymous", False)
     try:
         done = grade_class(
             [read_path(path, wanted="enter the submissions") for path in paths],
@@ -267,8 +273,8 @@ def regrade_class(
             out=Path(folder),
             options=Options(
                 jobs=os.cpu_count() or 1,
-                anonymous=anonymous,
                 lateness=Path(lateness) if lateness else None,
+                **options,
             ),
             progress=lambda done, total, last: progress(f"{done} of {total}"),
         )

@@ -8,9 +8,17 @@ from pathlib import Path
 import pytest
 
 from pipeline.desk.app import DeskServer
+from pipeline.grading.batch.grade_class import Options
 from pipeline.grading.grade import Grade
 from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.intake.repairs import read_original, text_key
+from pipeline.grading.intake.repairs import (
+    FOLDER,
+    Run,
+    read_original,
+    read_run,
+    save_run,
+    text_key,
+)
 from pipeline.simulated.submission import write_submission
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.desks import Visitor
@@ -135,3 +143,15 @@ def test_an_anonymous_class_shows_no_file(handed_in, tmp_path):
         assert "Repair submission.toml" not in ta.get(address).text
         sent = {"do": "repair", "by": "Ada", "why": WHY, "text": right}
         assert ta.post(address, **sent, of_text="x").status == 404
+
+
+def test_a_run_keeps_the_options_that_decide_its_result(tmp_path):
+    """What was graded is kept with its limits and its choice of figures. Older files lack them."""
+    options = Options(time_limit=7.0, memory_limit=2_000_000_000, figures=False, anonymous=True)
+    run = Run(paths=("a",), rubric="r.toml", options=options.lasting())
+    (tmp_path / FOLDER).mkdir()
+    save_run(tmp_path, run)
+    assert read_run(tmp_path) == run
+    assert Options(**run.options) == options
+    (tmp_path / FOLDER / "run.json").write_text('{"paths": ["a"], "rubric": "r.toml"}')
+    assert read_run(tmp_path) == Run(paths=("a",), rubric="r.toml")

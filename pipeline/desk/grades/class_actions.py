@@ -17,6 +17,7 @@ from pipeline.desk.scratch import scratch_folder
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.override import read_wishes
 from pipeline.grading.intake.lms_names import Platform
+from pipeline.grading.intake.repairs import read_run
 from pipeline.grading.publish.export import export
 from pipeline.words.numbers import count
 
@@ -87,6 +88,7 @@ def regrade(ask: Ask) -> Response:
     if not typed["paths"] or not typed["rubric"]:
         raise ConfigError("enter the submissions and the rubric")
     ask.desk.books.asked[folder] = typed
+    run = read_run(folder)
     ask.start(
         "regrade_class",
         title="Grading",
@@ -94,7 +96,7 @@ def regrade(ask: Ask) -> Response:
         paths=[_find(path) for path in typed["paths"].splitlines()],
         rubric=_find(typed["rubric"]),
         lateness=_find(typed["lateness"]),
-        anonymous=shown.rubric.anonymous,
+        options={**(run.options if run else {}), "anonymous": shown.rubric.anonymous},
     )
     return ask.back(ask.here + "#work")
 

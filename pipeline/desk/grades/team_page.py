@@ -119,7 +119,7 @@ def _repair(ask: Ask, shown: Class, team: Listing, *, by: str) -> Response:
     message = "Saved. It counts when the class is graded again."
     if run := read_run(place):
         with suppress(Busy):  # another job is running in this folder
-            ask.start("regrade_class", title="Grading", **asdict(run), anonymous=False)
+            ask.start("regrade_class", title="Grading", **asdict(run))
             message = "Saved. The team is being graded again: load this page again in a moment."
     return ask.back(write_address(ask, team.line.submission), message)
 

@@ -6,8 +6,9 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.grading.batch.runner import Executor, Progress, grade_batch, run_here, silent
@@ -95,6 +96,11 @@ class Options:
     gradebook: str | None = None
     lateness: Path | None = None
 
+    def lasting(self) -> dict[str, Any]:
+        """Return the options that decide the result, to grade the class again in the same way."""
+        kept = ("time_limit", "memory_limit", "figures", "anonymous")
+        return {name: getattr(self, name) for name in kept}
+
     def setup(self, rubric: Rubric, *, scratch: Path) -> Setup:
         """Return the settings that are passed to the grading processes."""
         return Setup(
@@ -134,16 +140,17 @@ def grade_class(
     _refuse_submission(named_folder(out))
     if options.gradebook is None:
         _refuse_another_class(out, assignment=rubric_file.stem)
-    _refuse_lost_gradebook(place, out=out, assignment=rubric_file.stem)
+    # The file name of the rubric identifies the assignment, because the title may change later.
+    book_of = partial(
+        Gradebook, place, assignment=rubric_file.stem, patience=_PATIENCE, waiting=say
+    )
+    _refuse_lost_gradebook(book_of, out=out)
     with lock_or_refuse(out, private=True), scratch_in(out) as scratch:
-        known = _listed_names(place, assignment=rubric_file.stem)
+        known = _listed_names(book_of)
         passed: list[str] = []
         found = find_hand_ins(paths, scratch=scratch, skip=[out], known=known, say=passed.append)
         hand_ins, unknown = settle_lateness(found, late=rubric.late, table=late_table)
-        # The file name of the rubric identifies the assignment, because the title may change later.
-        with Gradebook(
-            place, assignment=rubric_file.stem, create=True, patience=_PATIENCE, waiting=say
-        ) as book:
+        with book_of(create=True) as book:
             shown = _pseudonyms(book) if hidden else str
             batch = grade_batch(
                 hand_ins,
@@ -174,7 +181,10 @@ def grade_class(
                 late = str(options.lateness.resolve()) if options.lateness else ""
                 absolute = tuple(str(Path(path).resolve()) for path in paths)
                 rubric_path = str(find_rubric(rubric_file).resolve())
-                save_run(out, Run(paths=absolute, rubric=rubric_path, lateness=late))
+                run = Run(
+                    paths=absolute, rubric=rubric_path, lateness=late, options=options.lasting()
+                )
+                save_run(out, run)
             doubles = write_outputs(book, out, progress=lambda what: progress(total, total, what))
     return Summary(
         total=total,
@@ -211,7 +221,7 @@ def _refuse_another_class(out: Path, *, assignment: str) -> None:
         )
 
 
-def _refuse_lost_gradebook(place: str | Path, *, out: Path, assignment: str) -> None:
+def _refuse_lost_gradebook(book_of: Callable[[], Gradebook], *, out: Path) -> None:
     """Raise a ConfigError if `out` holds feedback whose gradebook is missing or empty.
 
     Otherwise the feedback would be replaced without the points given by hand.
@@ -219,7 +229,7 @@ def _refuse_lost_gradebook(place: str | Path, *, out: Path, assignment: str) -> 
     if not any(out.glob("feedback/*/grade.json")):
         return
     try:
-        with Gradebook(place, assignment=assignment) as book:
+        with book_of() as book:
             book.assignment  # noqa: B018  # raises an error if there is no class list
     except Lost:
         raise  # the server does not answer now
@@ -314,11 +324,13 @@ def _names(names: Sequence[str]) -> str:
     return listing(names, most=_NAMED)
 
 
-def _listed_names(place: Path | str, *, assignment: str) -> list[str]:
+def _listed_names(book_of: Callable[[], Gradebook]) -> list[str]:
     """Return the names on the current class list, or no names if there is no gradebook."""
     try:
-        with Gradebook(place, assignment=assignment) as book:
+        with book_of() as book:
             return [member.submission for member in book.listed()]
+    except Lost:
+        raise  # the server does not answer now
     except ConfigError:
         return []
 

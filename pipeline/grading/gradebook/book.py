@@ -411,7 +411,8 @@ class Gradebook:
             raise ConfigError(f"{criterion}: the rubric has no such criterion{hint}")
         elif points is not None and not 0 <= points <= out_of[criterion]:
             raise ConfigError(
-                f"{criterion}: expected 0 to {out_of[criterion]:g} points, found {points:g}"
+                f"{criterion}: expected 0 to {out_of[criterion]:g} points, found {points:g}; "
+                "to deduct from the total, or to add to it, use cartlab adjust"
             )
         before = select(overrides.c.id).filter_by(
             submission_id=row.submission_id, criterion=criterion, points=points

@@ -296,7 +296,7 @@ class Database:
     ----------
     place : a folder that holds `gradebook.sqlite`, an SQLite file, or any SQLAlchemy URL.
     create : whether to create missing tables; otherwise the gradebook must exist.
-    patience : time in s to wait for a server that stops answering, for example during a restart.
+    patience : time in s to wait for a server that does not answer, for example during a restart.
     waiting : function that is called with a message while it waits.
 
     Raises
@@ -312,24 +312,27 @@ class Database:
         patience: float = 0.0,
         waiting: Callable[[str], None] = silent,
     ) -> None:
-        self._patience, self._waiting = 0.0, waiting  # a wrong address is reported at once
+        self._patience, self._waiting = patience, waiting
         self._engine = _engine(place, create=create)
         self._writer = self._engine.execution_options(writes=True)
-        opened = self._writer if create else self._engine
         try:
-            with self._translated(), opened.begin() as connection:
-                if create:
-                    _create(connection)
-                elif not self._engine.dialect.has_table(connection, settings.name):
-                    raise ConfigError(f"{self.name}: holds no gradebook")
-                _check_version(connection, name=self.name)
-                whole = _is_whole(connection)
+            whole = self.repeat(lambda: self._open(create=create))
         except _SENSELESS as error:  # some drivers read the address only when they connect
             raise ConfigError(_NO_ADDRESS) from error
         if not whole:  # an older version wrote it, with fewer tables or columns
             with self.writing() as connection:
                 _create(connection)
-        self._patience = patience
+
+    def _open(self, *, create: bool) -> bool:
+        """Check the tables, or create them; return whether none is missing."""
+        opened = self._writer if create else self._engine
+        with self._translated(), opened.begin() as connection:
+            if create:
+                _create(connection)
+            elif not self._engine.dialect.has_table(connection, settings.name):
+                raise ConfigError(f"{self.name}: holds no gradebook")
+            _check_version(connection, name=self.name)
+            return _is_whole(connection)
 
     @property
     def name(self) -> str:

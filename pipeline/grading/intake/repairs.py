@@ -7,9 +7,10 @@ graded, and not if the team hands in another version.
 import hashlib
 import json
 import shutil
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from pipeline.errors import ConfigError
 from pipeline.output import own_folder, write_file
@@ -30,11 +31,15 @@ class Repair:
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """What was graded last: the paths, the rubric's file, and the file of days late or ""."""
+    """What was graded last: the paths, the rubric's file, and the file of days late or "".
+
+    `options` are the other options of `grade_class.Options` that decide the result.
+    """
 
     paths: tuple[str, ...]
     rubric: str
     lateness: str = ""
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 def text_key(text: str) -> str:

@@ -182,6 +182,9 @@ def test_points_come_from_a_table(tmp_path):
     assert (grade.points, grade.adjustments[0].points) == (20.5, -2)
     assert "−2 points: copied plots" in (tmp_path / "feedback/team-1/feedback.html").read_text()
     assert "total −2 (copied plots)" in (tmp_path / "class.html").read_text(encoding="utf-8")
+    done = cartlab_here("override", tmp_path, "team-1", "pieces", "-1", "--why", "more", *by)
+    assert done.returncode == 2
+    assert "pieces: expected 0 to 1 points, found -1; to deduct from the total" in done.stderr
     table.write_text("submission,discussion\nteam-1,9\n", encoding="utf-8")
     done = cartlab_here("override", tmp_path, "--from", table, *by, "--why", "more")
     assert done.returncode == 2

@@ -5,14 +5,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 from sqlalchemy import Engine
 from sqlalchemy.event import listen, remove
 from sqlalchemy.exc import OperationalError
 
-from pipeline.errors import ConfigError
+from pipeline.grading.batch import grade_class
 from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.schema import Lost
 from pipeline.grading.gradings import Batch, Grading
 from tests.helpers import postgres
 from tests.helpers.grades import make_grade, make_outcome, two_cart_rubric
@@ -50,6 +52,34 @@ def restart(server: postgres.Server) -> None:
     """Stop the server at once, and start it again a little later, in the background."""
     server.stop()
     threading.Thread(target=lambda: (time.sleep(AWAY), server.start()), daemon=True).start()
+
+
+def test_a_server_that_is_away_at_the_start_is_waited_for(server, told):
+    """A gradebook waits for a server that does not answer yet, and says so."""
+    restart(server)
+    with Gradebook(
+        server.url, assignment="start", create=True, patience=60.0, waiting=told.append
+    ) as book:
+        store(book, "a")
+    assert "trying again for" in told[0]
+
+
+def test_a_class_is_not_graded_without_its_list(server, told, tmp_path, monkeypatch):
+    """If the server stays away, grading ends at its first question, before any name is chosen."""
+    monkeypatch.setattr(grade_class, "_PATIENCE", 0.1)
+    server.stop()
+    try:
+        with pytest.raises(Lost):
+            grade_class.grade_class(
+                [tmp_path],
+                rubric_file=Path("throne-1dof"),
+                out=tmp_path / "out",
+                options=grade_class.Options(gradebook=server.url),
+                say=told.append,
+            )
+    finally:
+        server.start()
+    assert "trying again for" in told[0]
 
 
 def store(book: Gradebook, *names: str) -> list[Grading]:
@@ -113,11 +143,17 @@ def test_a_grading_is_stored_once_if_the_answer_was_lost(server, book):
     assert n_graded(book, "a") == 1
 
 
-def test_a_wrong_address_is_refused_at_once(server):
-    """A server that never answered is not waited for."""
-    begin = time.monotonic()
-    with pytest.raises(ConfigError):
-        Gradebook(
-            server.url.replace("pg-", "none-"), assignment="x", create=True, patience=60.0
-        ).close()
-    assert time.monotonic() - begin < 30  # s; the connection is refused in a few ms
+def test_a_wrong_address_is_named_while_waiting(server, told):
+    """A wrong address looks like a server that restarts: each message names it and the reason."""
+    wrong = server.url.replace("pg-", "none-")
+    with pytest.raises(Lost, match="none-"):
+        Gradebook(wrong, assignment="x", create=True, patience=0.2, waiting=told.append).close()
+    assert "none-" in told[0]
+
+
+def test_a_server_is_not_waited_for_without_patience(server, told):
+    """All commands but `grade` report at once that the server does not answer."""
+    wrong = server.url.replace("pg-", "none-")
+    with pytest.raises(Lost):
+        Gradebook(wrong, assignment="x", create=False, waiting=told.append).close()
+    assert told == []
