@@ -90,7 +90,7 @@ def _watched(figures: Path | None) -> Iterator[None]:
         yield
 
 
-def commanded(name: str, *command: str | Path, folder: Path) -> Facts:
+def commanded(*command: str | Path, folder: Path) -> Facts:
     """Return the facts of one command that writes a folder, with those of its figures."""
     out, figures = folder / "out", folder / "figures"
     status = run(*command, "--no-pdf", "--out", out, figures=figures)
@@ -102,13 +102,19 @@ def commanded(name: str, *command: str | Path, folder: Path) -> Facts:
     return found
 
 
-def case(kind: str, name: str, submission: Path, *options: str) -> Case:
-    """Return the case of a report, solution or gap of one submission."""
+def case(kind: str, name: str, submission: Callable[[], Path]) -> Case:
+    """Return the case of a report, solution or gap of one submission.
+
+    Parameters
+    ----------
+    submission : writes the submission, if it is not there yet, and returns its folder.
+    """
 
     def facts(folder: Path) -> Facts:
-        found = commanded(name, kind, submission, *options, folder=folder)
+        there = submission()
+        found = commanded(kind, there, folder=folder)
         if kind == "report":
-            found["records"] = records(submission)
+            found["records"] = records(there)
         return found
 
     return Case(name=f"{kind}/{name}", facts=facts)
@@ -147,6 +153,7 @@ def file_facts(file: Path, _folder: Path) -> Facts:
     if said.getvalue():
         (one,) = json.loads(said.getvalue())
         found["inspect"] = tree({k: v for k, v in one.items() if k != "file"})
+        found["problems"] = len(one.get("problems", ()))
     try:
         table, _ = read_table(file.parent, file.name)
     except Exception as error:
@@ -168,6 +175,11 @@ def write_made(made: Made, folder: Path) -> Path:
     return target
 
 
+def example(name: str) -> Path:
+    """Return the folder of a shipped example."""
+    return ROOT / "submissions" / name
+
+
 def write_class(folder: Path, *, carts: int, teams: Teams, seed: int) -> Path:
     """Write a class in which each team makes its own mistakes."""
     for number, (team, edits) in enumerate(teams.items()):
@@ -176,12 +188,18 @@ def write_class(folder: Path, *, carts: int, teams: Teams, seed: int) -> Path:
 
 
 def write_rubric(folder: Path, *, carts: int) -> Path:
-    """Write the shipped rubric, with a chain of three criteria that require each other."""
+    """Write the shipped rubric, stricter.
+
+    Three criteria require each other in a chain, and initial and final numbers may hardly differ.
+    """
     file = folder / f"rubric-{carts}.toml"
     document: Any = tomlkit.parse((ROOT / "rubrics" / f"throne-{carts}dof.toml").read_text("utf-8"))
     for one in document["criteria"]:
         if one["id"] == "prefilter":
             one["requires"] = ["comparison"]
+        if one["id"] == "comparison":
+            one["full_percent"], one["none_percent"] = 0.5, 4
+            one["parameters"] = ["omega_*"]
     file.write_text(tomlkit.dumps(document), encoding="utf-8", newline="\n")
     return file
 
@@ -213,9 +231,12 @@ def read_facts_of(file: Path) -> Facts:
 
 def class_case(inputs: Path, *, carts: int, teams: Teams, seed: int) -> Case:
     """Return the case of a class."""
-    folder = write_class(inputs / f"class-{carts}", carts=carts, teams=teams, seed=seed)
-    rubric = write_rubric(inputs, carts=carts)
-    return Case(name=f"grade/class-{carts}", facts=partial(graded, folder, rubric))
+
+    def facts(folder: Path) -> Facts:
+        there = write_class(inputs / f"class-{carts}", carts=carts, teams=teams, seed=seed)
+        return graded(there, write_rubric(inputs, carts=carts), folder)
+
+    return Case(name=f"grade/class-{carts}", facts=facts)
 
 
 # ----------------------------------------------------------------------------------------- lists
@@ -224,7 +245,7 @@ def class_case(inputs: Path, *, carts: int, teams: Teams, seed: int) -> Case:
 def gap_sample(inputs: Path) -> Iterator[Case]:
     """Yield the case of the sample that takes longest."""
     stop = Made(name="stop", carts=1, seed=5, hide=("end_stop:cart=1",))
-    yield case("gap", "stop", write_made(stop, inputs))
+    yield case("gap", stop.name, partial(write_made, stop, inputs))
 
 
 def sample(inputs: Path) -> Iterator[Case]:
@@ -234,14 +255,13 @@ def sample(inputs: Path) -> Iterator[Case]:
         clipped("sweep", "input", side=-1),
         setting("design", "input_limit", 0.08),
     )
-    two_carts = write_made(Made(name="two", carts=2, seed=7, edits=two), inputs)
     rough = Made(
         name="rough", carts=1, seed=5, hide=("coulomb_friction:cart=1",),
-        edits=(recording("*", coarse),),
+        edits=(without("sine", "sweep"), recording("*", coarse)),
     )  # fmt: skip
-    yield case("report", "two", two_carts)
-    yield case("report", "rough", write_made(rough, inputs))
-    yield case("solution", "two-cart", ROOT / "submissions" / "two-cart")
+    for made in (Made(name="two", carts=2, seed=7, edits=two), rough):
+        yield case("report", made.name, partial(write_made, made, inputs))
+    yield case("solution", "two-cart", partial(example, "two-cart"))
     yield class_case(inputs, carts=1, teams=FEW_TEAMS, seed=40)
 
 
@@ -260,16 +280,15 @@ def everything(inputs: Path) -> Iterator[Case]:
         for number, (name, edits) in enumerate(SPOILT.items())
     ]
     for made in sets:
-        submission = write_made(made, inputs)
+        submission = partial(write_made, made, inputs)
         yield case("report", made.name, submission)
         if made.name in HIDDEN or made.name.startswith("plain-2"):
             yield case("gap", made.name, submission)
         if made.name.endswith(("-1", "springs", "low-limit", "cubic")):
             yield case("solution", made.name, submission)
     for name in EXAMPLES:
-        submission = ROOT / "submissions" / name
         for kind in ("report", "solution", "gap"):
-            yield case(kind, f"example-{name}", submission)
+            yield case(kind, f"example-{name}", partial(example, name))
     yield class_case(inputs, carts=2, teams=MISTAKES, seed=100)
     yield class_case(inputs, carts=1, teams=FEW_TEAMS, seed=200)
     yield class_case(inputs, carts=3, teams=FEW_TEAMS, seed=300)
@@ -280,14 +299,16 @@ def real_cases(inputs: Path) -> Iterator[Case]:
     """Yield the cases of real measurements."""
     if not REAL_DATA.is_dir():
         return
+    one_cart = partial(write_one_cart_submission, data=REAL_DATA)
+    two_carts = partial(write_two_cart_submission, data=REAL_DATA, steps=(1, 2, 3, 4, 5))
     for file in sorted(p for p in REAL_DATA.rglob("*") if p.suffix in _DATA_FILES):
         name = "-".join(file.relative_to(REAL_DATA).parts)
         yield Case(name=f"inspect/{name}", facts=partial(file_facts, file))
-    one, two = inputs / "real-one", inputs / "real-two"
-    if not one.exists():
-        write_one_cart_submission(one, REAL_DATA)
-        write_two_cart_submission(two, REAL_DATA, steps=(1, 2, 3, 4, 5))
-    for submission in (one, two):
-        yield case("report", submission.name, submission)
-        yield case("gap", submission.name, submission)
-    yield case("solution", two.name, two)
+    for kind in ("report", "gap"):
+        yield case(kind, "real-one", partial(_real, inputs / "real-one", one_cart))
+    for kind in ("report", "gap", "solution"):
+        yield case(kind, "real-two", partial(_real, inputs / "real-two", two_carts))
+
+
+def _real(folder: Path, write: Callable[[Path], Path]) -> Path:
+    return folder if folder.exists() else write(folder)

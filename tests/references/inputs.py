@@ -311,7 +311,7 @@ MISTAKES: dict[str, tuple[Edit, ...]] = {
     "slightly-apart": (times("omega_[2n]", 1.22, tables="initial"),),
     "apart-in-two-digits": (
         typed("initial", "omega_[2n]", digits=2),
-        times("omega_[2n]", 1.2, tables="final"),
+        times("omega_[2n]", 1.04, tables="final"),
         typed("initial", "K(_1)?", digits=1),
     ),
     "negative": (times("zeta(_a)?", -1.0, tables="final"),),
@@ -342,7 +342,11 @@ FEW_TEAMS: dict[str, tuple[Edit, ...]] = {
     "a-honest": (),
     "apart": (*MISTAKES["apart-in-two-digits"], *MISTAKES["prefilter"]),
     "dwells-missing": MISTAKES["dwells-missing"],
-    "twice": (*MISTAKES["hertz-twice"], *MISTAKES["gains-small"]),
+    "twice": (
+        *MISTAKES["hertz-twice"],
+        *MISTAKES["gains-small"],
+        clipped("sine-1?", "x1", side=-1),
+    ),
     "two-loops": (times(_GAINS, 1.22, tables="initial"), *MISTAKES["two-loops"]),
 }
 SPOILT: dict[str, tuple[Edit, ...]] = {
