@@ -26,7 +26,7 @@ import numpy as np
 from scipy.stats import beta
 
 from benchmarks import grading_notebooks as notebooks
-from benchmarks.grading_batch import copies, grade, write_class
+from benchmarks.grading_batch import grade, write_class
 from benchmarks.grading_notebooks import COPIED, Graded, cartlab, nbgrader, otter, write_teams
 from benchmarks.grading_points import points
 from benchmarks.page import Table, missing, share, spread
@@ -60,13 +60,12 @@ KINDS = (
 
 
 def tables(*, quick: bool) -> list[Table]:
-    """Return mistakes named, points, copies found, the cost of a submission, and other graders."""
+    """Return mistakes named, points, the cost of a submission, and other graders."""
     with tempfile.TemporaryDirectory() as folder:
         base = Path(folder)
         return [
             mistakes(start=60_000, count=1 if quick else 40),
             points([gradings(960_000 + n, slips=4) for n in range(1 if quick else 40)]),
-            copies(base / "copies", teams=2 if quick else 60),
             costs(
                 base / "costs",
                 teams=1 if quick else 24,

@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.grading_batch import disguised, grade, write_class
+from benchmarks.copies import disguised
+from benchmarks.grading_batch import grade, write_class
 from benchmarks.page import significant
 from pipeline.grading.batch.task import Task
 from pipeline.grading.batch.worker import grade_task
@@ -84,7 +85,7 @@ def measure(*, teams: int) -> dict[str, Any]:
         members = []
         for number in range(n):
             own = records[number % len(records)]
-            other = tuple(disguised(r, rng, noise=20.0) for r in own)
+            other = disguised(own, own, rng, noise=20.0)
             name = str(number)
             members.append(
                 Member(submission=name, authors=(name,), fingerprints=fingerprint(other))
