@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from pipeline.bench.host.acquire import acquire
-from pipeline.bench.host.raw import read_raw
-from pipeline.bench.host.record import readings_of
-from pipeline.bench.live.observer import Anomalies
-from pipeline.bench.protocol.messages import Reading
+from pipeline.bench.acquire import acquire
+from pipeline.bench.events import Anomalies
+from pipeline.bench.experiments import readings_of
+from pipeline.bench.raw import read_raw
 from pipeline.errors import ConfigError
 from pipeline.experiments.plan import PlanLimits
 from pipeline.plant.chain import PRESETS
+from pipeline.protocol import Reading
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.acquisitions import Notes, host, sine, write_work

@@ -22,9 +22,9 @@ import numpy as np
 
 from benchmarks.drawn import Drawn, acted, counted, draw, run_study, wilson
 from pipeline.errors import DataError, PipelineError
-from pipeline.experiments.exploring.error_goal import ErrorGoal
-from pipeline.experiments.exploring.exploration import Exploration
-from pipeline.experiments.plan_words import session_time
+from pipeline.experiments.exploration import Exploration
+from pipeline.experiments.goal import ErrorGoal
+from pipeline.experiments.plan import session_time
 from pipeline.experiments.propose import extend_plan, propose_plan
 from pipeline.plant.catalogue import find_effect
 from pipeline.submission import load_submission

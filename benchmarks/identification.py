@@ -18,7 +18,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.estimation.chain.parametrisation import Parametrisation, named_estimates
+from pipeline.estimation.parametrisation import Parametrisation, named_estimates
 from pipeline.plant.chain import Chain
 from pipeline.results import ChainFit, FrequencyResponse
 from pipeline.set_up import Bench

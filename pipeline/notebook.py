@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigError, DataError
-from pipeline.exchange import frames, gap_frames
 from pipeline.gap.types import Gap
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.self_check.check import check_numbers
 from pipeline.grading.self_check.log import CheckAnswer
 from pipeline.grading.self_check.words import answer_lines
 from pipeline.plant.chain import Chain
+from pipeline.plant.export.motion import EquationsOfMotion
 from pipeline.plant.margins import closed_loop
-from pipeline.plant.motion import EquationsOfMotion
+from pipeline.report import gap_tables, tables
 from pipeline.report.document import Block, Document, Heading
 from pipeline.report.draft.content import build_document
 from pipeline.report.gap.beside import with_gap
@@ -125,38 +125,38 @@ class Lab:
     @cached_property
     def parameters(self) -> "pd.DataFrame":
         """Initial and final estimates, one row per parameter."""
-        return frames.parameters(self.results)
+        return tables.parameters(self.results)
 
     @cached_property
     def checks(self) -> "pd.DataFrame":
         """The consistency checks, one row per check."""
-        return frames.checks(self.results)
+        return tables.checks(self.results)
 
     @cached_property
     def decays(self) -> "pd.DataFrame":
         """Natural frequency and damping of each free decay, with its friction test."""
-        return frames.decays(self.results)
+        return tables.decays(self.results)
 
     @cached_property
     def steps(self) -> "pd.DataFrame":
         """The static gain of each step and cart."""
-        return frames.steps(self.results)
+        return tables.steps(self.results)
 
     @cached_property
     def dwells(self) -> "pd.DataFrame":
         """Amplitudes, ratio and phase of each sine dwell and cart."""
-        return frames.dwells(self.results)
+        return tables.dwells(self.results)
 
     @cached_property
     def frequency_response(self) -> "pd.DataFrame":
         """The measured points of the Bode plots, by cart and frequency."""
-        return frames.frequency_response(self.results)
+        return tables.frequency_response(self.results)
 
     @cached_property
     def records(self) -> "dict[str, pd.DataFrame]":
         """The measured data by experiment, as tables with index `time` and columns `u`, `x1`, …"""
         records = self.results.records
-        return {r.id: frames.record_frame(r, analysis=self.results) for r in records}
+        return {r.id: tables.record_frame(r, analysis=self.results) for r in records}
 
     # ------------------------------------------------------------------ report
 
@@ -213,12 +213,12 @@ class ExplainedGap:
     @cached_property
     def effects(self) -> "pd.DataFrame":
         """The effects in the order found, one row each; the columns are the keys of `gap.json`."""
-        return gap_frames.effects(self.results)
+        return gap_tables.effects(self.results)
 
     @cached_property
     def parameters(self) -> "pd.DataFrame":
         """The parameters of the effects, one row each, with standard errors and units."""
-        return gap_frames.parameters(self.results)
+        return gap_tables.parameters(self.results)
 
     @cached_property
     def linear(self) -> "control.StateSpace":
@@ -250,12 +250,12 @@ class ExplainedGap:
         if record not in self.records:
             known = ", ".join(self.records)
             raise ConfigError(f"no recording {record!r} was used; there are {known}")
-        return gap_frames.simulated(self.results, record)
+        return gap_tables.simulated(self.results, record)
 
     @cached_property
     def residual(self) -> "pd.DataFrame":
         """The force that the model does not explain, one row per cart and short window."""
-        return gap_frames.residual(self.results, analysis=self.analysis)
+        return gap_tables.residual(self.results, analysis=self.analysis)
 
     def __repr__(self) -> str:
         return terminal_verdict(self.results)

@@ -42,7 +42,7 @@ settings.load_profile("cartlab")
 
 _BENCHES = "benches"  # group of the files that mostly wait for virtual benches
 _WITH_BENCHES = {
-    "bench/host/test_acquire", "bench/host/test_mistakes", "bench/host/test_safety",
+    "bench/test_acquire", "bench/test_mistakes", "bench/test_safety",
     "simulated/emulator/test_server", "system/test_live_page",
 }  # fmt: skip
 _PAGES = "pages"  # group of the files that share a browser
@@ -53,7 +53,7 @@ _WITH_BROWSER = {
 }  # fmt: skip
 _LONGEST = {  # each takes ten seconds or more, so it must not start late
     "desk/test_bench", "desk/test_doors", "desk/test_grades", "desk/test_student",
-    "experiments/exploring/test_exploration", "gap/test_explain",
+    "experiments/test_exploration", "gap/test_explain",
     "grading/autograder/test_gradescope", "grading/batch/test_faults_of_the_computer",
     "grading/mistakes/test_faults", "grading/similarity/test_shared_data",
     "grading/test_class_so_far", "report/test_gap", "report/test_report", "report/test_solution",
@@ -136,9 +136,9 @@ def _group(nodeid: str) -> str:
 def _patient_host() -> Iterator[None]:
     """Give virtual benches more time to answer, since they may have to wait for a processor."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipeline.bench.host.session.SILENCE", 3.0)
-        for module in ("session", "serial_line"):
-            patch.setattr(f"pipeline.bench.host.{module}.FIRST_LINE", 5.0)
+        patch.setattr("pipeline.bench.run.SILENCE", 3.0)
+        for module in ("run", "serial_line"):
+            patch.setattr(f"pipeline.bench.{module}.FIRST_LINE", 5.0)
         yield
 
 
@@ -185,8 +185,8 @@ def real(real_bench: Emulator) -> Emulator:
 
     A run of ten lines, which no test records, marks the end of the earlier tests' events.
     """
-    from pipeline.bench.host.serial_line import open_line
-    from pipeline.bench.protocol.messages import Hands, Start, Wave
+    from pipeline.bench.serial_line import open_line
+    from pipeline.protocol import Hands, Start, Wave
 
     with open_line(real_bench.address, baud=115_200) as line:
         line.send(Hands(), Start(wave=Wave.DELTA, frequency=100.0, amplitude=0))

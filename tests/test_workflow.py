@@ -11,13 +11,13 @@ from numpy.testing import assert_allclose
 from scipy.io import loadmat
 
 from pipeline.errors import DataError
-from pipeline.estimation.chain.follow import follow
-from pipeline.exchange.saved import matlab_file
+from pipeline.estimation.record_fit import follow
 from pipeline.json_files import json_text
 from pipeline.notebook import Lab
 from pipeline.plant.chain import PRESETS
 from pipeline.report.draft.content import build_document
 from pipeline.report.render.html import render_html
+from pipeline.report.saved_tables import matlab_file
 from pipeline.report.solution.write import build_solution
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission

@@ -12,8 +12,8 @@ from pipeline.cli.common import Folder, app
 from pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
-    from pipeline.bench.live.observer import Buttons, Observer
-    from pipeline.bench.live.terminal import Terminal
+    from pipeline.bench.events import Buttons, Observer
+    from pipeline.bench.terminal import Terminal
 
 
 @app.command()
@@ -44,7 +44,7 @@ def acquire(
     ] = False,
 ) -> None:
     """Record the plan on a bench, or import files as they appear, into a submission."""
-    from pipeline.bench.live.terminal import Terminal
+    from pipeline.bench.terminal import Terminal
 
     if (port is None) == (source is None):
         raise ConfigError("state where the data come from: either --port or --import")
@@ -84,7 +84,7 @@ def watching(
     if not web:
         yield [terminal], None
         return
-    from pipeline.bench.live.live_page import LivePage
+    from pipeline.bench.live_page import LivePage
 
     with LivePage(folder) as page:
         terminal.remark(f"watch{'' if yes else ' and confirm'} at {page.url}")
@@ -100,7 +100,7 @@ def _record(
     buttons: "Buttons | None",
     only: Collection[str],
 ) -> None:
-    from pipeline.bench.host.acquire import acquire as carry_out
+    from pipeline.bench.acquire import acquire as carry_out
 
     try:
         outcomes = carry_out(folder, port=port, observers=observers, only=only, buttons=buttons)
@@ -124,7 +124,7 @@ def _record(
 
 
 def _import(folder: Path, source: Path, terminal: "Terminal", *, once: bool) -> None:
-    from pipeline.bench.host.importing import Importer
+    from pipeline.bench.importing import Importer
     from pipeline.lock import lock_or_refuse
 
     if not folder.exists():  # the imported files do not state the number of carts

@@ -24,7 +24,7 @@ def demo(
     from pipeline.output import named_folder
     from pipeline.report.draft.write import Files
     from pipeline.resources import EXAMPLES
-    from pipeline.simulated.classroom import PLANTED, PRESET, write_class
+    from pipeline.simulated.examples import PLANTED, PRESET, write_class
 
     out = named_folder(out)
     with search_beside(out) as beside:

@@ -42,7 +42,7 @@ def emulate(
     ] = False,
 ) -> None:
     """Run a virtual bench that speaks the serial protocol; print its address on stderr."""
-    from pipeline.simulated.emulator.announce import RunningBench, announced
+    from pipeline.simulated.emulator.links import RunningBench, announced
     from pipeline.simulated.emulator.server import EmulatorOptions, Server
     from pipeline.simulated.hidden import prepare_bench
 

@@ -34,9 +34,9 @@ def explore(
     ] = False,
 ) -> None:
     """Record, identify, analyse the gap and choose the next recording, until the goal is met."""
-    from pipeline.bench.live.terminal import Terminal
-    from pipeline.experiments.exploring.at_bench import explore_bench
-    from pipeline.experiments.exploring.error_goal import read_error_goal, read_time
+    from pipeline.bench.explore import explore_bench
+    from pipeline.bench.terminal import Terminal
+    from pipeline.experiments.goal import read_error_goal, read_time
     from pipeline.report.exploration import NAME
 
     goal, seconds = read_error_goal(until), read_time(limit)

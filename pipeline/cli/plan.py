@@ -30,10 +30,10 @@ def plan(
     as_json: AsJson = False,
 ) -> None:
     """Propose the experiments to record: write plan.toml, or add to it."""
-    from pipeline.bench.host.raw import known_commands
+    from pipeline.bench.raw import known_commands
     from pipeline.experiments.goal import WORST
     from pipeline.experiments.next_recordings import plan_next
-    from pipeline.experiments.plan_words import plan_data, plan_table
+    from pipeline.experiments.plan import plan_data, plan_table
     from pipeline.experiments.propose import current_plan, make_plan
     from pipeline.submission import load_submission
     from pipeline.words.text import with_symbols

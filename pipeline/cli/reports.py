@@ -331,10 +331,10 @@ def explain(
         out = named_folder(out) if out else own_folder(submission.folder, "gap")
         analysis = analyse(submission, design=False, progress=progress)
         # These imports load the compiled simulator.
-        from pipeline.exchange.model.saved import clear_model, save_model
         from pipeline.experiments.discriminate import propose_for
         from pipeline.gap.explain import investigate
         from pipeline.report.gap.verdict import terminal_verdict
+        from pipeline.report.model_files import clear_model, save_model
         from pipeline.report.render.folder import write_files
 
         found = investigate(analysis, budget=budget, progress=progress)

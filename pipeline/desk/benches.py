@@ -11,8 +11,8 @@ from typing import Any
 
 from starlette.responses import Response
 
-from pipeline.bench.live.live_page import press_button, stream_events
-from pipeline.bench.live.live_state import ShownSession
+from pipeline.bench.live_page import press_button, stream_events
+from pipeline.bench.live_state import ShownSession
 from pipeline.processes import LineProcess
 
 

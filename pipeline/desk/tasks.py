@@ -142,11 +142,11 @@ def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
 
 def make_gap(folder: str, *, progress: Progress) -> None:
     """Write the report on the gap into the submission's folder."""
-    from pipeline.exchange.model.saved import clear_model
     from pipeline.experiments.discriminate import propose_for
     from pipeline.gap.explain import investigate
     from pipeline.json_files import json_text
     from pipeline.report.gap.story import make_gap_files
+    from pipeline.report.model_files import clear_model
     from pipeline.report.render.folder import write_files
     from pipeline.workflow import analyse
 
@@ -201,11 +201,10 @@ def weigh_recording(
     folder: str, recording: dict[str, Any], goal: str, *, progress: Progress
 ) -> dict[str, Any]:
     """Return how much a typed recording would reduce the error, and how much the best one would."""
-    from pipeline.bench.host.raw import known_commands
-    from pipeline.experiments.plan import Recording
-    from pipeline.experiments.plan_words import what_words
+    from pipeline.bench.raw import known_commands
+    from pipeline.experiments.next_recordings import weigh as weighed
+    from pipeline.experiments.plan import Recording, what_words
     from pipeline.experiments.propose import current_plan
-    from pipeline.experiments.weigh import weigh as weighed
     from pipeline.workflow import analyse
 
     submission = load_submission(Path(folder))

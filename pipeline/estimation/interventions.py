@@ -10,15 +10,25 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 from pipeline.estimation.law_of_motion import ForceLeft, Seen, forces_left, see
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA
-from pipeline.estimation.sliding import most_around
 from pipeline.results import Intervention, Record
+
+T = TypeVar("T", bound=np.generic)
+
+
+def most_around(values: NDArray[T], width: int) -> NDArray[T]:
+    """Return, for each value, the largest of the `width` values centred on it; `width` is odd."""
+    padded = np.pad(values, width // 2, mode="edge")
+    return sliding_window_view(padded, width).max(axis=-1)
+
 
 _BULK = 2.0  # standard deviations of the law's residual, as in its fit
 # A burst must exceed the first multiple of `_BULK`. It begins and ends at the second multiple.

@@ -5,11 +5,11 @@ from math import ceil, floor
 from pathlib import Path
 from typing import Literal, get_args
 
-from pipeline.bench.protocol.messages import FREQUENCIES
 from pipeline.errors import ConfigError
 from pipeline.experiments.plan import Plan, Recording
 from pipeline.experiments.plan_file import add_recordings, recording_problems
 from pipeline.experiments.propose import EDGES, current_plan, let_go
+from pipeline.protocol import FREQUENCIES
 from pipeline.submission import Submission, load_submission
 
 RecordingKind = Literal["step", "sweep", "sine", "decay"]

@@ -13,7 +13,6 @@ from typing import Any, Self, TypeAlias
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.bench.protocol.messages import FULL_SCALE, Description, PidGains, StateGains
 from pipeline.errors import DataError
 from pipeline.experiments.plan import PidLoop, PlanLimits, Recording, StateLoop
 from pipeline.identify.remarks import is_reversed
@@ -28,6 +27,7 @@ from pipeline.plant.sampled_loop import (
     discretise,
     simulate_loop,
 )
+from pipeline.protocol import FULL_SCALE, Description, PidGains, StateGains
 from pipeline.results import Analysis, FeedbackDesign
 from pipeline.submission import Design, Submission
 

@@ -20,23 +20,21 @@ from typing import Self
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.bench.protocol.messages import Start, Tone, Wave
-from pipeline.bench.protocol.waves import shape_at
 from pipeline.errors import DataError
-from pipeline.estimation.chain.bode_points import Points, response_at, weighted_residuals
-from pipeline.estimation.chain.parametrisation import (
+from pipeline.estimation.bode_points import Points, response_at, weighted_residuals
+from pipeline.estimation.noise import noise_beyond_rounding, score_covariance
+from pipeline.estimation.parametrisation import (
     Parametrisation,
     critical_damping,
     parameter_jacobian,
 )
-from pipeline.estimation.chain.time_search import look
-from pipeline.estimation.chain.time_window import FitWindow, open_window, weighed
-from pipeline.estimation.colour import score_covariance
-from pipeline.estimation.noise import noise_beyond_rounding
+from pipeline.estimation.time_search import look
+from pipeline.estimation.time_window import FitWindow, open_window, weighed
 from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.experiments.propose import identified_chain
 from pipeline.plant.chain import Chain
 from pipeline.plant.simulate import SETTLED_DWELL, settling_wait, simulate_linear
+from pipeline.protocol import Start, Tone, Wave, shape_at
 from pipeline.results import Analysis, ChainFit, FrequencyResponse, Record, SinePoint
 
 

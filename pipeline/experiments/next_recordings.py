@@ -14,9 +14,8 @@ from pipeline.errors import ConfigError, DataError
 from pipeline.experiments.candidates import propose_candidates
 from pipeline.experiments.goal import GAP, WORST, Goal, check_goal, choose, find_goal
 from pipeline.experiments.information import Knowledge
-from pipeline.experiments.plan import Plan, PlanLimits, Recording
+from pipeline.experiments.plan import Plan, PlanLimits, Recording, session_time, time_words
 from pipeline.experiments.plan_file import add_recordings, plan_path
-from pipeline.experiments.plan_words import session_time, time_words
 from pipeline.experiments.propose import current_plan
 from pipeline.gap.types import read_gap
 from pipeline.ingest.read import read_data
@@ -291,3 +290,56 @@ def _promise(words: str, before: float, after: float) -> str:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.2g} %"
+
+
+# The fit treats the error of each sample as independent, but for a cart that hardly moves the
+# rounding error is the same in many samples.
+_WHY_WORSE = (
+    "the fit would be worse: the rounding errors of encoders do not average out while carts rest, "
+    "or move by few counts; try a larger motion, or a shorter run"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weighed:
+    """Relative errors: now, after only the proposed recording, and after only the best recording.
+
+    Attributes
+    ----------
+    words : the error to reduce, such as "the error of zeta_2".
+    why : why the proposed recording does not help, or even does harm; empty if it helps.
+    """
+
+    words: str
+    now: float
+    proposed: float
+    why: str
+    chosen: Recording
+    best: float
+
+
+def weigh(
+    analysis: Analysis, proposed: Recording, plan: Plan, *, goal: str, commands: frozenset[str]
+) -> Weighed:
+    """Compare a recording with the best recording for a goal that the plan's limits allow.
+
+    Raises
+    ------
+    DataError, ConfigError : see `choose_next`.
+    """
+    nothing_open = plan.model_copy(update={"recordings": ()})
+    found = choose_next(analysis, nothing_open, n=1, goal=goal, commands=commands)
+    known = Knowledge.of(analysis)
+    error = find_goal(goal, known, feedback=analysis.feedback).of
+    why = why_useless(proposed, known, limits=plan.limits)
+    after = found.now if why else float(error(known.information + known.of_recording(proposed)))
+    if after > 1.01 * found.now:  # 1 % is visible in two digits
+        why = _WHY_WORSE
+    return Weighed(
+        words=found.words,
+        now=found.now,
+        proposed=after,
+        why=why,
+        chosen=found.recordings[0],
+        best=found.errors[-1],
+    )

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from pipeline.bench.protocol.messages import FREQUENCIES, MOST_TONES
 from pipeline.errors import ConfigError
 from pipeline.experiments.plan import Plan, PlanLimits, Recording, StateLoop
 from pipeline.lock import lock_when_free
 from pipeline.output import write_file
+from pipeline.protocol import FREQUENCIES, MOST_TONES
 from pipeline.submission import Submission, System, load_submission
 from pipeline.submission.complaints import (
     Location,

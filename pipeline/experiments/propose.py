@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.bench.protocol.messages import CHIRP_SPAN, FULL_SCALE, Description
 from pipeline.errors import DataError
 from pipeline.experiments.gains import propose_pid
 from pipeline.experiments.plan import Plan, PlanLimits, Recording, StateLoop
@@ -27,6 +26,7 @@ from pipeline.plant.simulate import (
     settling_wait,
     steady_time,
 )
+from pipeline.protocol import CHIRP_SPAN, FULL_SCALE, Description
 from pipeline.results import Analysis, Stage
 from pipeline.submission import Design, Submission, System
 from pipeline.words.numbers import count

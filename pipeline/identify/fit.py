@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.estimation.chain.follow import Followed, find_misread, follow, most_follow, near
+from pipeline.estimation.record_fit import Followed, find_misread, follow, most_follow, near
 from pipeline.identify.log import Log
 from pipeline.names import own_zeta
 from pipeline.results import ChainFit, Estimate, FrequencyResponse, Record, Stage

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from pipeline.errors import DataError
-from pipeline.estimation.chain.follow import follow, is_driven
+from pipeline.estimation.record_fit import follow, is_driven
 from pipeline.identify.carts import Identified
 from pipeline.names import read_name
 from pipeline.plant.chain import Chain

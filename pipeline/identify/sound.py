@@ -6,7 +6,7 @@ from functools import partial
 from itertools import combinations
 
 from pipeline.errors import DataError
-from pipeline.estimation.chain.follow import Followed, follow, most_follow
+from pipeline.estimation.record_fit import Followed, follow, most_follow
 from pipeline.identify.carts import Identified, identify
 from pipeline.ingest.read import Ingested
 from pipeline.plant.chain import Chain

@@ -11,7 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.estimation.chain.follow import (
+from pipeline.estimation.record_fit import (
+    FASTEST,
+    TIME_FACTORS,
     Followed,
     Misread,
     force_on,
@@ -20,8 +22,7 @@ from pipeline.estimation.chain.follow import (
     most_follow,
     near,
 )
-from pipeline.estimation.chain.time_search import FOLLOWED
-from pipeline.estimation.units_and_clocks import FASTEST, TIME_FACTORS
+from pipeline.estimation.time_search import FOLLOWED
 from pipeline.plant.chain import Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Record, StepGain

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.estimation.chain.follow import measured
-from pipeline.estimation.units_and_clocks import LENGTH_SCALES
+from pipeline.estimation.record_fit import LENGTH_SCALES, measured
 from pipeline.ingest.channels import stuck_spans
 from pipeline.results import Record
 from pipeline.soundness.fault import SAME, WITNESSES, RecordingFault

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipeline.estimation.chain.channel_delay import ChannelDelay, find_channel_delays
+from pipeline.estimation.channel_delay import ChannelDelay, find_channel_delays
 from pipeline.results import LateChannel, Record
 from pipeline.soundness.fault import RecordingFault
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.estimation.chain.follow import Followed, Misread, find_misread
+from pipeline.estimation.record_fit import Followed, Misread, find_misread
 from pipeline.plant.chain import Chain
 from pipeline.results import Record
 from pipeline.soundness.fault import SAME, SAME_SIZE, WITNESSES, RecordingFault

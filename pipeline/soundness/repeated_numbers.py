@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.estimation.units_and_clocks import TIME_FACTORS
+from pipeline.estimation.record_fit import TIME_FACTORS
 from pipeline.names import gain_name, own_omega, own_zeta, read_name
 from pipeline.results import Check, Estimate, LogDecrement, StepGain
 from pipeline.soundness.fault import SAME_SIZE, SIGMAS, RecordingFault

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from pipeline.estimation.units_and_clocks import TIME_UNITS
+from pipeline.estimation.record_fit import TIME_UNITS
 from pipeline.ingest.columns import conversion
 from pipeline.results import Record
 from pipeline.set_up import Bench

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
-from pipeline.estimation.chain.parametrisation import ASSUMED_ZETA
+from pipeline.estimation.parametrisation import ASSUMED_ZETA
 from pipeline.estimation.record_transforms import transfer_ratio, visible_band
 from pipeline.names import (
     NULLS,

@@ -7,9 +7,8 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.estimation.colour import colour
 from pipeline.estimation.independent import inverse_of
-from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_left
+from pipeline.estimation.noise import colour, grain, noise_beyond_rounding, rounding_left
 from pipeline.results import Record, SinePoint
 
 FEW_COUNTS = 20  # encoder steps; smaller amplitudes are known only to a few percent

@@ -8,9 +8,8 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.estimation.colour import colour
 from pipeline.estimation.decay.ringing import find_poles, fit_ringing
-from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_left
+from pipeline.estimation.noise import colour, grain, noise_beyond_rounding, rounding_left
 from pipeline.estimation.peaks import extrema, plateaus
 from pipeline.results import Record, StepEdge, StepGain
 

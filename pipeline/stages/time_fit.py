@@ -16,14 +16,10 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.estimation.chain.parametrisation import (
-    Parametrisation,
-    critical_damping,
-    named_estimates,
-)
-from pipeline.estimation.chain.time_search import Attempt, condense, descend, look, search
-from pipeline.estimation.chain.time_window import FitWindow, open_window
-from pipeline.estimation.colour import long_run_variance, score_covariance
+from pipeline.estimation.noise import long_run_variance, score_covariance
+from pipeline.estimation.parametrisation import Parametrisation, critical_damping, named_estimates
+from pipeline.estimation.time_search import Attempt, condense, descend, look, search
+from pipeline.estimation.time_window import FitWindow, open_window
 from pipeline.names import read_name
 from pipeline.plant.chain import Chain
 from pipeline.results import ChainFit, Estimate, Record

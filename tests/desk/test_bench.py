@@ -14,7 +14,7 @@ from urllib.parse import urlencode
 
 import pytest
 
-from pipeline.bench.host.raw import read_raw
+from pipeline.bench.raw import read_raw
 from pipeline.desk.app import DeskServer
 from pipeline.experiments.plan_file import load_plan
 from pipeline.report.exploration.diary import NAME as DIARY

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from pipeline.errors import DataError
-from pipeline.estimation.chain.parametrisation import (
+from pipeline.estimation.parametrisation import (
     Parametrisation,
     even_chain,
     named_estimates,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter1d
 
-from pipeline.estimation.sliding import most_around
+from pipeline.estimation.interventions import most_around
 
 
 @pytest.mark.parametrize("width", [1, 3, 7, 61])

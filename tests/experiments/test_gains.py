@@ -7,7 +7,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.arrays import Array
-from pipeline.bench.protocol.messages import Description, Start, StateGains, Wave, encode
 from pipeline.errors import DataError
 from pipeline.experiments.gains import (
     CountScales,
@@ -19,6 +18,7 @@ from pipeline.experiments.gains import (
 from pipeline.experiments.plan import PidLoop, PlanLimits, Recording, StateLoop
 from pipeline.plant.chain import Chain
 from pipeline.plant.sampled_loop import LoopSetup, Pid, StateFeedback, discretise, simulate_loop
+from pipeline.protocol import Description, Start, StateGains, Wave, encode
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, FeedbackDesign
 from pipeline.simulated.emulator.core import ReferenceCore

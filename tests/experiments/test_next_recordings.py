@@ -7,7 +7,30 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.bench.protocol.messages import (
+from pipeline.errors import ConfigError, DataError
+from pipeline.experiments.candidates import (
+    low_peak_phases,
+    optimal_tones,
+    propose_candidates,
+    schroeder_phases,
+)
+from pipeline.experiments.goal import Goal, choose, find_goal
+from pipeline.experiments.information import Knowledge
+from pipeline.experiments.next_recordings import (
+    STATISTICAL,
+    _doubt,
+    choose_next,
+    weigh,
+    why_useless,
+)
+from pipeline.experiments.plan import Plan, PlanLimits, Recording
+from pipeline.experiments.plan_file import load_plan
+from pipeline.experiments.propose import extend_plan, propose_plan, renamed
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.limits import CALIBRATION
+from pipeline.plant.sampled_loop import LoopSetup, simulate_loop
+from pipeline.plant.simulate import simulate_linear
+from pipeline.protocol import (
     EXTENSIONS,
     Description,
     Start,
@@ -15,22 +38,8 @@ from pipeline.bench.protocol.messages import (
     Wave,
     encode,
     parse_reading,
+    target_at,
 )
-from pipeline.bench.protocol.waves import target_at
-from pipeline.errors import ConfigError, DataError
-from pipeline.experiments.candidates import propose_candidates
-from pipeline.experiments.goal import Goal, choose, find_goal
-from pipeline.experiments.information import Knowledge
-from pipeline.experiments.multisine import low_peak_phases, optimal_tones, schroeder_phases
-from pipeline.experiments.next_recordings import STATISTICAL, _doubt, choose_next, why_useless
-from pipeline.experiments.plan import Plan, PlanLimits, Recording
-from pipeline.experiments.plan_file import load_plan
-from pipeline.experiments.propose import extend_plan, propose_plan, renamed
-from pipeline.experiments.weigh import weigh
-from pipeline.plant.chain import PRESETS
-from pipeline.plant.limits import CALIBRATION
-from pipeline.plant.sampled_loop import LoopSetup, simulate_loop
-from pipeline.plant.simulate import simulate_linear
 from pipeline.resources import EXAMPLES
 from pipeline.simulated.emulator.core import ReferenceCore
 from pipeline.simulated.hidden import prepare_bench

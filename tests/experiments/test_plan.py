@@ -8,8 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.bench.protocol.messages import FULL_SCALE, Description, Start, Wave
-from pipeline.bench.protocol.waves import target_at
 from pipeline.cli import main
 from pipeline.errors import ConfigError, DataError
 from pipeline.experiments.by_hand import add_recording
@@ -18,6 +16,7 @@ from pipeline.experiments.plan_file import load_plan, plan_path, plan_text, save
 from pipeline.experiments.propose import AIM, extend_plan, let_go, make_plan, propose_plan
 from pipeline.plant.chain import PRESETS, quadratic_factors
 from pipeline.plant.simulate import SETTLED_DWELL, settling_wait, simulate_linear
+from pipeline.protocol import FULL_SCALE, Description, Start, Wave, target_at
 from pipeline.resources import EXAMPLES
 from pipeline.submission import (
     Design,

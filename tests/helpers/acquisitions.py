@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from pipeline.bench.live.observer import Anomalies, RunOutcome
-from pipeline.bench.protocol.messages import Reading
+from pipeline.bench.events import Anomalies, RunOutcome
 from pipeline.experiments.plan import Plan, PlanLimits, Recording
 from pipeline.experiments.plan_file import save_plan
+from pipeline.protocol import Reading
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
 from tests.helpers.waiting import started, until

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.sampled_loop import StateFeedback
 from pipeline.results import Record
-from pipeline.simulated import claims, runs
+from pipeline.simulated import runs, submission
 from pipeline.simulated.bench import COUNT, BenchRun, SimulatedBench, TrueMotion
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.stages.state_feedback import design_feedback
@@ -48,7 +48,7 @@ def move_class(
     teams = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        controller = _controller(claims.believed_chain(bench.chain, rng), bench)
+        controller = _controller(submission.believed_chain(bench.chain, rng), bench)
         own = [
             *runs.plan_decays(session, rng),  # since no two hands release a cart in the same way
             runs.plan_closed_loop(session, cart=min(2, bench.chain.n), controller=controller),

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipeline.bench.protocol.messages import Description, format_description
+from pipeline.protocol import Description, format_description
 from tests.helpers.places import ROOT
 
 FIRMWARE = ROOT / "firmware"
@@ -98,7 +98,7 @@ def kept_going(serve: Callable[[Callable[[], bool]], None]) -> Iterator[None]:
 
 # A bench that gets no processor time may be silent for a while.
 _PATIENT = (
-    "from pipeline.bench.host import session; session.SILENCE = 5.0; "
+    "from pipeline.bench import run; run.SILENCE = 5.0; "
     "from pipeline.cli import main; main()"
 )
 

@@ -11,9 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from unittest.mock import patch
 
-from pipeline.bench.host.serial_line import SerialLine
-from pipeline.bench.protocol.command_reader import CommandReader
-from pipeline.bench.protocol.messages import (
+from pipeline.bench.serial_line import SerialLine
+from pipeline.protocol import (
     EXTENSIONS,
     STOCK_STOP,
     Command,
@@ -26,7 +25,7 @@ from pipeline.bench.protocol.messages import (
     format_reading,
     parse_reading,
 )
-from pipeline.simulated.emulator.core import ReferenceCore
+from pipeline.simulated.emulator.core import CommandReader, ReferenceCore
 
 PER_COUNT = 0.002  # cm
 BENCH = Description(

@@ -7,26 +7,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.bench.host.experiments import add_experiment, recorded_entry
-from pipeline.bench.host.orders import make_order
-from pipeline.bench.host.record import data_file, log_text
-from pipeline.bench.protocol.messages import (
-    EXTENSIONS,
-    Description,
-    Hands,
-    Reading,
-    Start,
-    encode,
-    parse_reading,
-)
-from pipeline.experiments.exploring.exploration import Recorded
+from pipeline.bench.experiments import add_experiment, data_file, log_text, recorded_entry
+from pipeline.bench.orders import make_order
+from pipeline.experiments.exploration import Recorded
 from pipeline.experiments.gains import CountScales
-from pipeline.experiments.plan import PlanLimits, Recording
+from pipeline.experiments.plan import PlanLimits, Recording, session_time
 from pipeline.experiments.plan_file import load_plan, plan_path, save_plan
-from pipeline.experiments.plan_words import session_time
 from pipeline.experiments.propose import propose_plan
 from pipeline.output import write_file
 from pipeline.plant.augmented import simulate_augmented
+from pipeline.protocol import EXTENSIONS, Description, Hands, Reading, Start, encode, parse_reading
 from pipeline.simulated.bench import SimulatedBench
 from pipeline.simulated.emulator.carts import _NOISE, TRUE_PERIOD, VirtualCarts, input_per_count
 from pipeline.simulated.emulator.core import ReferenceCore

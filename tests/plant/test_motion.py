@@ -12,7 +12,7 @@ from pipeline.plant.augmented import simulate_augmented
 from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain, Effect, chain_scales
-from pipeline.plant.motion import STOP_TIME, EquationsOfMotion
+from pipeline.plant.export.motion import STOP_TIME, EquationsOfMotion
 from tests.helpers.effects import make_term
 
 CHAIN = PRESETS["throne-2dof"]

@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.grading.batch.grade_class import Options, grade_class
 from pipeline.grading.gradebook.book import Gradebook
-from pipeline.simulated.classroom import PRESET, write_class
+from pipeline.simulated.examples import PRESET, write_class
 
 
 @pytest.mark.slow

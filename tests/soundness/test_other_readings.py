@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.estimation.chain.follow import Followed, Misread
+from pipeline.estimation.record_fit import Followed, Misread
 from pipeline.results import Record
 from pipeline.soundness.other_readings import without_lone_factors
 

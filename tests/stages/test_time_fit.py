@@ -7,11 +7,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.errors import DataError
-from pipeline.estimation.chain.modal_response import find_modes
-from pipeline.estimation.chain.parametrisation import Parametrisation
-from pipeline.estimation.chain.time_search import search
-from pipeline.estimation.chain.time_window import compare, open_window, usable_segment, weighed
-from pipeline.estimation.colour import long_run_variance, score_covariance
+from pipeline.estimation.modal_response import find_modes
+from pipeline.estimation.noise import long_run_variance, score_covariance
+from pipeline.estimation.parametrisation import Parametrisation
+from pipeline.estimation.time_search import search
+from pipeline.estimation.time_window import compare, open_window, usable_segment, weighed
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.simulate import simulate_linear

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from pipeline.bench.protocol.messages import (
+from pipeline.protocol import (
     FULL_SCALE,
     ChirpEnd,
     Description,

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from pipeline.bench.protocol.messages import (
+from pipeline.protocol import (
     Description,
     PidGains,
     Reading,

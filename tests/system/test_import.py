@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pipeline.bench.host.importing import Importer
+from pipeline.bench.importing import Importer
 from pipeline.cli import app
 from pipeline.errors import ConfigError
 from pipeline.experiments.plan import Recording

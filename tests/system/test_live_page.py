@@ -18,12 +18,12 @@ import psutil
 import pytest
 from playwright.sync_api import expect
 
-from pipeline.bench.live.live_page import LivePage
-from pipeline.bench.live.live_state import LiveState
-from pipeline.bench.live.observer import Anomalies, RunOutcome
-from pipeline.bench.protocol.messages import HEARTBEAT_EVERY, Reading
+from pipeline.bench.events import Anomalies, RunOutcome
+from pipeline.bench.live_page import LivePage
+from pipeline.bench.live_state import LiveState
 from pipeline.errors import ConfigError, HardwareError
 from pipeline.experiments.plan import Plan, PlanLimits, Recording, StateLoop
+from pipeline.protocol import HEARTBEAT_EVERY, Reading
 from tests.helpers.accessibility import violations
 from tests.helpers.acquisitions import sine, write_work
 from tests.helpers.benches import emulator

@@ -9,7 +9,7 @@ from random import Random
 
 import pytest
 
-from pipeline.bench.host.importing import Importer
+from pipeline.bench.importing import Importer
 from pipeline.errors import ConfigError
 from pipeline.experiments.plan_file import load_plan, plan_path, plan_text
 from pipeline.experiments.propose import propose_plan

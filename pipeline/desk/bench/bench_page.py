@@ -10,7 +10,7 @@ from markupsafe import Markup
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
-from pipeline.bench.live.live_page import live_view
+from pipeline.bench.live_page import live_view
 from pipeline.desk.ask import Ask
 from pipeline.desk.bench.plan_rows import plan_ids, read_plan
 from pipeline.desk.bench.ports import list_ports, read_port
@@ -18,7 +18,7 @@ from pipeline.desk.benches import BenchSession
 from pipeline.desk.served_files import serve_file
 from pipeline.desk.typed import read_number, read_whole_number
 from pipeline.errors import ConfigError, PipelineError
-from pipeline.experiments.exploring.error_goal import read_error_goal
+from pipeline.experiments.goal import read_error_goal
 from pipeline.experiments.plan import Recording
 from pipeline.names import read_name
 from pipeline.report.exploration import NAME as DIARY

@@ -6,12 +6,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.bench.host.serial_line import port_names
+from pipeline.bench.serial_line import port_names
 from pipeline.desk.ask import Ask
 from pipeline.desk.ending import find_log
 from pipeline.errors import ConfigError
 from pipeline.output import write_file
-from pipeline.simulated.emulator.announce import running_benches
+from pipeline.simulated.emulator.links import running_benches
 
 _KEPT = 200  # folders whose port is remembered
 

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from pipeline.bench.host.acquire import acquire
-from pipeline.bench.live.live_state import FRAME, LiveState
+from pipeline.bench.acquire import acquire
+from pipeline.bench.live_state import FRAME, LiveState
 from pipeline.errors import PipelineError
 from pipeline.processes import answering, lines_sent
 
@@ -55,8 +55,8 @@ def _acquire(folder: Path, request: dict[str, Any], state: LiveState) -> str:
 
 def _explore(folder: Path, request: dict[str, Any], state: LiveState) -> str:
     """Explore; return a sentence on what is known at the end."""
-    from pipeline.experiments.exploring.at_bench import explore_bench
-    from pipeline.experiments.exploring.error_goal import read_error_goal, read_time
+    from pipeline.bench.explore import explore_bench
+    from pipeline.experiments.goal import read_error_goal, read_time
     from pipeline.words.text import with_symbols
 
     until, limit = request["explore"]

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.arrays import Array, ComplexArray
-from pipeline.estimation.colour import colour
 from pipeline.estimation.decay.separable import fit_separable
+from pipeline.estimation.noise import colour
 
 _MAX_EVALUATIONS = 100
 _MOST_GROWTH = 50.0  # bound of an exponent, against overflow

@@ -16,8 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.estimation.colour import score_covariance
-from pipeline.estimation.noise import noise_beyond_rounding
+from pipeline.estimation.noise import noise_beyond_rounding, score_covariance
 from pipeline.gap.data.runs import GapRun
 from pipeline.gap.fit.levenberg_marquardt import GapFit, Mapper, anchor
 from pipeline.gap.fit.linearise import (

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.estimation.chain.time_search import FOLLOWED
+from pipeline.estimation.time_search import FOLLOWED
 from pipeline.grading import limits
 from pipeline.grading.references.readings import readings
 from pipeline.names import read_name

@@ -45,7 +45,9 @@ def make_report(
     clear_files(out, "results.mat")  # left by an earlier report
     clear_files(tables, "*.csv")
     if files.tables:
-        from pipeline.exchange.saved import save_tables  # imported late, because it loads pandas
+        from pipeline.report.saved_tables import (
+            save_tables,
+        )  # imported late, because it loads pandas
 
         save_tables(analysis, out)
     return analysis, changes, draft

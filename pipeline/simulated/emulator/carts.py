@@ -6,9 +6,9 @@ from collections.abc import Generator
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.bench.protocol.messages import FULL_SCALE, Hands
 from pipeline.plant.augmented import SteppedBench
 from pipeline.plant.effect import AugmentedChain
+from pipeline.protocol import FULL_SCALE, Hands
 from pipeline.simulated.bench import ReleasingHand, SimulatedBench, before_stop
 
 TRUE_PERIOD = 1.0024e-3  # s between ticks, although the controller assumes 1 ms

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pipeline.arrays import Array
-from pipeline.estimation.chain.follow import find_misread, follow
+from pipeline.estimation.record_fit import find_misread, follow
 from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.plant.chain import PRESETS

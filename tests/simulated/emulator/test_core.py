@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.bench.protocol.messages import (
+from pipeline.plant.chain import Chain
+from pipeline.plant.sampled_loop import LoopSetup, Pid, StateFeedback, simulate_loop
+from pipeline.protocol import (
     EXTENSIONS,
     FULL_SCALE,
     Description,
@@ -14,10 +16,8 @@ from pipeline.bench.protocol.messages import (
     Wave,
     encode,
     parse_reading,
+    target_at,
 )
-from pipeline.bench.protocol.waves import target_at
-from pipeline.plant.chain import Chain
-from pipeline.plant.sampled_loop import LoopSetup, Pid, StateFeedback, simulate_loop
 from pipeline.simulated.emulator.core import ReferenceCore
 
 PERIOD = 1e-3

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 import serial
 
-from pipeline.bench.protocol.messages import (
+from pipeline.errors import ConfigError
+from pipeline.plant.chain import PRESETS
+from pipeline.protocol import (
     STOCK_STOP,
     WATCHDOG,
     Hands,
@@ -22,12 +24,10 @@ from pipeline.bench.protocol.messages import (
     parse_description,
     parse_reading,
 )
-from pipeline.errors import ConfigError
-from pipeline.plant.chain import PRESETS
 from pipeline.results import Record
 from pipeline.simulated.emulator.carts import TRUE_PERIOD, VirtualCarts
-from pipeline.simulated.emulator.faults import Faults, read_fault
 from pipeline.simulated.emulator.links import open_link
+from pipeline.simulated.emulator.server import Faults, read_fault
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.stages.log_decrement import fit_log_decrement
 from tests.helpers.benches import Emulator, emulator

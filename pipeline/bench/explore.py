@@ -1,0 +1,73 @@
+"""Explore a bench over a serial line, while people watch and intervene."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from pipeline.bench.acquire import acquire, ensure_plan
+from pipeline.bench.events import Buttons, Observer, Observers, Stopped
+from pipeline.bench.serial_line import Runaway
+from pipeline.experiments.exploration import Exploration, Recorded
+from pipeline.experiments.goal import ErrorGoal
+from pipeline.experiments.plan import Recording, session_time
+from pipeline.report.exploration.diary import Turn
+from pipeline.submission.load import NAME
+from pipeline.words.text import with_symbols
+
+
+def explore_bench(
+    folder: Path,
+    *,
+    port: str,
+    observers: Sequence[Observer],
+    buttons: Buttons | None,
+    goal: ErrorGoal,
+    seconds: float,
+    vetoes: Callable[[Recording], bool] = lambda recording: False,
+) -> tuple[Turn, ...]:
+    """Explore the bench at a port; return the turns.
+
+    Parameters
+    ----------
+    observers, buttons : see `acquire`. "skip" vetoes the chosen recording, before or during it;
+        "stop" ends the exploration, even during a computation.
+    goal, seconds, vetoes : see `Exploration`.
+
+    Raises
+    ------
+    Stopped : a signal or a button ended the exploration.
+    HardwareError, ConfigError, DataError : see `acquire` and `Exploration`.
+    """
+    everyone, buttons = Observers(observers), buttons or Buttons()
+
+    def record(ids: Sequence[str]) -> Recorded:
+        outcomes = acquire(folder, port=port, observers=observers, only=ids, buttons=buttons)
+        if astray := [o.partial for o in outcomes if o.is_astray]:
+            raise Runaway(f"{astray[-1]}; the exploration ends here")
+        made = tuple(o.recording.id for o in outcomes if not o.partial)
+        tried = [o.recording for o in outcomes if o.lines]
+        skipped = any(o.wish == "skip" for o in outcomes)
+        ends = dict.fromkeys(o.partial for o in outcomes if o.partial)
+        return Recorded(
+            ids=made,
+            seconds=session_time(tried),
+            vetoed=skipped and not made,
+            why=". Then: ".join(ends),
+        )
+
+    def think(stage: str) -> None:
+        if buttons.pressed == "stop":
+            raise Stopped("by hand")
+        everyone.thinking(stage)
+
+    if (folder / NAME).exists():
+        ensure_plan(folder, port=port)
+    exploration = Exploration(
+        folder=folder,
+        record=record,
+        goal=goal,
+        seconds=seconds,
+        announce=lambda sentence: everyone.thought(with_symbols(sentence)),
+        progress=think,
+        vetoes=vetoes,
+    )
+    return exploration.run()

@@ -1,1 +1,0 @@
-"""Views of a session: the terminal, a page in the browser."""

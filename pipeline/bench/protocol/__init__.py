@@ -1,1 +1,0 @@
-"""The messages between host and bench, and the clock of the bench."""

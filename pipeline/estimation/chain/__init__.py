@@ -1,1 +1,0 @@
-"""Fit a chain: its parameters, its response, and the residuals of records."""

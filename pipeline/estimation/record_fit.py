@@ -1,0 +1,276 @@
+"""How well records follow a chain, and what correction would make a record follow it.
+
+Apart from start and encoder zeros, the residual of a record is linear in the record's columns. So
+the best factors on the columns directly show which column has the wrong sign or unit.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import combinations
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.errors import DataError
+from pipeline.estimation.modal_response import Modes, find_modes
+from pipeline.estimation.parametrisation import Parametrisation
+from pipeline.estimation.time_search import FOLLOWED
+from pipeline.estimation.time_window import FitWindow, compare, open_window
+from pipeline.plant.chain import Chain
+from pipeline.results import Record
+from pipeline.set_up import Bench
+
+LENGTH_SCALES = (10.0, 100.0, 1000.0, 2.54, 25.4)  # between mm, cm, m and inches
+# For each factor of a time column in another unit: the name of the unit, in full and in headings.
+TIME_UNITS = {1e3: ("milliseconds", "ms"), 1e6: ("microseconds", "us")}
+TIME_FACTORS = {
+    **{factor: f"its time seems to be in {unit}" for factor, (unit, _) in TIME_UNITS.items()},
+    1e-3: "its time looks to be in thousands of seconds, or in seconds under a heading that says "
+    "ms (correct the heading)",
+    2.0: "its clock seems to run at twice the right speed",
+    0.5: "its clock seems to run at half the right speed",
+}
+FASTEST = 1e-4  # s between samples; no bench reads its encoders faster
+
+
+_ModesOf = Callable[[tuple[int, ...]], Modes]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Followed:
+    """How well a record follows a chain.
+
+    Attributes
+    ----------
+    lost : by cart, the share of its motion's power that neither chain nor noise explains.
+    missed : by cart, simulated minus measured position (n,).
+    reach : by cart, the root mean square of its motion, relative to the chain's motion.
+    friction : by cart, the largest dry friction that is compatible with `lost`, in input units.
+    """
+
+    lost: dict[int, float]
+    missed: dict[int, Array]
+    reach: dict[int, float]
+    friction: dict[int, float]
+
+    @property
+    def share(self) -> float:
+        """The mean of `lost` over the carts."""
+        return float(np.mean(list(self.lost.values())))
+
+    @property
+    def belongs(self) -> bool:
+        """Whether the record follows the chain."""
+        return self.share <= FOLLOWED
+
+
+@dataclass(frozen=True, kw_only=True)
+class Misread:
+    """The correction that makes a record follow the chain.
+
+    Attributes
+    ----------
+    words : a description of the mistake.
+    legal : whether the record may be right as it is.
+    remedy : what the student must do if all records of a bench contain the mistake.
+    scale : the ratio of the motion's unit to the input's, given if nothing else is wrong.
+    clock : the ratio of the record's time to the true time, given if nothing else is wrong.
+    """
+
+    words: str
+    remedy: str = "correct it in the files"
+    legal: bool = False
+    scale: float | None = None
+    clock: float | None = None
+
+
+def is_driven(record: Record) -> bool:
+    """Return whether a logged input that no controller chose moves the carts."""
+    driven = record.kind in ("step", "sine", "sweep") and 1 in record.free
+    return driven and record.u is not None and bool(np.ptp(record.u) > 0)
+
+
+def measured(record: Record) -> list[int]:
+    """Return the free carts that were measured."""
+    return [cart for cart in record.carts if cart in record.free]
+
+
+def follow(records: Sequence[Record], chain: Chain) -> dict[str, Followed]:
+    """Return, by id, how well each driven record follows the chain.
+
+    Records in which no measured cart moves are skipped.
+    """
+    modes = _modes(chain)
+    found = {r.id: _hold_against(r, chain, modes) for r in records if is_driven(r)}
+    return {name: fit for name, fit in found.items() if fit}
+
+
+def most_follow(fits: Mapping[str, Followed]) -> bool:
+    """Return whether at least half of the records follow the chain; true without records."""
+    return 2 * sum(fit.belongs for fit in fits.values()) >= len(fits)
+
+
+def near(record: Record, chain: Chain) -> list[Followed]:
+    """Return how well a record follows slightly slower or faster copies of the chain.
+
+    A spring that stiffens, or an input that arrives late, shifts resonances by some percent. At a
+    resonance, this changes the whole motion of a dwell.
+    """
+    modes = _modes(chain)
+    # Scaling the time of the record is the same as scaling the chain's frequencies.
+    detuned = [replace(record, t=factor * record.t) for factor in np.linspace(0.85, 1.15, 13)]
+    return [fit for other in detuned if (fit := _hold_against(other, chain, modes))]
+
+
+def find_misread(
+    record: Record, chain: Chain, fit: Followed, *, better: float = 10.0
+) -> Misread | None:
+    """Return the correction with which a record follows the chain better by a given factor.
+
+    Parameters
+    ----------
+    fit : how the record follows the chain without correction.
+    better : smallest factor by which the residual must fall.
+    """
+    found, least = None, min(fit.share / better, FOLLOWED)
+    # The rest of the residual of a good record is friction, which no correction removes.
+    if better > 1 and fit.share < 0.005:
+        return None
+    # Use the sign convention of the bench: this record's own sign was found from its data.
+    record = (
+        replace(record, u=0.0 - record.u)
+        if record.sign_reversed and record.u is not None
+        else record
+    )
+    modes = _modes(chain)
+    for misread, other in _readings(record, modes):
+        held = _hold_against(other, chain, modes)
+        # A different sign is legal, but then the residual must be below 2 %. With a long delay
+        # instead, it would be larger.
+        if held and held.share <= (min(least, 0.02) if misread.legal else least):
+            found, least = misread, held.share
+    return found
+
+
+def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record]]:
+    for i, j in combinations(measured(record), 2):
+        rows = list(range(len(record.carts)))
+        a, b = record.carts.index(i), record.carts.index(j)
+        rows[a], rows[b] = b, a
+        words = f"x{i} and x{j} look swapped"
+        other = replace(record, y=record.y[rows], resolution=record.resolution[rows])
+        remedy = f'state columns = {{ x{i} = "x{j}", x{j} = "x{i}" }} for each'
+        yield Misread(words=words, remedy=remedy), other
+    for factor, words in TIME_FACTORS.items():
+        if record.sample_time >= factor * FASTEST:  # over too short a time, any curve fits
+            yield Misread(words=words, clock=factor), replace(record, t=record.t / factor)
+    try:
+        window = open_window(record)
+    except DataError:
+        return
+    # Rounding can change a motion below five encoder steps by any factor.
+    if np.any(np.ptp(window.y, axis=1) < 5.0 * np.sqrt(12) * window.stated_sigma):
+        return
+    if (said := _describe_mistake(window.carts, _weights(window, modes(window.free)))) is not None:
+        misread, factors = said
+        by_cart = dict(zip(window.carts, factors, strict=True))
+        rows = np.array([by_cart.get(cart, 1.0) for cart in record.carts])
+        yield (
+            misread,
+            replace(record, y=rows[:, None] * record.y, resolution=abs(rows) * record.resolution),
+        )
+
+
+def _weights(window: FitWindow, modes: Modes) -> Array:
+    """Return the factors (p,) on the columns of the record for which it follows the chain best."""
+    driven = compare(replace(window, y=0 * window.y), modes).residual.ravel()
+    alone = [
+        compare(replace(window, drive_u=None, y=window.y * row[:, None]), modes).residual.ravel()
+        for row in np.eye(len(window.carts))
+    ]
+    best, *_ = np.linalg.lstsq(-np.array(alone).T, driven, rcond=None)
+    return np.asarray(best, dtype=np.float64)
+
+
+def _describe_mistake(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
+    """Describe the mistake that these factors on the columns would correct; None if unknown.
+
+    A wrong unit applies to the whole file. A single cart with a small motion is not a wrong unit:
+    it may just be near its null.
+    """
+    sign, size = np.sign(weights), np.abs(weights)
+    # Smaller factors do not count, since an amplifier at its limit reduces the input by 2 or 3.
+    scales = [scale for scale in LENGTH_SCALES if scale >= 10.0]
+    for scale in (*scales, *(1 / scale for scale in scales)):
+        # A factor may be off by 10 %, as the known factors are at least 2.5 apart.
+        if np.all(np.abs(size * scale - 1) < 0.1) and len(set(sign)) == 1:
+            words = (
+                "its positions or its input seem to be in another unit: the recorded motion is "
+                f"{scale:.3g} times the motion that the input causes"
+            )
+            return Misread(words=words, scale=scale), sign / scale
+    turned = [f"x{cart}" for cart, s in zip(carts, sign, strict=True) if s < 0]
+    if len(turned) == len(carts):
+        return Misread(words="its input seems to have the opposite sign", legal=True), sign
+    if turned:
+        return Misread(words=f"the sign of {' and '.join(turned)} looks reversed"), sign
+    return None
+
+
+# ---------------------------------------------------------- one record and the chain
+
+
+def _modes(chain: Chain) -> _ModesOf:
+    """Return a function that finds the chain's modes for given free carts, without derivatives."""
+    P = Parametrisation(bench=Bench(springs=tuple(bool(k) for k in chain.k)))
+
+    @cache
+    def find(free: tuple[int, ...]) -> Modes:
+        modes = find_modes(chain, free=free, parametrisation=P, dp_dtheta=np.zeros(len(P.names)))
+        return replace(
+            modes,
+            d_poles=modes.d_poles[:0],
+            d_shapes=modes.d_shapes[:0],
+            d_entry=modes.d_entry[:0],
+            d_drive=modes.d_drive[:0],
+        )
+
+    return find
+
+
+def _hold_against(record: Record, chain: Chain, modes: _ModesOf) -> Followed | None:
+    try:
+        window = open_window(record)
+        residual = compare(window, modes(window.free)).residual * window.sigma[:, None]
+    except DataError:  # nothing moves, or the motor does not reach the last cart
+        return None
+    power = np.var(window.y, axis=1)
+    excess = np.mean(residual**2, axis=1) - window.stated_sigma**2  # beyond encoder steps and noise
+    lost = np.maximum(excess, 0.0) / power
+    reach = np.sqrt(power) / np.maximum(np.std(window.y + residual, axis=1), window.stated_sigma)
+    # In simulations, carts with dry friction F under a force of amplitude A leave a share of at
+    # least (F / 5A)² if they move at all. This is doubled here. Encoder steps and noise hide
+    # smaller shares.
+    return Followed(
+        lost=dict(zip(window.carts, lost.tolist(), strict=True)),
+        missed=dict(zip(window.carts, residual, strict=True)),
+        reach=dict(zip(window.carts, reach.tolist(), strict=True)),
+        friction={
+            cart: float(10.0 * np.sqrt(max(share, 1e-4)) * np.ptp(force) / 2)
+            for cart, share in zip(window.carts, lost, strict=True)
+            if share <= FOLLOWED and (force := force_on(record, chain, cart=cart)) is not None
+        },
+    )
+
+
+def force_on(record: Record, chain: Chain, *, cart: int) -> Array | None:
+    """Return the force (n,) on a cart from the input and its neighbours; None if unknown."""
+    assert record.u is not None
+    force = record.u if cart == 1 else np.zeros_like(record.u)
+    for neighbour, k in ((cart - 1, chain.k[cart - 1]), (cart + 1, chain.k[cart])):
+        if neighbour in record.carts:
+            force = force + k * record.position(neighbour)
+        elif neighbour in record.free:
+            return None
+    return force

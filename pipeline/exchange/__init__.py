@@ -1,1 +1,0 @@
-"""Export an analysis for other programs: tables for pandas, variables for MATLAB, models."""

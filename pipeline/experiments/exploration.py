@@ -1,0 +1,355 @@
+"""Record, identify, look for the gap and choose again, until all is known or time is up."""
+
+import gc
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.bench.raw import known_commands
+from pipeline.errors import ConfigError, DataError
+from pipeline.estimation.parametrisation import named_estimates
+from pipeline.experiments.by_hand import add_recording
+from pipeline.experiments.choice import SETTLED, choose_recordings
+from pipeline.experiments.discriminate import propose_for
+from pipeline.experiments.goal import GAP, ErrorGoal
+from pipeline.experiments.plan import Recording, session_time, time_words
+from pipeline.experiments.plan_file import load_plan, plan_path, save_plan
+from pipeline.experiments.propose import FIRST_SWEEP_TIME, propose_plan
+from pipeline.experiments.turn import (
+    WORDS,
+    describe_accuracy,
+    describe_doubt,
+    list_explanations,
+    relative_errors,
+)
+from pipeline.gap.explain import investigate
+from pipeline.gap.types import Gap
+from pipeline.json_files import json_text
+from pipeline.names import parameter_names
+from pipeline.output import own_folder, write_file
+from pipeline.report.exploration.diary import Turn, write_diary
+from pipeline.results import Analysis, Stage
+from pipeline.submission import System, load_submission
+from pipeline.submission.load import NAME
+from pipeline.submission.models import MOST_CARTS
+from pipeline.words.numbers import listing
+from pipeline.words.progress import Progress, silent
+from pipeline.words.text import capital
+from pipeline.workflow import analyse
+
+_FIRST = "sweep"  # the first recording that the plan proposes; nobody has to hold a cart for it
+_SEARCH = 300.0  # s, limit of one search for the gap; most take ten
+# most recordings in a row that distinguish explanations; then another purpose comes first
+_OFTEN = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """The result of the requested recordings.
+
+    Attributes
+    ----------
+    ids : ids of the recordings that were made.
+    seconds : total time of all attempts, in s.
+    vetoed : whether recordings are missing because a person at the bench refused them.
+    why : why requested recordings are missing; empty if none are, or if the reason is unknown.
+    """
+
+    ids: tuple[str, ...]
+    seconds: float
+    vetoed: bool = False
+    why: str = ""
+
+
+@dataclass(kw_only=True)
+class Exploration:
+    """An exploration of a bench, turn by turn; a submission collects its recordings.
+
+    After each turn, the folder holds the submission, gap/gap.json and the diary. A recording that a
+    person adds to plan.toml takes precedence over cartlab's choice.
+
+    Attributes
+    ----------
+    folder : the submission's folder.
+    record : function that makes recordings of the plan, given by their ids. Its first call also
+        makes submission and plan if they are missing.
+    goal : the errors to reach.
+    seconds : time allowed at the bench, including rests. A recording that would exceed it is not
+        begun. Each interrupted attempt counts in full.
+    announce : function that is called with a sentence in each turn.
+    progress : function that is called often with a few words during computations. An exception that
+        it raises ends the exploration.
+    vetoes : function that returns whether a person refuses the chosen recording; if so, another one
+        is chosen.
+    turns : the knowledge after each turn.
+    made : ids of the recordings made since the last turn.
+    spent : time spent at the bench, in s.
+    ours : ids in the plan that cartlab added. All other recordings without data were added by a
+        person.
+    refused : recordings that were vetoed or failed.
+    asked : recordings that were made to decide between explanations.
+    lost : the reason why the last chosen recording is missing; empty if it was made.
+    failures : number of failures in a row.
+    """
+
+    folder: Path
+    record: Callable[[Sequence[str]], Recorded]
+    goal: ErrorGoal
+    seconds: float
+    announce: Progress
+    progress: Progress = silent
+    vetoes: Callable[[Recording], bool] = lambda recording: False
+    turns: list[Turn] = field(default_factory=list)
+    made: tuple[str, ...] = ()
+    spent: float = 0.0
+    ours: set[str] = field(default_factory=lambda: {_FIRST})
+    refused: list[Recording] = field(default_factory=list)
+    asked: list[Recording] = field(default_factory=list)
+    lost: str = ""
+    failures: int = 0
+
+    def run(self) -> tuple[Turn, ...]:
+        """Explore until all is known, nothing would help or time is up; return the turns.
+
+        Raises
+        ------
+        DataError : the first recordings do not identify the carts.
+        ConfigError : the carts have no parameter that the goal names, or the first sweep alone
+            takes too long.
+        """
+        self._begin()
+        self._analyse()
+        while recordings := self._take_turn():
+            self._try_out(recordings)
+        return tuple(self.turns)
+
+    def _begin(self) -> None:
+        """Make the first recordings of an empty submission, after checking the goal."""
+        submission = load_submission(self.folder) if (self.folder / NAME).exists() else None
+        self._check_goal(submission and submission.system)
+        known = submission is not None and bool(submission.experiments)
+        planned = submission is not None and plan_path(submission).exists()
+        first = FIRST_SWEEP_TIME
+        if submission and planned:
+            plan = load_plan(submission)
+            self.ours.update(one.id for one in plan.recordings)
+            first = session_time([one for one in plan.recordings if one.id == _FIRST])
+        if not known:
+            if first > self.seconds:
+                raise ConfigError(
+                    f"--time: the first sweep alone takes {time_words(first)}, "
+                    f"more than the {time_words(self.seconds)} allowed"
+                )
+            self._record([_FIRST])
+        submission = load_submission(self.folder)
+        usual = propose_plan(submission)
+        if not plan_path(submission).exists():
+            save_plan(usual, submission)
+        if not planned:
+            self.ours.update(one.id for one in usual.recordings)
+        if not known:
+            recordings = load_plan(submission).recordings
+            steps = [one for one in recordings if one.kind == "step" and not one.release]
+            if steps and self._has_time_for(steps):
+                self._record([step.id for step in steps])
+
+    def _check_goal(self, system: System | None) -> None:
+        """Refuse a goal that the carts cannot meet.
+
+        If `system` is None, the number of carts is not known yet.
+        """
+        if system:
+            names = parameter_names(system.carts, rigid=not system.bench.tied)
+        else:
+            of_any = (name for n in range(1, MOST_CARTS + 1) for name in parameter_names(n))
+            names = (*parameter_names(1, rigid=True), *of_any)
+        self.goal.missing(dict.fromkeys(names))
+
+    def _record(self, ids: Sequence[str]) -> Recorded:
+        recorded = self.record(ids)
+        self.made += recorded.ids
+        self.spent += recorded.seconds
+        return recorded
+
+    def _has_time_for(self, recordings: Sequence[Recording]) -> bool:
+        return self.spent + session_time(recordings) <= self.seconds
+
+    def _analyse(self) -> None:
+        """Identify the carts and look for the gap with all data so far."""
+        if self.turns:  # their arrays and the new ones need not be in memory together
+            del self.analysis
+        self.gap: Gap | None = None
+        gc.collect()  # figures and searches are reference cycles with large arrays
+        analysis = analyse(load_submission(self.folder), progress=self.progress)
+        try:
+            self.gap = investigate(analysis, progress=self.progress, budget=_SEARCH)
+        except DataError as error:
+            self.announce(f"the search for the gap is not possible: {error}")
+        self._propose(analysis)
+        self.analysis = _identify_beside(analysis, self.gap)
+
+    def _propose(self, analysis: Analysis) -> None:
+        """Find the recording that best distinguishes the explanations; save it in gap.json."""
+        if self.gap is None:
+            return
+        often = [r for r in self.asked if sum(map(r.resembles, self.asked)) >= _OFTEN]
+        without = [*self.refused, *often]
+        self.gap = propose_for(self.gap, load_submission(self.folder), without=without)
+        place = own_folder(self.folder, "gap")
+        place.mkdir(exist_ok=True)
+        write_file(place / "gap.json", json_text(self.gap))
+
+    def _take_turn(self) -> tuple[Recording, ...]:
+        """Report what is known; add the next recordings to the plan and return them."""
+        self.progress("what to record next")
+        gap, errors = self.gap, relative_errors(self.analysis)
+        missing = self.goal.missing(errors)
+        recordings, why = self._choose(missing)
+        doubt = describe_doubt(gap) if gap else WORDS.text("no_look")
+        if gap and not gap.complete:
+            doubt += WORDS.text("search_ended", seconds=f"{_SEARCH:.0f}")
+        parts = [describe_accuracy(missing, errors), doubt, capital(why) or WORDS.text("the_end")]
+        why_ended = ""
+        if recordings and not self._has_time_for(recordings[:1]):
+            name = recordings[0].id
+            why_ended = WORDS.text("time_up", time=time_words(self.seconds), name=name)
+        # after three failures in a row, another choice does not help
+        elif recordings and self.failures >= 3:
+            why_ended = WORDS.text("none_came", count=self.failures)
+        if why_ended:
+            recordings = ()
+        # whether something useful was left undone
+        is_cut_short = bool(why_ended or (self.failures and not recordings))
+        turn = Turn(
+            seconds=self.spent,
+            recorded=self.made,
+            errors=errors,
+            verdict=gap.verdict if gap else "",
+            explanations=list_explanations(gap) if gap else (),
+            left=gap.final if gap else None,
+            floor=gap.noise_floor if gap else None,
+            reached=not missing and not is_cut_short and gap is not None and gap.verdict in SETTLED,
+            summary=". ".join(filter(None, [self.lost, *parts, why_ended])).replace("?. ", "? "),
+            gap=gap,
+        )
+        self.turns.append(turn)
+        self.made = ()
+        write_diary(self.turns, self.analysis, self.folder, wanted=self.goal.error)
+        self.announce(turn.summary)
+        return recordings
+
+    def _choose(self, missing: dict[str, float]) -> tuple[tuple[Recording, ...], str]:
+        """Return the next recordings as written in the plan, and their reason."""
+        plan, recordings = load_plan(load_submission(self.folder)), ()
+        try:
+            recordings, why = choose_recordings(
+                self.analysis,
+                self.gap,
+                plan,
+                missing=missing,
+                wanted=self.goal.error,
+                seconds=self.seconds - self.spent,
+                refused=self.refused,
+                commands=known_commands(self.folder),
+            )
+        except DataError as error:
+            why = str(error)
+        if added := self._added():  # during the computation
+            return (added,), WORDS.text("added", name=added.id)
+        if not recordings:
+            return (), why
+        still, planned = self._unrecorded(), []
+        for recording in recordings:
+            same = (o for o in still if o.aim == recording.aim and _shape(o) == _shape(recording))
+            planned.append(next(same, None) or add_recording(self.folder, recording))
+            still = [one for one in still if one.id != planned[-1].id]
+        key = "therefore" if len(planned) == 1 else "therefore_these"
+        names = listing([one.id for one in planned])
+        return tuple(planned), WORDS.text(key, name=names, why=why)
+
+    def _unrecorded(self) -> list[Recording]:
+        """Return the recordings of the plan that have no data."""
+        submission = load_submission(self.folder)
+        done = {experiment.id for experiment in submission.experiments}
+        return [one for one in load_plan(submission).recordings if one.id not in done]
+
+    def _added(self) -> Recording | None:
+        """Return the first recording without data that a person added to the plan."""
+        return next((one for one in self._unrecorded() if one.id not in self.ours), None)
+
+    def _try_out(self, recordings: Sequence[Recording]) -> None:
+        """Make the chosen recordings, and analyse all data again if there are new ones.
+
+        One that fails, or that a person adds to the plan, ends the series.
+        """
+        self.turns[-1] = self.turns[-1].without_other_traces()
+        self.ours.update(one.id for one in recordings)
+        for recording in recordings:
+            if self.made and (self._added() or not self._has_time_for([recording])):
+                break
+            if not self._comes(recording):
+                break
+        if self.made:
+            self._analyse()
+        else:
+            self._propose(self.analysis)  # find again which recording decides
+
+    def _comes(self, recording: Recording) -> bool:
+        """Make a recording; return whether it was made, or else remember why not."""
+        if self.vetoes(recording):
+            came = Recorded(ids=(), seconds=0.0, vetoed=True)
+        else:
+            came = self._record([recording.id])
+        if came.ids:
+            self.lost, self.failures = "", 0
+            if recording.aim == GAP:
+                self.asked.append(recording)
+            return True
+        self.refused.append(recording)
+        self.failures = 0 if came.vetoed else self.failures + 1
+        key = "vetoed" if came.vetoed else "lost_why" if came.why else "lost"
+        values = {"name": recording.id} | ({"why": came.why} if key == "lost_why" else {})
+        self.lost = WORDS.text(key, **values)
+        return False
+
+
+def _identify_beside(analysis: Analysis, gap: Gap | None) -> Analysis:
+    """Return the analysis with the carts as identified together with the effects of the gap.
+
+    Raises
+    ------
+    DataError : the carts could be identified neither with effects nor without.
+    """
+    fit, acting = analysis.fit, gap is not None and bool(gap.model.terms)
+    if fit is None or not (fit.converged or acting):
+        reasons = "; ".join(
+            one.reason for one in analysis.skipped if one.stage is Stage.FINAL_ESTIMATES
+        )
+        raise DataError(f"the carts are not identified: {reasons or 'see the report'}")
+    if gap is None or not acting:
+        return analysis
+    model, covariance = gap.model, gap.chain_covariance
+    if covariance is None or not model.chain.is_tied:
+        return analysis
+    names = tuple(gap.chain_std)
+    # With effects, the residual of the linear chain is not noise, so only the encoders' noise is
+    # used.
+    noise = {name: np.ones_like(left) for name, left in fit.standardised.items()}
+    parameters = named_estimates(model.chain, names=names, covariance=covariance, source="gap")
+    fit = replace(
+        fit,
+        chain=model.chain,
+        names=names,
+        covariance=covariance,
+        parameters=parameters,
+        standardised=noise,
+        converged=True,
+    )
+    return replace(analysis, fit=fit)
+
+
+def _shape(recording: Recording) -> str:
+    """Return the content of a recording without its name, for comparison."""
+    return recording.model_copy(update={"id": "", "note": "", "aim": ""}).model_dump_json()

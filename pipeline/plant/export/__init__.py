@@ -1,0 +1,1 @@
+"""The model for other programs: python-control, C, MATLAB and FMU."""

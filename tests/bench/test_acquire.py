@@ -1,0 +1,522 @@
+"""`acquire` carries out a plan on a virtual bench over a real line."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from pipeline.bench.acquire import acquire
+from pipeline.bench.events import Anomalies, RunOutcome
+from pipeline.bench.experiments import prepare_submission, readings_of
+from pipeline.bench.orders import make_order
+from pipeline.bench.raw import read_raw
+from pipeline.bench.run import Session
+from pipeline.bench.serial_line import open_line
+from pipeline.bench.terminal import Terminal, sparkline
+from pipeline.cli import app
+from pipeline.errors import ConfigError, HardwareError
+from pipeline.experiments.gains import CountScales
+from pipeline.experiments.plan import Plan, PlanLimits, Recording, StateLoop
+from pipeline.experiments.plan_file import load_plan
+from pipeline.ingest.read import read_data
+from pipeline.plant.chain import PRESETS
+from pipeline.protocol import Description, Reading
+from pipeline.submission import StateFeedbackController, System, load_submission
+from pipeline.workflow import analyse
+from tests.helpers.acquisitions import LIMITS, Notes, host, sine, until_bytes, write_work
+from tests.helpers.benches import emulator
+
+NEAR = PlanLimits(input=0.5, travel=0.1)  # cm: a dwell of 0.01 V passes it within its first swing
+
+
+class Alone(Notes):
+    """A session without a person at the bench, in which every instruction is refused."""
+
+    def confirm(self, instruction: str) -> None:
+        """Refuse the instruction."""
+        raise ConfigError(f"{instruction}: nobody")
+
+
+def decay(name: str, cart: int = 1) -> Recording:
+    """Return a decay of one cart that is released by hand."""
+    return Recording(
+        id=name,
+        kind="decay",
+        carts=(cart,),
+        wave="delta",
+        amplitude=0.0,
+        frequency=1 / 6.0,
+        release=cart,
+        settle=0.3,
+    )
+
+
+def last_run(bench) -> dict:
+    """Wait until a stop or the watchdog has ended a run; return the bench's report of it."""
+    while (sent := bench.event("run"))["ended"] not in ("stopped", "watchdog"):
+        pass
+    return sent
+
+
+# ----------------------------------------------------------------- a whole session
+
+
+def test_a_plan_becomes_a_submission(tmp_path, fast):
+    """Decays, a dwell and a closed loop of a plan each get a file and a table in the right units.
+
+    The virtual bench holds and releases its carts itself, so no person is asked. Existing comments
+    are kept.
+    """
+    loop = Recording(
+        id="control",
+        kind="closed_loop",
+        carts=(1, 2),
+        wave="square",
+        amplitude=0.3,
+        frequency=0.25,
+        controller=StateLoop(gains=(0.01, 0.002, 0.0, 0.0), prefilter=0.05),
+    )
+    # The carts must be identified before their loop is closed: a step and a sweep suffice.
+    step = Recording(
+        id="step",
+        kind="step",
+        carts=(1, 2),
+        wave="square",
+        amplitude=0.02,
+        frequency=0.1,
+        settle=0.5,
+    )
+    work = write_work(tmp_path / "work", [decay("decay-1"), step, sine("dwell", seconds=8), loop])
+    notes = Notes()
+    outcomes = acquire(
+        work, port=fast.address, observers=[notes], only=["decay-1", "step", "dwell", "control"]
+    )
+    whole = [outcome.recording.id for outcome in outcomes if not outcome.partial]
+    assert whole == ["decay-1", "step", "dwell", "control"]
+    assert all(asked.endswith("again") for asked in notes.confirmed)  # if the host was busy
+    submission = load_submission(work)
+    assert "# ours" in (work / "submission.toml").read_text(encoding="utf-8")
+    assert submission.system.position.per_count == 0.00227
+    records = {record.id: record for record in read_data(submission).records}
+    # Without friction, 0.02 V move the first cart of throne-2dof by 0.486 cm, at 24.3 cm per volt.
+    assert records["step"].y[0].max() > 0.45
+    assert records["decay-1"].free == (1,)
+    assert np.ptp(records["decay-1"].y[1]) == 0.0  # held
+    assert np.ptp(records["decay-1"].y[0]) > 1.5
+    assert records["dwell"].omega == pytest.approx(2 * np.pi * 2.0)
+    reference = records["control"].reference
+    assert reference is not None
+    # An amplitude is sent in whole counts of 0.00227 cm.
+    assert reference.max() == pytest.approx(0.3, abs=0.5 * 0.00227)
+    controller = next(e.controller for e in submission.experiments if e.id == "control")
+    assert isinstance(controller, StateFeedbackController)
+    # Commands carry nine digits, the table has six.
+    assert controller.gains == pytest.approx((0.01, 0.002, 0.0, 0.0), rel=1e-5)
+
+
+def test_a_folder_without_a_submission_gets_one(tmp_path):
+    """An empty folder gets a submission with the bench's description, and a plan."""
+    with emulator("--speed", "20", "--period", "5.003", preset="throne-1dof") as bench:
+        outcomes = acquire(
+            tmp_path / "new", port=bench.address, observers=[Notes()], only=["step-1"]
+        )
+    assert outcomes[-1].partial == ""
+    submission = load_submission(tmp_path / "new")
+    assert submission.system.carts == 1
+    assert submission.system.input.sign == 1
+    assert {"decay-1a", "step-2", "sweep"} <= {r.id for r in load_plan(submission).recordings}
+
+
+def test_existing_recordings_are_skipped(tmp_path, fast):
+    """A second session records only what is missing."""
+    work = write_work(tmp_path, [sine("a", seconds=1), sine("b", seconds=1)])
+    first = acquire(work, port=fast.address, observers=[Notes()], only=["a"])
+    notes = Notes()
+    second = acquire(work, port=fast.address, observers=[notes], only=["a", "b"])
+    assert {o.recording.id for o in first} == {"a"}
+    assert {o.recording.id for o in second} == {"b"}
+    assert notes.plans == [(2, frozenset("a"))]
+    assert [e.id for e in load_submission(work).experiments] == ["a", "b"]
+
+
+def test_a_stock_bench_is_driven_by_people(tmp_path):
+    """On a stock bench a person holds the carts, and no watchdog guards the motor."""
+    work = write_work(tmp_path, [sine("dwell", seconds=1, settle=0.3)], scales="")
+    text = (work / "submission.toml").read_text(encoding="utf-8")
+    scaled = text.replace('unit = "cm"', 'unit = "cm", per_count = 0.00227')
+    (work / "submission.toml").write_text(scaled, encoding="utf-8")
+    notes = Notes()
+    with emulator("--stock", "--speed", "5", "--period", "5.003") as bench:
+        *_, outcome = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
+    assert outcome.partial == ""
+    assert notes.confirmed[0] == "All carts free"
+    assert any("no watchdog" in remark for remark in notes.remarks)
+    (record,) = read_data(load_submission(work)).records
+    assert record.input_scale == 5 / 4096
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
+def test_a_pty_is_a_port_like_any_other(tmp_path):
+    """A plan can be recorded through a pseudo-terminal as well as through a socket."""
+    work = write_work(tmp_path, [sine("dwell", seconds=1)])
+    with emulator("--port", "pty", "--speed", "5") as bench:
+        *_, outcome = acquire(work, port=bench.address, observers=[Notes()], only=["dwell"])
+    assert outcome.partial == ""
+    assert outcome.lines == pytest.approx(1000 / 1.0024, abs=2)
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_the_whole_cycle_finds_the_hidden_effect(tmp_path):
+    """Plan, recordings, report and gap analysis find the dry friction hidden in a virtual bench."""
+    work = tmp_path / "work"
+    hidden = "coulomb_friction:cart=1,force=0.0025"
+    with emulator("--hide", hidden, "--speed", "20", "--period", "8.84") as bench:
+        outcomes = acquire(
+            work,
+            port=bench.address,
+            observers=[Notes()],
+            only=["decay-1a", "decay-2a", "step-1", "step-2", "sweep"],
+        )
+    assert {o.recording.id for o in outcomes if not o.partial} >= {"decay-1a", "step-1", "sweep"}
+    runner = CliRunner()
+    assert runner.invoke(app, ["report", str(work), "--no-pdf"]).exit_code in (0, 1)
+    assert runner.invoke(app, ["gap", str(work), "--no-pdf"]).exit_code == 0
+    gap = json.loads((work / "gap" / "gap.json").read_text(encoding="utf-8"))
+    assert gap["verdict"] == "named"
+    (effect,) = gap["effects"]
+    assert (effect["effect"], effect["where"]) == ("coulomb_friction", {"cart": 1})
+    force = effect["parameters"]["force"]
+    assert abs(force["value"] - 0.0025) < 4 * force["std"]
+    assert gap["gap"]["final"] < 1.5 * gap["gap"]["noise_floor"]
+
+
+# ----------------------------------------------------------------- what goes wrong
+
+
+def test_faults_of_every_kind_are_counted_and_the_rest_is_kept(tmp_path):
+    """With 1 % of the lines damaged in each way, good lines are kept and faults counted."""
+    work = write_work(tmp_path, [sine("dwell", seconds=8)])
+    options = [o for kind in ("drop", "garble", "merge") for o in ("--fault", f"{kind}=0.01")]
+    with emulator(*options, "--speed", "10") as bench:
+        *_, outcome = acquire(work, port=bench.address, observers=[Notes()], only=["dwell"])
+        while (sent := bench.event("run"))["ended"] != "done" or sent["lines"] < 7000:
+            pass
+    struck = sent["injected"]
+    spoilt = struck["drop"] + struck["garble"] + 2 * struck["merge"]
+    assert outcome.lines == sent["lines"] - spoilt
+    assert outcome.anomalies.garbled == struck["garble"] + struck["merge"]
+    # At the very beginning or end of a run, a lost line leaves no gap in the stamps.
+    assert abs(outcome.anomalies.lost - struck["drop"]) <= 2
+    submission = load_submission(work)
+    assert f"{outcome.anomalies.garbled} garbled" in submission.experiments[0].note
+    # The record is as good as a complete one: it gives the preset's gains at this frequency.
+    points = analyse(submission).sine_points
+    true = np.abs(PRESETS["throne-2dof"].frequency_response(np.array([points[0].omega])))[:, 0]
+    for point in points:
+        # The input of 10 mV is sent in counts of 0.12 mV; stamps are accurate to half a ms in 500.
+        assert point.gain == pytest.approx(true[point.cart - 1], rel=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("fault", "why"),
+    [
+        ("reset@0.6", "the bench restarted during the run"),
+        ("disconnect@0.6", "the line to the bench is gone"),
+    ],
+)
+def test_a_run_that_breaks_off_is_saved_as_partial_and_recorded_again(tmp_path, fault, why):
+    """A run that breaks off is saved as partial, where no report reads it, and is repeated.
+
+    The second try succeeds.
+    """
+    work = write_work(tmp_path, [sine("dwell", seconds=2)])
+    notes = Notes()
+    with emulator("--fault", fault) as bench:
+        outcomes = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
+    assert [bool(o.partial) for o in outcomes] == [True, False]
+    assert why in outcomes[0].partial
+    # The request to record again contains the reason.
+    assert notes.confirmed == [f"dwell ended early: {outcomes[0].partial}. Record dwell again"]
+    assert (work / "data" / "dwell.partial.txt").exists()
+    assert [e.file for e in load_submission(work).experiments] == ["data/dwell.txt"]
+    partial = readings_of(read_raw(work / "raw" / "dwell-1.raw"))
+    assert partial[-1].ms == pytest.approx(600, abs=20)
+
+
+def test_a_run_that_passes_the_travel_limit_is_stopped_at_once(tmp_path, real):
+    """A run that passes the travel limit is stopped at once and not added as an experiment."""
+    work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=NEAR)
+    (outcome,) = acquire(work, port=real.address, observers=[Alone()], only=["dwell"])
+    assert last_run(real)["ended"] == "stopped"
+    run = readings_of(read_raw(work / "raw" / "dwell-1.raw"))
+    offending = next(r.ms for r in run if max(map(abs, r.counts)) > NEAR.travel / 0.00227)
+    assert re.match(r"stopped: cart 1 was -?0.1\d* cm from its zero, the limit", outcome.partial)
+    assert_stopped_at_once(work / "raw" / "dwell-1.raw", offending)
+    assert load_submission(work).experiments == ()
+
+
+def test_a_run_that_passes_the_input_limit_is_stopped_at_once(tmp_path, real):
+    """A run that passes the input limit is stopped at once, whatever program set the input."""
+    recording, system = sine("dwell", seconds=4), System(carts=2, springs=(True,) * 3)
+    with open_line(real.address, baud=115_200) as line:
+        order = make_order(
+            recording,
+            limits=LIMITS,
+            scales=CountScales(input=line.bench.input_per_count, position=0.00227),
+            system=system,
+            bench=line.bench,
+        )
+        session = Session(line, carts=2, limits=LIMITS, observer=Notes())
+        raw = tmp_path / "dwell-1.raw"
+        outcome = session.record(replace(order, most_duty=50), raw)
+        assert last_run(real)["ended"] == "stopped"
+    offending = next(r.ms for r in readings_of(read_raw(raw)) if abs(r.duty) > 50)
+    assert re.match(r"stopped: the input was 0.006\d* V, the limit is 0.006", outcome.partial)
+    assert_stopped_at_once(raw, offending)
+
+
+def assert_stopped_at_once(raw: Path, offending: int) -> None:
+    """Check that the port was not read again after the offending line was found."""
+    run = read_raw(raw)
+    *_, last = [lump for lump, _ in run.lumps()]
+    seen = readings_of(replace(run, content=run.content[: -len(last)], arrivals=run.arrivals[:-1]))
+    assert not seen or offending >= seen[-1].ms
+
+
+def test_an_amplitude_past_the_limits_is_never_sent(tmp_path, real):
+    """A plan with an amplitude beyond its own limits is refused before anything is sent."""
+    work = write_work(tmp_path, [sine("dwell", seconds=1)])
+    plan = (work / "plan.toml").read_text(encoding="utf-8")
+    (work / "plan.toml").write_text(plan.replace("input = 0.5", "input = 0.005"), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"expected at most the limit of 0\.005 V, found 0\.01"):
+        acquire(work, port=real.address, observers=[Notes()])
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no SIGTERM to catch")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["ctrl-c", "sigterm"])
+def test_an_interrupted_host_stops_the_motor_and_saves(tmp_path, number, real):
+    """Ctrl-C or SIGTERM ends a run by a stop command, and the partial record is saved."""
+    work = write_work(tmp_path, [sine("dwell", seconds=30)])
+    with host(work, real.address, "--only", "dwell") as process:
+        until_bytes(work / "raw" / "dwell-1.raw", process)
+        process.send_signal(number)
+        _, said = process.communicate()
+    assert last_run(real)["ended"] == "stopped"
+    assert process.returncode == 130
+    assert "stopped; repeat the command to continue" in said
+    assert (work / "data" / "dwell.partial.txt").exists()
+    assert load_submission(work).experiments == ()
+
+
+def test_a_killed_host_leaves_a_readable_file_and_a_motor_that_is_off(tmp_path, fast):
+    """After `kill -9` the watchdog stops the motor, and the file lacks only the latest lines."""
+    work = write_work(tmp_path, [sine("dwell", seconds=10)])
+    with emulator(watchdog=2.0) as bench:
+        with host(work, bench.address, "--only", "dwell", "--yes") as process:
+            until_bytes(work / "raw" / "dwell-1.raw", process, least=20_000)
+            process.kill()
+        silent = bench.event("motor off")["ms_after_heartbeat"]
+        sent = last_run(bench)["lines"]
+    kept = readings_of(read_raw(work / "raw" / "dwell-1.raw"))
+    assert silent >= 1999
+    # The bench sent lines until its watchdog acted. Of those up to its last heartbeat, only lines
+    # that a busy machine had not yet delivered may be missing.
+    assert kept[-1].ms > 1.0024 * sent - silent - 500
+    notes = Notes()
+    *_, outcome = acquire(work, port=fast.address, observers=[notes], only=["dwell"])
+    assert outcome.partial == ""
+    assert "data/dwell.partial.txt holds the data of an interrupted session" in notes.remarks
+
+
+def test_a_stuck_encoder_is_reported(tmp_path):
+    """An encoder that does not move while the motor drives is counted and mentioned in a note."""
+    work = write_work(tmp_path, [sine("dwell", seconds=6)])
+    with emulator("--fault", "stuck=2@0.2", "--speed", "10", "--period", "5.003") as bench:
+        *_, outcome = acquire(work, port=bench.address, observers=[Notes()], only=["dwell"])
+    assert outcome.anomalies.stuck == 1
+    assert "1 encoder stuck" in load_submission(work).experiments[0].note
+
+
+# ----------------------------------------------------------------- ports and scales
+
+
+def test_a_port_without_a_bench_is_reported():
+    """If nothing listens at a port, one line says what to do."""
+    with pytest.raises(HardwareError, match="no bench listens there; start one"):
+        open_line("socket://127.0.0.1:9", baud=115_200)
+
+
+def test_a_missing_device_gets_the_list_of_ports():
+    """If a device does not exist, one line names the ports of this machine."""
+    with pytest.raises(HardwareError, match=r"no such port; is the bench plugged in\?; .*port"):
+        open_line("/dev/ttyNONE7", baud=115_200)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
+def test_a_port_in_use_is_reported():
+    """If another program has the port open, the message says so."""
+    controller, device = os.openpty()
+    import fcntl
+
+    fcntl.flock(device, fcntl.LOCK_EX)
+    try:
+        with pytest.raises(HardwareError, match="another program has this port open"):
+            open_line(os.ttyname(device), baud=115_200)
+    finally:
+        os.close(controller)
+        os.close(device)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
+def test_a_device_that_is_not_a_bench_is_reported():
+    """If a device does not answer like a bench, the message says so."""
+    controller, device = os.openpty()
+    echo = subprocess.Popen(
+        [sys.executable, "-c", f"import os\nwhile os.read({controller}, 99): "
+         f"os.write({controller}, b'login: ')"],
+        pass_fds=[controller],
+    )  # fmt: skip
+    try:
+        with pytest.raises(HardwareError, match="which is not a line of a bench"):
+            open_line(os.ttyname(device), baud=115_200)
+    finally:
+        echo.kill()
+        echo.wait()
+        os.close(controller)
+        os.close(device)
+
+
+BENCH = Description(
+    name="b",
+    encoders=2,
+    carts=2,
+    commands=frozenset("sk"),
+    position_unit="cm",
+    position_per_count=0.00227,
+)
+
+
+def test_scales_are_added_without_touching_the_rest(tmp_path):
+    """The bench's scales are added to [system], and all comments and the order of keys stay."""
+    text = """# first
+version = 1  # one
+
+[system]  # the bench
+carts = 2
+position = { unit = "cm" } # not yet scaled
+
+[design]
+cart = 1
+"""
+    (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
+    submission = prepare_submission(tmp_path, BENCH, stock=False)
+    assert submission.system.position.per_count == 0.00227
+    assert submission.system.input.per_count == 5 / 4096
+    new = (tmp_path / "submission.toml").read_text(encoding="utf-8")
+    for line in text.splitlines():
+        assert line.partition(" }")[0] in new
+
+
+@pytest.mark.parametrize("stock", [True, False])
+def test_an_unknown_scale_is_asked_for(tmp_path, stock):
+    """If the bench does not state its units, one line says what to add to the submission."""
+    text = 'version = 1\n[system]\ncarts = 2\nposition = { unit = "mm" }\n'
+    (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
+    wanted = r'position = \{ unit = "mm", per_count = … \} under \[system\]'
+    with pytest.raises(ConfigError, match=wanted):
+        prepare_submission(tmp_path, BENCH, stock=stock)
+
+
+def test_more_carts_than_encoders_is_refused(tmp_path):
+    """A submission of three carts is refused on a bench with two encoders."""
+    text = 'version = 1\n[system]\ncarts = 3\nposition = { unit = "cm" }\n'
+    (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match="has 3 carts, but the bench has 2 encoders"):
+        prepare_submission(tmp_path, BENCH, stock=False)
+
+
+@pytest.mark.parametrize("options", [[], ["--port", "x", "--import", "y"]])
+def test_a_port_and_a_folder_exclude_each_other(tmp_path, options):
+    """`acquire` with both a port and a folder to import, or with neither, is refused."""
+    result = CliRunner().invoke(app, ["acquire", str(tmp_path), *options])
+    assert isinstance(result.exception, ConfigError)
+    assert "either --port or --import" in str(result.exception)
+
+
+def test_an_unknown_id_gets_the_list_of_the_plan(tmp_path, real):
+    """`--only` with an unknown name gives the list of the plan's recordings."""
+    work = write_work(tmp_path, [sine("a", seconds=1)])
+    with pytest.raises(ConfigError, match=r"--only nine: no such recording; plan.toml has a$"):
+        acquire(work, port=real.address, observers=[Notes()], only=["nine"])
+
+
+# ----------------------------------------------------------------- the terminal
+
+
+def shown(*, terminal: bool, **options) -> tuple[Terminal, StringIO]:
+    """Return a terminal view and the text that it prints."""
+    out = StringIO()
+    return Terminal(console=Console(file=out, force_terminal=terminal, width=100), **options), out
+
+
+def test_the_terminal_shows_progress_faults_and_positions():
+    """During a run the terminal shows progress, lost lines and where the carts are."""
+    view, out = shown(terminal=True)
+    plan = Plan(limits=LIMITS, recordings=(sine("a", seconds=30), sine("b", seconds=45)))
+    with view:
+        view.planned(plan, frozenset("a"))
+        view.started(plan.recordings[1])
+        for ms in range(0, 2000, 50):
+            view.readings(
+                [Reading(counts=(ms, -ms), target=0, duty=0, ms=ms + i) for i in range(50)],
+                Anomalies(lost=7, stuck=1),
+            )
+    text = out.getvalue()
+    assert "1 of 2 recorded, 43 s left" in text
+    assert "b (sine): 2.0 of 45.0 s" in text
+    assert "7 lines lost, 1 encoder stuck" in text
+    assert sparkline(range(0, 2000, 50)) in text
+
+
+def test_without_a_terminal_only_bad_runs_are_reported():
+    """In a log file a good run leaves no line, and a bad run leaves its reason."""
+    view, out = shown(terminal=False)
+    well = RunOutcome(recording=sine("a", seconds=1), lines=998)
+    with view:
+        view.planned(Plan(limits=LIMITS, recordings=(well.recording,)), frozenset())
+        view.started(well.recording)
+        view.readings([Reading(counts=(1, 2), target=0, duty=0, ms=5)], Anomalies())
+        view.finished(well)
+        assert out.getvalue() == ""
+        view.finished(replace(well, partial="stopped: cart 1 [b] was too far"))
+    assert out.getvalue() == "a: stopped: cart 1 [b] was too far\n"
+
+
+def test_without_a_keyboard_nothing_is_confirmed(monkeypatch):
+    """Without a keyboard an instruction ends the session, unless `--yes` is given."""
+    monkeypatch.setattr("sys.stdin", StringIO())
+    view, _ = shown(terminal=False)
+    with pytest.raises(ConfigError, match=r"Hold cart 2: nobody is at the keyboard to confirm it"):
+        view.confirm("Hold cart 2")
+    view, out = shown(terminal=False, yes=True)
+    view.confirm("Hold cart 2")
+    assert out.getvalue() == "Hold cart 2: confirmed by --yes, continuing\n"
+
+
+@pytest.mark.parametrize(
+    ("values", "bars"), [([5, 5], "▁▁"), ([0, 7], "▁█"), (range(8), "▁▂▃▄▅▆▇█")]
+)
+def test_a_sparkline_has_a_bar_for_each_value(values, bars):
+    """A sparkline has one bar per value, scaled from lowest to highest; equal values are low."""
+    assert sparkline(values) == bars

@@ -1,0 +1,199 @@
+"""If a bench's clock, line or motor differs from what it states, the data are still kept."""
+
+import socket
+import threading
+import time
+import tracemalloc
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.bench.acquire import acquire
+from pipeline.bench.experiments import readings_of
+from pipeline.bench.raw import read_raw
+from pipeline.bench.stamps import fit_stamps
+from pipeline.protocol import (
+    EXTENSIONS,
+    Description,
+    Reading,
+    Signal,
+    Start,
+    Wave,
+    format_description,
+    format_reading,
+    target_at,
+)
+from pipeline.simulated.emulator.core import CommandReader
+from pipeline.submission import load_submission
+from tests.helpers.acquisitions import Notes, sine, write_work
+
+BENCH = Description(
+    name="odd",
+    encoders=2,
+    carts=2,
+    commands=EXTENSIONS - {"h"},
+    input_per_count=0.5 / 4096,
+    position_unit="cm",
+    position_per_count=0.002,
+)
+RUN = 4000  # ms
+NOTHING = Start(wave=Wave.DELTA, frequency=20.0, amplitude=0)
+
+
+class OddBench(threading.Thread):
+    """A bench on a socket that keeps to the protocol, but changes the lines of a run.
+
+    Parameters
+    ----------
+    lines : function from a run's correct lines to the lines that are sent.
+    late : further lines that arrive just after the first stop.
+    """
+
+    def __init__(
+        self, lines: Callable[[list[Reading]], Iterator[Reading]], *, late: Sequence[Reading] = ()
+    ) -> None:
+        super().__init__(daemon=True)
+        self._lines = lines
+        self._late = late
+        self._door = socket.create_server(("127.0.0.1", 0))
+        self.address = f"socket://127.0.0.1:{self._door.getsockname()[1]}"
+        self.start()
+
+    def run(self) -> None:
+        """Serve one host until it hangs up."""
+        peer, _ = self._door.accept()
+        reader = CommandReader(encoders=2, extensions=BENCH.commands)
+        with self._door, peer:
+            while heard := peer.recv(4096):
+                for command in reader.feed(heard):
+                    if command is Signal.QUERY:
+                        peer.sendall(format_description(BENCH))
+                    elif isinstance(command, Start):
+                        peer.sendall(b"".join(map(format_reading, self._lines(_whole(command)))))
+                    elif command is Signal.STOP and self._late:
+                        time.sleep(0.3)
+                        peer.sendall(b"".join(map(format_reading, self._late)))
+                        self._late = ()
+
+
+def _whole(start: Start) -> list[Reading]:
+    targets = [target_at(start, 1e-3 * ms) for ms in range(round(1e3 * start.duration))]
+    return [Reading(counts=(2 * r, r), target=r, duty=r, ms=ms) for ms, r in enumerate(targets)]
+
+
+def _with(reading: Reading, **changes: int) -> Reading:
+    return Reading(**{**vars(reading), **changes})
+
+
+def frozen(lines: list[Reading]) -> Iterator[Reading]:
+    """Freeze the clock from 0.5 s on."""
+    return (lines[min(r.ms, 500)] for r in lines)
+
+
+def never_began(lines: list[Reading]) -> Iterator[Reading]:
+    """Keep the clock at zero."""
+    return (lines[0] for _ in lines)
+
+
+def leapt(lines: list[Reading]) -> Iterator[Reading]:
+    """Advance the clock by a hundred days."""
+    return (_with(r, ms=r.ms if r.ms < 500 else r.ms + 8_640_000_000) for r in lines)
+
+
+@pytest.mark.parametrize(
+    ("lines", "said", "kept"),
+    [
+        (frozen, "the bench's clock hardly moves: 124 ms in 500 lines", 877),
+        (never_began, "the bench's clock hardly moves: 0 ms in 500 lines", 501),
+        (leapt, "the bench's time stamps jump from 0.499 to 8640000.500 s", 500),
+    ],
+)
+def test_a_clock_that_stops_or_leaps_ends_the_run(tmp_path, lines, said, kept):
+    """A run whose clock stops or leaps is ended as partial; the lines received so far are saved."""
+    work = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)])
+    tracemalloc.start()
+    outcomes = acquire(work, port=OddBench(lines).address, observers=[Notes()], only=["dwell"])
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert [outcome.partial[: len(said)] for outcome in outcomes] == [said] * 3
+    assert load_submission(work).experiments == ()
+    rows = (work / "data" / "dwell.partial.txt").read_text(encoding="utf-8").splitlines()[1:]
+    assert len(rows) == kept
+    assert len(readings_of(read_raw(work / "raw" / "dwell-1.raw"))) == kept
+    assert most < 50e6  # bytes
+
+
+def test_late_lines_of_the_previous_run_do_not_count(tmp_path):
+    """Lines of an earlier run that arrive late are not counted in the next run."""
+    first = iter([True])
+
+    def reset(lines: list[Reading]) -> Iterator[Reading]:
+        is_broken = len(lines) == RUN and next(first, False)
+        return (_with(r, ms=r.ms % 600) for r in lines[:700]) if is_broken else iter(lines)
+
+    bench = OddBench(reset, late=[_with(r, ms=r.ms + 50) for r in _whole(NOTHING)])
+    work = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)])
+    broken, again = acquire(work, port=bench.address, observers=[Notes()], only=["dwell"])
+    assert broken.partial.startswith("the bench restarted during the run")
+    assert (again.partial, again.lines, str(again.anomalies)) == ("", RUN, "none")
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.6])
+def test_any_number_of_lost_lines_is_counted(tmp_path, share):
+    """If the bench states its period, any number of missing lines is counted as lost and noted."""
+    lost = np.random.default_rng(5).random(RUN) < share
+
+    def thinned(lines: list[Reading]) -> Iterator[Reading]:
+        return (r for r in lines if not lost[r.ms])
+
+    work = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)])
+    (outcome,) = acquire(work, port=OddBench(thinned).address, observers=[Notes()], only=["dwell"])
+    assert outcome.partial == ""
+    assert outcome.anomalies.lost == pytest.approx(lost.sum(), rel=0.02)
+    assert f"{outcome.anomalies.lost} lines lost" in load_submission(work).experiments[0].note
+
+
+@pytest.mark.parametrize("lost", [(), (500, 1700, 1701)])
+def test_a_clock_slower_than_stated_loses_nothing(tmp_path, lost):
+    """A period of 1.3 ms instead of 1 ms is noted once, and only missing lines count as lost."""
+
+    def slow(lines: list[Reading]) -> Iterator[Reading]:
+        for k in range(round(len(lines) / 1.3)):
+            if k not in lost:
+                yield lines[int(1.3 * k)]
+
+    work, notes = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)]), Notes()
+    (outcome,) = acquire(work, port=OddBench(slow).address, observers=[notes], only=["dwell"])
+    assert outcome.partial == ""
+    assert outcome.anomalies.lost == len(lost)
+    assert len([r for r in notes.remarks if "every 1 ms, but it sends one every 1.3 ms" in r]) == 1
+
+
+@pytest.mark.parametrize("factor", [25, -1])
+def test_a_motor_driven_with_another_duty_than_the_target_is_stopped(tmp_path, factor):
+    """If the duty in open loop differs from the target, the run ends and is not repeated."""
+
+    def driven(lines: list[Reading]) -> Iterator[Reading]:
+        return (_with(r, duty=factor * r.duty) for r in lines)
+
+    work = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)])
+    (outcome,) = acquire(work, port=OddBench(driven).address, observers=[Notes()], only=["dwell"])
+    assert outcome.partial.startswith("stopped: the bench drives its motor with ")
+    assert load_submission(work).experiments == ()
+
+
+@given(
+    steps=st.lists(st.sampled_from([0, 0, 1, 1, 1, 2, 3, 7, 1000, 10**9]), max_size=60),
+    still=st.sampled_from([0, 1]),
+    period=st.sampled_from([0.5, 1.0, 1.0024, 1.3, 5.0, 1e6]),
+    stated=st.booleans(),
+)
+def test_any_stamps_have_a_clock(steps, still, period, stated):
+    """Time stamps that never decrease give a positive period and no negative number of losses."""
+    stamps = np.cumsum([0, *steps, *[still] * 60])
+    fit = fit_stamps(stamps, period=period, stated=stated)
+    assert fit.period > 0
+    assert fit.missing >= 0

@@ -1,0 +1,491 @@
+"""The motor never stays on, whatever happens to the line, the terminal or the plan."""
+
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+
+import pytest
+
+from pipeline.bench.acquire import acquire
+from pipeline.bench.events import Anomalies
+from pipeline.bench.experiments import readings_of
+from pipeline.bench.orders import make_order
+from pipeline.bench.raw import RawHeader, RawWriter, read_raw
+from pipeline.bench.run import Session
+from pipeline.bench.serial_line import open_line
+from pipeline.errors import ConfigError, DataError, HardwareError
+from pipeline.experiments.gains import CountScales
+from pipeline.experiments.plan import PlanLimits, Recording, StateLoop
+from pipeline.protocol import (
+    EXTENSIONS,
+    Command,
+    Description,
+    Reading,
+    Signal,
+    Start,
+    StateGains,
+    Wave,
+    encode,
+    parse_description,
+)
+from pipeline.simulated.emulator.core import ReferenceCore
+from pipeline.submission import System, load_submission
+from tests.helpers.acquisitions import LIMITS, Notes, host, sine, until_bytes, write_work
+from tests.helpers.benches import Emulator, emulator
+from tests.helpers.waiting import PATIENCE, started, until
+
+TWO_CARTS = System(carts=2, springs=(True,) * 3)
+
+
+class Alone(Notes):
+    """A session without a person at the bench, in which every instruction is refused."""
+
+    def confirm(self, instruction: str) -> None:
+        """Refuse the instruction."""
+        raise ConfigError(f"{instruction}: nobody")
+
+
+def test_lines_that_cannot_be_read_end_a_run(tmp_path):
+    """If lines cannot be read, no limit can be checked, so the motor is stopped."""
+    work = write_work(tmp_path, [sine("dwell", seconds=10)])
+    with emulator("--fault", "garble=1") as bench:
+        (outcome,) = acquire(work, port=bench.address, observers=[Alone()], only=["dwell"])
+        sent = bench.event("run")
+    assert outcome.partial == "stopped: the bench's lines cannot be read, so no limit is watched"
+    assert sent["ended"] == "stopped"
+    assert sent["lines"] < 5000
+
+
+def test_a_run_that_passed_a_limit_is_not_tried_again(tmp_path, fast):
+    """A run that passed a limit is not repeated, even with `--yes`."""
+    near = PlanLimits(input=0.5, travel=0.1)  # cm: the dwell passes it within its first swing
+    work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=near)
+    notes = Notes()
+    outcomes = acquire(work, port=fast.address, observers=[notes], only=["dwell"])
+    assert [outcome.partial[:14] for outcome in outcomes] == ["stopped: cart "]
+    assert notes.confirmed == []
+
+
+def test_a_plan_for_a_stronger_bench_moves_nothing(tmp_path, real):
+    """A plan for 5 V is refused on a bench of 0.5 V, and the message has both numbers."""
+    strong = PlanLimits(input=5.0, travel=2.5)
+    work = write_work(tmp_path, [sine("dwell", seconds=1)], limits=strong)
+    with pytest.raises(
+        ConfigError, match=r"input is 5 V, but this bench gives at most 0\.5 V.*Delete plan\.toml"
+    ):
+        acquire(work, port=real.address, observers=[Notes()])
+    with pytest.raises(queue.Empty):
+        real.event("run", timeout=0.5)
+    assert not (work / "raw").exists()
+
+
+def test_the_limits_are_printed_before_anything_moves(tmp_path, fast):
+    """Before anything moves, the limits and the bench's full scale are printed.
+
+    At 0.00227 cm per count, the travel limit of 2.5 cm is 1101 counts.
+    """
+    work = write_work(tmp_path, [sine("dwell", seconds=1)])
+    notes = Notes()
+    acquire(work, port=fast.address, observers=[notes], only=["dwell"])
+    said = "limits: 0.5 V of the 0.5 V that the bench can give, and 2.5 cm (1101 counts) from each"
+    assert any(remark.startswith(said) for remark in notes.remarks)
+
+
+def test_an_impossible_recording_is_skipped_with_a_reason(tmp_path):
+    """A chirp on a stock bench, or an amplitude below one count, is skipped with a reason.
+
+    All other recordings are made, and the exit status is 1.
+    """
+    chirp = Recording(
+        id="sweep",
+        kind="sweep",
+        carts=(1, 2),
+        wave="chirp",
+        amplitude=0.01,
+        frequency=1.0,
+        frequency_end=5.0,
+        settle=0.0,
+    )
+    faint = sine("faint", seconds=1).model_copy(update={"amplitude": 1e-5})
+    scales = 'input = { unit = "V", per_count = 0.0001220703125 }\n'
+    work = write_work(tmp_path, [chirp, faint, sine("dwell", seconds=1)], scales=scales)
+    text = (work / "submission.toml").read_text(encoding="utf-8")
+    text = text.replace('{ unit = "cm" }', '{ unit = "cm", per_count = 0.00227 }')
+    (work / "submission.toml").write_text(text, encoding="utf-8")
+    with emulator("--stock") as bench:
+        with host(work, bench.address, "--yes") as process:
+            _, said = process.communicate()
+    assert process.returncode == 1
+    assert "does not know the command chirp; remove this recording from plan.toml" in said
+    assert "sweep: the bench" in said
+    assert "sweep: sweep:" not in said
+    assert "less than half a count of the bench" in said
+    assert "not recorded: faint, sweep" in said
+    assert [e.id for e in load_submission(work).experiments] == ["dwell"]
+
+
+def test_a_bench_that_goes_on_after_its_run_is_stopped(tmp_path, monkeypatch, real):
+    """A bench that runs more cycles than ordered, as after a changed digit, is stopped."""
+    # A bench that gets no processor time near the end of its run would seem to have finished.
+    monkeypatch.setattr("pipeline.bench.run._AFTER_END", PATIENCE)
+    with _session(real) as (session, _, ask):
+        order = make_order(sine("dwell", seconds=20), **ask)
+        order = replace(order, recording=sine("dwell", seconds=1))
+        outcome, sent = session.record(order, tmp_path / "dwell.raw"), real.event("run")
+    assert outcome.partial == "stopped: the bench went on past the end of the run"
+    assert sent["ended"] == "stopped"
+
+
+@contextmanager
+def _session(bench: Emulator, *, carts: int = 2, observer: Notes | None = None):
+    """Yield a session on a new line, and the other arguments of `make_order`."""
+    with open_line(bench.address, baud=115_200) as line:
+        session = Session(line, carts=carts, limits=LIMITS, observer=observer or Notes())
+        yield (
+            session,
+            line,
+            {
+                "limits": LIMITS,
+                "scales": CountScales(input=line.bench.input_per_count, position=0.00227),
+                "system": System(carts=carts, springs=(True,) * (carts + 1)),
+                "bench": line.bench,
+            },
+        )
+
+
+@pytest.mark.parametrize("change", [{"frequency": 3.0}, {"amplitude": 92}, {"wave": Wave.TRIANGLE}])
+def test_a_changed_digit_of_a_start_is_noticed(tmp_path, monkeypatch, change, real):
+    """If a digit of a start command was changed, the targets show it, and the run is repeated."""
+    with _session(real) as (session, line, ask):
+        order = make_order(sine("dwell", seconds=2), **ask)
+        send = line.send
+
+        def changed(*commands: Command) -> None:
+            send(*(replace(c, **change) if isinstance(c, Start) else c for c in commands))
+
+        monkeypatch.setattr(line, "send", changed)
+        outcome = session.record(order, tmp_path / "dwell-1.raw")
+        monkeypatch.undo()
+        sent = real.event("run")
+        again = session.record(order, tmp_path / "dwell-2.raw")
+    assert outcome.partial.startswith("the bench does not follow the wave that was ordered")
+    assert sent["ended"] == "stopped"
+    assert sent["lines"] < 1000
+    assert again.partial == ""
+
+
+class Slow(Notes):
+    """An observer that is slow once a cart is far out."""
+
+    def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
+        """Note the lines, and hang for two seconds."""
+        super().readings(batch, anomalies)
+        if any(abs(count) > 22 for reading in batch for count in reading.counts):
+            time.sleep(2.0)
+
+
+def test_the_stop_is_sent_before_observers_are_called(tmp_path, real):
+    """The motor is stopped even if an observer hangs at the line that passes the limit."""
+    with _session(real, observer=Slow()) as (session, _, ask):
+        near = PlanLimits(input=0.5, travel=22 * 0.00227)
+        order = make_order(sine("dwell", seconds=4), **{**ask, "limits": near})
+        outcome = session.record(order, tmp_path / "dwell-1.raw")
+        sent = real.event("run")
+    assert outcome.partial.startswith("stopped: cart ")
+    assert sent["ended"] == "stopped"
+    offending = next(
+        r.ms
+        for r in readings_of(read_raw(tmp_path / "dwell-1.raw"))
+        if max(map(abs, r.counts)) > 22
+    )
+    assert 1.0024 * sent["lines"] - offending < 1000
+
+
+def test_every_cart_of_the_bench_is_watched(tmp_path, real):
+    """On a bench of two carts, both are watched even if the submission has only one."""
+    with _session(real, carts=1) as (session, _, ask):
+        near = PlanLimits(input=0.5, travel=0.25)
+        # At the second resonance, near 6 Hz, the second cart moves twice as far as the first.
+        dwell = sine("dwell", seconds=8, frequency=6.0)
+        order = make_order(
+            dwell.model_copy(update={"carts": (1,), "amplitude": 0.02}), **{**ask, "limits": near}
+        )
+        outcome = session.record(order, tmp_path / "dwell-1.raw")
+    assert outcome.partial.startswith("stopped: cart 2 was ")
+
+
+def test_a_new_line_is_zeroed_once_the_carts_rest(tmp_path, real):
+    """If the line is opened while carts swing, they are zeroed again once they are at rest."""
+    recording = sine("dwell", seconds=1, settle=3.0)
+    notes = Notes()
+    with _session(real, observer=notes) as (session, line, ask):
+        line.send(Start(wave=Wave.SQUARE, frequency=0.5, amplitude=400))
+        heard = bytearray()
+
+        def away() -> bool:
+            heard.extend(line.receive())
+            *whole, _ = heard.split(b"\n")
+            return bool(whole) and int(whole[-1].split(b":")[0]) > 100
+
+        until(away, "a swing")  # at the latest after one second
+        line.send(Signal.RESET)  # every session starts with this
+        line.drain()
+        order = make_order(recording, **ask)
+        assert session.prepare(order) == ""
+        session.record(order, tmp_path / "dwell-1.raw")
+    assert max(map(abs, notes.readings_seen[0].counts)) <= 4  # as a cart at rest may flicker
+
+
+class Answers(threading.Thread):
+    """A port that answers each query with the next of the given answers."""
+
+    def __init__(self, answers: Iterable[bytes]) -> None:
+        super().__init__(daemon=True)
+        self._answers = iter(answers)
+        self._door = socket.create_server(("127.0.0.1", 0))
+        self.address = f"socket://127.0.0.1:{self._door.getsockname()[1]}"
+
+    def run(self) -> None:
+        """Serve one host until it hangs up."""
+        peer, _ = self._door.accept()
+        with self._door, peer:
+            while heard := peer.recv(4096):
+                for _ in range(heard.count(b"?;")):
+                    peer.sendall(next(self._answers))
+
+
+def test_a_description_must_arrive_twice():
+    """The host asks for the bench's description until two answers agree, as one may be damaged.
+
+    If no two answers agree, the error says to check the cable.
+    """
+    true = DESCRIPTION.encode() + b"\n"
+    wrong = [true.replace(b"0.002cm", b"0.00%dcm" % digit) for digit in (1, 3, 6)]
+    port = Answers([wrong[0], true, true])
+    port.start()
+    with open_line(port.address, baud=115_200) as line:
+        assert line.bench.position_per_count == 0.002
+    port = Answers([*wrong, true])
+    port.start()
+    with pytest.raises(HardwareError, match=r"describes itself differently each time.*check cable"):
+        open_line(port.address, baud=115_200)
+
+
+def test_a_run_starts_only_after_both_answers():
+    """Before a run the host waits for late answers to its queries, so that no byte is left over.
+
+    One damaged answer, here with a stray byte before it, is no error.
+    """
+    described = DESCRIPTION.encode() + b"\n"
+
+    def answers() -> Iterator[bytes]:
+        yield from (described, described)  # answers in the handshake
+        time.sleep(0.8)
+        yield described
+        time.sleep(0.1)
+        yield b"1:1:0:0:7\n" + described
+        yield b"#" + described
+        yield described
+
+    port = Answers(answers())
+    port.start()
+    with open_line(port.address, baud=115_200) as line:
+        line.clear()
+        time.sleep(0.3)
+        assert line.receive() == b""
+        line.clear()
+
+
+def test_a_stock_bench_may_take_half_a_second_to_begin(monkeypatch):
+    """A stock bench is recognised even if the lines of its trial run come half a second late."""
+    monkeypatch.setattr("pipeline.bench.serial_line._ANSWER", 0.05)  # no answer comes
+    door = socket.create_server(("127.0.0.1", 0))
+
+    def late() -> None:
+        peer, _ = door.accept()
+        with door, peer:
+            heard = b""
+            while not heard.endswith(b"d;d;o;o;10;0;1;"):
+                heard += peer.recv(4096)
+            time.sleep(0.5)
+            peer.sendall(b"".join(b"0:0:0:0:0:%d\n" % ms for ms in range(100)))
+            while peer.recv(4096):
+                pass
+
+    threading.Thread(target=late, daemon=True).start()
+    with open_line(f"socket://127.0.0.1:{door.getsockname()[1]}", baud=115_200) as line:
+        assert (line.bench.name, line.bench.encoders) == ("stock", 3)
+
+
+@pytest.fixture
+def _hearing() -> Iterator[None]:
+    """Let programs started by a test end with their terminal, even if pytest runs under nohup.
+
+    A program inherits the signal that nohup ignores, but not a handler that does nothing.
+    """
+    before = signal.signal(signal.SIGHUP, lambda number, frame: None)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no SIGHUP")
+@pytest.mark.usefixtures("_hearing")
+def test_a_closed_terminal_stops_the_motor(tmp_path, real):
+    """If the terminal is closed, the run ends by a stop command and its data are saved."""
+    work = write_work(tmp_path, [sine("dwell", seconds=30)])
+    with host(work, real.address, "--only", "dwell") as process:
+        until_bytes(work / "raw" / "dwell-1.raw", process)
+        process.send_signal(signal.SIGHUP)
+        process.communicate()
+    assert real.event("run")["ended"] == "stopped"
+    assert process.returncode == 130
+    assert (work / "data" / "dwell.partial.txt").exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows cannot limit file sizes")
+def test_a_full_disk_stops_the_motor_and_says_what_to_do(tmp_path, real):
+    """If the disk is full, the run ends by a stop command, and the message names the folder."""
+    work = write_work(tmp_path, [sine("dwell", seconds=30)])
+    command = 'ulimit -f 20; exec "$0" -m pipeline acquire "$1" --port "$2" --only dwell'
+    shell = ["sh", "-c", command, sys.executable, work, real.address]
+    with started(shell, stderr=subprocess.PIPE, encoding="utf-8") as process:
+        _, said = process.communicate()
+    assert real.event("run")["ended"] == "stopped"
+    assert process.returncode == 2
+    assert f"`acquire` writes into {work}; free some space" in said
+    assert "--out" not in said
+
+
+DESCRIPTION = (
+    "?cartlab/1 name=b encoders=2 carts=2 period=0.001 baud=115200 commands=sk "
+    "input=0.001V position=0.002cm"
+)
+
+
+@pytest.mark.parametrize(
+    ("stated", "wrong"),
+    [
+        ("position=0.002cm", "position=0cm"),
+        ("position=0.002cm", "position=nancm"),
+        ("input=0.001V", "input=1e999V"),
+        ("period=0.001", "period=nan"),
+        ("encoders=2", "encoders=9"),
+        ("carts=2", "carts=0"),
+    ],
+)
+def test_a_description_with_a_useless_scale_is_refused(stated, wrong):
+    """A description with an impossible scale, period or number is refused: no limit would hold."""
+    assert parse_description(DESCRIPTION.encode()).carts == 2
+    with pytest.raises(DataError, match=f"describes itself as .*{wrong}.* is wrong"):
+        parse_description(DESCRIPTION.replace(stated, wrong).encode())
+
+
+def test_more_than_the_bench_can_give_is_refused():
+    """An amplitude beyond full scale is refused, as it would be clipped."""
+    bench = Description(name="b", encoders=2, carts=2)
+    scales = CountScales(input=1e-4, position=0.002)
+    ask = {"limits": LIMITS, "scales": scales, "system": TWO_CARTS, "bench": bench}
+    least = sine("dwell", seconds=1).model_copy(update={"amplitude": 0.4096})
+    assert make_order(least, **ask).commands
+    with pytest.raises(ConfigError, match=r"amplitude 0\.41 V is more than the bench can give"):
+        make_order(least.model_copy(update={"amplitude": 0.41}), **ask)
+
+
+def test_no_earlier_gains_act_after_a_lost_byte():
+    """A gain command that lost a letter or a semicolon does nothing.
+
+    Gains sent earlier do not act either.
+    """
+    bench = Description(name="b", encoders=2, carts=2, commands=EXTENSIONS)
+    loop = sine("loop", seconds=1).model_copy(update={"controller": StateLoop()})
+    order = make_order(
+        loop,
+        limits=LIMITS,
+        scales=CountScales(input=1e-4, position=0.002),
+        system=TWO_CARTS,
+        bench=bench,
+        gains=StateGains(gains=(0.5, 0.0, 0.0, 0.0), prefilter=0.5),
+    )
+    *before, gains, start = (encode(command) for command in order.commands)
+    for lost in (at for at, byte in enumerate(gains) if byte in b"f;"):
+        core = ReferenceCore(bench)
+        core.receive(encode(StateGains(gains=(5.0, 0.0, 0.0, 0.0), prefilter=5.0)))
+        core.receive(b"".join([*before, gains[:lost], gains[lost + 1 :], start]))
+        assert {core.tick((0, 0), stamp=ms, now=0) for ms in range(200)} == {0}
+
+
+# ----------------------------------------------------------------- files of others
+
+
+def _header(name: str) -> RawHeader:
+    return RawHeader(
+        recording=sine("dwell", seconds=1).model_copy(update={"id": name}),
+        limits=LIMITS,
+        commands=(),
+        bench=Description(name="b", encoders=2, carts=2),
+        begun="",
+    )
+
+
+def test_nothing_is_written_outside_or_over_the_data_of_others(tmp_path, fast):
+    """Neither the path in a raw file nor a plan's id can make cartlab write to another file."""
+    work = write_work(tmp_path / "a" / "work", [sine("dwell", seconds=1)])
+    (work / "data").mkdir()
+    mine = work / "data" / "dwell.txt"
+    mine.write_text("mine", encoding="utf-8")
+    with RawWriter(work / "raw" / "x-1.raw", _header("../../elsewhere")) as raw:
+        raw.write(b"".join(b"0:0:0:0:%d\n" % ms for ms in range(20)))
+    with (work / "submission.toml").open("a", encoding="utf-8") as file:
+        file.write("""\n[[experiments]]\nid = "first"\nkind = "step"\nfile = "data/dwell.txt"\n""")
+    with pytest.raises(ConfigError, match=r"dwell: data/dwell\.txt holds the experiment 'first'"):
+        acquire(work, port=fast.address, observers=[Notes()])
+    assert mine.read_text(encoding="utf-8") == "mine"
+    assert not list(tmp_path.rglob("elsewhere*"))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need a privilege on Windows")
+def test_a_raw_file_is_not_written_through_a_link(tmp_path):
+    """A link in place of a run's time file is replaced, and its target stays as it is."""
+    mine = tmp_path / "mine"
+    mine.write_text("mine", encoding="utf-8")
+    (tmp_path / "dwell-1.times").symlink_to(mine)
+    with RawWriter(tmp_path / "dwell-1.raw", _header("dwell")) as raw:
+        raw.write(b"0:0:0:0:0\n")
+    assert mine.read_text(encoding="utf-8") == "mine"
+    assert (tmp_path / "dwell-1.times").stat().st_size == 16
+
+
+# ----------------------------------------------------------------- at the keyboard
+
+ASK = """from pipeline.bench.terminal import Terminal
+Terminal().confirm('Hold cart 1')
+print('held')"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
+@pytest.mark.parametrize(("typed", "held"), [(b"\n", True), (b"\x04", False)])
+def test_only_a_later_enter_answers_the_question(typed, held):
+    """Only an Enter typed after the question starts the motor, and Ctrl-D means no."""
+    controller, terminal = os.openpty()
+    pipes = {"stdin": terminal, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with started([sys.executable, "-c", ASK], **pipes, encoding="utf-8") as process:
+        os.write(controller, b"\n\n")
+        assert process.stderr is not None
+        while (heard := process.stderr.read(1)) != ")":
+            assert heard, "nothing was asked"
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(timeout=1)
+        os.write(controller, typed)
+        said, complaint = process.communicate()
+    os.close(controller)
+    os.close(terminal)
+    assert ("held" in said) is held
+    assert ("Hold cart 1: the keyboard was closed" in complaint) is not held

@@ -1,0 +1,457 @@
+"""A bench explores itself, with the emulator's carts and over a real line."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from pipeline.bench.events import Stopped
+from pipeline.errors import ConfigError, DataError
+from pipeline.experiments.by_hand import add_recording
+from pipeline.experiments.candidates import propose_candidates
+from pipeline.experiments.choice import choose_recordings
+from pipeline.experiments.discriminate import propose_for
+from pipeline.experiments.exploration import Exploration, Recorded
+from pipeline.experiments.goal import ErrorGoal, find_goal, read_error_goal, read_time
+from pipeline.experiments.information import Knowledge
+from pipeline.experiments.plan import PlanLimits, session_time, time_words
+from pipeline.experiments.plan_file import load_plan, save_plan
+from pipeline.experiments.propose import propose_plan
+from pipeline.report.exploration.diary import NAME
+from pipeline.simulated.hidden import prepare_bench
+from pipeline.submission import load_submission
+from pipeline.words.progress import silent
+from pipeline.workflow import analyse
+from tests.helpers.benches import emulator
+from tests.helpers.commandline import cartlab_here
+from tests.helpers.desks import a_recorded_cart
+from tests.helpers.virtual import VirtualBench, VirtualSession, new_folder
+
+
+@pytest.mark.parametrize(
+    ("text", "wish"),
+    [
+        ("zeta 1%", ErrorGoal(prefix="zeta", error=0.01)),
+        ("1 %", ErrorGoal(error=0.01)),
+        ("all 0.5%", ErrorGoal(error=0.005)),
+        ("omega_1 0.05 %", ErrorGoal(prefix="omega_1", error=0.0005)),
+    ],
+)
+def test_error_goals_are_read_from_text(text, wish):
+    """A goal is a percentage, with or without a parameter's name before it."""
+    assert read_error_goal(text) == wish
+
+
+def test_durations_are_read_in_seconds_minutes_or_hours():
+    """A duration is read in seconds, minutes or hours."""
+    assert [read_time(t) for t in ("90s", "20min", "20 min", "1.5h")] == [90, 1200, 1200, 5400]
+
+
+@pytest.mark.parametrize(
+    "text", ["zeta", "zeta 1", "zeta omega 1%", "1.5", "0%", "200%", "%", "zeta 1% K 2%"]
+)
+def test_a_text_that_is_not_a_goal_is_refused(text):
+    """A text that is not a goal is refused with an example."""
+    with pytest.raises(ConfigError, match="expected a name and a percentage"):
+        read_error_goal(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["20", "min", "-3s", "20 parsec", "inf s", "1e999s", "1e308h", "nan s"]
+)
+def test_a_text_that_is_not_a_duration_is_refused(text):
+    """A text that is not a duration is refused with an example."""
+    with pytest.raises(ConfigError, match="expected a duration"):
+        read_time(text)
+
+
+@pytest.fixture(scope="module")
+def explored(tmp_path_factory):
+    """Return the exploration of a bench with an end stop on one side that no step reaches."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=["end_stop:position=-1.7"])
+    folder = tmp_path_factory.mktemp("explored") / "work"
+    said: list[str] = []
+    session = VirtualSession(folder, VirtualBench(bench, seed=2))
+    turns = Exploration(
+        folder=folder,
+        record=session,
+        goal=read_error_goal("all 1%"),
+        seconds=400.0,
+        announce=said.append,
+    ).run()
+    return folder, turns, said, bench
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_an_exploration_names_the_effect_and_finds_the_carts(explored):
+    """The exploration names the end stop on its cart, and finds every parameter correctly."""
+    folder, turns, said, bench = explored
+    last = turns[-1]
+    assert last.verdict == "named"
+    assert last.reached
+    assert last.recorded == ("sweep-2",)  # the second sweep reaches the end stop
+    assert "the worst to ±" in last.summary
+    (explanation,) = last.explanations
+    assert "cart 1" in explanation.name
+    assert all(error is not None and error < 0.01 for error in last.errors.values())
+    gap = json.loads((folder / "gap" / "gap.json").read_text(encoding="utf-8"))
+    assert [one["effect"] for one in gap["effects"]] == ["end_stop"]
+    m = gap["chain"]["m"][0]
+    assert m == pytest.approx(bench.chain.m[0], rel=0.01)
+    assert said == [turn.summary for turn in turns]
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_an_exploration_writes_a_submission_and_a_diary(explored):
+    """Every record is in submission.toml and plan.toml, and the diary shows each decision."""
+    folder, turns, _, _ = explored
+    recorded = [name for turn in turns for name in turn.recorded]
+    submission = load_submission(folder)
+    assert [experiment.id for experiment in submission.experiments] == recorded
+    assert analyse(submission).records
+    diary = (folder / NAME).read_text(encoding="utf-8").replace("\u00a0", " ")
+    for turn in turns:
+        assert f"{turn.seconds:.0f} s" in diary
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_an_exploration_keeps_only_runs_that_its_diary_shows(explored):
+    """Each earlier decision keeps one run, for its picture; the last decision keeps all runs."""
+    folder, turns, _, _ = explored
+    *earlier, last = [turn.gap for turn in turns]
+    assert earlier
+    assert [len(gap.traces) for gap in earlier] == [1] * len(earlier)
+    assert len(last.traces) == len(load_submission(folder).experiments)
+
+
+@pytest.fixture
+def no_gap(monkeypatch):
+    """Make the search for the gap fail, so that only the carts are identified."""
+
+    def none(analysis, **other):
+        raise DataError("no run can be held out")
+
+    monkeypatch.setattr("pipeline.experiments.exploration.investigate", none)
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+@pytest.mark.usefixtures("no_gap")
+def test_an_exploration_ends_before_it_exceeds_its_time(tmp_path):
+    """A recording that would exceed the time is not begun, and the diary names it.
+
+    If the gap analysis fails, the carts are still identified, and no effect is named.
+    """
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
+    (turn,) = Exploration(
+        folder=tmp_path / "work",
+        record=session,
+        goal=ErrorGoal(error=1e-7),
+        seconds=90.0,
+        announce=silent,
+    ).run()
+    assert turn.seconds <= 90.0
+    assert (turn.verdict, turn.reached) == ("", False)
+    assert turn.errors
+    assert "would run out before" in turn.summary
+
+
+def test_too_little_time_for_the_sweep_moves_no_cart(tmp_path):
+    """If the time is too short for the first sweep, nothing is recorded, and a message says so."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    virtual = VirtualBench(bench, seed=1)
+    session = VirtualSession(tmp_path / "work", virtual)
+    with pytest.raises(ConfigError, match="the first sweep alone takes"):
+        Exploration(
+            folder=tmp_path / "work",
+            record=session,
+            goal=ErrorGoal(),
+            seconds=10.0,
+            announce=silent,
+        ).run()
+    assert virtual.seconds == 0.0
+
+
+def test_a_goal_for_an_unknown_parameter_is_refused(tmp_path):
+    """A goal for a parameter that does not exist is refused with the nearest name."""
+    asked: list[str] = []
+
+    def record(ids):
+        asked.extend(ids)
+        return Recorded(ids=(), seconds=0.0)
+
+    wish = read_error_goal("Zeta 1%")
+    known = a_recorded_cart(tmp_path / "known")
+    for folder in (known, tmp_path / "unknown"):  # with known carts, and with unknown ones
+        with pytest.raises(ConfigError, match="did you mean 'zeta'"):
+            Exploration(
+                folder=folder, record=record, goal=wish, seconds=900.0, announce=silent
+            ).run()
+    assert not asked
+    with pytest.raises(ConfigError, match="no such parameter"):
+        ErrorGoal(prefix="zeta_7").missing({"zeta_1": 0.1, "zeta_2": None})
+
+
+def test_a_goal_for_a_rigid_cart_is_accepted(tmp_path):
+    """A goal for a rigid cart is accepted, as cartlab cannot know yet whether there are springs."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
+    with pytest.raises(ConfigError, match="the first sweep alone takes"):
+        Exploration(
+            folder=tmp_path / "work",
+            record=session,
+            goal=ErrorGoal(prefix="mass"),
+            seconds=10.0,
+            announce=silent,
+        ).run()
+
+
+@pytest.mark.usefixtures("no_gap")
+def test_an_exploration_ends_after_three_failures(tmp_path):
+    """If three recordings fail, an exploration ends, and the diary says what failed and why."""
+    asked = []
+
+    def record(ids):
+        asked.extend(ids)
+        return Recorded(ids=(), seconds=20.0, why="the line is silent: is it plugged in?")
+
+    turns = Exploration(
+        folder=a_recorded_cart(tmp_path / "work"),
+        record=record,
+        goal=ErrorGoal(error=1e-7),
+        seconds=900.0,
+        announce=silent,
+    ).run()
+    assert len(set(asked)) == 3
+    assert [turn.summary.split("? ")[0] for turn in turns[1:]] == [
+        f"{name} failed: the line is silent: is it plugged in" for name in asked
+    ]
+    assert not turns[-1].reached
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
+    """A recording that a person vetoes is replaced, and one that is added comes next.
+
+    gap.json is then written again with a new proposal in place of the vetoed one.
+    """
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    folder, offered, said = tmp_path / "work", [], []
+    session = VirtualSession(folder, VirtualBench(bench, seed=1))
+
+    def proposed(gap, submission, *, without=()):
+        found = propose_for(gap, submission, without=without)
+        return replace(found, next_experiment="another") if without else found
+
+    def vetoes(recording):
+        offered.append(recording)
+        gap = json.loads((folder / "gap" / "gap.json").read_text(encoding="utf-8"))
+        assert (gap["next_experiment"] == "another") == (len(offered) >= 2)  # after a new search
+        if len(offered) == 1:
+            step = next(one for one in load_plan(load_submission(folder)).recordings
+                        if one.kind == "step")  # fmt: skip
+            add_recording(folder, step.model_copy(update={"id": "mine", "amplitude": 0.015}))
+        elif len(offered) == 3:
+            raise Stopped("by hand")
+        return len(offered) == 1
+
+    monkeypatch.setattr("pipeline.experiments.exploration.propose_for", proposed)
+    with pytest.raises(Stopped):
+        Exploration(
+            folder=folder,
+            record=session,
+            goal=ErrorGoal(error=1e-7),
+            seconds=400.0,
+            announce=said.append,
+            vetoes=vetoes,
+        ).run()
+    first, mine, other = offered
+    assert mine.id == "mine"
+    assert not other.resembles(first)
+    recorded = {experiment.id for experiment in load_submission(folder).experiments}
+    assert mine.id in recorded
+    assert first.id not in recorded
+    assert said[1].startswith(f"{first.id} was vetoed. ")
+    assert "mine, which was added by hand" in said[1]
+    assert f"{first.id} was vetoed" in (folder / NAME).read_text(encoding="utf-8")
+
+
+def test_an_added_recording_comes_next_whatever_its_id(tmp_path):
+    """A recording that a person adds comes next, even with the id of the program's own step."""
+    bench = VirtualBench(prepare_bench(preset="throne-1dof", model=None, hide=[]), seed=1)
+    folder = new_folder(tmp_path / "work", bench, springs=[True, True])
+    submission = load_submission(folder)
+    usual = propose_plan(submission, bench=bench.description)
+    sweep, step = (next(one for one in usual.recordings if one.id == name)
+                   for name in ("sweep", "step-1"))  # fmt: skip
+    save_plan(usual.model_copy(update={"recordings": (sweep,)}), submission)
+    session, offered = VirtualSession(folder, bench), []
+    session(["sweep"])
+
+    def add(stage):
+        if stage == "what to record next":
+            add_recording(folder, step)
+
+    def enough(recording):
+        offered.append(recording)
+        raise Stopped("by hand")
+
+    with pytest.raises(Stopped):
+        Exploration(
+            folder=folder,
+            record=session,
+            goal=ErrorGoal(error=1e-7),
+            seconds=400.0,
+            announce=silent,
+            progress=add,
+            vetoes=enough,
+        ).run()
+    assert offered == [step]
+
+
+def test_a_large_step_is_proposed_after_all_else_was_refused(tmp_path):
+    """After all better proposals were refused, a large step is proposed."""
+    submission = load_submission(a_recorded_cart(tmp_path / "work"))
+    analysis = analyse(submission)
+    plan = propose_plan(submission)
+    plan = plan.model_copy(update={"limits": PlanLimits(input=100.0, travel=100.0)})
+    goal = find_goal("zeta", known := Knowledge.of(analysis), feedback=None)
+    refused = propose_candidates(known, limits=plan.limits, commands=frozenset("c"), goal=goal)
+    (step,), why = choose_recordings(
+        analysis,
+        None,
+        plan,
+        missing={"zeta": 0.1},
+        wanted=1e-7,
+        seconds=900.0,
+        refused=refused,
+        commands=frozenset("c"),
+    )
+    assert step.aim == "far"
+    assert "no input was above" in why
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_the_number_of_chosen_recordings_grows_with_the_data(tmp_path):
+    """A tenth of the data so far is chosen at once, but no more than goal and time need."""
+    submission = load_submission(a_recorded_cart(tmp_path / "work"))
+    analysis = analyse(submission)
+    often = replace(analysis, records=analysis.records * 12)
+    plan = propose_plan(submission)
+
+    def chosen(analysis, *, wanted=1e-7, seconds=900.0):
+        recordings, why = choose_recordings(
+            analysis,
+            None,
+            plan,
+            missing={"zeta": 0.1},
+            wanted=wanted,
+            seconds=seconds,
+            refused=(),
+            commands=frozenset("c"),
+        )
+        assert f"{time_words(session_time(recordings))} at the bench" in why
+        return recordings
+
+    several = chosen(often)
+    assert len(several) == len(often.records) // 10 >= 3
+    assert len(chosen(analysis)) == 1
+    assert len(chosen(often, wanted=0.09)) == 1
+    assert chosen(often, seconds=session_time(several[:2])) == several[:2]
+    assert len(chosen(often, seconds=1.0)) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+@pytest.mark.usefixtures("no_gap")
+@pytest.mark.parametrize("ends", ["not", "added", "vetoed"])
+def test_a_series_ends_when_a_person_intervenes(tmp_path, monkeypatch, ends):
+    """Chosen recordings are made and then analysed together; a veto or an addition ends this."""
+    monkeypatch.setattr("pipeline.experiments.choice._SHARE", 1.0)
+    bench = VirtualBench(prepare_bench(preset="throne-1dof", model=None, hide=[]), seed=1)
+    folder, asked = tmp_path / "work", []
+    session = VirtualSession(folder, bench)
+
+    def vetoes(recording):
+        asked.append(recording.id)
+        if len(asked) == 2 and ends == "added":
+            add_recording(folder, recording.model_copy(update={"id": "mine"}))
+        if "mine" in asked or len(asked) > 3:
+            raise Stopped("by hand")
+        return len(asked) == 3 and ends == "vetoed"
+
+    exploration = Exploration(
+        folder=folder,
+        record=session,
+        goal=ErrorGoal(error=1e-7),
+        seconds=600.0,
+        announce=silent,
+        vetoes=vetoes,
+    )
+    with pytest.raises(Stopped):
+        exploration.run()
+    first, second = exploration.turns
+    assert f"The next recordings are {asked[0]}, {asked[1]} and " in first.summary
+    assert second.recorded == tuple(asked[:3] if ends == "not" else asked[:2])
+    assert second.summary.startswith(f"{asked[2]} was vetoed. " if ends == "vetoed" else "")
+    assert (asked[2] == "mine") == (ends == "added")
+
+
+def test_thinking_can_be_ended(tmp_path):
+    """An exception in the progress display ends the exploration, and the recordings stay."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
+
+    def enough(stage):
+        raise Stopped("by hand")
+
+    with pytest.raises(Stopped):
+        Exploration(
+            folder=tmp_path / "work",
+            record=session,
+            goal=ErrorGoal(),
+            seconds=90.0,
+            announce=silent,
+            progress=enough,
+        ).run()
+    assert len(load_submission(tmp_path / "work").experiments) == 3
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_the_command_explores_a_bench_over_its_line(tmp_path):
+    """`cartlab explore` makes a submission with its diary from an empty folder, over a socket.
+
+    The time limit also holds for the first recordings: the sweep fits, but the steps do not.
+    """
+    folder = tmp_path / "work"
+    with emulator("--speed", "8", "--port", "socket://127.0.0.1:0", preset="throne-1dof") as bench:
+        done = cartlab_here(
+            "explore", folder, "--port", bench.address, "--until", "all 5%", "--time", "40s"
+        )
+    assert done.returncode == 1, done.stderr
+    assert (folder / NAME).exists()
+    assert [e.kind for e in load_submission(folder).experiments] == ["sweep"]
+    assert "would run out before" in done.stderr
+
+
+@pytest.mark.slow
+def test_the_large_step_and_the_far_sweep_are_made_only_once(tmp_path):
+    """If drag keeps carts from the wanted distance, the recordings for it are still made once."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=["quadratic_drag"])
+    session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=13))
+    turns = Exploration(
+        folder=tmp_path / "work",
+        record=session,
+        goal=ErrorGoal(),
+        seconds=300.0,
+        announce=silent,
+    ).run()
+    assert [turn.verdict for turn in turns] == ["named"] * 3
+    assert [turn.recorded for turn in turns[1:]] == [("step-3",), ("sweep-2",)]

@@ -1,0 +1,73 @@
+"""The example of docs/model.md compensates for friction on a virtual bench."""
+
+import re
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from docs.friction_compensation import main
+from pipeline.plant.effect import AugmentedChain
+from pipeline.report.model_files import save_model
+from pipeline.simulated.emulator.server import EmulatorOptions, Server
+from pipeline.simulated.hidden import prepare_bench
+from tests.helpers.commandline import cartlab_here
+from tests.helpers.examples import analysed
+from tests.helpers.exported import no_compiler
+from tests.helpers.places import ROOT
+
+PAGE = (ROOT / "docs" / "model.md").read_text(encoding="utf-8")
+BENCH = "--preset throne-1dof --hide coulomb_friction:force=0.006"
+HIDDEN = prepare_bench(preset="throne-1dof", hide=("coulomb_friction:force=0.006",))
+
+
+@contextmanager
+def running_bench() -> Iterator[str]:
+    """Run the page's virtual bench; yield its address."""
+    server, stop = Server(HIDDEN, EmulatorOptions(speed=8.0)), threading.Event()
+    serving = threading.Thread(target=server.serve, kwargs={"until": stop.is_set})
+    serving.start()
+    try:
+        yield server.address
+    finally:
+        stop.set()
+        serving.join()
+        server.close()
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+@no_compiler
+def test_friction_is_compensated_on_the_virtual_bench(tmp_path):
+    """With friction in the model the cart rests on the target; without it, far from the target.
+
+    The cart rests within one count of the target; the encoder's noise adds another count.
+    """
+    model = AugmentedChain(chain=HIDDEN.chain, terms=HIDDEN.effects)
+    save_model(model, analysed("one-cart"), tmp_path, free=(1,))
+    with running_bench() as address:
+        errors = main(tmp_path / "model.fmu", address)
+    assert abs(errors["with friction"]) <= 2
+    # As the page says.
+    told = re.search(r"linear: set point \d+ counts, error \+(\d+) counts", PAGE)
+    assert told is not None
+    assert abs(errors["linear"] - int(told[1])) <= 2
+
+
+@no_compiler
+@pytest.mark.slow
+@pytest.mark.sample
+def test_the_commands_of_the_page_compensate_the_bench(tmp_path, monkeypatch):
+    """The commands of docs/model.md lead from simulated recordings to the compensated bench."""
+    monkeypatch.chdir(tmp_path)
+    commands = re.findall(r"^cartlab ((?:simulate|gap) .*bench-4.*)$", PAGE, re.MULTILINE)
+    assert [c.split()[0] for c in commands] == ["simulate", "gap"]
+    assert f"cartlab emulate {BENCH}\n" in PAGE
+    for command in commands:
+        done = cartlab_here(*command.split())
+        assert done.returncode == 0, done.stderr
+    with running_bench() as address:
+        errors = main(Path("bench-4/gap/model.fmu"), address)
+    assert abs(errors["with friction"]) <= 2 < abs(errors["linear"])
