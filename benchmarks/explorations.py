@@ -21,12 +21,14 @@ import json
 import numpy as np
 
 from benchmarks.drawn import Drawn, acted, counted, draw, run_study, wilson
+from pipeline.bench.raw import known_commands
 from pipeline.errors import DataError, PipelineError
 from pipeline.experiments.exploration import Exploration
 from pipeline.experiments.goal import ErrorGoal
 from pipeline.experiments.plan import session_time
 from pipeline.experiments.propose import extend_plan, propose_plan
 from pipeline.plant.catalogue import find_effect
+from pipeline.report.exploration.diary import write_diary
 from pipeline.submission import load_submission
 from tests.helpers.virtual import LimitPassed, VirtualBench, VirtualSession
 
@@ -47,6 +49,8 @@ def run(seed: int) -> dict:
         row = {"carts": bench.description.carts, "hidden": sorted(map(list, drawn.hidden))}
         try:
             turns = Exploration(
+                write_diary=write_diary,
+                known_commands=known_commands,
                 folder=folder,
                 record=session,
                 goal=ErrorGoal(),

@@ -5,11 +5,12 @@ from pathlib import Path
 
 from pipeline.bench.acquire import acquire, ensure_plan
 from pipeline.bench.events import Buttons, Observer, Observers, Stopped
+from pipeline.bench.raw import known_commands
 from pipeline.bench.serial_line import Runaway
 from pipeline.experiments.exploration import Exploration, Recorded
 from pipeline.experiments.goal import ErrorGoal
 from pipeline.experiments.plan import Recording, session_time
-from pipeline.report.exploration.diary import Turn
+from pipeline.experiments.turn import Turn
 from pipeline.submission.load import NAME
 from pipeline.words.text import with_symbols
 
@@ -21,6 +22,7 @@ def explore_bench(
     observers: Sequence[Observer],
     buttons: Buttons | None,
     goal: ErrorGoal,
+    write_diary: Callable[..., object],
     seconds: float,
     vetoes: Callable[[Recording], bool] = lambda recording: False,
 ) -> tuple[Turn, ...]:
@@ -30,7 +32,7 @@ def explore_bench(
     ----------
     observers, buttons : see `acquire`. "skip" vetoes the chosen recording, before or during it;
         "stop" ends the exploration, even during a computation.
-    goal, seconds, vetoes : see `Exploration`.
+    goal, seconds, vetoes, write_diary : see `Exploration`.
 
     Raises
     ------
@@ -64,6 +66,8 @@ def explore_bench(
     exploration = Exploration(
         folder=folder,
         record=record,
+        write_diary=write_diary,
+        known_commands=known_commands,
         goal=goal,
         seconds=seconds,
         announce=lambda sentence: everyone.thought(with_symbols(sentence)),

@@ -38,6 +38,7 @@ def explore(
     from pipeline.bench.terminal import Terminal
     from pipeline.experiments.goal import read_error_goal, read_time
     from pipeline.report.exploration import NAME
+    from pipeline.report.exploration.diary import write_diary
 
     goal, seconds = read_error_goal(until), read_time(limit)
     if ask and not sys.stdin.isatty():
@@ -54,6 +55,7 @@ def explore(
                 observers=observers,
                 buttons=buttons,
                 goal=goal,
+                write_diary=write_diary,
                 seconds=seconds,
                 vetoes=terminal.vetoes if ask else lambda recording: False,
             )

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.bench.raw import known_commands
 from pipeline.errors import ConfigError, DataError
 from pipeline.estimation.parametrisation import named_estimates
 from pipeline.experiments.by_hand import add_recording
@@ -19,6 +18,7 @@ from pipeline.experiments.plan_file import load_plan, plan_path, save_plan
 from pipeline.experiments.propose import FIRST_SWEEP_TIME, propose_plan
 from pipeline.experiments.turn import (
     WORDS,
+    Turn,
     describe_accuracy,
     describe_doubt,
     list_explanations,
@@ -29,7 +29,6 @@ from pipeline.gap.types import Gap
 from pipeline.json_files import json_text
 from pipeline.names import parameter_names
 from pipeline.output import own_folder, write_file
-from pipeline.report.exploration.diary import Turn, write_diary
 from pipeline.results import Analysis, Stage
 from pipeline.submission import System, load_submission
 from pipeline.submission.load import NAME
@@ -75,6 +74,8 @@ class Exploration:
     folder : the submission's folder.
     record : function that makes recordings of the plan, given by their ids. Its first call also
         makes submission and plan if they are missing.
+    write_diary : function that writes the page of all turns; see `report.exploration.diary`.
+    known_commands : function that returns the extensions of the protocol that the bench knows.
     goal : the errors to reach.
     seconds : time allowed at the bench, including rests. A recording that would exceed it is not
         begun. Each interrupted attempt counts in full.
@@ -96,6 +97,8 @@ class Exploration:
 
     folder: Path
     record: Callable[[Sequence[str]], Recorded]
+    write_diary: Callable[..., object]
+    known_commands: Callable[[Path], frozenset[str]]
     goal: ErrorGoal
     seconds: float
     announce: Progress
@@ -236,7 +239,7 @@ class Exploration:
         )
         self.turns.append(turn)
         self.made = ()
-        write_diary(self.turns, self.analysis, self.folder, wanted=self.goal.error)
+        self.write_diary(self.turns, self.analysis, self.folder, wanted=self.goal.error)
         self.announce(turn.summary)
         return recordings
 
@@ -252,7 +255,7 @@ class Exploration:
                 wanted=self.goal.error,
                 seconds=self.seconds - self.spent,
                 refused=self.refused,
-                commands=known_commands(self.folder),
+                commands=self.known_commands(self.folder),
             )
         except DataError as error:
             why = str(error)

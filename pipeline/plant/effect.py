@@ -376,3 +376,18 @@ def chain_scales(
         damping=float(max(chain.c[near], 0.02 * np.sqrt(chain.m[near] * stiffness))),
         stiffness=float(stiffness),
     )
+
+
+def effect_name(effect: Effect, where: Mapping[str, int]) -> str:
+    """Return an effect's name inside a sentence: "dry (Coulomb) friction on cart 2"."""
+    title = effect.title[:1].lower() + effect.title[1:]
+    place = place_name(where)
+    if not place:
+        return title
+    named = any(kind in title for kind in where)  # for example "a hidden mass on a cart"
+    return f"{title} ({place})" if named else f"{title} on {place}"
+
+
+def place_name(where: Mapping[str, int]) -> str:
+    """Return "cart 2" or "spring 1"; "" for the input."""
+    return " ".join(f"{kind} {number}" for kind, number in where.items())

@@ -12,7 +12,7 @@ from pipeline.names import read_name
 from pipeline.plant.chain import Chain
 from pipeline.plant.sampled_loop import StateFeedback
 from pipeline.results import FeedbackDesign
-from pipeline.simulated import runs, submission
+from pipeline.simulated import runs
 from pipeline.simulated.bench import BenchRun, SimulatedBench, TrueMotion
 from pipeline.simulated.hidden import preset_bench
 from pipeline.stages.state_feedback import design_feedback
@@ -73,7 +73,7 @@ def write_submission(
     bench.refuse_endless()
     students = students or Students()
     rng = np.random.default_rng(seed)
-    believed = submission.believed_chain(bench.chain, rng)
+    believed = believed_chain(bench.chain, rng)
     task = _task(bench)
     design = _design(believed, task)
     programme = _programme(bench, rng, compact=compact, design=design, believed=believed)
@@ -91,12 +91,12 @@ def write_submission(
     ]
     if reported:
         hertz = [run.frequency for run in programme if run.frequency]
-        initial = submission.initial_estimates(bench.chain, dwells_hz=hertz, rng=rng)
+        initial = initial_estimates(bench.chain, dwells_hz=hertz, rng=rng)
         sections += [
             toml_section("[reported.initial]", initial),
-            toml_section("[reported.final]", submission.final_estimates(believed)),
-            toml_section("[reported.state_space]", submission.state_space(believed)),
-            toml_section("[reported.feedback]", submission.feedback(design)),
+            toml_section("[reported.final]", final_estimates(believed)),
+            toml_section("[reported.state_space]", state_space(believed)),
+            toml_section("[reported.feedback]", feedback(design)),
         ]
     (folder / "data").mkdir(parents=True, exist_ok=True)
     for file, text in logs.items():

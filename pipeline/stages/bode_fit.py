@@ -12,15 +12,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.estimation.bode_points import (
-    LogMagnitude,
-    Points,
-    Scale,
-    StagedFit,
-    fit_stage_by_stage,
-    response_at,
-    weighted_residuals,
-)
+from pipeline.estimation.bode_points import Points, Scale, response_at, weighted_residuals
 from pipeline.estimation.minimise import minimise
 from pipeline.estimation.parametrisation import (
     Parametrisation,
@@ -28,6 +20,7 @@ from pipeline.estimation.parametrisation import (
     named_estimates,
     physical_start,
 )
+from pipeline.estimation.staged_fit import LogMagnitude, StagedFit, fit_stage_by_stage
 from pipeline.names import own_zeta, read_name
 from pipeline.plant.chain import Chain
 from pipeline.plant.identities import recover_chain

@@ -15,6 +15,7 @@ from pipeline.experiments.gains import CountScales
 from pipeline.experiments.goal import ErrorGoal
 from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.protocol import EXTENSIONS, Reading
+from pipeline.report.exploration.diary import write_diary
 from pipeline.submission import System, load_submission
 from tests.helpers.acquisitions import Notes, sine, write_work
 from tests.helpers.runaway import BENCH, PER_COUNT, RunawayBench
@@ -291,6 +292,7 @@ def test_an_exploration_ends_if_the_bench_misbehaves(tmp_path, wrong):
         with pytest.raises(HardwareError, match=r"stopped: .*; the exploration ends here"):
             explore_bench(
                 tmp_path / "new",
+                write_diary=write_diary,
                 port=bench.address,
                 observers=[Notes()],
                 buttons=None,

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from pipeline.bench.events import Stopped
+from pipeline.bench.raw import known_commands
 from pipeline.errors import ConfigError, DataError
 from pipeline.experiments.by_hand import add_recording
 from pipeline.experiments.candidates import propose_candidates
@@ -17,7 +18,7 @@ from pipeline.experiments.information import Knowledge
 from pipeline.experiments.plan import PlanLimits, session_time, time_words
 from pipeline.experiments.plan_file import load_plan, save_plan
 from pipeline.experiments.propose import propose_plan
-from pipeline.report.exploration.diary import NAME
+from pipeline.report.exploration.diary import NAME, write_diary
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission
 from pipeline.words.progress import silent
@@ -73,6 +74,8 @@ def explored(tmp_path_factory):
     said: list[str] = []
     session = VirtualSession(folder, VirtualBench(bench, seed=2))
     turns = Exploration(
+        write_diary=write_diary,
+        known_commands=known_commands,
         folder=folder,
         record=session,
         goal=read_error_goal("all 1%"),
@@ -148,6 +151,8 @@ def test_an_exploration_ends_before_it_exceeds_its_time(tmp_path):
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
     (turn,) = Exploration(
+        write_diary=write_diary,
+        known_commands=known_commands,
         folder=tmp_path / "work",
         record=session,
         goal=ErrorGoal(error=1e-7),
@@ -167,6 +172,8 @@ def test_too_little_time_for_the_sweep_moves_no_cart(tmp_path):
     session = VirtualSession(tmp_path / "work", virtual)
     with pytest.raises(ConfigError, match="the first sweep alone takes"):
         Exploration(
+            write_diary=write_diary,
+            known_commands=known_commands,
             folder=tmp_path / "work",
             record=session,
             goal=ErrorGoal(),
@@ -189,7 +196,13 @@ def test_a_goal_for_an_unknown_parameter_is_refused(tmp_path):
     for folder in (known, tmp_path / "unknown"):  # with known carts, and with unknown ones
         with pytest.raises(ConfigError, match="did you mean 'zeta'"):
             Exploration(
-                folder=folder, record=record, goal=wish, seconds=900.0, announce=silent
+                write_diary=write_diary,
+                known_commands=known_commands,
+                folder=folder,
+                record=record,
+                goal=wish,
+                seconds=900.0,
+                announce=silent,
             ).run()
     assert not asked
     with pytest.raises(ConfigError, match="no such parameter"):
@@ -202,6 +215,8 @@ def test_a_goal_for_a_rigid_cart_is_accepted(tmp_path):
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
     with pytest.raises(ConfigError, match="the first sweep alone takes"):
         Exploration(
+            write_diary=write_diary,
+            known_commands=known_commands,
             folder=tmp_path / "work",
             record=session,
             goal=ErrorGoal(prefix="mass"),
@@ -220,6 +235,8 @@ def test_an_exploration_ends_after_three_failures(tmp_path):
         return Recorded(ids=(), seconds=20.0, why="the line is silent: is it plugged in?")
 
     turns = Exploration(
+        write_diary=write_diary,
+        known_commands=known_commands,
         folder=a_recorded_cart(tmp_path / "work"),
         record=record,
         goal=ErrorGoal(error=1e-7),
@@ -263,6 +280,8 @@ def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
     monkeypatch.setattr("pipeline.experiments.exploration.propose_for", proposed)
     with pytest.raises(Stopped):
         Exploration(
+            write_diary=write_diary,
+            known_commands=known_commands,
             folder=folder,
             record=session,
             goal=ErrorGoal(error=1e-7),
@@ -303,6 +322,8 @@ def test_an_added_recording_comes_next_whatever_its_id(tmp_path):
 
     with pytest.raises(Stopped):
         Exploration(
+            write_diary=write_diary,
+            known_commands=known_commands,
             folder=folder,
             record=session,
             goal=ErrorGoal(error=1e-7),
@@ -387,6 +408,8 @@ def test_a_series_ends_when_a_person_intervenes(tmp_path, monkeypatch, ends):
         return len(asked) == 3 and ends == "vetoed"
 
     exploration = Exploration(
+        write_diary=write_diary,
+        known_commands=known_commands,
         folder=folder,
         record=session,
         goal=ErrorGoal(error=1e-7),
@@ -413,6 +436,8 @@ def test_thinking_can_be_ended(tmp_path):
 
     with pytest.raises(Stopped):
         Exploration(
+            write_diary=write_diary,
+            known_commands=known_commands,
             folder=tmp_path / "work",
             record=session,
             goal=ErrorGoal(),
@@ -447,6 +472,8 @@ def test_the_large_step_and_the_far_sweep_are_made_only_once(tmp_path):
     bench = prepare_bench(preset="throne-1dof", model=None, hide=["quadratic_drag"])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=13))
     turns = Exploration(
+        write_diary=write_diary,
+        known_commands=known_commands,
         folder=tmp_path / "work",
         record=session,
         goal=ErrorGoal(),

@@ -98,8 +98,7 @@ def kept_going(serve: Callable[[Callable[[], bool]], None]) -> Iterator[None]:
 
 # A bench that gets no processor time may be silent for a while.
 _PATIENT = (
-    "from pipeline.bench import run; run.SILENCE = 5.0; "
-    "from pipeline.cli import main; main()"
+    "from pipeline.bench import run; run.SILENCE = 5.0; from pipeline.cli import main; main()"
 )
 
 

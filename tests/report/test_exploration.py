@@ -8,12 +8,11 @@ from html import unescape
 import numpy as np
 from numpy.testing import assert_allclose
 
-from pipeline.experiments.turn import name_model
+from pipeline.experiments.turn import Turn, WeighedExplanation, deciding_trace, name_model
 from pipeline.plant.catalogue import find_effect
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain, EffectTerm
-from pipeline.report.exploration.diary import Turn, WeighedExplanation, write_diary
-from pipeline.report.gap.story import deciding_trace
+from pipeline.report.exploration.diary import write_diary
 from tests.helpers.analysis_factory import make_analysis
 from tests.report.test_gap import make_gap, two_cart_analysis
 

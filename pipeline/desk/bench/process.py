@@ -57,6 +57,7 @@ def _explore(folder: Path, request: dict[str, Any], state: LiveState) -> str:
     """Explore; return a sentence on what is known at the end."""
     from pipeline.bench.explore import explore_bench
     from pipeline.experiments.goal import read_error_goal, read_time
+    from pipeline.report.exploration.diary import write_diary
     from pipeline.words.text import with_symbols
 
     until, limit = request["explore"]
@@ -66,6 +67,7 @@ def _explore(folder: Path, request: dict[str, Any], state: LiveState) -> str:
         observers=[state],
         buttons=state.buttons,
         goal=read_error_goal(until),
+        write_diary=write_diary,
         seconds=read_time(limit),
     )
     reached = "The goal is reached" if turns[-1].reached else "The goal was not reached"

@@ -1,13 +1,13 @@
 """The page `exploration.html`: first what is known, then how it was found, turn by turn."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from pipeline.experiments.turn import Turn, deciding_trace
 from pipeline.gap.types import Gap
 from pipeline.names import read_name
 from pipeline.output import write_file
@@ -15,7 +15,7 @@ from pipeline.report.document import Block, Heading, Tile, Tiles, Tone, paragrap
 from pipeline.report.exploration import NAME
 from pipeline.report.figures.colours import QUIET, SECOND
 from pipeline.report.figures.style import legend_above, panels
-from pipeline.report.gap.story import before_after_picture, deciding_trace
+from pipeline.report.gap.story import before_after_picture
 from pipeline.report.gap.verdict import error_board, verdict_blocks, verdict_title
 from pipeline.report.render.html import render_html
 from pipeline.report.sections.page import Page
@@ -26,58 +26,6 @@ from pipeline.words.spans import spans
 from pipeline.words.text import capital, clean, name_span, rich, symbol_text
 
 _WORDS = phrases("exploration")
-
-
-@dataclass(frozen=True, kw_only=True)
-class WeighedExplanation:
-    """One explanation of the gap: its effects in words, and its weight among all explanations."""
-
-    name: str
-    weight: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Turn:
-    """What was known after one turn of an exploration.
-
-    Attributes
-    ----------
-    seconds : time at the bench up to the end of this turn, including rests.
-    recorded : ids of the recordings made in this turn.
-    errors : relative standard error of each parameter, by name; None if unknown.
-    verdict : verdict of the gap analysis; "" if the analysis was not possible.
-    explanations : the competing explanations, the one in the model first. If none compete, only the
-        named explanation; empty if the linear chain is enough.
-    left : the model's error as a share of the motion; None if unknown.
-    floor : the noise floor as a share of the motion; None if unknown.
-    reached : whether all requested parameters are known and the gap is named or absent.
-    summary : results, doubts and the reason for the next recording, as sentences.
-    gap : the gap analysis of this turn; None if it was not possible. For an earlier turn, it keeps
-        only the trace that the diary shows.
-    """
-
-    seconds: float
-    recorded: tuple[str, ...]
-    errors: dict[str, float | None]
-    verdict: str
-    explanations: tuple[WeighedExplanation, ...]
-    left: float | None
-    floor: float | None
-    reached: bool
-    summary: str
-    gap: Gap | None = None
-
-    def without_other_traces(self) -> "Turn":
-        """Return the turn without the traces that the diary does not show.
-
-        Each gap analysis has the traces of all runs so far. If they were all kept, memory use would
-        grow with the square of the number of turns.
-        """
-        if self.gap is None:
-            return self
-        shown = deciding_trace(self.gap, self.recorded)
-        kept = replace(self.gap, traces=(shown,) if shown else (), measure_left=tuple)
-        return replace(self, gap=kept)
 
 
 def write_diary(turns: Sequence[Turn], analysis: Analysis, folder: Path, *, wanted: float) -> Path:

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from pipeline.gap.replay import Replay, replay_driven
 from pipeline.gap.types import Gap
+from pipeline.plant.effect import effect_name
 from pipeline.report.document import Block, paragraph
 from pipeline.report.equations.effects import augmented_equations, in_order, law
 from pipeline.report.figures.style import (
@@ -24,7 +25,6 @@ from pipeline.report.gap.tables import error_table
 from pipeline.report.gap.verdict import (
     WORDS,
     added_name,
-    effect_name,
     error_board,
     next_block,
     scope_blocks,

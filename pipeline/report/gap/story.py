@@ -1,6 +1,6 @@
 """The gap report: the verdict on one page, then the evidence step by step."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from pipeline import __version__
@@ -8,7 +8,7 @@ from pipeline.arrays import Array
 from pipeline.estimation.interventions import without_releases
 from pipeline.gap.types import FoundEffect, Gap, RecordGap, Trace
 from pipeline.gap.verdict.residual_force import ResidualForce, residual_forces
-from pipeline.plant.effect import AugmentedChain
+from pipeline.plant.effect import AugmentedChain, effect_name, place_name
 from pipeline.report.document import Block, Document, bullet_list, paragraph
 from pipeline.report.equations.effects import augmented_equations, in_order, law
 from pipeline.report.figures.gap import (
@@ -32,12 +32,10 @@ from pipeline.report.gap.verdict import (
     WORDS,
     added_name,
     contenders,
-    effect_name,
     error_board,
     is_set_up_alone,
     kept_together,
     next_block,
-    place_name,
     scope_blocks,
     share,
     shares,
@@ -430,21 +428,6 @@ def _method(gap: Gap) -> list[Block]:
     else:
         method = WORDS.spans("method" if gap.complete else "method_so_far")
     return [paragraph(method), runs, *remarks(list(gap.notes))]
-
-
-def deciding_trace(gap: Gap, recorded: Collection[str]) -> Trace | None:
-    """Return the trace that the linear model describes worst, from the `recorded` runs.
-
-    If the gap has no traces of these runs, all traces are considered. Returns None if it has no
-    traces at all.
-    """
-
-    def size(trace: Trace) -> float:
-        row = _row(gap, trace)
-        return row.baseline if row else 0.0
-
-    new = [trace for trace in gap.traces if trace.experiment in recorded]
-    return max(new or gap.traces, key=size, default=None)
 
 
 def _worst_first(gap: Gap) -> list[Trace]:

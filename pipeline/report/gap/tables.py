@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 
 from pipeline.gap.types import FoundEffect, Gap, GapWindow
+from pipeline.plant.effect import effect_name
 from pipeline.report.document import Cell, Table, Tone, cell
-from pipeline.report.gap.verdict import WORDS, effect_name, kept_together, phase, share
+from pipeline.report.gap.verdict import WORDS, kept_together, phase, share
 from pipeline.report.sections.page import Page
 from pipeline.results import Intervention
 from pipeline.words.numbers import listing, percent, unit_text, with_error

@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.gap.limits import AS_REPEATS, AT_FLOOR, NOTHING
 from pipeline.gap.types import FoundEffect, Gap, NamedValue, RecordGap, Rival
-from pipeline.plant.effect import Effect
+from pipeline.plant.effect import Effect, effect_name, place_name
 from pipeline.report.document import Block, Tile, Tiles, Tone, bullet_list, paragraph, plain_lines
 from pipeline.words.numbers import count, listing, significant, unit_text, with_error
 from pipeline.words.phrases import phrases
@@ -270,21 +270,6 @@ def kept_together(effects: Sequence[FoundEffect]) -> list[tuple[FoundEffect, ...
 
 
 # ----------------------------------------------------------------------- phrases
-
-
-def effect_name(effect: Effect, where: Mapping[str, int]) -> str:
-    """Return an effect's name inside a sentence: "dry (Coulomb) friction on cart 2"."""
-    title = effect.title[:1].lower() + effect.title[1:]
-    place = place_name(where)
-    if not place:
-        return title
-    named = any(kind in title for kind in where)  # for example "a hidden mass on a cart"
-    return f"{title} ({place})" if named else f"{title} on {place}"
-
-
-def place_name(where: Mapping[str, int]) -> str:
-    """Return "cart 2" or "spring 1"; "" for the input."""
-    return " ".join(f"{kind} {number}" for kind, number in where.items())
 
 
 def sizes_text(parameters: Mapping[str, NamedValue]) -> str:
