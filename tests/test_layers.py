@@ -31,7 +31,7 @@ LEVELS = (
         "__main__",
     ),
 )
-# What packages of the highest level may import of each other; the others may import all.
+# The packages of the highest level that each of them may import; the others may import all.
 OTHERS = {
     "bench": (),
     "simulated": (),

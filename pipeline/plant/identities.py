@@ -1,4 +1,4 @@
-"""What the numbers of one real chain have in common: their order, and the chain that they imply.
+"""The order that the frequencies and gains of a real chain keep, and the chain that they imply.
 
 Holding a cart raises every frequency. So, without damping, resonances and nulls interlace (Cauchy).
 With heavy damping they may not.

@@ -324,7 +324,7 @@ class Database:
                 _create(connection)
 
     def _open(self, *, create: bool) -> bool:
-        """Check the tables, or create them; return whether none is missing."""
+        """Check the tables, or create them; return whether all are there."""
         opened = self._writer if create else self._engine
         with self._translated(), opened.begin() as connection:
             if create:
