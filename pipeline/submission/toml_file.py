@@ -33,12 +33,13 @@ _HEADING = re.compile(
 # The name at the beginning of a line, and = if it is there.
 _NAME = re.compile(r"\s*[\"']?([^\W\d][\w.-]*)[\"']?(?:[^\W\d]|[ \t])*([=:]?)")
 _QUOTES = "\"'“”„‟«»‘’‚"
-# A name and one number in any form that people type; a unit that changes its size is not allowed.
+# A name and one number in any form that people type, with single spaces. A unit that changes its
+# size is not allowed.
 _ONE_NUMBER = re.compile(
-    rf"\s*(?P<key>[^\s=:]+(?:[ ][^\W\d]\w*)?)(?:\s*[=:]\s*|\s+)[{_QUOTES}]*\s*(?P<sign>[-+−–—]?)\s*"
+    rf" ?(?P<key>[^\s=:]+(?:[ ][^\W\d]\w*)?)(?: ?[=:] ?| )[{_QUOTES}]* ?(?P<sign>[-+−–—]?) ?"
     r"(?P<number>\d+(?:[.,]\d*)?|[.,]\d+)"
-    r"(?:(?:[eE]|\s*[*·x×]\s*10\^?)(?P<exponent>[-+−–—]?\d+))?\.?"
-    rf"[{_QUOTES}]*\s*(?:(?!m?Hz|°|deg)[A-Za-zµ][^#]*|(?:±|\+/-)[^#]*)?(?:#.*)?"
+    r"(?:(?:[eE]| ?[*·x×] ?10\^?)(?P<exponent>[-+−–—]?\d+))?\.?"
+    rf"[{_QUOTES}]* ?(?:(?!m?Hz|°|deg)[A-Za-zµ][^#]*|(?:±|\+/-)[^#]*)?(?:#.*)?"
 )
 MOST_SPOILT = 200  # statements and tables; a file with more mistakes is refused
 _NOT_VALID = "not valid TOML"
@@ -333,7 +334,7 @@ def _merge(into: dict[str, Any], table: Location, new: Mapping[str, Any]) -> boo
 
 def mend_number(line: str) -> str:
     """Return a line with a name and one number as TOML; "" if its meaning is not certain."""
-    typed = _ONE_NUMBER.fullmatch(line[:_LONGEST_LINE].strip())
+    typed = _ONE_NUMBER.fullmatch(" ".join(line[:_LONGEST_LINE].split()))
     if not typed:
         return ""
     key = unicodedata.normalize("NFKC", typed["key"].strip(_QUOTES)).replace(" ", "_")
