@@ -206,9 +206,16 @@ def test_diverging_model_is_reported_as_nan():
     )
     t = sample_times(600, 0.005)
 
-    got = simulate(AugmentedChain(chain=chain, terms=(term,)).tables(), t, np.full(t.size, 0.05))
+    tables = AugmentedChain(chain=chain, terms=(term,)).tables()
+    run = describe_run(t, np.full(t.size, 0.05), free=[True])
+    start = StartState(np.zeros((1, 1)), np.zeros((1, 1)), np.ones(1))
 
-    assert np.all(np.isnan(got))
+    readings, derivatives = kernel.simulate(
+        [(tables, start)], run, of=np.array([[sensitivity.BY_MASS], [0]])
+    )
+
+    assert np.all(np.isnan(readings))
+    assert np.all(np.isnan(derivatives))
 
 
 def test_batch_gives_what_single_runs_give():

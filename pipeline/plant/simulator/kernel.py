@@ -381,8 +381,8 @@ def simulate(
 
     Returns
     -------
-    readings (b, n, samples) without encoder zero, NaN for a variant that diverged; derivatives
-    (lanes, n, samples) of the first variant's readings.
+    readings (b, n, samples) without encoder zero; derivatives (lanes, n, samples) of the first
+    variant's readings. Both are NaN for a variant that diverged.
     """
     of = _plain(of, np.int64)
     run = run._replace(held=np.zeros_like(run.held))  # threads may share a run
@@ -393,6 +393,6 @@ def simulate(
         start = StartState(*(_plain(array, np.float64) for array in start))
         bodies = assemble(tables, run.free)
         if not _simulate(tables, bodies, run, start, make_lanes(of, bodies.N), y[b], dy):
-            y[b] = np.nan
+            y[b] = dy[:] = np.nan
         of, dy = NO_LANES, dy[:0]
     return y, derivatives
