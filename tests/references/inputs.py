@@ -345,7 +345,7 @@ FEW_TEAMS: dict[str, tuple[Edit, ...]] = {
     "twice": (
         *MISTAKES["hertz-twice"],
         *MISTAKES["gains-small"],
-        clipped("sine-1?", "x1", side=-1),
+        clipped("sweep", "input", side=-1),
     ),
     "two-loops": (times(_GAINS, 1.22, tables="initial"), *MISTAKES["two-loops"]),
 }
