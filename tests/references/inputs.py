@@ -384,6 +384,6 @@ HIDDEN = {
     "delay": (2, "input_delay"),
     "lag": (1, "actuator_lag"),
     "sensor": (2, "sensor_gain:cart=2"),
-    "cogging": (1, "cogging:cart=1"),
+    "cogging": (1, "cogging"),
     "offset": (1, "force_offset:cart=1"),
 }
