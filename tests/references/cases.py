@@ -189,16 +189,16 @@ def write_class(folder: Path, *, carts: int, teams: Teams, seed: int) -> Path:
 
 
 def write_rubric(folder: Path, *, carts: int) -> Path:
-    """Write the shipped rubric, stricter.
+    """Write the shipped rubric, in which three criteria require each other in a chain.
 
-    Three criteria require each other in a chain, and initial and final numbers may hardly differ.
+    For one cart, the initial and final numbers may hardly differ.
     """
     file = folder / f"rubric-{carts}.toml"
     document: Any = tomlkit.parse((ROOT / "rubrics" / f"throne-{carts}dof.toml").read_text("utf-8"))
     for one in document["criteria"]:
         if one["id"] == "prefilter":
             one["requires"] = ["comparison"]
-        if one["id"] == "comparison":
+        if one["id"] == "comparison" and carts == 1:
             one["full_percent"], one["none_percent"] = 0.5, 4
             one["parameters"] = ["omega_*"]
     file.write_text(tomlkit.dumps(document), encoding="utf-8", newline="\n")
