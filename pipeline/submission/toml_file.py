@@ -475,7 +475,7 @@ def _explain_slip(slip: _Slip, line: str, root: type[BaseModel], *, numbers: boo
         tomllib.loads(new)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError):
         return words
-    mended = new != line and new.isprintable() and len(new) <= _SHOWN
+    mended = new not in ("", line) and new.isprintable() and len(new) <= _SHOWN
     return f"{words}: write {new}" if mended else words
 
 

@@ -8,7 +8,13 @@ import pytest
 
 from pipeline.desk.student.folder_tasks import students_see
 from pipeline.errors import SubmissionError
-from pipeline.grading.judge.run import grade_submission
+from pipeline.grading.grade import Grade
+from pipeline.grading.judge.run import (
+    analyse_under,
+    grade_analysis,
+    grade_submission,
+    under_rubric,
+)
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.simulated.submission import write_submission
 from pipeline.submission import Reported, Submission, load_submission
@@ -205,12 +211,15 @@ def reordered(text: str) -> str:
         ("omega_a = 2*pi*1.6", ""),
         ("omega_a = 10 1", ""),
         ("omega_a = ten", ""),
+        ("omega_a =", ""),
+        ("omega_a = 10.1 // from the fit", ""),
     ],
 )
 def test_the_advice_is_a_line_that_can_be_read(tmp_path, typed, write):
     """The message has the line to write if it is certain, and never one that is wrong too."""
     (part,) = read(tmp_path, TEXT.replace("omega_a = 10.1", typed)).unread
     assert re.findall(r"write (\S+ = [^;\s]+)", part.message) == [write] * bool(write)
+    assert "write ;" not in part.message
     assert "not valid TOML" not in part.message
     if write:
         assert not read(tmp_path, TEXT.replace("omega_a = 10.1", write)).unread
@@ -289,6 +298,62 @@ def test_an_edit_still_needs_a_valid_file(tmp_path):
     read(tmp_path, TEXT.replace("10.1", '"n/a"'))
     with pytest.raises(SubmissionError, match="expected a number, found 'n/a'"):
         edit_submission(tmp_path, lambda document: document.update({"title": "t"}))
+
+
+@pytest.fixture(scope="module")
+def judged(tmp_path_factory):
+    """Return a function that grades an edit of the final table of a right submission."""
+    folder = tmp_path_factory.mktemp("typos") / "team-07"
+    write_submission(folder, "throne-2dof", seed=3, compact=True, reported=True)
+    rubric = load_rubric(Path("throne-2dof"))
+    analysis = analyse_under(load_submission(folder), rubric=rubric).analysis
+    toml = folder / "submission.toml"
+    text = toml.read_text("utf-8")
+
+    def grade(old: str, new: str) -> Grade:
+        head, final = text.split("[reported.final]")
+        final = re.sub(old, new, f"[reported.final]{final}", count=1, flags=re.MULTILINE)
+        toml.write_text(head + final, "utf-8", newline="\n")
+        submission, _ = under_rubric(load_submission(folder), rubric)
+        return grade_analysis(submission, analysis, rubric=rubric, name="t").grade
+
+    return grade
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "losing"),
+    [
+        ("^(omega_a = .*)", r"\1", set()),
+        ("^(omega_a = 1.).", r"\1,", {"pieces", "final-frequencies"}),
+        ("^omega_a = .*", 'omega_a = "n/a"', {"pieces", "final-frequencies"}),
+        ("^omega_a =.*", "omega_a =", {"pieces", "final-frequencies"}),
+        ("^omega_1", "omega1", {"pieces", "final-frequencies"}),
+        # What is left out, not mistyped, cannot satisfy a law; a zero says no more.
+        ("^omega_a =.*", "omega_a = 0", {"final-frequencies", "laws"}),
+        ("^omega_a =.*", "", {"pieces", "final-frequencies", "laws"}),
+    ],
+)
+def test_a_mistyped_number_costs_only_itself(judged, old, new, losing):
+    """The laws of the table are judged without a number that cannot be read."""
+    grade = judged(old, new)
+    assert {c.id for c in grade.criteria if c.points < c.out_of} == losing
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("^omega_1", "omega1", "final.omega1: unknown parameter; did you mean 'omega_1'?"),
+        (r"^\[reported.final\]", "[reported.finale]", "did you mean 'final'?"),
+        (r"^\[reported.feedback\]", "", "state_space.prefilter: unknown key"),
+        (r"^\[reported.state_space\]", "[reported.statespace]", "did you mean 'state_space'?"),
+    ],
+)
+def test_a_wrong_name_is_said_where_its_number_is_missing(judged, old, new, said):
+    """The feedback quotes the mistyped name of a number or table."""
+    (missing,) = (c for c in judged(old, new).criteria if c.id == "pieces")
+    assert "Missing: " in missing.message
+    assert "Cannot be read: submission.toml line " in missing.message
+    assert said in missing.message
 
 
 def test_one_typo_costs_one_number_in_grading(tmp_path):

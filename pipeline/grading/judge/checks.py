@@ -44,8 +44,8 @@ def judge(criterion: asked.Criterion, work: Work) -> Verdict:
 def judge_with_undoing(criterion: asked.Criterion, work: Work) -> Judgement:
     """Judge one criterion as typed, and again with the mistakes of the student undone."""
     typed, slips = judge(criterion, work), work.slips(criterion.check)
-    incomplete = criterion.check == "laws" and typed.share is None
-    if not slips or incomplete:  # a law of a complete table says nothing about missing numbers
+    # No law can judge numbers that were left out; those that cannot be read cost only themselves.
+    if not slips or (criterion.check == "laws" and work.omits_final):
         return Judgement.plain(typed)
     undone = judge(criterion, work.leaving(()))
     only = {
@@ -70,6 +70,9 @@ def _required(criterion: asked.RequiredPieces, work: Work) -> Verdict:
     missing = [piece for piece in pieces if piece.share < 1]
     unread = first_few(list(work.analysis.unreadable), _NAMED)
     said = say_missing(missing, most=_NAMED) or "Everything required is here."
+    if any(piece.kind is None for piece in pieces) and work.strange:
+        unknown = "; ".join(work.strange[:_NAMED])
+        said += f" Cannot be read: {unknown}{'' if unknown.endswith('?') else '.'}"
     return Verdict(
         share=share_there(pieces),
         message=said + (f" Not counted, because they cannot be read: {unread}." if unread else ""),

@@ -18,7 +18,13 @@ from pipeline.grading.references.reference import References
 from pipeline.grading.rubric import RequiredPieces, RequiredRuns, Rubric, matching
 from pipeline.names import read_name
 from pipeline.results import Analysis, Kind
-from pipeline.submission import Experiment, Reported, ReportedStateSpace, Submission
+from pipeline.submission import (
+    Experiment,
+    Reported,
+    ReportedFeedback,
+    ReportedStateSpace,
+    Submission,
+)
 from pipeline.words.numbers import first_few
 
 
@@ -137,6 +143,27 @@ class Work:
         """Return why a number of `[reported]`, or its whole table, cannot be read; else ""."""
         parts = {one.at[1:]: one.message for one in self.submission.unread}
         return next((parts[at[:n]] for n in range(len(at) + 1) if at[:n] in parts), "")
+
+    @property
+    def omits_final(self) -> bool:
+        """Whether the final table lacks more numbers than it has that cannot be read."""
+        lacking = set(self.rubric.names) - set(self.reported.final)
+        unread = [one for one in self.submission.unread if one.at[1:2] == ("final",)]
+        return len(lacking) > len(unread)
+
+    @property
+    def strange(self) -> list[str]:
+        """The messages on parts of `[reported]` with a name that no table has, such as `K1`."""
+        names = self.rubric.names
+        known = {"initial": names, "final": names}
+        known |= {"state_space": [*ReportedStateSpace.model_fields]}
+        known |= {"feedback": [*ReportedFeedback.model_fields]}
+        return [
+            one.message
+            for one in self.submission.unread
+            for table, *below in [one.at[1:]] * (len(one.at) > 1)
+            if table not in known or (below and below[0] not in known[table])
+        ]
 
     def because_unread(self, *at: str) -> str:
         """Return the reason as a further sentence, with a space before it; "" without a reason."""
