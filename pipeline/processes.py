@@ -16,6 +16,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, Literal
 
@@ -302,16 +303,17 @@ def serve(prepare: Callable[..., Callable[[Any, Progress], Any]]) -> None:
     threading.Thread(target=_listen, args=(sent,), daemon=True).start()
     first = json.loads(sent.get())
     do = prepare(**first["setup"])
-    limit_memory(first["memory"])
-    say(ready=True)
-    while True:
-        asked = json.loads(sent.get())
-        faulthandler.dump_traceback_later(asked["limit"] + _GRACE, exit=True)
-        try:
-            say(done=attempt(lambda task=asked["task"]: do(task, lambda stage: say(stage=stage))))
-        except Failed as error:
-            say(failed=str(error))
-        faulthandler.cancel_dump_traceback_later()
+    with limited_memory(first["memory"]):
+        say(ready=True)
+        while True:
+            asked = json.loads(sent.get())
+            faulthandler.dump_traceback_later(asked["limit"] + _GRACE, exit=True)
+            task = asked["task"]
+            try:
+                say(done=attempt(lambda task=task: do(task, lambda stage: say(stage=stage))))
+            except Failed as error:
+                say(failed=str(error))
+            faulthandler.cancel_dump_traceback_later()
 
 
 def attempt(work: Callable[[], Any]) -> Any:
@@ -363,16 +365,27 @@ def lines_sent() -> Iterator[bytes]:
         yield from lines
 
 
-def limit_memory(more: int) -> None:
-    """Limit the growth of this process's address space to `more` bytes, on Linux only."""
+@contextmanager
+def limited_memory(more: int) -> Iterator[bool]:
+    """Limit the growth of this process's address space to `more` bytes, on Linux only.
+
+    A lower limit that is set already remains. Yields whether the new limit holds.
+    """
     if sys.platform != "linux":
+        yield False
         return
     import resource
 
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
     limit = pages * resource.getpagesize() + more
-    _, hard = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
+    before, hard = resource.getrlimit(resource.RLIMIT_AS)
+    lower = before == resource.RLIM_INFINITY or limit < before
+    if lower:
+        resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
+    try:
+        yield lower
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (before, hard))
 
 
 def _listen(sent: "queue.SimpleQueue[bytes]") -> None:

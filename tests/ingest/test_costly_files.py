@@ -3,6 +3,7 @@
 import gc
 import re
 import shutil
+import sys
 import time
 import zlib
 from io import BytesIO
@@ -16,6 +17,7 @@ from pipeline.ingest import columns
 from pipeline.ingest.formats import recognise, text, workbook
 from pipeline.ingest.formats.recognise import parse_table, read_table
 from pipeline.ingest.read import read_data
+from pipeline.processes import limited_memory
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission, toml_file
 from pipeline.submission.load import NAME
@@ -104,6 +106,21 @@ def test_the_time_to_read_one_file_is_limited(tmp_path, monkeypatch):
     monkeypatch.undo()
     assert read_table(tmp_path, "short.csv")[0].values.shape == (2, 2)
     assert read_table(tmp_path, "long.csv")[0].values.shape == (2, 400_000)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits address space")
+def test_the_memory_to_read_one_file_is_limited(tmp_path, monkeypatch):
+    """A file that takes too much memory is refused by itself, and the next one is read."""
+    (tmp_path / "long.csv").write_text("time,x1\n" + "0.001,12\n" * 1_000_000, encoding="utf-8")
+    (tmp_path / "short.csv").write_text("time,x1\n0,1\n1,2\n", encoding="utf-8")
+    monkeypatch.setattr(recognise, "MOST_MEMORY", 10_000_000)
+    with pytest.raises(SubmissionError, match=r"long\.csv: needs more than 0\.01 GB"):
+        read_table(tmp_path, "long.csv")
+    assert read_table(tmp_path, "short.csv")[0].values.shape == (2, 2)
+    with limited_memory(5_000_000), pytest.raises(MemoryError):  # the limit of a whole submission
+        read_table(tmp_path, "long.csv")
+    monkeypatch.undo()
+    assert read_table(tmp_path, "long.csv")[0].values.shape == (2, 1_000_000)
 
 
 # The patterns that are applied to text of any length, and how.

@@ -16,6 +16,7 @@ from pipeline.ingest.formats.table import FileTable
 from pipeline.ingest.formats.tdms import is_tdms, read_tdms
 from pipeline.ingest.formats.text import read_text
 from pipeline.ingest.formats.workbook import is_workbook, read_workbook
+from pipeline.processes import limited_memory
 from pipeline.submission.load import file_problem
 
 # Endings of data files.
@@ -41,6 +42,7 @@ _READERS = (
     (is_tdms, read_tdms),
 )
 
+MOST_MEMORY = 900_000_000  # bytes to read one file; the largest recording takes 850,000,000
 MOST_SECONDS = 30.0  # of processor time to read one file; the largest recording takes ten
 
 # First bytes of files that are submitted by mistake, and the advice to give.
@@ -89,10 +91,10 @@ class _TooLong(BaseException):
 
 @contextmanager
 def _limited(source: str) -> Iterator[None]:
-    """Limit the processor time for reading one file, so that it costs only its own recording.
+    """Limit the time and memory for reading one file, so that it costs only its own recording.
 
     Processor time does not depend on the load of the computer. On Windows, and outside the main
-    thread, there is no such limit; there, the limit of the whole submission remains.
+    thread, there are no such limits; there, those of the whole submission remain.
 
     Raises
     ------
@@ -106,18 +108,25 @@ def _limited(source: str) -> Iterator[None]:
     def stop(*_: object) -> None:
         raise _TooLong
 
-    before = signal.signal(signal.SIGVTALRM, stop)
+    before, own = signal.signal(signal.SIGVTALRM, stop), False
     try:
         try:
             # Again every second: Python drops an exception in a callback of its garbage collector.
             signal.setitimer(signal.ITIMER_VIRTUAL, MOST_SECONDS, 1.0)
-            yield
+            with limited_memory(MOST_MEMORY) as own:
+                yield
         finally:
             signal.setitimer(signal.ITIMER_VIRTUAL, 0)
             signal.signal(signal.SIGVTALRM, before)
     except _TooLong:
         why = f"takes more than {MOST_SECONDS:g} s of processor time to read"
-        raise SubmissionError(f"{source}: {why}; save the recording as CSV") from None
+    except MemoryError:
+        if not own:  # the whole submission needs more than it may
+            raise
+        why = f"needs more than {MOST_MEMORY / 1e9:g} GB of memory to read"
+    else:
+        return
+    raise SubmissionError(f"{source}: {why}; save the recording as CSV")
 
 
 def is_recording(head: bytes) -> bool:
