@@ -19,6 +19,9 @@ _ORDERS = 3, 8  # least and most order of the flexible change; in between, one f
 _SAME = 1e-3  # share of a column outside the others, below which it adds nothing
 _LINE = 25.0  # power of a line above the noise that chance does not reach
 _BINS = 24  # frequencies near that of the decay that give the noise
+# What may be left as noise: a share of the motion, or a multiple of the noise between neighbouring
+# samples. The flexible change cannot follow a second mode over many periods.
+_NOISE_SHARE, _NOISE_RATIO = 0.01, 10.0
 SECOND = 0.3, 3.0  # frequencies where a second mode may be, relative to that of the first
 UNKNOWNS = 6  # of an exponential decay with a drift
 
@@ -29,8 +32,8 @@ class Departure:
 
     Attributes
     ----------
-    statistic : F-statistic of the flexible change, or that of dry friction or another mode if it
-        says more.
+    statistic : F-statistic of the flexible change, or that of dry friction, another mode or too
+        much noise if it says more.
     limit : what the statistic exceeds by chance in one of 10,000 exponential decays.
     columns : number of columns of the flexible change.
     left : residual (n,) of the exponential fit.
@@ -49,11 +52,17 @@ class Departure:
         return self.statistic > self.limit
 
 
-def find_departure(t: Array, y: Array, fit: Ringing, *, step: float, friction: Array) -> Departure:
+def find_departure(
+    t: Array, y: Array, fit: Ringing, *, step: float, floor: float, friction: Array
+) -> Departure:
     """Test whether the residual of an exponential exceeds the noise of the decay `y`.
 
-    `step` is the encoder step. `friction` (n,) is what a little dry friction adds to the decay;
-    this one column shows less friction than the many of the flexible change.
+    Parameters
+    ----------
+    step : the encoder step.
+    floor : the noise between neighbouring samples (root mean square).
+    friction : what a little dry friction adds to the decay, shape (n,). This one column shows less
+        friction than the many of the flexible change.
     """
     tau, residual, pole = t - t[0], y - fit(t), complex(fit.poles[0])
     n, angle = t.size, pole.imag * float(t[-1] - t[0]) / (t.size - 1)
@@ -79,11 +88,13 @@ def find_departure(t: Array, y: Array, fit: Ringing, *, step: float, friction: A
     friction = friction - basis @ (basis.T @ friction)
     # Friction only ever brakes, so chance has twice its share on this side.
     rubbed = max(float(friction @ left), 0.0) ** 2 / float(friction @ friction) / density
+    most = max(_NOISE_SHARE * float(np.ptp(y)), _NOISE_RATIO * floor)
     return Departure(
         statistic=max(
             float(along @ along) / along.size / density,
             limit / float(fdtri(1, freedom, 1 - 2 * _CHANCE)) * rubbed,
             limit / _LINE * _highest_line(noise, angle=angle),
+            limit * (float(np.std(noise)) / most) ** 2 if most > 0 else 0.0,
         ),
         limit=limit,
         columns=along.size,

@@ -193,6 +193,7 @@ def fit_decay(
                 y[own],
                 fit,
                 step=step,
+                floor=floor,
                 turning=t[run],
                 falling=bool(y[run[1]] < y[run[0]]),
                 only=known.name if known else None,

@@ -173,6 +173,7 @@ def explain_decay(
     fit: Ringing,
     *,
     step: float,
+    floor: float,
     turning: Array,
     falling: bool,
     only: DecayCause | None = None,
@@ -184,6 +185,7 @@ def explain_decay(
     t, y : times and readings (n,) of one free decay.
     fit : the exponential fit to the same samples.
     step : the encoder step.
+    floor : the noise between neighbouring samples (root mean square).
     turning : times of the turning points.
     falling : whether y decreases after the first turning point.
     only : the only law to try; by default all compete.
@@ -200,6 +202,7 @@ def explain_decay(
         coarse_y,
         fit,
         step=step / np.sqrt(size),
+        floor=floor,
         friction=swings_at(coarse_t, around, cycles=np.inf).columns[:, 3],
     )
     noise, columns = departure.noise, departure.columns + UNKNOWNS
