@@ -612,6 +612,23 @@ def test_a_broken_submission_file_is_shown_with_its_error(filled, text):
     assert visitor.get(HERE + "hand-in.zip").status == 422
 
 
+@pytest.mark.parametrize("typo", ["K_1 = 24,3", "K_1 24.3", "K_1 ="])
+def test_a_mistyped_number_does_not_hide_the_recordings(typo, filled):
+    """The recordings keep their tables, none can be moved aside, and the page quotes the line."""
+    visitor, folder = filled
+    stranger = "that is not in submission.toml"
+    before = visitor.get(HERE).text
+    text = (folder / NAME).read_text(encoding="utf-8").partition("[reported")[0]
+    (folder / NAME).write_text(f"{text}\n[reported.final]\n{typo}\n", encoding="utf-8")
+    page = visitor.get(HERE).text
+    assert page.count(stranger) == before.count(stranger)
+    assert any(typo in wrong for wrong in wrongs(page))
+    assert "in an editor" in page
+    named = load_submission(folder).experiments[0].file
+    assert visitor.post(HERE + "aside", file=named).status == 422
+    assert (folder / named).exists()
+
+
 @pytest.mark.parametrize("broken", [b"version = \n", b"\xff", b"#" * 1_000_001])
 def test_an_unreadable_submission_file_is_refused_and_can_be_replaced(broken, filled):
     """A `submission.toml` that cannot be read is not accepted as an upload.

@@ -47,12 +47,19 @@ _LARGEST = 10_000  # bits of a whole number that is shown in decimal digits
 
 
 def read_document(text: str, *, folder: str = "", progress: Progress = silent) -> dict[str, Any]:
-    """Return the tables of a file with numbers as typed text; {} if it is not valid TOML."""
+    """Return the tables of a file with numbers as typed text; {} if it is not valid TOML.
+
+    A mistake in `[reported]` costs only the number or table there.
+    """
     if find_deep_key(text):
         return {}
     try:
         return _plain(tomllib.loads(text, parse_float=str))  # type: ignore[arg-type]
     except (tomllib.TOMLDecodeError, RecursionError, ValueError):
+        pass
+    try:
+        return _plain(read_apart(text, "reported").document)
+    except (TomlSlip, RecursionError):
         return {}
 
 
