@@ -196,6 +196,8 @@ def _decades(a: TypedNumber, b: TypedNumber, spread: tuple[float, float]) -> flo
     both_gross = min(abs(one.error - middle) for one in (a, b)) > _GROSS * sigma
     if a.digits < _FEWEST_DIGITS or equal_data or both_gross or (a.is_right and b.is_right):
         return 0.0
+    if not sigma:  # most teams report exact numbers, so nothing is known about errors
+        return 0.0
     # The largest density of a normal distribution, times the width of a step.
     chance = a.step / (a.value * sigma * math.sqrt(2 * math.pi))
     return min(max(-math.log10(chance), 0.0), _MOST_DECADES)
