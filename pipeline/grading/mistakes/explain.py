@@ -76,7 +76,8 @@ def explain(
     believed : codes of mistakes found in the other table; here they cost no likelihood.
     """
     typed = {name: Typed.of(number) for name, number in table.items()}
-    ways = _by_way([_Tried.on(m, typed, label) for m in mistakes if not m.beside.intersection(off)])
+    tried = [m for m in mistakes if not m.beside.intersection(off)]
+    ways = _by_way([_Tried.on(m, typed, label, believed=believed) for m in tried])
     remaining, codes = list(off), frozenset[Code]()
     found: list[ExplainedNumbers] = []
     while remaining:
@@ -149,20 +150,31 @@ class _Tried:
     Attributes
     ----------
     errors : for each parameter, the difference between table and prediction, in percent.
+    is_believed : whether the other table has the same mistake. Its numbers may then differ from the
+        predictions as much as honest numbers do.
     """
 
     mistake: Mistake
     label: Label
     errors: Mapping[str, float]
+    is_believed: bool
 
     @classmethod
-    def on(cls, mistake: Mistake, table: Mapping[str, Typed], label: Label) -> "_Tried":
+    def on(
+        cls,
+        mistake: Mistake,
+        table: Mapping[str, Typed],
+        label: Label,
+        *,
+        believed: frozenset[Code],
+    ) -> "_Tried":
         errors = {
             name: table[name].percent_off(predicted, sigmas=limits.SIGMAS)
             for name, predicted in mistake.predicted.items()
             if name in table
         }
-        return cls(mistake=mistake, label=label, errors=errors)
+        is_believed = believed.issuperset(mistake.codes)
+        return cls(mistake=mistake, label=label, errors=errors, is_believed=is_believed)
 
     def explains(self, remaining: Sequence[str]) -> list[str]:
         """Return the remaining wrong numbers that the mistake explains; none if it is not credible.
@@ -173,6 +185,7 @@ class _Tried:
         mistake = self.mistake
         met = [name for name in self.errors if self.off_by(name) <= 1]
         near = [name for name in self.errors if name in met or self._is_near(name)]
+        met = near if self.is_believed else met
         if len(met) < mistake.least or 2 * len(met) < len(near):
             return []
         if mistake.whole and len(near) < len(self.errors):

@@ -189,6 +189,15 @@ def test_a_decrement_with_log10_is_flagged(carts):
 
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
+def test_a_mistake_found_in_one_table_explains_a_careless_number_in_the_other(carts):
+    """Gains 5 % below twice the true ones prove nothing by themselves, but beside exact ones do."""
+    one, names = student(carts), own("K", carts)
+    careless = scaled(one, "initial", names, 1.9)
+    assert "peak_to_peak" not in codes(careless)
+    assert codes(scaled(careless, "final", names, 2.0)) == ["peak_to_peak"]
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
 @pytest.mark.parametrize("table", ["initial", "final"])
 def test_gains_from_peak_to_peak_and_in_counts_are_flagged(carts, table):
     """Gains that are twice the true gains are flagged as read from peak to peak.
