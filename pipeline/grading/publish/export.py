@@ -81,6 +81,15 @@ def export(
                 f"{first_few(unfinished, _NAMED)}"
             )
         )
+    above = [e for e in entries if e.grade.points > rubric.out_of]
+    if platform == "moodle" and above:
+        named = [f"{e.submission} ({points_text(e.grade.points)})" for e in above]
+        remarks.append(
+            Remark(
+                text=f"more than the maximum of {points_text(rubric.out_of)}, which Moodle does "
+                f"not import: {first_few(named, _NAMED)}"
+            )
+        )
     if platform == "canvas" and (word := _IGNORED.search(title)):
         remarks.append(
             Remark(

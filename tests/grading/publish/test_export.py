@@ -349,6 +349,15 @@ def test_moodle_gets_the_reason_for_points_by_hand(tmp_path):
     assert "by hand from 0 to" in rows[1][2]
 
 
+@pytest.mark.parametrize(("platform", "told"), [("moodle", 1), ("canvas", 0)])
+def test_points_above_the_maximum_are_named_for_moodle(tmp_path, platform, told):
+    """A bonus may exceed the maximum, which Moodle's import refuses and Canvas' does not."""
+    more = make_grade("a", authors=("ann",)).model_copy(update={"points": RUBRIC.out_of + 1.5})
+    _, said = write(tmp_path, make_outcome(more), platform=platform)
+    named = [text for text in said if f"a ({RUBRIC.out_of + 1.5:g})" in text]
+    assert len(named) == told
+
+
 def test_moodle_gets_a_table_if_participants_are_unknown(tmp_path):
     """Without participant numbers, Moodle gets a table of grades by id number."""
     rows, _ = write(tmp_path, FULL, platform="moodle", title="Lab 3")
