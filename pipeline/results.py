@@ -373,8 +373,23 @@ class FrequencyResponse:
 
     @property
     def has_signal(self) -> NDArray[np.bool_]:
-        """Whether each magnitude (n_w,) is above the noise, by three standard errors."""
-        return self.magnitude > SIGNAL * self.magnitude_std
+        """Whether each magnitude (n_w,) is above the noise, by three standard errors.
+
+        A table without standard errors shows no noise.
+        """
+        return (self.magnitude > 0) & ~(self.magnitude <= SIGNAL * self.magnitude_std)
+
+    def only(self, kept: NDArray[np.bool_]) -> "FrequencyResponse":
+        """Return the response with only the points for which `kept` (n_w,) is true."""
+        phase, phase_std = self.phase, self.phase_std
+        return replace(
+            self,
+            omega=self.omega[kept],
+            magnitude=self.magnitude[kept],
+            magnitude_std=self.magnitude_std[kept],
+            phase=None if phase is None else phase[kept],
+            phase_std=None if phase_std is None else phase_std[kept],
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -216,11 +216,14 @@ def find_resonances(responses: Sequence[FrequencyResponse], *, n: int) -> dict[s
       the last cart's own frequency.
     - Gains are the magnitudes at the lowest frequency.
     - Dampings of modes and nulls are assumed.
+
+    Only points above the noise count.
     """
-    by_cart = {response.cart: response for response in responses}
+    seen = [r.only(r.has_signal) for r in responses if r.has_signal.any()]
+    by_cart = {response.cart: response for response in seen}
     names = set(parameter_names(n))
     found: dict[str, Estimate] = {}
-    modes = _shared_peaks(responses, n=n)
+    modes = _shared_peaks(seen, n=n)
     if len(modes) == n - 1 and n in by_cart:
         modes = _with_damped_mode(by_cart[n], modes)
     nulls = {cart: _between(_extrema(r, sign=-1), modes) for cart, r in by_cart.items()}
@@ -237,7 +240,7 @@ def find_resonances(responses: Sequence[FrequencyResponse], *, n: int) -> dict[s
         found |= _estimates(omega_names(NULLS), _strongest(nulls[1], 2))
     assumed = [mode_zeta(suffix) for suffix in (*symbols, *NULLS)]
     # The carts share the peaks, which also correct the gains.
-    runs = tuple(dict.fromkeys(run for response in responses for run in response.experiments))
+    runs = tuple(dict.fromkeys(run for response in seen for run in response.experiments))
     measured = {name: replace(one, experiments=runs) for name, one in found.items()}
     return measured | {
         name: Estimate(value=ASSUMED_ZETA, std=None, source="assumed")

@@ -1,5 +1,7 @@
 """The frequency response is measured from dwells and records, with its peaks and nulls."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -318,6 +320,37 @@ def test_noise_gives_no_resonance():
     got = find_resonances([flat], n=1)
 
     assert set(got) == {"zeta"}
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("top", [0.9, 1.4, 3.0])
+def test_points_without_signal_give_no_estimate(preset, top):
+    """Dwells in which no cart moves above the noise change no initial estimate.
+
+    Below the first resonance or between two, a missing mode would be read from them.
+    """
+    chain = PRESETS[preset]
+    top *= chain.parameters()["omega_n" if chain.n == 1 else "omega_a"]
+    seen = table(chain, np.geomspace(0.5 * top, top, 15))
+    faint = np.concatenate([np.geomspace(0.05, 0.4, 6) * top, np.geomspace(1.1, 8.0, 25) * top])
+    rng = np.random.default_rng(7)
+
+    def with_faint(r: FrequencyResponse) -> FrequencyResponse:
+        size = 1e-3 * float(r.magnitude.min())
+        order = np.argsort(np.concatenate([r.omega, faint]))
+        # Below three standard errors there is no signal.
+        noise = size * rng.uniform(0.05, 2.9, faint.size)
+        return replace(
+            r,
+            omega=np.concatenate([r.omega, faint])[order],
+            magnitude=np.concatenate([r.magnitude, noise])[order],
+            magnitude_std=np.concatenate([r.magnitude_std, np.full(faint.size, size)])[order],
+        )
+
+    assert find_resonances([*map(with_faint, seen)], n=chain.n) == find_resonances(seen, n=chain.n)
+    unseen = [with_faint(r) for r in seen]
+    unseen = [replace(r, magnitude_std=np.maximum(r.magnitude_std, r.magnitude)) for r in unseen]
+    assert find_resonances(unseen, n=chain.n) == {}
 
 
 def test_no_response_gives_no_estimates():

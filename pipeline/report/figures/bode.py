@@ -1,7 +1,6 @@
 """The frequency response of one cart, measured and fitted (the paper's Figures 4, 6, 7, 9-11)."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -158,15 +157,7 @@ def plot_residual(ax: Axes, response: FrequencyResponse, *, chain: Chain) -> Non
 
 
 def _positive(response: FrequencyResponse) -> FrequencyResponse:
-    keep = (response.magnitude > 0) & (response.omega > 0)
-    if keep.all():
-        return response
-    kept = {
-        name: values[keep]
-        for name in ("omega", "magnitude", "magnitude_std", "phase", "phase_std")
-        if (values := getattr(response, name)) is not None
-    }
-    return replace(response, **kept)
+    return response.only((response.magnitude > 0) & (response.omega > 0))
 
 
 def _points(

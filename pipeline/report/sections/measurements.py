@@ -28,7 +28,7 @@ def response_blocks(page: Page) -> list[Block]:
     responses, chain = page.analysis.frequency_responses, page.analysis.chain
     key, pictures = "bode" if chain else "bode_points", []
     for response in sorted(responses, key=lambda r: -r.cart):
-        if np.any(response.magnitude > 0):
+        if response.has_signal.any():
             figure = bode_figure(response, chain=chain, units=page.units)
             name, values = f"bode-cart-{response.cart}", _bode_words(page, response)
             pictures.append(page.picture(name, figure, _WORDS, key, alt="bode_alt", **values))
@@ -69,7 +69,7 @@ def _bode_words(page: Page, response: FrequencyResponse) -> dict[str, object]:
     Points without a signal are only counted.
     """
     chain, n, cart = page.analysis.chain, page.analysis.bench.n, response.cart
-    clear = response.has_signal if response.has_signal.any() else response.magnitude > 0
+    clear = response.has_signal
     omega, magnitude = response.omega[clear], response.magnitude[clear]
     faint = response.omega.size - omega.size
     peak = int(np.argmax(magnitude))
