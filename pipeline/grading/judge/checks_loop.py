@@ -201,6 +201,9 @@ def judge_hardware(criterion: asked.Hardware, work: Work) -> Verdict:
         skipped = work.analysis.skipped
         reasons = [one.reason for one in skipped if one.stage is Stage.HARDWARE_CHECK]
         why = reasons[0] if reasons else "the controller that ran or its gains are not stated"
+        fit = work.analysis.fit
+        if fit is None or not fit.converged:  # this proves nothing about the loop
+            return Verdict(share=None, message=f"Not checked: {why}.")
         return Verdict(share=NONE, message=f"The loop cannot be compared: {why}.")
     errors = {run: 100 * float(np.sqrt(np.mean(np.square(e)))) for run, e in closed.items()}
     run = min(errors, key=lambda name: errors[name])

@@ -330,6 +330,16 @@ def test_recordings_earn_points_without_reported_numbers():
     assert set(earned) == {"pieces", "dwells", "data", "hardware"}
 
 
+@pytest.mark.parametrize("lacking", ["carts", "controller"])
+def test_a_loop_without_a_model_is_not_judged(lacking):
+    """Without fitted carts a person judges the loop; without its controller it earns nothing."""
+    one = student(2)
+    fit = None if lacking == "carts" else one.analysis.fit
+    graded = replace(one, analysis=replace(one.analysis, fit=fit, hardware=())).grade()
+    (loop,) = [c for c in graded.criteria if c.id == "hardware"]
+    assert (loop.outcome, loop.points) == ("skip" if lacking == "carts" else "fail", 0)
+
+
 def test_further_flags_keep_the_order_of_the_codes():
     """Flags that a batch adds are sorted in the order of the codes."""
     graded = student(2).without("final", "zeta_b").grade()
