@@ -2,6 +2,7 @@
 
 import re
 import unicodedata
+from collections.abc import Iterator
 
 from markupsafe import Markup, escape
 
@@ -11,18 +12,29 @@ from pipeline.words.numbers import listing, subscript, typeset
 from pipeline.words.spans import Span, Spans
 
 _NAME = re.compile(r"\b(?:omega|zeta|K|X|m|c|k)_(?:\d|[a-h]|[nxy])\b|\b(?:omega|zeta)\b")
+# What a file contains or should contain: "write omega_a = 10.1", 'omega_1', reported.final.omega_1.
+_CODE = re.compile(r"((?<=write |found )[\w-]+ [=:] [-+,.\w]*\w|'[^'\s]+'|\breported\.[\w.]*\w)")
 _BREAK = re.compile(r"(?<=\w[._-])(?=[^\W\d])")  # "zeta_1" stays whole
 
 
 def rich(text: str) -> Spans:
-    """Return one of cartlab's sentences with names such as `omega_a` as mathematics."""
-    text = typeset(text)
+    """Return one of cartlab's sentences with names such as `omega_a` as mathematics.
+
+    Quotations from a file stay as they are typed.
+    """
     parts: list[Span] = []
+    for i, piece in enumerate(_CODE.split(text)):
+        parts += [Span(piece)] if i % 2 else _with_math(typeset(piece))
+    return tuple(part for part in parts if part.text)
+
+
+def _with_math(text: str) -> Iterator[Span]:
     end = 0
     for match in _NAME.finditer(text):
-        parts += [Span(text[end : match.start()]), name_span(match[0])]
+        yield Span(text[end : match.start()])
+        yield name_span(match[0])
         end = match.end()
-    return tuple(part for part in (*parts, Span(text[end:])) if part.text)
+    yield Span(text[end:])
 
 
 def name_span(name: str) -> Span:
@@ -39,8 +51,10 @@ def symbol_text(name: str) -> str:
 
 
 def with_symbols(text: str) -> str:
-    """Return a sentence with parameter names replaced by symbols, as plain text."""
-    return _NAME.sub(lambda match: symbol_text(match[0]), text)
+    """Return a sentence with parameter names replaced by symbols, as plain text; see `rich`."""
+    pieces = _CODE.split(text)
+    pieces[::2] = [_NAME.sub(lambda match: symbol_text(match[0]), piece) for piece in pieces[::2]]
+    return "".join(pieces)
 
 
 def names_spans(names: list[str]) -> Spans:
