@@ -926,6 +926,7 @@ class Analysis:
     fit : the fitted chain; if it is None, `skipped` says why.
     files : the SHA-256 of each data file.
     unreadable : for each experiment that could not be read, the reason.
+    unread : the line and the reason for each reported number or table that could not be read.
     unexplained : for each driven recording with motion, the share of its power that the fitted
         carts do not explain.
     discussion : `notes.md`, without its comments.
@@ -995,6 +996,7 @@ class Analysis:
     warnings: tuple[str, ...] = written()
     files: dict[str, str]
     unreadable: dict[str, str] = field(default_factory=dict)
+    unread: tuple[str, ...] = ()
     unexplained: dict[str, float] = field(default_factory=dict)
     discussion: str | None
     left_out: tuple[LeftOut, ...] = ()

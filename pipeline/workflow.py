@@ -102,6 +102,7 @@ def analyse(
         warnings=(),
         files=data.files,
         unreadable=data.unreadable,
+        unread=tuple(part.message for part in submission.unread),
         unexplained={name: one.share for name, one in found.fitted.fits.items()},
         discussion=submission.discussion,
         left_out=tuple(left_out),

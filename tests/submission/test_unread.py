@@ -16,6 +16,8 @@ from pipeline.grading.judge.run import (
     under_rubric,
 )
 from pipeline.grading.rubric_file import load_rubric
+from pipeline.report.document import plain_lines
+from pipeline.report.sections.actions import next_steps
 from pipeline.simulated.submission import write_submission
 from pipeline.submission import Reported, Submission, load_submission
 from pipeline.submission.edit import edit_submission
@@ -376,7 +378,11 @@ def test_one_typo_costs_one_number_in_grading(tmp_path):
     assert f"a decimal comma; write a point: write {line}" in found
     assert found.startswith("Cannot be read: omega_n: submission.toml line ")
     assert [flag.code for flag in grade.flags] == ["missing"]
-    assert any("a decimal comma" in said for said in analyse(submission).warnings)
+    analysis = analyse(submission)
+    assert any("a decimal comma" in said for said in analysis.warnings)
+    told = plain_lines([next_steps(analysis)])
+    assert f"write {line}" in told
+    assert "Nothing to fix" not in told
     done = cartlab_here("check", folder)
     assert "a decimal comma" not in done.stderr
     _, said = done.stdout.split("Not checked, because they cannot be read:\n")

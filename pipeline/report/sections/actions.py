@@ -126,6 +126,8 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
     """Yield further advice that does not come from a failed check."""
     say, fit, design = _WORDS.spans, analysis.fit, analysis.feedback
     asked = {_group(check) for check in analysis.failed_checks}
+    if analysis.unread:
+        yield say("next_unread", lines=rich(clean("; ".join(analysis.unread[:_MOST_TOLD]))))
     if wrong := list(dict.fromkeys(reported_off(analysis))):
         yield say("next_reported", names=names_spans(wrong))
     if short := sorted({point.experiment for point in analysis.sine_points if not point.settled}):
