@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pipeline.gap.explain import investigate
-from pipeline.names import toml_flags
+from pipeline.names import read_name, toml_flags
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.report.gap.verdict import terminal_verdict
 from pipeline.report.sections.questions import ask
@@ -25,6 +25,7 @@ from pipeline.submission import load_submission
 from pipeline.submission.load import spring_names
 from pipeline.words.progress import silent
 from pipeline.workflow import analyse
+from tests.helpers.honest_benches import draw_effect
 
 
 def bench_of(k: tuple[float, ...]) -> SimulatedBench:
@@ -182,22 +183,82 @@ def test_an_input_that_no_converter_gives_is_asked_about(tmp_path, preset, scale
     assert why in first_step(analysis)
 
 
-@pytest.mark.parametrize("heavy", ["s[tw]", "decay-1", "none"])
-def test_recordings_of_heavier_carts_are_named(tmp_path, heavy):
-    """Steps, or decays, made with 1.5 times the first mass are a group with their own numbers."""
-    light = bench_of((0.06, 0.08, 0.05))
-    masses = np.array([1.5, 1.0]) * light.chain.m
-    write_submission(tmp_path / "lab", light, seed=3)
-    other = SimulatedBench(chain=replace(light.chain, m=masses))
-    write_submission(tmp_path / "other", other, seed=3)
-    for path in (tmp_path / "other" / "data").glob(f"{heavy}*.csv"):
-        shutil.copy(path, tmp_path / "lab" / "data" / path.name)
-    analysis = analyse(load_submission(tmp_path / "lab"), design=False)
-    assert [check.kind for check in analysis.causes] == ([] if heavy == "none" else ["groups"])
-    if heavy != "none":
-        first, second = analysis.groups
-        assert all(fnmatch(name, f"{heavy}*") for name in second.experiments)
-        (name,) = first.values
-        # A mass 1.5 times as large lowers the cart's frequency by the square root of 1.5.
-        ratio = 1.5 if name == "m_1" else 1.5**-0.5
-        assert second.values[name] / first.values[name] == pytest.approx(ratio, rel=0.02)
+def mixed(folder: Path, *, n: int, cart: int, ratio: float, heavy: str) -> Analysis:
+    """Analyse recordings of which some were made with another mass of one cart.
+
+    Parameters
+    ----------
+    heavy : patterns of the names of the recordings with the other mass, separated by commas.
+    """
+    light = bench_of(_TWO if n == 2 else _THREE)
+    m = light.chain.m * np.where(np.arange(1, n + 1) == cart, ratio, 1.0)
+    write_submission(folder / "lab", light, seed=3, compact=True)
+    other = SimulatedBench(chain=replace(light.chain, m=m))
+    write_submission(folder / "other", other, seed=4, compact=True)
+    for pattern in heavy.split(","):
+        for path in (folder / "other" / "data").glob(f"{pattern}*.csv"):
+            shutil.copy(path, folder / "lab" / "data" / path.name)
+    return analyse(load_submission(folder / "lab"), design=False)
+
+
+def assert_groups_differ(analysis: Analysis, *, cart: int, ratio: float, heavy: str) -> None:
+    """Assert that the recordings with the other mass are a group that shows this mass."""
+    assert [check.kind for check in analysis.causes] == ["groups"]
+    first, second = analysis.groups
+    patterns = [f"{pattern}*" for pattern in heavy.split(",")]
+    held = {any(fnmatch(name, one) for one in patterns) for name in second.experiments}
+    assert len(held) == 1
+    if held == {False}:  # the larger group has the other mass
+        ratio = 1 / ratio
+    (name,) = first.values
+    assert read_name(name).cart == cart
+    # A frequency falls with the square root of the mass.
+    expected = ratio if name == f"m_{cart}" else ratio**-0.5
+    # The errors of both numbers are below 0.5 %, and the smallest difference is 5 %.
+    assert second.values[name] / first.values[name] == pytest.approx(expected, rel=0.01)
+
+
+_LONG = (pytest.mark.slow, pytest.mark.sample)
+_MIXED = [  # carts, the cart with another mass, its ratio, and the recordings with it
+    (2, 2, 1.1, "step,sweep"),
+    (2, 2, 1 / 1.1, "decay"),
+    pytest.param(2, 1, 1.2, "sweep", marks=_LONG),
+    pytest.param(3, 3, 1.3, "step,sweep", marks=_LONG),
+]
+
+
+@pytest.mark.parametrize(("n", "cart", "ratio", "heavy"), _MIXED)
+def test_recordings_of_other_masses_are_named(tmp_path, n, cart, ratio, heavy):
+    """Recordings made with a mass that is 10 % off or more are a group with their own number."""
+    analysis = mixed(tmp_path, n=n, cart=cart, ratio=ratio, heavy=heavy)
+    assert_groups_differ(analysis, cart=cart, ratio=ratio, heavy=heavy)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("heavy", ["step,sweep", "decay", "sine", "step,sweep,decay", "sweep"])
+@pytest.mark.parametrize("ratio", [1.1, 1.2, 1.3, 1 / 1.1, 1 / 1.3])
+@pytest.mark.parametrize("cart", [1, 2, 3])
+def test_any_mass_and_kind_of_recording_is_named(tmp_path, cart, ratio, heavy):
+    """The same for each of three carts, masses, and kinds of recordings."""
+    analysis = mixed(tmp_path, n=3, cart=cart, ratio=ratio, heavy=heavy)
+    assert_groups_differ(analysis, cart=cart, ratio=ratio, heavy=heavy)
+
+
+@pytest.mark.parametrize("n", [2, pytest.param(3, marks=_LONG)])
+def test_recordings_of_one_bench_are_one_group(tmp_path, n):
+    """Recordings of one bench cause no question, and no group."""
+    analysis = mixed(tmp_path, n=n, cart=1, ratio=1.0, heavy="sweep")
+    assert not analysis.causes
+    assert not analysis.groups
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["throne-1dof", "throne-2dof", "throne-3dof"])
+@pytest.mark.parametrize("seed", range(60, 70))
+def test_an_honest_bench_has_no_groups(tmp_path, preset, seed):
+    """With one hidden effect, or none, no recordings are said to want other carts."""
+    chain = PRESETS[preset]
+    effects = (draw_effect(chain, seed),) if seed % 3 else ()
+    bench = SimulatedBench(chain=chain, effects=effects)
+    write_submission(tmp_path, bench, seed=seed, compact=seed % 2 == 1)
+    assert not analyse(load_submission(tmp_path), design=False).groups

@@ -45,12 +45,14 @@ class Followed:
     ----------
     lost : by cart, the share of its motion's power that neither chain nor noise explains.
     missed : by cart, simulated minus measured position (n,).
+    chi_square : mean square of `missed` over the variance of encoder step and noise.
     reach : by cart, the root mean square of its motion, relative to the chain's motion.
     friction : by cart, the largest dry friction that is compatible with `lost`, in input units.
     """
 
     lost: dict[int, float]
     missed: dict[int, Array]
+    chi_square: float
     reach: dict[int, float]
     friction: dict[int, float]
 
@@ -255,6 +257,7 @@ def _hold_against(record: Record, chain: Chain, modes: _ModesOf) -> Followed | N
     return Followed(
         lost=dict(zip(window.carts, lost.tolist(), strict=True)),
         missed=dict(zip(window.carts, residual, strict=True)),
+        chi_square=float(np.mean((residual / window.stated_sigma[:, None]) ** 2)),
         reach=dict(zip(window.carts, reach.tolist(), strict=True)),
         friction={
             cart: float(10.0 * np.sqrt(max(share, 1e-4)) * np.ptp(force) / 2)

@@ -5,11 +5,13 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from pipeline.errors import DataError
-from pipeline.estimation.record_fit import follow, is_driven
+from pipeline.estimation.parametrisation import Parametrisation
+from pipeline.estimation.record_fit import is_driven
+from pipeline.estimation.time_search import look
+from pipeline.estimation.time_window import open_window
 from pipeline.identify.carts import Identified
 from pipeline.names import read_name
-from pipeline.plant.chain import Chain
-from pipeline.results import ChainFit, Check, ParameterRow, Record, RecordingGroup
+from pipeline.results import EXPLAINED, ChainFit, Check, ParameterRow, Record, RecordingGroup
 from pipeline.set_up import Bench
 from pipeline.stages.compare import SIGMA_LIMIT
 from pipeline.stages.time_fit import fit_records
@@ -17,14 +19,13 @@ from pipeline.words.numbers import abridge, listing, with_error
 from pipeline.words.phrases import phrases
 
 _WORDS = phrases("checks")
-# Share of a recording's power that the chain of its group may leave. A chain fitted to one step is
-# slightly off, but much less than one with a mass that is 10 % off.
-_OWN = 0.01
-_DIFFERENT = 0.05  # relative difference of a mass or spring that matters
+# Relative difference of a mass or spring that matters, and of a frequency, its square root.
+_DIFFERENT, _DETUNED = 0.05, 0.025
 _MOST_SEEDS = 8  # recordings from which a group is started
 _MOST_FAILED = 2  # recordings that no chain explains; after these, the carts are not linear
 _MOST_GROUPS = 3
 _ENOUGH = 0.9  # share of the driven recordings that must be in a group
+_FARTHER = 1.5  # times the motion of another group
 _MOST_DWELLS = 8  # dwells that are fitted if a group has no other recordings
 
 
@@ -37,25 +38,33 @@ def find_groups(
     no set of carts explains them all. With hidden physics, a residual remains. If the
     driven recordings follow a fit that explains its data, only the decays are compared with it.
     """
-    fit = found.fit
+    fit, fits = found.fit, found.fitted.fits
     explained = fit if fit and fit.converged and fit.explains_data else None
-    fits = found.fitted.fits
+    driven = [r for r in records if is_driven(r) and len(r.free) == len(r.carts) == bench.n]
+    one = explained and all(fits[r.id].chi_square <= EXPLAINED for r in driven if r.id in fits)
+    groups = [] if one else _driven_groups(driven, start=explained, bench=bench)
+    if told := _described(groups):
+        return told
     if explained and all(fits[r.id].belongs for r in records if r.id in fits):
         return _against_decays(explained, found=found, rows=rows)
-    driven = [r for r in records if is_driven(r) and len(r.free) == len(r.carts) == bench.n]
-    start = explained and explained.chain
+    return ()
+
+
+def _driven_groups(
+    driven: Sequence[Record], *, start: ChainFit | None, bench: Bench
+) -> list[tuple[list[Record], ChainFit]]:
+    """Return groups of driven recordings with the carts that explain each; none if they are one."""
     groups: list[tuple[list[Record], ChainFit]] = []
-    rest = driven
-    while len(rest) > (1 - _ENOUGH) * len(driven):
-        members = _largest(rest, start=start, bench=bench)
-        own = _fit(members, bench=bench) if len(members) > 1 else None
-        if own is None or not (own.converged and own.explains_data) or len(groups) == _MOST_GROUPS:
-            return ()
+    rest = list(driven)
+    while rest and len(groups) < _MOST_GROUPS:
+        members, fit = _largest(rest, start=start, bench=bench)
+        own = fit if fit is start else _fit(members, bench=bench)
+        if own is None or not (own.converged and own.explains_data):
+            break
         groups.append((members, own))
         rest = [record for record in rest if record not in members]
-    if len(groups) < 2 or not _overlap([members for members, _ in groups]):
-        return ()
-    return _described(groups)
+    most = len(rest) <= (1 - _ENOUGH) * len(driven)
+    return groups if most and _overlap([members for members, _ in groups]) else []
 
 
 def check_groups(groups: Sequence[RecordingGroup]) -> list[Check]:
@@ -75,7 +84,7 @@ def check_groups(groups: Sequence[RecordingGroup]) -> list[Check]:
 def _against_decays(
     fit: ChainFit, *, found: Identified, rows: Sequence[ParameterRow]
 ) -> tuple[RecordingGroup, ...]:
-    """Return the fitted recordings and the decays, if these want other masses.
+    """Return the fitted recordings and the decays, if these want other masses or springs.
 
     The springs are the same if all static gains agree. Other decays than exponential ones
     prove nothing.
@@ -85,7 +94,7 @@ def _against_decays(
     pairs = {
         row.name: (row.initial, row.final)
         for row in rows
-        if row.consistent is False and read_name(row.name).is_frequency
+        if read_name(row.name).is_frequency and _differs(row)
         if row.initial and row.initial.source == "log_decrement" and row.final
         if not bent & set(row.initial.experiments)
     }
@@ -102,38 +111,71 @@ def _against_decays(
     )
 
 
-def _largest(rest: Sequence[Record], *, start: Chain | None, bench: Bench) -> list[Record]:
-    """Return the largest group of recordings that follow one chain."""
+def _differs(row: ParameterRow) -> bool:
+    """Return whether initial and final frequency differ by more than chance and by enough."""
+    return (
+        abs(row.change_percent or 0.0) > 100 * _DETUNED
+        and row.change_sigmas is not None
+        and row.change_sigmas > SIGMA_LIMIT
+    )
+
+
+def _largest(
+    rest: Sequence[Record], *, start: ChainFit | None, bench: Bench
+) -> tuple[list[Record], ChainFit | None]:
+    """Return the largest group of recordings that follow one fit, and this fit."""
     largest: list[Record] = []
+    best: ChainFit | None = None
     followed: set[str] = set()
-    for chain in _chains(rest, followed, start=start, bench=bench):
-        own = {name for name, one in follow(rest, chain).items() if one.share <= _OWN}
-        followed |= own
+    for fit in _fits(rest, followed, start=start, bench=bench):
+        own = [record for record in rest if _follows(record, fit)]
+        followed |= {record.id for record in own}
         if len(own) > len(largest):
-            largest = [record for record in rest if record.id in own]
-    return largest
+            largest, best = own, fit
+    return largest, best
 
 
-def _chains(
-    rest: Sequence[Record], followed: set[str], *, start: Chain | None, bench: Bench
-) -> Iterator[Chain]:
-    """Yield chains that recordings may follow: `start`, then those of single recordings.
+def _fits(
+    rest: Sequence[Record], followed: set[str], *, start: ChainFit | None, bench: Bench
+) -> Iterator[ChainFit]:
+    """Yield fits that recordings may follow: `start`, then those of single recordings.
 
-    Recordings that are in `followed` by then are skipped. So are those that no chain explains.
+    Recordings that are in `followed` by then are skipped. So are those that no chain explains. A
+    single dwell does not determine the carts, so dwells are fitted together.
     """
     if start is not None:
         yield start
+    whole = [record for record in rest if record.kind != "sine"][:_MOST_SEEDS]
     failed = 0
-    for record in [record for record in rest if record.kind != "sine"][:_MOST_SEEDS]:
-        if record.id in followed:
+    for seed in [[record] for record in whole] or [rest]:
+        if any(record.id in followed for record in seed):
             continue
-        fit = _fit([record], bench=bench)
+        fit = _fit(seed, bench=bench)
         if fit and fit.explains_data:
-            yield fit.chain
+            yield fit
         else:
             failed += 1
         if failed == _MOST_FAILED:
             return
+
+
+def _follows(record: Record, fit: ChainFit) -> bool:
+    """Return whether a recording follows a fit within the noise and the errors of the fit."""
+    chain = fit.chain
+    springs = tuple(bool(k) for k in chain.k)
+    zero = tuple(name for name, value in _physical(fit).items() if not value > 0)
+    P = Parametrisation(bench=Bench(springs=springs), zero=zero)
+    try:
+        attempt = look([open_window(record)], P, P.pack(chain))
+    except DataError:  # nothing moves
+        return True
+    (misfit,) = attempt.misfits
+    slopes = (misfit.jacobian / P.dp_dtheta(attempt.theta)[:, None, None]).reshape(len(P.names), -1)
+    known = [name for name in P.names if name in fit.names]
+    at, of = [P.names.index(x) for x in known], [fit.names.index(x) for x in known]
+    doubt = np.sum(slopes[at] * (fit.covariance[np.ix_(of, of)] @ slopes[at]))
+    # The doubt is the expected χ² due to the errors of the fit; few of them make up most of it.
+    return bool(attempt.cost <= EXPLAINED * attempt.n_points + SIGMA_LIMIT**2 * doubt)
 
 
 def _fit(members: Sequence[Record], *, bench: Bench) -> ChainFit | None:
@@ -146,16 +188,18 @@ def _fit(members: Sequence[Record], *, bench: Bench) -> ChainFit | None:
 
 
 def _overlap(groups: Sequence[Sequence[Record]]) -> bool:
-    """Return whether the motion of each group is as large as that of the others.
+    """Return whether no group moves far more, or far less, than another one does.
 
     With a spring that stiffens, small and large motion want different carts too.
     """
     sizes = [[float(np.ptp(record.position(1))) for record in members] for members in groups]
-    return all(min(a) <= np.median(b) <= max(a) for a in sizes for b in sizes)
+    return all(min(a) <= _FARTHER * max(b) for a in sizes for b in sizes)
 
 
 def _described(groups: Sequence[tuple[Sequence[Record], ChainFit]]) -> tuple[RecordingGroup, ...]:
     """Return the groups with the numbers that differ, if any do."""
+    if len(groups) < 2:
+        return ()
     fits = [fit for _, fit in groups]
     values = [_physical(fit) for fit in fits]
     names = [

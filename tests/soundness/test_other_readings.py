@@ -35,7 +35,7 @@ def kept(found: Mapping[str, Misread], *others: Record, sizes: Mapping[str, floa
     records = [*(record(name, size=size) for name, size in sizes.items()), *others]
     follows = {r.id: 1.0 if r.id in found else 0.0 for r in records}
     fits = {
-        name: Followed(lost={1: lost}, missed={}, reach={1: 1.0}, friction={})
+        name: Followed(lost={1: lost}, missed={}, chi_square=1.0, reach={1: 1.0}, friction={})
         for name, lost in follows.items()
     }
     return set(without_lone_factors(found, records, fits=fits))
@@ -66,7 +66,7 @@ def test_another_clock_needs_another_sampling_rate():
     assert kept({"sine-1": SLOW}, *others, sizes={"sine-1": 1.0}) == set()
     slow = replace(record("sine-1"), t=np.linspace(0.0, 1.98, 100))
     fits = {
-        name: Followed(lost={1: lost}, missed={}, reach={1: 1.0}, friction={})
+        name: Followed(lost={1: lost}, missed={}, chi_square=1.0, reach={1: 1.0}, friction={})
         for name, lost in (("sine-1", 1.0), ("sine-2", 0.0), ("sine-3", 0.0))
     }
     assert without_lone_factors({"sine-1": SLOW}, [slow, *others], fits=fits) == {"sine-1": SLOW}
