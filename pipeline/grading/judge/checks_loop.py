@@ -14,7 +14,7 @@ from pipeline.grading.judge.work import Verdict, Work
 from pipeline.grading.mistakes.controller import Controller, does, same_gains
 from pipeline.grading.mistakes.loop_numbers import LoopNumbers
 from pipeline.grading.mistakes.state_model import order_names
-from pipeline.grading.references.reference import OFF_SCALE, Reference, off_scale
+from pipeline.grading.references.reference import OFF_SCALE, Reference, clock_units, off_scale
 from pipeline.grading.references.tolerance import NO_CREDIT, as_typed, exact, percent_off, rounding
 from pipeline.grading.words import WORDS
 from pipeline.results import Stage
@@ -191,7 +191,7 @@ def judge_hardware(criterion: asked.Hardware, work: Work) -> Verdict:
     runs = {e.id for e in work.submission.experiments if e.kind == "closed_loop"}
     if not runs:
         return Verdict(share=NONE, message="No closed-loop run was submitted.")
-    if off_scale(work.analysis):
+    if off_scale(work.analysis) or clock_units(work.analysis) != 1.0:
         return Verdict(share=None, message=f"Not checked: {OFF_SCALE}.")
     closed: dict[str, list[float]] = {}
     for check in work.analysis.hardware:

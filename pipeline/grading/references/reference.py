@@ -1,10 +1,12 @@
 """Compute each parameter again from the student's recordings, with bounds for honest readings."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pipeline.estimation.record_fit import TIME_UNITS
 from pipeline.estimation.time_search import FOLLOWED
 from pipeline.grading import limits
 from pipeline.grading.references.readings import readings
@@ -14,6 +16,7 @@ from pipeline.results import Analysis, Estimate, ParameterRow
 from pipeline.stages.compare import GAIN_AND_FREQUENCY_LIMIT
 
 OFF_SCALE = "the recordings are not in the stated units"
+_SLOWEST = 0.3  # s between samples; benches sample 20 times as often, or more
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,26 +88,50 @@ def off_scale(analysis: Analysis) -> set[str]:
     return {c.kind for c in analysis.checks if c.kind in ("position_scale", "input_scale")}
 
 
+def clock_units(analysis: Analysis) -> float:
+    """Return how many units of the time columns are a second: 1, or 1000 if they are milliseconds.
+
+    They are not seconds if all dwells are slower than stated by such a factor, and if the samples
+    would be longer apart than those of any bench.
+    """
+    ratios = [c.value for c in analysis.checks if c.kind == "dwells" and c.value]
+    slow = min((record.sample_time for record in analysis.records), default=0.0) > _SLOWEST
+    found = (u for u in TIME_UNITS for ratio in ratios if math.isclose(ratio, u, rel_tol=0.01))
+    return next(found, 1.0) if slow else 1.0
+
+
 def in_scale(
     references: References, chain: Chain | None, *, analysis: Analysis, per_count: float | None
 ) -> tuple[References, Chain | None]:
     """Return references and chain in the stated units, even if the recordings are in other units.
 
-    Positions in counts are converted by the stated length per count. Numbers whose scale is unknown
-    are left out.
+    Positions in counts are converted by the stated length per count, and times to seconds. Numbers
+    whose scale is unknown are left out.
     """
-    wrong = off_scale(analysis)
-    if not wrong:
+    wrong, clock = off_scale(analysis), clock_units(analysis)
+    if not wrong and clock == 1.0:
         return references, chain
-    factor = per_count if wrong == {"position_scale"} else None
+    factor = per_count if wrong == {"position_scale"} else None if wrong else 1.0
 
     def scaled(table: Mapping[str, Reference]) -> dict[str, Reference]:
         kept = {n: r for n, r in table.items() if factor or not read_name(n).is_gain}
-        return {n: r.times(factor or 1.0) if read_name(n).is_gain else r for n, r in kept.items()}
+        return {
+            n: r.times(factor or 1.0)
+            if read_name(n).is_gain
+            else r.times(clock)
+            if read_name(n).is_frequency
+            else r
+            for n, r in kept.items()
+        }
 
     return (
         References(initial=scaled(references.initial), final=scaled(references.final)),
-        replace(chain, m=chain.m / factor, c=chain.c / factor, k=chain.k / factor)
+        replace(
+            chain,
+            m=chain.m / (factor * clock**2),
+            c=chain.c / (factor * clock),
+            k=chain.k / factor,
+        )
         if chain and factor
         else None,
     )

@@ -78,3 +78,12 @@ def test_an_input_in_a_wrong_unit_is_flagged(tmp_path):
     graded = grade(scaled(tmp_path / "team", "input", 1e4))
     assert [flag.code for flag in graded.flags] == ["data_problem"]
     assert {c.id: c.outcome for c in graded.criteria}["final-gains"] == "skip"
+
+
+@pytest.mark.parametrize("units", [1e3, 1e6])
+def test_a_time_in_milliseconds_costs_no_number_of_the_tables(tmp_path, units):
+    """If the clock counts milliseconds, that is said once, and right numbers are right."""
+    graded = grade(scaled(tmp_path, "time", units))
+    assert [flag.code for flag in graded.flags] == ["data_problem"]
+    outcomes = {c.id: c.outcome for c in graded.criteria if c.outcome != "pass"}
+    assert outcomes == {"data": "partial", "hardware": "skip"}
