@@ -217,6 +217,10 @@ DecayCause = Literal[
 ]
 
 
+# Two periods have a limit of 7. With a larger limit, even strong drag or friction may not show.
+_LARGEST_LIMIT = 8.0
+
+
 @result(eq=False)
 class DecayLaw:
     """The law that a free decay follows, and the linear damping and frequency that it implies."""
@@ -241,6 +245,11 @@ class DecayLaw:
     def is_exponential(self) -> bool:
         """Whether an exponential leaves only noise."""
         return self.name == "exponential"
+
+    @property
+    def is_untested(self) -> bool:
+        """Whether so few swings were tested that even a strong cause would not show."""
+        return self.is_exponential and self.limit > _LARGEST_LIMIT
 
     @property
     def is_friction(self) -> bool:

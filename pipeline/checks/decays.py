@@ -1,6 +1,6 @@
 """Say which law a free decay follows."""
 
-from pipeline.results import LogDecrement
+from pipeline.results import DecayLaw, LogDecrement
 from pipeline.words.numbers import significant, with_error
 from pipeline.words.phrases import phrases
 
@@ -11,14 +11,18 @@ def say_law(decay: LogDecrement, *, unit: str) -> str:
     """Return the law with its numbers, as the end of a sentence about the decay."""
     law, said = decay.law, _numbers(decay, unit=unit)
     numbers = _WORDS.text("numbers", zeta=said["zeta"], omega_n=said["omega_n"])
-    return _WORDS.text(law.name, numbers=numbers, **said)
+    return _WORDS.text(_key(law), numbers=numbers, **said)
 
 
 def name_law(decay: LogDecrement, *, unit: str) -> str:
     """Return the law in a few words, with the size of its cause."""
     law = decay.law
     said = _numbers(decay, unit=unit) | {"size": with_error(law.size, law.size_std)}
-    return _WORDS.text(f"short_{law.name}", **said)
+    return _WORDS.text(f"short_{_key(law)}", **said)
+
+
+def _key(law: DecayLaw) -> str:
+    return "untested" if law.is_untested else law.name
 
 
 def _numbers(decay: LogDecrement, *, unit: str) -> dict[str, str]:

@@ -154,7 +154,7 @@ def check_decays(
                 run=decay.experiment,
                 cart=decay.cart,
                 part=str(decay.number or ""),
-                outcome=passed(decay.law.is_exponential),
+                outcome="skip" if decay.law.is_untested else passed(decay.law.is_exponential),
                 value=decay.law.statistic,
                 limit=decay.law.limit,
                 message=f"{decay.name}: {what} {said}",

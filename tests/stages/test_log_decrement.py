@@ -7,12 +7,14 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
+from pipeline.checks.estimates import check_decays
 from pipeline.errors import DataError
 from pipeline.estimation.decay.ringing import Ringing
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Kind, Record
+from pipeline.set_up import Bench
 from pipeline.stages.log_decrement import fit_log_decrement
 from pipeline.submission import load_submission
 from tests.helpers.ucsd import write_two_cart_submission
@@ -356,6 +358,30 @@ def test_quadratic_drag_is_named_and_left_out(drag, zeta):
     assert abs(got.law.size - drag) < 4 * got.law.size_std + 0.02 * drag
     assert_allclose(got.omega_n, OMEGA, rtol=1e-3)
     assert abs(got.zeta - zeta) < 4 * got.zeta_std + 1e-4
+
+
+@pytest.mark.parametrize(("periods", "outcome"), [(1.0, "skip"), (3.0, "pass")])
+def test_a_decay_of_few_swings_is_not_called_exponential(periods, outcome):
+    """If strong drag would not show either, the check neither passes nor fails."""
+    t = np.arange(0.0, periods * 2 * np.pi / OMEGA, 0.01)
+    y = 1.2 * np.exp(-0.05 * OMEGA * t) * np.cos(OMEGA * t)
+    decay = fit_log_decrement(record(t, y), cart=1)
+    (check,) = check_decays([decay], bench=Bench(springs=(True, True)))
+    assert check.outcome == outcome
+    assert ("too few swings" in check.message) == (outcome == "skip")
+
+
+@pytest.mark.parametrize("periods", [1.0, 1.5])
+def test_drag_in_few_swings_does_not_pass_as_exponential(periods):
+    """Drag that doubles the damping cannot hide in a short decay."""
+
+    def force(x, v):
+        return -(OMEGA**2) * x - 2 * 0.05 * OMEGA * v - v * abs(v)
+
+    moving = swinging(force, seed=5, duration=periods * 2 * np.pi / OMEGA)
+    decay = fit_log_decrement(moving, cart=1)
+    (check,) = check_decays([decay], bench=Bench(springs=(True, True)))
+    assert check.outcome != "pass"
 
 
 @pytest.mark.parametrize("swing", [0.3, 0.7, 1.1])  # rad at the release
