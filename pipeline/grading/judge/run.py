@@ -174,14 +174,15 @@ def prepare_work(
     """Return the input to the checks, all flags in the order of `CODES`, and notes.
 
     The notes say whether reported signs were reversed, because the recordings have the opposite
-    sign.
+    sign, and whether the recordings contradict a stated unit.
     """
     reported, signed = turned_round(submission.reported or Reported(), analysis.records)
     submission = submission.model_copy(update={"reported": reported})
     work, flags_so_far = _prepare(submission, analysis, rubric=rubric)
     more, meant = _flags(work)
     flags = sorted([*flags_so_far, *more], key=lambda flag: CODES.index(flag.code))
-    return replace(work, meant=meant), tuple(flags), signed
+    units = (c.message for c in analysis.checks if c.kind in ("position_unit", "input_unit"))
+    return replace(work, meant=meant), tuple(flags), (*signed, *units)
 
 
 def _prepare(

@@ -87,3 +87,13 @@ def test_a_time_in_milliseconds_costs_no_number_of_the_tables(tmp_path, units):
     assert [flag.code for flag in graded.flags] == ["data_problem"]
     outcomes = {c.id: c.outcome for c in graded.criteria if c.outcome != "pass"}
     assert outcomes == {"data": "partial", "hardware": "skip"}
+
+
+def test_a_unit_that_the_encoder_contradicts_is_said(tmp_path):
+    """If positions in centimetres are stated as millimetres, the grade has a note."""
+    folder = scaled(tmp_path, "x1", 1.0)
+    toml = folder / "submission.toml"
+    text = toml.read_text(encoding="utf-8")
+    toml.write_text(text.replace('unit = "cm"', 'unit = "mm"'), encoding="utf-8")
+    (check,) = [c for c in analyse(load_submission(folder)).checks if c.kind == "position_unit"]
+    assert check.message in grade(folder).notes
