@@ -82,14 +82,14 @@ def test_an_input_in_a_wrong_unit_is_flagged(tmp_path):
 
 @pytest.mark.parametrize("units", [1e3, 1e6])
 def test_a_time_in_milliseconds_costs_no_number_of_the_tables(tmp_path, units):
-    """If the clock counts milliseconds, that is said once, and right numbers are right."""
+    """If the clock counts milliseconds, one flag names it, and right numbers are right."""
     graded = grade(scaled(tmp_path, "time", units))
     assert [flag.code for flag in graded.flags] == ["data_problem"]
     outcomes = {c.id: c.outcome for c in graded.criteria if c.outcome != "pass"}
     assert outcomes == {"data": "partial", "hardware": "skip"}
 
 
-def test_a_unit_that_the_encoder_contradicts_is_said(tmp_path):
+def test_a_unit_that_the_encoder_contradicts_is_noted(tmp_path):
     """If positions in centimetres are stated as millimetres, the grade has a note."""
     folder = scaled(tmp_path, "x1", 1.0)
     toml = folder / "submission.toml"
