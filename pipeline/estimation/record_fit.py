@@ -162,7 +162,7 @@ def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record
         rows[a], rows[b] = b, a
         words = f"x{i} and x{j} look swapped"
         other = replace(record, y=record.y[rows], resolution=record.resolution[rows])
-        remedy = f'state columns = {{ x{i} = "x{j}", x{j} = "x{i}" }} for each'
+        remedy = f'state columns = {{ x{i} = "x{j}", x{j} = "x{i}" }} once, under [system]'
         yield Misread(words=words, remedy=remedy), other
     for factor, words in TIME_FACTORS.items():
         if record.sample_time >= factor * FASTEST:  # over too short a time, any curve fits
