@@ -45,7 +45,10 @@ class Class:
 
     @cached_property
     def lost(self) -> Mapping[str, set[str]]:
-        """For each criterion, the teams without full points or without a judgement."""
+        """For each criterion, the teams without full points or without a judgement.
+
+        A criterion that a person has yet to grade has lost nothing yet.
+        """
         lost: dict[str, set[str]] = {asked.id: set() for asked in self.rubric.criteria}
         whole = {asked.id: asked.points for asked in self.rubric.criteria}
         for name, team in self.teams.items():
@@ -54,6 +57,8 @@ class Class:
                 continue
             judged = team.line.judged
             for key, points in whole.items():
+                if key in team.line.open:
+                    continue
                 if key not in judged or judged[key]["points"] < points:
                     lost[key].add(name)
         return lost

@@ -127,6 +127,12 @@ class Grade(GradeTable):
         Field(description="criteria that a person has not graded yet; if any, points may rise"),
     ] = ()
 
+    @property
+    def lost(self) -> frozenset[str]:
+        """The judged criteria without full points; an open criterion has lost nothing yet."""
+        lost = (criterion.id for criterion in self.criteria if criterion.points < criterion.out_of)
+        return frozenset(lost).difference(self.open)
+
     @classmethod
     def failed(
         cls,

@@ -2,18 +2,27 @@
 
 import re
 from html import unescape
+from urllib.parse import urlsplit
 
 import pytest
 
 from pipeline.desk.app import DeskServer
 from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.open_book import OpenBook
+from pipeline.grading.gradebook.request_book import RequestBook
 from pipeline.grading.gradings import Batch
 from pipeline.grading.intake.files import digest
 from pipeline.grading.rubric import Manual
-from tests.helpers.desks import Visitor
+from tests.helpers.desks import Visitor, through_proxy, write_users
 from tests.helpers.grades import make_grade, make_outcome, shared_flag, two_cart_rubric
 
 pytestmark = pytest.mark.usefixtures("all_work_here")
+STUDENT = """
+[[users]]
+name = "s1"
+role = "student"
+grades = [{ gradebook = "grades", submission = "team-1" }]
+"""
 TEAM = "/grades/0/team?of=team-1"
 TOTAL = re.compile(r'#total" class="steps"><input type="hidden" name="seen" value="(.*?)"')
 
@@ -40,6 +49,41 @@ def grades(tmp_path):
         book.put(outcome)
         book.finish(Batch(keys=(outcome.key,), shared={}), rubric=rubric)
     return out
+
+
+def test_the_class_page_says_that_grades_are_not_final(grades):
+    """It says so until a person has graded the criterion, which lost no points before."""
+    told = "1 submission not final: a person still has to grade discussion (1)."
+    with DeskServer() as server:
+        ta = Visitor.of(server.url)
+        ta.post("/open", folder=str(grades))
+        page = ta.get("/grades/0/").text
+        assert told in ta.get("/grades/0/class.html").text
+        for card in ("Students with accounts", "Export"):
+            assert told in page.split(f"<h3>{card}</h3>")[1].split("</article>")[0]
+        assert "Nobody lost points." in page
+        assert "1 of 1." in ta.get("/grades/0/?state=open").text
+        with OpenBook(grades) as book:
+            book.override("team-1", "discussion", 1, why="too short", by="Ada")
+        page = ta.get("/grades/0/").text
+        assert "not final:" not in page
+        assert "?lost=discussion#class" in page
+        assert "0 of 1." in ta.get("/grades/0/?state=open").text
+
+
+def test_a_student_reads_that_a_grade_is_not_final(grades, tmp_path):
+    """An open criterion lost no points yet, so there is nothing to ask about."""
+    with RequestBook(grades) as book:
+        book.release(by="Ada", released=True)
+    with DeskServer(users=write_users(tmp_path, STUDENT)) as server:
+        student = through_proxy(urlsplit(server.url).port or 0, "s1")
+        page = student.get("/feedback/0/").text
+        assert "Not final: a person has yet to grade" in page
+        waiting = page.split(">Not graded yet</h2>")[1]
+        assert "Discussion: – of 4" in waiting
+        assert "<textarea" not in page
+        sent = student.post("/feedback/0/ask", criterion="discussion", why="see page 3")
+        assert (sent.status, "only where points were lost" in sent.text) == (422, True)
 
 
 def test_a_ta_reads_grades_and_adjusts_a_team(grades):

@@ -20,7 +20,7 @@ from pipeline.grading.gradebook.open_book import Listing
 from pipeline.grading.gradebook.override import TOTAL
 from pipeline.grading.gradebook.request_book import RequestBook
 from pipeline.grading.publish.anonymous import STRANGER, anonymise
-from pipeline.grading.publish.class_page import class_page
+from pipeline.grading.publish.class_page import class_page, not_final
 from pipeline.grading.publish.feedback import feedback_page
 from pipeline.grading.publish.outputs import doubles_of
 from pipeline.grading.similarity.clusters import find_clusters, renamed
@@ -91,6 +91,7 @@ def show(ask: Ask) -> Response:
         found=len(chosen),
         total=len(shown.teams),
         failed=sum(team.line.status == "failed" for team in shown.teams.values()),
+        not_final=not_final([team.line for team in shown.teams.values()]),
         words=WORDS,
         titles=titles,
         next=next(unseen, ""),

@@ -124,7 +124,7 @@ def describe_criterion(
         "out_of": points_text(asked.points),
         "outcome": WORDS.text(f"outcome_{own.outcome}") if own else "not judged",
         "tone": TONES[own.outcome] if own else "quiet",
-        "lost": own is not None and own.points < own.out_of,
+        "lost": asked.id in grade.lost,
         "text": show_message(own) if own else "",
         "numbers": show_numbers(own, asked.check, grade.units) if own else "",
         "steps": steps,

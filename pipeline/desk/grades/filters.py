@@ -14,6 +14,7 @@ _STATES: Mapping[str, tuple[str, Callable[[Listing], bool]]] = {
     "failed": ("could not be graded", lambda team: team.line.status == "failed"),
     "late": ("late", lambda team: team.line.days_late > 0),
     "hand": ("changed by hand", lambda team: bool(team.line.by_hand)),
+    "open": ("not final", lambda team: bool(team.line.open)),
     "remark": ("with a remark", lambda team: bool(team.line.codes)),
 }
 _SEEN = {"no": "not yet reviewed", "yes": "reviewed"}

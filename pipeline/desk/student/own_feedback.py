@@ -19,7 +19,7 @@ from pipeline.grading.judge.costs import find_remarks
 from pipeline.grading.publish.anonymous import anonymise
 from pipeline.grading.publish.feedback import TONES, feedback_page, sentence
 from pipeline.grading.rubric import Criterion as Asked
-from pipeline.grading.words import WORDS, points_text
+from pipeline.grading.words import WORDS, person_lines, points_text
 from pipeline.report.document import paragraph
 from pipeline.report.render.html import render_blocks
 from pipeline.words.numbers import NOTHING
@@ -113,7 +113,9 @@ def _show_page(
         grade=grade,
         points=points_text,
         lost=[one for one in criteria if one["lost"]],
-        kept=[one for one in criteria if not one["lost"]],
+        kept=[one for one in criteria if not one["lost"] and one["id"] not in grade.open],
+        waiting=[one for one in criteria if not one["lost"] and one["id"] in grade.open],
+        by_person=person_lines(grade),
         n_waiting=sum(request.state == "asked" for request in found.requests.values()),
         n_answered=sum(request.state == "answered" for request in found.requests.values()),
         most=MOST_LETTERS,
@@ -131,7 +133,7 @@ def _describe_criteria(
     refused : by criterion, the typed reason and why it was refused.
     hidden : whether to hide numbers that the student must find.
     """
-    judged = {criterion.id: criterion for criterion in grade.criteria}
+    judged = {own.id: own for own in grade.criteria if own.id not in grade.open}
     lost = points_lost(grade, found.rubric)
     described = []
     for asked in found.rubric.criteria:

@@ -79,8 +79,8 @@ class Line(GradeTable):
 
     @cached_property
     def judged(self) -> dict[str, Judged]:
-        """The results of the criteria, by id."""
-        return {criterion["id"]: criterion for criterion in self.criteria}
+        """The results of the criteria, by id, without those that a person has yet to grade."""
+        return {own["id"]: own for own in self.criteria if own["id"] not in self.open}
 
     @property
     def codes(self) -> tuple[Code, ...]:

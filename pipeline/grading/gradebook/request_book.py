@@ -287,9 +287,13 @@ class RequestBook(OpenBook):
 
 
 def points_lost(grade: Grade, rubric: Rubric) -> frozenset[str]:
-    """Return the criteria without full points, including those that were not judged."""
+    """Return the criteria without full points, including those that were not judged.
+
+    A criterion that a person has yet to grade has lost nothing yet.
+    """
     points = {criterion.id: criterion.points for criterion in grade.criteria}
-    return frozenset(c.id for c in rubric.criteria if points.get(c.id, 0.0) < c.points)
+    lost = (c.id for c in rubric.criteria if points.get(c.id, 0.0) < c.points)
+    return frozenset(lost).difference(grade.open)
 
 
 def _read_queued(connection: Connection, last: Row, events: Sequence[Row]) -> list[Queued]:

@@ -111,11 +111,8 @@ def _to_look_at(
     blocks: list[Block] = []
     if asked := wrong_springs(line.springs for line in lines if line.status == "graded"):
         blocks.append(paragraph(capital(asked)))
-    if unfinished := [line for line in lines if line.open]:
-        waiting = Counter(id_ for line in unfinished for id_ in line.open)
-        told = listing([f"{id_} ({n})" for id_, n in waiting.items()])
-        n = counted(len(unfinished), "submission")
-        blocks.append(paragraph(WORDS.text("not_final", submissions=n, criteria=told)))
+    if told := not_final(lines):
+        blocks.append(paragraph(told))
     if failed:
         reasons = bullet_list(
             spans(_link(line.submission), f": {clean(on_one_line(line.reason))}", _by_hand(line))
@@ -132,6 +129,16 @@ def _to_look_at(
         others = bullet_list(spans(_link(one.submission), f": {one}.") for one in distant)
         blocks += [paragraph(WORDS.text("distant")), others]
     return blocks
+
+
+def not_final(lines: Sequence[Line]) -> str:
+    """Return how many submissions a person has yet to grade, and where; "" if all are final."""
+    waiting = Counter(id_ for line in lines for id_ in line.open)
+    if not waiting:
+        return ""
+    n = counted(sum(bool(line.open) for line in lines), "submission")
+    named = listing([f"{id_} ({many})" for id_, many in waiting.items()])
+    return WORDS.text("not_final", submissions=n, criteria=named)
 
 
 def _by_hand(line: Line) -> str:
@@ -158,27 +165,34 @@ def _criteria(page: PageBuilder, graded: "pd.DataFrame", rubric: Rubric) -> list
         return []
     ids = [asked.id for asked in rubric.criteria]
     points = graded.pivot(index="submission", columns="criterion", values="points")[ids]
-    shares = (points.mean() / [asked.points for asked in rubric.criteria]).fillna(0.0).to_list()
-    outcomes = pd.crosstab(graded["criterion"], graded["outcome"])
+    shares = (points.mean() / [asked.points for asked in rubric.criteria]).to_list()
+    outcomes = pd.crosstab(graded["criterion"], graded["outcome"].replace("", "skip"))
     outcomes = outcomes.reindex(index=ids, columns=[*_OUTCOMES], fill_value=0)
     rows = [
         [
             clean(asked.title or asked.id),
             points_text(asked.points),
-            f"{100 * share:.0f} %",
+            NOTHING if math.isnan(share) else f"{100 * share:.0f} %",
             *map(str, outcomes.loc[asked.id]),
         ]
         for asked, share in zip(rubric.criteria, shares, strict=True)
     ]
-    hardest = rubric.criteria[int(np.argmin(shares))]
+    judged = [
+        (asked.title or asked.id, share)
+        for asked, share in zip(rubric.criteria, shares, strict=True)
+        if not math.isnan(share)
+    ]
+    table = page.table(WORDS, "class_criteria", rows, "lrrrrrr")
+    if not judged:
+        return [table]
+    titles, known = zip(*judged, strict=True)
     told = {
-        "criteria": str(len(shares)),
-        "hardest": hardest.title or hardest.id,
-        "least": f"{100 * min(shares):.0f}",
+        "criteria": str(len(judged)),
+        "hardest": titles[int(np.argmin(known))],
+        "least": f"{100 * min(known):.0f}",
     }
-    figure = difficulty_figure([c.title or c.id for c in rubric.criteria], np.array(shares))
-    picture = page.picture("difficulty", figure, WORDS, "difficulty", **told)
-    return [picture, page.table(WORDS, "class_criteria", rows, "lrrrrrr")]
+    figure = difficulty_figure(titles, np.array(known))
+    return [page.picture("difficulty", figure, WORDS, "difficulty", **told), table]
 
 
 def _mistakes(page: PageBuilder, lines: Sequence[Line]) -> list[Block]:

@@ -209,7 +209,7 @@ def _comment_lines(grade: Grade, *, by_hand: Collection[str]) -> list[str]:
         f"{c.title or c.id}: {points_text(c.points)} of {points_text(c.out_of)}. "
         f"{with_symbols(c.message)}"
         for c in grade.criteria
-        if c.points < c.out_of or c.id in by_hand
+        if c.id in grade.lost or c.id in by_hand
     ]
     late = [f"Late: {points_text(grade.deducted)} points off."] if grade.deducted else []
     return [*lost, *flag_messages(grade), *late, *person_lines(grade)]

@@ -138,7 +138,9 @@ def counted_criteria(n: int) -> str:
 
 def _lost(grade: Grade) -> list[Block]:
     """Return the table of lost points, the largest loss first."""
-    lost = [c for c in grade.criteria if c.points < c.out_of]
+    lost = [c for c in grade.criteria if c.id in grade.lost]
+    if not lost and grade.open:  # nothing lost, but not all earned
+        return []
     if not lost:
         return [paragraph(WORDS.text("earned_all_but_look" if grade.flags else "earned_all"))]
     lost.sort(key=lambda c: c.points - c.out_of)

@@ -1,22 +1,28 @@
 """Criteria that a person grades, and changes of the total with a reason."""
 
+import csv
 import json
+import re
 
 import pytest
 
-from pipeline.grading.grade import read_grade
+from pipeline.grading.grade import Criterion, Grade, read_grade
 from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.class_lines import Line
 from pipeline.grading.gradebook.history import history_text
 from pipeline.grading.gradebook.open_book import OpenBook
 from pipeline.grading.gradebook.override import TOTAL, read_wishes
+from pipeline.grading.gradebook.request_book import points_lost
 from pipeline.grading.gradings import Batch
 from pipeline.grading.judge.reweigh import findings_text, read_findings, reweigh
+from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.export import export
 from pipeline.grading.publish.gradescope import results_text
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.rubric import Manual, Rubric
 from pipeline.grading.rubric_file import InvalidRubric, parse_rubric
 from pipeline.grading.rubric_text import rubric_text
+from pipeline.grading.words import WORDS
 from pipeline.resources import RUBRICS
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.grades import failed_grade, make_grade, make_outcome, two_cart_rubric
@@ -79,18 +85,18 @@ def test_another_rubric_leaves_a_manual_criterion_open(honest):
     assert (again.points, again.open) == (graded.grade.points, ("discussion",))
 
 
+def with_open(grade: Grade) -> Grade:
+    """Return the grade with a criterion that a person still has to grade."""
+    own = Criterion(
+        id="discussion", title="discussion", outcome="skip", points=0.0, out_of=4.0,
+        message="Graded by a person; not yet.", expected={}, found={},
+    )  # fmt: skip
+    return grade.model_copy(update={"criteria": (*grade.criteria, own), "open": ("discussion",)})
+
+
 def test_an_open_criterion_is_said_everywhere(tmp_path):
     """Class page, feedback, export and Gradescope say that the grade is not final."""
-    rubric = with_manual(two_cart_rubric())
-    own = (
-        make_grade("team-1")
-        .criteria[0]
-        .model_copy(
-            update={"id": "discussion", "title": "discussion", "outcome": "skip", "points": 0.0}
-        )
-    )
-    grade = make_grade("team-1")
-    grade = grade.model_copy(update={"criteria": (*grade.criteria, own), "open": ("discussion",)})
+    rubric, grade = with_manual(two_cart_rubric()), with_open(make_grade("team-1"))
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         put(book, grade, rubric=rubric)
         write_outputs(book, tmp_path)
@@ -98,11 +104,40 @@ def test_an_open_criterion_is_said_everywhere(tmp_path):
     assert "1 submission not final" in (tmp_path / "class.html").read_text(encoding="utf-8")
     feedback = (tmp_path / "feedback" / "team-1" / "feedback.html").read_text(encoding="utf-8")
     assert "Not final: a person has yet to grade discussion." in feedback
-    assert "Not final" in (tmp_path / "moodle.csv").read_text(encoding="utf-8")
+    summary = feedback.split('id="criteria"')[0]
+    assert (WORDS.text("lost") in summary, WORDS.text("earned_all") in summary) == (False, False)
+    table = (tmp_path / "moodle.csv").read_text(encoding="utf-8")
+    assert ("Not final" in table, "discussion: 0 of" in table) == (True, False)
     assert ["not final" in one.text for one in done.remarks].count(True) == 1
     result = json.loads(results_text(grade, rubric=rubric))
     assert "status" not in result["tests"][-1]
     assert "Not final" in result["output"]
+
+
+def test_an_open_criterion_has_no_points_yet(tmp_path):
+    """Tables leave its points empty, also 0; means and lost points do not count it."""
+    rubric = with_manual(two_cart_rubric())
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        outcomes = [make_outcome(with_open(make_grade(name))) for name in ("a", "b", "c")]
+        for outcome in outcomes:
+            book.put(outcome)
+        book.finish(Batch(keys=tuple(one.key for one in outcomes), shared={}), rubric=rubric)
+        page = class_page([Line.of(one.grade) for one in book.entries()], rubric=rubric)
+        assert "lowest: discussion" not in page
+        book.override("a", "discussion", 3, why="no word on damping", by="Ada")
+        book.override("b", "discussion", 0, why="none handed in", by="Ada")
+        write_outputs(book, tmp_path)
+        frame = book.to_frame()
+        grades = [entry.grade for entry in book.entries()]
+    with (tmp_path / "grades.csv").open(encoding="utf-8", newline="") as file:
+        assert [row["discussion"] for row in csv.DictReader(file)] == ["3", "0", ""]
+    own = frame.loc[frame["criterion"] == "discussion"]
+    assert own["outcome"].to_list() == ["partial", "fail", ""]
+    assert own["points"].isna().to_list() == [False, False, True]
+    # (3 + 0) of twice 4 points: the mean over the two teams that were graded
+    assert re.search(r"discussion</td>.*?38\s%", (tmp_path / "class.html").read_text("utf-8"), re.S)
+    lost = [points_lost(grade, rubric) for grade in grades]
+    assert lost == [{"discussion"}, {"discussion"}, set()]
 
 
 def test_adjustments_add_up_and_survive_regrading(place):
