@@ -183,6 +183,38 @@ def test_an_input_that_no_converter_gives_is_asked_about(tmp_path, preset, scale
     assert why in first_step(analysis)
 
 
+_LONG = (pytest.mark.slow, pytest.mark.sample)
+_ALL = "decay,step,sine,sweep,control"
+
+
+@pytest.mark.parametrize(
+    ("n", "cart", "where", "noise"),
+    [
+        (2, 2, _ALL, "counts"),  # a dead encoder that flickers
+        (2, 1, _ALL, "smooth"),  # an open analogue input
+        (2, 2, "step,sweep", "counts"),
+        pytest.param(2, 1, "sine", "smooth", marks=_LONG),
+        (2, 2, "decay-2a", "counts"),
+    ],
+)
+def test_a_column_of_noise_is_the_first_cause(tmp_path, n, cart, where, noise):
+    """If one column holds only noise, the summary first asks to mend its recordings."""
+    write_submission(tmp_path, bench_of(_TWO if n == 2 else _THREE), seed=3, compact=True)
+    rng = np.random.default_rng(5)
+    for path in (p for one in where.split(",") for p in (tmp_path / "data").glob(f"{one}*.csv")):
+        lines = path.read_text(encoding="utf-8").splitlines()
+        at = lines[0].split(",").index(f"x{cart}")
+        rows = np.genfromtxt(lines[1:], delimiter=",")
+        drawn = 2 * rng.standard_normal(len(rows))
+        count = 1e-3 * float(np.ptp(rows[:, at]))
+        rows[:, at] = count * (np.rint(drawn) if noise == "counts" else drawn)
+        np.savetxt(path, rows, delimiter=",", header=lines[0], comments="", fmt="%.8g")
+    analysis = analyse(load_submission(tmp_path), design=False)
+    told = first_step(analysis)
+    assert f"the column of cart {cart} holds only noise" in told
+    assert where.split(",")[0].split("-")[0] in told
+
+
 def mixed(folder: Path, *, n: int, cart: int, ratio: float, heavy: str) -> Analysis:
     """Analyse recordings of which some were made with another mass of one cart.
 
@@ -218,7 +250,6 @@ def assert_groups_differ(analysis: Analysis, *, cart: int, ratio: float, heavy: 
     assert second.values[name] / first.values[name] == pytest.approx(expected, rel=0.01)
 
 
-_LONG = (pytest.mark.slow, pytest.mark.sample)
 _MIXED = [  # carts, the cart with another mass, its ratio, and the recordings with it
     (2, 2, 1.1, "step,sweep"),
     (2, 2, 1 / 1.1, "decay"),

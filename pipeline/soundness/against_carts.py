@@ -33,15 +33,23 @@ from pipeline.soundness.other_readings import find_other_readings
 # share of the record afterwards. It is a fault if the identified carts meanwhile move by this many
 # encoder steps and by three tenths of their motion. A delay or play holds a cart only briefly.
 _STILL, _SEEN_COUNTS = 0.2, 5.0
+# Least ratio of the mean square change from sample to sample to twice the variance. It is 1 for
+# noise. A motion with this ratio has a period of at most five samples. (J. von Neumann, Annals of
+# Mathematical Statistics 12, 1941.)
+_WHITE = 0.8
 _FEWEST_CYCLES = 1.5  # cycles of a dwell; with fewer there is no steady state at any damping
 
 
 def standing_still(records: Sequence[Record]) -> set[str]:
-    """Return the driven records with a constant reading of a free cart while the input changes."""
+    """Return the driven records in which the reading of a free cart may show nothing.
+
+    It is constant while the input changes, or only noise.
+    """
     return {
         record.id
         for record in records
-        if is_driven(record) and any(any(_still(record, cart)) for cart in measured(record))
+        if is_driven(record)
+        and any(_is_noise(record, cart) or any(_still(record, cart)) for cart in measured(record))
     }
 
 
@@ -65,14 +73,15 @@ def find_faults(
     for record in records:
         for cart in measured(record):
             steps[cart] = max(steps.get(cart, 0.0), record.encoder_step(cart))
-            if is_driven(record) and np.ptp(record.position(cart)) > 0:
+            y = record.position(cart)
+            if is_driven(record) and np.ptp(y) > 0 and not _is_noise(record, cart):
                 moving.add(cart)
-    friction = {
-        cart: float(
-            np.median([f.friction.get(cart, np.inf) for f in fits.values() if cart in f.lost])
-        )
-        for cart in {cart for fit in fits.values() for cart in fit.lost}
-    }
+    allowed: dict[int, list[float]] = {}  # noise shows no friction
+    for record in (record for record in records if record.id in fits):
+        fit = fits[record.id]
+        for cart in (cart for cart in fit.lost if not _is_noise(record, cart)):
+            allowed.setdefault(cart, []).append(fit.friction.get(cart, np.inf))
+    friction = {cart: float(np.median(values)) for cart, values in allowed.items()}
     # All records are compared here, because no bench samples some of them a thousand times more
     # slowly.
     clocks = [record.sample_time for record in records]
@@ -123,6 +132,13 @@ def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, RecordingFault
 # ------------------------------------------------------------------ single channels
 
 
+def _is_noise(record: Record, cart: int) -> bool:
+    """Return whether the reading of a cart changes from sample to sample like noise."""
+    y = record.position(cart)
+    change = float(np.mean(np.diff(y) ** 2))
+    return change > 0 and change >= 2 * _WHITE * float(np.var(y))
+
+
 def _edges(y: np.ndarray) -> np.ndarray:
     """Return the starts of stretches of constant reading, and the end of the last one."""
     return np.concatenate([[0], np.flatnonzero(np.diff(y)) + 1, [y.size]])
@@ -150,15 +166,19 @@ def _dead_channels(
     steps: Mapping[int, float],
     moving: Set[int],
 ) -> Iterator[RecordingFault]:
-    """Yield a fault for each free cart with a constant reading although the cart must have moved.
+    """Yield a fault for each free cart that must have moved, although its reading shows no motion.
 
-    For each cart, `friction` is the largest friction that the records allow, and `steps` the
-    encoder step. `moving` are the carts that any input ever moved.
+    The reading is constant, or only noise. For each cart, `friction` is the largest friction that
+    the records allow, and `steps` the encoder step. `moving` are the carts that any input ever
+    moved.
     """
     for cart in measured(record):
         y = record.position(cart)
         never = is_driven(record) and cart not in moving
-        if np.ptp(y) == 0 and (record.kind == "decay" or never):
+        noise = _is_noise(record, cart)
+        if noise and (record.kind == "decay" or cart not in moving):
+            yield RecordingFault(code="only_noise", run=record.id, cart=cart)
+        elif np.ptp(y) == 0 and (record.kind == "decay" or never):
             others = [free for free in record.free if free != cart]
             code = "never_changes_held" if others else "never_changes"
             yield RecordingFault(
@@ -167,11 +187,14 @@ def _dead_channels(
         if chain is None or record.u is None or not is_driven(record):
             continue
         force = force_on(record, chain, cart=cart)
-        for still in _still(record, cart):
+        for still in [slice(None)] if noise else _still(record, cart):
             # Friction holds a cart equally in both directions.
             if force is None or 2 * friction.get(cart, np.inf) >= np.ptp(force[still]):
                 continue
             if not _must_move(record, chain, still, cart=cart, step=steps[cart]):
+                continue
+            if noise:
+                yield RecordingFault(code="only_noise", run=record.id, cart=cart)
                 continue
             code = "dead" if np.ptp(y) == 0 else "froze_at_input"
             yield RecordingFault(code=code, run=record.id, cart=cart, details=_span(record, still))
