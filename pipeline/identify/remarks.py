@@ -6,7 +6,7 @@ from math import ceil
 import numpy as np
 
 from pipeline.estimation.interventions import without_releases
-from pipeline.ingest.columns import conversion
+from pipeline.ingest.formats.headings import conversion
 from pipeline.ingest.read import Ingested
 from pipeline.results import Intervention, Record
 from pipeline.soundness.encoders import find_other_units

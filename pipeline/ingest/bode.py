@@ -6,7 +6,8 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
-from pipeline.ingest.columns import Column, conversion
+from pipeline.ingest.columns import Column
+from pipeline.ingest.formats.headings import conversion
 from pipeline.ingest.formats.table import FileTable, refuse_extreme
 from pipeline.results import FrequencyResponse
 

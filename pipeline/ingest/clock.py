@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
-from pipeline.ingest.columns import Column, conversion
+from pipeline.ingest.columns import Column
+from pipeline.ingest.formats.headings import conversion
 from pipeline.ingest.formats.table import FileTable
 
 SLOW = 0.5  # s between samples; no bench records more slowly

@@ -5,44 +5,52 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from pipeline.errors import SubmissionError
+from pipeline.ingest.formats.headings import (
+    COUNTS,
+    FACTORS,
+    SHARES,
+    TIME,
+    is_known_unit,
+    parse_heading,
+    plain_name,
+    unit_symbol,
+)
 from pipeline.ingest.formats.table import FileTable
 
-_ROLES = (
-    ("time", r"t|times?|time ?stamps?|t received|elapsed time"),
-    ("input", r"u|inputs?|control effort|effort|duty|duty cycle|voltage|motor|motor voltage|force"),
-    ("reference", r"r|ref|reference|set ?point|commanded pos(ition)?|target( v| value)?"),
-    ("frequency", r"f|freq|frequency|omega|w"),
-)
+# For each role, the words that name it. Words of the second list count only if none of the first
+# is there: a file may have the voltage and also the current, or x and also the angle.
+_ROLES = {
+    "time": (TIME, ""),
+    "input": (
+        r"u|inputs?|control effort|effort|duty|duty cycle|voltage|motor|motor voltage|force",
+        r"f|current|i|torque|motor current|motor force|control( signal| input)?|command|pwm|"
+        r"spannung|motorspannung|kraft|strom|drehmoment|eingang|stellgr(ö|oe)sse|tension|commande|"
+        r"excitation|drive|actuator|voltage in|u in|v in|vin",
+    ),
+    "reference": (
+        r"r|ref|reference|set ?point|commanded pos(ition)?|target( v| value)?",
+        r"sollwert|soll|f(ü|ue)hrungsgr(ö|oe)sse|consigne|desired( position)?|"
+        r"command(ed)? position",
+    ),
+    "frequency": (r"f|freq|frequency|omega|w|ω|frequenz|kreisfrequenz|fréquence", ""),
+}
 _POSITION = re.compile(
-    r"x ?(\d)|enc(?:oder)? ?(\d)(?: pos(?:ition)?)?|(?:cart|pos|position) ?(\d) ?(?:pos(?:ition)?)?"
+    r"x ?(\d)|(?:enc|encoder) ?(\d)(?: (?:pos|position|count|counts))?|"
+    r"(?:(?:cart|mass|pos|position|displacement|weg|y|theta|angle|winkel|wagen) ?(\d)|"
+    r"(?:position|pos|displacement|weg|angle|winkel) (?:of )?(?:cart|mass|wagen) ?(\d))"
+    r"(?: ?(?:pos|position|displacement))?"
 )
-_ONE_POSITION = re.compile(r"x|y|pos|position|displacement")
+_ONE_POSITION = (
+    r"x|y|pos|position|displacement",
+    r"weg|auslenkung|distance|distanz|abstand|angle|theta|θ|phi|φ|winkel|encoder|enc|"
+    r"encoder pos(ition)?|déplacement|deplacement|elongation|laser|sensor|cart|cart position",
+)
 # known headings of columns that have no role
-_NO_ROLE = re.compile(r"|sample|samples|index|n|no|nr")
+_NO_ROLE = re.compile(r"|sample|samples|index|n|no|nr|i|row|#")
 _IN_UNITS = ("csv", "workbook", "lvm", "tdms")  # formats whose values are in the submission's units
 _COUNTED = re.compile(r"\benc|counts?\b|commanded pos", re.IGNORECASE)
-# A unit as in "time [ms]", "x1 (cm)" or "x1_cm". The last form is not for every unit: "u_in" does
-# not mean inches.
-_UNIT = re.compile(
-    r"[\[(]\s*([^\s\[\]()](?:[^\[\]()]*[^\s\[\]()])?)\s*[\])]\s*$|(?<=[a-z0-9])_(s|ms|us|m|cm|mm|V|mV|N|counts?|Hz|dB)$"
-)
-
-# For each unit, the factor to a common unit of the same quantity.
-_FACTORS = {
-    "time": {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
-    "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "inch": 0.0254},
-    "voltage": {"V": 1.0, "mV": 1e-3},
-    "force": {"N": 1.0, "mN": 1e-3},
-    "current": {"A": 1.0, "mA": 1e-3},
-    "torque": {"N m": 1.0, "Nm": 1.0, "N·m": 1.0},
-    "angle": {"rad": 1.0, "deg": 0.017453292519943295, "°": 0.017453292519943295}
-    | {"turn": 6.283185307179586, "rev": 6.283185307179586},
-    "frequency": {"Hz": 1.0, "kHz": 1e3, "rad/s": 0.15915494309189535},
-}
 _OF_POSITIONS = ("length", "angle")
 _OF_INPUTS = ("voltage", "current", "force", "torque")
-_PLAIN = ("count", "counts", "pulse", "pulses")  # counts of an encoder or of a controller's output
-_SHARES = ("duty", "%")  # shares of the largest input
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +70,7 @@ class Column:
     @property
     def is_counted(self) -> bool:
         """Whether the heading says that this column holds encoder counts."""
-        return bool(_COUNTED.search(self.name)) or self.unit in ("count", "counts")
+        return bool(_COUNTED.search(self.name)) or self.unit == "count"
 
     @property
     def is_duty(self) -> bool:
@@ -75,14 +83,6 @@ def holds_counts(table: FileTable, column: Column) -> bool:
     return table.whole[column.index] and (table.form not in _IN_UNITS or column.is_counted)
 
 
-def conversion(found: str | None, wanted: str) -> float | None:
-    """Return the factor from one unit to another; None if they measure different quantities."""
-    if found is None or found == wanted:
-        return 1.0
-    a, b = _plain_micro(found), _plain_micro(wanted)
-    return next((of[a] / of[b] for of in _FACTORS.values() if a in of and b in of), None)
-
-
 def is_count(unit: str) -> bool:
     """Return whether a position unit is the encoder count."""
     return unit.rstrip("s") == "count"
@@ -90,22 +90,19 @@ def is_count(unit: str) -> bool:
 
 def position_units() -> tuple[str, ...]:
     """Return the known units of positions."""
-    return (*_PLAIN, *(unit for quantity in _OF_POSITIONS for unit in _FACTORS[quantity]))
+    return (*COUNTS, *(unit for quantity in _OF_POSITIONS for unit in FACTORS[quantity]))
 
 
 def input_units() -> tuple[str, ...]:
     """Return the known units of inputs."""
-    known = (unit for quantity in _OF_INPUTS for unit in _FACTORS[quantity])
-    return (*_PLAIN, *_SHARES, *known)
+    known = (unit for quantity in _OF_INPUTS for unit in FACTORS[quantity])
+    return (*COUNTS, *SHARES, *known)
 
 
 def is_known(unit: str, known: Collection[str]) -> bool:
-    """Return whether a unit is known, with either Unicode character for µ."""
-    return _plain_micro(unit) in known
-
-
-def _plain_micro(unit: str) -> str:
-    return unit.replace("µ", "u").replace("μ", "u")
+    """Return whether a unit is known; "CM" is not, because its prefix may be meant otherwise."""
+    symbol = unit_symbol(unit)
+    return unit in known or (symbol in known and unit.casefold() != symbol.casefold())
 
 
 def assign_columns(
@@ -122,45 +119,87 @@ def assign_columns(
     """
     columns: dict[str, Column] = {}
     for role, wanted in (explicit or {}).items():
-        index = table.index(wanted)
-        columns[role] = _column(table, index, role)
+        columns[role] = _column(table, table.index(wanted), role)
     taken = {column.index for column in columns.values()}
+    plain = [plain_name(name) for name in table.names]
+    is_time = [bool(re.fullmatch(TIME, name)) for name in plain]
+    has_time = "time" in columns or any(is_time)
+    found: dict[str, list[tuple[int, int]]] = {}  # for each role, (rank, column)
     unused: list[str] = []
-    for index, name in enumerate(table.names):
+    for index, name in enumerate(plain):
         if index in taken:
             continue
-        role = _role(name, free=free)
+        role, rank = _role(name, free=free, has_time=has_time, unit=_unit(table, index))
         if role is None or (explicit and role in explicit):
-            if role is not None or not _NO_ROLE.fullmatch(_plain(name)):
-                unused.append(name)
-        elif role in columns:
-            raise SubmissionError(
-                f"{table.source}: {columns[role].name!r} and {name!r} both look like {role}; "
-                f"say which: columns = {{ {role} = {name!r} }}"
-            )
+            if role is not None or not _NO_ROLE.fullmatch(name):
+                unused.append(table.names[index])
         else:
-            columns[role] = _column(table, index, role)
+            found.setdefault(role, []).append((rank, index))
+    for role, candidates in found.items():
+        (rank, first), *others = sorted(candidates)
+        if others and others[0][0] == rank:
+            a, b = (table.names[index] for index in (first, others[0][1]))
+            raise SubmissionError(
+                f"{table.source}: {a!r} and {b!r} both look like {role}; "
+                f"say which: columns = {{ {role} = {a!r} }}"
+            )
+        columns[role] = _column(table, first, role)
+        unused += [table.names[index] for _, index in others]
     return columns, tuple(unused)
 
 
+def refuse_unknown_unit(table: FileTable, column: Column, *, stated: str = "") -> None:
+    """Refuse a column whose heading states a unit that is not known.
+
+    Raises
+    ------
+    SubmissionError : the unit is not known, and it is not the one that the submission states.
+    """
+    unit = column.unit
+    if unit is not None and unit != stated and not is_known_unit(unit):
+        raise SubmissionError(
+            f"{table.source}: {column.name!r} states the unit {unit!r}, which is not known: which "
+            "unit is it? Write it in the heading, as in 'x1 [mm]'"
+        )
+
+
+def _unit(table: FileTable, index: int) -> str | None:
+    return parse_heading(table.names[index]).unit
+
+
 def _column(table: FileTable, index: int, role: str) -> Column:
-    name = table.names[index]
-    unit = _UNIT.search(name)
-    return Column(role=role, index=index, name=name, unit=(unit[1] or unit[2]) if unit else None)
+    unit = _unit(table, index)
+    if unit is None and role == "time":  # "millis" is a name and a unit
+        unit = _NAMED_UNITS.get(plain_name(table.names[index]))
+    return Column(role=role, index=index, name=table.names[index], unit=unit)
 
 
-def _plain(name: str) -> str:
-    """Return a heading in lower case, without its unit and special characters."""
-    return re.sub(r"[^a-z0-9]+", " ", _UNIT.sub("", name).casefold()).strip()
+_NAMED_UNITS = {
+    "millis": "ms", "micros": "us", "milliseconds": "ms", "microseconds": "us",
+}  # fmt: skip
 
 
-def _role(name: str, *, free: tuple[int, ...]) -> str | None:
-    plain = _plain(name)
-    for role, pattern in _ROLES:
-        if re.fullmatch(pattern, plain):
-            return role
+def _role(
+    plain: str, *, free: tuple[int, ...], has_time: bool, unit: str | None
+) -> tuple[str | None, int]:
+    """Return the role that a heading names, and the rank of the word; None without a role.
+
+    A file with a time is no table of frequencies: there, F is a force and omega a speed.
+    """
+    for role, words in _ROLES.items():
+        for rank, pattern in enumerate(words):
+            if not re.fullmatch(pattern or "$^", plain):
+                continue
+            if role == "frequency" and has_time:
+                continue
+            if plain == "f" and role == "input" and not has_time:
+                continue
+            if plain == "i" and unit is None:  # a row's number
+                continue
+            return role, rank
     if match := _POSITION.fullmatch(plain):
-        return f"x{next(number for number in match.groups() if number)}"
-    if len(free) == 1 and _ONE_POSITION.fullmatch(plain):
-        return f"x{free[0]}"
-    return None
+        return f"x{next(number for number in match.groups() if number)}", 0
+    for rank, pattern in enumerate(_ONE_POSITION):
+        if len(free) == 1 and re.fullmatch(pattern, plain):
+            return f"x{free[0]}", rank
+    return None, 0

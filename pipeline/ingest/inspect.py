@@ -11,7 +11,8 @@ from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
 from pipeline.ingest.clock import FEWEST_SAMPLES, Clock, clock_notes, read_clock
-from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
+from pipeline.ingest.columns import Column, assign_columns, holds_counts
+from pipeline.ingest.formats.headings import conversion
 from pipeline.ingest.formats.recognise import FORM_TITLES, read_table
 from pipeline.ingest.formats.table import FileTable, Variable
 from pipeline.ingest.unnamed import Roles, find_roles

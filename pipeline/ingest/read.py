@@ -12,7 +12,8 @@ from pipeline.errors import SubmissionError
 from pipeline.ingest.bode import Points, frequency_responses, read_points
 from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
 from pipeline.ingest.clock import FEWEST_SAMPLES, Clock, clock_notes, read_clocks, time_stamps
-from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts, is_count
+from pipeline.ingest.columns import Column, assign_columns, holds_counts, is_count
+from pipeline.ingest.formats.headings import conversion
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import FileTable, refuse_extreme
 from pipeline.ingest.input_sign import Signs, with_signs

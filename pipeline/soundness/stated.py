@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from pipeline.estimation.record_fit import TIME_UNITS
-from pipeline.ingest.columns import conversion
+from pipeline.ingest.formats.headings import conversion
 from pipeline.results import Record
 from pipeline.set_up import Bench
 from pipeline.soundness.fault import SAME, RecordingFault, say

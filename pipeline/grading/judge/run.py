@@ -31,7 +31,8 @@ from pipeline.grading.references.signs import turned_round
 from pipeline.grading.references.springs import with_all_springs
 from pipeline.grading.references.tolerance import rounding, with_total
 from pipeline.grading.rubric import Rubric
-from pipeline.ingest.columns import conversion, is_count
+from pipeline.ingest.columns import is_count
+from pipeline.ingest.formats.headings import conversion
 from pipeline.results import Analysis
 from pipeline.soundness.bad_recordings import find_bad_recordings
 from pipeline.submission import (

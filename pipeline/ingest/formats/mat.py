@@ -14,7 +14,7 @@ _MOST_NAMED = 8
 _BENCH = ({"enc1", "duty", "time"}, {"cart1pos", "duty_cycle", "t_received"})
 
 
-def read_mat(raw: bytes, *, source: str) -> FileTable:
+def read_mat(raw: bytes, *, source: str) -> list[FileTable]:
     """Read the vectors, or the only matrix, of a `.mat` file.
 
     Raises
@@ -59,16 +59,18 @@ def read_mat(raw: bytes, *, source: str) -> FileTable:
             notes.append(f"{name}: a {column.dtype} counter that overflowed was made continuous")
         columns.append(unwrapped)
     values = np.array(columns)
-    return FileTable(
-        source=source,
-        form=form,
-        names=tuple(names),
-        values=values,
-        whole=tuple(bool((column == np.round(column)).all()) for column in values),
-        lines=None,
-        notes=tuple(notes),
-        variables=made,
-    )
+    return [
+        FileTable(
+            source=source,
+            form=form,
+            names=tuple(names),
+            values=values,
+            whole=tuple(bool((column == np.round(column)).all()) for column in values),
+            lines=None,
+            notes=tuple(notes),
+            variables=made,
+        )
+    ]
 
 
 def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariable]:

@@ -4,12 +4,16 @@ import hashlib
 import signal
 import sys
 import threading
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from pipeline.errors import SubmissionError, is_file_fault
-from pipeline.ingest.formats.lvm import is_lvm, read_lvm
+from pipeline.ingest.formats.headings import is_time
+from pipeline.ingest.formats.labview import is_lvm, read_lvm
 from pipeline.ingest.formats.mat import read_mat
 from pipeline.ingest.formats.mat_variables import is_mat
 from pipeline.ingest.formats.table import FileTable
@@ -18,6 +22,7 @@ from pipeline.ingest.formats.text import read_text
 from pipeline.ingest.formats.workbook import is_workbook, read_workbook
 from pipeline.processes import limited_memory
 from pipeline.submission.load import file_problem
+from pipeline.words.numbers import first_few
 
 # Endings of data files.
 ENDINGS = (
@@ -35,7 +40,7 @@ FORM_TITLES = {
     "lvm": "LabVIEW measurement file (.lvm)",
 }
 # For each format, a function that recognises it and one that reads it; all other files are text.
-_READERS = (
+_READERS: tuple[tuple[Callable[[bytes], bool], Callable[..., list[FileTable]]], ...] = (
     (is_mat, read_mat),
     (is_workbook, read_workbook),
     (is_lvm, read_lvm),
@@ -50,17 +55,17 @@ _STRANGERS = (
     (b"PK\x03\x04", "a zip archive, or a document of LibreOffice: save the sheet as .xlsx or CSV"),
     (b"\xd0\xcf\x11\xe0", "an old Excel workbook, or a locked one; save it as .xlsx, unlocked"),
     (b"\x89HDF", "an HDF5 file that MATLAB did not write; save the recording as CSV"),
-    (b"\x1f\x8b", "a gzip archive; unpack it"),
+    (b"\x01\x8b", "a gzip archive; unpack it"),
     (b"%PDF", "a PDF document; export the recording as CSV"),
     (b"\x89PNG", "a picture; export the recording as CSV"),
     (b"\xff\xd8\xff", "a picture; export the recording as CSV"),
 )
 
 
-def read_table(
+def read_tables(
     folder: Path, name: str, *, shown: str | None = None, taken: Collection[str] = ()
-) -> tuple[FileTable, str]:
-    """Return the columns of a data file and the SHA-256 of its bytes.
+) -> tuple[list[FileTable], str]:
+    """Return the recordings in a data file and the SHA-256 of its bytes.
 
     Messages call the file `shown`, by default its name. If the file is missing, similar names are
     suggested, except those in `taken`.
@@ -81,8 +86,39 @@ def read_table(
             raise
         raise SubmissionError(f"{source}: cannot be read ({error.strerror})") from None
     with _limited(source):
-        table = parse_table(raw, source=source)
-    return table, hashlib.sha256(raw).hexdigest()
+        tables = parse_tables(raw, source=source)
+    return tables, hashlib.sha256(raw).hexdigest()
+
+
+def read_table(
+    folder: Path, name: str, *, shown: str | None = None, taken: Collection[str] = ()
+) -> tuple[FileTable, str]:
+    """Return the only recording in a data file; otherwise as `read_tables`."""
+    tables, digest = read_tables(folder, name, shown=shown, taken=taken)
+    return choose_run(tables), digest
+
+
+def choose_run(tables: Sequence[FileTable], run: str | int | None = None) -> FileTable:
+    """Return one of the recordings of a file: the only one, or that of a run.
+
+    Raises
+    ------
+    SubmissionError : there is no such run, or there are several and none is stated.
+    """
+    if run is None and len(tables) == 1:
+        return tables[0]
+    labels = [table.run for table in tables]
+    source, shown = tables[0].source, first_few([repr(label) for label in labels], 8)
+    if run is None:
+        raise SubmissionError(
+            f"{source}: holds several recordings ({shown}); say which: run = {labels[0]!r}, or "
+            "let `cartlab fill` write one experiment for each"
+        )
+    if str(run) in labels:
+        return tables[labels.index(str(run))]
+    if isinstance(run, int) and 1 <= run <= len(tables):
+        return tables[run - 1]
+    raise SubmissionError(f"{source}: there is no run {run!r}; it has {shown or 'only one'}")
 
 
 class _TooLong(BaseException):
@@ -135,13 +171,59 @@ def is_recording(head: bytes) -> bool:
 
 
 def parse_table(raw: bytes, *, source: str) -> FileTable:
-    """Return the columns of a data file from its bytes."""
+    """Return the columns of a data file with one recording, from its bytes."""
+    return choose_run(parse_tables(raw, source=source))
+
+
+def parse_tables(raw: bytes, *, source: str) -> list[FileTable]:
+    """Return the recordings of a data file from its bytes, each with its own `run`."""
     if not raw.strip():
         raise SubmissionError(f"{source}: the file is empty")
-    for is_theirs, read in _READERS:
-        if is_theirs(raw):
-            return read(raw, source=source)
-    for start, what in _STRANGERS:
-        if raw.startswith(start):
-            raise SubmissionError(f"{source}: {what}")
-    return read_text(raw, source=source)
+    read = next((read for is_theirs, read in _READERS if is_theirs(raw)), None)
+    if read is None:
+        for start, what in _STRANGERS:
+            if raw.startswith(start):
+                raise SubmissionError(f"{source}: {what}")
+        read = read_text
+    tables = _joined(read(raw, source=source))
+    if len(tables) == 1:
+        return tables
+    labels = [table.run for table in tables]
+    if len(set(labels)) < len(labels) or not all(labels):
+        labels = [str(i) for i in range(1, len(tables) + 1)]
+    return [replace(table, run=label) for table, label in zip(tables, labels, strict=True)]
+
+
+def _joined(tables: Sequence[FileTable]) -> list[FileTable]:
+    """Return the recordings of a file; pieces that continue each other in time are one."""
+    joined = [tables[0]]
+    counts = [1]
+    for table in tables[1:]:
+        before = joined[-1]
+        if _continues(before, table):
+            assert before.lines is not None
+            assert table.lines is not None
+            joined[-1] = replace(
+                before,
+                values=np.hstack([before.values, table.values]),
+                whole=tuple(map(all, zip(before.whole, table.whole, strict=True))),
+                lines=np.concatenate([before.lines, table.lines]),
+                cut=table.cut,
+                notes=tuple(dict.fromkeys((*before.notes, *table.notes))),
+            )
+            counts[-1] += 1
+        else:
+            joined.append(table)
+            counts.append(1)
+    return [
+        replace(one, notes=(*one.notes, f"{n} segments that continue each other were joined"))
+        if n > 1 else one for one, n in zip(joined, counts, strict=True)
+    ]  # fmt: skip
+
+
+def _continues(before: FileTable, after: FileTable) -> bool:
+    """Return whether a table has the same columns as the one before, at later times."""
+    if before.names != after.names or before.lines is None or after.lines is None or before.cut:
+        return False
+    times = [i for i, name in enumerate(before.names) if is_time(name)]
+    return bool(times and after.values[times[0], 0] > before.values[times[0], -1])

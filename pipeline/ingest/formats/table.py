@@ -12,6 +12,8 @@ from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.words.numbers import first_few
 
+MOST_COLUMNS = 64
+_LONGEST_HEADING = 100  # characters
 _MOST_NAMED = 8
 # Range of values that a bench can measure, in any unit: times, positions, inputs, ratios. Powers
 # and products of several such values, as in the stages, neither overflow nor underflow.
@@ -58,6 +60,7 @@ class FileTable:
     cut : the broken last line of a truncated file; None if the file is complete.
     notes : repairs and omissions made while reading.
     variables : the variables of a binary file, in the order of the file.
+    run : which of the file's recordings this is; "" if there is only one.
     """
 
     source: str
@@ -70,6 +73,7 @@ class FileTable:
     notes: tuple[str, ...] = ()
     lines_are: str = "line"
     variables: tuple[Variable, ...] = ()
+    run: str = ""
 
     @property
     def cut_short(self) -> str:
@@ -113,6 +117,35 @@ class FileTable:
         """Return the headings as one short line of text."""
         shown = ", ".join(self.names[:12])
         return shown + (", …" if len(self.names) > 12 else "")
+
+
+def checked_names(
+    names: Sequence[str], *, place: str, numbers: Sequence[int] | None = None
+) -> list[str]:
+    """Return headings without quotes; an empty one becomes the number of its column.
+
+    `numbers` (from 0) are the numbers of the columns, if some are left out.
+
+    Raises
+    ------
+    SubmissionError : there are too many headings, or a heading is too long or repeated; the message
+        begins with `place`.
+    """
+    if len(names) > MOST_COLUMNS:
+        raise SubmissionError(f"{place}: more than {MOST_COLUMNS} columns")
+    if (longest := max(map(len, names), default=0)) > _LONGEST_HEADING:
+        raise SubmissionError(
+            f"{place}: a heading of {longest:,} characters; the limit is {_LONGEST_HEADING}"
+        )
+    numbers = numbers if numbers is not None else range(len(names))
+    clean = [name.strip(" \"'") or str(i + 1) for i, name in zip(numbers, names, strict=True)]
+    clean = [name if name.isprintable() else repr(name)[1:-1] for name in clean]
+    seen: set[str] = set()
+    for name in clean:
+        if name.casefold() in seen:
+            raise SubmissionError(f"{place}: the heading {name[:40]!r} appears twice")
+        seen.add(name.casefold())
+    return clean
 
 
 def not_read(variables: Sequence[Variable]) -> list[str]:

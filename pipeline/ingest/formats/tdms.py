@@ -20,9 +20,15 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
-from pipeline.ingest.formats.labview import even_times, with_unit
-from pipeline.ingest.formats.table import FileTable, Variable, not_read, refuse_unusable
-from pipeline.ingest.formats.text import checked_names
+from pipeline.ingest.formats.headings import join_unit
+from pipeline.ingest.formats.labview import even_times
+from pipeline.ingest.formats.table import (
+    FileTable,
+    Variable,
+    checked_names,
+    not_read,
+    refuse_unusable,
+)
 from pipeline.words.numbers import first_few
 
 if TYPE_CHECKING:
@@ -44,7 +50,7 @@ def is_tdms(raw: bytes) -> bool:
     return raw.startswith(b"TDSm")
 
 
-def read_tdms(raw: bytes, *, source: str) -> FileTable:
+def read_tdms(raw: bytes, *, source: str) -> list[FileTable]:
     """Read the channels of the only group that holds a recording.
 
     Raises
@@ -75,16 +81,18 @@ def read_tdms(raw: bytes, *, source: str) -> FileTable:
     names = checked_names(names, place=f"{source} group {group!r}")
     values = np.array(columns, dtype=np.float64)
     refuse_unusable(values, names=names, place=lambda row: f"{source} sample {row + 1}")
-    return FileTable(
-        source=source,
-        form="tdms",
-        names=tuple(names),
-        values=values,
-        whole=tuple(bool((column == np.round(column)).all()) for column in values),
-        lines=None,
-        notes=tuple(not_read([variable for variable in variables if not variable.read])),
-        variables=variables,
-    )
+    return [
+        FileTable(
+            source=source,
+            form="tdms",
+            names=tuple(names),
+            values=values,
+            whole=tuple(bool((column == np.round(column)).all()) for column in values),
+            lines=None,
+            notes=tuple(not_read([variable for variable in variables if not variable.read])),
+            variables=variables,
+        )
+    ]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -109,7 +117,7 @@ class _Channel:
     @property
     def heading(self) -> str:
         """The channel's name and unit."""
-        return with_unit(self.name, self.unit)
+        return join_unit(self.name, self.unit)
 
 
 # ------------------------------------------------------------------- checks before npTDMS reads

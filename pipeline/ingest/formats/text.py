@@ -1,7 +1,13 @@
-"""Read data files of text: ECP exports, bench logs, and CSV with any delimiter and decimal mark."""
+"""Read tables from text: CSV in any dialect, ECP exports, bench logs, exports of oscilloscopes.
 
+The first long block of lines that look alike is the table; the last line of text above it is its
+heading. Another heading with another block begins another run.
+"""
+
+import csv
+import datetime as dt
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from operator import methodcaller
@@ -10,34 +16,59 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
-from pipeline.ingest.formats.table import FileTable, refuse_unusable
+from pipeline.ingest.formats.headings import are_units, join_unit, parse_heading
+from pipeline.ingest.formats.table import FileTable, checked_names, refuse_unusable
+from pipeline.words.numbers import first_few
 
-MOST_COLUMNS = 64
-_SNIFFED_ROWS = 40
+_FEW_LINES, _SNIFFED_LINES = 40, 400
+_LONG = 8  # rows that look alike and begin a table; a shorter table must be alone in its file
+_WORST = 0.01  # largest share of rows that may be skipped
+_SPARSE = 0.1  # share of missing values from which a column is left out
+_MOST_NAMED = 4
+_DATED = 1e6  # s; a time of day is less, the time since 1900 is more
 # The names in an ECP heading consist of words with single spaces between them.
 _HEADING_WORDS = re.compile(
-    r"encoder\s*\d+\s+(?:pos|vel|acc)\w*|commanded\s+\w+|control\s+effort|[^\s,;]+", re.IGNORECASE
-)
-_TIME_HEADING = re.compile(
-    r"(?:^|[,;\t])[^\w,;\t]*(?:sample\s+)?(?:t|time)(?![a-z])", re.IGNORECASE
+    r"encoder\s*\d+\s+(?:pos|vel|acc)\w*|commanded\s+\w+|control\s+effort|"
+    r"[^\s,;\[(]+(?: ?[\[(][^\[\]()]{0,20}[\])])?",
+    re.IGNORECASE,
 )
 _OPENING = re.compile(r"^[^\S\n]*(?:[A-Za-z]\w*\s*=\s*)?\[", re.MULTILINE)
-_LONGEST_HEADING = 100  # characters
-_LONGEST_UNIT = 8  # characters; enough for "counts" and "rad/s"
-QUOTES = " \"'"
+_MISSING = frozenset({"", "-", "--", "nan", "na", "n/a", "null", "none", "#n/a", "inf", "-inf"})
+_TIME_OF_DAY = re.compile(
+    r"(?:(\d{4}[-/.]\d\d?[-/.]\d\d?|\d\d?[./-]\d\d?[./-]\d{4})[T ,]+)?"
+    r"(\d\d?):(\d\d)(?::(\d\d(?:[.,:]\d+)?))?(Z| ?[AaPp][Mm])?"
+)
+_THOUSANDS = {
+    ".": re.compile(r"[-+]?[1-9]\d{0,2}(?:[, '’\u00a0\u202f]\d{3})+(?:\.\d*)?"),
+    ",": re.compile(r"[-+]?[1-9]\d{0,2}(?:[. '’\u00a0\u202f]\d{3})+(?:,\d*)?"),
+}
+_FIRST_DAY = dt.date(1900, 1, 1)
+_FORTRAN = re.compile(r"([-+]?[\d.]+)[dD]([-+]?\d+)")
 
 
-def read_text(raw: bytes, *, source: str) -> FileTable:
-    """Read a table of numbers from text.
+def read_text(raw: bytes, *, source: str) -> list[FileTable]:
+    """Read the tables of a text file, one for each run.
 
     Raises
     ------
-    SubmissionError : the file is not text or not a table, or a row does not fit; the message names
-        the line.
+    SubmissionError : the file is not text or not a table, or too many rows do not fit; the message
+        names the line.
     """
     text = decode(raw, source=source).replace("\r\n", "\n").replace("\r", "\n")
-    opening = _OPENING.search(text) if "[" in text else None
-    return _ecp(text, opening, source) if opening else _delimited(text, source)
+    if (opening := _OPENING.search(text)) and (lines := _in_brackets(text, opening, source)):
+        head, rows, cut, notes = lines
+        layout = Layout(None, comma=False)
+        block = Block(head=head, rows=rows, source=source)
+        names = _names_above(block, layout)
+        table = read_block(block, layout, form="ecp", names=names, cut=cut)
+        return [replace(table, notes=(*table.notes, *notes))]
+    lines = [(i, line) for i, line in enumerate(text.split("\n"), 1) if line.strip(' \t;,"')]
+    sample = [line for _, line in lines[:_SNIFFED_LINES]]
+    layout = _sniff(sample[:_FEW_LINES], least=_LONG) or _sniff(sample)
+    if layout is None:
+        raise SubmissionError(_no_table(lines, source))
+    blocks = find_blocks(lines, layout, source=source)
+    return [table for block in blocks for table in read_runs(block, layout, form="csv")]
 
 
 def decode(raw: bytes, *, source: str) -> str:
@@ -61,296 +92,545 @@ def decode(raw: bytes, *, source: str) -> str:
         return raw.decode("latin-1")  # such as a micro sign from an old Windows program
 
 
-# ------------------------------------------------------------------------- rows of numbers
+def _no_table(lines: Sequence[tuple[int, str]], source: str) -> str:
+    if not any(line.strip() for _, line in lines):
+        return f"{source}: the file is empty"
+    if all(line.lstrip().startswith(("#", "%", "sep=")) for _, line in lines):
+        return f"{source}: holds no rows of numbers"
+    number, line = lines[-1]
+    words = re.split(r"[,;\t]", line[:300])
+    if len(words) > 1 and parse_heading(words[0]).name.strip("\"' ").casefold() in ("t", "time"):
+        return f"{source} line {number}: headings, but no rows of numbers below"
+    number, line = lines[min(1, len(lines) - 1)]
+    return f"{source} line {number}: not a table of numbers, found {line.strip()[:40]!r}"
+
+
+# ---------------------------------------------------------------------------------- one cell
 
 
 @dataclass(frozen=True)
-class Rows:
-    """Parsed rows of a file: numbers (n, width), their lines, and signs of truncation."""
+class Layout:
+    """How lines are split; `delimiter` None means any white space, `comma` a decimal comma."""
 
+    delimiter: str | None
+    comma: bool
+    quoted: bool = False
+
+    def split(self, line: str) -> list[str]:
+        """Return the fields of one line."""
+        if self.delimiter is None:
+            return line.split()
+        if self.quoted:
+            try:
+                return next(csv.reader([line], delimiter=self.delimiter, skipinitialspace=True), [])
+            except csv.Error:
+                return []
+        return line.split(self.delimiter)
+
+    @property
+    def fast(self) -> Callable[[str], Iterable[str]]:
+        """The function that splits a row of plain numbers."""
+        if self.comma:
+            return lambda row: [field.replace(",", ".") for field in self.split(row)]
+        if self.delimiter is None or self.quoted:
+            return self.split
+        return methodcaller("split", self.delimiter)  # white space around a number does no harm
+
+    def cell(self, field: str) -> float:
+        """Return the number in a field; NaN if the field is empty or says that it has none.
+
+        Raises
+        ------
+        ValueError : the field holds text.
+        """
+        try:
+            return float(field.replace(",", ".") if self.comma else field)
+        except ValueError:
+            plain = field.strip(" \t\"'").replace("\u2212", "-")
+        if plain.casefold() in _MISSING:
+            return np.nan
+        if _THOUSANDS["," if self.comma else "."].fullmatch(plain):
+            plain = re.sub(r"[^\d+\-,.]" + (r"|\." if self.comma else "|,"), "", plain)
+        if match := _FORTRAN.fullmatch(plain.replace(",", ".")):
+            plain = f"{match[1]}e{match[2]}"
+        return float(plain.replace(",", ".") if self.comma else plain)
+
+
+def _time_of_day(field: str) -> float | None:
+    """Return the seconds of a time of day, from midnight or, with a date, from 1900."""
+    if not (match := _TIME_OF_DAY.fullmatch(field.strip(" \"'"))):
+        return None
+    date, hour, minute, second, half = match.groups()
+    if second is None and (half is None or half == "Z"):
+        return None
+    seconds = float((second or "0").replace(",", ".").replace(":", "."))
+    hours = int(hour) % 12 + 12 * (half.strip().casefold() == "pm") if half and half != "Z" else (
+        int(hour)
+    )  # fmt: skip
+    days = 0
+    if date:
+        numbers = [int(part) for part in re.split(r"[-/.]", date)]
+        try:
+            year, *rest = numbers if numbers[0] > 31 else numbers[::-1]
+            days = (dt.date(year, *rest) - _FIRST_DAY).days if rest[0] <= 12 else (
+                (dt.date(year, rest[1], rest[0]) - _FIRST_DAY).days
+            )  # fmt: skip
+        except ValueError:
+            return None
+    return 86_400.0 * days + 3600.0 * hours + 60.0 * int(minute) + seconds
+
+
+def _value(layout: Layout, field: str) -> float | None:
+    """Return the number or the time of day in a field, NaN for an empty one, None for text."""
+    try:
+        return layout.cell(field)
+    except ValueError:
+        return _time_of_day(field)
+
+
+# ------------------------------------------------------------------------------- the layout
+
+
+def _signature(layout: Layout, line: str) -> str:
+    """Return a letter for each field of a line: n number, - empty, x text; "" for a comment."""
+    if line.lstrip().startswith(("#", "%")):
+        return ""
+    values = [_value(layout, field) for field in layout.split(line)]
+    return "".join("x" if v is None else "-" if v != v else "n" for v in values)
+
+
+def _alike(a: str, b: str) -> bool:
+    """Return whether two rows may belong to one table: the same cells hold numbers."""
+    same = len(a) == len(b) and "n" in a and "n" in b
+    return same and all(p == q or "-" in (p, q) for p, q in zip(a, b, strict=True))
+
+
+def _start(signatures: Sequence[str]) -> tuple[int, int]:
+    """Return (start, length) of the first long run of rows that look alike, or of the longest.
+
+    A row that does not fit does not end a run, unless it may be a heading.
+    """
+    best, start = (0, 0), 0
+    while start < len(signatures):
+        first = signatures[start]
+        last, length = start, 1 if "n" in first else 0
+        for i in range(start + 1, len(signatures) if length else 0):
+            if _alike(first, signatures[i]):
+                last, length = i, length + 1
+                first = signatures[i] if "-" not in signatures[i] else first
+            elif i - last > 3 or ("n" not in signatures[i] and len(signatures[i]) == len(first)):
+                break
+            if length >= _LONG:
+                return start, length
+        if length > best[1]:
+            best = start, length
+        start = last + 1
+    return best
+
+
+def _sniff(sample: Sequence[str], *, least: int = 1) -> Layout | None:
+    """Return the layout in which the first long block of rows has most numbers; None without one.
+
+    `least` is the smallest number of its rows.
+
+    Among equally good layouts, the first one is used. So "0,5;1,2" is two numbers with decimal
+    commas, and "0,5" is two integers.
+    """
+    best, most = None, 0.0
+    quoted = any('"' in line for line in sample)
+    for delimiter in ("\t", ";", ",", "|", None):
+        if delimiter and not any(delimiter in line for line in sample):
+            continue
+        for comma in (False, True) if delimiter != "," or quoted else (False,):
+            layout = Layout(delimiter, comma, quoted=quoted and delimiter is not None)
+            signatures = [_signature(layout, line) for line in sample]
+            start, length = _start(signatures)
+            rows = sample[start : start + min(length, _LONG)]
+            plain = sum(_is_plain(field, comma) for row in rows for field in layout.split(row))
+            share = plain / max(sum(map(len, signatures[start : start + min(length, _LONG)])), 1)
+            # A single column counts only if nothing else fits.
+            wide = 1.0 if length and len(signatures[start]) > 1 else 0.3
+            numbers = sum(s.count("n") / len(s) for s in signatures[start : start + length])
+            score = wide * numbers * (0.5 + share)
+            if length >= least and score > 1.001 * most:
+                best, most = layout, score
+    return best
+
+
+def _is_plain(field: str, comma: bool) -> bool:
+    """Return whether a field is a number without thousands separators, or a time, or empty."""
+    plain = field.strip(" \"'")
+    if comma and "." in plain and ":" not in plain:
+        return False
+    try:
+        float(plain.replace(",", ".") if comma else plain)
+    except ValueError:
+        return not plain or _time_of_day(plain) is not None
+    return True
+
+
+# ------------------------------------------------------------------------------- the blocks
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """The lines of one table with their numbers: those above it, and those from its first row.
+
+    `line` is what the numbers count, such as the rows of a sheet. `values` are the numbers in the
+    rows (n, width), if that is all that the rows hold.
+    """
+
+    head: Sequence[tuple[int, str]]
+    rows: Sequence[tuple[int, str]]
     source: str
-    names: Sequence[str]
-    values: np.ndarray
-    lines: np.ndarray
-    cut: str | None
+    line: str = "line"
+    values: Array | None = None
+
+    def place(self, number: int) -> str:
+        """Return the file and a line of it, as in "a.csv line 12"."""
+        return f"{self.source} {self.line} {number}"
 
 
-def parse_rows(
-    rows: Sequence[str],
-    lines: Sequence[int],
+def find_blocks(
+    lines: Sequence[tuple[int, str]], layout: Layout, *, source: str, line: str = "line"
+) -> Iterator[Block]:
+    """Yield the tables of a file: each begins with rows that look alike, below its heading."""
+    start, length = _start([_signature(layout, line) for _, line in lines[:_FEW_LINES]])
+    if length < _LONG:
+        start, _ = _start([_signature(layout, line) for _, line in lines[:_SNIFFED_LINES]])
+    head, rows = lines[:start], lines[start:]
+    width = len(layout.split(rows[0][1]))
+    values = _numbers([row for _, row in rows], layout, width)
+    if values is None:
+        signatures = [_signature(layout, line) for _, line in rows]
+        at = 0
+        while at < len(rows):
+            texts = range(at + 1, len(rows) - _LONG)
+            again = next((i for i in texts if _begins(signatures, i)), None)
+            if again is None:
+                break
+            above = next(i for i in range(again, 0, -1) if "n" in signatures[i - 1])
+            yield Block(head=head, rows=rows[at:above], source=source, line=line)
+            head, at = rows[above:again], again
+        rows = rows[at:]
+    yield Block(head=head, rows=rows, source=source, line=line, values=values)
+
+
+def _begins(signatures: Sequence[str], i: int) -> bool:
+    """Return whether a long block with a heading of its width begins at line i."""
+    if "n" in signatures[i - 1] or "n" not in signatures[i]:
+        return False
+    above = signatures[max(i - 3, 0) : i]
+    named = any(len(s) == len(signatures[i]) > s.count("-") + 1 and "n" not in s for s in above)
+    return named and _start(signatures[i : i + _LONG]) == (0, _LONG)
+
+
+def read_runs(block: Block, layout: Layout, *, form: str) -> list[FileTable]:
+    """Return the table of each run in a block: runs may stand side by side.
+
+    Raises
+    ------
+    SubmissionError : as for `read_block`.
+    """
+    names = number_repeats(_names_above(block, layout))
+    of_run = [parse_heading(name).run for name in names]
+    runs = [run for run in dict.fromkeys(of_run) if run]
+    if len(runs) < 2:
+        table = read_block(block, layout, form=form, names=names)
+        return [replace(table, run=runs[0] if runs else "")]
+    tables = []
+    rows = [(number, layout.split(row)) for number, row in block.rows]
+    for run in runs:
+        # A column that belongs to no run, such as the time, belongs to all.
+        columns = [i for i, other in enumerate(of_run) if other in ("", run)]
+        own = [i for i in columns if of_run[i]]
+        parts = [
+            (number, [fields[i] if i < len(fields) else "" for i in columns])
+            for number, fields in rows
+            if any(fields[i].strip() for i in own if i < len(fields))
+        ]
+        if parts:
+            apart = Layout("\x01", comma=layout.comma)
+            lines = [(number, "\x01".join(fields)) for number, fields in parts]
+            own_names = [names[i] for i in columns]
+            part = replace(block, rows=lines, values=None)
+            table = read_block(part, apart, form=form, names=own_names)
+            tables.append(replace(table, run=run))
+    return tables
+
+
+def number_repeats(names: Sequence[str]) -> list[str]:
+    """Return headings in which each repetition of a whole series of headings is a run."""
+    plain = [name.casefold().strip() for name in names]
+    n = len(plain)
+    for width in range(2, n // 2 + 1):
+        if n % width == 0 and plain == plain[:width] * (n // width) and all(plain):
+            return [f"{name} Run #{i // width + 1}" for i, name in enumerate(names)]
+    return [*names]
+
+
+def _names_above(block: Block, layout: Layout) -> list[str]:
+    typed = layout.split(block.rows[0][1])
+    ends = len(typed) > 1 and not typed[-1].strip()  # a delimiter ends each row
+    return find_names(block, layout, width=len(typed), ends=ends)
+
+
+def read_block(
+    block: Block,
+    layout: Layout,
     *,
-    split: Callable[[str], Sequence[str]],
+    form: str,
     names: Sequence[str],
-    source: str,
-) -> Rows:
-    """Parse rows into numbers; a bad last row means a truncated file, any other is an error.
+    cut: str | None = None,
+) -> FileTable:
+    """Return a table without the rows that do not fit; its notes name them.
 
     Parameters
     ----------
-    lines : line number in the file, for each row.
-    split : function that returns the fields of a row.
+    cut : why the file is truncated, if it is known to be.
+
+    Raises
+    ------
+    SubmissionError : more than one row in a hundred does not fit.
     """
-    values, cut = _numbers(map(split, rows), width=len(names)), None
-    if values is None:
-        bad = next(i for i, row in enumerate(rows) if not _fits(split(row), width=len(names)))
-        cut = f"line {lines[bad]}: {_what_is_wrong(split(rows[bad]), names)}"
-        values = _numbers(map(split, rows[:bad]), width=len(names))
-        if bad < len(rows) - 1 or values is None or not values.size:
-            raise SubmissionError(f"{source} {cut}")
-    if not values.size:
-        raise SubmissionError(f"{source}: holds no rows of numbers")
-    lines = lines[: len(values)]
-    refuse_unusable(values.T, names=names, place=lambda row: f"{source} line {lines[row]}")
-    return Rows(source=source, names=names, values=values, lines=np.array(lines), cut=cut)
+    lines = [number for number, _ in block.rows]
+    rows = [row for _, row in block.rows]
+    typed = layout.split(rows[0])
+    width = len(typed)
+    if width != len(names):
+        raise SubmissionError(
+            f"{block.place(lines[0])}: expected {len(names)} columns as in the heading, "
+            f"found {width}"
+        )
+    notes: list[str] = []
+    values = _numbers(rows, layout, width) if block.values is None else block.values
+    used = list(range(width))
+    if values is None or not np.isfinite(values).all():
+        values, lines, used, names, notes, cut = _mend(block, layout, names=names, cut=cut)
+    place = block.place(block.head[-1][0] if block.head else lines[0])
+    names = checked_names([names[i] for i in used], numbers=used, place=place)
+    refuse_unusable(values.T, names=names, place=lambda row: block.place(lines[row]))
+    values = np.ascontiguousarray(values.T)
+    whole = tuple(
+        not set(typed[i]) & set(".,:") and bool((column == np.round(column)).all())
+        for i, column in zip(used, values, strict=True)
+    )
+    return FileTable(
+        source=block.source,
+        form="bench_log" if form == "csv" and is_bench_log(names) else form,
+        names=tuple(names),
+        values=values,
+        whole=whole,
+        lines=np.array(lines),
+        lines_are=block.line,
+        cut=cut,
+        notes=tuple(notes),
+    )
 
 
-def _numbers(rows: Iterable[Sequence[str]], *, width: int) -> Array | None:
+def _numbers(rows: Sequence[str], layout: Layout, width: int) -> Array | None:
     """Return the rows as numbers (n, width); None if a field is not a number or a row does not fit.
 
     To save time, the rows are not checked one by one.
     """
-    fields = chain.from_iterable(row if len(row) == width else ("",) for row in rows)
+    split = layout.fast
+    fields = chain.from_iterable(
+        row if len(row) == width else ("",)  # type: ignore[arg-type]
+        for row in map(split, rows)
+    )
     try:
         return np.fromiter(map(float, fields), np.float64).reshape(-1, width)
     except ValueError:
         return None
 
 
-def _fits(row: Sequence[str], *, width: int) -> bool:
-    return len(row) == width and all(map(is_number, row))
+def _mend(
+    block: Block, layout: Layout, *, names: Sequence[str], cut: str | None
+) -> tuple[Array, list[int], list[int], list[str], list[str], str | None]:
+    """Return the rows that fit, with their lines, columns, names, notes, and a broken last row."""
+    width, names = len(names), list(names)
+    lines, rows = zip(*block.rows, strict=True)
+    table = np.full((len(rows), width), np.nan)
+    texts = np.zeros((len(rows), width), dtype=np.bool_)
+    times = np.zeros_like(texts)
+    faults: dict[int, str] = {}
+    end = len(rows)
+    while end > 1 and "n" not in _signature(layout, rows[end - 1]):
+        end -= 1  # text below the table
+    comments = {i for i, row in enumerate(rows) if i >= end or row.lstrip()[:1] in ("#", "%")}
+    for i, row in enumerate(rows):
+        if i in comments:
+            continue
+        fields = layout.split(row)
+        while len(fields) > width and not fields[-1].strip():
+            fields.pop()
+        if len(fields) != width:
+            faults[i] = f"expected {width} columns, found {len(fields)}"
+            continue
+        for j, field in enumerate(fields):
+            try:
+                table[i, j] = layout.cell(field)
+            except ValueError:
+                if (seconds := _time_of_day(field)) is None:
+                    texts[i, j] = True
+                else:
+                    table[i, j] = seconds
+                    times[i, j] = True
+    kept = np.array([i for i in range(len(rows)) if i not in faults and i not in comments])
+    notes = []
+    if comments:
+        where = first_few([str(lines[i]) for i in sorted(comments)], _MOST_NAMED)
+        notes.append(f"not read: text in {block.line} {where}")
+    if not kept.size:
+        raise SubmissionError(f"{block.source}: holds no rows of numbers")
+    used, timed = [], times.sum(axis=0)
+    for j in range(width):
+        good = np.isfinite(table[kept, j])
+        last = int(np.flatnonzero(good)[-1]) + 1 if good.any() else 0
+        name = names[j].strip(" \"'") or str(j + 1)
+        if good.mean() < 1 - _SPARSE or last < min((1 - _WORST) * kept.size, kept.size - 1):
+            if (good.any() and good.mean() >= 1 - _SPARSE) or good.mean() > 0.2:
+                notes.append(f"not read: {name!r} has {good.sum():,} of {kept.size:,} values")
+            elif names[j].strip():
+                notes.append(f"not read: {name!r} has no numbers")
+            continue
+        used.append(j)
+        if 0 < timed[j] < 0.5 * good.sum():  # spreadsheets turn numbers such as 1.5 into dates
+            texts[times[:, j], j], table[times[:, j], j] = True, np.nan
+        elif timed[j]:
+            stamps = table[:, j]
+            first = stamps[np.isfinite(stamps)][0]
+            if first > _DATED:  # a date: rounded, because doubles keep a date to 1e-6 s
+                stamps[:] = np.round(stamps - first, 5)
+            names[j] = f"{parse_heading(name).name} [s]"
+    if not used:
+        raise SubmissionError(f"{block.source}: holds no rows of numbers")
+    for i in kept:
+        bad = next((j for j in used if not np.isfinite(table[i, j])), None)
+        if bad is not None:
+            name, field = names[bad].strip(" \"'") or str(bad + 1), layout.split(rows[i])[bad]
+            empty = field.strip(" \"'").casefold() in _MISSING
+            faults[i] = (
+                f"{name!r} is not a number: {field.strip()[:30]!r}" if texts[i, bad]
+                else f"{name!r} is empty" if not field.strip(" \"'")
+                else f"{name!r} is not a finite number" if empty or np.isinf(table[i, bad])
+                else f"{name!r} is too large"
+            )  # fmt: skip
+    fits = [int(i) for i in kept if i not in faults]
+    cut, faults = _cut_end(block, faults, cut=cut)
+    if faults:
+        where = first_few([str(lines[i]) for i in sorted(faults)], _MOST_NAMED)
+        first = min(faults)
+        if len(faults) > _WORST * len(rows) or not fits:
+            more = f" (and {len(faults) - 1} more rows: {where})" if len(faults) > 1 else ""
+            raise SubmissionError(f"{block.place(lines[first])}: {faults[first]}{more}")
+        rows_are = "1 row was" if len(faults) == 1 else f"{len(faults)} rows were"
+        notes.append(f"{rows_are} skipped, {block.line} {where}: {faults[first]}")
+    if not fits:
+        raise SubmissionError(f"{block.source} {cut}")
+    return table[np.ix_(fits, used)], [lines[i] for i in fits], used, names, notes, cut
 
 
-def _what_is_wrong(fields: Sequence[str], names: Sequence[str]) -> str:
-    """Return why a row does not fit its heading."""
-    if [field.strip(QUOTES).casefold() for field in fields] == [n.casefold() for n in names]:
-        return "a second heading: two recordings were pasted together"
-    if len(fields) != len(names):
-        return f"expected {len(names)} columns, found {len(fields)}"
-    for name, field in zip(names, fields, strict=True):
-        if not is_number(field):
-            if not field.strip():
-                return f"{name!r} is empty"
-            return f"{name!r} is not a number: {field[:30]!r}"
-    return "not a row of numbers"
+def _cut_end(
+    block: Block, faults: dict[int, str], *, cut: str | None
+) -> tuple[str | None, dict[int, str]]:
+    """Return what is wrong with a last row that was cut off, and the other faults."""
+    last = len(block.rows) - 1
+    if cut or last not in faults or len(faults) > 1 + _WORST * len(block.rows):
+        return cut, faults
+    if not faults[last].startswith("expected"):
+        return cut, faults
+    what = f"{block.line} {block.rows[last][0]}: {faults[last]}"
+    return what, {i: fault for i, fault in faults.items() if i != last}
 
 
-def is_number(field: str) -> bool:
-    """Return whether a field holds a number."""
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return True
+# ------------------------------------------------------------------------------- headings
 
 
-def make_table(
-    rows: Rows,
-    *,
-    form: str,
-    typed: Sequence[str],
-    cut: str | None,
-    notes: Sequence[str] = (),
-) -> FileTable:
-    """Return a table made of rows; `typed` is the first row as written in the file."""
-    values = np.ascontiguousarray(rows.values.T)
-    whole = tuple(
-        "." not in field and "," not in field and bool((column == np.round(column)).all())
-        for column, field in zip(values, typed, strict=True)
-    )
-    return FileTable(
-        source=rows.source,
-        form=form,
-        names=tuple(rows.names),
-        values=values,
-        whole=whole,
-        lines=rows.lines,
-        cut=cut or rows.cut,
-        notes=tuple(notes),
-    )
+def find_names(block: Block, layout: Layout, *, width: int, ends: bool) -> list[str]:
+    """Return the headings from the lines above a table; numbers if there are none.
 
+    `ends` says that a delimiter ends each row.
 
-def checked_names(names: Sequence[str], *, place: str) -> list[str]:
-    """Return headings without quotes; an empty one becomes its number.
+    Below the names, a row may hold units; above them, a row may hold the numbers of runs.
 
     Raises
     ------
-    SubmissionError : there are too many headings, or a heading is too long or repeated; the message
-        begins with `place`.
+    SubmissionError : the last line has another number of names than the table has columns.
     """
-    if len(names) > MOST_COLUMNS:
-        raise SubmissionError(f"{place}: more than {MOST_COLUMNS} columns")
-    if (longest := max(map(len, names), default=0)) > _LONGEST_HEADING:
-        raise SubmissionError(
-            f"{place}: a heading of {longest:,} characters; the limit is {_LONGEST_HEADING}"
-        )
-    clean = [name.strip(QUOTES) or str(i) for i, name in enumerate(names, start=1)]
-    clean = [name if name.isprintable() else repr(name)[1:-1] for name in clean]
-    seen: set[str] = set()
-    for name in clean:
-        if name.casefold() in seen:
-            raise SubmissionError(f"{place}: the heading {name[:40]!r} appears twice")
-        seen.add(name.casefold())
-    return clean
+    texts = [
+        (number, line.strip(" ").lstrip("#%").strip(" "), line.lstrip().startswith(("#", "%")))
+        for number, line in block.head
+        if _is_name(line) and not line.startswith("sep=")
+    ]
+    found: list[list[str]] = []
+    for number, text, is_comment in reversed(texts[-4:]):
+        names = _fields(text, layout, width, ends=ends)
+        if names is None:
+            fields = [field for field in layout.split(text) if field.strip()]
+            many = layout.delimiter is not None and len(fields) > 1 and len(fields) != width
+            if not found and not is_comment and many and not _is_remark(fields):
+                raise SubmissionError(
+                    f"{block.place(number)}: expected {width} columns as in the rows below, "
+                    f"found {len(fields)}"
+                )
+            if found or not is_comment:
+                break
+            continue
+        found.append([name.strip(" \"'") for name in names])
+    if not found:
+        return [str(i) for i in range(1, width + 1)]
+    names, above = found[0], found[1:]
+    if above and are_units(names) and sum(map(bool, above[0])) >= sum(map(bool, names)):
+        names = [join_unit(n, u) if n else u for n, u in zip(above[0], names, strict=True)]
+        above = above[1:]
+    if above and not all(names) and not _runs(above[0]):  # a name over two rows
+        names = [name or over for name, over in zip(names, above[0], strict=True)]
+    if above and (runs := _runs(above[0])):
+        names = [f"{name} {run}".strip() for name, run in zip(names, runs, strict=True)]
+    return names
 
 
-# ------------------------------------------------------------------------------ ECP exports
+def _runs(fields: Sequence[str]) -> list[str]:
+    """Return the run of each column from a row of runs; [] if it is another row."""
+    held = [field for field in fields if field]
+    if not held or not all(re.fullmatch(r"(?i)\W*(run|trial|messung)\s*#?\s*\d+\W*", f)
+                           for f in held):  # fmt: skip
+        return []
+    runs = []
+    for field in fields:
+        runs.append(field.strip(" :;,") or (runs[-1] if runs else ""))
+    return runs
 
 
-def _ecp(text: str, opening: re.Match[str], source: str) -> FileTable:
-    """Read `heading [ row; row; … ]`, as written by the ECP program and by MATLAB scripts."""
-    first_line = text.count("\n", 0, opening.end()) + 1
-    end = text.find("]", opening.end())
-    body = text[opening.end() : end if end >= 0 else len(text)]
-    rows: list[str] = []
-    lines: list[int] = []
-    for line, content in enumerate(body.replace(",", " ").split("\n"), start=first_line):
-        found = [piece for piece in content.partition("%")[0].split(";") if piece.strip()]
-        rows += found
-        lines += [line] * len(found)
-    if not rows:
-        raise SubmissionError(f"{source} line {first_line}: no rows after the opening bracket")
-    typed = rows[0].split()
-    width = len(typed)
-    heading, heading_line = _ecp_heading(text[: opening.start()])
-    if heading and len(heading) != width:
-        raise SubmissionError(
-            f"{source} line {lines[0]}: expected {len(heading)} columns "
-            f"as in the heading, found {width}"
-        )
-    names = checked_names(
-        heading or [str(i) for i in range(1, width + 1)], place=f"{source} line {heading_line}"
-    )
-    notes = []
-    cut = None
-    if end < 0:
-        cut = f"line {lines[-1]}: the closing bracket is missing"
-    elif (rest := text[end + 1 :].strip("; \t\n")) != "":
-        line = text.count("\n", 0, end) + 1
-        if "[" in rest:
-            raise SubmissionError(
-                f"{source} line {line}: more data after the closing bracket: two recordings were "
-                f"pasted together"
-            )
-        notes.append(f"text after line {line} is not data and was not read")
-    return make_table(
-        parse_rows(rows, lines, split=str.split, names=names, source=source),
-        form="ecp",
-        typed=typed,
-        cut=cut,
-        notes=notes,
-    )
+def _is_remark(fields: Sequence[str]) -> bool:
+    """Return whether the fields of a line are a sentence, or a setting and its value."""
+    return len(fields) <= 2 and parse_heading(fields[0]).unit is None
 
 
-def _ecp_heading(head: str) -> tuple[list[str], int]:
-    """Return the names in an ECP heading, and the number of its line."""
-    lines = head.split("\n")
-    for number in range(len(lines), 0, -1):
-        line = lines[number - 1].strip().lstrip("%#").strip()
-        if re.search(r"\b(time|encoder)\b", line, re.IGNORECASE):
-            return _HEADING_WORDS.findall(line), number
-    return [], 1
+def _fields(text: str, layout: Layout, width: int, *, ends: bool) -> list[str] | None:
+    """Return the names in a line, if there are `width` of them; None otherwise."""
+    ways: list[Callable[[], list[str]]] = [lambda: layout.split(text)]
+    if layout.delimiter is None:
+        ways = [
+            lambda: re.split(r"\t+|\s{2,}", text.strip()),
+            lambda: _HEADING_WORDS.findall(text[:4000]),
+            lambda: text.split(),
+            lambda: [field.strip() for field in re.split("[,;\t]", text)],
+        ]
+    for way in ways:
+        fields = way()
+        if len(fields) == width + 1 and not fields[-1].strip():
+            fields = fields[:-1]
+        if len(fields) == width - 1 and ends:
+            fields = [*fields, ""]
+        if len(fields) == width and any(map(_is_name, fields)):
+            return fields
+    return None
 
 
-# ----------------------------------------------------------------------------- delimited text
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """How the lines of a table are split; `delimiter` None means any white space."""
-
-    delimiter: str | None
-    decimal_comma: bool
-    has_heading: bool
-    trailing: bool  # whether a delimiter ends each row
-
-    def fields(self, line: str) -> list[str]:
-        """Return the fields of one line."""
-        if self.delimiter is None:
-            words = _HEADING_WORDS.findall(line)
-            return words if any(word[0].isalpha() for word in words) else line.split()
-        fields = line.strip(" " if self.delimiter == "\t" else None).split(self.delimiter)
-        return fields[:-1] if self.trailing and not fields[-1].strip() else fields
-
-    @property
-    def split(self) -> Callable[[str], list[str]]:
-        """The function that splits a row of numbers and replaces decimal commas by points."""
-        if self.decimal_comma:
-            return lambda row: [field.replace(",", ".") for field in self.fields(row)]
-        if self.delimiter is None or self.trailing:
-            return self.fields
-        return methodcaller("split", self.delimiter)  # white space around a number does no harm
-
-
-def _delimited(text: str, source: str) -> FileTable:
-    """Read a heading and rows; delimiter and decimal mark are found from the text."""
-    # A spreadsheet may write rows of empty cells after its last row.
-    numbered = enumerate(text.split("\n"), start=1)
-    lines = [(i, line) for i, line in numbered if line.strip().strip(' \t;,"')]
-    start = 0
-    while start < len(lines) and lines[start][1].lstrip().startswith(("#", "%", "sep=")):
-        start += 1
-    if start == len(lines):
-        raise SubmissionError(
-            f"{source}: the file is empty" if not lines else f"{source}: holds no rows of numbers"
-        )
-    layout = _sniff([line for _, line in lines[start : start + _SNIFFED_ROWS + 1]])
-    if layout is None:
-        number, line = lines[start]
-        if start + 1 == len(lines) and _TIME_HEADING.search(line):
-            raise SubmissionError(f"{source} line {number}: headings, but no rows of numbers below")
-        number, line = lines[min(start + 1, len(lines) - 1)]
-        raise SubmissionError(
-            f"{source} line {number}: not a table of numbers, found {line.strip()[:40]!r}"
-        )
-    heading, first = _heading(lines, start, layout)
-    typed = layout.fields(lines[first][1])
-    names = checked_names(
-        heading or [str(i) for i in range(1, len(typed) + 1)],
-        place=f"{source} line {lines[start][0]}",
-    )
-    rows = parse_rows(
-        [line for _, line in lines[first:]],
-        [number for number, _ in lines[first:]],
-        split=layout.split,
-        names=names,
-        source=source,
-    )
-    return make_table(
-        rows,
-        form="bench_log" if is_bench_log(names) else "csv",
-        typed=typed if len(typed) == len(names) else [""] * len(names),
-        cut=None,
-    )
-
-
-def _heading(
-    lines: Sequence[tuple[int, str]], start: int, layout: _Layout
-) -> tuple[list[str] | None, int]:
-    """Return the headings, None if missing, and the index of the first row of numbers.
-
-    The last comment before a table without headings may be its heading. A row of units below the
-    heading ("ms", "V") is added to the names: "time [ms]".
-    """
-    if not layout.has_heading:
-        width = len(layout.fields(lines[start][1]))
-        above = lines[start - 1][1].lstrip(" %#") if start else ""
-        names = layout.fields(above)
-        return (names if len(names) == width else None), start
-    names = layout.fields(lines[start][1])
-    if start + 2 < len(lines):
-        united = with_units(names, layout.fields(lines[start + 1][1]))
-        if united is not None:
-            return united, start + 2
-    return names, start + 1
-
-
-def with_units(names: Sequence[str], units: Sequence[str]) -> list[str] | None:
-    """Return headings joined with units, "time [ms]"; None if `units` are not units."""
-    bare = [unit.strip(' ()[]"') for unit in units]
-    words = all(re.fullmatch(rf"[^\d]{{1,{_LONGEST_UNIT}}}", unit) for unit in bare)
-    if not words or len(bare) != len(names) or bare == list(names):
-        return None
-    return [f"{name.strip(QUOTES)} [{unit}]" for name, unit in zip(names, bare, strict=True)]
+def _is_name(field: str) -> bool:
+    return any(c.isalpha() for c in field)
 
 
 def is_bench_log(names: Sequence[str]) -> bool:
@@ -366,28 +646,41 @@ def is_bench_log(names: Sequence[str]) -> bool:
     )
 
 
-def _sniff(sample: Sequence[str]) -> _Layout | None:
-    """Return the layout in which the most lines are rows of equally many numbers; None if none are.
+# ------------------------------------------------------------------------------ ECP exports
 
-    Among equally good layouts, the first one is used. So "0,5;1,2" is two numbers with decimal
-    commas, and "0,5" is two integers.
+
+def _in_brackets(
+    text: str, opening: re.Match[str], source: str
+) -> tuple[list[tuple[int, str]], list[tuple[int, str]], str | None, list[str]]:
+    """Return the lines above, the rows, a missing end and notes of `heading [ row; row; … ]`.
+
+    The ECP program and scripts of MATLAB write this.
+
+    Raises
+    ------
+    SubmissionError : there are no rows, or two recordings.
     """
-    best, best_score = None, 0.0
-    for delimiter in ("\t", ";", ",", None):
-        for decimal_comma in (False, True) if delimiter != "," else (False,):
-            trailing = delimiter not in (None, "\t") and all(
-                line.rstrip().endswith(delimiter) for line in sample[1:] or sample
-            )
-            layout = _Layout(delimiter, decimal_comma, has_heading=False, trailing=trailing)
-            split = list(map(layout.split, sample))
-            has_heading = not all(map(is_number, split[0]))
-            width = len(split[0])
-            numeric = [len(row) for row in split[has_heading:] if all(map(is_number, row))]
-            # A single column counts only if nothing else fits. Numbers under a heading of another
-            # width count only so that the error can be reported.
-            score = numeric.count(width) * (2 if width > 1 else 1) + 0.01 * len(numeric)
-            if score > best_score:
-                best, best_score = replace(layout, has_heading=has_heading), score
-            if width > 1 and numeric.count(width) == len(split) - has_heading > 0:
-                return best  # every line contains the delimiter, and no number does
-    return best
+    first_line = text.count("\n", 0, opening.end()) + 1
+    end = text.find("]", opening.end())
+    body = text[opening.end() : end if end >= 0 else len(text)]
+    rows = [
+        (number, piece)
+        for number, line in enumerate(body.replace(",", " ").split("\n"), start=first_line)
+        for piece in line.partition("%")[0].split(";")
+        if piece.strip()
+    ]
+    if not rows:
+        raise SubmissionError(f"{source} line {first_line}: no rows after the opening bracket")
+    above = list(enumerate(text[: opening.start()].split("\n"), start=1))
+    head = [one for one in above if re.search(r"(?i)\b(time|encoder)\b", one[1])][-1:]
+    if end < 0:
+        return head, rows, f"line {rows[-1][0]}: the closing bracket is missing", []
+    if (rest := text[end + 1 :].strip("; \t\n")) == "":
+        return head, rows, None, []
+    line = text.count("\n", 0, end) + 1
+    if "[" in rest:
+        raise SubmissionError(
+            f"{source} line {line}: more data after the closing bracket: two recordings were "
+            f"pasted together"
+        )
+    return head, rows, None, [f"text after line {line} is not data and was not read"]
