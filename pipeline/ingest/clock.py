@@ -6,6 +6,7 @@ perfectly even. The records of a session share one clock, so together they revea
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ _ROUNDING_BAND = 0.65
 # Widths of a strip around a line, in rounding steps: 1 if stamps are only rounded, more if some
 # ticks of the clock are late.
 _BANDS = (1.0, 1.02, 1.05, 1.1, 1.2, 2 * _ROUNDING_BAND)
+# Ranges of clocks in s: 32 or 16 bits of µs or ms, or of the file's unit; a day; half a day.
+_RANGES = (2**32 * 1e-6, 2**32 * 1e-3, 2**16 * 1e-3, 2**16 * 1e-6, 2**32, 2**16, 86_400, 43_200)
 _HAIR = 1e-6  # numerical error of doubles, in rounding steps
 # A smaller range of slopes does not show the period; it comes from stamps that flicker.
 _NO_ROOM = 10 * _HAIR
@@ -94,7 +97,7 @@ def time_stamps(table: FileTable, column: Column | None, *, sample_rate: float |
         raise SubmissionError(
             f"{table.source}: {column.name!r} is in {column.unit}, which is not a unit of time"
         )
-    return table.values[column.index] * factor
+    return unroll(table.values[column.index] * factor)
 
 
 def clock_notes(
@@ -158,7 +161,7 @@ def read_clocks(session: Sequence[Array]) -> list[Clock]:
     for record, period in zip(rounded, _periods(rounded), strict=True):
         t, pieces = record.straight(period)
         if (np.diff(t) <= 0).any():
-            t, pieces = record.stamps, 0
+            t, pieces = _steady(record.stamps, record.rounding)
         clocks.append(_checked(t, record.rounding, pieces=pieces, period=period))
     return clocks
 
@@ -260,11 +263,63 @@ def _stretches(stamps: Array, rounding: float) -> tuple[tuple[int, int], ...]:
             found.append((start, end))
         # Pieces of fewer than 32 samples would fit a line by chance.
         elif end - start >= 2 * 32:
-            middle = (start + end) // 2
+            pauses = _pauses(stamps[start:end], rounding)
+            middle = start + int(pauses[0]) if pauses.size else (start + end) // 2
             waiting += [(start, middle), (middle, end)]
     explained = sum(end - start for start, end in found)
     # If straight pieces cover less than 80 %, the clock itself is uneven.
     return tuple(sorted(found)) if explained >= 0.8 * stamps.size else ()
+
+
+def _pauses(stamps: Array, rounding: float) -> NDArray[np.intp]:
+    """Return the samples before which time is missing."""
+    mean = (stamps[-1] - stamps[0]) / (stamps.size - 1)
+    steps = np.diff(stamps)
+    usual = min(float(np.median(steps)) or mean, mean) + rounding
+    return np.flatnonzero(steps > _GAP * usual + 1.5 * rounding) + 1
+
+
+def _steady(stamps: Array, rounding: float) -> tuple[Array, int]:
+    """Return even times for stamps that repeat because they are rounded to a sample or more.
+
+    Between pauses, a straight line replaces them; they may scatter about it by a few samples. Other
+    stamps are kept, with 0 lines: a clock that stands still by itself is no rounded one.
+    """
+    bounds = [0, *_pauses(stamps, rounding).tolist(), stamps.size]
+    pieces = [stamps[a:b] for a, b in pairwise(bounds)]
+    if (np.diff(stamps) < 0).any() or min(piece.size for piece in pieces) < FEWEST_SAMPLES:
+        return stamps, 0
+    slope = _common_slope(pieces)
+    t = np.concatenate([_line(piece, slope=slope) for piece in pieces])
+    scatter = float(np.sqrt(np.mean((t - stamps) ** 2)))
+    if rounding < 0.4 * slope or scatter > 2 * (rounding + slope) or (np.diff(t) <= 0).any():
+        return stamps, 0
+    return t, len(pieces)
+
+
+def _common_slope(pieces: Sequence[Array]) -> float:
+    """Return the least-squares slope that all pieces share."""
+    moments = [(np.arange(p.size) - (p.size - 1) / 2, p) for p in pieces]
+    return float(sum(i @ p for i, p in moments) / sum(i @ i for i, _ in moments))
+
+
+def unroll(stamps: Array) -> Array:
+    """Return stamps (n,) in s without the overflow of a counter, and across midnight.
+
+    Time goes back by a counter's range, of which all but one usual interval is missing.
+    """
+    steps = np.diff(stamps)
+    if not (back := np.flatnonzero(steps < 0)).size:
+        return stamps
+    forward = steps[steps > 0]
+    usual = float(np.median(forward)) if forward.size else 0.0
+    for range_ in _RANGES:
+        missing = steps[back] + range_
+        if (missing >= 0).all() and (missing <= _GAP * usual + 1e-9 * range_).all():
+            wraps = np.zeros(stamps.size)
+            wraps[back + 1] = range_
+            return stamps + np.cumsum(wraps)
+    return stamps
 
 
 def _usual(stamps: Array, rounding: float) -> NDArray[np.bool_]:

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
-from pipeline.ingest.clock import FEWEST_SAMPLES, Clock, clock_notes, read_clock
+from pipeline.ingest.clock import FEWEST_SAMPLES, Clock, clock_notes, read_clock, unroll
 from pipeline.ingest.columns import Column, assign_columns, holds_counts
 from pipeline.ingest.formats.headings import conversion
 from pipeline.ingest.formats.recognise import FORM_TITLES, read_table
@@ -224,7 +224,7 @@ def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str])
     if column is None or factor is None:
         problems.append(NO_CLOCK)
         return None
-    clock = read_clock(table.values[column.index] * factor)
+    clock = read_clock(unroll(table.values[column.index] * factor))
     problems += clock_notes(table, column, clock, sample_rate=None)
     # Jitter above 1 % of the interval (rms) is worth mentioning.
     if not clock.pieces and clock.jitter > 0.01 * clock.mean_interval:
@@ -252,6 +252,8 @@ def _guess(
     problems += channel_problems(t, u, positions)
     if reference is not None and "x1" in signals and holds_counts(table, columns["reference"]):
         reference = None if mirrors(reference, signals["x1"]) else reference
+    if u is not None and u[0] != 0.0 and np.ptp(u) == 0.0 and _starts_at_rest(positions):
+        return "step", None  # the log begins at the step
     if u is None or np.ptp(u) == 0.0:
         if table.form != "bench_mat" or reference is None or np.ptp(reference) == 0.0:
             return "decay", None
@@ -266,6 +268,15 @@ def _guess(
         return "step", None
     frequency = line_frequency(t, u)
     return ("sweep", None) if frequency is None else ("sine", frequency if clock else None)
+
+
+def _starts_at_rest(positions: Mapping[str, Array]) -> bool:
+    """Return whether all positions start at zero, and slowly."""
+    return all(
+        abs(x[0]) < 0.02 * np.ptp(x) and abs(x[2] - x[0]) < 0.1 * np.ptp(x)
+        for x in positions.values()
+        if np.ptp(x) > 0
+    )
 
 
 def _follows(u: Array, reference: Array) -> bool:
@@ -294,8 +305,9 @@ def is_stepped(u: Array) -> bool:
         return False
     pieces = np.split(u, edges)
     spread = np.sqrt(sum(((piece - np.median(piece)) ** 2).sum() for piece in pieces) / u.size)
-    # Between edges the input may vary by 3 % of its range (rms).
-    return bool(spread < 0.03 * np.ptp(u))
+    # Between edges the input may vary by 3 % of its range (rms). A constant input may have been
+    # switched on at the first sample.
+    return bool(spread <= 0.03 * np.ptp(u))
 
 
 def line_frequency(t: Array, u: Array) -> float | None:

@@ -6,17 +6,25 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.bode import Points, frequency_responses, read_points
 from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
 from pipeline.ingest.clock import FEWEST_SAMPLES, Clock, clock_notes, read_clocks, time_stamps
-from pipeline.ingest.columns import Column, assign_columns, holds_counts, is_count
+from pipeline.ingest.columns import (
+    Column,
+    assign_columns,
+    holds_counts,
+    is_count,
+    refuse_unknown_unit,
+)
 from pipeline.ingest.formats.headings import conversion
-from pipeline.ingest.formats.recognise import read_table
+from pipeline.ingest.formats.recognise import choose_run, read_tables
 from pipeline.ingest.formats.table import FileTable, refuse_extreme
 from pipeline.ingest.input_sign import Signs, with_signs
+from pipeline.ingest.repairs import repair_positions
 from pipeline.results import FrequencyResponse, HeadingUnit, Record
 from pipeline.submission import Experiment, Submission, System
 
@@ -62,7 +70,7 @@ def read_data(submission: Submission) -> Ingested:
             f"{submission.folder.resolve().name}/submission.toml: it has no [[experiments]] "
             f"table yet; add one for each data file, as `cartlab fill` does"
         )
-    tables: dict[str, tuple[FileTable, str]] = {}
+    tables: dict[str, tuple[list[FileTable], str]] = {}
     opened: list[_Opened] = []
     points: Points = {}
     warnings: list[str] = []
@@ -72,10 +80,10 @@ def read_data(submission: Submission) -> Ingested:
     for experiment in submission.experiments:
         with _noted(experiment, unreadable):
             if experiment.file not in tables:
-                tables[experiment.file] = read_table(
+                tables[experiment.file] = read_tables(
                     submission.folder, experiment.file, taken=taken
                 )
-            table, _ = tables[experiment.file]
+            table = choose_run(tables[experiment.file][0], experiment.run)
             if experiment.kind == "bode":
                 if _read_bode(table, experiment, submission.system, points, warnings):
                     tables_read.append(experiment.id)
@@ -127,7 +135,7 @@ def _unused_scale(records: Sequence[Record], system: System) -> list[str]:
     ]
 
 
-def _copies(tables: Mapping[str, tuple[FileTable, str]]) -> list[str]:
+def _copies(tables: Mapping[str, tuple[Sequence[FileTable], str]]) -> list[str]:
     """Return a warning for every file that is a copy of another."""
     first: dict[str, str] = {}
     return [
@@ -222,6 +230,17 @@ def _read_record(opened: _Opened, clock: Clock) -> Record:
     y = np.array(
         [table.values[c.index] * scale for c, scale in zip(positions, scales, strict=True)]
     )
+    given = {c.name: row for c, row in zip(positions, y, strict=True)}
+    repaired, good, said = repair_positions(
+        clock.t,
+        given,
+        unit=opened.system.position.unit,
+        scales={c.name: scale for c, scale in zip(positions, scales, strict=True)},
+        wanted=experiment.repair.model_dump(),
+    )
+    notes += said
+    y = np.array([repaired[c.name] for c in positions])
+    keep = np.flatnonzero(good)[np.isin(np.flatnonzero(good), np.arange(clock.t.size)[keep])]
     resolution = [
         scale if holds_counts(table, c) else encoder_step(row)
         for c, row, scale in zip(positions, y, scales, strict=True)
@@ -318,6 +337,7 @@ def _unit_scale(
     opened: _Opened, column: Column, unit: str, role: Literal["position", "input"]
 ) -> float:
     """Return the factor from the heading's unit to the submission's, and add a note."""
+    refuse_unknown_unit(opened.table, column, stated=unit)
     factor = conversion(column.unit, unit)
     if column.unit is not None:
         converts = factor is not None
@@ -367,7 +387,7 @@ def _beyond_volts(values: Array) -> bool:
     return bool(np.all(values == np.round(values)) and np.abs(values).max() > _FEW_COUNTS)
 
 
-def _reference(opened: _Opened, keep: slice) -> Array | None:
+def _reference(opened: _Opened, keep: NDArray[np.intp]) -> Array | None:
     """Return the set point of a closed loop, from the experiment's table or else from its file."""
     table, experiment, columns = opened.table, opened.experiment, opened.columns
     if experiment.kind != "closed_loop":

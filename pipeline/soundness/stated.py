@@ -15,7 +15,7 @@ OTHER_DWELL = 0.1  # relative; a dwell this far from its stated frequency is ano
 LEAST_SHARE = 0.2
 # Share of the free carts' swing. A cart that is held firmly moves less.
 _HELD_FIRMLY = 0.05
-_LONGEST = 3.0  # metres; no bench has a longer track
+_LONGEST = 20.0  # metres; no bench has a longer track, and no record of counts has decimals
 _LONGEST_WHOLE = 0.5  # metres; the limit if all readings are whole numbers, as counts are
 _ECP_STEP = 2.27e-5  # metres per count of the encoders of an ECP 210
 _LARGEST = 100.0  # volts; no amplifier at a bench gives as much

@@ -172,6 +172,15 @@ class PidController(TomlTable):
 Controller = Annotated[StateFeedbackController | PidController, Field(discriminator="type")]
 
 
+class Repair(TomlTable):
+    """Which repairs of a position are made; `false` keeps the readings as they are."""
+
+    unwrap: bool = True
+    jumps: bool = True
+    spikes: bool = True
+    repeats: bool = True
+
+
 class Experiment(TomlTable):
     """One data file and how it was recorded."""
 
@@ -202,6 +211,10 @@ class Experiment(TomlTable):
     sample_rate: Positive | None = Field(
         default=None, title="Sample rate", description="Hz, for a file without a time column"
     )
+    run: str | int | None = Field(
+        default=None, title="Run", description="of a file that holds several, as `inspect` names it"
+    )
+    repair: Repair = Repair()
     hold: Literal["zero_order", "band_limited"] = "zero_order"
     controlled_cart: int | None = Field(default=None, title="Controlled cart")
     controller: Controller | None = None

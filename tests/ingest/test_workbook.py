@@ -227,10 +227,11 @@ CLOSE = "</sheetData></worksheet>"
 FAR = '<row><c t="str"><v>x1</v></c></row><row r="2"><c r="A2"><v>1</v></c></row>'
 ENTITIES = "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 12))
 
+REFUSED = r"no sheet has|no rows of numbers|broken, cut short or larger"
 BOMBS = {
     "two cells far apart": (
         package(OPEN + FAR + '<row r="1048576"><c r="XFD1048576"><v>2</v></c></row>' + CLOSE),
-        r"no sheet has|empty|cut short",
+        REFUSED,
     ),
     "a size that is not true": (
         package(BOOK.replace("<sheetData>", '<dimension ref="A1:XFD1048576"/><sheetData>')),
@@ -240,47 +241,47 @@ BOMBS = {
         package(OPEN + '<row><c t="s"><v>7</v></c></row>' + FAR + CLOSE, texts=(
             f'<sst xmlns="{NAMESPACE}" uniqueCount="99999999999"><si><t>x1</t></si></sst>'
         )),
-        r"broken, cut short or larger",
+        REFUSED,
     ),
     "entities": (
         package(f'<!DOCTYPE w [<!ENTITY a0 "aaaaaaaaaa">{ENTITIES}]>'
                 + OPEN + '<row><c t="str"><v>&a11;</v></c></row>' + CLOSE),
-        r"broken, cut short or larger",
+        REFUSED,
     ),
     "a file elsewhere": (
         package('<!DOCTYPE w [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
                 + OPEN + '<row><c t="str"><v>&a;</v></c></row>' + CLOSE),
-        r"broken, cut short or larger",
+        REFUSED,
     ),
-    "a tag without end": (package(OPEN + f'<row x="{"y" * 5_000_000}"/>' + CLOSE), r"larger"),
-    "nested without end": (package(OPEN + "<a>" * 1_000), r"cut short or larger"),
-    "a cell beyond the last": (package(OPEN + '<c r="XFE1"><v>1</v></c>' + CLOSE), r"cut short"),
-    "row 0": (package(OPEN + '<c r="A0"><v>1</v></c>' + CLOSE), r"cut short"),
+    "a tag without end": (package(OPEN + f'<row x="{"y" * 5_000_000}"/>' + CLOSE), REFUSED),
+    "nested without end": (package(OPEN + "<a>" * 1_000), REFUSED),
+    "a cell beyond the last": (package(OPEN + '<c r="XFE1"><v>1</v></c>' + CLOSE), REFUSED),
+    "row 0": (package(OPEN + '<c r="A0"><v>1</v></c>' + CLOSE), REFUSED),
     "many parts": (
-        package(BOOK, more={f"{i:0600}": b"" for i in range(2_000)}), r"cut short or larger",
+        package(BOOK, more={f"{i:0600}": b"" for i in range(2_000)}), REFUSED,
     ),
     "a sheet that is elsewhere": (
         package(BOOK, more={"xl/_rels/workbook.xml.rels": (
             b'<Relationships><Relationship Id="b" Type="x/worksheet" TargetMode="External" '
             b'Target="http://example.org/one.xml"/></Relationships>'
         )}),
-        r"no sheet has a row of headings|cut short",
+        REFUSED,
     ),
     "a sheet that is missing": (
         package(BOOK, more={"xl/_rels/workbook.xml.rels": (
             b'<Relationships><Relationship Id="b" Type="x/worksheet" Target="../../two.xml"/>'
             b"</Relationships>"
         )}),
-        r"broken, cut short",
+        REFUSED,
     ),
     "not a workbook": (
         package(BOOK, more={"_rels/.rels": (
             b'<Relationships><Relationship Id="a" Type="x/officeDocument" '
             b'Target="word/document.xml"/></Relationships>'
         )}),
-        r"cut short",
+        REFUSED,
     ),
-    "bits": (package(b"\xff\xfe\0\0"), r"broken, cut short"),
+    "bits": (package(b"\xff\xfe\0\0"), REFUSED),
 }  # fmt: skip
 
 

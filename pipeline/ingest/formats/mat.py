@@ -1,15 +1,23 @@
 """Find the recording in a `.mat` file: which variables form it, and their columns."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from pipeline.errors import SubmissionError
+from pipeline.ingest.formats.headings import is_time
 from pipeline.ingest.formats.mat_variables import MatVariable, read_variables
-from pipeline.ingest.formats.table import FileTable, not_read, refuse_unusable
+from pipeline.ingest.formats.table import (
+    MOST_COLUMNS,
+    FileTable,
+    checked_names,
+    not_read,
+    refuse_unusable,
+)
 from pipeline.words.numbers import first_few
 
 _MAX_COLUMNS = 64
+_MOST_SETTINGS = 8  # numbers in a variable; a recording has more samples
 _MOST_NAMED = 8
 _BENCH = ({"enc1", "duty", "time"}, {"cart1pos", "duty_cycle", "t_received"})
 
@@ -22,6 +30,8 @@ def read_mat(raw: bytes, *, source: str) -> list[FileTable]:
     SubmissionError : the file is broken, or contains no usable numbers.
     """
     variables = read_variables(raw, source=source)
+    if tables := _structures(variables, source=source):
+        return tables
     record = _record(variables, source=source)
     notes: list[str] = []
     names, arrays = [], []
@@ -71,6 +81,66 @@ def read_mat(raw: bytes, *, source: str) -> list[FileTable]:
             variables=made,
         )
     ]
+
+
+def _structures(variables: Sequence[MatVariable], *, source: str) -> list[FileTable]:
+    """Return the recordings that stand in structs; none if there are vectors beside them.
+
+    Simulink's "structure with time" has the fields `time` and `signals`, whose elements have
+    `values` and perhaps a `label`. Other structs have a vector for each signal.
+    """
+    whole = {v.name: v for v in variables}
+    if (one := _structure("", whole, source=source)) is not None:
+        return [one]
+    if sum(v.values is not None and v.samples > _MOST_SETTINGS for v in variables) > 1:
+        return []
+    found = (
+        _structure(v.name, element, source=source) for v in variables for element in v.elements
+    )
+    return [table for table in found if table is not None]
+
+
+def _structure(name: str, fields: Mapping[str, MatVariable], *, source: str) -> FileTable | None:
+    signals = fields.get("signals")
+    elements = signals.elements if signals else ()
+    if not elements and not name:
+        return None
+    time = next((fields[key] for key in fields if is_time(key)), None)
+    if elements:
+        parts = [(_label(one), one["values"]) for one in elements if "values" in one]
+        parts = [("time", time), *parts] if time else parts
+    else:
+        parts = [*fields.items()]
+    parts = [(label, v) for label, v in parts if v.values is not None and v.samples > 1]
+    longest = max((v.samples for _, v in parts), default=0)
+    columns: list[tuple[str, np.ndarray]] = []
+    for label, v in parts:
+        values = v.numbers if v.numbers.shape[0] == longest else v.numbers.T
+        if values.shape[0] == longest and values.shape[1] <= MOST_COLUMNS:
+            label = label if values.shape[1] == 1 else ""  # it does not name several signals
+            columns += [(label, column) for column in values.T]
+    if len(columns) < 2 or longest <= _MOST_SETTINGS:
+        return None
+    named = all(label for label, _ in columns)
+    names = [label if named else str(i) for i, (label, _) in enumerate(columns, start=1)]
+    names = checked_names(names, place=f"{source} {name}".strip())
+    values = np.array([column.astype(np.float64) for _, column in columns])
+    refuse_unusable(values, names=names, place=lambda row: f"{source} sample {row + 1}")
+    return FileTable(
+        source=source,
+        form="variables" if named else "matrix",
+        names=tuple(names),
+        values=values,
+        whole=tuple(bool((column == np.round(column)).all()) for column in values),
+        lines=None,
+        run=name,
+    )
+
+
+def _label(element: Mapping[str, MatVariable]) -> str:
+    """Return the label of a signal of Simulink; "" if it has none."""
+    text = element["label"].text.strip() if "label" in element else ""
+    return text if text.isprintable() else ""
 
 
 def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariable]:

@@ -10,7 +10,7 @@ import math
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from itertools import islice
 from typing import Any
@@ -30,6 +30,7 @@ _DEFLATE, _CHECKSUM, _SIZE_OF_CHECKSUM = 1, 3, 4
 _MOST_ABSENT = 1_000_000  # bytes of zeros that MATLAB may leave out
 # Codes of version 5: types of elements, a flag, classes of variables, and storage types.
 _MATRIX, _COMPRESSED, _OPAQUE, _COMPLEX = 14, 15, 17, 0x800
+_STRUCT, _TEXT, _DEEPEST, _MOST_FIELDS = 2, 4, 4, 500
 _CLASSES = {
     6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8",
 }  # fmt: skip
@@ -48,7 +49,8 @@ _NUMBERS = frozenset(
 class MatVariable:
     """A variable with its numbers (rows, columns), or with a description if `values` is None.
 
-    `bytes` is the variable's size in the file if its numbers are not read.
+    `bytes` is the variable's size in the file if its numbers are not read. `elements` are those of
+    a struct, each with its fields by name; `text` is that of a text.
     """
 
     name: str
@@ -56,6 +58,8 @@ class MatVariable:
     kind: str
     size: tuple[int, ...] = ()
     bytes: int = 0
+    elements: tuple[dict[str, "MatVariable"], ...] = ()
+    text: str = ""
 
     @property
     def numbers(self) -> np.ndarray:
@@ -178,7 +182,33 @@ def _element(content: bytes, at: int, order: str) -> tuple[int, bytes, int]:
     return word & 0xFFFF, data, at + 8
 
 
-def _read_matrix(content: bytes, order: str) -> MatVariable:
+def _read_struct(
+    content: bytes, at: int, order: str, *, depth: int
+) -> Iterator[dict[str, MatVariable]]:
+    """Yield the fields of each element of a struct, from where their names begin."""
+    _, width, at = _element(content, at, order)
+    (length,) = struct.unpack_from(order + "i", width)
+    _, names, at = _element(content, at, order)
+    if not 0 < length <= _LONGEST_NAME or len(names) > _MOST_FIELDS * length:
+        raise ValueError(length)
+    fields = [
+        _label(names[i : i + length].partition(b"\0")[0]) for i in range(0, len(names), length)
+    ]
+    left = _MOST_FIELDS
+    while fields and at + 8 <= len(content):
+        element = {}
+        for name in fields:
+            _, part = _content(content, at, order)
+            at += 8 + len(part)
+            left -= 1
+            if left < 0:
+                return
+            if part:
+                element[name] = _read_matrix(part, order, depth=depth + 1)
+        yield element
+
+
+def _read_matrix(content: bytes, order: str, *, depth: int = 0) -> MatVariable:
     _, flags, at = _element(content, 0, order)
     (flag,) = struct.unpack_from(order + "I", flags)
     code = flag & 0xFF
@@ -190,6 +220,21 @@ def _read_matrix(content: bytes, order: str) -> MatVariable:
         shape = tuple(int(d) for d in np.frombuffer(dims, dtype=order + "i4"))
     _, name, at = _element(content, at, order)
     label = _label(name)
+    if code == _STRUCT and depth < _DEEPEST:
+        elements = tuple(_read_struct(content, at, order, depth=depth))
+        return MatVariable(
+            name=label,
+            values=None,
+            kind="struct",
+            size=shape,
+            bytes=len(content),
+            elements=elements,
+        )
+    if code == _TEXT:
+        _, data, _ = _element(content, at, order)
+        text = data.decode("utf-16" if data[1:2] == b"\0" else "latin-1", errors="replace")
+        text = text.replace("\0", "")[:_LONGEST_NAME]
+        return replace(_nothing(label, "text", size=shape, bytes=len(content)), text=text)
     kind = "" if code in _CLASSES else _OTHER_CLASSES.get(code, "unknown")
     kind = kind or ("complex" if flag & _COMPLEX else _no_matrix(shape))
     if kind:
@@ -273,7 +318,11 @@ def _version_7_3(raw: bytes) -> Iterator[MatVariable]:
                 objects -= len(own)
                 parts = [item[key] for key in own] if objects >= 0 else []
                 taken = sum(part.nbytes for part in parts if isinstance(part, h5py.Dataset))
-                yield _nothing(name, kind, size=(1, 1), bytes=taken)
+                elements = (_fields_of(item, left=left),) if kind == "struct" else ()
+                left -= taken
+                yield MatVariable(
+                    name=name, values=None, kind=kind, size=(1, 1), bytes=taken, elements=elements
+                )
                 continue
             size = tuple(reversed(item.shape)) if len(item.shape) > 1 else (item.size, 1)
             kind = _class_of(item)
@@ -291,6 +340,28 @@ def _version_7_3(raw: bytes) -> Iterator[MatVariable]:
                 if values.dtype.names == ("real", "imag"):
                     values = values["real"] + 1j * values["imag"]
                 yield _matrix(name, values.T.reshape(size), bytes=item.nbytes)
+
+
+def _fields_of(group: Any, *, left: int, depth: int = 0) -> dict[str, MatVariable]:
+    """Return the fields of a struct in a version 7.3 file: vectors, matrices and structs."""
+    import h5py
+
+    fields: dict[str, MatVariable] = {}
+    for key in islice(group, _MOST_FIELDS):
+        if not isinstance(group.get(key, getlink=True), h5py.HardLink):
+            continue
+        item = group[key]
+        if isinstance(item, h5py.Group) and depth < _DEEPEST:
+            inner = _fields_of(item, left=left, depth=depth + 1)
+            fields[key] = MatVariable(name=key, values=None, kind="struct", elements=(inner,))
+        elif isinstance(item, h5py.Dataset) and _class_of(item) in _NUMBERS:
+            left -= _bytes_to_read(item)
+            if left < 0 or item.is_virtual or item.external:
+                raise ValueError(key)
+            _check_chunks(item)
+            if len(item.shape) == 2 and _holds_numbers(item.dtype):
+                fields[key] = _matrix(key, item[()].T, bytes=item.nbytes)
+    return fields
 
 
 def _bytes_to_read(item: Any) -> int:

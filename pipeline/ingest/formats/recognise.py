@@ -55,7 +55,7 @@ _STRANGERS = (
     (b"PK\x03\x04", "a zip archive, or a document of LibreOffice: save the sheet as .xlsx or CSV"),
     (b"\xd0\xcf\x11\xe0", "an old Excel workbook, or a locked one; save it as .xlsx, unlocked"),
     (b"\x89HDF", "an HDF5 file that MATLAB did not write; save the recording as CSV"),
-    (b"\x01\x8b", "a gzip archive; unpack it"),
+    (b"\x1f\x8b", "a gzip archive; unpack it"),
     (b"%PDF", "a PDF document; export the recording as CSV"),
     (b"\x89PNG", "a picture; export the recording as CSV"),
     (b"\xff\xd8\xff", "a picture; export the recording as CSV"),

@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
-from pipeline.ingest.formats.headings import are_units, join_unit, parse_heading
+from pipeline.ingest.formats.headings import are_units, is_time, join_unit, parse_heading
 from pipeline.ingest.formats.table import FileTable, checked_names, refuse_unusable
 from pipeline.words.numbers import first_few
 
@@ -536,7 +536,9 @@ def _cut_end(
 ) -> tuple[str | None, dict[int, str]]:
     """Return what is wrong with a last row that was cut off, and the other faults."""
     last = len(block.rows) - 1
-    if cut or last not in faults or len(faults) > 1 + _WORST * len(block.rows):
+    if cut:
+        return cut, {i: fault for i, fault in faults.items() if i != last}
+    if last not in faults or len(faults) > 1 + _WORST * len(block.rows):
         return cut, faults
     if not faults[last].startswith("expected"):
         return cut, faults
@@ -559,21 +561,17 @@ def find_names(block: Block, layout: Layout, *, width: int, ends: bool) -> list[
     SubmissionError : the last line has another number of names than the table has columns.
     """
     texts = [
-        (number, line.strip(" ").lstrip("#%").strip(" "), line.lstrip().startswith(("#", "%")))
-        for number, line in block.head
+        (line.strip(" ").lstrip("#%").strip(" "), line.lstrip().startswith(("#", "%")))
+        for _, line in block.head
         if _is_name(line) and not line.startswith("sep=")
     ]
     found: list[list[str]] = []
-    for number, text, is_comment in reversed(texts[-4:]):
+    for text, is_comment in reversed(texts[-4:]):
         names = _fields(text, layout, width, ends=ends)
         if names is None:
-            fields = [field for field in layout.split(text) if field.strip()]
-            many = layout.delimiter is not None and len(fields) > 1 and len(fields) != width
-            if not found and not is_comment and many and not _is_remark(fields):
-                raise SubmissionError(
-                    f"{block.place(number)}: expected {width} columns as in the rows below, "
-                    f"found {len(fields)}"
-                )
+            said = _other_width(text, layout, width=width)
+            if said and not found and (layout.delimiter is None or not is_comment):
+                raise SubmissionError(f"{block.place(block.rows[0][0])}: {said}")
             if found or not is_comment:
                 break
             continue
@@ -603,9 +601,20 @@ def _runs(fields: Sequence[str]) -> list[str]:
     return runs
 
 
-def _is_remark(fields: Sequence[str]) -> bool:
-    """Return whether the fields of a line are a sentence, or a setting and its value."""
-    return len(fields) <= 2 and parse_heading(fields[0]).unit is None
+def _other_width(text: str, layout: Layout, *, width: int) -> str:
+    """Return what is wrong with headings that are more or fewer than the columns; "" for a remark.
+
+    A remark is a sentence, or a setting and its value.
+    """
+    if layout.delimiter is None:
+        words = _HEADING_WORDS.findall(text[:4000])
+        return (
+            f"expected {len(words)} columns as in the heading, found {width}"
+            if any(map(is_time, words)) else ""
+        )  # fmt: skip
+    fields = [field for field in layout.split(text) if field.strip()]
+    are_names = len(fields) > 2 or any(map(is_time, fields))
+    return f"expected {len(fields)} columns, found {width}" if 1 < len(fields) and are_names else ""
 
 
 def _fields(text: str, layout: Layout, width: int, *, ends: bool) -> list[str] | None:

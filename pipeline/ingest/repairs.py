@@ -1,0 +1,195 @@
+"""Undo what a sensor did to a position: a position cannot jump.
+
+No cart moves in one sample much farther than in the samples on each side, because that needs an
+enormous force twice. So such a step is the sensor's doing: a counter that wrapped, a new zero, a
+wrong reading, or a reading that was repeated until the next one came.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.arrays import Array
+from pipeline.ingest.channels import encoder_step, stuck_spans
+from pipeline.ingest.formats.headings import unit_symbol
+from pipeline.words.numbers import first_few
+
+_SIDE = 8  # samples on each side of a step
+_FARTHER = 4.0  # times as far as any step beside it
+_STEPS = 12.0  # encoder steps, or times the noise; a smaller jump does no harm
+_LEAST = 0.02  # share of the range
+_MOST_BAD = 12  # readings in a row that a spike lasts
+_MOST_SHARE = 0.05  # share of readings that may be wrong
+_BITS = (8, 10, 12, 14, 16, 20, 24, 32)
+_FEWEST_CHANGES = 20
+_MOST_NAMED = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Repair:
+    """One repair of a position.
+
+    Attributes
+    ----------
+    key : "unwrap", "jumps", "spikes" or "repeats", as in `repair = { … }`.
+    x : the repaired positions (n,).
+    keep : the samples (n,) that remain.
+    at : the samples concerned.
+    message : what was done, without the samples.
+    """
+
+    key: str
+    x: Array
+    keep: NDArray[np.bool_]
+    at: NDArray[np.intp]
+    message: str
+
+
+def repair_positions(
+    t: Array, y: Mapping[str, Array], *, unit: str, scales: Mapping[str, float], wanted: Mapping
+) -> tuple[dict[str, Array], NDArray[np.bool_], list[str]]:
+    """Return the positions by heading, which samples remain, and notes.
+
+    Parameters
+    ----------
+    y : positions (n,) in `unit`, by heading.
+    scales : position units per number in the file, by heading.
+    wanted : for each key of a repair, whether it is made; True if it is missing.
+    """
+    done: dict[str, Array] = {}
+    keep = np.ones(t.size, dtype=np.bool_)
+    notes = []
+    for name, x in y.items():
+        for repair in _repairs(x, unit=unit, scale=scales[name], wanted=wanted):
+            x = repair.x
+            keep &= repair.keep
+            where = first_few([f"{t[i]:.4g} s" for i in repair.at], _MOST_NAMED)
+            notes.append(
+                f"{name!r}: {repair.message} ({where}); to undo: "
+                f"repair = {{ {repair.key} = false }}"
+            )
+        done[name] = x
+    return done, keep, notes
+
+
+def _repairs(x: Array, *, unit: str, scale: float, wanted: Mapping) -> Iterator[Repair]:
+    every = np.ones(x.size, dtype=np.bool_)
+    held = _held(x) if wanted.get("repeats", True) else None
+    rows = np.flatnonzero(held) if held is not None else np.arange(x.size)
+    own = x[rows]
+    if own.size > 4 * _SIDE and wanted.get("unwrap", True):
+        jumps, period = _wraps(own, unit=unit, scale=scale)
+        if period:
+            own = np.unwrap(own, period=period)
+            message = f"the counter wrapped {jumps.size} times; {period:.6g} was added back"
+            yield Repair(
+                key="unwrap", x=_spread(x, rows, own), keep=every, at=rows[jumps], message=message
+            )
+            x = _spread(x, rows, own)
+    if own.size > 4 * _SIDE and wanted.get("spikes", True) and (bad := _wrong(own)).any():
+        n = int(bad.sum())
+        keep = every.copy()
+        keep[rows[bad]] = False
+        message = f"{n} samples cannot be right (spikes or dropouts) and were left out"
+        yield Repair(key="spikes", x=x, keep=keep, at=rows[bad], message=message)
+        rows, own = rows[~bad], own[~bad]
+    if own.size > 4 * _SIDE and wanted.get("jumps", True):
+        jumps = _jumps(own)
+        if 0 < jumps.size <= 5:
+            shift = np.zeros(own.size)
+            for i in jumps:
+                beside = 0.5 * (own[i - 1] - own[i - 2] + own[min(i + 1, own.size - 1)] - own[i])
+                shift[i:] += own[i] - own[i - 1] - beside
+            step = encoder_step(own - shift) if scale == 1.0 else scale
+            own = own - (np.round(shift / step) * step if step else shift)
+            x = _spread(x, rows, own)
+            message = f"the reading jumped {jumps.size} times (a new zero); the jumps were removed"
+            yield Repair(key="jumps", x=x, keep=every, at=rows[jumps], message=message)
+    if held is not None and not held.all():
+        n = round(x.size / held.sum())
+        message = f"each reading is repeated {n} times, so only the first of each is used"
+        yield Repair(key="repeats", x=x, keep=held, at=rows[:1], message=message)
+
+
+def _spread(x: Array, rows: NDArray[np.intp], own: Array) -> Array:
+    """Return all samples, given those of some rows; the others repeat the one before."""
+    return own[np.maximum(np.searchsorted(rows, np.arange(x.size), side="right") - 1, 0)]
+
+
+def _jumps(x: Array, *, spare: int = 0) -> NDArray[np.intp]:
+    """Return the samples before which the position jumps farther than physics allows.
+
+    `spare` is how many of the steps on each side may be jumps, too.
+    """
+    moves = np.abs(np.diff(x))
+    step = encoder_step(x)
+    least = max(_LEAST * float(np.ptp(x)), _STEPS * max(float(np.median(moves)), step))
+    after_hold = {last for _, last in stuck_spans(x)}
+    found = []
+    for i in np.flatnonzero(moves > least):
+        sides = moves[max(i - _SIDE, 0) : i], moves[i + 1 : i + 1 + _SIDE]
+        if not all(side.size > spare for side in sides):
+            continue
+        before, after = (float(np.sort(side)[: side.size - spare][-1]) for side in sides)
+        # Behind a stuck encoder, the reading jumps back to a cart that moves.
+        stuck = i in after_hold and after > 2 * step
+        if moves[i] > _FARTHER * max(before, after) and not stuck:
+            found.append(i + 1)
+    return np.array(found, dtype=np.intp)
+
+
+def _wraps(x: Array, *, unit: str, scale: float) -> tuple[NDArray[np.intp], float]:
+    """Return the samples at which a counter or an angle wraps, and its range; 0 if it does not."""
+    moves, span = np.abs(np.diff(x)), float(np.ptp(x))
+    jumps = np.flatnonzero(moves > 0.5 * span) + 1
+    rest = float(np.delete(moves, jumps - 1).max(initial=0.0))
+    periods = [factor * 2.0**bits for bits in _BITS for factor in {1.0, scale}]
+    angles = {"rad": 2 * np.pi, "deg": 360.0, "rev": 1.0}
+    periods += [angles[symbol]] if (symbol := unit_symbol(unit)) in angles else []
+    for period in periods:
+        # The cart moves while the counter wraps, as far as in other samples.
+        fits = np.abs(moves[jumps - 1] - period) <= 1.5 * rest + 2 * encoder_step(x)
+        if jumps.size and fits.all() and rest < 0.2 * period and span <= 1.001 * period:
+            return jumps, period
+    return jumps, 0.0
+
+
+def _wrong(x: Array) -> NDArray[np.bool_]:
+    """Return which samples cannot be right: the position jumps to them and soon back again."""
+    jumps = _jumps(x, spare=2).tolist()
+    wrong = np.zeros(x.size, dtype=np.bool_)
+    for start, end in pairwise(jumps):
+        there, back = x[start] - x[start - 1], x[end] - x[end - 1]
+        if end - start <= _MOST_BAD and abs(there + back) < 0.5 * min(abs(there), abs(back)):
+            wrong[start:end] = not wrong[start - 1]
+    return wrong if wrong.mean() <= _MOST_SHARE else np.zeros_like(wrong)
+
+
+def _held(x: Array) -> NDArray[np.bool_] | None:
+    """Return which samples are new readings, if a slow sensor repeats each; None otherwise."""
+    starts = np.flatnonzero(np.diff(x) != 0) + 1
+    if starts.size < _FEWEST_CHANGES:
+        return None
+    lengths = np.diff(starts)
+    n = float(np.median(lengths))
+    if n < 3:
+        return None
+    times = np.maximum(np.round(lengths / n), 1)
+    single = times == 1
+    # A slow cart, too, changes an encoder's count every few samples, but by one step.
+    changes = np.abs(np.diff(x)[starts - 1])
+    step = encoder_step(x)
+    regular = np.abs(lengths - times * n) <= 1 + 0.05 * lengths
+    if regular.mean() < 0.95 or single.mean() < 0.6 or np.median(changes) < 1.5 * step:
+        return None
+    if np.mean(lengths[single] == n) < 0.5:
+        return None
+    keep = np.zeros(x.size, dtype=np.bool_)
+    keep[np.arange(starts[0], -1, -round(n))] = True
+    for start, length, count in zip(starts, lengths, times, strict=False):
+        keep[start + np.round(np.arange(count) * length / count).astype(int)] = True
+    keep[np.arange(starts[-1], x.size, round(n))] = True
+    return keep
