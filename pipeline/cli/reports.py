@@ -48,7 +48,7 @@ def inspect(
     from pipeline.ingest.inspect import (
         format_inspection,
         format_inspections,
-        inspect_file,
+        inspect_runs,
         unread_entry,
     )
 
@@ -66,8 +66,9 @@ def inspect(
         for file in listed:  # a broken file must not hide the others
             progress(f"reading {file.name}")
             try:
-                inspections.append(inspect_file(file))
-                entries.append(inspections[-1].to_dict())
+                runs = inspect_runs(file)
+                inspections += runs
+                entries += [one.to_dict() for one in runs]
             except PipelineError as error:
                 unreadable.append(str(error))
                 entries.append(unread_entry(file, "broken", str(error)))

@@ -25,6 +25,7 @@ _ROUNDING_BAND = 0.65
 # Widths of a strip around a line, in rounding steps: 1 if stamps are only rounded, more if some
 # ticks of the clock are late.
 _BANDS = (1.0, 1.02, 1.05, 1.1, 1.2, 2 * _ROUNDING_BAND)
+_REPEATS = 0.05  # share of stamps that repeat if a sample is shorter than their rounding
 # Ranges of clocks in s: 32 or 16 bits of µs or ms, or of the file's unit; a day; half a day.
 _RANGES = (2**32 * 1e-6, 2**32 * 1e-3, 2**16 * 1e-3, 2**16 * 1e-6, 2**32, 2**16, 86_400, 43_200)
 _HAIR = 1e-6  # numerical error of doubles, in rounding steps
@@ -287,7 +288,8 @@ def _steady(stamps: Array, rounding: float) -> tuple[Array, int]:
     """
     bounds = [0, *_pauses(stamps, rounding).tolist(), stamps.size]
     pieces = [stamps[a:b] for a, b in pairwise(bounds)]
-    if (np.diff(stamps) < 0).any() or min(piece.size for piece in pieces) < FEWEST_SAMPLES:
+    repeats = np.mean(np.diff(stamps) == 0) if (np.diff(stamps) >= 0).all() else 0.0
+    if repeats < _REPEATS or min(piece.size for piece in pieces) < FEWEST_SAMPLES:
         return stamps, 0
     slope = _common_slope(pieces)
     t = np.concatenate([_line(piece, slope=slope) for piece in pieces])

@@ -25,7 +25,7 @@ _ROLES = {
         r"u|inputs?|control effort|effort|duty|duty cycle|voltage|motor|motor voltage|force",
         r"f|current|i|torque|motor current|motor force|control( signal| input)?|command|pwm|"
         r"spannung|motorspannung|kraft|strom|drehmoment|eingang|stellgr(ö|oe)sse|tension|commande|"
-        r"excitation|drive|actuator|voltage in|u in|v in|vin",
+        r"potential|excitation|drive|actuator|voltage in|u in|v in|vin",
     ),
     "reference": (
         r"r|ref|reference|set ?point|commanded pos(ition)?|target( v| value)?",
@@ -102,7 +102,8 @@ def input_units() -> tuple[str, ...]:
 def is_known(unit: str, known: Collection[str]) -> bool:
     """Return whether a unit is known; "CM" is not, because its prefix may be meant otherwise."""
     symbol = unit_symbol(unit)
-    return unit in known or (symbol in known and unit.casefold() != symbol.casefold())
+    spelled = symbol is not None and unit.casefold() != symbol.casefold()
+    return unit in known or (spelled and symbol in known)
 
 
 def assign_columns(
@@ -135,6 +136,10 @@ def assign_columns(
                 unused.append(table.names[index])
         else:
             found.setdefault(role, []).append((rank, index))
+    seconds = [i for i in range(len(plain)) if _unit(table, i) in FACTORS["time"]]
+    if not has_time and len(seconds) == 1 and table.names[seconds[0]] in unused:
+        found["time"] = [(0, seconds[0])]  # its unit says that it is the time
+        unused.remove(table.names[seconds[0]])
     for role, candidates in found.items():
         (rank, first), *others = sorted(candidates)
         if others and others[0][0] == rank:

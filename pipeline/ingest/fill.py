@@ -25,8 +25,8 @@ from pipeline.ingest.folder import (
     recordings_beside,
     refused,
 )
-from pipeline.ingest.formats.recognise import ENDINGS, read_table
-from pipeline.ingest.inspect import NO_CLOCK, Inspection, inspect_file
+from pipeline.ingest.formats.recognise import ENDINGS, choose_run, read_tables
+from pipeline.ingest.inspect import NO_CLOCK, Inspection, inspect_runs
 from pipeline.results import Kind
 from pipeline.submission.edit import (
     append_experiment,
@@ -80,6 +80,11 @@ class Found:
     unsure: tuple[str, ...] = ()
     advice: str = ""
 
+    @property
+    def run(self) -> str:
+        """The run in a file that holds several; "" in others."""
+        return self.inspection.run if self.inspection else ""
+
     def to_dict(self) -> dict[str, Any]:
         """Return the findings as plain values for JSON."""
         return asdict(self)
@@ -120,11 +125,20 @@ def examine_file(folder: Path, file: str, *, columns: Mapping[str, str | int] = 
     ----------
     columns : the columns that `submission.toml` states, by role.
     """
+    return examine_runs(folder, file, columns=columns)[0]
+
+
+def examine_runs(folder: Path, file: str, *, columns: Mapping[str, str | int] = {}) -> list[Found]:
+    """Return what each recording in a file contains, as `examine_file` does for the first."""
     try:
-        inspection = inspect_file(folder / file, columns=columns)
+        runs = inspect_runs(folder / file, columns=columns)
     except SubmissionError as error:
         reason = str(error).removeprefix(str(folder / file)).lstrip(": ")
-        return Found(file=file, state="broken", remarks=(reason,))
+        return [Found(file=file, state="broken", remarks=(reason,))]
+    return [_found(file, inspection) for inspection in runs]
+
+
+def _found(file: str, inspection: Inspection) -> Found:
     carts, unsure = free_carts(inspection)
     return Found(
         file=file,
@@ -181,6 +195,8 @@ def experiment_entry(
     if known and len(known) < n:
         entry["carts"] = known
     entry["file"] = file
+    if inspection.run:
+        entry["run"] = inspection.run
     if inspection.guessed:
         missing = {f"x{cart}" for cart in inspection.positions if cart > n}
         entry["columns"] = {k: v for k, v in inspection.guessed.items() if k not in missing}
@@ -211,8 +227,9 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
     text = "" if new else submission_text(folder)
     document = parse_toml(text, where=f"{folder.resolve().name}/{NAME}", error=SubmissionError)
     looked = [
-        examine_file(folder, file, columns=stated_columns(document, file))
+        one
         for file in data_files(folder)
+        for one in examine_runs(folder, file, columns=stated_columns(document, file))
     ]
     if not looked:
         what = "; ".join(_not_looked_into(passed_over(folder)))
@@ -242,7 +259,9 @@ class _Filling:
         self, document: tomlkit.TOMLDocument, folder: Path, looked: Sequence[Found]
     ) -> None:
         self._document, self._folder = document, folder
-        self._inspections = {one.file: one.inspection for one in looked if one.inspection}
+        self._inspections = {
+            (one.file, one.run): one.inspection for one in looked if one.inspection
+        }
         system: Any = document.get("system", {})
         self._n = system.get("carts", 1)
 
@@ -255,16 +274,16 @@ class _Filling:
         if found.inspection is None:
             return found
         for table in self._tables:
-            if posix(str(table["file"])) == found.file:
+            if _place(table) in ((found.file, found.run), (found.file, "")):
                 return self._complete(table, found, found.inspection)
-        if (same := self._same(found.file)) is not None:
+        if (same := self._same(found)) is not None:
             remark = f"is a copy of {same}; one entry is enough"
             return replace(found, state="copy", remarks=(remark,))
         if found.kind is None:
             self._say_unknown(found)
             return found
         taken = [str(table.get("id", "")) for table in self._tables]
-        name = free_id(PurePosixPath(found.file).stem, taken)
+        name = free_id(" ".join((PurePosixPath(found.file).stem, found.run)).strip(), taken)
         entry = experiment_entry(
             found.inspection,
             name=name,
@@ -297,6 +316,8 @@ class _Filling:
             table["kind"] = found.kind
         if "columns" not in table and inspection.guessed:
             table["columns"] = toml_item(inspection.guessed)
+        if "run" not in table and found.run:
+            table["run"] = found.run
         carts = tuple(table.get("carts", range(1, self._n + 1)))
         known = {NO_CLOCK} if "sample_rate" in table else set()  # already stated in the table
         if "columns" in table and not inspection.guessed:
@@ -322,28 +343,32 @@ class _Filling:
                     file=file, state="missing", experiment=name, kind=kind, remarks=(wrong,)
                 )
 
-    def _same(self, file: str) -> str | None:
+    def _same(self, found: Found) -> str | None:
         """Return another file of the submission that has the same samples, in any format."""
-        for name in (posix(str(table["file"])) for table in self._tables):
+        here = (found.file, found.run)
+        for there in map(_place, self._tables):
+            name, run = there
+            if name == found.file and run != found.run:
+                continue
             other = self._folder / name
-            if other.is_file() and filecmp.cmp(other, self._folder / file, shallow=False):
+            if other.is_file() and not run and filecmp.cmp(other, self._folder / found.file, False):
                 return name
-            if self._same_ranges(name, file) and self._signals(name) == self._signals(file):
+            if self._same_ranges(there, here) and self._signals(there) == self._signals(here):
                 return name
         return None
 
-    def _same_ranges(self, *files: str) -> bool:
+    def _same_ranges(self, *places: tuple[str, str]) -> bool:
         """Return whether files may hold the same samples, judged by the ranges of their columns."""
         seen = [
             one and {c.role: (one.samples, c.low, c.high) for c in one.columns if c.role}
-            for one in map(self._inspections.get, files)
+            for one in map(self._inspections.get, places)
         ]
         return bool(seen[0]) and seen[0] == seen[1]
 
-    def _signals(self, file: str) -> dict[str, bytes]:
+    def _signals(self, place: tuple[str, str]) -> dict[str, bytes]:
         """Return the samples of each column that has a role."""
-        table, _ = read_table(self._folder, file, shown=file)
-        columns = self._inspections[file].columns
+        tables, _ = read_tables(self._folder, place[0], shown=place[0])
+        table, columns = choose_run(tables, place[1] or None), self._inspections[place].columns
         return {c.role: table.values[i].tobytes() for i, c in enumerate(columns) if c.role}
 
     def _say_unknown(self, found: Found) -> None:
@@ -358,6 +383,11 @@ class _Filling:
         needs = [_TO_STATE[key] for key in found.inspection.needs] if found.inspection else []
         for text in (UNSURE + why, "[[experiments]]", f"id = {id_}", kind, line, *needs):
             self._document.add(tomlkit.comment(comment_text(text)))
+
+
+def _place(table: Any) -> tuple[str, str]:
+    """Return the file and the run of a table of an experiment."""
+    return posix(str(table["file"])), str(table.get("run", ""))
 
 
 def _beside_held(found: Found, carts: Collection[int]) -> tuple[str, ...]:

@@ -1,7 +1,8 @@
 """Inspect the content of a data file before it is used."""
 
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +12,19 @@ from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
 from pipeline.ingest.clock import FEWEST_SAMPLES, Clock, clock_notes, read_clock, unroll
-from pipeline.ingest.columns import Column, assign_columns, holds_counts
-from pipeline.ingest.formats.headings import conversion
-from pipeline.ingest.formats.recognise import FORM_TITLES, read_table
+from pipeline.ingest.columns import Column, assign_columns, holds_counts, refuse_unknown_unit
+from pipeline.ingest.formats.headings import conversion, parse_heading, plain_name
+from pipeline.ingest.formats.recognise import FORM_TITLES, choose_run, read_tables
 from pipeline.ingest.formats.table import FileTable, Variable
 from pipeline.ingest.unnamed import Roles, find_roles
 from pipeline.results import Kind
 from pipeline.words.numbers import by_note, count, first_few
 
+# Words in headings of signals that drive nothing.
+_NOT_INPUT = re.compile(
+    r"^v ?\d?$|^w$|vel|speed|omega|acc|geschw|temp|^y\d?$|^z\d?$|angle|theta|phi|pos|^x|^a ?\d?$|"
+    r"time|frame|index|count|enc|remark|comment|note|status"
+)
 NO_CLOCK = "no time column: state `sample_rate`"
 _MOST_COLUMNS = 16  # most columns listed in a sentence
 _COPIED = 0.999  # correlation above which a reference is the input itself
@@ -57,6 +63,7 @@ class Inspection:
     guessed : column numbers by role, if the file has no headings but its signals reveal the roles.
     doubts : reasons to check the guessed numbers.
     cut_short : whether the file seems to end in the middle of a recording.
+    run : which of the file's recordings this is; "" if it holds only one.
     """
 
     file: str
@@ -76,6 +83,12 @@ class Inspection:
     guessed: Mapping[str, int]
     doubts: tuple[str, ...]
     cut_short: bool
+    run: str = ""
+
+    @property
+    def title(self) -> str:
+        """The file's name, with the run if the file holds several."""
+        return f"{self.file} run {self.run}" if self.run else self.file
 
     @property
     def positions(self) -> dict[int, ColumnInspection]:
@@ -98,19 +111,39 @@ class Inspection:
         return {"state": "read", **shown, "advice": ""}
 
 
-def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspection:
+def inspect_file(
+    path: Path, *, columns: Mapping[str, str | int] = {}, run: str | int | None = None
+) -> Inspection:
     """Inspect one data file; anything that would stop a report is listed as a problem.
 
     Parameters
     ----------
     columns : columns by role, as stated; a column that the file lacks is ignored.
+    run : which of several recordings in the file.
 
     Raises
     ------
-    SubmissionError : the file is missing, of unknown format, or broken; the path is as given.
+    SubmissionError : the file is missing, of unknown format, or broken, or there is no such run;
+        the path is as given.
     """
+    return _inspect(choose_run(_tables(path), run), path, columns=columns)
+
+
+def inspect_runs(path: Path, *, columns: Mapping[str, str | int] = {}) -> list[Inspection]:
+    """Inspect each recording in a data file; otherwise as `inspect_file`."""
+    tables = _tables(path)
+    return [
+        replace(_inspect(table, path, columns=columns), run=table.run if len(tables) > 1 else "")
+        for table in tables
+    ]
+
+
+def _tables(path: Path) -> list[FileTable]:
     real = Path(path).resolve()  # a link on the command line is the user's own choice
-    table, _ = read_table(real.parent, real.name, shown=str(path))
+    return read_tables(real.parent, real.name, shown=str(path))[0]
+
+
+def _inspect(table: FileTable, path: Path, *, columns: Mapping[str, str | int]) -> Inspection:
     unusable = [table.cut_short] if table.cut_short else []
     problems = [*unusable]
     stated = {role: column for role, column in columns.items() if table.has(column)}
@@ -138,6 +171,19 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
         unusable.append(str(error).removeprefix(f"{table.source} "))
         further.append(unusable[-1])
     kind, frequency = _guess(table, assigned, clock, further)
+    for column in assigned.values() if kind != "bode" else ():
+        try:
+            refuse_unknown_unit(table, column)
+        except SubmissionError as error:
+            unusable.append(str(error).removeprefix(f"{table.source}: "))
+            problems.append(unusable[-1])
+    inputs = _possible_inputs(table, unused) if "input" not in assigned else []
+    if kind == "decay" and inputs:  # without the input, a step looks like a decay
+        kind = None
+        problems.append(
+            f"is {first_few(inputs, 4)} the input? Say so in columns = {{ input = … }}, or state "
+            'kind = "decay"'
+        )
     problems += table.notes
     needs = []
     if bare or (kind != "bode" and not any(role[0] == "x" for role in assigned)):
@@ -163,6 +209,18 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
         doubts=roles.doubts,
         cut_short=bool(table.cut_short),
     )
+
+
+def _possible_inputs(table: FileTable, unused: Sequence[str]) -> list[str]:
+    """Return the columns without a role that may be the input: they change and are no speeds."""
+    names = []
+    for name in unused:
+        heading, values = parse_heading(name), table.values[table.index(name)]
+        is_other = heading.unit is not None and conversion(heading.unit, "V") is None
+        is_speed = _NOT_INPUT.search(plain_name(name)) or re.fullmatch(r"\d+", name)
+        if np.ptp(values) > 0 and not is_speed and not (is_other and heading.unit not in ("%",)):
+            names.append(repr(name))
+    return names
 
 
 def _inspect_columns(
@@ -334,7 +392,7 @@ def format_inspections(inspections: Sequence[Inspection]) -> str:
             "" if number is None else f"{number:.4g}" for number in (one.duration, one.rate)
         )
         rows.append(
-            (one.file, one.format, str(one.samples), duration, rate, _describe_kind(one), roles)
+            (one.title, one.format, str(one.samples), duration, rate, _describe_kind(one), roles)
         )
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
@@ -342,7 +400,7 @@ def format_inspections(inspections: Sequence[Inspection]) -> str:
         for row in rows
     ]
     problems = by_note(
-        (one.file, said)
+        (one.title, said)
         for one in inspections
         for said in (*one.problems, *filter(None, [one.ranges]))
     )
@@ -356,7 +414,7 @@ def _describe_kind(inspection: Inspection) -> str:
 
 def format_inspection(inspection: Inspection) -> str:
     """Return the inspection as plain text."""
-    lines = [inspection.file, f"  format    {inspection.format}"]
+    lines = [inspection.title, f"  format    {inspection.format}"]
     if inspection.variables:
         read = [str(one) for one in inspection.variables if one.read]
         lines.append(f"  read      {first_few(read, _MOST_COLUMNS)}")

@@ -524,3 +524,18 @@ def test_a_truncated_export_is_a_problem_for_inspect_and_fill(tmp_path):
         assert done.exit_code == 1
         assert reason in done.stdout
     assert "a report cannot use these files as they are: data/cut.txt" in done.stderr
+
+
+def test_each_run_of_a_file_gets_an_experiment(tmp_path):
+    """A file with two runs gets two experiments, which read their own samples; again adds none."""
+    (tmp_path / "data").mkdir()
+    rows = "".join(f"{0.01 * i:.2f},{int(i > 20)},{i * i}\n" for i in range(60))
+    heading = "time [s],input [V],x1 [cm]\n"
+    (tmp_path / "data" / "a.csv").write_text(2 * (heading + rows + "\n"))
+    found = fill_submission(tmp_path)
+    assert [(one.state, one.experiment, one.run) for one in found] == [
+        ("new", "a-1", "1"), ("new", "a-2", "2"),
+    ]  # fmt: skip
+    records = read_data(load_submission(tmp_path)).records
+    assert [record.t.size for record in records] == [60, 60]
+    assert [one.state for one in fill_submission(tmp_path)] == ["there", "there"]

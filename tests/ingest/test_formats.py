@@ -11,7 +11,7 @@ import scipy.io
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.formats.recognise import parse_table, read_table
+from pipeline.ingest.formats.recognise import parse_table, parse_tables, read_table
 from pipeline.ingest.formats.table import FileTable
 
 N = 50
@@ -288,8 +288,16 @@ def test_a_possible_second_recording_gets_advice():
     assert "save('new.mat', 'log')" in notes["log"]
     with pytest.raises(SubmissionError, match=r"holds several matrices \(a \(.* × 2, float64\), b"):
         table(mat(a=np.column_stack([TIME, X1]), b=np.column_stack([TIME, U])))
-    with pytest.raises(SubmissionError, match=r"but log \(1 × 1, struct\); log: .*'-struct'"):
-        table(mat(log={"t": TIME, "x1": X1}))
+
+
+def test_the_fields_of_a_struct_are_columns():
+    """The vectors of a struct are its columns; several structs are several runs."""
+    got = table(mat(log={"t": TIME, "x1": X1}))
+    assert got.names == ("t", "x1")
+    assert_array_equal(got.values, [TIME, X1])
+    runs = parse_tables(mat(a={"t": TIME, "x1": X1}, b={"t": TIME, "x1": U}), source="f")
+    assert [one.run for one in runs] == ["a", "b"]
+    assert_array_equal(runs[1].values, [TIME, U])
 
 
 def test_a_matlab_table_is_refused_with_advice():

@@ -252,7 +252,7 @@ BAD_TDMS = {
     "lengths": (tdms([channel("t", TIME), channel("x1", X1[:30])]), r"differ in length: t \(40\)"),
     "two groups": (
         tdms([channel("t", TIME), channel("t", TIME, group="b")]),
-        r"several recordings, the groups 'b', 'run'; keep one",
+        r"several recordings \('b', 'run'\)",
     ),
     "two rates": (
         tdms([channel("u", U, wf_increment=0.1), channel("x1", X1, wf_increment=0.2)]),

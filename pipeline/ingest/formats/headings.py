@@ -76,6 +76,7 @@ _RUN = re.compile(
     re.IGNORECASE,
 )
 _BRACKETS = re.compile(r"\[([^\[\]]*)\]|\(([^()]*)\)")
+_NUMBER = re.compile(r"[-+]?[\d.]+[eE][-+]?\d+")
 _LABEL = re.compile(
     r"raw|filtered|measured|simulated|smoothed|left|right|top|bottom|abs|rel|relative|absolute|"
     r"output|input|ref|reference|motor|encoder|sensor|position|laser|.*[\s_#]?\d+",
@@ -192,7 +193,8 @@ def plain_name(text: str) -> str:
 
 def are_units(fields: Sequence[str]) -> bool:
     """Return whether the fields of a row below the names are their units."""
-    held = [field.strip(' "') for field in fields if field.strip(' "')]
+    held = [field.strip(' "') for field in fields if any(c.isalpha() or c in "%°" for c in field)]
+    held = [field for field in held if not _NUMBER.fullmatch(field)]
     known = [unit_symbol(field.strip("()[]")) is not None for field in held]
     bracketed = [field[0] in "([" and field[-1] in ")]" for field in held]
     return bool(held) and (all(bracketed) or 2 * sum(known) > len(held))

@@ -103,7 +103,7 @@ def choose_run(tables: Sequence[FileTable], run: str | int | None = None) -> Fil
 
     Raises
     ------
-    SubmissionError : there is no such run, or there are several and none is stated.
+    SubmissionError : the run does not exist, or there are several and none is stated.
     """
     if run is None and len(tables) == 1:
         return tables[0]

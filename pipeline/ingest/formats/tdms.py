@@ -1,4 +1,4 @@
-"""Read National Instruments' binary format (.tdms): find the group of channels with the recording.
+"""Read National Instruments' binary format (.tdms): each group of channels is a recording.
 
 npTDMS reads the file, and a hostile file could keep it busy for hours. So the work is estimated
 first, from the lead-ins of the segments: objects times segments, and bytes of metadata. Layout:
@@ -6,12 +6,11 @@ first, from the lead-ins of the segments: objects times segments, and bytes of m
 """
 
 import logging
-import re
 import struct
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from itertools import islice
 from typing import TYPE_CHECKING
@@ -20,7 +19,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
-from pipeline.ingest.formats.headings import join_unit
+from pipeline.ingest.formats.headings import is_time, join_unit
 from pipeline.ingest.formats.labview import even_times
 from pipeline.ingest.formats.table import (
     FileTable,
@@ -42,7 +41,6 @@ _MOST_VISITS = 2_000_000  # limit; npTDMS visits each object in each segment
 _MOST_VALUES, _MOST_CHUNKS = 5_000_000, 200_000
 _SETTING = 0.1  # share of the longest channel; shorter channels are settings, as in a .mat file
 _MOST_NAMED = 8
-_TIME = re.compile(r"\s*(elapsed[ _])?(t|times?|time[ _]?stamps?)\s*([\[(].*)?", re.IGNORECASE)
 
 
 def is_tdms(raw: bytes) -> bool:
@@ -51,48 +49,55 @@ def is_tdms(raw: bytes) -> bool:
 
 
 def read_tdms(raw: bytes, *, source: str) -> list[FileTable]:
-    """Read the channels of the only group that holds a recording.
+    """Read the channels of each group that holds a recording.
 
     Raises
     ------
-    SubmissionError : the file is broken or truncated, or holds no recording or several.
+    SubmissionError : the file is broken or truncated, or holds no recording.
     """
     _refuse_endless(raw, source=source)
     channels = _read_channels(raw, source=source)
-    group, read = _recording(channels, source=source)
-    longest = max(channel.samples for channel in read)
+    groups = _recordings(channels, source=source)
+    used = [channel for read in groups.values() for channel in read]
+    longest = max(channel.samples for channel in used)
     variables = tuple(
         Variable(
             name=f"{channel.group}/{channel.name}",
             size=(channel.samples, 1),
             kind=channel.kind,
-            read=channel in read,
+            read=channel in used,
             advice=_advice(channel, longest=longest),
         )
         for channel in channels
     )
+    notes = tuple(not_read([variable for variable in variables if not variable.read]))
+    return [
+        replace(_table(group, read, source=source), variables=variables, notes=notes)
+        for group, read in groups.items()
+    ]
+
+
+def _table(group: str, read: Sequence["_Channel"], *, source: str) -> FileTable:
+    """Return the channels of a group, with the time that they state."""
     names = [channel.heading for channel in read]
     columns = [channel.numbers for channel in read]
-    if not any(_TIME.fullmatch(channel.name) for channel in read):
+    if not any(is_time(channel.name) for channel in read):
         interval, start = _clock(read, source=source)
         if interval:
             names.insert(0, "time")
-            columns.insert(0, even_times(longest, start=start, interval=interval))
+            columns.insert(0, even_times(read[0].samples, start=start, interval=interval))
     names = checked_names(names, place=f"{source} group {group!r}")
     values = np.array(columns, dtype=np.float64)
     refuse_unusable(values, names=names, place=lambda row: f"{source} sample {row + 1}")
-    return [
-        FileTable(
-            source=source,
-            form="tdms",
-            names=tuple(names),
-            values=values,
-            whole=tuple(bool((column == np.round(column)).all()) for column in values),
-            lines=None,
-            notes=tuple(not_read([variable for variable in variables if not variable.read])),
-            variables=variables,
-        )
-    ]
+    return FileTable(
+        source=source,
+        form="tdms",
+        names=tuple(names),
+        values=values,
+        whole=tuple(bool((column == np.round(column)).all()) for column in values),
+        lines=None,
+        run=group,
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -249,29 +254,29 @@ class _Listener(logging.Handler):
 # --------------------------------------------------------------------- choice of the recording
 
 
-def _recording(channels: Sequence[_Channel], *, source: str) -> tuple[str, list[_Channel]]:
-    """Return the name and channels of the group that is the recording, without short channels.
+def _recordings(channels: Sequence[_Channel], *, source: str) -> dict[str, list[_Channel]]:
+    """Return the channels of each group that is a recording, without short channels.
 
     A short channel holds settings.
 
     Raises
     ------
-    SubmissionError : there is no recording, there are several, or its channels differ in length.
+    SubmissionError : there is no recording, or the channels of a group differ in length.
     """
     signals = [one for one in channels if one.values is not None and one.samples > 1]
     if not signals:
         found = first_few([f"{one.group}/{one.name}" for one in channels], _MOST_NAMED)
         raise SubmissionError(f"{source}: holds no channel of numbers, but {found or 'nothing'}")
     longest = max(one.samples for one in signals)
-    signals = [one for one in signals if one.samples > _SETTING * longest]
-    groups = list(dict.fromkeys(one.group for one in signals))
-    if len(groups) > 1:
-        shown = first_few([repr(group) for group in groups], _MOST_NAMED)
-        raise SubmissionError(f"{source}: holds several recordings, the groups {shown}; keep one")
-    if any(one.samples < longest for one in signals):
-        sizes = first_few([f"{one.name} ({one.samples:,})" for one in signals], _MOST_NAMED)
-        raise SubmissionError(f"{source}: the channels differ in length: {sizes}")
-    return groups[0], signals
+    groups: dict[str, list[_Channel]] = {}
+    for one in signals:
+        if one.samples > _SETTING * longest:
+            groups.setdefault(one.group, []).append(one)
+    for read in groups.values():
+        if len({one.samples for one in read}) > 1:
+            sizes = first_few([f"{one.name} ({one.samples:,})" for one in read], _MOST_NAMED)
+            raise SubmissionError(f"{source}: the channels differ in length: {sizes}")
+    return groups
 
 
 def _advice(channel: _Channel, *, longest: int) -> str:

@@ -1,7 +1,6 @@
 """Read tables from text: CSV in any dialect, ECP exports, bench logs, exports of oscilloscopes.
 
-The first long block of lines that look alike is the table; the last line of text above it is its
-heading. Another heading with another block begins another run.
+The first long block of similar lines is the table; the last line of text above it has the headings. Another heading with another block begins another run.
 """
 
 import csv
@@ -21,7 +20,7 @@ from pipeline.ingest.formats.table import FileTable, checked_names, refuse_unusa
 from pipeline.words.numbers import first_few
 
 _FEW_LINES, _SNIFFED_LINES = 40, 400
-_LONG = 8  # rows that look alike and begin a table; a shorter table must be alone in its file
+_LONG = 8  # similar rows that begin a table; a shorter table must be alone in its file
 _WORST = 0.01  # largest share of rows that may be skipped
 _SPARSE = 0.1  # share of missing values from which a column is left out
 _MOST_NAMED = 4
@@ -137,7 +136,7 @@ class Layout:
         return methodcaller("split", self.delimiter)  # white space around a number does no harm
 
     def cell(self, field: str) -> float:
-        """Return the number in a field; NaN if the field is empty or says that it has none.
+        """Return the number in a field; NaN for an empty field.
 
         Raises
         ------
@@ -206,7 +205,7 @@ def _alike(a: str, b: str) -> bool:
 
 
 def _start(signatures: Sequence[str]) -> tuple[int, int]:
-    """Return (start, length) of the first long run of rows that look alike, or of the longest.
+    """Return (start, length) of the first long run of similar rows, or of the longest.
 
     A row that does not fit does not end a run, unless it may be a heading.
     """
@@ -294,7 +293,7 @@ class Block:
 def find_blocks(
     lines: Sequence[tuple[int, str]], layout: Layout, *, source: str, line: str = "line"
 ) -> Iterator[Block]:
-    """Yield the tables of a file: each begins with rows that look alike, below its heading."""
+    """Yield the tables of a file: each begins with similar rows, below its heading."""
     start, length = _start([_signature(layout, line) for _, line in lines[:_FEW_LINES]])
     if length < _LONG:
         start, _ = _start([_signature(layout, line) for _, line in lines[:_SNIFFED_LINES]])
@@ -550,7 +549,7 @@ def _cut_end(
 
 
 def find_names(block: Block, layout: Layout, *, width: int, ends: bool) -> list[str]:
-    """Return the headings from the lines above a table; numbers if there are none.
+    """Return the headings from the lines above a table; numbers without headings.
 
     `ends` says that a delimiter ends each row.
 

@@ -106,7 +106,7 @@ def _is_number(value: object) -> bool:
 
 
 def _text(value: object) -> str:
-    """Return the content of a cell as it would stand in a text file."""
+    """Return the content of a cell as a text file would show it."""
     if value is None:
         return ""
     if isinstance(value, bool):
@@ -122,7 +122,7 @@ def _text(value: object) -> str:
 
 
 def _read_sheet(name: str, lines: Sequence[tuple[int, str]], *, source: str) -> list[FileTable]:
-    """Return the tables of a sheet; a sheet without headings has none."""
+    """Return the tables of a sheet; no tables without headings."""
     layout = Layout("\x01", comma=False)
     where = f"{source} sheet {name!r}"
     tables = []

@@ -1,0 +1,97 @@
+"""Faults of a position sensor are repaired and reported, unless the submission forbids it."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from pipeline.ingest.read import read_data
+from pipeline.submission import load_submission
+
+N = 1200
+T = 0.005 * np.arange(N)
+U = np.where(T > 0.5, 1.0, 0.0)
+RNG = np.random.default_rng(3)
+X = 2 * U * (1 - np.exp(-2 * (T - 0.5)) * np.cos(20 * (T - 0.5))) + 0.002 * RNG.normal(size=N)
+COUNTS = np.round(1000 * X)
+SPIKES = np.arange(100, N, 190)
+
+
+def record(folder, x, *, unit="cm", more="", rate=1.0):
+    """Return the record of a step with these positions."""
+    lines = "".join(f"{t / rate:.6f},{u},{v:.6f}\n" for t, u, v in zip(T, U, x, strict=False))
+    if unit == "count":
+        lines = "".join(f"{t:.6f},{u},{v:.0f}\n" for t, u, v in zip(T, U, x, strict=True))
+    (folder / "a.csv").write_text("time [s],input [V],x1\n" + lines)
+    (folder / "submission.toml").write_text(
+        "version = 1\n[system]\ncarts = 1\ninput = { unit = 'V', sign = 1 }\n"
+        f"position = {{ unit = {unit!r} }}\n"
+        f"[[experiments]]\nid = 'a'\nkind = 'step'\nfile = 'a.csv'\n{more}\n"
+    )
+    (got,) = read_data(load_submission(folder)).records
+    return got
+
+
+def wrapped(period: float, offset: float, scale: float) -> np.ndarray:
+    """Return positions as a counter with this range shows them."""
+    return (scale * X + offset) % period
+
+
+OFF = "unwrap = false, spikes = false, jumps = false"
+WRAPS = {
+    "16 bits": (np.round(wrapped(65536, 64_000, 1000)), "count", 1000.0),
+    "12 bits": (np.round(wrapped(4096, 3_000, 500)), "count", 500.0),
+    "rad": (wrapped(2 * np.pi, 5.0, 1.0), "rad", 1.0),
+    "deg": (wrapped(360.0, 300.0, 60.0), "deg", 60.0),
+}
+
+
+@pytest.mark.parametrize(("x", "unit", "scale"), WRAPS.values(), ids=WRAPS.keys())
+def test_a_counter_that_wraps_is_unwrapped(x, unit, scale, tmp_path):
+    """Positions of a counter or an angle that wraps become continuous."""
+    got = record(tmp_path, x, unit=unit)
+    # Counts are rounded, and the file has six decimals.
+    assert_allclose(got.y[0] - got.y[0, 0], scale * (X - X[0]), atol=1.1)
+    assert any("unwrap = false" in note for note in got.notes)
+    kept = record(tmp_path, x, unit=unit, more=f"repair = {{ {OFF} }}")
+    assert_allclose(kept.y[0], x, atol=1e-6)
+
+
+@pytest.mark.parametrize("value", [357.0, -40.0, 0.0])
+def test_wrong_readings_are_left_out(value, tmp_path):
+    """Lone spikes, and dropouts to zero of a cart that rests elsewhere, are left out."""
+    x = X + 12.0
+    x[SPIKES] = value
+    got = record(tmp_path, x)
+    right = np.delete(np.arange(N), SPIKES)
+    assert_array_equal(got.t, T[right].round(6))
+    assert_allclose(got.y[0], x[right], atol=1e-6)
+    kept = record(tmp_path, x, more="repair = { spikes = false, jumps = false }")
+    assert kept.t.size == N
+
+
+def test_a_new_zero_is_taken_back(tmp_path):
+    """A position that is zeroed during the run continues where it was."""
+    x = X.copy()
+    x[700:] -= x[700]
+    got = record(tmp_path, x)
+    # The cart moves by the mean of the steps beside the jump, which the noise of 0.002 blurs.
+    assert_allclose(got.y[0], X, atol=0.02)
+    assert any("jumps = false" in note for note in got.notes)
+
+
+@pytest.mark.parametrize("n", [8, 20])
+def test_repeated_readings_are_used_once(n, tmp_path):
+    """A slow sensor in a fast log is read at its own rate, and is not stuck."""
+    x = X[np.arange(N) // n * n]
+    got = record(tmp_path, x)
+    assert_array_equal(got.t, T[::n].round(6))
+    assert_allclose(got.y[0], X[::n], atol=1e-6)
+    assert not any("stuck" in note for note in got.notes)
+
+
+@pytest.mark.parametrize("x", [X, X + 5.0, np.round(X, 1), np.round(X, 2), 0.01 * X])
+def test_an_honest_position_is_left_alone(x, tmp_path):
+    """Noise, a coarse encoder and a fast start are no reason for a repair."""
+    got = record(tmp_path, x)
+    assert got.t.size == N
+    assert_allclose(got.y[0], x, atol=1e-6)
