@@ -99,7 +99,7 @@ class Heading:
     name : the rest of the heading.
     unit : its symbol, such as "ms" for "milliseconds"; as written if it is not known; None if the
         heading states none.
-    run : number of the run; "" if there is none.
+    run : number of the run, or "".
     """
 
     name: str

@@ -84,7 +84,7 @@ def read_mat(raw: bytes, *, source: str) -> list[FileTable]:
 
 
 def _structures(variables: Sequence[MatVariable], *, source: str) -> list[FileTable]:
-    """Return the recordings that stand in structs; none if there are vectors beside them.
+    """Return the recordings in structs; none if vectors stand beside them.
 
     Simulink's "structure with time" has the fields `time` and `signals`, whose elements have
     `values` and perhaps a `label`. Other structs have a vector for each signal.
@@ -138,7 +138,7 @@ def _structure(name: str, fields: Mapping[str, MatVariable], *, source: str) -> 
 
 
 def _label(element: Mapping[str, MatVariable]) -> str:
-    """Return the label of a signal of Simulink; "" if it has none."""
+    """Return the label of a signal of Simulink, or ""."""
     text = element["label"].text.strip() if "label" in element else ""
     return text if text.isprintable() else ""
 

@@ -1,6 +1,7 @@
 """Read tables from text: CSV in any dialect, ECP exports, bench logs, exports of oscilloscopes.
 
-The first long block of similar lines is the table; the last line of text above it has the headings. Another heading with another block begins another run.
+The first long block of similar lines is the table. The last line of text above it has the headings.
+Another heading with another block begins another run.
 """
 
 import csv
