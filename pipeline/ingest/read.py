@@ -230,10 +230,12 @@ def _read_record(opened: _Opened, clock: Clock) -> Record:
     y = np.array(
         [table.values[c.index] * scale for c, scale in zip(positions, scales, strict=True)]
     )
+    drive = columns.get("input")
     given = {c.name: row for c, row in zip(positions, y, strict=True)}
     repaired, good, said = repair_positions(
         clock.t,
         given,
+        None if drive is None else table.values[drive.index],
         unit=opened.system.position.unit,
         scales={c.name: scale for c, scale in zip(positions, scales, strict=True)},
         wanted=experiment.repair.model_dump(),

@@ -49,21 +49,32 @@ class Repair:
 
 
 def repair_positions(
-    t: Array, y: Mapping[str, Array], *, unit: str, scales: Mapping[str, float], wanted: Mapping
+    t: Array,
+    y: Mapping[str, Array],
+    u: Array | None,
+    *,
+    unit: str,
+    scales: Mapping[str, float],
+    wanted: Mapping[str, bool],
 ) -> tuple[dict[str, Array], NDArray[np.bool_], list[str]]:
     """Return the positions by heading, which samples remain, and notes.
 
     Parameters
     ----------
     y : positions (n,) in `unit`, by heading.
+    u : the input (n,), in any unit.
     scales : position units per number in the file, by heading.
     wanted : for each key of a repair, whether it is made; True if it is missing.
     """
     done: dict[str, Array] = {}
     keep = np.ones(t.size, dtype=np.bool_)
     notes = []
+    moved = (
+        np.flatnonzero(np.abs(np.diff(u)) > 0.2 * np.ptp(u)) + 1 if u is not None else np.array([])
+    )
+    edges = np.concatenate([moved - 1, moved, moved + 1])
     for name, x in y.items():
-        for repair in _repairs(x, unit=unit, scale=scales[name], wanted=wanted):
+        for repair in _repairs(x, edges, unit=unit, scale=scales[name], wanted=wanted):
             x = repair.x
             keep &= repair.keep
             where = first_few([f"{t[i]:.4g} s" for i in repair.at], _MOST_NAMED)
@@ -75,7 +86,9 @@ def repair_positions(
     return done, keep, notes
 
 
-def _repairs(x: Array, *, unit: str, scale: float, wanted: Mapping) -> Iterator[Repair]:
+def _repairs(
+    x: Array, edges: Array, *, unit: str, scale: float, wanted: Mapping[str, bool]
+) -> Iterator[Repair]:
     every = np.ones(x.size, dtype=np.bool_)
     held = _held(x) if wanted.get("repeats", True) else None
     rows = np.flatnonzero(held) if held is not None else np.arange(x.size)
@@ -98,6 +111,8 @@ def _repairs(x: Array, *, unit: str, scale: float, wanted: Mapping) -> Iterator[
         rows, own = rows[~bad], own[~bad]
     if own.size > 4 * _SIDE and wanted.get("jumps", True):
         jumps = _jumps(own)
+        # A jump with the input is no new zero.
+        jumps = jumps[~np.isin(rows[jumps], edges)]
         if 0 < jumps.size <= 5:
             shift = np.zeros(own.size)
             for i in jumps:
