@@ -225,7 +225,8 @@ def _read_record(opened: _Opened, clock: Clock) -> Record:
         notes.append(f"columns not used: {', '.join([*opened.unused, *extra])}")
     if (time := columns.get("time")) is not None:
         notes += clock_notes(table, time, clock, sample_rate=experiment.sample_rate)
-    keep = _window(clock, experiment)
+    inside = np.zeros(clock.t.size, dtype=np.bool_)
+    inside[_window(clock, experiment)] = True
     scales = [_position_scale(opened, column) for column in positions]
     y = np.array(
         [table.values[c.index] * scale for c, scale in zip(positions, scales, strict=True)]
@@ -242,7 +243,7 @@ def _read_record(opened: _Opened, clock: Clock) -> Record:
     )
     notes += said
     y = np.array([repaired[c.name] for c in positions])
-    keep = np.flatnonzero(good)[np.isin(np.flatnonzero(good), np.arange(clock.t.size)[keep])]
+    keep = np.flatnonzero(good & inside)
     resolution = [
         scale if holds_counts(table, c) else encoder_step(row)
         for c, row, scale in zip(positions, y, scales, strict=True)

@@ -69,12 +69,8 @@ def repair_positions(
     done: dict[str, Array] = {}
     keep = np.ones(t.size, dtype=np.bool_)
     notes = []
-    moved = (
-        np.flatnonzero(np.abs(np.diff(u)) > 0.2 * np.ptp(u)) + 1 if u is not None else np.array([])
-    )
-    edges = np.concatenate([moved - 1, moved, moved + 1])
     for name, x in y.items():
-        for repair in _repairs(x, edges, unit=unit, scale=scales[name], wanted=wanted):
+        for repair in _repairs(x, u, unit=unit, scale=scales[name], wanted=wanted):
             x = repair.x
             keep &= repair.keep
             where = first_few([f"{t[i]:.4g} s" for i in repair.at], _MOST_NAMED)
@@ -87,12 +83,12 @@ def repair_positions(
 
 
 def _repairs(
-    x: Array, edges: Array, *, unit: str, scale: float, wanted: Mapping[str, bool]
+    x: Array, u: Array | None, *, unit: str, scale: float, wanted: Mapping[str, bool]
 ) -> Iterator[Repair]:
     every = np.ones(x.size, dtype=np.bool_)
     held = _held(x) if wanted.get("repeats", True) else None
     rows = np.flatnonzero(held) if held is not None else np.arange(x.size)
-    own = x[rows]
+    own = x if held is None else x[rows]
     if own.size > 4 * _SIDE and wanted.get("unwrap", True):
         jumps, period = _wraps(own, unit=unit, scale=scale)
         if period:
@@ -111,8 +107,9 @@ def _repairs(
         rows, own = rows[~bad], own[~bad]
     if own.size > 4 * _SIDE and wanted.get("jumps", True):
         jumps = _jumps(own)
-        # A jump with the input is no new zero.
-        jumps = jumps[~np.isin(rows[jumps], edges)]
+        if jumps.size and u is not None:  # a jump with the input is no new zero
+            moved = np.flatnonzero(np.abs(np.diff(u)) > 0.2 * np.ptp(u)) + 1
+            jumps = jumps[~np.isin(rows[jumps], [moved - 1, moved, moved + 1])]
         if 0 < jumps.size <= 5:
             shift = np.zeros(own.size)
             for i in jumps:
@@ -140,19 +137,28 @@ def _jumps(x: Array, *, spare: int = 0) -> NDArray[np.intp]:
     `spare` is how many of the steps on each side may be jumps, too.
     """
     moves = np.abs(np.diff(x))
+    most = float(moves.max())
+    # To save time, the median is only found if most moves are small.
+    if 2 * np.count_nonzero(_STEPS * moves >= most) > moves.size:
+        return np.array([], dtype=np.intp)
+    least = max(_LEAST * float(np.ptp(x)), _STEPS * float(np.median(moves)))
+    rows = np.flatnonzero(moves > least)
+    if not rows.size:
+        return rows
+    beside = rows[:, None] + np.arange(_SIDE)
+    padded = np.full(moves.size + 2 * _SIDE, -1.0)
+    padded[_SIDE:-_SIDE] = moves
+    before, after = (
+        np.sort(padded[beside + shift], axis=1)[:, -1 - spare] for shift in (0, _SIDE + 1)
+    )
+    is_far = (moves[rows] > _FARTHER * np.maximum(before, after)) & (np.minimum(before, after) >= 0)
+    far = dict(zip(rows[is_far].tolist(), after[is_far].tolist(), strict=True))
+    if not far:
+        return np.array([], dtype=np.intp)
     step = encoder_step(x)
-    least = max(_LEAST * float(np.ptp(x)), _STEPS * max(float(np.median(moves)), step))
-    after_hold = {last for _, last in stuck_spans(x)}
-    found = []
-    for i in np.flatnonzero(moves > least):
-        sides = moves[max(i - _SIDE, 0) : i], moves[i + 1 : i + 1 + _SIDE]
-        if not all(side.size > spare for side in sides):
-            continue
-        before, after = (float(np.sort(side)[: side.size - spare][-1]) for side in sides)
-        # Behind a stuck encoder, the reading jumps back to a cart that moves.
-        stuck = i in after_hold and after > 2 * step
-        if moves[i] > _FARTHER * max(before, after) and not stuck:
-            found.append(i + 1)
+    # Behind a stuck encoder, the reading jumps back to a cart that moves.
+    back = {last for _, last in stuck_spans(x) if far.get(last, 0.0) > 2 * step}
+    found = [i + 1 for i in far if moves[i] > _STEPS * step and i not in back]
     return np.array(found, dtype=np.intp)
 
 
@@ -160,6 +166,8 @@ def _wraps(x: Array, *, unit: str, scale: float) -> tuple[NDArray[np.intp], floa
     """Return the samples at which a counter or an angle wraps, and its range; 0 if it does not."""
     moves, span = np.abs(np.diff(x)), float(np.ptp(x))
     jumps = np.flatnonzero(moves > 0.5 * span) + 1
+    if not jumps.size:
+        return jumps, 0.0
     rest = float(np.delete(moves, jumps - 1).max(initial=0.0))
     periods = [factor * 2.0**bits for bits in _BITS for factor in {1.0, scale}]
     angles = {"rad": 2 * np.pi, "deg": 360.0, "rev": 1.0}
@@ -167,7 +175,7 @@ def _wraps(x: Array, *, unit: str, scale: float) -> tuple[NDArray[np.intp], floa
     for period in periods:
         # The cart moves while the counter wraps, as far as in other samples.
         fits = np.abs(moves[jumps - 1] - period) <= 1.5 * rest + 2 * encoder_step(x)
-        if jumps.size and fits.all() and rest < 0.2 * period and span <= 1.001 * period:
+        if fits.all() and rest < 0.2 * period and span <= 1.001 * period:
             return jumps, period
     return jumps, 0.0
 
@@ -189,18 +197,18 @@ def _held(x: Array) -> NDArray[np.bool_] | None:
     if starts.size < _FEWEST_CHANGES:
         return None
     lengths = np.diff(starts)
+    if lengths.sum() < 2 * lengths.size:  # less than half of them are 3
+        return None
     n = float(np.median(lengths))
     if n < 3:
         return None
     times = np.maximum(np.round(lengths / n), 1)
     single = times == 1
-    # A slow cart, too, changes an encoder's count every few samples, but by one step.
-    changes = np.abs(np.diff(x)[starts - 1])
-    step = encoder_step(x)
     regular = np.abs(lengths - times * n) <= 1 + 0.05 * lengths
-    if regular.mean() < 0.95 or single.mean() < 0.6 or np.median(changes) < 1.5 * step:
+    if regular.mean() < 0.95 or single.mean() < 0.6 or np.mean(lengths[single] == n) < 0.5:
         return None
-    if np.mean(lengths[single] == n) < 0.5:
+    # A slow cart, too, changes an encoder's count every few samples, but by one step.
+    if np.median(np.abs(np.diff(x)[starts - 1])) < 1.5 * encoder_step(x):
         return None
     keep = np.zeros(x.size, dtype=np.bool_)
     keep[np.arange(starts[0], -1, -round(n))] = True

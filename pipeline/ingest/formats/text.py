@@ -22,6 +22,7 @@ from pipeline.words.numbers import first_few
 
 _FEW_LINES, _SNIFFED_LINES = 40, 400
 _LONG = 8  # similar rows that begin a table; a shorter table must be alone in its file
+_BEST = 1.5 * _LONG  # score of a layout in which every field is a plain number
 _WORST = 0.01  # largest share of rows that may be skipped
 _SPARSE = 0.1  # share of missing values from which a column is left out
 _MOST_NAMED = 4
@@ -55,7 +56,11 @@ def read_text(raw: bytes, *, source: str) -> list[FileTable]:
         names the line.
     """
     text = decode(raw, source=source).replace("\r\n", "\n").replace("\r", "\n")
-    if (opening := _OPENING.search(text)) and (lines := _in_brackets(text, opening, source)):
+    if (
+        "[" in text
+        and (opening := _OPENING.search(text))
+        and (lines := _in_brackets(text, opening, source))
+    ):
         head, rows, cut, notes = lines
         layout = Layout(None, comma=False)
         block = Block(head=head, rows=rows, source=source)
@@ -158,7 +163,7 @@ class Layout:
 
 def _time_of_day(field: str) -> float | None:
     """Return the seconds of a time of day, from midnight or, with a date, from 1900."""
-    if not (match := _TIME_OF_DAY.fullmatch(field.strip(" \"'"))):
+    if ":" not in field or not (match := _TIME_OF_DAY.fullmatch(field.strip(" \"'"))):
         return None
     date, hour, minute, second, half = match.groups()
     if second is None and (half is None or half == "Z"):
@@ -195,7 +200,10 @@ def _signature(layout: Layout, line: str) -> str:
     """Return a letter for each field of a line: n number, - empty, x text; "" for a comment."""
     if line.lstrip().startswith(("#", "%")):
         return ""
-    values = [_value(layout, field) for field in layout.split(line)]
+    try:
+        values: list[float | None] = list(map(float, layout.fast(line)))
+    except ValueError:
+        values = [_value(layout, field) for field in layout.split(line)]
     return "".join("x" if v is None else "-" if v != v else "n" for v in values)
 
 
@@ -205,7 +213,22 @@ def _alike(a: str, b: str) -> bool:
     return same and all(p == q or "-" in (p, q) for p, q in zip(a, b, strict=True))
 
 
-def _start(signatures: Sequence[str]) -> tuple[int, int]:
+class _Signatures:
+    """The signatures of lines, found only as far as they are asked for."""
+
+    def __init__(self, layout: Layout, lines: Sequence[str]) -> None:
+        self._layout, self._lines, self._found = layout, lines, list[str]()
+
+    def __len__(self) -> int:
+        return len(self._lines)
+
+    def __getitem__(self, i: int) -> str:
+        while len(self._found) <= i:
+            self._found.append(_signature(self._layout, self._lines[len(self._found)]))
+        return self._found[i]
+
+
+def _start(signatures: Sequence[str] | _Signatures) -> tuple[int, int]:
     """Return (start, length) of the first long run of similar rows, or of the longest.
 
     A row that does not fit does not end a run, unless it may be a heading.
@@ -243,17 +266,20 @@ def _sniff(sample: Sequence[str], *, least: int = 1) -> Layout | None:
             continue
         for comma in (False, True) if delimiter != "," or quoted else (False,):
             layout = Layout(delimiter, comma, quoted=quoted and delimiter is not None)
-            signatures = [_signature(layout, line) for line in sample]
+            signatures = _Signatures(layout, sample)
             start, length = _start(signatures)
-            rows = sample[start : start + min(length, _LONG)]
+            found = [signatures[i] for i in range(start, start + length)]
+            rows = sample[start : start + length]
             plain = sum(_is_plain(field, comma) for row in rows for field in layout.split(row))
-            share = plain / max(sum(map(len, signatures[start : start + min(length, _LONG)])), 1)
+            share = plain / max(sum(map(len, found)), 1)
             # A single column counts only if nothing else fits.
-            wide = 1.0 if length and len(signatures[start]) > 1 else 0.3
-            numbers = sum(s.count("n") / len(s) for s in signatures[start : start + length])
+            wide = 1.0 if length and len(found[0]) > 1 else 0.3
+            numbers = sum(s.count("n") / len(s) for s in found)
             score = wide * numbers * (0.5 + share)
             if length >= least and score > 1.001 * most:
                 best, most = layout, score
+            if most >= _BEST:
+                return best
     return best
 
 
@@ -295,9 +321,10 @@ def find_blocks(
     lines: Sequence[tuple[int, str]], layout: Layout, *, source: str, line: str = "line"
 ) -> Iterator[Block]:
     """Yield the tables of a file: each begins with similar rows, below its heading."""
-    start, length = _start([_signature(layout, line) for _, line in lines[:_FEW_LINES]])
+    sample = [line for _, line in lines[:_SNIFFED_LINES]]
+    start, length = _start(_Signatures(layout, sample[:_FEW_LINES]))
     if length < _LONG:
-        start, _ = _start([_signature(layout, line) for _, line in lines[:_SNIFFED_LINES]])
+        start, _ = _start(_Signatures(layout, sample))
     head, rows = lines[:start], lines[start:]
     width = len(layout.split(rows[0][1]))
     values = _numbers([row for _, row in rows], layout, width)
