@@ -15,7 +15,9 @@ OTHER_DWELL = 0.1  # relative; a dwell this far from its stated frequency is ano
 LEAST_SHARE = 0.2
 # Share of the free carts' swing. A cart that is held firmly moves less.
 _HELD_FIRMLY = 0.05
-_LONGEST = 20.0  # metres; no bench has a longer track, and no record of counts has decimals
+_LONGEST = 3.0  # metres; no bench has a longer track
+_LONGEST_SLOW = 20.0  # metres; the limit if nothing moves faster than a person runs
+_SLOW = 10.0  # metres per second
 _LONGEST_WHOLE = 0.5  # metres; the limit if all readings are whole numbers, as counts are
 _ECP_STEP = 2.27e-5  # metres per count of the encoders of an ECP 210
 _LARGEST = 100.0  # volts; no amplifier at a bench gives as much
@@ -83,7 +85,9 @@ def find_other_scales(records: Sequence[Record], *, bench: Bench) -> list[Record
     unit, metres = bench.units.position, conversion(bench.units.position, "m")
     travel, run = _reached((r, float(np.ptp(r.y, axis=1).max())) for r in records)
     whole = all(np.array_equal(record.y, np.round(record.y)) for record in records)
-    if metres and travel > (limit := (_LONGEST_WHOLE if whole else _LONGEST) / metres):
+    fastest = max(np.abs(np.diff(r.y) / np.diff(r.t)).max(initial=0.0) for r in records)
+    longest = _LONGEST_SLOW if metres and fastest * metres < _SLOW else _LONGEST
+    if metres and travel > (limit := (_LONGEST_WHOLE if whole else longest) / metres):
         why = say("position_scale_whole" if whole else "position_scale_long")
         details = {"reach": f"{travel:.4g}", "unit": unit, "quoted": repr(unit), "why": why}
         found.append(

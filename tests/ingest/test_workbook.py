@@ -3,6 +3,7 @@
 import datetime as dt
 import re
 import tracemalloc
+import zipfile
 from collections.abc import Callable
 from io import BytesIO
 
@@ -37,6 +38,15 @@ def sheet(fill: Callable[..., object]) -> bytes:
     book = openpyxl.Workbook()
     fill(book.active)
     return saved(book)
+
+
+def document() -> bytes:
+    """Return an Office document that is no workbook."""
+    stream = BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        archive.writestr("[Content_Types].xml", "<Types/>")
+        archive.writestr("word/document.xml", "<document/>")
+    return stream.getvalue()
 
 
 def plain(ws) -> None:
@@ -123,6 +133,8 @@ def test_unread_rows_and_columns_are_reported():
     assert got.names == ("time [s]", "input [V]", "x1 [cm]")
     assert got.notes == ("not read: text in row 60",)
     assert got.place(0) == "row 8"
+    (said,) = table(sheet(typed)).notes
+    assert said == "the comma in '0,00' is taken as a decimal mark"
 
 
 def test_every_sheet_with_headings_is_a_run():
@@ -165,6 +177,21 @@ def test_dates_and_times_of_day_become_seconds():
     assert_array_equal(table(sheet(times)).values[0], 43_200 + TIME)
 
 
+def test_percent_is_read_and_reported():
+    """A cell with 50 % is read as 0.5, and a note says so."""
+
+    def fill(ws) -> None:
+        plain(ws)
+        for row in range(2, N + 2):
+            ws.cell(row, 2).number_format = "0.0%"
+
+    got = table(sheet(fill))
+    assert_array_equal(got.values[1], U)
+    assert got.notes == (
+        "column B is shown in percent, but its stored value is used: 0.5 for 50 %",
+    )
+
+
 @pytest.mark.parametrize(
     "code",
     ["General", "0.000", '0.0" s"', "[Red]0.0", r"0.0\ \d", "#,##0.00 [$€-407]", "0.00E+00", "@"],
@@ -187,7 +214,11 @@ BAD = {
     "nan": (changed(C7="nan"), r"row 7: 'x1' is not a finite number"),
     "fault": (changed(C7="#DIV/0!"), r"row 7: 'x1' is not a number: '#DIV/0!'"),
     "truth": (changed(C7=True), r"row 7: 'x1' is not a number: 'TRUE'"),
-    "formula": (changed(C7="=A2+1"), r"row 7: 'x1' is empty"),
+    "formula": (changed(C7="=A2+1"), r"row 7: a formula without its value: open"),
+    "formulas": (
+        changed(**{f"C{i}": "=A2" for i in range(2, N + 2)}),
+        r"row 2: a formula without its value",
+    ),
     "date": (
         changed(C7=dt.datetime.fromisoformat("2026-05-01")),
         r"row 7: 'x1' is not a number: '2026-05-01",
@@ -274,6 +305,7 @@ BOMBS = {
         )}),
         REFUSED,
     ),
+    "not a workbook": (document(), r"not an Excel workbook"),
     "bits": (package(b"\xff\xfe\0\0"), REFUSED),
 }  # fmt: skip
 

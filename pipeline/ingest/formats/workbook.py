@@ -3,9 +3,11 @@
 import datetime as dt
 import re
 import zipfile
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from io import BytesIO
+from typing import Any
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.formats.table import FileTable
@@ -18,6 +20,8 @@ _MOST_PARTS = 1_000
 _SETTING = 0.1  # share of the longest; shorter columns and tables are settings
 _MOST_NAMED = 8
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(e[-+]?\d+)?", re.IGNORECASE)
+_FORMULA = re.compile(rb"<(?:\w+:)?f[ >]")
+_FIRST_ROWS = 40  # rows that show how the numbers of a column are formatted
 _BOUND = 2**14  # columns of a sheet
 
 
@@ -34,12 +38,13 @@ def read_workbook(raw: bytes, *, source: str) -> list[FileTable]:
     SubmissionError : the file is broken or has no headings, or too many cells are not numbers; the
         message names the row.
     """
-    _check_archive(raw, source=source)
+    has_formulas = _check_archive(raw, source=source)
     tables, sheets = [], []
-    for name, rows in _sheets(raw, source=source):
+    for name, rows, notes in _sheets(raw, source=source, has_formulas=has_formulas):
         sheets.append(name)
-        if lines := _lines(rows):
-            tables += _read_sheet(name, lines, source=source)
+        if lines := _lines(rows, notes, where=f"{source} sheet {name!r}"):
+            found = _read_sheet(name, lines, source=source)
+            tables += [replace(one, notes=(*one.notes, *notes)) for one in found]
     if not tables:
         names = first_few([repr(name) for name in sheets], _MOST_NAMED) or "none"
         raise SubmissionError(
@@ -50,30 +55,71 @@ def read_workbook(raw: bytes, *, source: str) -> list[FileTable]:
     return [table for table in tables if table.values.shape[1] > _SETTING * longest]
 
 
-def _check_archive(raw: bytes, *, source: str) -> None:
-    """Refuse an archive that is broken, locked, or larger than any recording when unpacked."""
+def _check_archive(raw: bytes, *, source: str) -> bool:
+    """Return whether a workbook has formulas.
+
+    Raises
+    ------
+    SubmissionError : the archive is broken, locked, no workbook, or larger than any recording.
+    """
+    broken = SubmissionError(
+        f"{source}: the workbook is broken, cut short or larger than a recording; save it again"
+    )
     try:
         with zipfile.ZipFile(BytesIO(raw)) as archive:
             parts = archive.infolist()
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
-        parts = []
-    if any(part.flag_bits & 1 for part in parts):
-        raise SubmissionError(f"{source}: the workbook is locked by a password; save it without")
-    if not parts or len(parts) > _MOST_PARTS or sum(p.file_size for p in parts) > _MOST_BYTES:
-        raise SubmissionError(
-            f"{source}: the workbook is broken, cut short or larger than a recording; save it again"
-        )
+            if any(part.flag_bits & 1 for part in parts):
+                raise SubmissionError(
+                    f"{source}: the workbook is locked by a password; save it without"
+                )
+            if len(parts) > _MOST_PARTS or sum(p.file_size for p in parts) > _MOST_BYTES:
+                raise broken
+            if parts and not any(part.filename.startswith("xl/") for part in parts):
+                raise SubmissionError(f"{source}: an Office document, but not an Excel workbook")
+            sheets = [p for p in parts if p.filename.startswith("xl/worksheets/")]
+            return any(_FORMULA.search(archive.read(sheet)) for sheet in sheets)
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError, zlib.error):
+        raise broken from None
 
 
-def _sheets(raw: bytes, *, source: str) -> Iterator[tuple[str, list[tuple[object, ...]]]]:
-    """Yield the name and the rows of each sheet."""
+def _sheets(
+    raw: bytes, *, source: str, has_formulas: bool
+) -> Iterator[tuple[str, list[tuple[object, ...]], list[str]]]:
+    """Yield the name, the rows and notes of each sheet."""
     import openpyxl
 
+    def load(*, data_only: bool) -> Any:
+        return openpyxl.load_workbook(BytesIO(raw), read_only=True, data_only=data_only)
+
     try:
-        book = openpyxl.load_workbook(BytesIO(raw), read_only=True, data_only=True)
+        book = load(data_only=True)
         for sheet in book.worksheets:
             sheet.reset_dimensions()  # the stated size need not be true
-            yield sheet.title, list(sheet.iter_rows(values_only=True))
+            rows = list(sheet.iter_rows(values_only=True))
+            if has_formulas:
+                other = load(data_only=False)[sheet.title]
+                other.reset_dimensions()
+                for i, row in enumerate(other.iter_rows(values_only=True)):
+                    if any(isinstance(value, str) and value[:1] == "=" for value in row):
+                        pairs = zip(rows[i], row, strict=True)
+                        rows[i] = tuple(
+                            _Formula(b) if a is None and b is not None else a for a, b in pairs
+                        )
+            percent = {
+                cell.column_letter
+                for row in sheet.iter_rows(max_row=_FIRST_ROWS)
+                for cell in row
+                if cell.value is not None and str(cell.number_format).endswith("%")
+            }
+            yield (
+                sheet.title,
+                rows,
+                [
+                    f"column {letter} is shown in percent, but its stored value is used: "
+                    "0.5 for 50 %"
+                    for letter in sorted(percent)
+                ],
+            )
     except SubmissionError:
         raise
     except Exception:  # openpyxl raises many kinds of errors
@@ -82,8 +128,21 @@ def _sheets(raw: bytes, *, source: str) -> Iterator[tuple[str, list[tuple[object
         ) from None
 
 
-def _lines(rows: Sequence[tuple[object, ...]]) -> list[tuple[int, str]]:
-    """Return the rows of a sheet as lines, without empty rows and columns of a few cells."""
+class _Formula(str):
+    """A formula without the value that a spreadsheet program computes for it."""
+
+    __slots__ = ()
+
+
+def _lines(
+    rows: Sequence[tuple[object, ...]], notes: list[str], *, where: str
+) -> list[tuple[int, str]]:
+    """Return the rows of a sheet as lines, without empty rows and columns of a few cells.
+
+    Raises
+    ------
+    SubmissionError : a column of numbers has a formula without a value.
+    """
     counts: dict[int, int] = {}
     for row in rows:
         for i, value in enumerate(row[:_BOUND]):
@@ -93,13 +152,28 @@ def _lines(rows: Sequence[tuple[object, ...]]) -> list[tuple[int, str]]:
     used = [i for i, count in sorted(counts.items()) if count > _SETTING * most]
     lines = []
     for number, row in enumerate(rows, start=1):
-        fields = [_text(row[i]) if i < len(row) else "" for i in used]
+        cells = [row[i] if i < len(row) else None for i in used]
+        if any(isinstance(cell, _Formula) for cell in cells):
+            raise SubmissionError(
+                f"{where} row {number}: a formula without its value: open the workbook in Excel "
+                "or LibreOffice, and save it"
+            )
+        fields = [_text(cell) for cell in cells]
         if any(fields):
             lines.append((number, "\x01".join(fields)))
+    commas = (cell for row in rows for cell in row if isinstance(cell, str) and _is_comma(cell))
+    if (example := next(commas, None)) is not None:
+        notes.append(f"the comma in {example.strip()!r} is taken as a decimal mark")
     return lines
 
 
+def _is_comma(text: str) -> bool:
+    return _DECIMAL_COMMA.fullmatch(text.strip()) is not None
+
+
 def _is_number(value: object) -> bool:
+    if isinstance(value, _Formula):
+        return True
     if isinstance(value, str):
         return value.strip()[:1] in tuple("0123456789+-.,")
     return not isinstance(value, bool)
@@ -117,7 +191,7 @@ def _text(value: object) -> str:
         return value.isoformat(" ") if isinstance(value, dt.datetime) else value.isoformat()
     if isinstance(value, str):
         text = " ".join(value.split())
-        return text.replace(",", ".") if _DECIMAL_COMMA.fullmatch(text) else text
+        return text.replace(",", ".") if _is_comma(text) else text
     return repr(value)
 
 
