@@ -85,8 +85,8 @@ def find_other_scales(records: Sequence[Record], *, bench: Bench) -> list[Record
     unit, metres = bench.units.position, conversion(bench.units.position, "m")
     travel, run = _reached((r, float(np.ptp(r.y, axis=1).max())) for r in records)
     whole = all(np.array_equal(record.y, np.round(record.y)) for record in records)
-    fastest = max(np.abs(np.diff(r.y) / np.diff(r.t)).max(initial=0.0) for r in records)
-    longest = _LONGEST_SLOW if metres and fastest * metres < _SLOW else _LONGEST
+    speeds = [np.abs(np.diff(r.y) / np.diff(r.t)).max(initial=0.0) for r in records]
+    longest = _LONGEST_SLOW if max(speeds, default=0.0) * (metres or 0.0) < _SLOW else _LONGEST
     if metres and travel > (limit := (_LONGEST_WHOLE if whole else longest) / metres):
         why = say("position_scale_whole" if whole else "position_scale_long")
         details = {"reach": f"{travel:.4g}", "unit": unit, "quoted": repr(unit), "why": why}

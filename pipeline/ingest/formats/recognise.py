@@ -103,7 +103,7 @@ def choose_run(tables: Sequence[FileTable], run: str | int | None = None) -> Fil
 
     Raises
     ------
-    SubmissionError : the run does not exist, or there are several and none is stated.
+    SubmissionError : the run is missing, or the file has several and none is stated.
     """
     if run is None and len(tables) == 1:
         return tables[0]
@@ -118,7 +118,7 @@ def choose_run(tables: Sequence[FileTable], run: str | int | None = None) -> Fil
         return tables[labels.index(str(run))]
     if isinstance(run, int) and 1 <= run <= len(tables):
         return tables[run - 1]
-    raise SubmissionError(f"{source}: there is no run {run!r}; it has {shown or 'only one'}")
+    raise SubmissionError(f"{source}: run {run!r} is missing; it has {shown or 'only one'}")
 
 
 class _TooLong(BaseException):
