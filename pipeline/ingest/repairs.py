@@ -89,7 +89,9 @@ def _repairs(
     held = _held(x) if wanted.get("repeats", True) else None
     rows = np.flatnonzero(held) if held is not None else np.arange(x.size)
     own = x if held is None else x[rows]
-    if own.size > 4 * _SIDE and wanted.get("unwrap", True):
+    # To save time, a position whose moves are mostly alike is not looked at further.
+    may_jump = own.size > 4 * _SIDE and not _is_even(own)
+    if may_jump and wanted.get("unwrap", True):
         jumps, period = _wraps(own, unit=unit, scale=scale)
         if period:
             own = np.unwrap(own, period=period)
@@ -98,14 +100,14 @@ def _repairs(
                 key="unwrap", x=_spread(x, rows, own), keep=every, at=rows[jumps], message=message
             )
             x = _spread(x, rows, own)
-    if own.size > 4 * _SIDE and wanted.get("spikes", True) and (bad := _wrong(own)).any():
+    if may_jump and wanted.get("spikes", True) and (bad := _wrong(own)).any():
         n = int(bad.sum())
         keep = every.copy()
         keep[rows[bad]] = False
         message = f"{n} samples cannot be right (spikes or dropouts) and were left out"
         yield Repair(key="spikes", x=x, keep=keep, at=rows[bad], message=message)
         rows, own = rows[~bad], own[~bad]
-    if own.size > 4 * _SIDE and wanted.get("jumps", True):
+    if may_jump and wanted.get("jumps", True):
         jumps = _jumps(own)
         if jumps.size and u is not None:  # a jump with the input is no new zero
             moved = np.flatnonzero(np.abs(np.diff(u)) > 0.2 * np.ptp(u)) + 1
@@ -126,6 +128,14 @@ def _repairs(
         yield Repair(key="repeats", x=x, keep=held, at=rows[:1], message=message)
 
 
+def _is_even(x: Array) -> bool:
+    """Return whether no step is far above the median, or above half of the range."""
+    moves = np.abs(np.diff(x))
+    most = float(moves.max())
+    few = 2 * np.count_nonzero(_STEPS * moves >= most) > moves.size
+    return bool(few and most <= 0.5 * np.ptp(x))
+
+
 def _spread(x: Array, rows: NDArray[np.intp], own: Array) -> Array:
     """Return all samples, given those of some rows; the others repeat the one before."""
     return own[np.maximum(np.searchsorted(rows, np.arange(x.size), side="right") - 1, 0)]
@@ -137,10 +147,6 @@ def _jumps(x: Array, *, spare: int = 0) -> NDArray[np.intp]:
     `spare` is how many of the steps on each side may be jumps, too.
     """
     moves = np.abs(np.diff(x))
-    most = float(moves.max())
-    # To save time, the median is only found if most moves are small.
-    if 2 * np.count_nonzero(_STEPS * moves >= most) > moves.size:
-        return np.array([], dtype=np.intp)
     least = max(_LEAST * float(np.ptp(x)), _STEPS * float(np.median(moves)))
     rows = np.flatnonzero(moves > least)
     if not rows.size:
