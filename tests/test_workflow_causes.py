@@ -198,7 +198,7 @@ _ALL = "decay,step,sine,sweep,control"
     ],
 )
 def test_a_column_of_noise_is_the_first_cause(tmp_path, n, cart, where, noise):
-    """If one column holds only noise, the summary first asks to mend its recordings."""
+    """If one column holds only noise, the first step is to repair its recordings."""
     write_submission(tmp_path, bench_of(_TWO if n == 2 else _THREE), seed=3, compact=True)
     rng = np.random.default_rng(5)
     for path in (p for one in where.split(",") for p in (tmp_path / "data").glob(f"{one}*.csv")):
