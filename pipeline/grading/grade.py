@@ -103,6 +103,13 @@ class Grade(GradeTable):
         str,
         Field(description="why the submission could not be graded, one line per reason, or empty"),
     ] = ""
+    unsettled: Annotated[
+        bool,
+        Field(
+            description="whether a limit, a crash or this computer ended the grading; the next run "
+            "grades the submission again"
+        ),
+    ] = False
     criteria: tuple[Criterion, ...] = ()
     flags: tuple[Flag, ...] = ()
     notes: tuple[str, ...] = ()
@@ -142,6 +149,7 @@ class Grade(GradeTable):
         out_of: float,
         authors: tuple[str, ...],
         days_late: float,
+        unsettled: bool = False,
     ) -> "Grade":
         """Return the grade of a submission that could not be graded."""
         return cls(
@@ -152,7 +160,13 @@ class Grade(GradeTable):
             out_of=out_of,
             days_late=days_late,
             reason=reason,
+            unsettled=unsettled,
         )
+
+    @property
+    def awaits_grading(self) -> bool:
+        """Whether the next run grades the submission again and nobody gave points by hand."""
+        return self.unsettled and not (self.overrides or self.adjustments)
 
     def with_flags(self, *flags: Flag) -> "Grade":
         """Return the grade with further flags; all flags are sorted in the order of `Code`."""

@@ -12,6 +12,12 @@ def on_one_line(reason: str) -> str:
     return "; ".join(line.rstrip(".") for line in reason.split("\n"))
 
 
+def waiting_text(grade: Grade) -> str:
+    """Return why a submission is not graded yet, and that the next run grades it again."""
+    then = WORDS.text("unsettled_then")
+    return f"Could not be graded yet: {on_one_line(grade.reason)}. {then}"
+
+
 def points_text(points: float) -> str:
     """Return points with at most two decimals, without trailing zeros."""
     return f"{points:.2f}".rstrip("0").rstrip(".")

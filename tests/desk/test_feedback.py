@@ -15,7 +15,7 @@ from pipeline.grading.gradings import Batch
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.resources import RUBRICS
 from tests.helpers.desks import Answer, Visitor, a_submission, through_proxy, write_users
-from tests.helpers.grades import two_cart_rubric, write_class
+from tests.helpers.grades import failed_grade, make_outcome, two_cart_rubric, write_class
 from tests.helpers.hostile import SECRET
 
 pytestmark = pytest.mark.usefixtures("all_work_here")
@@ -354,3 +354,22 @@ def test_students_who_must_find_the_numbers_see_none(tmp_path, by_class):
         assert student.get(HERE + "whole").status == 403
         assert "19.6" in ta.get(ROOM + "team?of=team-04").text
         assert ask(student, why="please").status == 303
+
+
+def test_a_student_reads_that_a_stopped_submission_is_not_graded_yet(tmp_path):
+    """If a limit ended the grading, the student sees no points and no lost criteria."""
+    write_class(tmp_path / "grades")
+    a_submission(tmp_path / "five")
+    stopped = failed_grade("team-04", "stopped after 120 s").model_copy(update={"unsettled": True})
+    outcome = make_outcome(stopped, key="stopped", authors=("s4",), settled=False)
+    with RequestBook(tmp_path / "grades", assignment="lab") as book:
+        book.put(outcome)
+        others = (entry.key for entry in book.entries() if entry.submission != "team-04")
+        book.finish(Batch(keys=(*others, "stopped"), shared={}), rubric=two_cart_rubric())
+    with DeskServer(users=write_users(tmp_path, USERS)) as server:
+        port = urlsplit(server.url).port or 0
+        through_proxy(port, "prof").post(ROOM + "release", do="release")
+        page = through_proxy(port, "s4").get(HERE)
+    assert "Not graded yet" in page.text
+    assert "nothing is wrong with the submission" in page.text
+    assert not re.search(r"0 of \d|Where points were lost", page.text)

@@ -19,7 +19,7 @@ from pipeline.grading.judge.costs import find_remarks
 from pipeline.grading.publish.anonymous import anonymise
 from pipeline.grading.publish.feedback import TONES, feedback_page, sentence
 from pipeline.grading.rubric import Criterion as Asked
-from pipeline.grading.words import WORDS, person_lines, points_text
+from pipeline.grading.words import WORDS, person_lines, points_text, waiting_text
 from pipeline.report.document import paragraph
 from pipeline.report.render.html import render_blocks
 from pipeline.words.numbers import NOTHING
@@ -104,6 +104,8 @@ def _show_page(
     grade = _hide_others(found, own)
     hidden = hides_values(ask.user, found.rubric)
     criteria = _describe_criteria(found, grade, refused=refused or {}, hidden=hidden)
+    if grade.awaits_grading:
+        criteria = []
     return ask.page(
         "feedback",
         status=status,
@@ -112,6 +114,7 @@ def _show_page(
         found=found,
         grade=grade,
         points=points_text,
+        waits=waiting_text(grade) if grade.awaits_grading else "",
         lost=[one for one in criteria if one["lost"]],
         kept=[one for one in criteria if not one["lost"] and one["id"] not in grade.open],
         waiting=[one for one in criteria if not one["lost"] and one["id"] in grade.open],

@@ -34,6 +34,8 @@ from pipeline.resources import TEMPLATES
 Progress = Callable[[int, int, str], None]
 Executor = Callable[[Sequence[Task], Setup], Iterator[Grading]]
 
+_AUTHORS_LIMIT = 60.0  # s to read the authors of a submission whose grading was stopped
+
 
 def silent(done: int, total: int, what: str) -> None:
     """Report no progress."""
@@ -169,16 +171,23 @@ class Grader:
         """
         too_large = f"needed more than {self._setup.memory_limit / 1e9:g} GB of memory"
         try:
-            plain = self._process.do(asdict(task), limit=self._setup.time_limit, stop=stop)
+            plain = self._process.do(
+                ("grade", asdict(task)), limit=self._setup.time_limit, stop=stop
+            )
         except Ended as end:
             if end.how == "start":
                 last = end.stderr_end.strip().splitlines() or ["they gave no reason"]
                 raise ConfigError(f"the grading processes do not start: {last[-1]}") from None
             reasons = {"memory": too_large, "crash": f"the grader crashed ({end.status})"}
-            return self._failed(task, reasons.get(end.how, str(end)), detail=end.stderr_end)
+            return self._failed(
+                task,
+                reasons.get(end.how, str(end)),
+                authors=() if end.how == "stopped" else self._authors(task, stop),
+                detail=end.stderr_end,
+            )
         except Failed as error:
             self.close()  # after a failure, a new process is safer
-            return self._failed(task, str(error))
+            return self._failed(task, str(error), authors=self._authors(task, stop))
         outcome = read_grading(plain)
         if not outcome.settled:
             self.close()
@@ -189,6 +198,14 @@ class Grader:
     def close(self) -> None:
         """End the process; the next task starts a new one."""
         self._process.close()
+
+    def _authors(self, task: Task, stop: threading.Event | None) -> Sequence[str]:
+        """Return the authors of a submission whose grading was stopped; () if it hides them."""
+        try:
+            plain = self._process.do(("authors", asdict(task)), limit=_AUTHORS_LIMIT, stop=stop)
+        except Failed:
+            return ()
+        return tuple(plain)
 
     def _failed(
         self, task: Task, reason: str, *, authors: Sequence[str] = (), detail: str = ""

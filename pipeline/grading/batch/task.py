@@ -73,7 +73,14 @@ def failed(
     lines = (" ".join(line.split()) for line in reason.split("\n"))
     reason = "".join(c if c.isprintable() or c == "\n" else "�" for c in "\n".join(lines))
     people = tuple(authors)
-    grade = Grade.failed(task.id, reason, out_of=out_of, authors=people, days_late=task.days_late)
+    grade = Grade.failed(
+        task.id,
+        reason,
+        out_of=out_of,
+        authors=people,
+        days_late=task.days_late,
+        unsettled=not settled,
+    )
     return Grading(
         submission=task.id,
         authors=people,

@@ -2,8 +2,9 @@
 
 import re
 import tempfile
+import tomllib
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -91,6 +92,22 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
     return replace(outcome, is_disk_full=no_room, original=original)
 
 
+def read_authors(task: Task, *, scratch: Path) -> tuple[str, ...]:
+    """Open one submission and return the author ids that it names, without grading it.
+
+    Raises
+    ------
+    PipelineError, OSError : as for `open_submission`.
+    """
+    with tempfile.TemporaryDirectory(
+        dir=scratch, prefix="open-", ignore_cleanup_errors=True
+    ) as folder:
+        sources = [Path(source) for source in task.sources]
+        opened = open_submission(sources, Path(folder) / task.id, digest=task.digest)
+        _repair(opened, task, _handed_in(opened))
+        return named_authors(opened)
+
+
 def _handed_in(folder: Path) -> str:
     """Return the text of `submission.toml`; "" if it is too long or not text."""
     try:
@@ -112,7 +129,7 @@ def _repair(folder: Path, task: Task, text: str) -> Repair | None:
 def named_authors(folder: Path) -> tuple[str, ...]:
     """Return the author ids in `submission.toml`, even if the file has mistakes.
 
-    The file is read line by line, not as TOML.
+    A file that is not valid TOML is read line by line.
 
     Raises
     ------
@@ -120,13 +137,23 @@ def named_authors(folder: Path) -> tuple[str, ...]:
     """
     with (folder / NAME).open(encoding="utf-8-sig", errors="replace") as file:
         text = file.read(MAX_TOML_BYTES)
-    found, table = [], ""
+    try:
+        authors = tomllib.loads(text).get("authors")
+    except (tomllib.TOMLDecodeError, RecursionError):
+        found = _ids_by_line(text)
+    else:
+        people = authors if isinstance(authors, list) else []
+        found = (str(one["id"]) for one in people if isinstance(one, dict) and "id" in one)
+    return tuple(dict.fromkeys(id_.strip() for id_ in found if id_.strip()))
+
+
+def _ids_by_line(text: str) -> Iterator[str]:
+    table = ""
     for line in text.splitlines():
         if heading := _TABLE.match(line):
             table = heading[1]
         elif table == "authors" and (id_ := _ID.match(line)):
-            found.append(id_[1].strip())
-    return tuple(dict.fromkeys(found))
+            yield id_[1]
 
 
 def _figures(
@@ -158,17 +185,23 @@ def _traceback() -> str:
 
 def _prepare(
     rubric: str, scratch: str, *, figures: bool
-) -> Callable[[dict[str, Any], object], dict[str, Any]]:
-    """Return a function that grades submissions by a rubric, which is given as JSON."""
+) -> Callable[[tuple[str, dict[str, Any]], object], dict[str, Any] | Sequence[str]]:
+    """Return a function that grades submissions, or only reads their authors.
+
+    Parameters
+    ----------
+    rubric : the rubric as JSON.
+    """
     asked = Rubric.model_validate_json(rubric)
 
-    def grade(task: dict[str, Any], _: object) -> dict[str, Any]:
-        whole = Task(**{**task, "sources": tuple(task["sources"])})
-        return plain_grading(
-            grade_task(whole, rubric=asked, scratch=Path(scratch), figures=figures)
-        )
+    def do(wanted: tuple[str, dict[str, Any]], _: object) -> dict[str, Any] | Sequence[str]:
+        what, plain = wanted
+        task = Task(**{**plain, "sources": tuple(plain["sources"])})
+        if what == "authors":
+            return read_authors(task, scratch=Path(scratch))
+        return plain_grading(grade_task(task, rubric=asked, scratch=Path(scratch), figures=figures))
 
-    return grade
+    return do
 
 
 if __name__ == "__main__":

@@ -56,6 +56,7 @@ class Line(GradeTable):
     days_late: float = 0.0
     deducted: float = 0.0
     reason: str = ""
+    unsettled: bool = False
     criteria: tuple[Judged, ...] = ()
     flags: tuple[Flagged, ...] = ()
     springs: tuple[str, ...] = ()

@@ -258,7 +258,9 @@ def _row(line: Line) -> list[Cell | str | Spans]:
         points_text(line.points),
         f"{math.floor(share)}",  # rounded down, so that only full points give 100
         f"{line.days_late:.3g}" if line.days_late else "0",
-        cell("not graded", "bad") if failed else ", ".join(line.codes),
+        cell("not graded yet" if line.unsettled else "not graded", "bad")
+        if failed
+        else ", ".join(line.codes),
         _hand_text(line),
     ]
 

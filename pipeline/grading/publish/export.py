@@ -27,7 +27,7 @@ from pipeline.grading.publish.platforms import FORMS, WORKSHEET
 from pipeline.grading.publish.roster import POINTS_POSSIBLE, Roster
 from pipeline.grading.publish.students import Remark, Student, students_of
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.words import on_one_line, person_lines, points_text
+from pipeline.grading.words import on_one_line, person_lines, points_text, waiting_text
 from pipeline.output import csv_text, named_folder, own_folder, write_file
 from pipeline.words.numbers import first_few
 from pipeline.words.text import with_symbols
@@ -203,6 +203,8 @@ def _comment_lines(grade: Grade, *, by_hand: Collection[str]) -> list[str]:
 
     The deduction for lateness and the changes of the total come last.
     """
+    if grade.awaits_grading:
+        return [waiting_text(grade)]
     if grade.status == "failed" and not grade.criteria:
         return [f"Could not be graded: {on_one_line(grade.reason)}", *person_lines(grade)]
     lost = [

@@ -87,8 +87,9 @@ def _summary(grade: Grade) -> list[Block]:
     points = f"{points_text(grade.points)} of {points_text(grade.out_of)}"
     by_hand = Tile(spans("Set by hand"), spans(counted_criteria(len(overrides))))
     if grade.status == "failed":
-        tile = Tile(spans("Points"), spans(points), tone="" if overrides else "bad")
-        key = "failed_by_hand" if overrides else "failed"
+        key = "failed_by_hand" if overrides else "unsettled" if grade.unsettled else "failed"
+        shown = WORDS.text("unsettled_points") if grade.awaits_grading else points
+        tile = Tile(spans("Points"), spans(shown), tone="bad" if key == "failed" else "")
         then = WORDS.text(f"{key}_then")
         first, *others = map(sentence, grade.reason.split("\n"))
         blocks: list[Block] = [paragraph(WORDS.spans(key, why=f"{first} {then}"))]

@@ -105,8 +105,10 @@ def students_of(
     students = [one_of(several) for several in found.values()]
     remarks = [Remark(text=s.undecided, left_out=True) for s in students if s.undecided]
     strangers = [s for s in students if not (s.id or s.name or s.number)]
-    if nobodys := [s for s in strangers if not s.by_hand]:
+    if nobodys := [s for s in strangers if not (s.by_hand or s.grade.unsettled)]:
         remarks.append(not_exported("it names no author", nobodys))
+    if unread := [s for s in strangers if s.grade.awaits_grading]:
+        remarks.append(not_exported("its authors could not be read yet", unread))
     if by_hand := [s.grade.submission for s in strangers if s.by_hand]:
         folders = f"so exported under the name of its folder: {', '.join(by_hand)}"
         remarks.append(Remark(text=f"it names no author, {folders}"))

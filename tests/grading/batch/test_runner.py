@@ -15,12 +15,13 @@ import pytest
 
 from pipeline.grading.batch.runner import Grader, grade_batch, run_here
 from pipeline.grading.batch.task import Setup, Task
-from pipeline.grading.batch.worker import grade_task
+from pipeline.grading.batch.worker import grade_task, named_authors, read_authors
 from pipeline.grading.grade import grade_text, read_grade
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.grading.publish import feedback_figures
 from pipeline.grading.publish.outputs import write_outputs
+from pipeline.grading.publish.students import students_of
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.processes import LineProcess
 from pipeline.simulated.submission import Students, write_submission
@@ -50,7 +51,9 @@ def school(tmp_path_factory):
     return folder
 
 
-def run(paths, out, *, jobs=1, time_limit=PATIENCE, execute=None, progress=lambda *_: None):
+def run(
+    paths, out, *, jobs=1, time_limit=PATIENCE, execute=None, progress=lambda *_: None, finish=False
+):
     """Grade into a new gradebook; return the batch, and each submission's outcome and grade."""
     scratch = out / "scratch"
     scratch.mkdir(parents=True, exist_ok=True)
@@ -62,6 +65,8 @@ def run(paths, out, *, jobs=1, time_limit=PATIENCE, execute=None, progress=lambd
             execute=execute or run_here(jobs=jobs),
             progress=progress,
         )
+        if finish:
+            book.finish(batch, rubric=RUBRIC)
         rows = {}
         for outcome in filter(None, (book.known(key, figures=False) for key in batch.keys)):
             flag, grade = batch.shared.get(outcome.submission), read_grade(outcome.grade)
@@ -217,8 +222,54 @@ def test_a_hang_is_stopped_and_tried_again(school, tmp_path):
     """A submission that takes too long gets a row that says so; a run with more time grades it."""
     _, hung = run([school / "team-0"], tmp_path, time_limit=0.01)
     assert hung["team-0"][0].reason == "stopped after 0.01 s"
+    assert hung["team-0"][0].authors == ("s0",)
+    grade = read_grade(hung["team-0"][0].grade)
+    assert (grade.authors, grade.unsettled) == (("s0",), True)
     _, graded = run([school / "team-0"], tmp_path, execute=in_this_process)
     assert graded["team-0"][0].status == "graded"
+
+
+def test_the_files_of_a_stopped_submission_name_its_authors(school, tmp_path):
+    """If a submission is stopped, its authors are in every table, and no mark is shown.
+
+    Its feedback blames the submission for nothing.
+    """
+    run([school / "team-0"], tmp_path, time_limit=0.01, finish=True)
+    with Gradebook(tmp_path) as book:
+        write_outputs(book, tmp_path)
+        entries = list(book.entries())
+    remarks = [remark.text for remark in students_of(entries, platform="canvas")[1]]
+    assert remarks == ["could not be graded, left blank: team-0"]
+    assert '"team-0","s0","failed",' in (tmp_path / "grades.csv").read_text(encoding="utf-8")
+    assert "not graded yet" in (tmp_path / "class.html").read_text(encoding="utf-8")
+    page = (tmp_path / "feedback" / "team-0" / "feedback.html").read_text(encoding="utf-8")
+    assert "could not be graded yet" in page
+    assert "nothing is wrong with the submission" in page
+    assert "hand it in again" not in page
+    assert f"0 of {RUBRIC.out_of:g}" not in page
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '[[authors]]\nid = "s1"\n[[authors]]\nname = "B"\nid = "s2"\n',
+        'authors = [{id = "s1"}, {name = "B", id = "s2"}]\n',
+        '[[authors]]\nid = "s1"\n[[authors]]\nid = “s2”\nversion = [',
+    ],
+)
+def test_authors_are_read_however_they_are_written(text, tmp_path):
+    """Authors are found in tables, in a list, and in a file that is not valid TOML."""
+    (tmp_path / "team").mkdir()
+    (tmp_path / "team" / "submission.toml").write_text(text, encoding="utf-8")
+    task = Task(id="team", key="k", sources=(str(tmp_path / "team"),))
+    assert read_authors(task, scratch=tmp_path) == ("s1", "s2")
+
+
+@pytest.mark.parametrize("text", ["authors = 3", "authors = [1, {id = ''}]", "a = " + "[" * 5000])
+def test_strange_authors_are_no_authors(text, tmp_path):
+    """If `authors` is no list of tables with ids, nobody is named and nothing fails."""
+    (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
+    assert named_authors(tmp_path) == ()
 
 
 def killed_within(rng, book, command):

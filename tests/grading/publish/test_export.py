@@ -138,6 +138,14 @@ def test_a_submission_without_authors_is_named_in_a_message(tmp_path):
     assert remarks[0] == "it names no author, so not exported: team-8"
 
 
+def test_a_submission_whose_authors_are_not_read_yet_is_not_said_to_name_none(tmp_path):
+    """If the grading ended before the authors were read, the message says that."""
+    lost = failed_grade("team-8", "the cluster could not grade it")
+    lost = make_outcome(lost.model_copy(update={"unsettled": True}), settled=False)
+    _, remarks = write(tmp_path, FULL, lost, platform="canvas")
+    assert remarks[0] == "its authors could not be read yet, so not exported: team-8"
+
+
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 def test_a_number_of_another_platform_is_ignored(tmp_path, platform):
     """A student's number on another platform is ignored, since here it may be somebody else's."""

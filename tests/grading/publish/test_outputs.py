@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from pipeline.errors import ConfigError
 from pipeline.grading.batch.grade_class import Options, grade_class
 from pipeline.grading.csv_table import read_table
-from pipeline.grading.grade import CODES, Criterion, Flag
+from pipeline.grading.grade import CODES, Adjustment, Criterion, Flag
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import Line
 from pipeline.grading.gradebook.override import HandPoints, read_points, with_overrides
@@ -325,6 +325,21 @@ def test_feedback_says_why_a_submission_was_not_graded():
     html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
     assert "No submission.toml in it." in html
     assert "Fix it and hand it in again" in html
+
+
+def test_a_stopped_submission_shows_no_mark_on_any_platform():
+    """If a limit ended the grading, no text shows a mark, unless points were given by hand."""
+    stopped = failed_grade("team-1", "stopped after 120 s").model_copy(update={"unsettled": True})
+    html = feedback_page(stopped, rubric=RUBRIC, figures=(), name="team-1")
+    assert "could not be graded yet" in html
+    assert "0 of 20" not in html
+    said = json.loads(results_text(stopped, rubric=RUBRIC))["output"]
+    assert said.startswith("Could not be graded yet: stopped after 120 s. As far as we know")
+    by_hand = stopped.model_copy(
+        update={"points": 5.0, "adjustments": (Adjustment(points=5.0, why="read by eye"),)}
+    )
+    html = feedback_page(by_hand, rubric=RUBRIC, figures=(), name="team-1")
+    assert "5 of 20" in html
 
 
 def test_feedback_lists_every_mistake_of_a_broken_submission(tmp_path):
