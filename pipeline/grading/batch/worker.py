@@ -139,11 +139,11 @@ def named_authors(folder: Path) -> tuple[str, ...]:
         text = file.read(MAX_TOML_BYTES)
     try:
         authors = tomllib.loads(text).get("authors")
-    except (tomllib.TOMLDecodeError, RecursionError):
-        found = _ids_by_line(text)
-    else:
         people = authors if isinstance(authors, list) else []
-        found = (str(one["id"]) for one in people if isinstance(one, dict) and "id" in one)
+        ids = [one.get("id") for one in people if isinstance(one, dict)]
+        found = [str(id_) for id_ in ids if isinstance(id_, str | int)]
+    except (ValueError, RecursionError):  # ValueError also for an integer of over 4,300 digits
+        found = _ids_by_line(text)
     return tuple(dict.fromkeys(id_.strip() for id_ in found if id_.strip()))
 
 

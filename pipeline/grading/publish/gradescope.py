@@ -14,7 +14,7 @@ from pipeline.grading.grade import CODES, Code, Criterion, Grade
 from pipeline.grading.judge.costs import find_remarks
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.flag import student_message
-from pipeline.grading.words import WORDS, person_lines, points_text, waiting_text
+from pipeline.grading.words import WORDS, person_lines, points_text
 from pipeline.words.text import with_symbols
 
 # Flags whose text has no computed numbers.
@@ -63,8 +63,7 @@ def _grade_lines(grade: Grade, *, by_hand: bool, hidden: bool) -> list[str]:
     """
     how = " automatically, so points were given by hand" if by_hand else ""
     failed = grade.status == "failed"
-    why = f"Could not be graded{how}: {grade.reason}"
-    lines = [waiting_text(grade) if grade.awaits_grading else why] if failed else []
+    lines = [f"Could not be graded{how}: {grade.reason}"] if failed else []
     if hidden:
         lines += [] if failed else [WORDS.text("gradescope_hidden")]
     lines += flag_messages(grade, codes=_WITHOUT_NUMBERS if hidden else CODES)

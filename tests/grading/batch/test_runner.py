@@ -265,7 +265,15 @@ def test_authors_are_read_however_they_are_written(text, tmp_path):
     assert read_authors(task, scratch=tmp_path) == ("s1", "s2")
 
 
-@pytest.mark.parametrize("text", ["authors = 3", "authors = [1, {id = ''}]", "a = " + "[" * 5000])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "authors = 3",
+        "authors = [1, {id = ''}, {id = []}]",
+        "a = " + "[" * 5000,
+        "a = 1" + "0" * 5000,
+    ],
+)
 def test_strange_authors_are_no_authors(text, tmp_path):
     """If `authors` is no list of tables with ids, nobody is named and nothing fails."""
     (tmp_path / "submission.toml").write_text(text, encoding="utf-8")

@@ -570,3 +570,13 @@ def test_no_comment_names_the_other_team(tmp_path, platform):
     said = [text for text in texts if "step-1 is also in another submission" in text]
     assert said
     assert not any("b-team" in text for text in texts)
+
+
+def test_a_comment_says_that_a_stopped_submission_is_graded_again(tmp_path):
+    """If a limit ended the grading, the comment on the platform says what the staff will do."""
+    stopped = failed_grade("team-8", "stopped after 120 s")
+    changes = {"unsettled": True, "authors": ("s8",)}
+    stopped = make_outcome(stopped.model_copy(update=changes), settled=False)
+    rows, _ = write(tmp_path, FULL, stopped, platform="moodle")
+    said = str(rows)
+    assert "Could not be graded yet: stopped after 120 s. As far as we know" in said
