@@ -124,7 +124,7 @@ def test_an_unreadable_file_affects_only_its_run(tmp_path):
     (folder / "data" / "decay-1a.csv").unlink()
     step = folder / "data" / "step-1.csv"
     lines = step.read_text(encoding="utf-8").splitlines()
-    step.write_text("\n".join([*lines[:40], "0.3,x,0.1", *lines[40:]]), encoding="utf-8")
+    step.write_text("\n".join([*lines[:40], *20 * ["0.3,x,0.1"], *lines[40:]]), encoding="utf-8")
     done = cartlab_here("report", folder, "--no-pdf", "--json")
     found = json.loads(done.stdout)
 
@@ -211,7 +211,8 @@ def test_inspect_shows_the_files_beside_a_broken_one(tmp_path):
     If no file can be read, the status is 2.
     """
     broken = tmp_path / "broken.csv"
-    broken.write_text("time,x1\n0,oops\n1,2\n", encoding="utf-8")
+    rows = [f"{i},{i}" if i % 15 else f"{i},oops" for i in range(1, 40)]
+    broken.write_text("\n".join(["time,x1", *rows]), encoding="utf-8")
     alone = cartlab_here("inspect", tmp_path)
     shutil.copyfile(EXAMPLES / "two-cart" / "data" / "sine-01.csv", tmp_path / "sound.csv")
 
@@ -220,4 +221,4 @@ def test_inspect_shows_the_files_beside_a_broken_one(tmp_path):
     assert (alone.returncode, alone.stdout) == (2, "")
     assert done.returncode == 1
     assert "sound.csv" in done.stdout
-    assert "broken.csv line 2" in done.stderr
+    assert "broken.csv line 16" in done.stderr
