@@ -89,7 +89,6 @@ def _repairs(
     held = _held(x) if wanted.get("repeats", True) else None
     rows = np.flatnonzero(held) if held is not None else np.arange(x.size)
     own = x if held is None else x[rows]
-    # To save time, a position whose moves are mostly alike is not looked at further.
     may_jump = own.size > 4 * _SIDE and not _is_even(own)
     if may_jump and wanted.get("unwrap", True):
         jumps, period = _wraps(own, unit=unit, scale=scale)

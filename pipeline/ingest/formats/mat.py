@@ -84,7 +84,7 @@ def read_mat(raw: bytes, *, source: str) -> list[FileTable]:
 
 
 def _structures(variables: Sequence[MatVariable], *, source: str) -> list[FileTable]:
-    """Return the recordings in structs; none if vectors stand beside them.
+    """Return the recordings in structs, or nothing if the file also has vectors.
 
     Simulink's "structure with time" has the fields `time` and `signals`, whose elements have
     `values` and perhaps a `label`. Other structs have a vector for each signal.

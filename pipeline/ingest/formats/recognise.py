@@ -103,7 +103,7 @@ def choose_run(tables: Sequence[FileTable], run: str | int | None = None) -> Fil
 
     Raises
     ------
-    SubmissionError : the run is missing, or the file has several and none is stated.
+    SubmissionError : the run is missing, or the file has several runs and the choice is open.
     """
     if run is None and len(tables) == 1:
         return tables[0]
