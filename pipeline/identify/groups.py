@@ -1,6 +1,7 @@
 """Find groups of recordings that want different carts, for example after masses were changed."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -162,9 +163,9 @@ def _fits(
 def _follows(record: Record, fit: ChainFit) -> bool:
     """Return whether a recording follows a fit within the noise and the errors of the fit."""
     chain = fit.chain
-    springs = tuple(bool(k) for k in chain.k)
-    zero = tuple(name for name, value in _physical(fit).items() if not value > 0)
-    P = Parametrisation(bench=Bench(springs=springs), zero=zero)
+    every = Parametrisation(bench=Bench(springs=tuple(bool(k) for k in chain.k)))
+    sizes = zip(every.names, every.physical(chain), strict=True)
+    P = replace(every, zero=tuple(name for name, size in sizes if not size > 0))
     try:
         attempt = look([open_window(record)], P, P.pack(chain))
     except DataError:  # nothing moves
