@@ -30,7 +30,7 @@ from pipeline.submission import (
     System,
     load_submission,
 )
-from pipeline.submission.models import Unread
+from pipeline.submission.models import Repair, Unread
 from pipeline.workflow import analyse
 
 RUN = Experiment(
@@ -44,6 +44,8 @@ RUN = Experiment(
     input=InputOverride(sign=-1, per_count=0.5),
     columns={"time": "Time", "x1": 3},
     sample_rate=500.0,
+    run="run 2",
+    repair=Repair(unwrap=False, jumps=False, spikes=False, repeats=False),
     hold="band_limited",
     controlled_cart=1,
     controller=PidController(type="pid", kp=0.05, ki=0.1, kd=0.2, scale=0.01, cart=2),
