@@ -49,6 +49,10 @@ _ONE_POSITION = (
 _NO_ROLE = re.compile(r"|sample|samples|index|n|no|nr|i|row|#")
 _IN_UNITS = ("csv", "workbook", "lvm", "tdms")  # formats whose values are in the submission's units
 _COUNTED = re.compile(r"\benc|counts?\b|commanded pos", re.IGNORECASE)
+# Names of a time that are its unit, too.
+_NAMED_UNITS = {
+    "millis": "ms", "micros": "us", "milliseconds": "ms", "microseconds": "us",
+}  # fmt: skip
 _OF_POSITIONS = ("length", "angle")
 _OF_INPUTS = ("voltage", "current", "force", "torque")
 
@@ -177,11 +181,6 @@ def _column(table: FileTable, index: int, role: str) -> Column:
     if unit is None and role == "time":  # "millis" is a name and a unit
         unit = _NAMED_UNITS.get(plain_name(table.names[index]))
     return Column(role=role, index=index, name=table.names[index], unit=unit)
-
-
-_NAMED_UNITS = {
-    "millis": "ms", "micros": "us", "milliseconds": "ms", "microseconds": "us",
-}  # fmt: skip
 
 
 def _role(

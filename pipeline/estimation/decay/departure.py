@@ -28,7 +28,7 @@ UNKNOWNS = 6  # of an exponential decay with a drift
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Departure:
-    """What an exponential leaves of a decay, relative to the noise.
+    """The residual of an exponential fit to a decay, relative to the noise.
 
     Attributes
     ----------

@@ -111,30 +111,25 @@ def in_scale(
     wrong, clock = off_scale(analysis), clock_units(analysis)
     if not wrong and clock == 1.0:
         return references, chain
-    factor = per_count if wrong == {"position_scale"} else None if wrong else 1.0
+    length = 1.0 if not wrong else per_count if wrong == {"position_scale"} else None
 
     def scaled(table: Mapping[str, Reference]) -> dict[str, Reference]:
-        kept = {n: r for n, r in table.items() if factor or not read_name(n).is_gain}
-        return {
-            n: r.times(factor or 1.0)
-            if read_name(n).is_gain
-            else r.times(clock)
-            if read_name(n).is_frequency
-            else r
-            for n, r in kept.items()
+        factors = {
+            name: length
+            if read_name(name).is_gain
+            else clock
+            if read_name(name).is_frequency
+            else 1.0
+            for name in table
         }
+        return {name: table[name].times(factor) for name, factor in factors.items() if factor}
 
-    return (
-        References(initial=scaled(references.initial), final=scaled(references.final)),
-        replace(
-            chain,
-            m=chain.m / (factor * clock**2),
-            c=chain.c / (factor * clock),
-            k=chain.k / factor,
-        )
-        if chain and factor
-        else None,
-    )
+    if chain and length:
+        m, c, k = chain.m / (length * clock**2), chain.c / (length * clock), chain.k / length
+        chain = replace(chain, m=m, c=c, k=k)
+    else:
+        chain = None
+    return References(initial=scaled(references.initial), final=scaled(references.final)), chain
 
 
 def recompute(analysis: Analysis) -> References:
