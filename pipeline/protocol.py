@@ -165,8 +165,9 @@ def encode(command: Command) -> bytes:
         case Hands(held=held, released=released):
             fields = ["h", str(sum(1 << (cart - 1) for cart in held)), str(released)]
         case Signal():
-            # The empty field before `s` ends a command that a lost byte left open.
-            fields = ["", "s"] if command is Signal.STOP else [command.value]
+            # The first semicolon ends a field that lost its own; the empty field after it ends
+            # a command that a lost byte left open.
+            fields = ["", "", "s"] if command is Signal.STOP else [command.value]
     return "".join(f"{field};" for field in fields).encode("ascii")
 
 

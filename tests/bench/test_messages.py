@@ -94,6 +94,8 @@ def garbled(draw):
 @example(b"d;q;o;o;1;10")
 @example(b"d;")
 @example(b"d;q")
+@example(b"d")
+@example(b"g;0;0;0;d")
 @example(b"0" * 40)
 def test_nothing_swallows_a_stop_or_a_reset(data):
     """After any noise, a bench still obeys the last stop or reset that was sent."""
