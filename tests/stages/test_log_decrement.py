@@ -282,7 +282,10 @@ def test_friction_that_stops_the_cart_is_measured(d):
 
 
 def swinging(force, *, seed, fs=200.0, duration=8.0, start=1.2):
-    """Return a record of x'' = force(x, x') after a release, with half a count of noise."""
+    """Return a record of x'' = force(x, x') after a release, with half a count of noise.
+
+    Without a `seed`, it is exact.
+    """
     t = np.arange(0.0, duration, 1 / fs)
     motion = solve_ivp(
         lambda _, x: [x[1], force(*x)],
@@ -292,6 +295,8 @@ def swinging(force, *, seed, fs=200.0, duration=8.0, start=1.2):
         rtol=1e-9,
         atol=1e-9,
     )
+    if seed is None:
+        return record(t, motion.y[0], count=0.0)
     noise = np.random.default_rng(seed).normal(size=t.size)
     return record(t, motion.y[0] + 0.5 * COUNT * noise)
 
@@ -400,6 +405,41 @@ def test_a_pendulum_has_the_frequency_of_small_swings(swing):
     assert_allclose(got.zeta, 0.01, rtol=0.04)
 
 
+def stiffening(shift, *, noise, seed, duration):
+    """Return a record of a cubic spring and its exact relative shift of frequency at the release.
+
+    `shift` is the first approximation of that shift.
+    """
+    k = shift / (3 / 8 * 1.2**2)
+    exact = swinging(
+        lambda x, v: -(OMEGA**2) * (x + k * x**3) - 2 * 0.01 * OMEGA * v,
+        seed=None,
+        duration=duration,
+    )
+    # The exact period of the undamped swing, by its energy.
+    angle = np.linspace(0.0, np.pi / 2, 2001)
+    slowness = 1 / np.sqrt(1 + k * 1.2**2 * (1 + np.sin(angle) ** 2) / 2)
+    period_share = float(np.mean((slowness[1:] + slowness[:-1]) / 2))
+    y = exact.y[0] + noise * COUNT * np.random.default_rng(seed).normal(size=exact.t.size)
+    return record(exact.t, y), 1 / period_share - 1
+
+
+@pytest.mark.parametrize("shift", [-0.03, 0.02, 0.054, 0.1])
+def test_the_size_of_a_shift_is_right(shift):
+    """The change of frequency at the release is right up to the square of the shift.
+
+    The law has all terms of the first order, so only those are left. A tenth of the square is also
+    what the frequency of small swings may be off, and the square what the damping may.
+    """
+    run, size = stiffening(shift, noise=0.5, seed=5, duration=8.0)
+    law = fit_log_decrement(run, cart=1).law
+    assert law.name == "frequency_shift"
+    assert_allclose(law.size, size, atol=shift**2)
+    assert_allclose(law.omega_n, OMEGA, rtol=0.1 * shift**2 + 1e-5)
+    assert_allclose(law.zeta, 0.01, rtol=shift**2 + 1e-3)
+    assert abs(law.size - size) < law.size_std
+
+
 def test_a_rest_point_that_creeps_is_a_drift():
     """If the rest point creeps at a falling speed, the drift is named and left out."""
     run = released(zeta=0.02, duration=8.0, noise=0.5 * COUNT, rng=np.random.default_rng(6))
@@ -476,6 +516,29 @@ def test_the_standard_errors_are_about_right():
     spread = np.sqrt(np.mean(standardised(60) ** 2, axis=0))
     assert np.all((0.65 < spread[:2]) & (spread[:2] < 1.35))  # the limits are 1 ± 4/sqrt(120)
     assert spread[2] < 1.35
+
+
+@pytest.mark.parametrize("name", ["second_mode", "frequency_shift"])
+def test_the_standard_errors_of_a_law_are_about_right(name):
+    """Over 40 noisy decays, the errors of a law's numbers are as large as their standard errors.
+
+    The root mean square is 1 ± 4/sqrt(80). What a law neglects is stated too, but is small here.
+    """
+    errors = []
+    for seed in range(40):
+        if name == "second_mode":
+            run = beating(0.2, seed=seed)
+            # Decay rate 0.18 and damped frequency 15 rad/s; the size is a damped frequency too.
+            truth = [0.18 / np.hypot(0.18, 15.0), np.hypot(0.18, 15.0), 17.0]
+        else:
+            run, size = stiffening(0.01, noise=8.0, seed=seed, duration=4.0)
+            truth = [0.01, OMEGA, size]
+        law = fit_log_decrement(run, cart=1).law
+        assert law.name == name
+        found = np.array([law.zeta, law.omega_n, law.size])
+        errors.append((found - truth) / [law.zeta_std, law.omega_n_std, law.size_std])
+    spread = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert np.all((0.55 < spread) & (spread < 1.45))
 
 
 # ----------------------------------------------------------------------- errors

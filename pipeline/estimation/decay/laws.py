@@ -21,7 +21,14 @@ from pipeline.estimation.decay.departure import (
     thinned,
 )
 from pipeline.estimation.decay.dry_friction import Swings
-from pipeline.estimation.decay.modulated import DECAY, DRAG, FREQUENCY, SHIFT, Modulated
+from pipeline.estimation.decay.modulated import (
+    DECAY,
+    DRAG,
+    FREQUENCY,
+    SHIFT,
+    SHIFTS_AGAIN,
+    Modulated,
+)
 from pipeline.estimation.decay.ringing import Ringing, Waves
 from pipeline.estimation.decay.separable import (
     PRECISION,
@@ -44,8 +51,8 @@ _ROUGH = 1e-4  # relative tolerance of the squares in the competition
 _SIGMAS = 3.0  # a damping ratio further below zero is impossible
 _LEAST_ROUNDING = 0.1  # share of the rounding error that any fit leaves
 _LEAST_RATE = 0.1  # smaller decay rate of two modes, in the larger
-# Errors relative to the next power of a shift, from simulated springs and pendulums.
-_NEGLECTED = np.array([0.5, 0.1, 1.0])  # of damping ratio, frequency and shift
+# Errors relative to the square of a shift, from simulated springs and pendulums.
+_NEGLECTED = np.array([1.0, 0.1, 1.0])  # of damping ratio, frequency and shift
 _MOST_SHIFT = 0.3  # relative shift of frequency up to which the series holds
 _APART = 0.5  # distance of two modes, in the larger decay rate
 
@@ -104,7 +111,7 @@ class Explained:
         assert self.law is not None
         zeta, omega_n, size = self.law.values
         shift = abs(size) if self.law.name == "frequency_shift" else 0.0
-        neglected = _NEGLECTED * np.array([zeta * shift, omega_n * shift**2, shift**2])
+        neglected = _NEGLECTED * np.array([zeta, omega_n, 1.0]) * shift**2
         return np.hypot(self.law.unit * np.sqrt(self.density + self.left[1]), neglected)
 
 
@@ -298,13 +305,12 @@ def _candidates(
         size: Callable[[Array, Array, Array], tuple[Array, bool]],
         *,
         power: int = 0,
-        kept: bool = False,
         bends: int = 1,
     ) -> _Candidate:
         return _Candidate(
             name=name,
             model=lambda t, p: Modulated.at(
-                t - start, p, free=free, power=power, kept=kept, bends=bends, length=length
+                t - start, p, free=free, power=power, bends=bends, length=length
             ),
             starts=[np.array(p)],
             scale=np.full(len(free), abs(pole)),
@@ -328,9 +334,7 @@ def _candidates(
     yield modulated("quadratic_drag", [DECAY, FREQUENCY, DRAG], drag, _drag_size, power=2)
     shift = [decay, omega, 0.0]
     yield modulated("frequency_shift", [DECAY, FREQUENCY, SHIFT], shift, _shift_size)
-    yield modulated(
-        "frequency_shift", [DECAY, FREQUENCY, SHIFT], shift, _shift_size, power=3, kept=True
-    )
+    yield modulated("frequency_shift", [DECAY, FREQUENCY, SHIFT], shift, _shift_size, power=3)
     for bends in (3, 6):
         if 2 * np.pi * bends <= omega * length:  # a drift is slower than the oscillation
             yield modulated("drift", [DECAY, FREQUENCY], [decay, omega], _bend_size, bends=bends)
@@ -353,12 +357,12 @@ def _drag_size(t: Array, p: Array, linear: Array) -> tuple[Array, bool]:
 
 def _shift_size(t: Array, p: Array, linear: Array) -> tuple[Array, bool]:
     """Return the weights of the relative change of frequency at the largest amplitude."""
-    weights = np.zeros(p.size + linear.size)
-    weights[2] = 1 / p[1]
+    weights, shift = np.zeros(p.size + linear.size), float(p[2] / p[1])
+    weights[2] = (1 - SHIFTS_AGAIN * shift) / p[1]
     # The changes of the waveform are of second order in the shift.
     amplitude, *others = np.hypot(*linear[2:].reshape(-1, 2).T)
-    shift = abs(p[2] / p[1])
-    return weights, shift < _MOST_SHIFT and max(others, default=0.0) < shift * amplitude / 2
+    small = max(others, default=0.0) < abs(shift) * amplitude / 2
+    return weights, abs(shift) < _MOST_SHIFT and small
 
 
 def _bend_size(t: Array, p: Array, linear: Array) -> tuple[Array, bool]:

@@ -14,12 +14,13 @@ import numpy as np
 from pipeline.arrays import Array
 
 _MOST_LOSS = 50.0  # bound of an exponent during the fit, against overflow
+_LEAST = 1e-3  # bound of a divisor during the fit
 _FLAT = 1e-3  # loss below which a series replaces a quotient of small numbers
 # Drag also slows the oscillation a little. The second coefficient is from simulations with beta A
 # from 0.02 to 0.4, which agree to 5 %.
 _SLOWS, _SLOWS_SQUARED = 0.5, 0.092
 _LEAD = 16  # points from the start to the first time, for the integrals
-_SHIFTS_AGAIN = 5 / 12  # of a cubic spring
+SHIFTS_AGAIN = 5 / 12  # of a cubic spring
 DECAY, FREQUENCY, DRAG, SHIFT = range(4)
 
 
@@ -27,29 +28,31 @@ DECAY, FREQUENCY, DRAG, SHIFT = range(4)
 class Modulated:
     """A decay y = drift + Re(amplitude E e^{i phi}), with envelope E and phase phi.
 
-    E = e^{-gamma tau} / (1 + b (1 - e^{-gamma tau}) / gamma), and phi' = omega + shift E² - (5/12
-    shift² E⁴ + b gamma E / 2 + 0.092 b² E²) / omega.
+    E = e^{-gamma tau} / (B sqrt(R)) with B = 1 + b (1 - e^{-gamma tau}) / gamma and, because a
+    stiffer spring stores more energy, R = 1 - (1 - e^{-2 gamma tau}) shift / omega. Further, phi' =
+    omega + shift E² - (5/12 shift² E⁴ + b gamma E / 2 + 0.092 b² E²) / omega.
 
     Attributes
     ----------
-    tau : time (n,) since the start, s.
-    free : the entries of (gamma, omega, b, shift) that are unknown. The others are zero.
-    envelope, phase : E and phi (n,).
-    slopes, turns : derivatives (n_free, n) of envelope and phase by the unknowns, which are in 1/s.
+    tau : time (n_lead + n,) since the start, s. The first times lead from the start to the samples.
+    p : gamma, omega, b and shift, 1/s.
+    free : which of p are unknown. The others are zero.
+    grown, below, bent : (1 - e^{-gamma tau}) / gamma, B and R (n_lead + n,).
+    envelope, phase : E and phi (n_lead + n,).
     power : if positive, there is a third harmonic that follows E^power.
-    kept : whether the fundamental also has a part that follows E^power.
     bends : highest power of time in the drift.
     length : unit of time of these powers, s.
     """
 
     tau: Array
+    p: Array
     free: Sequence[int]
+    grown: Array
+    below: Array
+    bent: Array
     envelope: Array
     phase: Array
-    slopes: Array
-    turns: Array
     power: int
-    kept: bool
     bends: int
     length: float
 
@@ -61,7 +64,6 @@ class Modulated:
         *,
         free: Sequence[int],
         power: int = 0,
-        kept: bool = False,
         bends: int = 1,
         length: float = 1.0,
     ) -> "Modulated":
@@ -69,40 +71,27 @@ class Modulated:
         full = np.zeros(4)
         full[list(free)] = p
         gamma, omega, b, shift = full
-        n, tau = tau.size, np.append(np.linspace(0.0, tau[0], _LEAD), tau)
-        loss = np.clip(gamma * tau, -_MOST_LOSS, _MOST_LOSS)
-        left = np.exp(-loss)
-        if abs(gamma) * np.max(np.abs(tau)) > _FLAT:
-            grown = (1 - left) / gamma
-            per_gamma = (tau * left - grown) / gamma
-        else:
-            grown, per_gamma = tau * (1 - loss / 2), -(tau**2) * (1 / 2 - loss / 3)
-        below = np.maximum(1 + b * grown, 1e-3)
-        envelope = left / below
-        by = np.array([-envelope * (tau + b * per_gamma / below), -envelope * grown / below])
-        # Powers 1, 2 and 4 of the envelope, integrated, and the derivatives by gamma and b. The
-        # envelope is slow, so the trapezoidal rule is exact enough between samples.
-        areas = _integral(np.array([envelope, envelope**2, envelope**4]), tau)
-        turned = _integral(np.array([by, 2 * envelope * by, 4 * envelope**3 * by]), tau)
-        squares = np.array([_SLOWS * b * gamma, _SLOWS_SQUARED * b**2, _SHIFTS_AGAIN * shift**2])
-        weight = np.array([0.0, shift, 0.0]) - squares / omega
-        by_gamma, by_drag = np.tensordot(weight, turned, axes=1)
-        by_gamma = by_gamma - _SLOWS * b / omega * areas[0]
-        by_drag = by_drag - (_SLOWS * gamma * areas[0] + 2 * _SLOWS_SQUARED * b * areas[1]) / omega
-        by_shift = areas[1] - 2 * _SHIFTS_AGAIN * shift / omega * areas[2]
-        turns = np.array([by_gamma, tau + squares @ areas / omega**2, by_drag, by_shift])
-        slopes = np.zeros_like(turns)
-        slopes[[DECAY, DRAG]] = by
-        phase = omega * tau + weight @ areas
+        tau = np.append(np.linspace(0.0, tau[0], _LEAD), tau)
+        left = np.exp(-np.clip(gamma * tau, -_MOST_LOSS, _MOST_LOSS))
+        flat = abs(gamma) * np.max(np.abs(tau)) <= _FLAT
+        grown = tau * (1 - gamma * tau / 2) if flat else (1 - left) / gamma
+        below = np.maximum(1 + b * grown, _LEAST)
+        bent = np.maximum(1 - (1 - left**2) * shift / omega, _LEAST)
+        envelope = left / below / np.sqrt(bent)
+        phase = omega * tau
+        if b or shift:
+            turning = shift * envelope**2 - _slowed(envelope, full) / omega
+            phase = phase + _integral(turning, tau)
         return cls(
-            tau=tau[-n:],
+            tau=tau,
+            p=full,
             free=free,
-            envelope=envelope[-n:],
-            phase=phase[-n:],
-            slopes=slopes[list(free), -n:],
-            turns=turns[list(free), -n:],
+            grown=grown,
+            below=below,
+            bent=bent,
+            envelope=envelope,
+            phase=phase,
             power=power,
-            kept=kept,
             bends=bends,
             length=length,
         )
@@ -110,32 +99,78 @@ class Modulated:
     @property
     def columns(self) -> Array:
         """The factors of drift, amplitude and harmonics, (n, n_linear)."""
-        drift = np.vander(self.tau / self.length, self.bends + 1, increasing=True).T
+        tau, envelope, phase = self.tau[_LEAD:], self.envelope[_LEAD:], self.phase[_LEAD:]
+        drift = np.vander(tau / self.length, self.bends + 1, increasing=True).T
         waves = [
             part
             for power, order in self._waves
-            for part in _parts(self.envelope**power * np.exp(1j * order * self.phase))
+            for part in _parts(envelope**power * np.exp(1j * order * phase))
         ]
         return np.array([*drift, *waves]).T
 
     @property
     def _waves(self) -> list[tuple[int, int]]:
         """Power of the envelope and order of the harmonic of each wave."""
-        waves = [(1, 1)]
-        if self.kept:
-            waves.append((self.power, 1))
-        return [*waves, (self.power, 3)] if self.power else waves
+        return [(1, 1), (self.power, 3)] if self.power else [(1, 1)]
 
     def derivatives(self, linear: Array) -> Array:
         """Return dy/dp (n, n_free)."""
-        by_envelope, by_phase = np.zeros((2, self.tau.size))
+        slopes, turns = self._changes
+        envelope, phase = self.envelope[_LEAD:], self.phase[_LEAD:]
+        by_size, by_phase = np.zeros((2, envelope.size))
         for (power, order), (cosine, sine) in zip(
             self._waves, linear[self.bends + 1 :].reshape(-1, 2), strict=True
         ):
-            wave = (cosine - 1j * sine) * np.exp(1j * order * self.phase)
-            by_envelope += power * self.envelope ** (power - 1) * wave.real
-            by_phase -= order * self.envelope**power * wave.imag
-        return (by_envelope * self.slopes + by_phase * self.turns).T
+            wave = (cosine - 1j * sine) * envelope**power * np.exp(1j * order * phase)
+            by_size += power * wave.real
+            by_phase -= order * wave.imag
+        return (by_size * slopes + by_phase * turns).T
+
+    @property
+    def _changes(self) -> tuple[Array, Array]:
+        """The derivatives (n_free, n) of ln E and of the phase by the unknowns."""
+        gamma, omega, b, shift = self.p
+        tau, E, grown = self.tau, self.envelope, self.grown
+        if not (b or shift or {DRAG, SHIFT} & set(self.free)):
+            zero = np.zeros_like(tau)
+            slopes, turns = np.array([-tau, zero]), np.array([zero, tau])
+            return slopes[:, _LEAD:], turns[:, _LEAD:]
+        left = np.exp(-np.clip(gamma * tau, -_MOST_LOSS, _MOST_LOSS))
+        flat = abs(gamma) * np.max(np.abs(tau)) <= _FLAT
+        per_gamma = -(tau**2) * (1 / 2 - gamma * tau / 3) if flat else (tau * left - grown) / gamma
+        by_shift = (1 - left**2) / (2 * self.bent * omega)
+        slopes = np.array(
+            [
+                shift / omega * tau * left**2 / self.bent - tau - b * per_gamma / self.below,
+                -shift / omega * by_shift,
+                -grown / self.below,
+                by_shift,
+            ]
+        )[list(self.free)]
+        slowing = _SLOWS * b * gamma * E, _SLOWS_SQUARED * (b * E) ** 2
+        again = SHIFTS_AGAIN * (shift * E**2) ** 2
+        per_size = 2 * shift * E**2 - (slowing[0] + 2 * slowing[1] + 4 * again) / omega
+        direct = np.array(
+            [
+                -_SLOWS * b * E / omega,
+                (slowing[0] + slowing[1] + again) / omega**2,
+                -(_SLOWS * gamma * E + 2 * _SLOWS_SQUARED * b * E**2) / omega,
+                E**2 - 2 * SHIFTS_AGAIN * shift * E**4 / omega,
+            ]
+        )[list(self.free)]
+        turns = _integral(direct + per_size * slopes, tau)
+        turns[self.free.index(FREQUENCY)] += tau
+        return slopes[:, _LEAD:], turns[:, _LEAD:]
+
+
+def _slowed(envelope: Array, p: Array) -> Array:
+    """Return what second order takes from the square of the frequency, at an envelope (n,)."""
+    gamma, _, b, shift = p
+    return (
+        _SLOWS * b * gamma * envelope
+        + _SLOWS_SQUARED * (b * envelope) ** 2
+        + SHIFTS_AGAIN * (shift * envelope**2) ** 2
+    )
 
 
 def _parts(wave: Array) -> tuple[Array, Array]:
@@ -143,6 +178,9 @@ def _parts(wave: Array) -> tuple[Array, Array]:
 
 
 def _integral(values: Array, t: Array) -> Array:
-    """Return the integral of `values` (…, n) from the first time on, by the trapezoidal rule."""
+    """Return the integral of `values` (…, n) from the first time on, by the trapezoidal rule.
+
+    The envelope is slow, so this is exact enough between samples.
+    """
     steps = np.diff(t) * (values[..., 1:] + values[..., :-1]) / 2
     return np.concatenate([np.zeros_like(values[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)

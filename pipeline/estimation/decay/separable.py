@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.optimize import leastsq
 
 from pipeline.arrays import Array
 from pipeline.estimation.minimise import evaluated_once
 
 PRECISION = 1e-8  # relative tolerance of the sum of squares, of p, and of the slope
+_APART = 1e3  # rounding errors by which columns differ that need no singular values
 _FOUND = (1, 2, 3, 4)  # MINPACK's codes for convergence
 
 
@@ -108,8 +110,12 @@ class _Point:
 def _solved(y: Array, model: SeparableModel) -> _Point:
     """Return the model with the linear unknowns that give the least residual."""
     X = model.columns
-    basis, sizes, turn = np.linalg.svd(X, full_matrices=False)
-    # Far from the solution, columns may be nearly equal; they then share their contribution.
-    apart = np.maximum(sizes, np.finfo(np.float64).eps * len(X) * sizes[0])
-    linear = (y @ basis / apart) @ turn
+    basis, upper = np.linalg.qr(X)
+    sizes = np.abs(np.diag(upper))
+    least = np.finfo(np.float64).eps * len(X) * np.max(sizes)
+    if np.min(sizes) > _APART * least:
+        linear = solve_triangular(upper, y @ basis, check_finite=False)
+    else:  # far from the solution, columns may be nearly equal; they then share their contribution
+        basis, sizes, turn = np.linalg.svd(X, full_matrices=False)
+        linear = (y @ basis / np.maximum(sizes, least)) @ turn
     return _Point(model=model, basis=basis, linear=linear, residual=X @ linear - y)
