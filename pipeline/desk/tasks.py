@@ -33,7 +33,7 @@ from pipeline.ingest.fill import (
     has_fractions,
     passed_over,
 )
-from pipeline.ingest.formats.recognise import read_table
+from pipeline.ingest.formats.recognise import OF_STRANGERS, read_table
 from pipeline.ingest.read import read_data
 from pipeline.lock import lock_or_refuse
 from pipeline.output import own_folder, write_file
@@ -392,4 +392,5 @@ def _write_points(row: Array) -> str:
 
 
 if __name__ == "__main__":
+    OF_STRANGERS.set(True)
     serve(lambda: do)

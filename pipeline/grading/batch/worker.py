@@ -20,6 +20,7 @@ from pipeline.grading.judge.run import Graded, grade_submission
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.self_check.words import asked_note
 from pipeline.grading.similarity.prints import fingerprint
+from pipeline.ingest.formats.recognise import OF_STRANGERS
 from pipeline.processes import serve
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.complaints import quote
@@ -205,4 +206,5 @@ def _prepare(
 
 
 if __name__ == "__main__":
+    OF_STRANGERS.set(True)
     serve(_prepare)

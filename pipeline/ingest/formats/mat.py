@@ -1,15 +1,23 @@
-"""Find the recording in a `.mat` file: which variables form it, and their columns."""
+"""Read a `.mat` file: its variables, which of them form the recording, and their columns.
 
-from collections.abc import Mapping, Sequence
+scipy reads version 5, h5py version 7.3. A few changed bytes can crash scipy's reader and its whole
+process, so `recognise` reads files of strangers in a process of their own.
+"""
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from typing import Any
 
 import numpy as np
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.formats.headings import is_time
-from pipeline.ingest.formats.mat_variables import MatVariable, read_variables
 from pipeline.ingest.formats.table import (
     MOST_COLUMNS,
     FileTable,
+    Variable,
     checked_names,
     not_read,
     refuse_unusable,
@@ -20,6 +28,59 @@ _MAX_COLUMNS = 64
 _MOST_SETTINGS = 8  # numbers in a variable; a recording has more samples
 _MOST_NAMED = 8
 _BENCH = ({"enc1", "duty", "time"}, {"cart1pos", "duty_cycle", "t_received"})
+_LONGEST_NAME, _DEEPEST = 64, 4  # characters; structs in structs
+_NUMBERS = frozenset(
+    "double single logical int8 uint8 int16 uint16 int32 uint32 int64 uint64".split()
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MatVariable:
+    """A variable with its numbers (rows, columns), or with a description if `values` is None.
+
+    `bytes` is the variable's size if its numbers are not read. `elements` are those of a struct,
+    each with its fields by name; `text` is that of a text.
+    """
+
+    name: str
+    kind: str
+    values: np.ndarray | None = None
+    size: tuple[int, ...] = ()
+    bytes: int = 0
+    elements: tuple[dict[str, "MatVariable"], ...] = ()
+    text: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.name.isprintable() or len(self.name) > _LONGEST_NAME:
+            raise ValueError(self.name)
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The numbers; the variable must have some."""
+        assert self.values is not None
+        return self.values
+
+    @property
+    def samples(self) -> int:
+        """The number of samples, if it is a signal or a matrix of signals."""
+        return max(self.numbers.shape)
+
+    @property
+    def is_vector(self) -> bool:
+        """Whether it is a single signal."""
+        return self.numbers.size > 1 and min(self.numbers.shape) == 1
+
+    def entry(self, *, read: bool, advice: str = "") -> Variable:
+        """Return the variable's entry in an inspection."""
+        return Variable(name=self.name, size=self.size, kind=self.kind, read=read, advice=advice)
+
+    def __str__(self) -> str:
+        return str(self.entry(read=False))
+
+
+def is_mat(raw: bytes) -> bool:
+    """Return whether the first bytes are those of a `.mat` file of version 5 or later."""
+    return raw.startswith(b"MATLAB")
 
 
 def read_mat(raw: bytes, *, source: str) -> list[FileTable]:
@@ -29,7 +90,7 @@ def read_mat(raw: bytes, *, source: str) -> list[FileTable]:
     ------
     SubmissionError : the file is broken, or contains no usable numbers.
     """
-    variables = read_variables(raw, source=source)
+    variables = _read_variables(raw, source=source)
     if tables := _structures(variables, source=source):
         return tables
     record = _record(variables, source=source)
@@ -218,3 +279,161 @@ def _unwrap(values: np.ndarray, dtype: np.dtype) -> np.ndarray:
     if dtype.kind not in "iu" or dtype.itemsize != 2 or np.abs(np.diff(values)).max() <= 2**15:
         return values
     return np.unwrap(values, period=2**16)
+
+
+# ------------------------------------------------------------------------------- variables
+
+
+def _read_variables(raw: bytes, *, source: str) -> list[MatVariable]:
+    """Return the variables of a `.mat` file, in the order of the file.
+
+    Raises
+    ------
+    SubmissionError : the file is broken.
+    """
+    is_7_3 = raw.startswith(b"MATLAB 7.3") or raw[512:516] == b"\x89HDF"
+    try:
+        return _version_7_3(raw) if is_7_3 else _version_5(raw)
+    except MemoryError:
+        raise
+    except Exception:  # scipy and h5py raise many kinds
+        raise SubmissionError(f"{source}: the .mat file is damaged or truncated") from None
+
+
+def _version_5(raw: bytes) -> list[MatVariable]:
+    from scipy.io import loadmat
+
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        content = loadmat(BytesIO(raw), mat_dtype=True, chars_as_strings=False)
+    if any(issubclass(one.category, np.exceptions.ComplexWarning) for one in said):
+        # With `mat_dtype`, scipy drops imaginary parts.
+        stored = loadmat(BytesIO(raw), chars_as_strings=False)
+        content |= {k: v for k, v in stored.items() if any(map(np.iscomplexobj, _leaves(v)))}
+    # Names with two underscores are those of scipy.
+    return [_of_scipy(name, one) for name, one in content.items() if not name.startswith("__")]
+
+
+def _of_scipy(name: str, value: Any, *, depth: int = 0) -> MatVariable:
+    """Return a variable as scipy reads it.
+
+    Raises
+    ------
+    ValueError : scipy could not read it, or it has no usable name.
+    """
+    from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque
+
+    if isinstance(value, MatlabOpaque):  # scipy gives its name as a value
+        return MatVariable(name=value.flat[0]["s0"].decode("ascii"), kind="object")
+    if not isinstance(value, np.ndarray):
+        if isinstance(value, str):  # scipy's error
+            raise ValueError(value)
+        return MatVariable(name=name, kind="sparse", size=value.shape, bytes=16 * value.nnz)
+    if value.dtype.kind == "U":
+        text = "".join(value.ravel())[:_LONGEST_NAME]
+        return MatVariable(name=name, kind="text", size=value.shape, bytes=value.nbytes, text=text)
+    if not value.dtype.hasobject:
+        return _matrix(name, value)
+    taken = sum(getattr(leaf, "nbytes", 0) for leaf in _leaves(value))
+    kind = "struct" if value.dtype.names else "cell"
+    if isinstance(value, MatlabFunction | MatlabObject):
+        kind = "function" if isinstance(value, MatlabFunction) else "object"
+    elements: tuple[dict[str, MatVariable], ...] = ()
+    if kind == "struct" and depth < _DEEPEST:
+        elements = tuple(
+            {key: _of_scipy(key, one[key], depth=depth + 1) for key in value.dtype.names}
+            for one in value.flat
+        )
+    return MatVariable(name=name, kind=kind, size=value.shape, bytes=taken, elements=elements)
+
+
+def _leaves(value: Any) -> Iterator[Any]:
+    """Yield all arrays in a cell array or a struct; another variable itself."""
+    if not isinstance(value, np.ndarray) or not value.dtype.hasobject:
+        yield value
+        return
+    for one in value.flat:
+        for part in one if value.dtype.names else [one]:
+            yield from _leaves(part)
+
+
+def _version_7_3(raw: bytes) -> list[MatVariable]:
+    import h5py
+
+    with h5py.File(BytesIO(raw), "r") as file:
+        return [*_of_group(file, depth=0, seen=set()).values()]
+
+
+def _of_group(group: Any, *, depth: int, seen: set[int]) -> dict[str, MatVariable]:
+    """Return the variables in an HDF5 file, or the fields of a struct in it.
+
+    `seen` are the addresses of objects: MATLAB writes each once, a bomb gives one a million names.
+
+    Raises
+    ------
+    ValueError : a name is not usable, or its numbers are in another file.
+    """
+    import h5py
+
+    found: dict[str, MatVariable] = {}
+    for name in map(str, group):
+        if name.startswith("#"):  # parts of MATLAB's cells and objects
+            continue
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            raise ValueError(name)
+        item = group[name]
+        address = h5py.h5o.get_info(item.id).addr
+        if address in seen:
+            raise ValueError(name)
+        seen.add(address)
+        if isinstance(item, h5py.Dataset):
+            found[name] = _of_data_set(name, item)
+        elif isinstance(item, h5py.Group):  # a named type has no numbers
+            kind = "sparse" if "MATLAB_sparse" in item.attrs else "struct"
+            inner = _of_group(item, depth=depth + 1, seen=seen) if depth < _DEEPEST else {}
+            taken = sum(v.bytes if v.values is None else v.values.nbytes for v in inner.values())
+            elements = (inner,) if kind == "struct" else ()
+            found[name] = MatVariable(
+                name=name, kind=kind, size=(1, 1), bytes=taken, elements=elements
+            )
+    return found
+
+
+def _of_data_set(name: str, item: Any) -> MatVariable:
+    if item.is_virtual or item.external:
+        raise ValueError(name)
+    size = tuple(reversed(item.shape)) if len(item.shape) > 1 else (item.size, 1)
+    kind, pair = _class_of(item), item.dtype.names == ("real", "imag")
+    parts = [item.dtype[part] for part in item.dtype.names] if pair else [item.dtype]
+    if kind in _NUMBERS and not all(part.kind in "biuf" and not part.shape for part in parts):
+        kind = "unknown"
+    if kind not in _NUMBERS:
+        return MatVariable(name=name, kind=kind, size=size, bytes=item.nbytes)
+    values = np.atleast_1d(item[()])
+    values = values["real"] + 1j * values["imag"] if pair else values
+    return _matrix(name, values.T.reshape(size))
+
+
+def _class_of(item: Any) -> str:
+    """Return MATLAB's class of a data set; numbers without a stated class are "double"."""
+    if "MATLAB_empty" in item.attrs:
+        return "empty"
+    of = item.attrs.get("MATLAB_class", b"double" if item.dtype.kind in "fiu" else b"unknown")
+    name = of.decode("ascii") if isinstance(of, bytes) else str(of)
+    if not name.isprintable() or len(name) > _LONGEST_NAME:
+        return "unknown"
+    if name not in _NUMBERS and "MATLAB_object_decode" in item.attrs:
+        return "object"
+    return "text" if name == "char" else name
+
+
+def _matrix(name: str, values: np.ndarray) -> MatVariable:
+    """Return a variable with its numbers, or with a description if it is not a real matrix."""
+    kind = "empty" if 0 in values.shape else "complex" if np.iscomplexobj(values) else ""
+    if len(values.shape) != 2:
+        kind = "array of more than two dimensions"
+    if kind:
+        return MatVariable(name=name, kind=kind, size=values.shape, bytes=values.nbytes)
+    dtype = np.dtype("u1") if values.dtype == bool else values.dtype.newbyteorder("=")
+    values = values.astype(dtype)
+    return MatVariable(name=name, values=values, kind=str(dtype), size=values.shape)
