@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -199,6 +199,7 @@ def _open(table: FileTable, experiment: Experiment, system: System) -> _Opened:
         if table.has(column) and column not in own.values()
     }
     columns, unused = assign_columns(table, explicit=shared | own, free=experiment.carts)
+    _refuse_partial(table, columns, experiment)
     positions = sorted(
         (c for role, c in columns.items() if role[0] == "x" and c.cart <= system.carts),
         key=lambda column: column.cart,
@@ -212,6 +213,22 @@ def _open(table: FileTable, experiment: Experiment, system: System) -> _Opened:
         positions=positions,
         unused=unused,
         stamps=time_stamps(table, columns.get("time"), sample_rate=experiment.sample_rate),
+    )
+
+
+def _refuse_partial(
+    table: FileTable, columns: Mapping[str, Column], experiment: Experiment
+) -> None:
+    """Refuse a file in which a column that the experiment needs has empty or broken cells."""
+    if not table.partial:
+        return
+    names = tuple(table.partial)
+    left_out = replace(table, names=names, values=np.zeros((len(names), 1)))
+    roles, _ = assign_columns(left_out, explicit=None, free=experiment.carts)
+    needed = {"time", *(f"x{cart}" for cart in experiment.carts)}
+    needed |= {"input"} if experiment.kind in _NEED_INPUT else set()
+    table.refuse_partial(
+        column.name for role, column in roles.items() if role in needed - columns.keys()
     )
 
 

@@ -132,6 +132,28 @@ def test_rows_that_do_not_fit_are_skipped_and_shown():
         parse_table((HEADING + "\n".join(lines)).encode(), source="f")
 
 
+@pytest.mark.parametrize("broken", ["0,oops,1", "05,0.1"])
+@pytest.mark.parametrize("last", [False, True])
+def test_a_broken_row_at_either_end_is_skipped_and_shown(broken, last):
+    """A first or last row that is cut off or garbled is skipped, and a note names its line."""
+    lines = [*PLAIN.splitlines(), broken] if last else [broken, *PLAIN.splitlines()]
+    got = parse_table((HEADING + "\n".join(lines)).encode(), source="f")
+    assert got.names == tuple(HEADING.strip().split(","))
+    assert got.values.shape == (3, N)
+    assert got.cut is None
+    assert len(got.notes) == 1
+    assert f"line {N + 2 if last else 2}" in got.notes[0]
+
+
+def test_a_column_with_many_bad_cells_is_refused_if_it_is_asked_for():
+    """A column with bad cells in one row of eight is left out, and is refused by its name."""
+    lines = [f"{row},{'' if i % 8 == 3 else i}" for i, row in enumerate(PLAIN.splitlines())]
+    got = parse_table((HEADING.strip() + ",note\n" + "\n".join(lines)).encode(), source="f")
+    assert got.names == tuple(HEADING.strip().split(","))
+    with pytest.raises(SubmissionError, match="'note' has 175 of 200 values, missing in line 5, "):
+        got.index("note")
+
+
 @pytest.mark.parametrize("name", ["x1 [furlong]", "x1/furlong", "x1 (furlong)", "x1 in furlongs"])
 def test_a_unit_that_is_not_known_is_asked_about(name):
     """A unit that is not known stops the reading; it is never ignored."""

@@ -115,16 +115,27 @@ def test_problems_are_named(columns, problem, tmp_path):
     assert any(problem in said for said in got.problems), got.problems
 
 
-def test_a_cut_file_is_still_inspected(tmp_path):
-    """If the last line of a file is cut, `inspect` names the line and shows everything else."""
+def test_a_last_line_that_is_cut_is_skipped(tmp_path):
+    """If the last line of a file is cut, `inspect` names the line, and the file can be used."""
     inspect(tmp_path, time=T, x1=X)
     text = (tmp_path / "a.csv").read_text().rstrip("\n")
     (tmp_path / "a.csv").write_text(text + "\n10.0")
     got = inspect_file(tmp_path / "a.csv")
     assert got.samples == 2000
-    (problem,) = got.unusable
-    assert got.problems == (problem,)
-    assert problem.startswith("line 2002: expected 2 columns, found 1; the file is truncated")
+    assert not got.unusable
+    (problem,) = got.problems
+    assert "line 2002" in problem
+
+
+def test_an_oscilloscope_that_names_its_units_beside_the_rows_is_no_decay(tmp_path):
+    """Old Tektronix files have their settings beside the first rows: volts are not a position."""
+    beside = ["Record Length,2000", "Source,CH1", "Vertical Units,V", "Horizontal Units,s"]
+    beside += [","] * (T.size - len(beside))
+    rows = (f"{said},,{t:.5f},{x:.5f},\n" for said, t, x in zip(beside, T, X, strict=True))
+    (tmp_path / "F0000CH1.CSV").write_text("".join(rows))
+    got = inspect_file(tmp_path / "F0000CH1.CSV")
+    assert [column.name for column in got.columns] == ["TIME [s]", "CH1 [V]"]
+    assert got.kind is None
 
 
 def test_a_file_with_a_remark_can_be_used(tmp_path):

@@ -341,7 +341,7 @@ def _of_scipy(name: str, value: Any, *, depth: int = 0) -> MatVariable:
     elements: tuple[dict[str, MatVariable], ...] = ()
     if kind == "struct" and depth < _DEEPEST:
         elements = tuple(
-            {key: _of_scipy(key, one[key], depth=depth + 1) for key in value.dtype.names}
+            {key: _of_scipy(key, one[key], depth=depth + 1) for key in value.dtype.names or ()}
             for one in value.flat
         )
     return MatVariable(name=name, kind=kind, size=value.shape, bytes=taken, elements=elements)
@@ -374,6 +374,7 @@ def _of_group(group: Any, *, depth: int, seen: set[int]) -> dict[str, MatVariabl
     ValueError : a name is not usable, or its numbers are in another file.
     """
     import h5py
+    from h5py import h5o
 
     found: dict[str, MatVariable] = {}
     for name in map(str, group):
@@ -382,7 +383,7 @@ def _of_group(group: Any, *, depth: int, seen: set[int]) -> dict[str, MatVariabl
         if not isinstance(group.get(name, getlink=True), h5py.HardLink):
             raise ValueError(name)
         item = group[name]
-        address = h5py.h5o.get_info(item.id).addr
+        address = h5o.get_info(item.id).addr
         if address in seen:
             raise ValueError(name)
         seen.add(address)

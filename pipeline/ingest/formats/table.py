@@ -1,8 +1,8 @@
 """A data file as written: named columns of numbers, without meaning or unit."""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 
 import numpy as np
@@ -60,6 +60,7 @@ class FileTable:
     cut : the broken last line of a truncated file; None if the file is complete.
     notes : repairs and omissions made while reading.
     variables : the variables of a binary file, in the order of the file.
+    partial : columns left out because cells are empty or not numbers: heading to a description.
     run : which of the file's recordings this is; "" if there is only one.
     """
 
@@ -73,6 +74,7 @@ class FileTable:
     notes: tuple[str, ...] = ()
     lines_are: str = "line"
     variables: tuple[Variable, ...] = ()
+    partial: Mapping[str, str] = field(default_factory=dict)
     run: str = ""
 
     @property
@@ -103,9 +105,22 @@ class FileTable:
         for i, name in enumerate(self.names):
             if _loosely(name) == wanted:
                 return i
+        self.refuse_partial(name for name in self.partial if _loosely(name) == wanted)
         close = get_close_matches(column, self.names, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"it has {self.headings()}"
         raise SubmissionError(f"{self.source}: there is no column {column[:60]!r}; {hint}")
+
+    def refuse_partial(self, names: Iterable[str]) -> None:
+        """Refuse columns that are needed, if they were left out for their cells.
+
+        Raises
+        ------
+        SubmissionError : there is such a column.
+        """
+        for name in names:
+            raise SubmissionError(
+                f"{self.source}: {self.partial[name]}; fill these cells, or leave out their rows"
+            )
 
     def has(self, column: str | int) -> bool:
         """Return whether there is such a column."""

@@ -303,7 +303,7 @@ class Block:
     """The lines of one table with their numbers: those above it, and those from its first row.
 
     `line` is what the numbers count, such as the rows of a sheet. `values` are the numbers in the
-    rows (n, width), if that is all that the rows hold.
+    rows (n, width), if that is all that the rows hold. `notes` are about lines left out.
     """
 
     head: Sequence[tuple[int, str]]
@@ -311,6 +311,7 @@ class Block:
     source: str
     line: str = "line"
     values: Array | None = None
+    notes: tuple[str, ...] = ()
 
     def place(self, number: int) -> str:
         """Return the file and a line of it, as in "a.csv line 12"."""
@@ -337,10 +338,27 @@ def find_blocks(
             if again is None:
                 break
             above = next(i for i in range(again, 0, -1) if "n" in signatures[i - 1])
-            yield Block(head=head, rows=rows[at:above], source=source, line=line)
+            head, said = _without_rows(head, layout, line=line)
+            yield Block(head=head, rows=rows[at:above], source=source, line=line, notes=said)
             head, at = rows[above:again], again
         rows = rows[at:]
-    yield Block(head=head, rows=rows, source=source, line=line, values=values)
+    head, said = _without_rows(head, layout, line=line)
+    yield Block(head=head, rows=rows, source=source, line=line, values=values, notes=said)
+
+
+def _without_rows(
+    head: Sequence[tuple[int, str]], layout: Layout, *, line: str
+) -> tuple[Sequence[tuple[int, str]], tuple[str, ...]]:
+    """Return the lines above a table without broken rows below its heading, and a note on these."""
+    end = len(head)
+    while end and _signature(layout, head[end - 1][1]).startswith("n"):
+        end -= 1
+    if end == len(head) or not end or not _is_name(head[end - 1][1]):
+        return head, ()
+    where = first_few([str(number) for number, _ in head[end:]], _MOST_NAMED)
+    what = head[end][1].strip()[:30]
+    rows_are = "1 row was" if end == len(head) - 1 else f"{len(head) - end} rows were"
+    return head[:end], (f"{rows_are} skipped, {line} {where}: expected numbers, found {what!r}",)
 
 
 def _begins(signatures: Sequence[str], i: int) -> bool:
@@ -430,10 +448,11 @@ def read_block(
             f"found {width}"
         )
     notes: list[str] = []
+    partial: dict[str, str] = {}
     values = _numbers(rows, layout, width) if block.values is None else block.values
     used = list(range(width))
     if values is None or not np.isfinite(values).all():
-        values, lines, used, names, notes, cut = _mend(block, layout, names=names, cut=cut)
+        values, lines, used, names, notes, partial = _mend(block, layout, names=names, cut=cut)
     place = block.place(block.head[-1][0] if block.head else lines[0])
     names = checked_names([names[i] for i in used], numbers=used, place=place)
     refuse_unusable(values.T, names=names, place=lambda row: block.place(lines[row]))
@@ -451,7 +470,8 @@ def read_block(
         lines=np.array(lines),
         lines_are=block.line,
         cut=cut,
-        notes=tuple(notes),
+        notes=(*block.notes, *notes),
+        partial=partial,
     )
 
 
@@ -473,8 +493,8 @@ def _numbers(rows: Sequence[str], layout: Layout, width: int) -> Array | None:
 
 def _mend(
     block: Block, layout: Layout, *, names: Sequence[str], cut: str | None
-) -> tuple[Array, list[int], list[int], list[str], list[str], str | None]:
-    """Return the rows that fit, with their lines, columns, names, notes, and a broken last row."""
+) -> tuple[Array, list[int], list[int], list[str], list[str], dict[str, str]]:
+    """Return the rows that fit, with their lines, columns, names, notes, and partial columns."""
     width, names = len(names), list(names)
     lines, rows = zip(*block.rows, strict=True)
     table = np.full((len(rows), width), np.nan)
@@ -510,14 +530,19 @@ def _mend(
         notes.append(f"not read: text in {block.line} {where}")
     if not kept.size:
         raise SubmissionError(f"{block.source}: holds no rows of numbers")
-    used, timed = [], times.sum(axis=0)
+    used, timed, partial = [], times.sum(axis=0), dict[str, str]()
     for j in range(width):
         good = np.isfinite(table[kept, j])
         last = int(np.flatnonzero(good)[-1]) + 1 if good.any() else 0
         name = names[j].strip(" \"'") or str(j + 1)
         if good.mean() < 1 - _SPARSE or last < min((1 - _WORST) * kept.size, kept.size - 1):
             if (good.any() and good.mean() >= 1 - _SPARSE) or good.mean() > 0.2:
-                notes.append(f"not read: {name!r} has {good.sum():,} of {kept.size:,} values")
+                said = f"{name!r} has {good.sum():,} of {kept.size:,} values"
+                if not good[:last].all():
+                    bad = [str(lines[i]) for i in kept[~good]]
+                    said += f", missing in {block.line} {first_few(bad, _MOST_NAMED)}"
+                    partial[name] = said
+                notes.append(f"not read: {said}")
             elif names[j].strip():
                 notes.append(f"not read: {name!r} has no numbers")
             continue
@@ -532,6 +557,13 @@ def _mend(
             names[j] = f"{parse_heading(name).name} [s]"
     if not used:
         raise SubmissionError(f"{block.source}: holds no rows of numbers")
+    first_rows = [layout.split(row)[:2] for row in rows[:_FEW_LINES]]
+    beside = {row[0].strip(): row[-1].strip() for row in first_rows if row}  # old Tektronix files
+    if len(used) == 2 and not {"Horizontal Units", "Vertical Units"} - beside.keys():
+        for j, name, unit in zip(
+            used, ("TIME", beside.get("Source", "CH1")), ("Horizontal", "Vertical"), strict=True
+        ):
+            names[j] = f"{name} [{beside[f'{unit} Units']}]"
     for i in kept:
         bad = next((j for j in used if not np.isfinite(table[i, j])), None)
         if bad is not None:
@@ -544,7 +576,11 @@ def _mend(
                 else f"{name!r} is too large"
             )  # fmt: skip
     fits = [int(i) for i in kept if i not in faults]
-    cut, faults = _cut_end(block, faults, cut=cut)
+    last = len(rows) - 1
+    if faults.get(last, "").startswith("expected") and fits:
+        what = faults.pop(last)
+        if cut is None:
+            notes.append(f"the last row, {block.line} {lines[last]}, is cut off: {what}")
     if faults:
         where = first_few([str(lines[i]) for i in sorted(faults)], _MOST_NAMED)
         first = min(faults)
@@ -553,24 +589,7 @@ def _mend(
             raise SubmissionError(f"{block.place(lines[first])}: {faults[first]}{more}")
         rows_are = "1 row was" if len(faults) == 1 else f"{len(faults)} rows were"
         notes.append(f"{rows_are} skipped, {block.line} {where}: {faults[first]}")
-    if not fits:
-        raise SubmissionError(f"{block.source} {cut}")
-    return table[np.ix_(fits, used)], [lines[i] for i in fits], used, names, notes, cut
-
-
-def _cut_end(
-    block: Block, faults: dict[int, str], *, cut: str | None
-) -> tuple[str | None, dict[int, str]]:
-    """Return what is wrong with a last row that was cut off, and the other faults."""
-    last = len(block.rows) - 1
-    if cut:
-        return cut, {i: fault for i, fault in faults.items() if i != last}
-    if last not in faults or len(faults) > 1 + _WORST * len(block.rows):
-        return cut, faults
-    if not faults[last].startswith("expected"):
-        return cut, faults
-    what = f"{block.line} {block.rows[last][0]}: {faults[last]}"
-    return what, {i: fault for i, fault in faults.items() if i != last}
+    return table[np.ix_(fits, used)], [lines[i] for i in fits], used, names, notes, partial
 
 
 # ------------------------------------------------------------------------------- headings
