@@ -168,8 +168,9 @@ def _read(segment: _Segment, layout: Layout, *, across: str, source: str) -> Fil
     apart = Layout("\x01", comma=layout.comma)
     table = read_block(block, apart, form="lvm", names=headings)
     most = max((int(n) for n in segment.tags.get("Samples", []) if n.isdecimal()), default=0)
-    if table.cut is None and len(rows) < most:
-        cut = f"line {segment.rows[-1][0]}: {len(rows):,} of {most:,} samples"
+    complete = len(rows) - (rows[-1][1].count("\x01") != len(used) - 1)
+    if complete < most:
+        cut = f"line {segment.rows[-1][0]}: {complete:,} of {most:,} samples"
         table = replace(table, cut=cut)
     notes = (*table.notes, *(["comments beside the rows are not read"] if beside else []))
     # All numbers have a decimal mark, whole or not.

@@ -374,7 +374,6 @@ def _of_group(group: Any, *, depth: int, seen: set[int]) -> dict[str, MatVariabl
     ValueError : a name is not usable, or its numbers are in another file.
     """
     import h5py
-    from h5py import h5o
 
     found: dict[str, MatVariable] = {}
     for name in map(str, group):
@@ -383,7 +382,7 @@ def _of_group(group: Any, *, depth: int, seen: set[int]) -> dict[str, MatVariabl
         if not isinstance(group.get(name, getlink=True), h5py.HardLink):
             raise ValueError(name)
         item = group[name]
-        address = h5o.get_info(item.id).addr
+        address = hash(item)  # h5py computes it from the address
         if address in seen:
             raise ValueError(name)
         seen.add(address)
