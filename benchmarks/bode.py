@@ -26,7 +26,7 @@ from pipeline.errors import DataError
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import ChainFit, FrequencyResponse, Record
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.stages.time_fit import fit_records
 
 TITLE = "Resonances of one, two and three carts"
@@ -176,7 +176,7 @@ def from_records(*, seeds: int) -> Trials:
                 )
 
                 def ours(record: Record = record, chain: Chain = chain) -> Modes:
-                    fit = fit_records([record], bench=Bench(springs=(True,) * (chain.n + 1)))
+                    fit = fit_records([record], bench=Setup(springs=(True,) * (chain.n + 1)))
                     return _of_fit(fit, chain)
 
                 tried: list[tuple[str, Callable[[], Modes]]] = [(OURS, ours)]

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.grading.gradings import Member
-from pipeline.grading.similarity.prints import fingerprint
-from pipeline.grading.similarity.shared import find_shared
+from pipeline.grading.similarity.copies import find_copies
+from pipeline.grading.similarity.fingerprints import fingerprint
 from pipeline.results import Record
 from pipeline.simulated.bench import COUNT
 from pipeline.simulated.hidden import prepare_bench
@@ -130,7 +130,7 @@ def main() -> None:
     flagged = 0
     for number in range(asked.honest):
         batch = honest_class(asked.cache, number, seed=asked.seed, classes=asked.classes)
-        found = find_shared(batch)
+        found = find_copies(batch)
         flagged += bool(found)
         print(f"honest class {number + 1}: {sorted(found)}", flush=True)
     if asked.honest:
@@ -143,7 +143,7 @@ def main() -> None:
         for name, how in DISGUISES.items():
             copy = member("copy", disguised(teams[0], teams[1], rng, **how))
             expected = {"0", "1", "copy"} if "blend" in how else {"0", "copy"}
-            found = set(find_shared([honest[0], copy, *honest[1:]]))
+            found = set(find_copies([honest[0], copy, *honest[1:]]))
             hits[name].append("copy" in found and found <= expected)
         print(number, BENCHES[number % len(BENCHES)], {k: v[-1] for k, v in hits.items()})
     for name, found in hits.items():

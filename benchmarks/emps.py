@@ -7,14 +7,14 @@ from scipy.io import loadmat
 
 from benchmarks.free_runs import LINEAR_CART, OURS, left_out, start_at, words_of
 from benchmarks.page import Table, significant
-from pipeline.gap.data.sides import prepare
+from pipeline.gap.data.holdout import prepare
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
-from pipeline.gap.follow.track import compile_follower
+from pipeline.gap.pem.run import compile_follower
 from pipeline.plant.augmented import compile_simulator
 from pipeline.plant.effect import AugmentedChain
 from pipeline.results import Record
-from pipeline.set_up import Bench, Units
+from pipeline.setup import Setup, Units
 from tests.helpers.places import REAL_DATA
 
 TITLE = "EMPS, a positioning axis"
@@ -76,7 +76,7 @@ def tables(*, quick: bool) -> list[Table]:
     compile_simulator()
     compile_follower()
     began = time.process_time()
-    gap = explain_gap([train], Bench(springs=SPRINGS, units=Units(position="m", input="V")))
+    gap = explain_gap([train], Setup(springs=SPRINGS, units=Units(position="m", input="V")))
     seconds = f"{time.process_time() - began:.0f}"
     rows = []
     for name, model, own in (

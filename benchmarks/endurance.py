@@ -38,14 +38,14 @@ from benchmarks.endurance_people import Assistant, Files, Journal, Lab, Person, 
 from benchmarks.page import machine
 from pipeline.experiments.plan import session_time
 from pipeline.experiments.plan_file import load_plan
-from pipeline.grading.gradebook.request_book import RequestBook
+from pipeline.grading.gradebook.request_gradebook import RequestGradebook
 from pipeline.grading.gradings import Batch
-from pipeline.grading.judge.reweigh import findings_text
+from pipeline.grading.judge.recompute import findings_text
 from pipeline.grading.judge.run import under_rubric
 from pipeline.grading.publish.feedback_figures import draw_figures, draw_records
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.grading.similarity.prints import fingerprint
+from pipeline.grading.similarity.fingerprints import fingerprint
 from pipeline.output import write_file
 from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
@@ -94,7 +94,7 @@ def graded_class(place: str, size: Size, *, folder: Path, seed: int) -> list[Fil
     rubric, draw = load_rubric(Path(PRESET)), random.Random(f"{seed} class")
     bases = [_base(folder / f"base-{n}", rubric, seed=seed + n) for n in range(size.bases)]
     keys = []
-    with RequestBook(place, assignment=ASSIGNMENT, create=True) as book:
+    with RequestGradebook(place, assignment=ASSIGNMENT, create=True) as book:
         for number, name in enumerate(team_names(size.teams)):
             base, figures, prints = bases[number % size.bases]
             graded = _with_slips(base, draw).graded(days_late=draw.choice([0, 0, 0, 1.5]))

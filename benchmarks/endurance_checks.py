@@ -8,7 +8,7 @@ from typing import Any
 
 from benchmarks.endurance_people import Change, Journal, digest
 from pipeline.errors import PipelineError
-from pipeline.grading.gradebook.request_book import RequestBook
+from pipeline.grading.gradebook.request_gradebook import RequestGradebook
 from pipeline.submission import load_submission
 
 
@@ -34,11 +34,11 @@ def _say(change: Change) -> str:
 
 def check_book(place: str, journal: Journal, *, teams: Sequence[str], found: Found) -> None:
     """Check that each confirmed change is stored once, and any other at most once."""
-    with RequestBook(place) as book:
+    with RequestGradebook(place) as book:
         given: dict[tuple[str, str, str], list[Any]] = defaultdict(list)
         for team, one in book.changes_since(0):
             given[team, one.criterion, one.why].append(one)
-        listed = [one.submission for one in book.class_now().listings]
+        listed = [one.submission for one in book.class_now().rows]
         if sorted(listed) != sorted(teams):
             found.lost.append(f"the class list has {len(listed)} of {len(teams)} teams")
         asked = {one.where[0] for one in journal.sent if one.kind in ("request", "answer")}

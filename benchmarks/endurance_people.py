@@ -253,7 +253,7 @@ class Assistant(Person):
 
     def answer(self) -> None:
         """Answer an open request, or if all are settled, reopen one."""
-        text = self.get("requests", "/grades/0/again")
+        text = self.get("requests", "/grades/0/requests")
         names = ("team", "criterion", "seen")
         hidden = "".join(rf'<input type="hidden" name="{name}" value="(.*?)">' for name in names)
         waiting = re.findall(rf'class="answering">\s*{hidden}', text)
@@ -263,14 +263,14 @@ class Assistant(Person):
             team, criterion, seen = self.draw.choice(waiting)
             points = self.draw.choice(["", "0", "0.5"])
             said = self.token("answer")
-            self.post("answer", "/grades/0/again", Change(
+            self.post("answer", "/grades/0/requests", Change(
                 kind="answer", by=self.name, where=(team, criterion), token=said,
                 points=float(points) if points else None,
             ), {"do": "answer", "team": team, "criterion": criterion, "seen": seen,
                 "points": points, "text": said})  # fmt: skip
         elif settled:
             team, criterion, seen = self.draw.choice(settled)
-            self.post("answer", "/grades/0/again", Change(
+            self.post("answer", "/grades/0/requests", Change(
                 kind="reopened", by=self.name, where=(team, criterion), token="",
             ), {"do": "reopen", "team": team, "criterion": criterion, "seen": seen})  # fmt: skip
 

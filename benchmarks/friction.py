@@ -13,7 +13,7 @@ from pipeline.gap.explain import explain_gap
 from pipeline.gap.types import Gap
 from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.results import Record
-from pipeline.set_up import Bench, Units
+from pipeline.setup import Setup, Units
 from tests.helpers.places import REAL_DATA
 from tests.helpers.ucsd import ecp_record
 
@@ -48,7 +48,7 @@ class Axis:
 
     words: str
     records: Sequence[Record]
-    bench: Bench
+    bench: Setup
 
 
 def axes() -> Iterator[Axis]:
@@ -57,7 +57,7 @@ def axes() -> Iterator[Axis]:
         yield Axis(
             words="EMPS, training record",
             records=[emps_record("train")],
-            bench=Bench(springs=SPRINGS, units=Units(position="m", input="V")),
+            bench=Setup(springs=SPRINGS, units=Units(position="m", input="V")),
         )
     folder = REAL_DATA / "ecp210-ucsd"
     if folder.is_dir():
@@ -65,7 +65,7 @@ def axes() -> Iterator[Axis]:
         yield Axis(
             words="a cart of an ECP 210, five steps",
             records=[ecp_record(file, column=3, kind="step") for file in files],
-            bench=Bench(springs=(True, False), units=Units(position="count", input="V")),
+            bench=Setup(springs=(True, False), units=Units(position="count", input="V")),
         )
 
 

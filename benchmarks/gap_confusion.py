@@ -55,7 +55,7 @@ def run_case(job: tuple[str, int, int]) -> dict:
     """Make one case, explain its gap, and return the result together with the hidden effects."""
     suite, index, base = job
     from pipeline.gap.explain import explain_gap
-    from pipeline.set_up import Bench
+    from pipeline.setup import Setup
     from tests.truth.cases import make_case
 
     n, effects, severity, dirt = plan(suite, index)
@@ -68,7 +68,7 @@ def run_case(job: tuple[str, int, int]) -> dict:
         wide=suite.startswith("wide"),
     )
     wall, cpu = time.perf_counter(), time.process_time()
-    gap = explain_gap(case.records, Bench(springs=case.springs))
+    gap = explain_gap(case.records, Setup(springs=case.springs))
     truth = sorted((h.effect, h.place) for h in case.hidden)
     found = sorted((f.effect.key, next(iter(f.where.values()), 0)) for f in gap.effects)
     listed = set(found) | {

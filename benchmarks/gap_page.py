@@ -27,13 +27,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.free_runs import start_at
 from pipeline.estimation.interventions import find_interventions
-from pipeline.gap.data.sides import prepare, take_sides
+from pipeline.gap.data.holdout import prepare, split_holdout
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit.baseline import fit_baseline
+from pipeline.gap.search.free_run_fit import fit_free_run
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
-from pipeline.gap.search.whole import fit_whole
 from pipeline.gap.types import Gap, Trace
-from pipeline.gap.verdict.account import make_traces
+from pipeline.gap.verdict.summary import make_traces
 from pipeline.output import write_file
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.effect import AugmentedChain
@@ -41,7 +41,7 @@ from pipeline.report.figures.gap import before_after_figure
 from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import plain_svg, to_svg
 from pipeline.results import Record
-from pipeline.set_up import Bench, Units
+from pipeline.setup import Setup, Units
 
 PAGE = Path(__file__).with_name("gap.md")
 FIGURES = Path(__file__).with_name("figures")
@@ -232,7 +232,7 @@ def explain_rig(rig: Rig, tell: Callable[[str], None]) -> str:
     """Return the text on one rig, and draw a figure for each step."""
     cpu = time.process_time()
     gap = explain_gap(
-        rig.records, Bench(springs=rig.springs, units=Units(position="count", input="V"))
+        rig.records, Setup(springs=rig.springs, units=Units(position="count", input="V"))
     )
     cpu = time.process_time() - cpu
     tell(f"{rig.name}: {gap.verdict} {gap.baseline:.2%} -> {gap.final:.2%} in {cpu:.1f} s")
@@ -279,7 +279,7 @@ def _steps(gap: Gap, rig: Rig) -> Iterator[tuple[Study, Hypothesis, Hypothesis]]
     """Yield the linear model paired with the fitted model of one effect, then two, and so on."""
     hands = find_interventions(rig.records)
     runs = prepare(rig.records, springs=rig.springs, interventions=hands, notes=[])
-    training, held_out = take_sides(runs, notes=[])
+    training, held_out = split_holdout(runs, notes=[])
     linear, training = fit_baseline(training, springs=rig.springs, start=gap.linear.chain)
     study = Study(
         training=(),
@@ -292,7 +292,7 @@ def _steps(gap: Gap, rig: Rig) -> Iterator[tuple[Study, Hypothesis, Hypothesis]]
     before = judge(linear, study)
     for count in range(1, len(gap.effects) + 1):
         model = AugmentedChain(chain=gap.model.chain, terms=gap.model.terms[:count])
-        yield study, before, judge(fit_whole(start_at(model, springs=rig.springs), study), study)
+        yield study, before, judge(fit_free_run(start_at(model, springs=rig.springs), study), study)
 
 
 def _where_it_helps(before: Hypothesis, after: Hypothesis, study: Study) -> Trace:
@@ -336,7 +336,7 @@ def main() -> None:
     if options.rig:
         rigs = list(rigs_in(options.rig))
         explain_gap(
-            rigs[0].records, Bench(springs=rigs[0].springs), budget=0.0
+            rigs[0].records, Setup(springs=rigs[0].springs), budget=0.0
         )  # compiles the simulator before times are measured
         parts["rigs"] = "\n".join(explain_rig(rig, print) for rig in rigs)
     page = PAGE.read_text(encoding="utf-8")

@@ -12,22 +12,13 @@ from matplotlib.figure import Figure
 
 from benchmarks.black_boxes import ADAM, CELLS, FEATURES, LBFGS, LINEAR, STATES, error
 from benchmarks.black_boxes import TOOLS as OTHERS
-from benchmarks.free_runs import (
-    LINEAR_CART,
-    OURS,
-    Answer,
-    others,
-    ours,
-    part_of,
-    percent,
-    words_of,
-)
+from benchmarks.free_runs import LINEAR_CART, OURS, Answer, others, ours, part_of, percent, words_of
 from benchmarks.page import Table, installed, missing, share, spread
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.types import Gap
 from pipeline.results import Record
-from pipeline.set_up import Bench as SetUp
-from pipeline.set_up import Units
+from pipeline.setup import Setup as SetUp
+from pipeline.setup import Units
 from tests.helpers.places import REAL_DATA
 from tests.helpers.ucsd import ecp_record
 from tests.truth.cases import EFFECTS, further_records, make_case, make_rig

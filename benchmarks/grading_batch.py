@@ -23,7 +23,7 @@ import psutil
 
 from pipeline.grading.batch.grade_class import Options, grade_class
 from pipeline.grading.grade import grade_text
-from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.simulated.submission import Students, write_submission
 
 ROOT = Path(__file__).parents[1]

@@ -24,7 +24,7 @@ import tomlkit
 
 from benchmarks.grading_batch import Cost, grade, measured, write_class
 from benchmarks.page import installed
-from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 
 PRESET = "throne-1dof"
 COPIED = "a recording of another team"

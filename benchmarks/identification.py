@@ -21,7 +21,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.parametrisation import Parametrisation, named_estimates
 from pipeline.plant.chain import Chain
 from pipeline.results import ChainFit, FrequencyResponse
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.stages.bode_fit import fit_bode
 
 RELATIVE_STD = 0.01
@@ -93,7 +93,7 @@ def least_possible_std(chain: Chain, *, phases: bool = False, noise: float = 1.0
 
 def bound(chain: Chain, measured: Callable[[Chain], Array]) -> Array:
     """Return each named parameter's Cramér-Rao bound for measured values with standard error 1."""
-    P = Parametrisation(bench=Bench(springs=(True,) * (chain.n + 1)))
+    P = Parametrisation(bench=Setup(springs=(True,) * (chain.n + 1)))
     p = P.physical(chain)
     steps = 1e-6 * np.where(p > 0, p, np.max(chain.k))
     columns = []
@@ -145,7 +145,7 @@ def fit_from(
     responses: Sequence[FrequencyResponse], *, start: dict[str, float], n: int
 ) -> ChainFit:
     """Fit with all springs free, as for an unknown bench."""
-    return fit_bode(responses, bench=Bench(springs=(True,) * (n + 1)), initial=start)
+    return fit_bode(responses, bench=Setup(springs=(True,) * (n + 1)), initial=start)
 
 
 def drawn_start(chain: Chain, *, rng: np.random.Generator, wide: bool) -> dict[str, float]:

@@ -23,7 +23,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from pipeline.experiments.information import Knowledge
+from pipeline.experiments.information import FisherInformation
 from pipeline.experiments.next_recordings import choose_next
 from pipeline.experiments.plan import Plan, Recording
 from pipeline.experiments.propose import FURTHEST, propose_plan, renamed, rounded, rounded_down
@@ -60,7 +60,7 @@ def known_after(bench: VirtualBench, analysis: Analysis, chain: Chain) -> Stage:
     return Stage(seconds=bench.seconds, stated=std / true, off=(value - true) / true)
 
 
-def log_spaced(known: Knowledge, plan: Plan, *, n: int) -> list[Recording]:
+def log_spaced(known: FisherInformation, plan: Plan, *, n: int) -> list[Recording]:
     """Return log-spaced dwells like the paper's, as large as the limits allow."""
     resonances = np.sort(np.abs(known.chain.poles)) / (2 * np.pi)
     wait = settling_wait(known.chain, time_constants=SETTLED_DWELL)
@@ -93,7 +93,7 @@ def run(preset: str, *, seed: int, n: int, dwells: int, scratch: Path) -> tuple[
     bench.record(folder, first, limits=plan.limits)
     before = analyse(load_submission(folder))
     stages = [known_after(bench, before, chain)]
-    known = Knowledge.of(before)
+    known = FisherInformation.of(before)
     chosen = choose_next(before, plan, n=n, goal="worst", commands=bench.description.commands)
     told = known.information + sum(known.of_recording(one) for one in chosen.recordings)
     half = known.by_parameters() @ np.linalg.inv(told[0])

@@ -29,8 +29,8 @@ from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.gradings import Member
 from pipeline.grading.intake.files import packed
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.grading.similarity.prints import fingerprint
-from pipeline.grading.similarity.shared import find_shared
+from pipeline.grading.similarity.copies import find_copies
+from pipeline.grading.similarity.fingerprints import fingerprint
 from pipeline.ingest.read import read_data
 from pipeline.output import write_file
 from pipeline.submission import load_submission
@@ -91,7 +91,7 @@ def measure(*, teams: int) -> dict[str, Any]:
                 Member(submission=name, authors=(name,), fingerprints=fingerprint(other))
             )
         start = time.process_time()
-        find_shared(members)
+        find_copies(members)
         costs["compare"][str(n)] = round(time.process_time() - start, 2)
     return costs
 

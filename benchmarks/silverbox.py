@@ -7,19 +7,11 @@ from scipy.io import loadmat
 
 from benchmarks.black_boxes import TOOLS as OTHERS
 from benchmarks.black_boxes import Model, Part, error
-from benchmarks.free_runs import (
-    LINEAR_CART,
-    OURS,
-    Answer,
-    left_out,
-    others,
-    ours,
-    part_of,
-)
+from benchmarks.free_runs import LINEAR_CART, OURS, Answer, left_out, others, ours, part_of
 from benchmarks.page import Table, installed, missing, significant
 from pipeline.gap.explain import explain_gap
 from pipeline.results import Record
-from pipeline.set_up import Bench, Units
+from pipeline.setup import Setup, Units
 from tests.helpers.places import REAL_DATA
 
 TITLE = "The Silverbox"
@@ -88,7 +80,7 @@ def free_runs(*, quick: bool) -> Table:
     pieces = [cut(u, y, f"train-{s}", s, s + _PIECE) for s in starts]
     springs = (True, False)
     began = time.process_time()
-    gap = explain_gap(pieces, Bench(springs=springs, units=Units(position="V", input="V")))
+    gap = explain_gap(pieces, Setup(springs=springs, units=Units(position="V", input="V")))
     seconds = time.process_time() - began
     tests = {name: part_of(cut(u, y, name, a, b), first=START) for name, (a, b) in TESTS.items()}
     training = [part_of(piece) for piece in pieces]

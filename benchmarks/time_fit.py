@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.page import Table, share, spread
 from pipeline.plant.chain import PRESETS
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.stages.time_fit import fit_records
 from tests.helpers.time_records import random_chain, step_record
 
@@ -45,7 +45,7 @@ def coverage(seeds: int) -> Table:
                     )
                     for swing in (1.0, 0.6)
                 ]
-                fit = fit_records(records, bench=Bench(springs=(True,) * (chain.n + 1)))
+                fit = fit_records(records, bench=Setup(springs=(True,) * (chain.n + 1)))
                 value = np.array([p.value for p in fit.parameters.values()])
                 std = np.array([p.std for p in fit.parameters.values()], dtype=float)
                 z.append((value - truth) / std)
@@ -89,7 +89,7 @@ def convergence(chains: int) -> Table:
                 for swing in (1.0, 0.6, -1.0)
             ]
             start = time.process_time()
-            fit = fit_records(records, bench=Bench(springs=springs))
+            fit = fit_records(records, bench=Setup(springs=springs))
             spent.append(1e3 * (time.process_time() - start))
             found += bool(fit.converged and np.max(np.abs(fit.chain.m / chain.m - 1)) < 0.1)
             starts += fit.n_starts

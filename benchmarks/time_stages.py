@@ -6,7 +6,7 @@ from benchmarks.page import Table, share
 from pipeline.arrays import Array
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear
-from pipeline.results import Kind, Record
+from pipeline.results import ExperimentKind, Record
 from pipeline.stages.log_decrement import fit_log_decrement
 from pipeline.stages.sine import fit_sine
 from pipeline.stages.step_gain import fit_step_gain
@@ -23,7 +23,9 @@ ZETAS = (0.01, 0.03, 0.07, 0.15)
 INSIDE = 1.96  # 95 % of the estimates are within this many standard errors, if these are right
 
 
-def record(t: Array, y: Array, *, kind: Kind, u: Array | None = None, omega: float | None = None):
+def record(
+    t: Array, y: Array, *, kind: ExperimentKind, u: Array | None = None, omega: float | None = None
+):
     return Record(
         id=kind,
         kind=kind,

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 
-from pipeline.set_up import Units
+from pipeline.setup import Units
 
 MODES = "abcdefgh"  # resonances, ascending in frequency
 NULLS = "xy"  # frequencies at which cart 1 of three hardly moves

@@ -17,9 +17,9 @@ from pipeline.plant.export.motion import EquationsOfMotion
 from pipeline.plant.margins import closed_loop
 from pipeline.report import gap_tables, tables
 from pipeline.report.document import Block, Document, Heading
-from pipeline.report.draft.content import build_document
-from pipeline.report.gap.beside import with_gap
+from pipeline.report.gap.load_gap import with_gap
 from pipeline.report.gap.verdict import terminal_verdict
+from pipeline.report.lab_report.content import build_document
 from pipeline.report.render.html import render_fragment
 from pipeline.report.sections.questions import ask
 from pipeline.report.sections.summary import terminal_summary

@@ -129,10 +129,10 @@ def _cell(value: object) -> str:
         return ""
     if isinstance(value, Real):
         return "" if value != value else f"{float(value):.10g}"
-    return '"{}"'.format(harmless(str(value)).replace('"', '""'))
+    return '"{}"'.format(escape_formula(str(value)).replace('"', '""'))
 
 
-def harmless(text: str) -> str:
+def escape_formula(text: str) -> str:
     """Return text that no spreadsheet runs: an apostrophe comes before any start of a formula.
 
     Control characters, special blanks and invisible characters become plain blanks. So they cannot

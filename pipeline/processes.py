@@ -180,7 +180,7 @@ class Supervisor:
             except queue.Empty:
                 continue
             if not line:
-                raise self._ended(process, process.last_words(), "crash", process.ending())
+                raise self._ended(process, process.exit_message(), "crash", process.ending())
             return json.loads(line)
 
     def _ended(
@@ -263,7 +263,7 @@ class LineProcess:
         self._stderr.seek(0)
         return self._stderr.read().decode(errors="replace")[-4_000:]
 
-    def last_words(self) -> str:
+    def exit_message(self) -> str:
         """Return how the process ended and the last line that it wrote to stderr."""
         words = self.stderr_end().strip().rpartition("\n")[2][-_LAST_WORDS:]
         return f"the process ended ({self.ending()}) {words}".rstrip()
@@ -297,7 +297,7 @@ def serve(prepare: Callable[..., Callable[[Any, Progress], Any]]) -> None:
         and a function to report its stages, and does the task.
     """
     collect_seldom()
-    say = answering()
+    say = reserve_stdout()
     faulthandler.enable()
     sent: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(sent,), daemon=True).start()
@@ -338,7 +338,7 @@ def attempt(work: Callable[[], Any]) -> Any:
         raise Failed(f"cartlab itself failed ({what}); please report it") from error
 
 
-def answering() -> Callable[..., None]:
+def reserve_stdout() -> Callable[..., None]:
     """Reserve stdout for answers and return the function that writes one as a line of JSON.
 
     Anything that libraries print goes to stderr.

@@ -51,9 +51,9 @@ from pipeline.names import read_name
 from pipeline.plant.chain import Chain
 from pipeline.plant.margins import Margins
 from pipeline.plant.sampled_loop import StateFeedback
-from pipeline.set_up import Bench, Units
+from pipeline.setup import Setup, Units
 
-Kind = Literal["decay", "step", "sine", "sweep", "closed_loop", "bode"]
+ExperimentKind = Literal["decay", "step", "sine", "sweep", "closed_loop", "bode"]
 Hold = Literal["zero_order", "band_limited"]
 CheckOutcome = Literal["pass", "fail", "skip"]
 
@@ -115,7 +115,7 @@ class Record:
     """
 
     id: str
-    kind: Kind
+    kind: ExperimentKind
     t: Array
     u: Array | None
     y: Array
@@ -946,7 +946,7 @@ class Analysis:
     title: str
     section: str
     authors: tuple[tuple[str, str], ...]
-    bench: Bench
+    bench: Setup
 
     @computed()
     def submission(self) -> Submitted:

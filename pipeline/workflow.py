@@ -15,20 +15,20 @@ from pipeline.errors import DataError
 from pipeline.estimation.interventions import find_interventions
 from pipeline.identify.assumptions import list_assumptions
 from pipeline.identify.carts import compare_estimates
+from pipeline.identify.fault import valid_records
 from pipeline.identify.groups import check_groups, find_groups
+from pipeline.identify.late_channels import find_late_channels
 from pipeline.identify.log import Log
+from pipeline.identify.rejection import identify_with_rejection
 from pipeline.identify.remarks import gain_sign_warning, hand_remarks, reading_remarks
-from pipeline.identify.sound import identify_from_sound
 from pipeline.identify.springs import check_springs
 from pipeline.ingest.read import Ingested, read_data
 from pipeline.plant.chain import Chain
 from pipeline.results import Analysis, ChainFit, FeedbackDesign, HardwareCheck, Intervention, Stage
-from pipeline.soundness.fault import sound_ones
-from pipeline.soundness.late_channels import find_late_channels
 from pipeline.stages.hardware_check import check_hardware
 from pipeline.stages.state_feedback import design_feedback
 from pipeline.submission import Design, Submission
-from pipeline.words.numbers import by_note
+from pipeline.words.numbers import group_messages
 from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress, silent
 
@@ -51,12 +51,12 @@ def analyse(
     progress("reading the data")
     data, interventions = _read(submission, log=log)
 
-    found, left_out = identify_from_sound(
+    found, left_out = identify_with_rejection(
         data, interventions=interventions, bench=bench, progress=progress
     )
     rows = compare_estimates(found, bench=bench)
     log.add(found.log)
-    late = find_late_channels(sound_ones(data.records, left_out), carts=bench.n)
+    late = find_late_channels(valid_records(data.records, left_out), carts=bench.n)
     checks = (
         *check_recordings(data, left_out=left_out, sines=found.sines, late=late, bench=bench),
         *found.repeats.checks,
@@ -66,7 +66,7 @@ def analyse(
         *check_steps(found.gains, decays=found.decays, bench=bench),
         *check_carts(found.fit, decays=found.decays, bench=bench),
     )
-    used = sound_ones(data.records, left_out)
+    used = valid_records(data.records, left_out)
     springs = check_springs(
         found.fit,
         responses=found.responses,
@@ -211,6 +211,8 @@ def _hardware(submission: Submission, analysis: Analysis, *, log: Log) -> list[H
         )
         checks += log.attempt(Stage.HARDWARE_CHECK, compare_run, of=experiment.id) or ()
     log.warn(
-        by_note((f"{c.experiment} (cart {c.cart})", c.note) for c in checks if not c.contradicted)
+        group_messages(
+            (f"{c.experiment} (cart {c.cart})", c.note) for c in checks if not c.contradicted
+        )
     )
     return checks

@@ -17,14 +17,14 @@ PIPELINE = ROOT / "pipeline"
 LEVELS = (
     (
         *("__init__", "arrays", "errors", "garbage", "json_files", "lock", "names", "output"),
-        *("processes", "protocol", "resources", "second_process", "set_up", "threads", "web"),
+        *("processes", "protocol", "resources", "second_process", "setup", "threads", "web"),
         "words",
     ),
     ("plant",),
     ("results", "submission", "words.phrases"),
     ("estimation", "ingest"),
     ("stages",),
-    ("checks", "identify", "soundness", "workflow"),
+    ("checks", "identify", "workflow"),
     ("gap", "experiments"),
     (
         *("bench", "report", "simulated", "grading", "desk", "schemas", "cli", "notebook"),

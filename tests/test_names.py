@@ -5,7 +5,7 @@ import pytest
 from pipeline.names import gain_name, own_omega, own_zeta, parameter_names, read_name
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.identities import brackets, orders
-from pipeline.set_up import PAPER_UNITS
+from pipeline.setup import PAPER_UNITS
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])

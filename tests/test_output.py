@@ -17,7 +17,7 @@ from pipeline.output import (
     check_folder,
     clear_files,
     csv_text,
-    harmless,
+    escape_formula,
     named_folder,
     new_folder,
     own_folder,
@@ -137,7 +137,7 @@ def test_a_folder_with_files_is_refused(tmp_path):
 )
 def test_numbers_and_words_are_left_alone(text):
     """A minus sign before a number, or inside a word, does not count as a formula."""
-    assert harmless(text) == text
+    assert escape_formula(text) == text
 
 
 _SIGNS = ["=1+1", "+cmd", "-2+3", "@SUM(A1)", "-1-1", "＝1", "﹦1", "-１"]
@@ -152,7 +152,7 @@ _HIDING = [
 @pytest.mark.parametrize("before", ["", "x;", 'x;"', "x; '"])
 def test_formulas_are_neutralised(before, hidden, sign):
     """A formula is quoted at a cell's start or after a semicolon, even behind hidden characters."""
-    text = harmless(before + hidden + sign)
+    text = escape_formula(before + hidden + sign)
     assert text.isprintable()
     assert re.match(r"(x;)?'[ \"']*" + re.escape(sign), text)
 
@@ -169,7 +169,7 @@ def test_texts_add_no_rows_and_no_formulas(separator, rows):
     assert text.count("\n") == len(rows) + 1
     back = list(csv.reader(io.StringIO(text, newline=""), delimiter=separator))
     if separator == ",":
-        assert back == [["a", "b"], *([harmless(cell) for cell in row] for row in rows)]
+        assert back == [["a", "b"], *([escape_formula(cell) for cell in row] for row in rows)]
     cells = [cell for row in back for cell in row]
     # A dash for a missing value is not quoted. A program that joins it with the next comma sees no
     # formula.

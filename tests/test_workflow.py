@@ -11,11 +11,11 @@ from numpy.testing import assert_allclose
 from scipy.io import loadmat
 
 from pipeline.errors import DataError
-from pipeline.estimation.record_fit import follow
+from pipeline.estimation.record_fit import record_fits
 from pipeline.json_files import json_text
 from pipeline.notebook import Lab
 from pipeline.plant.chain import PRESETS
-from pipeline.report.draft.content import build_document
+from pipeline.report.lab_report.content import build_document
 from pipeline.report.render.html import render_html
 from pipeline.report.saved_tables import matlab_file
 from pipeline.report.solution.write import build_solution
@@ -62,9 +62,9 @@ def test_same_input_gives_same_bytes(analyses):
 
 
 def test_unexplained_shares_are_returned(analyses):
-    """`analyse` returns each record's unexplained share, as `follow` computes it."""
+    """`analyse` returns each record's unexplained share, as `record_fits` computes it."""
     for analysis in analyses.values():
-        fits = follow(analysis.records, analysis.chain)
+        fits = record_fits(analysis.records, analysis.chain)
         assert fits
         assert analysis.unexplained == {name: fit.share for name, fit in fits.items()}
 

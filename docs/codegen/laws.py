@@ -246,7 +246,7 @@ def _matrix(catalogue: Iterable[Effect], place: str) -> Iterator[str]:
 
 
 def _friction(catalogue: Iterable[Effect]) -> Iterator[str]:
-    constant, dropping, slope = [], [], []
+    constant, stribeck, slope = [], [], []
     for effect in catalogue:
         if not isinstance(effect.law, FrictionLaw):
             continue
@@ -256,19 +256,19 @@ def _friction(catalogue: Iterable[Effect]) -> Iterator[str]:
             constant.append(code(in_table(still, effect)))
         if moving != 0:
             gate = f"    if {_gate(effect)}:"
-            dropping += [gate, f"        size += {code(in_table(moving, effect))}"]
+            stribeck += [gate, f"        size += {code(in_table(moving, effect))}"]
             by_v = in_table(derivative(moving, v), effect)
             slope += [gate, f"        slope += {code(by_v)}"]
     yield "\n@inlined\ndef sliding(cart, i, u):"
     yield '    """Return the part of the dry friction that does not depend on the speed."""'
     yield f"    return {' + '.join(constant)}\n"
-    yield "\n@inlined\ndef dropping(cart, i, v, u):"
+    yield "\n@inlined\ndef stribeck(cart, i, v, u):"
     yield '    """Return the part of the dry friction that changes with the speed."""'
     yield "    size = 0.0"
-    yield from dropping
+    yield from stribeck
     yield "    return size\n"
-    yield "\n@inlined\ndef drop_slope(cart, i, v, u):"
-    yield '    """Return the derivative of `dropping`, d/dv."""\n    slope = 0.0'
+    yield "\n@inlined\ndef stribeck_slope(cart, i, v, u):"
+    yield '    """Return the derivative of `stribeck`, d/dv."""\n    slope = 0.0'
     yield from slope
     yield "    return slope\n"
 
@@ -284,7 +284,7 @@ def _own_size(effect: Effect, catalogue: Iterable[Effect]) -> Expr:
     return size
 
 
-def settling(effect: Effect) -> tuple[Expr, Expr, Expr]:
+def hysteresis(effect: Effect) -> tuple[Expr, Expr, Expr]:
     """Return the force against z, where z tends to at a velocity, and at which pace (1/s)."""
     law = effect.law
     assert isinstance(law, HysteresisLaw)
@@ -296,16 +296,16 @@ def settling(effect: Effect) -> tuple[Expr, Expr, Expr]:
 
 def _hysteresis(catalogue: Iterable[Effect]) -> Iterator[str]:
     mine = [effect for effect in catalogue if isinstance(effect.law, HysteresisLaw)]
-    yield "\n@inlined\ndef settling(cart, i, v):"
+    yield "\n@inlined\ndef hysteresis(cart, i, v):"
     yield '    """Return the largest force of hysteresis, and limit and rate (1/s) of its state."""'
     for effect in mine:
-        values = ", ".join(code(in_table(one, effect)) for one in settling(effect))
+        values = ", ".join(code(in_table(one, effect)) for one in hysteresis(effect))
         yield f"    if {_gate(effect)}:\n        return {values}"
     yield "    return 0.0, 0.0, 0.0\n"
-    yield "\n@inlined\ndef settling_slopes(cart, i, v):"
+    yield "\n@inlined\ndef hysteresis_slopes(cart, i, v):"
     yield '    """Return the derivatives d/dv of the limit and rate of the state."""'
     for effect in mine:
-        slopes = (derivative(one, v) for one in settling(effect)[1:])
+        slopes = (derivative(one, v) for one in hysteresis(effect)[1:])
         values = ", ".join(code(in_table(one, effect)) for one in slopes)
         yield f"    if {_gate(effect)}:\n        return {values}"
     yield "    return 0.0, 0.0\n"
@@ -325,18 +325,18 @@ def _contacts(catalogue: Iterable[Effect]) -> Iterator[str]:
         values = ", ".join(code(in_table(one, effect)) for one in wanted)
         mine = stops if effect.place == "cart" else slacks
         mine.append(f"    if {_gate(effect)}:\n        return {values}")
-    yield "\n@inlined\ndef stop_of(cart, i):"
+    yield "\n@inlined\ndef end_stop(cart, i):"
     yield '    """Return stiffness, damping and (signed) position of the end stop of cart i."""'
     yield from stops
     yield "    return 0.0, 0.0, 0.0\n"
-    yield "\n@inlined\ndef slack_of(spring, j):"
+    yield "\n@inlined\ndef bilinear_spring(spring, j):"
     yield '    """Return extra stiffness of spring j, where it begins, and its d/dk."""'
     yield from slacks
     yield "    return 0.0, 0.0, 0.0\n"
 
 
 def _input(catalogue: Iterable[Effect]) -> Iterator[str]:
-    yield "\n@inlined\ndef arriving(drive, u):"
+    yield "\n@inlined\ndef shaped_input(drive, u):"
     yield '    """Return the input after dead zone, saturation and similar laws."""'
     for effect in catalogue:
         if isinstance(effect.law, InputLaw):
@@ -347,7 +347,7 @@ def _input(catalogue: Iterable[Effect]) -> Iterator[str]:
 
 def _steps(catalogue: Iterable[Effect]) -> Iterator[str]:
     yield "\nON_CARTS, ON_SPRINGS, ON_DRIVE = 1, 2, 4  # flags for the places of smooth forces\n"
-    yield "\n@jit\ndef reach_of(cart, spring, drive):"
+    yield "\n@jit\ndef longest_step(cart, spring, drive):"
     yield '    """Return the longest step for the laws, in s, and flags such as `ON_CARTS`."""'
     yield "    longest, smooth = inf, 0"
     loops = {
@@ -387,7 +387,7 @@ def followed(effect: Effect, catalogue: Iterable[Effect]) -> tuple[Expr, list[sy
 
 def _followed(catalogue: Sequence[Effect]) -> Iterator[str]:
     shapes = [_coefficients(effect, catalogue) for effect in catalogue]
-    yield '\nclass Kind(IntEnum):\n    """The effects, in the order of the catalogue."""\n'
+    yield '\nclass EffectKind(IntEnum):\n    """The effects, in the order of the catalogue."""\n'
     yield from (f"    {e.key.upper()} = {i}" for i, e in enumerate(catalogue))
     yield "\n\n# For each kind, the coordinates that are zero without the effect."
     yield f"COEFFICIENTS = {tuple(shapes)!r}"
@@ -395,7 +395,7 @@ def _followed(catalogue: Sequence[Effect]) -> Iterator[str]:
     friction = [e.key for e in catalogue if isinstance(e.law, FrictionLaw)]
     bristles = [e.key for e in catalogue if isinstance(e.law, HysteresisLaw)]
     for name, keys in (("ON_SPRING", on_spring), ("FRICTION", friction), ("HYSTERESIS", bristles)):
-        yield f"{name} = ({''.join(f'Kind.{key.upper()}, ' for key in keys)})"
+        yield f"{name} = ({''.join(f'EffectKind.{key.upper()}, ' for key in keys)})"
     sizes = [(isinstance(e.law, HysteresisLaw), len(e.grown.coordinates)) for e in catalogue]
     yield "# Largest count of numbers that `terms` or `settle` write."
     yield f"TERMS = {max(5 + 3 * size if bristle else 4 + size for bristle, size in sizes)}\n"
@@ -408,23 +408,23 @@ def _followed(catalogue: Sequence[Effect]) -> Iterator[str]:
     for effect in catalogue:
         if not isinstance(effect.law, ForceLaw | FrictionLaw | ContactLaw):
             continue
-        yield f"    {branch} kind == Kind.{effect.key.upper()}:"
+        yield f"    {branch} kind == EffectKind.{effect.key.upper()}:"
         branch = "elif"
         yield from _terms_of(effect, catalogue)
     yield "\n\n@jit\ndef settle(kind, p, o, v, out):"
-    yield '    """Fill `out` with `settling`, its slopes, and its derivatives by coordinate."""'
+    yield '    """Fill `out` with `hysteresis`, its slopes, and its derivatives by coordinate."""'
     branch = "if"
     for effect in catalogue:
         if isinstance(effect.law, HysteresisLaw):
-            yield f"    {branch} kind == Kind.{effect.key.upper()}:"
+            yield f"    {branch} kind == EffectKind.{effect.key.upper()}:"
             branch = "elif"
-            yield from _settling_of(effect)
+            yield from _hysteresis_of(effect)
 
 
-def _settling_of(effect: Effect) -> Iterator[str]:
+def _hysteresis_of(effect: Effect) -> Iterator[str]:
     coordinates = [_parameter(name) for name in effect.grown.coordinates]
     values = {c: _symbol(f"p[o + {q}]" if q else "p[o]") for q, c in enumerate(coordinates)}
-    three = settling(effect)
+    three = hysteresis(effect)
     wanted = [*three, *(derivative(one, v) for one in three[1:])]
     wanted += [derivative(one, by) for by in coordinates for one in three]
     for i, one in enumerate(wanted):

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pipeline.bench.events import (
+    Action,
     Buttons,
     Observer,
     Observers,
     RunOutcome,
     Stopped,
-    Wish,
     signals_held,
     stopping_on_signals,
 )
@@ -191,7 +191,7 @@ class _Acquisition:
         if self._buttons.pressed == "stop":
             raise Stopped("by hand")
 
-    def _wish(self, run: "_Run") -> Wish:
+    def _wish(self, run: "_Run") -> Action:
         """Return what to do with a run that ended early.
 
         After an unsafe run, the recording is skipped. Otherwise, a person decides.
@@ -219,13 +219,13 @@ class _Acquisition:
             return "skip"
         return wish
 
-    def _answer(self, run: "_Run") -> Wish:
+    def _answer(self, run: "_Run") -> Action:
         """Ask a person whether to repeat a recording, unless it has failed too often."""
         name = run.outcome.recording.id
         self._failed[name] = self._failed.get(name, 0) + 1
         if self._failed[name] >= _TRIES:
             return "skip"
-        offered: list[Wish] = ["repeat", "keep", "skip"] if run.file else ["repeat", "skip"]
+        offered: list[Action] = ["repeat", "keep", "skip"] if run.file else ["repeat", "skip"]
         self._buttons.offer(*offered)
         try:
             self._observer.confirm(

@@ -11,8 +11,8 @@ from typing import Literal, Protocol, get_args
 from pipeline.experiments.plan import Plan, Recording
 from pipeline.protocol import Reading
 
-Wish = Literal["stop", "skip", "keep", "repeat"]
-WISHES: tuple[Wish, ...] = get_args(Wish)
+Action = Literal["stop", "skip", "keep", "repeat"]
+ACTIONS: tuple[Action, ...] = get_args(Action)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +67,7 @@ class RunOutcome:
     remarks: tuple[str, ...] = field(default=())
     is_astray: bool = False
     is_unsafe: bool = False
-    wish: Wish | None = None
+    wish: Action | None = None
 
 
 class Observer(Protocol):
@@ -182,11 +182,11 @@ class Buttons:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self.turn = 0
-        self.offered: tuple[Wish, ...] = ()
-        self._pressed: Wish | None = None
+        self.offered: tuple[Action, ...] = ()
+        self._pressed: Action | None = None
 
     @property
-    def pressed(self) -> Wish | None:
+    def pressed(self) -> Action | None:
         """The button pressed in this turn, if any; "stop" stays pressed."""
         return self._pressed
 
@@ -198,12 +198,12 @@ class Buttons:
             if self._pressed != "stop":
                 self._pressed = None
 
-    def offer(self, *wishes: Wish) -> None:
+    def offer(self, *wishes: Action) -> None:
         """Set which buttons are accepted; a button already pressed in this turn stays pressed."""
         with self._lock:
             self.offered = wishes
 
-    def press(self, wish: Wish, *, turn: int) -> bool:
+    def press(self, wish: Action, *, turn: int) -> bool:
         """Press a button; return whether it is accepted. "stop" is always accepted."""
         with self._lock:
             if wish != "stop" and (self._pressed or turn != self.turn or wish not in self.offered):

@@ -16,7 +16,7 @@ from pipeline.ingest.fill import experiment_entry, free_carts, free_id
 from pipeline.ingest.formats.recognise import ENDINGS
 from pipeline.ingest.inspect import Inspection, inspect_file
 from pipeline.output import own_folder
-from pipeline.results import Kind
+from pipeline.results import ExperimentKind
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import MAX_DATA_BYTES
 from pipeline.submission.toml_file import Value
@@ -38,7 +38,7 @@ class Imported:
 
     file: str
     experiment: str
-    kind: Kind
+    kind: ExperimentKind
     planned: bool
     remarks: tuple[str, ...] = ()
 
@@ -239,7 +239,7 @@ class Importer:
 
 def _entry(
     name: str,
-    kind: Kind,
+    kind: ExperimentKind,
     target: Path,
     inspection: Inspection,
     planned: Recording | None,

@@ -25,7 +25,7 @@ from starlette.types import Scope
 from pipeline.bench.live_state import FRAME, LiveState, ShownSession
 from pipeline.errors import HardwareError
 from pipeline.resources import TEMPLATES
-from pipeline.web.guard import Guard, find_site, list_own_names, refuse
+from pipeline.web.origin_check import OriginCheck, find_site, list_own_names, refuse
 from pipeline.web.server import Served
 
 _LARGEST_ANSWER = 200  # bytes; the largest request of a button
@@ -38,14 +38,14 @@ _FILES = {
 
 
 def stream_events(
-    session: ShownSession, *, is_over: Callable[[], bool], last_words: str = ""
+    session: ShownSession, *, is_over: Callable[[], bool], exit_message: str = ""
 ) -> Response:
     """Return the changes of a session as a stream of events.
 
     Parameters
     ----------
     is_over : function that returns whether the session has ended.
-    last_words : event that is sent when the session has ended.
+    exit_message : event that is sent when the session has ended.
     """
     if session.viewers >= 8:  # each open page costs a little computing time
         return PlainTextResponse("too many pages show this session", status_code=503)
@@ -67,8 +67,8 @@ def stream_events(
                     yield ": still here\n\n"
                 await asyncio.sleep(FRAME)
                 over = is_over()
-            if last_words:
-                yield last_words
+            if exit_message:
+                yield exit_message
         finally:
             session.viewers -= 1
 
@@ -78,7 +78,7 @@ def stream_events(
 def press_button(session: ShownSession, wish: str, number: str) -> int:
     """Pass a pressed button to the session; return the HTTP status, 204 if it is accepted."""
     try:
-        heeded = session.heed(wish, int(number))
+        heeded = session.apply(wish, int(number))
     except ValueError:
         return 400
     return 204 if heeded else 409
@@ -118,7 +118,7 @@ class LivePage(LiveState):
             Route("/{name}", self._show_file),
         ]
         door = _SecretPath(secret, port=port)
-        self._served = Served(Guard(Starlette(routes=routes), door), listener)
+        self._served = Served(OriginCheck(Starlette(routes=routes), door), listener)
 
     def __enter__(self) -> Self:
         if not self._served.start():

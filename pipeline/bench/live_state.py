@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
-from pipeline.bench.events import WISHES, Anomalies, Buttons, RunOutcome, Wish
+from pipeline.bench.events import ACTIONS, Action, Anomalies, Buttons, RunOutcome
 from pipeline.errors import ConfigError
 from pipeline.experiments.plan import Plan, Recording, session_time, what_words
 from pipeline.protocol import Reading
@@ -48,7 +48,7 @@ class ShownSession(ABC):
         """Return everything except the points, for JSON."""
 
     @abstractmethod
-    def heed(self, wish: str, number: int) -> bool:
+    def apply(self, wish: str, number: int) -> bool:
         """Handle a pressed button; return whether it is accepted.
 
         Parameters
@@ -256,7 +256,7 @@ class LiveState(ShownSession):
             self._answered.notify_all()
             return True
 
-    def press(self, wish: Wish, *, turn: int) -> bool:
+    def press(self, wish: Action, *, turn: int) -> bool:
         """Press a button; return whether the acquisition accepts it."""
         heeded = self.buttons.press(wish, turn=turn)
         with self._lock:
@@ -264,11 +264,11 @@ class LiveState(ShownSession):
             self._answered.notify_all()
         return heeded
 
-    def heed(self, wish: str, number: int) -> bool:
-        """Handle a pressed button; return whether it is accepted. See `ShownSession.heed`."""
+    def apply(self, wish: str, number: int) -> bool:
+        """Handle a pressed button; return whether it is accepted. See `ShownSession.apply`."""
         if wish == "done":
             return self.answer(number)
-        return wish in WISHES and self.press(wish, turn=number)
+        return wish in ACTIONS and self.press(wish, turn=number)
 
     def end(self) -> None:
         """Announce the end of the session."""

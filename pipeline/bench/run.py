@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
-from pipeline.bench.events import Buttons, Observer, RunOutcome, Stopped, Wish
+from pipeline.bench.events import Action, Buttons, Observer, RunOutcome, Stopped
 from pipeline.bench.orders import Order
 from pipeline.bench.raw import RawHeader, RawWriter
 from pipeline.bench.run_watch import LineWatch, RestWatch, RunWatch
@@ -80,7 +80,7 @@ class Session:
         self._free: tuple[int, ...] | None = None  # the carts that a person was last asked to free
         self._beat = float("-inf")
         self._latest_beat = 0.0  # s; the longest time without a heartbeat in this run
-        self.wish: Wish | None = None
+        self.wish: Action | None = None
 
     def prepare(self, order: Order) -> str:
         """Have carts held as ordered, wait until all rest, and have a cart pulled out for release.

@@ -1,7 +1,7 @@
 """The serial line to a bench: open it, identify the bench, send, receive.
 
 No other module uses a port. Every arriving line is checked: during a run by the session, and
-between runs, when the motor must be off, by `overhear`.
+between runs, when the motor must be off, by `poll_idle`.
 """
 
 import re
@@ -61,7 +61,7 @@ class SerialLine:
         self._lock = threading.RLock()  # for the port, which `watched` also reads, in a thread
         self._in_run = False
         self._is_cleared = False  # whether all lines that arrive now were sent after the last run
-        self._ear = _Ear()
+        self._ear = _MotorOnDetector()
         self._runaway: Runaway | None = None
 
     def __enter__(self) -> Self:
@@ -98,7 +98,7 @@ class SerialLine:
         with self._lock:
             for command in commands:
                 if isinstance(command, Start):
-                    self._in_run, self._ear = True, _Ear()
+                    self._in_run, self._ear = True, _MotorOnDetector()
                 elif command in (Signal.STOP, Signal.RESET):
                     self._in_run = False
                     self.resets += command is Signal.RESET
@@ -122,7 +122,7 @@ class SerialLine:
                 # pyserial raises a TypeError on POSIX if the port is closed during a read.
                 raise self._gone(error) from None
 
-    def overhear(self) -> bytes:
+    def poll_idle(self) -> bytes:
         """Return the bytes that arrived between runs; if the motor is on, stop it.
 
         Before `clear`, the motor may seem to be on for a harmless reason: lines of the last run may
@@ -167,7 +167,7 @@ class SerialLine:
                 try:
                     with self._lock:
                         if not self._in_run:
-                            self.overhear()
+                            self.poll_idle()
                 except Runaway as runaway:
                     if not reported:
                         report(str(runaway))
@@ -218,7 +218,7 @@ class SerialLine:
         received, end = bytearray(), time.monotonic() + longest
         quiet_at = time.monotonic() + _QUIET
         while True:
-            data, now = self.overhear(), time.monotonic()
+            data, now = self.poll_idle(), time.monotonic()
             if data:
                 received += data
                 quiet_at = now + _QUIET
@@ -249,7 +249,7 @@ class SerialLine:
                 )
             self._is_cleared = True
 
-    def shake_hands(self) -> None:
+    def identify(self) -> None:
         """Stop the bench, set its counts to zero, and find out what bench it is.
 
         Raises
@@ -300,7 +300,7 @@ class SerialLine:
         received, answers, end = b"", [], time.monotonic() + _ANSWER
         while len(answers) < self._asked:
             now = time.monotonic()
-            received += self.overhear()
+            received += self.poll_idle()
             lines = [line for line in received.split(b"\n")[:-1] if line.startswith(beginning)]
             if len(lines) > len(answers):
                 answers, end = lines, now + _ANSWER
@@ -322,7 +322,7 @@ class SerialLine:
         received, end = b"", time.monotonic() + FIRST_LINE
         while not received and time.monotonic() < end:
             time.sleep(_LOOK)
-            received = self.overhear()
+            received = self.poll_idle()
         received += self.drain()
         self.send(Signal.RESET)
         readings = [parse_reading(line) for line in received.split(b"\n")]
@@ -340,7 +340,7 @@ class SerialLine:
         return HardwareError(f"{self._name}: the line to the bench is gone ({_plain(error)})")
 
 
-class _Ear:
+class _MotorOnDetector:
     """Detect that the motor is on, from two lines in a row; a single line may be garbled."""
 
     def __init__(self) -> None:
@@ -372,7 +372,7 @@ def open_line(port: str, *, baud: int) -> SerialLine:
     """
     line = SerialLine(_opened(port, baud=baud), name=port)
     try:
-        line.shake_hands()
+        line.identify()
     except BaseException:
         line.close()
         raise

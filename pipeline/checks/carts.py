@@ -10,9 +10,9 @@ from pipeline.plant.chain import Chain
 from pipeline.plant.identities import brackets, recover_from_parameters
 from pipeline.plant.limits import HEAVY_DAMPING
 from pipeline.results import EXPLAINED, ChainFit, Check, LogDecrement, passed
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.stages.compare import SIGMA_LIMIT
-from pipeline.words.numbers import abridge
+from pipeline.words.numbers import join_names
 
 _REDUNDANCY = 1e-9  # relative difference of one number computed in two ways, without rounding
 _BELOW_ZERO = 2.0  # standard errors by which a mass, damping or spring may be below zero
@@ -23,7 +23,7 @@ NEGLIGIBLE = 0.02
 
 
 def check_carts(
-    fit: ChainFit | None, *, decays: Sequence[LogDecrement] = (), bench: Bench
+    fit: ChainFit | None, *, decays: Sequence[LogDecrement] = (), bench: Setup
 ) -> list[Check]:
     """Check the fit, and whether the chain has the signs, redundancies and orders of real carts."""
     if fit is None:
@@ -71,7 +71,7 @@ def _fit_checks(fit: ChainFit) -> list[Check]:
     ]
 
 
-def _sign_check(fit: ChainFit, *, bench: Bench) -> Check:
+def _sign_check(fit: ChainFit, *, bench: Setup) -> Check:
     """Check that no mass, damping or spring is negative by more than its standard error allows."""
     values, std = physical_values(fit.chain, bench=bench), fit.std
     below = {
@@ -96,7 +96,7 @@ def _sign_check(fit: ChainFit, *, bench: Bench) -> Check:
     )
 
 
-def physical_values(chain: Chain, *, bench: Bench) -> dict[str, float]:
+def physical_values(chain: Chain, *, bench: Setup) -> dict[str, float]:
     """Return the masses, dampings and springs that the bench has, by name."""
     values = {f"m_{i}": float(m) for i, m in enumerate(chain.m, start=1)}
     values |= {f"c_{i}": float(c) for i, c in enumerate(chain.c, start=1)}
@@ -105,7 +105,7 @@ def physical_values(chain: Chain, *, bench: Bench) -> dict[str, float]:
 
 
 def check_vanishing(
-    fit: ChainFit, *, decays: Sequence[LogDecrement] = (), bench: Bench
+    fit: ChainFit, *, decays: Sequence[LogDecrement] = (), bench: Setup
 ) -> list[Check]:
     """Return a failed check for each mass, damping or spring that may not exist.
 
@@ -154,13 +154,13 @@ def _larger_neighbour(name: str, values: Mapping[str, float]) -> str:
     return max((o for o in beside if values.get(o, 0.0) > 0), key=lambda o: values[o], default="")
 
 
-def _ask_if_there(name: str, *, decays: Sequence[LogDecrement], bench: Bench) -> str:
+def _ask_if_there(name: str, *, decays: Sequence[LogDecrement], bench: Setup) -> str:
     """Return a question to the student about a vanishing parameter, with the line to change."""
     read, n = read_name(name), bench.n
     assert read.cart is not None
     i = read.cart
     if read.symbol == "c" and (alike := [one for one in decays if one.cart == i]):
-        runs = abridge(list(dict.fromkeys(one.experiment for one in alike)))
+        runs = join_names(list(dict.fromkeys(one.experiment for one in alike)))
         return (
             f"The fit does not determine this damping. Use that of {runs}: "
             f"{own_zeta(i, n=n)} = {alike[0].zeta:.2g}."

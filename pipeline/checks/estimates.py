@@ -16,9 +16,9 @@ from pipeline.results import (
     StepGain,
     passed,
 )
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.stages.compare import change_limit
-from pipeline.words.numbers import abridge, listing, significant
+from pipeline.words.numbers import join_names, listing, significant
 from pipeline.words.phrases import phrases
 
 _WORDS = phrases("checks")
@@ -128,7 +128,7 @@ def _advice(row: ParameterRow) -> str:
     }
     if name.is_gain:
         looks["frequency_response"] = "the points at the lowest frequencies"
-    look = looks.get(before.source, "{runs}").format(runs=abridge(before.experiments))
+    look = looks.get(before.source, "{runs}").format(runs=join_names(before.experiments))
     beside = (
         ", and at the points of the response near this frequency"
         if response and name.is_frequency
@@ -139,7 +139,7 @@ def _advice(row: ParameterRow) -> str:
 
 
 def check_decays(
-    decays: Sequence[LogDecrement], *, records: Sequence[Record] = (), bench: Bench
+    decays: Sequence[LogDecrement], *, records: Sequence[Record] = (), bench: Setup
 ) -> list[Check]:
     """Check for every decay whether it is exponential within the noise."""
     checks, kinds = [], {record.id: record.kind for record in records}
@@ -164,7 +164,7 @@ def check_decays(
 
 
 def check_steps(
-    steps: Sequence[StepGain], *, decays: Sequence[LogDecrement] = (), bench: Bench
+    steps: Sequence[StepGain], *, decays: Sequence[LogDecrement] = (), bench: Setup
 ) -> list[Check]:
     """Check whether every step has one static gain, or only an interval because the cart sticks.
 
@@ -182,7 +182,7 @@ def check_steps(
     return [_step_check(step, shown=rubs.get(step.cart, ()), bench=bench) for step in steps]
 
 
-def _step_check(step: StepGain, *, shown: Sequence[str], bench: Bench) -> Check:
+def _step_check(step: StepGain, *, shown: Sequence[str], bench: Setup) -> Check:
     outcome: CheckOutcome
     edges, width = len(step.edges), None
     if step.interval:
@@ -196,7 +196,7 @@ def _step_check(step: StepGain, *, shown: Sequence[str], bench: Bench) -> Check:
             ),
         )
     elif shown:
-        runs = abridge(list(dict.fromkeys(shown)))
+        runs = join_names(list(dict.fromkeys(shown)))
         outcome, found = (
             "skip",
             (

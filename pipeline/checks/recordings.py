@@ -5,14 +5,9 @@ from itertools import groupby
 
 import numpy as np
 
-from pipeline.ingest.columns import input_units, is_count, is_known, position_units
-from pipeline.ingest.input_sign import FEW_NAMES, Signs
-from pipeline.ingest.read import Ingested
-from pipeline.results import Check, CheckKind, HeadingUnit, LateChannel, LeftOut, Record, SinePoint
-from pipeline.set_up import Bench
-from pipeline.soundness.fault import sound_ones
-from pipeline.soundness.late_channels import late_fault
-from pipeline.soundness.stated import (
+from pipeline.identify.fault import valid_records
+from pipeline.identify.late_channels import late_fault
+from pipeline.identify.stated import (
     LEAST_SHARE,
     OTHER_DWELL,
     find_loose_holds,
@@ -22,7 +17,12 @@ from pipeline.soundness.stated import (
     swings,
     why_other_frequency,
 )
-from pipeline.words.numbers import abridge
+from pipeline.ingest.columns import input_units, is_count, is_known, position_units
+from pipeline.ingest.input_sign import FEW_NAMES, Signs
+from pipeline.ingest.read import Ingested
+from pipeline.results import Check, CheckKind, HeadingUnit, LateChannel, LeftOut, Record, SinePoint
+from pipeline.setup import Setup
+from pipeline.words.numbers import join_names
 from pipeline.words.phrases import phrases
 from pipeline.words.text import capital
 
@@ -37,14 +37,14 @@ def check_recordings(
     left_out: Sequence[LeftOut],
     sines: Sequence[SinePoint],
     late: Sequence[LateChannel],
-    bench: Bench,
+    bench: Setup,
 ) -> list[Check]:
     """Return all checks of the recordings, those whose failure affects most numbers first."""
     return [
         *check_signs(data.signs, without={one.experiment for one in left_out if one.is_wrong}),
         *check_files(data.unreadable),
         *check_units(data.records, bench=bench),
-        *check_scales(sound_ones(data.records, left_out), bench=bench),
+        *check_scales(valid_records(data.records, left_out), bench=bench),
         *check_left_out(left_out, records=data.records),
         *check_setup(data.records),
         *check_held(data.records),
@@ -66,7 +66,7 @@ def check_files(unreadable: Mapping[str, str]) -> list[Check]:
     ]
 
 
-def check_units(records: Sequence[Record], *, bench: Bench) -> list[Check]:
+def check_units(records: Sequence[Record], *, bench: Setup) -> list[Check]:
     """Return failed checks if a unit is unknown, or if headings or numbers contradict it."""
     counted = is_count(bench.units.position)
     fractions = [r.id for r in records if counted and _has_fractions_of_a_count(r)]
@@ -87,7 +87,7 @@ def check_units(records: Sequence[Record], *, bench: Bench) -> list[Check]:
             other = next(iter(headed.values()))
             message = _WORDS.text(
                 "other_heading",
-                runs=abridge(list(headed)),
+                runs=join_names(list(headed)),
                 heading=repr(other.heading),
                 unit=unit,
                 other=other.unit,
@@ -97,7 +97,7 @@ def check_units(records: Sequence[Record], *, bench: Bench) -> list[Check]:
         elif role == "position" and (other_step := find_other_steps(records, bench=bench)):
             checks.append(_unit_check(kind, capital(other_step.reason), n=len(records)))
         elif role == "position" and fractions:
-            runs = abridge(fractions)
+            runs = join_names(fractions)
             message = _WORDS.text("fractions", runs=runs, gain_unit=bench.units.gain)
             checks.append(_unit_check(kind, message, n=len(fractions)))
     return checks
@@ -123,7 +123,7 @@ def _has_fractions_of_a_count(record: Record) -> bool:
     return record.position_scale == 1.0 and not np.array_equal(record.y, np.round(record.y))
 
 
-def check_scales(records: Sequence[Record], *, bench: Bench) -> list[Check]:
+def check_scales(records: Sequence[Record], *, bench: Setup) -> list[Check]:
     """Return failed checks if positions or inputs are too large for any bench."""
     kinds: Mapping[str, CheckKind] = {
         "position_scale": "position_scale",
@@ -152,7 +152,7 @@ def check_signs(signs: Signs, *, without: Container[str]) -> list[Check]:
                 stated=sign,
                 found=f"{-sign:+d}",
                 found_plain=-sign,
-                runs=abridge(contrary, most=FEW_NAMES),
+                runs=join_names(contrary, most=FEW_NAMES),
                 those="all"
                 if contrary == determined
                 else f"{len(contrary)} of the {len(determined)}",
@@ -242,7 +242,7 @@ def check_channels(late: Sequence[LateChannel]) -> list[Check]:
     for cart, of_cart in groupby(sorted(late, key=lambda one: one.cart), key=lambda one: one.cart):
         alike = list(of_cart)
         surest = min(alike, key=lambda one: (one.than, one.limit))
-        kinds_text = abridge([kinds[one.kind] for one in alike])
+        kinds_text = join_names([kinds[one.kind] for one in alike])
         check = Check(
             kind="late_channel",
             cart=cart,

@@ -34,7 +34,7 @@ def desk(
 ) -> None:
     """Open the desk: all tasks of the other commands in a browser on this computer."""
     from pipeline.desk.app import DeskServer
-    from pipeline.desk.ending import Ending
+    from pipeline.desk.crash_log import CrashLog
     from pipeline.garbage import collect_for_hours
 
     if (host is None) != (users is None):
@@ -43,7 +43,7 @@ def desk(
         raise ConfigError("with --users, the file lists the folders: do not give one here")
     collect_for_hours()
     server = DeskServer(folder=folder, port=port, host=host or "127.0.0.1", users=users)
-    with Ending(say=say) as ending, server:
+    with CrashLog(say=say) as ending, server:
         say(f"ready: {server.url}")
         if browser and host is None:
             webbrowser.open(server.url)

@@ -92,7 +92,7 @@ def doctor(as_json: AsJson = False) -> None:
 
 def examine() -> Health:
     """Return the state of the installation."""
-    from pipeline.desk.ending import find_log
+    from pipeline.desk.crash_log import find_log
 
     needed, extras = _packages()
     folder, fresh = "", False

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
 
     from pipeline.grading.batch.grade_class import Summary
-    from pipeline.grading.gradebook.open_book import OpenBook
+    from pipeline.grading.gradebook.shared_gradebook import SharedGradebook
 
 
 @app.command()
@@ -229,13 +229,13 @@ def _change(
     grades: str,
     team: str,
     assignment: str | None,
-    change: "Callable[[OpenBook, str], object]",
+    change: "Callable[[SharedGradebook, str], object]",
 ) -> None:
     """Change the points of a team, which may be a pseudonym, and say its new total."""
-    from pipeline.grading.publish.anonymous import meant
+    from pipeline.grading.publish.anonymous import resolve_pseudonym
 
     with _changing(grades, assignment) as book:
-        name = meant(book, team)
+        name = resolve_pseudonym(book, team)
         change(book, name)
         grade = book.entry(name).grade
     shown = grade.submission if name == team else team
@@ -248,7 +248,7 @@ def _override_from(grades: str, table: Path, *, why: str, by: str, assignment: s
     from dataclasses import replace
 
     from pipeline.grading.gradebook.override import read_wishes
-    from pipeline.grading.publish.anonymous import meant
+    from pipeline.grading.publish.anonymous import resolve_pseudonym
     from pipeline.words.numbers import count
 
     wishes = read_wishes(table, why=why)
@@ -256,7 +256,7 @@ def _override_from(grades: str, table: Path, *, why: str, by: str, assignment: s
         named = []
         for wish in wishes:
             try:
-                name = book.entry(meant(book, wish.submission)).submission
+                name = book.entry(resolve_pseudonym(book, wish.submission)).submission
             except ConfigError as error:
                 raise ConfigError(f"{table.name} line {wish.line}: {error}") from None
             named.append(replace(wish, submission=name))
@@ -279,13 +279,13 @@ def remove(
     ] = False,
 ) -> None:
     """Take submissions off the class list; their history stays, unless --erase deletes it."""
-    from pipeline.grading.publish.anonymous import meant
+    from pipeline.grading.publish.anonymous import resolve_pseudonym
 
     if erase:
         _erase(grades, teams, assignment)
         return
     with _changing(grades, assignment) as book:
-        names = {meant(book, team): team for team in teams}
+        names = {resolve_pseudonym(book, team): team for team in teams}
         by_hand = [team for name, team in names.items() if _by_hand(book, name)]
         gone = [names.get(name, name) for name in book.remove(list(names))]
     say(f"no longer in the class: {', '.join(gone)}")
@@ -293,7 +293,7 @@ def remove(
         say(f"their points given by hand no longer count: {', '.join(by_hand)}")
 
 
-def _by_hand(book: "OpenBook", name: str) -> bool:
+def _by_hand(book: "SharedGradebook", name: str) -> bool:
     entry = book.entry(name)
     return bool(entry.overrides or entry.adjustments)
 
@@ -319,14 +319,14 @@ def _erase(grades: str, teams: list[str], assignment: str | None) -> None:
 
 
 @contextmanager
-def _changing(grades: str, assignment: str | None) -> Iterator["OpenBook"]:
+def _changing(grades: str, assignment: str | None) -> Iterator["SharedGradebook"]:
     """Open a gradebook to change it; if it is in a folder, update the pages there afterwards."""
-    from pipeline.grading.gradebook.open_book import OpenBook
+    from pipeline.grading.gradebook.shared_gradebook import SharedGradebook
     from pipeline.grading.publish.outputs import write_outputs
     from pipeline.lock import lock_or_refuse
 
     folder = Path(grades)
-    with OpenBook(grades, assignment=assignment) as book:
+    with SharedGradebook(grades, assignment=assignment) as book:
         if not folder.is_dir():
             yield book
             return
@@ -338,7 +338,7 @@ def _changing(grades: str, assignment: str | None) -> Iterator["OpenBook"]:
 @app.command()
 def history(grades: Grades, team: Team, assignment: Lab = None, as_json: AsJson = False) -> None:
     """Show every grade and change of a team, with who, when and why."""
-    from pipeline.grading.gradebook.book import Gradebook
+    from pipeline.grading.gradebook.gradebook import Gradebook
     from pipeline.grading.gradebook.history import history_dict, history_text
     from pipeline.grading.publish.anonymous import history_of
 
@@ -393,7 +393,7 @@ def export_grades(
         return _export_autograder(autograder, out or Path("autograder.zip"))
     if grades is None or lms is None:
         raise typer.BadParameter("give GRADES and --lms, or --autograder with a rubric")
-    from pipeline.grading.gradebook.book import Gradebook
+    from pipeline.grading.gradebook.gradebook import Gradebook
     from pipeline.grading.publish.export import export
 
     folder = Path(grades)

@@ -16,7 +16,7 @@ _START_LIMIT = 60.0  # s
 
 def launcher() -> dict[str, Any]:
     """Return how jupyter-server-proxy starts the desk; this function is its entry point."""
-    from pipeline.desk.doors import JUPYTER_SECRET
+    from pipeline.desk.login import JUPYTER_SECRET
     from pipeline.resources import TEMPLATES
 
     secret = secrets.token_urlsafe(24)
@@ -33,10 +33,10 @@ def main() -> None:
     """Serve the desk until Jupyter ends the process."""
     from pipeline.cli.common import say
     from pipeline.desk.app import DeskServer
-    from pipeline.desk.ending import Ending
+    from pipeline.desk.crash_log import CrashLog
 
     server = DeskServer(port=int(sys.argv[1]), jupyter=os.environ.pop(SECRET))
-    with Ending(say=say) as ending, server:
+    with CrashLog(say=say) as ending, server:
         while server.runs and not ending.asked.wait(0.5):  # s
             pass
 

@@ -15,8 +15,8 @@ from pipeline.second_process import SecondProcess
 from pipeline.words.progress import Progress
 
 if TYPE_CHECKING:
-    from pipeline.report.draft.changes import DraftChanges
-    from pipeline.report.draft.files import Files
+    from pipeline.report.lab_report.changes import DraftChanges
+    from pipeline.report.lab_report.files import Files
     from pipeline.results import Analysis
     from pipeline.submission import Submission
 
@@ -144,7 +144,7 @@ def report(
     as_json: AsJson = False,
 ) -> None:
     """Identify the carts, design the controller, check the hardware, write the report."""
-    from pipeline.report.draft.files import Files
+    from pipeline.report.lab_report.files import Files
 
     files = Files(pdf=pdf, tables=tables, plots=plots)
     analysis = run_report(folder, out=out, files=files, compare=compare)
@@ -167,9 +167,9 @@ def run_report(
 
     A second process loads what draws the report while this one loads what analyses the data.
     """
-    with SecondProcess("pipeline.report.draft.make", "make_draft") as second:
+    with SecondProcess("pipeline.report.lab_report.make", "make_draft") as second:
         from pipeline.output import named_folder, own_folder
-        from pipeline.report.draft.write import make_report
+        from pipeline.report.lab_report.write import make_report
 
         submission = _load(folder)
         out = named_folder(out) if out else own_folder(submission.folder, "report")
@@ -209,7 +209,7 @@ def _comparison(
     """
     if earlier is None:
         return lambda analysis: None
-    from pipeline.report.draft.changes import check_comparable, compare_drafts, read_results
+    from pipeline.report.lab_report.changes import check_comparable, compare_drafts, read_results
 
     before = read_results(earlier)
     check_comparable(before, bench=submission.system.bench)
@@ -323,7 +323,7 @@ def explain(
     progress: Progress,
 ) -> tuple[str, list[str]]:
     """Write the gap analysis of a submission; return the text of gap.json and the messages."""
-    with SecondProcess("pipeline.report.gap.story", "make_gap_files") as second:
+    with SecondProcess("pipeline.report.gap.gap_report", "make_gap_files") as second:
         from pipeline.json_files import json_text
         from pipeline.output import named_folder, own_folder, write_file
         from pipeline.workflow import analyse

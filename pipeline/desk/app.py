@@ -17,36 +17,24 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
-from pipeline.desk.ask import Ask, Desk, plain_error, prepare_pages
 from pipeline.desk.bench import bench_page
-from pipeline.desk.doors import PAGE_HEADERS, JupyterDoor, ProxyDoor, SecretDoor, limit_bodies
 from pipeline.desk.flow import limit_each_person
-from pipeline.desk.grades import (
-    class_actions,
-    class_table,
-    request_queue,
-    team_page,
-    together,
-)
+from pipeline.desk.grades import bulk_change, class_actions, class_table, request_queue, team_page
 from pipeline.desk.home import enter, open_place, show_folders, show_home
 from pipeline.desk.instructor import exercise_pages, rubric_editor, rubric_preview_page
+from pipeline.desk.login import PAGE_HEADERS, JupyterLogin, ProxyLogin, SecretLogin, limit_bodies
+from pipeline.desk.page_request import Desk, PageRequest, plain_error, prepare_pages
 from pipeline.desk.scratch import clear_scratch
-from pipeline.desk.seeing import REFUSED
 from pipeline.desk.served_files import serve_file, serve_static
-from pipeline.desk.student import (
-    check_page,
-    own_feedback,
-    plots_page,
-    report_page,
-    submission_page,
-)
+from pipeline.desk.student import check_page, my_feedback, plots_page, report_page, submission_page
 from pipeline.desk.users import User, read_users
+from pipeline.desk.visibility import REFUSED
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.grading.intake.unpack import HAND_IN
-from pipeline.web.guard import Door, Guard
+from pipeline.web.origin_check import Login, OriginCheck
 from pipeline.web.server import Served
 
-Handler = Callable[[Ask], Any]  # returns a Response or a coroutine of one
+Handler = Callable[[PageRequest], Any]  # returns a Response or a coroutine of one
 
 
 def _start(task: str, title: str, *, then: str = "") -> Handler:
@@ -58,7 +46,7 @@ def _start(task: str, title: str, *, then: str = "") -> Handler:
     then : last part of the URL to open next.
     """
 
-    def start(ask: Ask) -> Response:
+    def start(ask: PageRequest) -> Response:
         ask.start(task, title=title)
         return ask.back(ask.here + then)
 
@@ -70,7 +58,7 @@ def _serve(inside: str) -> Handler:
     return lambda ask: serve_file(ask.folder(), f"{inside}/{ask.request.path_params['name']}")
 
 
-def _stop(ask: Ask) -> Response:
+def _stop(ask: PageRequest) -> Response:
     """Stop the work in the folder that the URL names; what is already done stays."""
     ask.stop(ask.folder())
     return ask.back(ask.here + ("#work" if ask.here.startswith("/grades/") else "#report"))
@@ -79,12 +67,12 @@ def _stop(ask: Ask) -> Response:
 _BLANKS = re.compile(r"\s+")  # a line break would end the event
 
 
-async def _stream_events(ask: Ask) -> Response:
+async def _stream_events(ask: PageRequest) -> Response:
     """Return a stream of events that report the work in the place that the URL names."""
     return StreamingResponse(_events(ask, ask.place_or_404()), media_type="text/event-stream")
 
 
-async def _events(ask: Ask, place: Any) -> AsyncIterator[str]:
+async def _events(ask: PageRequest, place: Any) -> AsyncIterator[str]:
     """Yield an event for every new stage of the work; a slow reader gets only the latest stage."""
     version, quiet, frame = -1, 0.0, 0.2  # `frame` is the time in s between two checks for changes
     while (job := ask.desk.jobs.of(place)) is not None:
@@ -148,7 +136,7 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/bench/{n:nth}/acquire", "POST", bench_page.acquire),
     ("/bench/{n:nth}/explore", "POST", bench_page.explore),
     ("/bench/{n:nth}/add", "POST", bench_page.add),
-    ("/bench/{n:nth}/weigh", "GET", bench_page.weigh),
+    ("/bench/{n:nth}/weigh", "GET", bench_page.show_comparison),
     ("/bench/{n:nth}/exploration.html", "GET", bench_page.show_diary),
     ("/bench/{n:nth}/press", "POST", bench_page.press),
     ("/bench/{n:nth}/events", "GET", bench_page.stream),
@@ -174,16 +162,16 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/grades/{n:nth}/feedback/{name:path}/feedback.html", "GET", class_table.show_feedback),
     ("/grades/{n:nth}/team", "GET", team_page.show),
     ("/grades/{n:nth}/team", "POST", team_page.act),
-    ("/grades/{n:nth}/together", "GET", together.show),
-    ("/grades/{n:nth}/together", "POST", together.apply),
+    ("/grades/{n:nth}/together", "GET", bulk_change.show),
+    ("/grades/{n:nth}/together", "POST", bulk_change.apply),
     ("/grades/{n:nth}/figure", "GET", team_page.show_figure),
     ("/grades/{n:nth}/paper", "GET", team_page.send_paper),
-    ("/grades/{n:nth}/again", "GET", request_queue.show),
-    ("/grades/{n:nth}/again", "POST", request_queue.act),
+    ("/grades/{n:nth}/requests", "GET", request_queue.show),
+    ("/grades/{n:nth}/requests", "POST", request_queue.act),
     ("/grades/{n:nth}/release", "POST", class_actions.release),
-    ("/feedback/{n:nth}/", "GET", own_feedback.show),
-    ("/feedback/{n:nth}/whole", "GET", own_feedback.show_whole),
-    ("/feedback/{n:nth}/ask", "POST", own_feedback.send),
+    ("/feedback/{n:nth}/", "GET", my_feedback.show),
+    ("/feedback/{n:nth}/whole", "GET", my_feedback.show_whole),
+    ("/feedback/{n:nth}/ask", "POST", my_feedback.send),
     ("/grades/{n:nth}/import", "POST", class_actions.take_table),
     ("/grades/{n:nth}/export", "POST", class_actions.export_class),
     ("/grades/{n:nth}/publish", "POST", _start("publish_grades", "Writing", then="#work")),
@@ -229,13 +217,13 @@ class DeskServer:
             ) from None
         port = listener.getsockname()[1]
         self.url = f"http://{host}:{port}/"
-        door: Door
+        door: Login
         if listed:
-            door = ProxyDoor(*listed)
+            door = ProxyLogin(*listed)
         elif jupyter:
-            door = JupyterDoor(owner, secret=jupyter)
+            door = JupyterLogin(owner, secret=jupyter)
         else:
-            door = SecretDoor(owner, port=port, start=start)
+            door = SecretLogin(owner, port=port, start=start)
             self.url = f"http://127.0.0.1:{port}/{door.secret}/"
         self._desk = Desk()
         clear_scratch()
@@ -243,7 +231,7 @@ class DeskServer:
         if listed and any(user.folders for user in listed[1].values()):
             self._desk.workers.start()
         limited = limit_each_person(limit_bodies(application(self._desk), uploads=HAND_IN.total))
-        self._served = Served(Guard(limited, door, headers=PAGE_HEADERS), listener)
+        self._served = Served(OriginCheck(limited, door, headers=PAGE_HEADERS), listener)
 
     def __enter__(self) -> Self:
         if not self._served.start():
@@ -281,7 +269,7 @@ def _answer(desk: Desk, handler: Handler, *, path: str) -> Callable[[Request], A
         form = FormData()
         if request.method == "POST":
             form = await request.form(max_files=HAND_IN.members, max_fields=5_000)
-        ask = Ask(desk=desk, user=user, request=request, form=form)
+        ask = PageRequest(desk=desk, user=user, request=request, form=form)
         try:
             # A Stop must not wait until one of the shared threads is free, so it gets a thread of
             # its own.
@@ -303,10 +291,10 @@ def _answer(desk: Desk, handler: Handler, *, path: str) -> Callable[[Request], A
     return answer
 
 
-def _admit(ask: Ask, path: str) -> None:
+def _admit(ask: PageRequest, path: str) -> None:
     """Refuse a request whose folder is gone, or that could show what the student must find."""
     ask.require_place()
-    if ask.desk.seeing.is_refused(path, ask.user, ask.place):
+    if ask.desk.visibility.is_refused(path, ask.user, ask.place):
         raise HTTPException(403, REFUSED)
 
 
@@ -314,7 +302,7 @@ def _explain(desk: Desk) -> Callable[[Request, Exception], Response]:
     """Return the handler for unknown addresses, refused access, and failures of the desk."""
 
     def answer(request: Request, error: Exception) -> Response:
-        ask = Ask(desk=desk, user=request.scope["user"], request=request, form=FormData())
+        ask = PageRequest(desk=desk, user=request.scope["user"], request=request, form=FormData())
         if isinstance(error, HTTPException):
             return plain_error(ask, str(error.detail), status=error.status_code)
         what = f"the desk itself failed ({type(error).__name__}: {error}); please report it"

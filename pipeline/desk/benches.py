@@ -47,7 +47,7 @@ class BenchSession(ShownSession):
         """Return the state without the points of the plots, for JSON."""
         return self._state
 
-    def heed(self, wish: str, number: int) -> bool:
+    def apply(self, wish: str, number: int) -> bool:
         """Send a pressed button to the process; return whether it fits the current state.
 
         The process itself decides whether to act on it.
@@ -74,14 +74,14 @@ class BenchSession(ShownSession):
     def stop(self) -> None:
         """Stop the bench and end the session."""
         with suppress(OSError, ValueError):  # the process has ended and closed its pipe
-            self.heed("stop", 0)
+            self.apply("stop", 0)
 
     def stream(self) -> Response:
         """Return a stream of the session's events; the last one reports its end."""
         ended = "event: ended\ndata:\n\n"
         if self.ended.is_set():
             return Response(ended, media_type="text/event-stream")
-        return stream_events(self, is_over=self.ended.is_set, last_words=ended)
+        return stream_events(self, is_over=self.ended.is_set, exit_message=ended)
 
     def close(self, *, by: float) -> None:
         """Wait for the end of the session, then end its process.
@@ -101,7 +101,7 @@ class BenchSession(ShownSession):
             while line := self._line():
                 self._take(**json.loads(line))
             if not self.outcome:
-                self.outcome, self.failed = self._process.last_words(), True
+                self.outcome, self.failed = self._process.exit_message(), True
         finally:
             self._process.close()
             self.ended.set()

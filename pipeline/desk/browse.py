@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from pipeline.desk.typed import read_path
+from pipeline.desk.form_input import read_path
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.schema import FILE
 from pipeline.submission.load import NAME
@@ -14,7 +14,7 @@ from pipeline.submission.load import NAME
 MOST = 200  # folders shown in a list
 _LOOKED_AT = 20_000  # largest number of folders whose content is checked
 
-Kind = Literal["submission", "grading", "empty", "folder"]
+FolderKind = Literal["submission", "grading", "empty", "folder"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class Found:
 
     path: Path
     inside: str
-    kind: Kind
+    kind: FolderKind
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +122,7 @@ def _describe(path: Path, root: Path) -> Found:
     return Found(path=path, inside=path.relative_to(root).as_posix(), kind=_find_kind(path))
 
 
-def _find_kind(path: Path) -> Kind:
+def _find_kind(path: Path) -> FolderKind:
     try:
         if (path / FILE).is_file():
             return "grading"

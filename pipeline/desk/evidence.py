@@ -6,7 +6,7 @@ from pipeline.grading.grade import Criterion
 from pipeline.grading.publish.feedback import numbers_table, sentence
 from pipeline.report.document import paragraph
 from pipeline.report.render.html import render_blocks
-from pipeline.set_up import Units
+from pipeline.setup import Units
 from pipeline.words.text import rich
 
 

@@ -5,12 +5,12 @@ from typing import Any
 
 from starlette.responses import RedirectResponse, Response
 
-from pipeline.desk.ask import Ask
 from pipeline.desk.browse import MOST, list_folders
+from pipeline.desk.form_input import read_path
 from pipeline.desk.jobs import Job
 from pipeline.desk.last_report import find_state
-from pipeline.desk.rooms import list_feedback
-from pipeline.desk.typed import read_path
+from pipeline.desk.navigation import list_feedback
+from pipeline.desk.page_request import PageRequest
 from pipeline.desk.users import Place, User, name_place
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.experiments.plan_file import NAME as PLAN
@@ -22,7 +22,7 @@ _MADE = 3  # exercises listed on the first page
 _ROOMS = ("student", "bench", "solution")
 
 
-def show_home(ask: Ask) -> Response:
+def show_home(ask: PageRequest) -> Response:
     """Show what a person can do here; a person with only one place is taken to it."""
     user = ask.user
     places = {"student": user.folders, "grades": user.gradebooks, "feedback": user.grades}
@@ -41,7 +41,7 @@ def show_home(ask: Ask) -> Response:
     )
 
 
-def show_folders(ask: Ask) -> Response:
+def show_folders(ask: PageRequest) -> Response:
     """Show the list of folders to choose from."""
     to, folders = ask.text("to"), list_folders(ask.desk.root, ask.text("in"))
     return ask.page(
@@ -54,11 +54,11 @@ def show_folders(ask: Ask) -> Response:
     )
 
 
-def open_place(ask: Ask) -> Response:
+def open_place(ask: PageRequest) -> Response:
     """Open what a person chose or typed: a folder on this computer, or a database."""
     typed, to = ask.text("folder"), ask.text("to")
     if "://" in typed:
-        ask.desk.books.book(typed)
+        ask.desk.gradebooks.gradebook(typed)
         return RedirectResponse(_add_place(typed, ask.user.gradebooks, "grades"), status_code=303)
     address = enter(ask.user, read_path(typed, wanted="enter a folder"))
     if to in _ROOMS and address.startswith("/student/"):
@@ -99,14 +99,14 @@ def _add_place(place: Place, places: list[Any], room: str) -> str:
     return f"/{room}/{places.index(place)}/"
 
 
-def _list_made(ask: Ask) -> list[Job]:
+def _list_made(ask: PageRequest) -> list[Job]:
     """Return the jobs of the last exercises, finished or not, that the person may see."""
     shop, jobs = ask.user.workshop, ask.desk.jobs.list_of("make_exercises")
     seen = [job for job in jobs if ask.user.owns or (shop and job.place.is_relative_to(shop))]
     return seen[:_MADE]
 
 
-def _describe_submission(ask: Ask, n: int, folder: Path) -> dict[str, Any]:
+def _describe_submission(ask: PageRequest, n: int, folder: Path) -> dict[str, Any]:
     """Return the state of a submission: its files, report, recordings and solution."""
     session, data = ask.desk.benches.of(folder), folder / "data"
     try:
@@ -127,10 +127,10 @@ def _describe_submission(ask: Ask, n: int, folder: Path) -> dict[str, Any]:
     }
 
 
-def _describe_class(ask: Ask, n: int, place: Place) -> dict[str, Any]:
+def _describe_class(ask: PageRequest, n: int, place: Place) -> dict[str, Any]:
     """Return how many teams of a class were reviewed; all numbers are 0 if it cannot be read."""
     try:
-        teams = ask.desk.books.of(place).now.listings
+        teams = ask.desk.gradebooks.of(place).now.rows
     except (PipelineError, OSError):
         teams = ()
     return {
@@ -138,5 +138,5 @@ def _describe_class(ask: Ask, n: int, place: Place) -> dict[str, Any]:
         "name": name_place(place),
         "place": place,
         "teams": len(teams),
-        "seen": sum(1 for team in teams if team.seen),
+        "seen": sum(1 for team in teams if team.reviewed_by),
     }

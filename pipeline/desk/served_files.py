@@ -5,7 +5,7 @@ from pathlib import Path, PurePosixPath
 from starlette.exceptions import HTTPException
 from starlette.responses import FileResponse, Response
 
-from pipeline.desk.ask import Ask
+from pipeline.desk.page_request import PageRequest
 from pipeline.report.render.html import every_hash
 from pipeline.resources import TEMPLATES
 from pipeline.submission.load import file_problem
@@ -75,7 +75,7 @@ def _allow_own_scripts(policy: str) -> str:
     return policy.format(hashes=" ".join(f"'{one}'" for one in every_hash()))
 
 
-def serve_static(ask: Ask) -> Response:
+def serve_static(ask: PageRequest) -> Response:
     """Return a style sheet or script of the desk."""
     name = ask.request.path_params["name"]
     if name not in _STATIC:

@@ -18,9 +18,9 @@ from pipeline.desk.exercises import (
     make_exercises,
     make_solution,
 )
+from pipeline.desk.form_input import read_path
 from pipeline.desk.last_report import FINDINGS, PLOTS_OF, stat_sources
 from pipeline.desk.student.folder_tasks import FOLDER_TASKS
-from pipeline.desk.typed import read_path
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.identify.springs import fill as fill_folder
 from pipeline.ingest.channels import never_changes
@@ -84,9 +84,9 @@ def fill_tables(folder: str, *, progress: Progress) -> list[dict[str, Any]]:
 
 def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
     """Write the report into the submission's folder, and compare it with the previous one."""
-    from pipeline.report.draft.changes import changes_line, compare_drafts, read_results
-    from pipeline.report.draft.make import make_draft
-    from pipeline.report.draft.write import make_report as write_report
+    from pipeline.report.lab_report.changes import changes_line, compare_drafts, read_results
+    from pipeline.report.lab_report.make import make_draft
+    from pipeline.report.lab_report.write import make_report as write_report
     from pipeline.report.sections.housekeeping import taken_text
     from pipeline.report.sections.questions import ask
     from pipeline.words.text import with_symbols
@@ -145,7 +145,7 @@ def make_gap(folder: str, *, progress: Progress) -> None:
     from pipeline.experiments.discriminate import propose_for
     from pipeline.gap.explain import investigate
     from pipeline.json_files import json_text
-    from pipeline.report.gap.story import make_gap_files
+    from pipeline.report.gap.gap_report import make_gap_files
     from pipeline.report.model_files import clear_model
     from pipeline.report.render.folder import write_files
     from pipeline.workflow import analyse
@@ -164,7 +164,7 @@ def make_gap(folder: str, *, progress: Progress) -> None:
 
 def make_plots(folder: str, *, progress: Progress) -> None:
     """Write the page of plots into the submission's folder, next to its report."""
-    from pipeline.report.gap.beside import with_gap
+    from pipeline.report.gap.load_gap import with_gap
     from pipeline.report.plots.page import write_plots
     from pipeline.workflow import analyse
 
@@ -202,7 +202,7 @@ def weigh_recording(
 ) -> dict[str, Any]:
     """Return how much a typed recording would reduce the error, and how much the best one would."""
     from pipeline.bench.raw import known_commands
-    from pipeline.experiments.next_recordings import weigh as weighed
+    from pipeline.experiments.next_recordings import compare_recordings as weighed
     from pipeline.experiments.plan import Recording, what_words
     from pipeline.experiments.propose import current_plan
     from pipeline.workflow import analyse
@@ -237,7 +237,7 @@ def describe_exercise(
 
 def publish_grades(folder: str, *, progress: Progress) -> None:
     """Write the output files of the gradebook in a folder."""
-    from pipeline.grading.gradebook.book import Gradebook
+    from pipeline.grading.gradebook.gradebook import Gradebook
     from pipeline.grading.publish.outputs import write_outputs
     from pipeline.lock import lock_or_refuse
 
@@ -303,7 +303,7 @@ def render_notes(folder: str, *, progress: Progress) -> str:
 
 def preview_rubric(folder: str, text: str, *, progress: Progress) -> dict[str, Any]:
     """Return the points of a graded class under a different rubric; see `RubricPreview`."""
-    from pipeline.grading.gradebook.book import Gradebook
+    from pipeline.grading.gradebook.gradebook import Gradebook
     from pipeline.grading.publish.rubric_preview import preview_rubric as preview
     from pipeline.grading.rubric_file import parse_rubric
 

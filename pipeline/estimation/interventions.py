@@ -17,14 +17,19 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pipeline.arrays import Array
-from pipeline.estimation.law_of_motion import ForceLeft, Seen, forces_left, see
+from pipeline.estimation.force_balance import (
+    RecordResidualForce,
+    WindowMeans,
+    record_residual_forces,
+    window_means,
+)
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA
 from pipeline.results import Intervention, Record
 
 T = TypeVar("T", bound=np.generic)
 
 
-def most_around(values: NDArray[T], width: int) -> NDArray[T]:
+def running_max(values: NDArray[T], width: int) -> NDArray[T]:
     """Return, for each value, the largest of the `width` values centred on it; `width` is odd."""
     padded = np.pad(values, width // 2, mode="edge")
     return sliding_window_view(padded, width).max(axis=-1)
@@ -64,7 +69,7 @@ def _found_in(records: tuple[Record, ...]) -> tuple[Intervention, ...]:
     first = {record.id: _first_copy(record, open_loop) for record in open_loop}
     alone = [record for record in open_loop if first[record.id] == record.id]
     carts = sorted({cart for r in alone for cart in r.free if cart in r.carts})
-    seen = [one for one in map(see, alone) if one is not None]
+    seen = [one for one in map(window_means, alone) if one is not None]
     bursts = [one for cart in carts for one in _bursts(cart, seen)]
     found = [
         replace(one, experiment=name)
@@ -114,8 +119,8 @@ def between(record: Record, interventions: Sequence[Intervention]) -> list[Recor
     return pieces
 
 
-def _bursts(cart: int, seen: Sequence[Seen]) -> list[Intervention]:
-    forces, size = forces_left(cart, seen)
+def _bursts(cart: int, seen: Sequence[WindowMeans]) -> list[Intervention]:
+    forces, size = record_residual_forces(cart, seen)
     if not forces:
         return []
     shares = [_share(force, size) for force in forces]
@@ -123,7 +128,7 @@ def _bursts(cart: int, seen: Sequence[Seen]) -> list[Intervention]:
     least = max(_SHARE, _TYPICAL * float(np.quantile(usual, 0.75)))
     found = []
     for force, share, known in zip(forces, shares, _known(forces, size), strict=True):
-        left = np.abs(force.left)
+        left = np.abs(force.residual)
         bulk = size
         if force.follows.any():  # a record that departs from the law throughout cannot show a hand
             own = _BULK * MEDIAN_TO_SIGMA * float(np.median(left[force.follows]))
@@ -133,7 +138,7 @@ def _bursts(cart: int, seen: Sequence[Seen]) -> list[Intervention]:
         times = np.concatenate([force.record.t[:1], force.t[1:-1], force.record.t[-1:]])
         for first, last in _stretches(above, force.t):
             inside = slice(first, last + 1)
-            beyond = np.where(above[inside], force.left[inside], 0.0)
+            beyond = np.where(above[inside], force.residual[inside], 0.0)
             if _is_hand(beyond, strong=strong[inside], known=known[inside], hop=force.hop):
                 found.append(
                     Intervention(
@@ -165,13 +170,13 @@ def _recurs(one: Intervention, found: Sequence[Intervention], driven: Mapping[st
     )
 
 
-def _share(force: ForceLeft, size: float) -> Array:
+def _share(force: RecordResidualForce, size: float) -> Array:
     """Return which share of the force on the cart is unexplained, near each sample."""
-    acting = most_around(force.acting, 2 * round(_AROUND / force.hop) + 1)
-    return np.abs(force.left) / (acting + size)
+    acting = running_max(force.acting, 2 * round(_AROUND / force.hop) + 1)
+    return np.abs(force.residual) / (acting + size)
 
 
-def _known(forces: Sequence[ForceLeft], size: float) -> list[NDArray[np.bool_]]:
+def _known(forces: Sequence[RecordResidualForce], size: float) -> list[NDArray[np.bool_]]:
     """Return for each window whether the law holds at other times in the same state.
 
     Position, stretches, velocity and input are checked one by one: most windows at about the same
@@ -180,7 +185,7 @@ def _known(forces: Sequence[ForceLeft], size: float) -> list[NDArray[np.bool_]]:
     """
     state = np.concatenate([force.state for force in forces], axis=1)
     follows = np.concatenate([force.follows for force in forces])
-    quiet = np.concatenate([(np.abs(f.left) < _BEGINS * size) & f.moves for f in forces])
+    quiet = np.concatenate([(np.abs(f.residual) < _BEGINS * size) & f.moves for f in forces])
     known = np.ones(follows.size, dtype=np.bool_)
     for values in state:
         low, high = values[follows].min(), values[follows].max()
@@ -194,7 +199,7 @@ def _known(forces: Sequence[ForceLeft], size: float) -> list[NDArray[np.bool_]]:
         known &= inside & ((calm >= _MOST * visits) & (calm >= _VISITS))[at]
     bounds = np.cumsum([0, *(force.t.size for force in forces)])
     # A window also shows a little of its neighbours.
-    parts = [~most_around(~known[first:stop], 3) for first, stop in pairwise(bounds)]
+    parts = [~running_max(~known[first:stop], 3) for first, stop in pairwise(bounds)]
     return [part | force.idle for part, force in zip(parts, forces, strict=True)]
 
 
@@ -220,7 +225,7 @@ def _is_hand(
 ) -> bool:
     """Return whether a burst is due to a hand.
 
-    Where the unexplained force is below the level at which a burst begins, `left` is zero. The
+    Where the unexplained force is below the level at which a burst begins, `residual` is zero. The
     windows are `hop` s apart.
     """
     swings = np.count_nonzero(np.diff(np.sign(left[left != 0.0])))

@@ -73,7 +73,7 @@ def high_frequency_noise(residual: Array, *, half_width: int = 4) -> float:
     return float(np.sqrt(np.mean(rest**2) / gain))
 
 
-def grain(t: Array, y: Array, *, step: float) -> float:
+def resolution(t: Array, y: Array, *, step: float) -> float:
     """Return the smallest significant change: the encoder step, or the noise if that is larger.
 
     To compare the two, noise sigma is converted to sqrt(12) sigma, the step whose rounding error is
@@ -106,7 +106,7 @@ def _parzen(x: Array) -> Array:
     return np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * np.clip(1 - x, 0.0, None) ** 3)
 
 
-def colour(residual: Array, *, angle: float) -> float:
+def relative_psd(residual: Array, *, angle: float) -> float:
     """Return the residual's spectral density at `angle` (rad per sample), relative to white noise.
 
     The factor multiplies the variance that a fitted sinusoid's coefficients have in white noise. It

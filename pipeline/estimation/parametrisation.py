@@ -17,7 +17,7 @@ from pipeline.errors import DataError
 from pipeline.names import read_name
 from pipeline.plant.chain import Chain
 from pipeline.results import Estimate
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 
 # Initial damping ratios for carts and modes without a measured one:
 START_ZETA = 0.05  # of a single cart; typical of a cart on bearings
@@ -43,7 +43,7 @@ class Parametrisation:
         beyond it.
     """
 
-    bench: Bench
+    bench: Setup
     zero: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -205,7 +205,7 @@ def critical_damping(chain: Chain) -> float:
     return float(np.sqrt(m * k)) or m  # without a spring, the damping that stops it within a second
 
 
-def physical_start(found: Chain, *, bench: Bench, zeta: float = START_ZETA) -> Chain:
+def physical_start(found: Chain, *, bench: Setup, zeta: float = START_ZETA) -> Chain:
     """Return a physically possible chain near the one that a measured table implies.
 
     `found` may hold impossible values (a negative spring, a mass far too small); these are clipped.
@@ -223,7 +223,7 @@ def _raised(values: Array) -> Array:
     return np.maximum(values, _SMALLEST_SHARE * np.max(np.abs(values)))
 
 
-def even_chain(values: Mapping[str, float], *, bench: Bench) -> Chain:
+def even_chain(values: Mapping[str, float], *, bench: Setup) -> Chain:
     """Return a chain of equal carts and springs with the gain and mean frequency of `values`.
 
     It starts a fit if there are too few estimates to compute a chain. `values` needs the first

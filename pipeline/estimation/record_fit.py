@@ -19,7 +19,7 @@ from pipeline.estimation.time_search import FOLLOWED
 from pipeline.estimation.time_window import FitWindow, compare, open_window
 from pipeline.plant.chain import Chain
 from pipeline.results import Record
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 
 LENGTH_SCALES = (10.0, 100.0, 1000.0, 2.54, 25.4)  # between mm, cm, m and inches
 # For each factor of a time column in another unit: the name of the unit, in full and in headings.
@@ -38,37 +38,39 @@ _ModesOf = Callable[[tuple[int, ...]], Modes]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Followed:
+class RecordFit:
     """How well a record follows a chain.
 
     Attributes
     ----------
-    lost : by cart, the share of its motion's power that neither chain nor noise explains.
-    missed : by cart, simulated minus measured position (n,).
-    chi_square : mean square of `missed` over the variance of encoder step and noise.
-    reach : by cart, the root mean square of its motion, relative to the chain's motion.
-    friction : by cart, the largest dry friction that is compatible with `lost`, in input units.
+    unexplained_share : by cart, the share of its motion's power that neither chain nor noise
+        explains.
+    residual : by cart, simulated minus measured position (n,).
+    chi_square : mean square of `residual` over the variance of encoder step and noise.
+    amplitude_ratio : by cart, the root mean square of its motion, relative to the chain's motion.
+    friction : by cart, the largest dry friction that is compatible with `unexplained_share`, in
+        input units.
     """
 
-    lost: dict[int, float]
-    missed: dict[int, Array]
+    unexplained_share: dict[int, float]
+    residual: dict[int, Array]
     chi_square: float
-    reach: dict[int, float]
+    amplitude_ratio: dict[int, float]
     friction: dict[int, float]
 
     @property
     def share(self) -> float:
-        """The mean of `lost` over the carts."""
-        return float(np.mean(list(self.lost.values())))
+        """The mean of `unexplained_share` over the carts."""
+        return float(np.mean(list(self.unexplained_share.values())))
 
     @property
-    def belongs(self) -> bool:
+    def is_consistent(self) -> bool:
         """Whether the record follows the chain."""
         return self.share <= FOLLOWED
 
 
 @dataclass(frozen=True, kw_only=True)
-class Misread:
+class Correction:
     """The correction that makes a record follow the chain.
 
     Attributes
@@ -98,7 +100,7 @@ def measured(record: Record) -> list[int]:
     return [cart for cart in record.carts if cart in record.free]
 
 
-def follow(records: Sequence[Record], chain: Chain) -> dict[str, Followed]:
+def record_fits(records: Sequence[Record], chain: Chain) -> dict[str, RecordFit]:
     """Return, by id, how well each driven record follows the chain.
 
     Records in which no measured cart moves are skipped.
@@ -108,12 +110,12 @@ def follow(records: Sequence[Record], chain: Chain) -> dict[str, Followed]:
     return {name: fit for name, fit in found.items() if fit}
 
 
-def most_follow(fits: Mapping[str, Followed]) -> bool:
+def most_are_consistent(fits: Mapping[str, RecordFit]) -> bool:
     """Return whether at least half of the records follow the chain; true without records."""
-    return 2 * sum(fit.belongs for fit in fits.values()) >= len(fits)
+    return 2 * sum(fit.is_consistent for fit in fits.values()) >= len(fits)
 
 
-def near(record: Record, chain: Chain) -> list[Followed]:
+def fit_detuned(record: Record, chain: Chain) -> list[RecordFit]:
     """Return how well a record follows slightly slower or faster copies of the chain.
 
     A spring that stiffens, or an input that arrives late, shifts resonances by some percent. At a
@@ -125,9 +127,9 @@ def near(record: Record, chain: Chain) -> list[Followed]:
     return [fit for other in detuned if (fit := _hold_against(other, chain, modes))]
 
 
-def find_misread(
-    record: Record, chain: Chain, fit: Followed, *, better: float = 10.0
-) -> Misread | None:
+def find_correction(
+    record: Record, chain: Chain, fit: RecordFit, *, better: float = 10.0
+) -> Correction | None:
     """Return the correction with which a record follows the chain better by a given factor.
 
     Parameters
@@ -155,7 +157,7 @@ def find_misread(
     return found
 
 
-def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record]]:
+def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Correction, Record]]:
     for i, j in combinations(measured(record), 2):
         rows = list(range(len(record.carts)))
         a, b = record.carts.index(i), record.carts.index(j)
@@ -163,10 +165,10 @@ def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record
         words = f"x{i} and x{j} look swapped"
         other = replace(record, y=record.y[rows], resolution=record.resolution[rows])
         remedy = f'state columns = {{ x{i} = "x{j}", x{j} = "x{i}" }} once, under [system]'
-        yield Misread(words=words, remedy=remedy), other
+        yield Correction(words=words, remedy=remedy), other
     for factor, words in TIME_FACTORS.items():
         if record.sample_time >= factor * FASTEST:  # over too short a time, any curve fits
-            yield Misread(words=words, clock=factor), replace(record, t=record.t / factor)
+            yield Correction(words=words, clock=factor), replace(record, t=record.t / factor)
     try:
         window = open_window(record)
     except DataError:
@@ -195,7 +197,7 @@ def _weights(window: FitWindow, modes: Modes) -> Array:
     return np.asarray(best, dtype=np.float64)
 
 
-def _describe_mistake(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
+def _describe_mistake(carts: Sequence[int], weights: Array) -> tuple[Correction, Array] | None:
     """Describe the mistake that these factors on the columns would correct; None if unknown.
 
     A wrong unit applies to the whole file. A single cart with a small motion is not a wrong unit:
@@ -211,12 +213,12 @@ def _describe_mistake(carts: Sequence[int], weights: Array) -> tuple[Misread, Ar
                 "its positions or its input seem to be in another unit: the recorded motion is "
                 f"{scale:.3g} times the motion that the input causes"
             )
-            return Misread(words=words, scale=scale), sign / scale
+            return Correction(words=words, scale=scale), sign / scale
     turned = [f"x{cart}" for cart, s in zip(carts, sign, strict=True) if s < 0]
     if len(turned) == len(carts):
-        return Misread(words="its input seems to have the opposite sign", legal=True), sign
+        return Correction(words="its input seems to have the opposite sign", legal=True), sign
     if turned:
-        return Misread(words=f"the sign of {' and '.join(turned)} looks reversed"), sign
+        return Correction(words=f"the sign of {' and '.join(turned)} looks reversed"), sign
     return None
 
 
@@ -225,7 +227,7 @@ def _describe_mistake(carts: Sequence[int], weights: Array) -> tuple[Misread, Ar
 
 def _modes(chain: Chain) -> _ModesOf:
     """Return a function that finds the chain's modes for given free carts, without derivatives."""
-    P = Parametrisation(bench=Bench(springs=tuple(bool(k) for k in chain.k)))
+    P = Parametrisation(bench=Setup(springs=tuple(bool(k) for k in chain.k)))
 
     @cache
     def find(free: tuple[int, ...]) -> Modes:
@@ -241,7 +243,7 @@ def _modes(chain: Chain) -> _ModesOf:
     return find
 
 
-def _hold_against(record: Record, chain: Chain, modes: _ModesOf) -> Followed | None:
+def _hold_against(record: Record, chain: Chain, modes: _ModesOf) -> RecordFit | None:
     try:
         window = open_window(record)
         residual = compare(window, modes(window.free)).residual * window.sigma[:, None]
@@ -254,11 +256,11 @@ def _hold_against(record: Record, chain: Chain, modes: _ModesOf) -> Followed | N
     # In simulations, carts with dry friction F under a force of amplitude A leave a share of at
     # least (F / 5A)² if they move at all. This is doubled here. Encoder steps and noise hide
     # smaller shares.
-    return Followed(
-        lost=dict(zip(window.carts, lost.tolist(), strict=True)),
-        missed=dict(zip(window.carts, residual, strict=True)),
+    return RecordFit(
+        unexplained_share=dict(zip(window.carts, lost.tolist(), strict=True)),
+        residual=dict(zip(window.carts, residual, strict=True)),
         chi_square=float(np.mean((residual / window.stated_sigma[:, None]) ** 2)),
-        reach=dict(zip(window.carts, reach.tolist(), strict=True)),
+        amplitude_ratio=dict(zip(window.carts, reach.tolist(), strict=True)),
         friction={
             cart: float(10.0 * np.sqrt(max(share, 1e-4)) * np.ptp(force) / 2)
             for cart, share in zip(window.carts, lost, strict=True)

@@ -26,7 +26,7 @@ from pipeline.estimation.parametrisation import Parametrisation, even_chain, phy
 from pipeline.estimation.time_window import FitWindow, Misfit, compare
 from pipeline.plant.chain import Chain
 from pipeline.results import EXPLAINED
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 
 WIDTHS = (0.15, 0.3, 0.6, 1.2)  # s; a bump should last about one period of the carts
 _HOP = 0.25  # distance of bumps over their width; they overlap, so closer bumps add little
@@ -39,7 +39,7 @@ _SWING_OVER_GAIN = 1.6  # range of a lightly damped cart after a step, over its 
 _SMALLEST_ZETA = 0.005  # least damping ratio, because noise may make a regressed damping negative
 
 
-def regress_chain(windows: Sequence[FitWindow], *, bench: Bench, width: float) -> Chain | None:
+def regress_chain(windows: Sequence[FitWindow], *, bench: Setup, width: float) -> Chain | None:
     """Regress a chain from the windows, with bumps of `width` (s).
 
     The result is None if some cart's equation cannot be set up, because the cart or a free
@@ -84,7 +84,7 @@ def _has_equation(window: FitWindow, cart: int, n: int) -> bool:
     return driven and cart in window.free and near <= set(window.carts)
 
 
-def _equation(cart: int, bench: Bench, x: Array, force: Array) -> tuple[Array, Array]:
+def _equation(cart: int, bench: Setup, x: Array, force: Array) -> tuple[Array, Array]:
     """Return the columns of m, c and the springs of a cart's equation, and its right side.
 
     The spring before the cart is a column only for cart 1; otherwise it is the right side. `x` (3,
@@ -135,7 +135,7 @@ def _around(t: Array, starts: Array, width: float) -> np.ndarray:
     return np.minimum(first[:, None] + np.arange(np.max(last - first) + 1), t.size - 1)
 
 
-def even_chains(windows: Sequence[FitWindow], *, bench: Bench) -> list[Chain]:
+def even_chains(windows: Sequence[FitWindow], *, bench: Setup) -> list[Chain]:
     """Return chains of equal carts, from slow to fast, with about the static gain of the records.
 
     They serve for records that a regression cannot use, such as one with an unmeasured cart. Their
@@ -214,7 +214,7 @@ class Attempt:
         return self.n_points - self.theta.size - sum(misfit.n_nuisance for misfit in self.misfits)
 
     @cached_property
-    def lost(self) -> float:
+    def unexplained_share(self) -> float:
         """The share of the motion's power (about its mean) that the chain does not explain."""
         power = sum(
             float(np.sum(((w.y - w.y.mean(axis=1, keepdims=True)) / w.sigma[:, None]) ** 2))
@@ -225,10 +225,12 @@ class Attempt:
     @property
     def follows(self) -> bool:
         """Whether the chain explains the motion down to the noise, or nearly all of it."""
-        return self.lost < FOLLOWED or self.cost < EXPLAINED * self.dof
+        return self.unexplained_share < FOLLOWED or self.cost < EXPLAINED * self.dof
 
 
-def look(windows: Sequence[FitWindow], parametrisation: Parametrisation, theta: Array) -> Attempt:
+def evaluate_chain(
+    windows: Sequence[FitWindow], parametrisation: Parametrisation, theta: Array
+) -> Attempt:
     """Compare the chain of theta with all windows."""
     chain, dp_dtheta = parametrisation.unpack(theta), parametrisation.dp_dtheta(theta)
     modes = {
@@ -239,7 +241,7 @@ def look(windows: Sequence[FitWindow], parametrisation: Parametrisation, theta: 
     return Attempt(parametrisation=parametrisation, theta=theta, windows=windows, misfits=misfits)
 
 
-def descend(
+def minimise_from(
     windows: Sequence[FitWindow],
     parametrisation: Parametrisation,
     theta: Array,
@@ -252,7 +254,7 @@ def descend(
     upper = np.minimum(parametrisation.bounds[1], theta + reach)
 
     def residual_and_jacobian(x: Array) -> tuple[Array, Array]:
-        triangle = condense(look(windows, parametrisation, x).misfits)
+        triangle = stacked_triangle(evaluate_chain(windows, parametrisation, x).misfits)
         return triangle[:, -1], triangle[:, :-1]
 
     solution = minimise(
@@ -264,13 +266,13 @@ def descend(
         max_evaluations=_MOST_EVALUATIONS,
     )
     return replace(
-        look(windows, parametrisation, solution.x),
+        evaluate_chain(windows, parametrisation, solution.x),
         converged=solution.status > 0,
         n_evaluations=solution.nfev,
     )
 
 
-def condense(misfits: Sequence[Misfit]) -> Array:
+def stacked_triangle(misfits: Sequence[Misfit]) -> Array:
     """Condense Jacobians and residuals to (n_p + 1, n_p + 1), the residuals in the last column.
 
     The result is the triangle of a QR decomposition, with the same products of columns as the full
@@ -318,7 +320,7 @@ def search(
     # 700 samples per record are enough for the search to come close.
     full, windows = windows, [window.thinned(700) for window in windows]
     near = [parametrisation.pack(chain) for chain in (given, *regressed) if chain is not None]
-    near.sort(key=lambda theta: look(windows, parametrisation, theta).cost)
+    near.sort(key=lambda theta: evaluate_chain(windows, parametrisation, theta).cost)
     even = [parametrisation.pack(chain) for chain in even_chains(windows, bench=bench)]
     best: Attempt | None = None
     tried = comparisons = 0
@@ -326,7 +328,7 @@ def search(
     for theta in (*near, *even):
         if cut_short := comparisons >= most_comparisons:
             break
-        found = descend(windows, parametrisation, theta)
+        found = minimise_from(windows, parametrisation, theta)
         tried, comparisons = tried + 1, comparisons + found.n_evaluations * len(windows)
         best = found if best is None or found.cost < best.cost else best
         # Chains of equal carts are far from the true chain, so a search from them may end at a
@@ -339,5 +341,5 @@ def search(
             "are the springs stated right?"
         )
     return SearchOutcome(
-        best=look(full, parametrisation, best.theta), n_starts=tried, cut_short=cut_short
+        best=evaluate_chain(full, parametrisation, best.theta), n_starts=tried, cut_short=cut_short
     )

@@ -10,7 +10,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.modal_response import Modes, drive_modes
 from pipeline.estimation.noise import local_noise, noise_beyond_rounding, rounding_left
 from pipeline.plant.simulate import OVERSAMPLING, interpolate_band_limited
-from pipeline.results import Kind, Record
+from pipeline.results import ExperimentKind, Record
 
 # A free decay is used after its largest swing has fallen to this share, because the hand or stop
 # has then let go of the cart.
@@ -38,7 +38,7 @@ class FitWindow:
     """
 
     id: str
-    kind: Kind
+    kind: ExperimentKind
     t: Array
     y: Array
     drive_t: Array

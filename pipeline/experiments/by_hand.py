@@ -8,7 +8,7 @@ from typing import Literal, get_args
 from pipeline.errors import ConfigError
 from pipeline.experiments.plan import Plan, Recording
 from pipeline.experiments.plan_file import add_recordings, recording_problems
-from pipeline.experiments.propose import EDGES, current_plan, let_go
+from pipeline.experiments.propose import EDGES, current_plan, release_by_hand
 from pipeline.protocol import FREQUENCIES
 from pipeline.submission import Submission, load_submission
 
@@ -78,7 +78,7 @@ def make_recording(wanted: WantedRecording, *, plan: Plan, submission: Submissio
             name = TYPED.get(key, key)
             raise ConfigError(f"{name}: expected {low:g} to {high:g} Hz, found {named[key]:g}")
     if kind == "decay":
-        made = let_go(wanted.cart, name=f"decay-{wanted.cart}", seconds=seconds)
+        made = release_by_hand(wanted.cart, name=f"decay-{wanted.cart}", seconds=seconds)
     else:
         driven = [one.settle for one in plan.recordings if one.amplitude]
         cycles = _count_periods(seconds, wanted.frequency) if kind != "step" else EDGES // 2

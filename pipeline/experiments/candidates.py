@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
 from pipeline.experiments.goal import Goal, choose
-from pipeline.experiments.information import Knowledge
+from pipeline.experiments.information import FisherInformation
 from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.experiments.propose import FURTHEST, rounded, rounded_down
 from pipeline.plant.simulate import SETTLED, SETTLED_DWELL, dwell_frequencies, settling_wait
@@ -25,7 +25,7 @@ _DIGITS = 4  # digits of shares and phases in the file
 
 
 def optimal_tones(
-    known: Knowledge, *, base: float, seconds: float, travel: float, goal: Goal
+    known: FisherInformation, *, base: float, seconds: float, travel: float, goal: Goal
 ) -> Tones:
     """Return harmonic, share of the peak and phase (rad) of each line of a multisine.
 
@@ -96,7 +96,7 @@ _DWELLS = 40  # number of frequencies for dwells
 
 
 def propose_candidates(
-    known: Knowledge, *, limits: PlanLimits, commands: Collection[str], goal: Goal
+    known: FisherInformation, *, limits: PlanLimits, commands: Collection[str], goal: Goal
 ) -> list[Recording]:
     """Return the recordings that could come next, with all carts free.
 
@@ -125,7 +125,7 @@ def propose_candidates(
     return candidates
 
 
-def _dwells(known: Knowledge) -> Iterator[Recording]:
+def _dwells(known: FisherInformation) -> Iterator[Recording]:
     """Yield dwells; each lasts twice as long as the carts need to reach the steady state.
 
     If the steady state takes too long to reach, no dwell is yielded. A transient would be mistaken
@@ -140,7 +140,7 @@ def _dwells(known: Knowledge) -> Iterator[Recording]:
 
 
 def _broadband(
-    known: Knowledge, limits: PlanLimits, commands: Collection[str], goal: Goal
+    known: FisherInformation, limits: PlanLimits, commands: Collection[str], goal: Goal
 ) -> Iterator[Recording]:
     resonances = np.sort(np.abs(known.chain.poles)) / (2 * np.pi)
     seconds = float(rounded(max(20.0, 20 / resonances[0])))  # 20 s, or 20 of the slowest periods

@@ -21,7 +21,13 @@ from pipeline.arrays import Array
 from pipeline.errors import DataError, PipelineError
 from pipeline.experiments.information import sampled_input
 from pipeline.experiments.plan import PlanLimits, Recording
-from pipeline.experiments.propose import FURTHEST, current_plan, let_go, rounded, rounded_down
+from pipeline.experiments.propose import (
+    FURTHEST,
+    current_plan,
+    release_by_hand,
+    rounded,
+    rounded_down,
+)
 from pipeline.gap.limits import CLOSE_BIC, THINNING
 from pipeline.gap.types import Gap, Prediction, Proposal
 from pipeline.plant.augmented import rest_positions, simulate_augmented
@@ -32,7 +38,7 @@ from pipeline.plant.simulator import sensitivity
 from pipeline.plant.simulator.kernel import StartState, describe_run, simulate
 from pipeline.submission import Submission
 
-Kind = Literal["step", "sweep"]
+TrialKind = Literal["step", "sweep"]
 Shape = Literal["square", "triangle", "chirp"]
 
 _PERIOD = 5e-3  # s between samples
@@ -190,7 +196,7 @@ def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, f
             max(_BEYOND * resonances[-1], 1 / (_PER_CYCLE * _PERIOD)),
         )
     )
-    waves: tuple[tuple[Shape, Kind, float, float | None], ...] = (
+    waves: tuple[tuple[Shape, TrialKind, float, float | None], ...] = (
         ("square", "step", slow, None),
         ("square", "sweep", rounded(float(resonances[0])), None),
         ("triangle", "sweep", slow, None),
@@ -227,7 +233,7 @@ def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, f
             continue
         for share in (0.6, 0.2):  # shares of the travel limit, for a release by hand
             height = rounded(share * limits.travel)
-            release = let_go(cart, name=f"apart-decay-{cart}", seconds=_TIME)
+            release = release_by_hand(cart, name=f"apart-decay-{cart}", seconds=_TIME)
             note = f"let go at {share:.0%} of the travel limit, {height:g} from the zero"
             yield release.model_copy(update={"note": note, "aim": "gap"}), height
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import ConfigError, DataError
-from pipeline.experiments.information import Knowledge
+from pipeline.experiments.information import FisherInformation
 from pipeline.names import names_beginning
 from pipeline.plant.chain import Chain
 from pipeline.plant.sampled_loop import LoopSetup, simulate_loop
@@ -75,7 +75,7 @@ def check_goal(name: str, *, names: Sequence[str]) -> None:
         raise ConfigError(f"--for {name}: there is no such parameter or goal{nearest(name, goals)}")
 
 
-def find_goal(name: str, known: Knowledge, *, feedback: FeedbackDesign | None) -> Goal:
+def find_goal(name: str, known: FisherInformation, *, feedback: FeedbackDesign | None) -> Goal:
     """Return the goal with this name: a parameter, "design", "worst", "mean" or "volume".
 
     Raises
@@ -107,7 +107,7 @@ def find_goal(name: str, known: Knowledge, *, feedback: FeedbackDesign | None) -
     return Goal(name=name, words=f"the error of {name}", rows=rows[at : at + 1])
 
 
-def _by_overshoot(known: Knowledge, feedback: FeedbackDesign) -> Array:
+def _by_overshoot(known: FisherInformation, feedback: FeedbackDesign) -> Array:
     """Return the derivatives (1, n_p) of the loop's peak with respect to the parameters.
 
     The parameters change by shares of their values, and the peak is a share of the step. The

@@ -28,7 +28,7 @@ from pipeline.estimation.parametrisation import (
     critical_damping,
     parameter_jacobian,
 )
-from pipeline.estimation.time_search import look
+from pipeline.estimation.time_search import evaluate_chain
 from pipeline.estimation.time_window import FitWindow, open_window, weighed
 from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.experiments.propose import identified_chain
@@ -39,7 +39,7 @@ from pipeline.results import Analysis, ChainFit, FrequencyResponse, Record, Sine
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Knowledge:
+class FisherInformation:
     """The information in the records so far, and the precision of the next ones.
 
     Attributes
@@ -168,7 +168,7 @@ class Knowledge:
         """Return H and S of a window, with positions rounded as the encoders round them."""
         rows = [cart - 1 for cart in window.carts]
         theta = self.parametrisation.pack(self.chain)
-        (misfit,) = look([window], self.parametrisation, theta).misfits
+        (misfit,) = evaluate_chain([window], self.parametrisation, theta).misfits
         J = misfit.jacobian * (self.size / self.parametrisation.dp_dtheta(theta))[:, None, None]
         exact = window.y + misfit.residual * window.sigma[:, None]
         resting = window.n_resting

@@ -13,7 +13,7 @@ from pipeline.arrays import Array
 from pipeline.errors import ConfigError, DataError
 from pipeline.experiments.candidates import propose_candidates
 from pipeline.experiments.goal import GAP, WORST, Goal, check_goal, choose, find_goal
-from pipeline.experiments.information import Knowledge
+from pipeline.experiments.information import FisherInformation
 from pipeline.experiments.plan import Plan, PlanLimits, Recording, session_time, time_words
 from pipeline.experiments.plan_file import add_recordings, plan_path
 from pipeline.experiments.propose import current_plan
@@ -176,7 +176,7 @@ def choose_next(
     ------
     DataError, ConfigError : see `plan_next`.
     """
-    known = Knowledge.of(analysis)
+    known = FisherInformation.of(analysis)
     wanted = find_goal(goal, known, feedback=analysis.feedback)
     candidates = [
         one
@@ -216,7 +216,7 @@ def choose_next(
     )
 
 
-def why_useless(recording: Recording, known: Knowledge, *, limits: PlanLimits) -> str:
+def why_useless(recording: Recording, known: FisherInformation, *, limits: PlanLimits) -> str:
     """Return why a recording would not improve the carts' parameters; "" if it would."""
     kinds = ("sine",) if known.dwells else ("step", "sweep")
     if recording.kind not in kinds:
@@ -273,7 +273,7 @@ def _decisive(submission: Submission, limits: PlanLimits) -> tuple[Recording, fl
     return recording, found.proposal.separation
 
 
-def _words(goal: Goal, known: Knowledge, *, after: Array) -> str:
+def _words(goal: Goal, known: FisherInformation, *, after: Array) -> str:
     if goal.name != WORST:
         return goal.words
     names = list(known.chain.parameters())
@@ -301,7 +301,7 @@ _WHY_WORSE = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Weighed:
+class ComparedRecordings:
     """Relative errors: now, after only the proposed recording, and after only the best recording.
 
     Attributes
@@ -318,9 +318,9 @@ class Weighed:
     best: float
 
 
-def weigh(
+def compare_recordings(
     analysis: Analysis, proposed: Recording, plan: Plan, *, goal: str, commands: frozenset[str]
-) -> Weighed:
+) -> ComparedRecordings:
     """Compare a recording with the best recording for a goal that the plan's limits allow.
 
     Raises
@@ -329,13 +329,13 @@ def weigh(
     """
     nothing_open = plan.model_copy(update={"recordings": ()})
     found = choose_next(analysis, nothing_open, n=1, goal=goal, commands=commands)
-    known = Knowledge.of(analysis)
+    known = FisherInformation.of(analysis)
     error = find_goal(goal, known, feedback=analysis.feedback).of
     why = why_useless(proposed, known, limits=plan.limits)
     after = found.now if why else float(error(known.information + known.of_recording(proposed)))
     if after > 1.01 * found.now:  # 1 % is visible in two digits
         why = _WHY_WORSE
-    return Weighed(
+    return ComparedRecordings(
         words=found.words,
         now=found.now,
         proposed=after,

@@ -22,7 +22,7 @@ from pipeline.plant.simulate import (
     SETTLED,
     SETTLED_DWELL,
     dwell_frequencies,
-    reach,
+    largest_motion,
     settling_wait,
     steady_time,
 )
@@ -198,10 +198,12 @@ def _decays(cart: int, system: System) -> list[Recording]:
     """Return releases of one cart by hand; a cart without a spring gives no release."""
     if not (system.springs[cart - 1] or system.springs[cart]):
         return []
-    return [let_go(cart, name=f"decay-{cart}{repeat}", seconds=10.0) for repeat in _REPEATS]
+    return [
+        release_by_hand(cart, name=f"decay-{cart}{repeat}", seconds=10.0) for repeat in _REPEATS
+    ]
 
 
-def let_go(cart: int, *, name: str, seconds: float) -> Recording:
+def release_by_hand(cart: int, *, name: str, seconds: float) -> Recording:
     """Return the recording of one cart that is released by hand while the others are held."""
     return Recording(
         id=name,
@@ -304,7 +306,7 @@ def _driven(chain: Chain, limits: PlanLimits) -> list[Recording]:
     for number, hertz in enumerate(dwell_frequencies(chain, n=_DWELLS), start=1):
         cycles = ceil(hertz * (wait + steady_time(hertz)))
         t = np.arange(0.0, cycles / hertz, min(0.005, 1 / (40 * hertz)))
-        unit = reach(chain, t, shape=np.sin(2 * np.pi * hertz * t), wait=wait)
+        unit = largest_motion(chain, t, shape=np.sin(2 * np.pi * hertz * t), wait=wait)
         amplitude = min(aim / unit.steady, furthest / unit.furthest, limits.input)
         recordings.append(
             Recording(

@@ -9,7 +9,7 @@ from pipeline.gap.limits import NOTHING
 from pipeline.gap.types import Gap, Trace
 from pipeline.plant.effect import AugmentedChain, effect_name
 from pipeline.results import Analysis
-from pipeline.words.numbers import abridge
+from pipeline.words.numbers import join_names
 from pipeline.words.phrases import phrases
 
 WORDS = phrases("exploration")
@@ -105,7 +105,7 @@ def describe_accuracy(missing: dict[str, float], errors: dict[str, float | None]
 
 def describe_doubt(gap: Gap) -> str:
     """Describe the effects found, or the explanations that are still in dispute."""
-    named = abridge([effect_name(found.effect, found.where) for found in gap.effects])
+    named = join_names([effect_name(found.effect, found.where) for found in gap.effects])
     times = "a gap"
     if gap.noise_floor:
         times = WORDS.text("times_noise", times=f"{gap.final / gap.noise_floor:.2g}")

@@ -11,7 +11,7 @@ from pipeline.plant.simulator.compiler import is_compiled, kept_in
 from pipeline.threads import with_one_thread
 
 _ROOM = Path(__file__).parent / "follow"
-_SCRIPT = "from pipeline.gap.follow.track import compile_follower; compile_follower()"
+_SCRIPT = "from pipeline.gap.pem.run import compile_follower; compile_follower()"
 
 
 @contextmanager

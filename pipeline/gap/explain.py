@@ -9,15 +9,17 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.estimation.interventions import find_interventions
 from pipeline.gap.compile_beside import follower_compiled
-from pipeline.gap.data.sides import drop_left_out, prepare, take_sides
+from pipeline.gap.data.holdout import drop_left_out, prepare, split_holdout
 from pipeline.gap.fit.baseline import fit_baseline
 from pipeline.gap.fit.levenberg_marquardt import Fitting, GapFit
-from pipeline.gap.follow.track import compile_follower
+from pipeline.gap.pem.run import compile_follower
 from pipeline.gap.search.deadline import Deadline
 from pipeline.gap.search.hypothesis import Study
 from pipeline.gap.search.search import Search
 from pipeline.gap.types import Cause, FoundEffect, Gap
-from pipeline.gap.verdict.account import (
+from pipeline.gap.verdict.free_run import free_runs
+from pipeline.gap.verdict.residual_map import map_residual
+from pipeline.gap.verdict.summary import (
     chain_covariance,
     chain_std,
     compare_by_record,
@@ -27,17 +29,15 @@ from pipeline.gap.verdict.account import (
     make_traces,
     repeatability,
 )
-from pipeline.gap.verdict.free_run import free_runs
-from pipeline.gap.verdict.left_force import left_forces
-from pipeline.gap.verdict.residual_map import map_residual
 from pipeline.gap.verdict.where import choose_experiment, find_windows
+from pipeline.gap.verdict.windowed_force import windowed_residual_forces
 from pipeline.gap.workers import two_workers
 from pipeline.plant.augmented import compile_simulator
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import Effect, EffectTerm
 from pipeline.results import Analysis, Record
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress, silent
 
@@ -85,7 +85,7 @@ def investigate(analysis: Analysis, *, progress: Progress, budget: float | None 
 
 def explain_gap(
     records: Sequence[Record],
-    bench: Bench,
+    bench: Setup,
     *,
     chain: Chain | None = None,
     catalogue: Sequence[Effect] = CATALOGUE,
@@ -110,7 +110,7 @@ def explain_gap(
     notes: list[str] = []
     interventions = find_interventions(records)
     runs = prepare(records, springs=bench.springs, interventions=interventions, notes=notes)
-    training, held_out = take_sides(runs, notes=notes)
+    training, held_out = split_holdout(runs, notes=notes)
     # If the longest run was cut in time, there is one run more than before.
     whole = runs if len(training) + len(held_out) > len(runs) and not any(bench.springs) else []
     # The matrices are small, so threads inside BLAS would only slow the workers down.
@@ -143,7 +143,7 @@ def explain_gap(
         )
 
 
-def _describe(search: Search, bench: Bench) -> Gap:
+def _describe(search: Search, bench: Setup) -> Gap:
     """Return the result of a search as a `Gap`."""
     study, path, chosen, final = search.study, search.path, search.chosen, search.final
     verdict, found, close = search.verdict, search.found, search.close
@@ -157,7 +157,9 @@ def _describe(search: Search, bench: Bench) -> Gap:
     settled = enough and study.is_noise(chosen)
     left = () if enough else find_windows(chosen.fit, study.training)
     told = enough or (verdict == "ambiguous" and study.explains(chosen))
-    measure_left = cache(partial(left_forces, final, *zip(*search.judged, strict=True)))
+    measure_left = cache(
+        partial(windowed_residual_forces, final, *zip(*search.judged, strict=True))
+    )
     repeated = study.repeatability > 0
     return Gap(
         bench=bench,

@@ -8,8 +8,8 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.measured_run import measured_run
+from pipeline.gap.data.holdout import prepare
 from pipeline.gap.data.runs import GapRun
-from pipeline.gap.data.sides import prepare
 from pipeline.plant.effect import AugmentedChain
 from pipeline.results import HardwareCheck, Record
 

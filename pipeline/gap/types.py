@@ -12,7 +12,7 @@ from pipeline.json_files import Number, computed, read_json, result, written
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import AugmentedChain, Effect
 from pipeline.results import ChainWithUnits, Intervention, LeftOut, Provenance, RecordingGroup
-from pipeline.set_up import Bench, Units
+from pipeline.setup import Setup, Units
 from pipeline.submission.complaints import first_refusal, quote
 
 Quantity = Literal["position", "velocity", "input"]
@@ -30,7 +30,7 @@ class NamedValue:
 
 
 @result()
-class Rival:
+class Alternative:
     """Another effect that could take the place of the found effect, fitted in the same way."""
 
     effect: Effect = written("name of the effect in the catalogue")
@@ -52,7 +52,7 @@ class FoundEffect:
     )
     nrmse_before: Number = written("without this effect")
     nrmse_after: Number = written("with this effect")
-    rivals: tuple[Rival, ...] = written()
+    rivals: tuple[Alternative, ...] = written()
 
 
 @result()
@@ -106,7 +106,7 @@ class Trace:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LeftForce:
+class WindowedResidualForce:
     """The unexplained force on one cart in one run, as a mean over each window.
 
     Attributes
@@ -188,7 +188,7 @@ class Residual:
 
 
 @result(eq=False)
-class Contender(AugmentedChain):
+class AlternativeModel(AugmentedChain):
     """A model that may be the true one."""
 
     weight: float = written("weight among the contenders, by the Bayesian criterion")
@@ -295,7 +295,7 @@ class Gap:
         "each effect lowers the error by a tenth or more, but a gap remains. Verdict "
         "`unexplained`: they are only suspects"
     )
-    suspects: tuple[Rival, ...] = written(
+    suspects: tuple[Alternative, ...] = written(
         "if the verdict is `unexplained`, the single effects that help most, the best first",
         default=(),
     )
@@ -366,7 +366,7 @@ class Gap:
 
     linear: AugmentedChain
     model: AugmentedChain = written("the chain with the effects")
-    contenders: tuple[Contender, ...] = written(
+    contenders: tuple[AlternativeModel, ...] = written(
         "models that may be true, the chosen one first, then the likeliest; empty if only noise is "
         "left",
         default=(),
@@ -393,14 +393,14 @@ class Gap:
     )
     provenance: Provenance = written(default_factory=lambda: Provenance(files={}))
     title: str = ""
-    bench: Bench
+    bench: Setup
     traces: tuple[Trace, ...]
-    measure_left: Callable[[], tuple[LeftForce, ...]] = tuple
+    measure_left: Callable[[], tuple[WindowedResidualForce, ...]] = tuple
     chain_covariance: Array | None = None
     proposal: Proposal | None = None
 
     @property
-    def left_forces(self) -> tuple[LeftForce, ...]:
+    def left_forces(self) -> tuple[WindowedResidualForce, ...]:
         """The force that the model does not explain, by run and cart."""
         return self.measure_left()
 
@@ -423,7 +423,7 @@ class Gap:
         if recording is not None and separation is not None:
             proposal = Proposal(recording=recording, limits=limits or {}, separation=separation)
         del own["chain"]  # also in the model
-        bench = Bench(springs=springs, units=units)
+        bench = Setup(springs=springs, units=units)
         return cls(
             bench=bench,
             title=submission.title,

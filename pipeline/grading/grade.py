@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field
 
 from pipeline.json_files import json_text
-from pipeline.set_up import Units
+from pipeline.setup import Units
 
 Outcome = Literal["pass", "partial", "fail", "skip"]
 Code = Literal[

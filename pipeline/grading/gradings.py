@@ -98,7 +98,7 @@ def person(author: str) -> str:
     return " ".join(unicodedata.normalize("NFKC", author).split()).casefold()
 
 
-def go_with(given: tuple[str, ...], authors: tuple[str, ...]) -> bool:
+def same_people(given: tuple[str, ...], authors: tuple[str, ...]) -> bool:
     """Return whether points given to some people apply to a submission by some authors.
 
     They do if at least one author is among those people. If the authors or the people are

@@ -17,7 +17,7 @@ from pydantic import (
 
 from pipeline.grading.grade import CODES, Code
 from pipeline.names import parameter_names
-from pipeline.results import Kind
+from pipeline.results import ExperimentKind
 from pipeline.submission import Design, Students, System
 from pipeline.submission.complaints import quote
 from pipeline.submission.models import TomlTable
@@ -38,7 +38,7 @@ class RequiredRuns(TomlTable):
     carts : the carts that are free to move; default: all.
     """
 
-    kind: Kind
+    kind: ExperimentKind
     carts: tuple[int, ...] = ()
     at_least: Count = 1
 
@@ -184,7 +184,7 @@ class RequiredPieces(_Criterion):
     """
 
     check: Literal["required"]
-    experiments: tuple[Kind, ...] = ()
+    experiments: tuple[ExperimentKind, ...] = ()
 
 
 class DataQuality(_Criterion):

@@ -15,7 +15,7 @@ from pipeline.ingest.read import DUTY_COUNT, Ingested
 from pipeline.results import Assumption, ChainFit, Check, Record
 from pipeline.submission import Submission, System
 from pipeline.submission.load import spring_names
-from pipeline.words.numbers import abridge
+from pipeline.words.numbers import join_names
 
 Support = Literal["supported", "contradicted", "open"]
 
@@ -97,7 +97,7 @@ def _units(
         if doubt := doubts.get(f"{role}_unit") or doubts.get(f"{role}_scale"):
             support, reason = "contradicted", doubt
         elif headed:
-            support, reason = "supported", f"the headings of {abridge(headed)} state a unit"
+            support, reason = "supported", f"the headings of {join_names(headed)} state a unit"
         elif role == "position" and is_count(side.unit) and records:
             support, reason = "supported", "the positions are whole numbers, as counts are"
         else:
@@ -147,8 +147,8 @@ def _sign(system: System, data: Ingested, *, failed: Sequence[Check]) -> Iterato
     if wrong:
         support, reason = "contradicted", wrong
     elif shown_by:
-        but = f"; the opposite sign is shown by {abridge(others)}"
-        support, reason = "supported", f"shown by {abridge(shown_by)}{but if others else ''}"
+        but = f"; the opposite sign is shown by {join_names(others)}"
+        support, reason = "supported", f"shown by {join_names(shown_by)}{but if others else ''}"
     else:
         reason = "no recording shows it"
     yield Assumption(
@@ -176,14 +176,14 @@ def _free_carts(
         still = [r.id for r in alike if any(_stands_still(r, c) for c in free if c in r.carts)]
         support: Support = "open"
         if contrary := [name for name in names if name in wrong]:
-            support, reason = "contradicted", f"in {abridge(contrary)} another cart moves"
+            support, reason = "contradicted", f"in {join_names(contrary)} another cart moves"
         elif still:
-            reason = f"in {abridge(still)} a cart stated as free does not move"
+            reason = f"in {join_names(still)} a cart stated as free does not move"
         elif little := [record.id for record in alike if _hardly_moving(record)]:
-            reason = f"in {abridge(little)} a cart stated as free hardly moves"
+            reason = f"in {join_names(little)} a cart stated as free hardly moves"
         elif unseen:
             what = "a held cart" if held else "a cart"
-            reason = f"in {abridge(unseen)} the position of {what} was not recorded"
+            reason = f"in {join_names(unseen)} the position of {what} was not recorded"
         else:
             support = "supported"
             reason = "the held carts hardly move" if held else "all carts move"

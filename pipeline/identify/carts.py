@@ -10,6 +10,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.interventions import between
 from pipeline.identify.fit import Fitted, Runs, fit_carts
 from pipeline.identify.log import Log
+from pipeline.identify.repeated_numbers import Repeats, compare_repeats
 from pipeline.ingest.read import Ingested
 from pipeline.names import parameter_names
 from pipeline.results import (
@@ -25,9 +26,8 @@ from pipeline.results import (
     Stage,
     StepGain,
 )
-from pipeline.set_up import Bench
-from pipeline.soundness.repeated_numbers import Repeats, compare_repeats
-from pipeline.stages.compare import compare, why_open
+from pipeline.setup import Setup
+from pipeline.stages.compare import compare, undetermined_reason
 from pipeline.stages.frequency_response import (
     collect_dwells,
     dwell_fault,
@@ -38,7 +38,7 @@ from pipeline.stages.initial import estimate_initially
 from pipeline.stages.log_decrement import fit_log_decrement
 from pipeline.stages.sine import Dwell
 from pipeline.stages.step_gain import fit_step_gain
-from pipeline.words.numbers import abridge, by_note
+from pipeline.words.numbers import group_messages, join_names
 from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress
 
@@ -69,7 +69,7 @@ def identify(
     *,
     interventions: Sequence[Intervention],
     without: Set[str],
-    bench: Bench,
+    bench: Setup,
     progress: Progress,
     measured: dict[str, Any],
 ) -> Identified:
@@ -98,7 +98,7 @@ def identify(
         *((f"{g.experiment} (cart {g.cart})", g.note) for g in gains if not g.interval),
         *((f"{p.experiment} (cart {p.cart})", p.note) for p in sines),
     ]
-    log.warn(by_note(notes))
+    log.warn(group_messages(notes))
     ended_early = {point.experiment for point in sines if not point.settled}
     short = [r for r in used if r.id in ended_early and len(r.free) == bench.n]
     runs = replace(runs, short=short)
@@ -125,7 +125,7 @@ def identify(
     )
 
 
-def compare_estimates(found: Identified, *, bench: Bench) -> tuple[ParameterRow, ...]:
+def compare_estimates(found: Identified, *, bench: Setup) -> tuple[ParameterRow, ...]:
     """Return the initial and final estimates side by side.
 
     Estimates that the fit does not determine are skipped. A failed fit determines none.
@@ -136,7 +136,7 @@ def compare_estimates(found: Identified, *, bench: Bench) -> tuple[ParameterRow,
     elif fit and not final:
         found.log.skip(Stage.NAMED_PARAMETERS, _WORDS.text("untied"))
     for name, estimate in final.items():
-        if reason := why_open(name, estimate):
+        if reason := undetermined_reason(name, estimate):
             skip = Skipped(stage=Stage.FINAL_PARAMETER, parameter=name, reason=reason)
             found.log.skipped.append(skip)
     return compare(
@@ -161,7 +161,7 @@ def _driven(records: Sequence[Record], *, n: int, log: Log) -> list[Record]:
     runs = [r for r in records if r.kind in ("step", "sweep") and r.u is not None]
     runs = [r for r in runs if len(r.free) == n]
     log.warn(
-        by_note(
+        group_messages(
             (run.id, _WORDS.text("carts_unseen", all=n, carts=_counted(run.carts)))
             for run in runs
             if len(run.carts) < n
@@ -171,7 +171,7 @@ def _driven(records: Sequence[Record], *, n: int, log: Log) -> list[Record]:
 
 
 def _log_decrements(
-    runs: Runs, *, bench: Bench, interventions: Sequence[Intervention], log: Log
+    runs: Runs, *, bench: Setup, interventions: Sequence[Intervention], log: Log
 ) -> list[LogDecrement]:
     """Return the decays of each cart alone; a cart without one is judged by its step ringing."""
     decays: list[LogDecrement] = []
@@ -224,14 +224,14 @@ def _skip_without(
 ) -> None:
     """Note that records of some kind are missing, or that all of them were left out."""
     if out:
-        reason = _WORDS.text("all_left_out", what=what, runs=abridge([r.id for r in out]))
+        reason = _WORDS.text("all_left_out", what=what, runs=join_names([r.id for r in out]))
         log.skip(stage, reason, cart=cart)
     else:
         reason = _WORDS.text("none_recorded", what=what)
         log.skip(stage, reason, cart=cart, missing=f"a {what}")
 
 
-def _step_gains(runs: Runs, *, bench: Bench, log: Log) -> list[StepGain]:
+def _step_gains(runs: Runs, *, bench: Setup, log: Log) -> list[StepGain]:
     if not bench.tied:
         log.skip(Stage.STEP_GAIN, _WORDS.text("untied"))
         return []
@@ -292,7 +292,7 @@ def _frequency_response(
 
 
 def _resonances(
-    responses: Sequence[FrequencyResponse], *, bench: Bench, log: Log
+    responses: Sequence[FrequencyResponse], *, bench: Setup, log: Log
 ) -> dict[str, Estimate]:
     if not bench.tied:
         log.skip(Stage.RESONANCES, _WORDS.text("untied_modes"))

@@ -7,13 +7,19 @@ from functools import partial
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.estimation.record_fit import Followed, find_misread, follow, most_follow, near
+from pipeline.estimation.record_fit import (
+    RecordFit,
+    find_correction,
+    fit_detuned,
+    most_are_consistent,
+    record_fits,
+)
+from pipeline.identify.corrections import without_lone_factors
+from pipeline.identify.fault import RecordingFault
 from pipeline.identify.log import Log
 from pipeline.names import own_zeta
 from pipeline.results import ChainFit, Estimate, FrequencyResponse, Record, Stage
-from pipeline.set_up import Bench
-from pipeline.soundness.fault import RecordingFault
-from pipeline.soundness.other_readings import without_lone_factors
+from pipeline.setup import Setup
 from pipeline.stages.bode_fit import fit_bode
 from pipeline.stages.coverage import motion_measured, points_measured, with_coverage
 from pipeline.stages.sine import FEW_COUNTS
@@ -36,7 +42,7 @@ class Fitted:
     """
 
     fit: ChainFit | None = None
-    fits: Mapping[str, Followed] = field(default_factory=dict)
+    fits: Mapping[str, RecordFit] = field(default_factory=dict)
     by_dwells: bool = False
     conflict: Mapping[str, RecordingFault] = field(default_factory=dict)
 
@@ -65,7 +71,7 @@ def fit_carts(
     *,
     runs: Runs,
     initial: dict[str, Estimate],
-    bench: Bench,
+    bench: Setup,
     log: Log,
 ) -> Fitted:
     """Return the Bode fit if the records follow it, or else the joint time-domain fit."""
@@ -124,7 +130,7 @@ def _fit_points(
     responses: Sequence[FrequencyResponse],
     runs: Runs,
     initial: Mapping[str, Estimate],
-    bench: Bench,
+    bench: Setup,
     log: Log,
 ) -> Fitted | None:
     """Return the fit to the frequency response, and whether the dwells follow it."""
@@ -139,7 +145,7 @@ def _fit_points(
     return bode and replace(bode, by_dwells="sine" in _kinds_that_follow(runs.used, bode))
 
 
-def _fit_records(records: Sequence[Record], runs: Runs, *, bench: Bench, log: Log) -> Fitted | None:
+def _fit_records(records: Sequence[Record], runs: Runs, *, bench: Setup, log: Log) -> Fitted | None:
     """Return the fit to whole records in the time domain."""
     fit = log.attempt(Stage.FINAL_ESTIMATES, partial(fit_records, records, bench=bench))
     if fit is None:
@@ -194,7 +200,7 @@ def _held(fit: ChainFit | None, runs: Runs, *, measured: Array) -> Fitted | None
     if fit is None:
         return None
     records = [*runs.used, *runs.left_out]
-    return Fitted(fit=with_coverage(fit, measured), fits=follow(records, fit.chain))
+    return Fitted(fit=with_coverage(fit, measured), fits=record_fits(records, fit.chain))
 
 
 def _kinds_that_follow(records: Sequence[Record], fitted: Fitted) -> set[str]:
@@ -202,7 +208,7 @@ def _kinds_that_follow(records: Sequence[Record], fitted: Fitted) -> set[str]:
     return {
         kind
         for kind, ids in _by_kind(records, fitted).items()
-        if most_follow({name: fitted.fits[name] for name in ids})
+        if most_are_consistent({name: fitted.fits[name] for name in ids})
     }
 
 
@@ -221,12 +227,12 @@ def _contrary_kinds(records: Sequence[Record], fitted: Fitted) -> set[str]:
 
     def contrary(name: str) -> bool:
         # With inches in place of centimetres, this share is 0.37.
-        return all(fit.share > 0.3 for fit in near(by_id[name], chain))
+        return all(fit.share > 0.3 for fit in fit_detuned(by_id[name], chain))
 
     return {
         kind
         for kind, ids in _by_kind(records, fitted).items()
-        if 2 * sum(not fitted.fits[name].belongs for name in ids) > len(ids)
+        if 2 * sum(not fitted.fits[name].is_consistent for name in ids) > len(ids)
         and 2 * sum(map(contrary, ids)) > len(ids)
     }
 
@@ -250,7 +256,7 @@ def _conflict(
     assert fitted.fit is not None
     chain, ids = fitted.fit.chain, _by_kind(records, fitted)
     others = [r for r in records if r.id in fitted.fits and r.kind in theirs - mine]
-    misread = {r.id: m for r in others if (m := find_misread(r, chain, fitted.fits[r.id]))}
+    misread = {r.id: m for r in others if (m := find_correction(r, chain, fitted.fits[r.id]))}
     held = [record for record in records if record.id in fitted.fits]
     found = without_lone_factors(misread, held, fits=fitted.fits)
     if 2 * len(found) <= len(others):

@@ -8,15 +8,15 @@ import numpy as np
 from pipeline.errors import DataError
 from pipeline.estimation.parametrisation import Parametrisation
 from pipeline.estimation.record_fit import is_driven
-from pipeline.estimation.time_search import look
+from pipeline.estimation.time_search import evaluate_chain
 from pipeline.estimation.time_window import open_window
 from pipeline.identify.carts import Identified
 from pipeline.names import read_name
 from pipeline.results import EXPLAINED, ChainFit, Check, ParameterRow, Record, RecordingGroup
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.stages.compare import SIGMA_LIMIT
 from pipeline.stages.time_fit import fit_records
-from pipeline.words.numbers import abridge, listing, with_error
+from pipeline.words.numbers import join_names, listing, with_error
 from pipeline.words.phrases import phrases
 
 _WORDS = phrases("checks")
@@ -31,7 +31,7 @@ _MOST_DWELLS = 8  # dwells that are fitted if a group has no other recordings
 
 
 def find_groups(
-    found: Identified, *, records: Sequence[Record], rows: Sequence[ParameterRow], bench: Bench
+    found: Identified, *, records: Sequence[Record], rows: Sequence[ParameterRow], bench: Setup
 ) -> tuple[RecordingGroup, ...]:
     """Return the groups of recordings that want different carts, the largest first.
 
@@ -46,13 +46,13 @@ def find_groups(
     groups = [] if one else _driven_groups(driven, start=explained, bench=bench)
     if told := _described(groups):
         return told
-    if explained and all(fits[r.id].belongs for r in records if r.id in fits):
+    if explained and all(fits[r.id].is_consistent for r in records if r.id in fits):
         return _against_decays(explained, found=found, rows=rows)
     return ()
 
 
 def _driven_groups(
-    driven: Sequence[Record], *, start: ChainFit | None, bench: Bench
+    driven: Sequence[Record], *, start: ChainFit | None, bench: Setup
 ) -> list[tuple[list[Record], ChainFit]]:
     """Return groups of driven recordings with the carts that explain each; none if they are one."""
     groups: list[tuple[list[Record], ChainFit]] = []
@@ -73,7 +73,7 @@ def check_groups(groups: Sequence[RecordingGroup]) -> list[Check]:
     if not groups:
         return []
     told = [
-        abridge(list(group.experiments))
+        join_names(list(group.experiments))
         + ": "
         + listing([f"{k} = {with_error(v, group.std.get(k))}" for k, v in group.values.items()])
         for group in groups
@@ -122,7 +122,7 @@ def _differs(row: ParameterRow) -> bool:
 
 
 def _largest(
-    rest: Sequence[Record], *, start: ChainFit | None, bench: Bench
+    rest: Sequence[Record], *, start: ChainFit | None, bench: Setup
 ) -> tuple[list[Record], ChainFit | None]:
     """Return the largest group of recordings that follow one fit, and this fit."""
     largest: list[Record] = []
@@ -137,7 +137,7 @@ def _largest(
 
 
 def _fits(
-    rest: Sequence[Record], followed: set[str], *, start: ChainFit | None, bench: Bench
+    rest: Sequence[Record], followed: set[str], *, start: ChainFit | None, bench: Setup
 ) -> Iterator[ChainFit]:
     """Yield fits that recordings may follow: `start`, then those of single recordings.
 
@@ -163,11 +163,11 @@ def _fits(
 def _follows(record: Record, fit: ChainFit) -> bool:
     """Return whether a recording follows a fit within the noise and the errors of the fit."""
     chain = fit.chain
-    every = Parametrisation(bench=Bench(springs=tuple(bool(k) for k in chain.k)))
+    every = Parametrisation(bench=Setup(springs=tuple(bool(k) for k in chain.k)))
     sizes = zip(every.names, every.physical(chain), strict=True)
     P = replace(every, zero=tuple(name for name, size in sizes if not size > 0))
     try:
-        attempt = look([open_window(record)], P, P.pack(chain))
+        attempt = evaluate_chain([open_window(record)], P, P.pack(chain))
     except DataError:  # nothing moves
         return True
     (misfit,) = attempt.misfits
@@ -179,7 +179,7 @@ def _follows(record: Record, fit: ChainFit) -> bool:
     return bool(attempt.cost <= EXPLAINED * attempt.n_points + SIGMA_LIMIT**2 * doubt)
 
 
-def _fit(members: Sequence[Record], *, bench: Bench) -> ChainFit | None:
+def _fit(members: Sequence[Record], *, bench: Setup) -> ChainFit | None:
     whole = [record for record in members if record.kind != "sine"]
     dwells = members[:: 1 + len(members) // _MOST_DWELLS]
     try:

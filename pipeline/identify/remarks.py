@@ -6,11 +6,11 @@ from math import ceil
 import numpy as np
 
 from pipeline.estimation.interventions import without_releases
+from pipeline.identify.encoders import find_other_units
 from pipeline.ingest.formats.headings import conversion
 from pipeline.ingest.read import Ingested
 from pipeline.results import Intervention, Record
-from pipeline.soundness.encoders import find_other_units
-from pipeline.words.numbers import by_note
+from pipeline.words.numbers import group_messages
 from pipeline.words.phrases import phrases
 
 _WORDS = phrases("skipped")
@@ -29,8 +29,8 @@ def reading_remarks(data: Ingested, *, unit: str) -> list[str]:
     return [
         *data.warnings,
         *_too_fast(data.records, unit=unit),
-        *by_note((record.id, note) for record in data.records for note in record.notes),
-        *by_note(
+        *group_messages((record.id, note) for record in data.records for note in record.notes),
+        *group_messages(
             (name, _WORDS.text("decay_in_other_unit", reason=one.reason))
             for name, one in units.items()
         ),
@@ -39,7 +39,7 @@ def reading_remarks(data: Ingested, *, unit: str) -> list[str]:
 
 def hand_remarks(interventions: Sequence[Intervention], *, records: Sequence[Record]) -> list[str]:
     """Return in which records and when a hand moves a cart, except for releases of decays."""
-    return by_note(
+    return group_messages(
         (
             one.experiment,
             _WORDS.text(

@@ -25,7 +25,7 @@ from pipeline.ingest.fill import (
 from pipeline.ingest.read import read_data
 from pipeline.names import toml_flags
 from pipeline.results import EXPLAINED, ChainFit, Check, FrequencyResponse, Record, StepGain
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.stages.bode_fit import fit_bode
 from pipeline.stages.compare import SIGMA_LIMIT
 from pipeline.stages.step_gain import fit_step_gain
@@ -164,7 +164,7 @@ def check_springs(
     responses: Sequence[FrequencyResponse],
     gains: Sequence[StepGain],
     records: Sequence[Record],
-    bench: Bench,
+    bench: Setup,
 ) -> list[Check]:
     """Return a failed check for each stated or missing spring that the data contradict.
 
@@ -217,7 +217,7 @@ def check_springs(
     return checks
 
 
-def _named(right: Sequence[bool], *, bench: Bench) -> str:
+def _named(right: Sequence[bool], *, bench: Setup) -> str:
     """Return the change from the stated springs to the right ones, in words."""
     names = spring_names(bench.n)
     pairs = list(zip(names, right, bench.springs, strict=True))
@@ -229,7 +229,7 @@ def _named(right: Sequence[bool], *, bench: Bench) -> str:
     return f"{said} but no spring {listing(fewer)}" if fewer else said
 
 
-def _last_by_gains(gains: Sequence[StepGain], *, bench: Bench) -> float | None:
+def _last_by_gains(gains: Sequence[StepGain], *, bench: Setup) -> float | None:
     """Return k_(n+1) / k_n by the steps if it contradicts the last stated spring, or else None."""
     n = bench.n
     by_run = {(gain.experiment, gain.cart): gain for gain in gains}
@@ -250,7 +250,7 @@ def _last_by_gains(gains: Sequence[StepGain], *, bench: Bench) -> float | None:
 
 
 def _better_springs(
-    fit: ChainFit | None, responses: Sequence[FrequencyResponse], *, bench: Bench
+    fit: ChainFit | None, responses: Sequence[FrequencyResponse], *, bench: Setup
 ) -> _BetterSprings | None:
     """Return springs with which the carts explain the frequency response much better."""
     n, stated = bench.n, bench.springs
@@ -284,7 +284,7 @@ def _better_springs(
 
 
 def _misfit(
-    fit: ChainFit | None, responses: Sequence[FrequencyResponse], *, bench: Bench
+    fit: ChainFit | None, responses: Sequence[FrequencyResponse], *, bench: Setup
 ) -> float | None:
     """Return χ² per degree of freedom with the stated springs; None if no such carts fit."""
     if fit and fit.method == "bode_fit":

@@ -27,7 +27,7 @@ from pipeline.ingest.folder import (
 )
 from pipeline.ingest.formats.recognise import ENDINGS, choose_run, read_tables
 from pipeline.ingest.inspect import NO_CLOCK, Inspection, inspect_runs
-from pipeline.results import Kind
+from pipeline.results import ExperimentKind
 from pipeline.submission.edit import (
     append_experiment,
     comment_text,
@@ -39,7 +39,7 @@ from pipeline.submission.load import NAME, file_problem, path_problem, posix, st
 from pipeline.submission.models import MOST_CARTS, MOST_EXPERIMENTS
 from pipeline.submission.template import write_templates
 from pipeline.submission.toml_file import Value, parse_toml
-from pipeline.words.numbers import by_note, first_few
+from pipeline.words.numbers import first_few, group_messages
 
 UNSURE = "unsure: "  # begins a comment below a table; a person who knows the answer removes it
 _TO_STATE = {  # facts that a file does not show
@@ -73,7 +73,7 @@ class Found:
     file: str
     state: State
     experiment: str = ""
-    kind: Kind | None = None
+    kind: ExperimentKind | None = None
     carts: tuple[int, ...] = ()
     inspection: Inspection | None = None
     remarks: tuple[str, ...] = ()
@@ -187,7 +187,13 @@ def _ranges(inspection: Inspection) -> dict[int, float]:
 
 
 def experiment_entry(
-    inspection: Inspection, *, name: str, kind: Kind, file: str, carts: Sequence[int], n: int
+    inspection: Inspection,
+    *,
+    name: str,
+    kind: ExperimentKind,
+    file: str,
+    carts: Sequence[int],
+    n: int,
 ) -> dict[str, Value]:
     """Return the keys of a file's `[[experiments]]` table, in a system with `n` carts."""
     entry: dict[str, Value] = {"id": name, "kind": kind}
@@ -515,7 +521,7 @@ def format_found(found: Sequence[Found]) -> str:
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in rows
     ]
-    remarks = by_note(
+    remarks = group_messages(
         (one.file, remark)
         for one in found
         for remark in (

@@ -23,7 +23,7 @@ from pipeline.arrays import Array
 from pipeline.estimation.modulating import bump, motion_period
 from pipeline.results import Record
 from pipeline.submission import Submission
-from pipeline.words.numbers import abridge
+from pipeline.words.numbers import join_names
 
 _NARROWEST = 8  # fewest samples under a bump
 _BUMPS = 6  # bumps side by side in a record
@@ -101,10 +101,10 @@ def _say_signs(
     usual = 1 if sum(signs[name] for name in searched) >= 0 else -1
     text = f"sign of the input found from the data: {usual:+d}"
     if others := [name for name in searched if signs[name] != usual]:
-        text += f", but {-usual:+d} in {abridge(others, most=FEW_NAMES)}"
+        text += f", but {-usual:+d} in {join_names(others, most=FEW_NAMES)}"
     if unsure := [name for name in searched if not found.get(name)]:
         text += (
-            f"; the data of {abridge(unsure, most=FEW_NAMES)} do not show it, so it is taken "
+            f"; the data of {join_names(unsure, most=FEW_NAMES)} do not show it, so it is taken "
             "from the other recordings"
         )
     return [text]

@@ -17,8 +17,8 @@ from pipeline.ingest.formats.headings import conversion, parse_heading, plain_na
 from pipeline.ingest.formats.recognise import FORM_TITLES, choose_run, read_tables
 from pipeline.ingest.formats.table import FileTable, Variable
 from pipeline.ingest.unnamed import Roles, find_roles
-from pipeline.results import Kind
-from pipeline.words.numbers import by_note, count, first_few
+from pipeline.results import ExperimentKind
+from pipeline.words.numbers import count, first_few, group_messages
 
 # Words in headings of signals that drive nothing.
 _NOT_INPUT = re.compile(
@@ -74,7 +74,7 @@ class Inspection:
     rate: float | None
     interval: float | None
     jitter: float | None
-    kind: Kind | None
+    kind: ExperimentKind | None
     frequency: float | None
     problems: tuple[str, ...]
     unusable: tuple[str, ...]
@@ -295,7 +295,7 @@ def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str])
 
 def _guess(
     table: FileTable, columns: Mapping[str, Column], clock: Clock | None, problems: list[str]
-) -> tuple[Kind | None, float | None]:
+) -> tuple[ExperimentKind | None, float | None]:
     """Return the likely kind of experiment, and the frequency of a dwell."""
     if "frequency" in columns:
         return "bode", None
@@ -399,7 +399,7 @@ def format_inspections(inspections: Sequence[Inspection]) -> str:
         "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in rows
     ]
-    problems = by_note(
+    problems = group_messages(
         (one.title, said)
         for one in inspections
         for said in (*one.problems, *filter(None, [one.ranges]))

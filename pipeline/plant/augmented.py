@@ -15,9 +15,9 @@ from pipeline.errors import DataError
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import AugmentedChain
 from pipeline.plant.simulator import kernel
-from pipeline.plant.simulator.contacts import guard, switch
-from pipeline.plant.simulator.laws import arriving, reach_of, settling
-from pipeline.plant.simulator.sensitivity import make_lanes
+from pipeline.plant.simulator.contacts import contact_gap, toggle_contact
+from pipeline.plant.simulator.laws import hysteresis, longest_step, shaped_input
+from pipeline.plant.simulator.sensitivity import make_sensitivities
 from pipeline.plant.simulator.state import Push
 from pipeline.plant.simulator.step import advance, smooth_forces
 from pipeline.plant.simulator.tables import DRY, Cart, Drive, Spring, Tables
@@ -123,7 +123,7 @@ class SteppedBench:
         for i in range(n, bodies.N):
             parent = 0 if i == bodies.motor else bodies.parent[i]
             self._state[kernel.X, i] = self._state[kernel.X, parent]
-        self._no_lanes = make_lanes(kernel.NO_LANES, bodies.N)
+        self._no_lanes = make_sensitivities(kernel.NO_LANES, bodies.N)
         self._step, contact_step = self._step_lengths()
         self._push = Push(
             u=0.0,
@@ -131,7 +131,7 @@ class SteppedBench:
             h=self._step,
             scatter=np.ones(n),
             dry=bool(np.any(self._tables.cart[:, DRY])),
-            smooth=reach_of(*self._tables)[1],
+            smooth=longest_step(*self._tables)[1],
             contact_step=contact_step,
         )
         self._close_contacts()
@@ -171,8 +171,8 @@ class SteppedBench:
         """
         if -self._tables.drive[Drive.INPUT_DELAY_DELAY] > interval * (1 + 1e-9):
             raise DataError("in a closed loop the input cannot lead its log by more than a sample")
-        self._inputs.append((self._now, arriving(self._tables.drive, u)))
-        upcoming = (self._now + interval, arriving(self._tables.drive, following))
+        self._inputs.append((self._now, shaped_input(self._tables.drive, u)))
+        upcoming = (self._now + interval, shaped_input(self._tables.drive, following))
         on = 1.0 if u != 0.0 else 0.0
         count = max(1, int(np.ceil(interval / self._step - 1e-9)))
         h = interval / count
@@ -187,7 +187,7 @@ class SteppedBench:
         if not np.all(np.abs(self._state[kernel.X]) < kernel._BLOWN_UP):
             raise DataError(_RUN_AWAY)
 
-    def carry(self, cart: int, *, to: float, interval: float) -> None:
+    def move_by_hand(self, cart: int, *, to: float, interval: float) -> None:
         """Move one cart by hand to a position within `interval` s.
 
         The other free carts are held meanwhile.
@@ -198,7 +198,7 @@ class SteppedBench:
         self._state[kernel.V, cart - 1] = (to - self._state[kernel.X, cart - 1]) / interval
         self.step(0.0, following=0.0, interval=interval)
 
-    def let_go(self, cart: int, *, velocity: float) -> float:
+    def release(self, cart: int, *, velocity: float) -> float:
         """Release all free carts, and give `cart` an initial velocity.
 
         Return the force that held this cart against its springs.
@@ -243,14 +243,14 @@ class SteppedBench:
         """Add the contacts that are closed at the start to the matrices."""
         bodies = self._bodies
         for e, which in enumerate(bodies.switches):
-            if guard(which, False, self._tables, bodies.s, 0.0) > 0.0:
+            if contact_gap(which, False, self._tables, bodies.s, 0.0) > 0.0:
                 bodies.active[e] = True
-                switch(which, 1.0, self._tables, bodies.s, bodies.K, bodies.C)
+                toggle_contact(which, 1.0, self._tables, bodies.s, bodies.K, bodies.C)
 
     def _bend_presliding(self) -> None:
         """Set the presliding states so that friction balances the forces at rest, if it can."""
         net = self._static_forces()
-        most = np.array([settling(self._tables.cart, i, 0.0)[0] for i in range(self._n)])
+        most = np.array([hysteresis(self._tables.cart, i, 0.0)[0] for i in range(self._n)])
         for i in np.flatnonzero(most):
             self._state[kernel.Z, i] = np.clip(net[i] / most[i], -1.0, 1.0)
 

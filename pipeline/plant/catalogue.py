@@ -14,9 +14,9 @@ from pipeline.plant.effect import Effect, EffectParameter
 from pipeline.plant.law import (
     BuiltLaw,
     ContactLaw,
+    FitCoordinates,
     ForceLaw,
     FrictionLaw,
-    Growth,
     HysteresisLaw,
     InputLaw,
 )
@@ -56,7 +56,7 @@ STICTION = Effect(
     law=FrictionLaw(
         "F + (S - F) * exp(-(v / w)**2)", at_rest="S", beyond="coulomb_friction", step=1.2e-3
     ),
-    growth=Growth(("E", "w"), {"S": "F + E"}),
+    growth=FitCoordinates(("E", "w"), {"S": "F + E"}),
     parameters=(
         FORCE,
         EffectParameter("static_force", "S", "input", scale="stiffness * position", typical=0.06),
@@ -190,7 +190,7 @@ SLACK_SPRING = Effect(
     sentence="Beyond some stretch the spring goes slack, or its coils touch.",
     place="spring",
     law=ContactLaw("r * k * (d - s)", past="s", pulls=True),
-    growth=Growth(("h", "s"), {"r": "h / k"}, signed=True),
+    growth=FitCoordinates(("h", "s"), {"r": "h / k"}, signed=True),
     parameters=(
         EffectParameter(
             "stiffness_change",
@@ -344,7 +344,9 @@ BACKLASH = Effect(
     sentence="Pinion and rack have play: at each reversal the motor runs free through a gap.",
     place="input",
     law=BuiltLaw("play", _PLAY),
-    growth=Growth(("g", "m_m", "e")),  # e: speed after an impact, divided by the speed before it
+    growth=FitCoordinates(
+        ("g", "m_m", "e")
+    ),  # e: speed after an impact, divided by the speed before it
     parameters=(
         EffectParameter("gap", "g", "position", scale="position", typical=0.08, neutral=0.0),
         EffectParameter(
@@ -394,7 +396,7 @@ COGGING = Effect(
     "backwards in turn as it travels.",
     place="input",
     law=ForceLaw("F * sin(2 * π * x / λ + φ)", on_motor=True, step=1e-3),
-    growth=Growth(("a", "b", "λ"), {"F": "hypot(a, b)", "φ": "atan2(b, a)"}, signed=True),
+    growth=FitCoordinates(("a", "b", "λ"), {"F": "hypot(a, b)", "φ": "atan2(b, a)"}, signed=True),
     parameters=(
         EffectParameter(
             "force", "F", "input", scale="stiffness * position", typical=0.01, neutral=0.0
@@ -426,7 +428,7 @@ END_STOP = Effect(
     sentence="Beyond some position the cart runs against a stop.",
     place="cart",
     law=ContactLaw("-k * (x - p) - c * v", past="p"),
-    growth=Growth(("k", "p", "c")),
+    growth=FitCoordinates(("k", "p", "c")),
     parameters=(
         EffectParameter("position", "p", "position", scale="position", typical=0.8, side=True),
         EffectParameter(
@@ -462,7 +464,7 @@ SENSOR_GAIN = Effect(
     sentence="One encoder reads more (or less) than the others for the same motion.",
     place="cart",
     law=BuiltLaw("reading", row("y", "=", "g", "x")),
-    growth=Growth(("e",), {"g": "1 + e"}, signed=True),
+    growth=FitCoordinates(("e",), {"g": "1 + e"}, signed=True),
     parameters=(EffectParameter("gain", "g", "", scale="1", typical=0.97, neutral=1.0),),
     fingerprint="No chain of springs can give the measured ratio between the carts' amplitudes.",
     deciding_run="Move each cart along a ruler and compare the distance with its encoder.",
@@ -488,7 +490,7 @@ EXTRA_MODE = Effect(
             *("m", sub(dot("v"), "h"), "=", "−", "f"),
         ),
     ),
-    growth=Growth(("m", "κ", "γ"), {"k": "m * κ", "c": "m * γ"}),
+    growth=FitCoordinates(("m", "κ", "γ"), {"k": "m * κ", "c": "m * γ"}),
     parameters=(
         EffectParameter(
             "mass",

@@ -177,7 +177,7 @@ class Chain:
         with np.errstate(divide="ignore"):
             return self.c / (2 * self.m * self.omega_carts)
 
-    def tails(self) -> list[Array]:
+    def subchain_polynomials(self) -> list[Array]:
         """Return polynomials T_1 … T_{n+1}, monic in falling powers; T_i belongs to carts i to n.
 
         T_1 is the common denominator. X_i/U is K_i T_{i+1}(s)/T_{i+1}(0) over T_1(s)/T_1(0). With
@@ -198,11 +198,11 @@ class Chain:
 
     def zeros(self, cart: int) -> ComplexArray:
         """Return the 2(n - cart) zeros of X_cart/U."""
-        return np.roots(self.tails()[cart]).astype(np.complex128)
+        return np.roots(self.subchain_polynomials()[cart]).astype(np.complex128)
 
     def transfer_function(self, cart: int) -> tuple[Array, Array]:
         """Return numerator and monic denominator of X_cart/U, in falling powers."""
-        tails = self.tails()
+        tails = self.subchain_polynomials()
         reach = np.prod(self.k[1:cart] / self.m[1:cart]) / self.m[0]
         return reach * tails[cart], tails[0]
 

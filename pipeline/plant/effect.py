@@ -13,9 +13,9 @@ from pipeline.json_files import computed, result, written
 from pipeline.plant.chain import Chain
 from pipeline.plant.law import (
     BuiltLaw,
+    FitCoordinates,
     ForceLaw,
     FrictionLaw,
-    Growth,
     HysteresisLaw,
     InputLaw,
     Law,
@@ -138,7 +138,7 @@ class Effect:
     deciding_run: str
     reference: str
     axis: Axis
-    growth: Growth | None = None
+    growth: FitCoordinates | None = None
     family: str = ""
     between_carts: bool = False
     fewest_carts: int = 1
@@ -225,10 +225,10 @@ class Effect:
         return tuple(p for p in self.parameters if p.symbol in mine)
 
     @property
-    def grown(self) -> Growth:
+    def grown(self) -> FitCoordinates:
         """The coordinates in which the law grows from zero; by default its parameters."""
         symbols = tuple(p.symbol for p in self.parameters)
-        return self.growth or Growth(symbols, signed=self.parameters[0].signed)
+        return self.growth or FitCoordinates(symbols, signed=self.parameters[0].signed)
 
     def column_name(self, parameter: EffectParameter) -> str:
         """Return the name of the column that holds a parameter."""

@@ -103,15 +103,15 @@ class Recovered:
         return Chain(m=self.m, c=self.c, k=self.k)
 
 
-def recover_chain(gains: Array, tails: Sequence[Array]) -> Recovered:
+def recover_chain(gains: Array, subchain_polynomials: Sequence[Array]) -> Recovered:
     """Compute masses, dampings and springs from static gains and the polynomials T_1 … T_n.
 
-    `gains` is (n,); `tails` are monic, in falling powers, T_i of degree 2 (n - i + 1). Extra axes
-    hold further chains. Each number is computed in the best-conditioned way. The s¹ coefficients
-    serve only as checks, because they amplify rounding some 15 times.
+    `gains` is (n,); `subchain_polynomials` are monic, in falling powers, T_i of degree 2 (n - i +
+    1). Extra axes hold further chains. Each number is computed in the best-conditioned way. The s¹
+    coefficients serve only as checks, because they amplify rounding some 15 times.
     """
-    n, others = len(gains), tails[0].shape[1:]
-    T = [*tails, np.ones((1, *others))]
+    n, others = len(gains), subchain_polynomials[0].shape[1:]
+    T = [*subchain_polynomials, np.ones((1, *others))]
     g, square, ratio = np.zeros((3, n, *others))  # ratio: k_i / m_i
     kappa = np.zeros((n, *others))  # kappa[i] couples carts i and i + 1 (counted from 1)
     routes: list[tuple[Array, Array]] = []

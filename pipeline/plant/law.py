@@ -107,7 +107,7 @@ Law = ForceLaw | FrictionLaw | HysteresisLaw | ContactLaw | InputLaw | BuiltLaw
 
 
 @dataclass(frozen=True)
-class Growth:
+class FitCoordinates:
     """Coordinates in which the force grows in proportion from zero, for a fit that starts at zero.
 
     Attributes

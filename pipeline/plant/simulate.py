@@ -181,7 +181,7 @@ def steady_time(hertz: float) -> float:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reach:
+class LargestMotion:
     """The largest motion of any cart per unit of input, in position units.
 
     Attributes
@@ -194,10 +194,10 @@ class Reach:
     furthest: float
 
 
-def reach(chain: Chain, t: Array, *, shape: Array, wait: float) -> Reach:
+def largest_motion(chain: Chain, t: Array, *, shape: Array, wait: float) -> LargestMotion:
     """Return the largest motions from rest under the input `shape` (n,).
 
     The transient lasts `wait` s.
     """
     unit = np.abs(simulate_linear(chain, t, shape))
-    return Reach(steady=float(np.max(unit[:, t >= wait])), furthest=float(np.max(unit)))
+    return LargestMotion(steady=float(np.max(unit[:, t >= wait])), furthest=float(np.max(unit)))

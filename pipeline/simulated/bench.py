@@ -12,7 +12,7 @@ from pipeline.plant.effect import AugmentedChain, EffectTerm
 from pipeline.plant.sampled_loop import LoopSetup, StateFeedback, simulate_loop
 from pipeline.plant.simulate import propagate, simulate_linear
 from pipeline.plant.simulator.tables import Cart
-from pipeline.results import Kind
+from pipeline.results import ExperimentKind
 
 # The servo loop and the encoder of the ECP 210.
 SAMPLE_TIME = 0.00884  # s
@@ -63,7 +63,7 @@ class BenchRun:
     """
 
     id: str
-    kind: Kind
+    kind: ExperimentKind
     t: Array
     u: Array
     free: tuple[int, ...]
@@ -237,10 +237,10 @@ def _release_with_effects(model: AugmentedChain, run: BenchRun, hand: ReleasingH
     pull = np.linspace(0.0, np.pi, round(1.5 / float(t[1] - t[0])))
     path = np.append(hand.hold(t[0])[0] * (1 - np.cos(pull)) / 2, hand.hold(t[: start + 1])[0])
     for sample, position in enumerate(path, start=-pull.size):
-        bench.carry(cart, to=float(position), interval=float(t[1] - t[0]))
+        bench.move_by_hand(cart, to=float(position), interval=float(t[1] - t[0]))
         if sample >= 0:
             x[:, sample] = bench.readings
-    force = bench.let_go(cart, velocity=float(hand.hold(t[start])[1]))
+    force = bench.release(cart, velocity=float(hand.hold(t[start])[1]))
     ramp = force * np.clip(1 - (t - t[start]) / hand.fade, 0.0, 1.0)
     for sample in range(start, t.size - 1):
         # Between the samples the force falls linearly, in ten short steps.

@@ -11,7 +11,7 @@ from pipeline.plant.simulate import (
     SETTLED,
     SETTLED_DWELL,
     dwell_frequencies,
-    reach,
+    largest_motion,
     settling_wait,
     simulate_linear,
     steady_time,
@@ -129,7 +129,7 @@ def plan_dwells(session: SimulatedSession) -> list[BenchRun]:
         wait = settling_wait(chain, time_constants=settled)
         t = session.clock(wait + steady_time(hertz))
         shape = np.sin(2 * np.pi * hertz * t)
-        unit = reach(chain, t, shape=shape, wait=wait)
+        unit = largest_motion(chain, t, shape=shape, wait=wait)
         # Far above the resonances, the carts swing far at first, then hardly move.
         amplitude = _typed(session.travel * min(0.8 / unit.steady, 1.5 / unit.furthest), session)
         runs.append(

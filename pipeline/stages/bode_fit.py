@@ -25,7 +25,7 @@ from pipeline.names import own_zeta, read_name
 from pipeline.plant.chain import Chain
 from pipeline.plant.identities import recover_chain
 from pipeline.results import EXPLAINED, ChainFit, Estimate, FrequencyResponse
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 
 _START_SPREAD = 0.5  # standard deviation of ln m and ln k in random starts
 _START_ZETAS = (0.02, 0.3)
@@ -38,7 +38,7 @@ _SHARES, _SHARE_PRECISION = (1e-6, 10.0), 0.01  # bounds and precision of an add
 def fit_bode(
     responses: Sequence[FrequencyResponse],
     *,
-    bench: Bench,
+    bench: Setup,
     initial: Mapping[str, float] | None = None,
     decays: Mapping[int, Estimate] | None = None,
     near: Chain | None = None,
@@ -101,7 +101,7 @@ def fit_bode(
 # ---------------------------------------------------------------------- starts
 
 
-def _stand_in(data: Points, known: Mapping[str, float], *, bench: Bench) -> Chain:
+def _stand_in(data: Points, known: Mapping[str, float], *, bench: Setup) -> Chain:
     """Return a chain of equal carts with the right gain and mean frequency."""
     first = np.flatnonzero(data.cart == np.min(data.cart))
     lowest = first[np.argmin(data.omega[data.at[first]])]
@@ -120,7 +120,7 @@ def _stand_in(data: Points, known: Mapping[str, float], *, bench: Bench) -> Chai
 
 
 def _staged_start(
-    data: Points, known: Mapping[str, float], *, bench: Bench, like: Chain
+    data: Points, known: Mapping[str, float], *, bench: Setup, like: Chain
 ) -> tuple[StagedFit | None, Chain]:
     """Fit stage by stage; return this fit and its chain, corrected to be physically possible."""
     if not any(bench.springs):
@@ -140,7 +140,7 @@ def _staged_start(
     return staged, physical_start(implied, bench=bench)
 
 
-def _random_starts(like: Chain, *, bench: Bench) -> Iterator[Chain]:
+def _random_starts(like: Chain, *, bench: Setup) -> Iterator[Chain]:
     rng = np.random.default_rng(_SEED)
     # Eight random starts, tried if the first start does not explain the data.
     for _ in range(8):

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.names import read_name
 from pipeline.results import DeterminedBy, Estimate, ParameterRow
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 
 # In Throne's tables, the two estimates of gains and frequencies differ by up to 14 %. For one null,
 # read by eye, it is 29 %. Damping ratios differ by half and more.
@@ -30,7 +30,7 @@ def compare(
     *,
     final: Mapping[str, Estimate],
     names: Sequence[str],
-    bench: Bench,
+    bench: Setup,
     fitted_to: Collection[str] = (),
 ) -> tuple[ParameterRow, ...]:
     """Combine the initial and the final estimate of every parameter in `names`.
@@ -46,7 +46,7 @@ def compare(
         note = ""
         if before is not None and before.source == "assumed":
             note = "the initial value was assumed, not measured"
-        if after is not None and (reason := why_open(name, after)):
+        if after is not None and (reason := undetermined_reason(name, after)):
             note, after = reason, None
         one_source = before is not None and after is not None and before.source == after.source
         if one_source:
@@ -97,7 +97,7 @@ def _determined_by(
     return "points" if after.source == "bode_fit" else "motion"
 
 
-def why_open(name: str, final: Estimate) -> str:
+def undetermined_reason(name: str, final: Estimate) -> str:
     """Return why a fitted value cannot be relied on, or ""."""
     if final.at_bound:
         return AT_BOUND

@@ -204,7 +204,7 @@ def _run_loop(
     """
     joined = sampled_loop.LoopSetup(input_limit=limit, drive=drive, rest=run.rest, free=run.free)
     best, least = None, 10.0  # times the measured motion; above this, the loop is unstable
-    for law_as_run, sample_time, delay in _ways(run, law, drive=drive):
+    for law_as_run, sample_time, delay in _controller_variants(run, law, drive=drive):
         with np.errstate(over="ignore", invalid="ignore"):
             how = replace(joined, sample_time=sample_time, delay=delay)
             loop = sampled_loop.simulate_loop(
@@ -218,7 +218,7 @@ def _run_loop(
     return best, least
 
 
-def _ways(
+def _controller_variants(
     run: MeasuredRun, law: Controller, *, drive: float
 ) -> list[tuple[Controller, float | None, int]]:
     """Return controllers to try, each with its sample time (None: as logged) and delay in ticks."""

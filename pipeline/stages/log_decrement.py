@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.decay.free_decay import FreeDecay, find_decay, fit_decay
-from pipeline.estimation.noise import grain
+from pipeline.estimation.noise import resolution
 from pipeline.results import DecayLaw, LogDecrement, Record
 
 _PEAKS_FOR_REGRESSION = 4  # enough for two amplitudes
@@ -56,7 +56,7 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
         oscillation.
     """
     t, y = record.t, record.position(cart)
-    size = grain(t, y, step=record.encoder_step(cart))
+    size = resolution(t, y, step=record.encoder_step(cart))
     floor = size / np.sqrt(12)
     step = record.encoder_step(cart)
     stretch, run = find_decay(record, cart=cart, size=size)

@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.independent import inverse_of
-from pipeline.estimation.noise import colour, grain, noise_beyond_rounding, rounding_left
+from pipeline.estimation.noise import noise_beyond_rounding, relative_psd, resolution, rounding_left
 from pipeline.results import Record, SinePoint
 
 FEW_COUNTS = 20  # encoder steps; smaller amplitudes are known only to a few percent
@@ -73,7 +73,7 @@ class _Sine:
     def _sigma(self) -> float:
         left = max(self.residual.size - self.coefficients.size, 1)
         variance = float(self.residual @ self.residual) / left
-        return float(np.sqrt(variance * colour(self.residual, angle=self.part.angle)))
+        return float(np.sqrt(variance * relative_psd(self.residual, angle=self.part.angle)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +127,7 @@ class Dwell:
             raise DataError(
                 f"{record.id}: a sine fit needs a full cycle of driven motion, found {cycles:.2f}"
             )
-        floor = grain(self._t, y, step=step) / np.sqrt(12)
+        floor = resolution(self._t, y, step=step) / np.sqrt(12)
         steady = self._steady_part(y, floor=floor)
         t = self._t[steady.start :]
         position, drive = self._fit(y, steady.start), self._fit(self._u, steady.start)

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.decay.ringing import find_poles, fit_ringing
-from pipeline.estimation.noise import colour, grain, noise_beyond_rounding, rounding_left
+from pipeline.estimation.noise import noise_beyond_rounding, relative_psd, resolution, rounding_left
 from pipeline.estimation.peaks import extrema, plateaus
 from pipeline.results import Record, StepEdge, StepGain
 
@@ -70,7 +70,7 @@ def fit_step_gain(record: Record, *, cart: int) -> StepGain:
         raise DataError(f"{record.id}: step gain needs a cart that is free, cart {cart} is held")
     if np.ptp(y) == 0:
         raise DataError(f"{record.id}: step gain needs motion, cart {cart} does not move")
-    size = grain(t, y, step=step)
+    size = resolution(t, y, step=step)
     found = [_settle(record, y, part, size=size, step=step) for part in parts]
     for _ in range(_DRIFT_PASSES):  # without the drift, more samples count as settled
         more = _drift(t, y, [p.level for p in found if p.level], size=size)
@@ -199,7 +199,7 @@ def _mean_level(y: Array, first: int, *, step: float, arithmetic: float) -> _Lev
     window = y[first:]
     residual = window - window.mean()
     rms = float(np.sqrt(np.mean(residual**2)))
-    scatter = max(rms, arithmetic) * np.sqrt(colour(residual, angle=0.0) / window.size)
+    scatter = max(rms, arithmetic) * np.sqrt(relative_psd(residual, angle=0.0) / window.size)
     rounding = step / np.sqrt(12) * rounding_left(noise_beyond_rounding(rms, step=step), step=step)
     return _Level(
         first=first,
@@ -267,7 +267,7 @@ def _drift(t: Array, y: Array, levels: Sequence[_Level], *, size: float) -> floa
         residual = window - window.mean() - slope * tau
         rms = max(float(np.sqrt(np.mean(residual**2))), size / np.sqrt(12))
         slopes.append(slope)
-        errors.append(rms * np.sqrt(colour(residual, angle=0.0) / (tau @ tau)))
+        errors.append(rms * np.sqrt(relative_psd(residual, angle=0.0) / (tau @ tau)))
     if len(slopes) < 2:
         return 0.0
     weight = 1 / np.square(errors)

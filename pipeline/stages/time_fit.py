@@ -18,17 +18,23 @@ from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.noise import long_run_variance, score_covariance
 from pipeline.estimation.parametrisation import Parametrisation, critical_damping, named_estimates
-from pipeline.estimation.time_search import Attempt, condense, descend, look, search
+from pipeline.estimation.time_search import (
+    Attempt,
+    evaluate_chain,
+    minimise_from,
+    search,
+    stacked_triangle,
+)
 from pipeline.estimation.time_window import FitWindow, open_window
 from pipeline.names import read_name
 from pipeline.plant.chain import Chain
 from pipeline.results import ChainFit, Estimate, Record
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 
 _TOLERANCE = 1e-9  # relative change of the cost; far below one standard error for any record
 
 
-def fit_records(records: Sequence[Record], *, bench: Bench, start: Chain | None = None) -> ChainFit:
+def fit_records(records: Sequence[Record], *, bench: Setup, start: Chain | None = None) -> ChainFit:
     """Fit one chain to all records at once.
 
     Records may differ in length, sample rate, and free and measured carts; held carts are removed
@@ -54,12 +60,12 @@ def fit_records(records: Sequence[Record], *, bench: Bench, start: Chain | None 
     found = search(windows, parametrisation, given=start)
     attempt, explained = found.best, found.best.follows
     windows = [_informed(attempt, index) for index in range(len(windows))]
-    attempt = descend(windows, parametrisation, attempt.theta, tolerance=_TOLERANCE)
+    attempt = minimise_from(windows, parametrisation, attempt.theta, tolerance=_TOLERANCE)
     covariance = _covariance(attempt)
     while zero := _negligible(attempt, covariance):
         parametrisation = parametrisation.holding_at_zero(*zero)
         theta = parametrisation.pack(attempt.chain)
-        attempt = descend(windows, parametrisation, theta, tolerance=_TOLERANCE)
+        attempt = minimise_from(windows, parametrisation, theta, tolerance=_TOLERANCE)
         covariance = _covariance(attempt)
     if not explained:
         remarks.insert(0, "no chain reproduces the recordings")
@@ -104,10 +110,13 @@ def _starts_at_rest(attempt: Attempt, index: int) -> bool:
     has few independent values.
     """
     resting = replace(attempt.windows[index], at_rest=True)
-    (held,) = look([resting], attempt.parametrisation, attempt.theta).misfits
+    (held,) = evaluate_chain([resting], attempt.parametrisation, attempt.theta).misfits
     others = [misfit for i, misfit in enumerate(attempt.misfits) if i != index]
     misfit = attempt.misfits[index]
-    gain = condense([*others, held])[-1, -1] ** 2 - condense([*others, misfit])[-1, -1] ** 2
+    gain = (
+        stacked_triangle([*others, held])[-1, -1] ** 2
+        - stacked_triangle([*others, misfit])[-1, -1] ** 2
+    )
     # A record is assumed to have 20 independent values of the chain's own error.
     structure = (np.sum(misfit.residual**2) - misfit.residual.size) / 20
     chance = max(long_run_variance(misfit.residual), structure)
@@ -181,7 +190,7 @@ def _released(attempt: Attempt) -> Attempt:
     free = replace(held, zero=springs)
     # 1e-6 of critical damping: almost zero, but its logarithm has derivatives.
     c = np.where(chain.c > 0, chain.c, 1e-6 * critical_damping(chain))
-    return look(attempt.windows, free, free.pack(replace(chain, c=c)))
+    return evaluate_chain(attempt.windows, free, free.pack(replace(chain, c=c)))
 
 
 # ------------------------------------------------------------------- the outcome
@@ -228,7 +237,7 @@ def _message(attempt: Attempt, remarks: Sequence[str]) -> str:
     count = len(attempt.windows)
     parts = [
         f"{count} time record{'s' * (count > 1)}, "
-        f"{100 * (1 - attempt.lost):.1f} % of the motion explained",
+        f"{100 * (1 - attempt.unexplained_share):.1f} % of the motion explained",
         *remarks,
     ]
     if attempt.parametrisation.zero:

@@ -47,14 +47,14 @@ def text_digest(text: str) -> str:
 
 
 def edit_submission(
-    folder: Path, change: Callable[[tomlkit.TOMLDocument], None], *, seen: str = ""
+    folder: Path, change: Callable[[tomlkit.TOMLDocument], None], *, version: str = ""
 ) -> Submission:
     """Change the document of a submission; write it only if the result is valid.
 
     Parameters
     ----------
     change : function that changes the document.
-    seen : digest of the text for which the change was prepared; empty to change any text.
+    version : digest of the text for which the change was prepared; empty to change any text.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def edit_submission(
     """
     with lock_when_free(folder):
         text = submission_text(folder)
-        if seen and seen != text_digest(text):
+        if version and version != text_digest(text):
             raise Outdated(text)
         where = f"{folder.resolve().name}/{NAME}"
         if len(text) > 200_000:  # tomlkit takes seconds for the worst text of this size

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from pipeline.set_up import Bench, Units
+from pipeline.setup import Setup, Units
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -107,10 +107,10 @@ class System(TomlTable):
         return "springs" in self.model_fields_set
 
     @property
-    def bench(self) -> Bench:
+    def bench(self) -> Setup:
         """The bench as stated."""
         units = Units(position=self.position.unit, input=self.input.unit)
-        return Bench(springs=self.springs, units=units, sign=self.input.sign)
+        return Setup(springs=self.springs, units=units, sign=self.input.sign)
 
 
 class Design(TomlTable):

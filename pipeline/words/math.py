@@ -16,14 +16,14 @@ _NUMBER = re.compile(r"\d+(\.\d+)?")
 _OPERATORS = frozenset("+−=·,()[]≥≤<≈≠→")
 _RELATIONS = frozenset("=≥≤<≈≠→")
 
-Kind = Literal["row", "fraction", "sub", "sup", "dot", "ddot", "matrix", "parens", "lines"]
+MathKind = Literal["row", "fraction", "sub", "sup", "dot", "ddot", "matrix", "parens", "lines"]
 
 
 @dataclass(frozen=True)
 class Math:
     """A node; `columns` is the number of columns of a matrix, whose parts are in rows."""
 
-    kind: Kind
+    kind: MathKind
     parts: tuple["Term", ...]
     columns: int = 0
 

@@ -111,20 +111,20 @@ def first_few(names: Sequence[str], most: int) -> str:
     return ", ".join(names[:most]) + more
 
 
-def abridge(ids: Sequence[str], *, most: int = 4) -> str:
+def join_names(ids: Sequence[str], *, most: int = 4) -> str:
     """Return names; if there are more than `most`, leave out the middle: "a, b … z (9 in all)"."""
     if len(ids) <= most:
         return ", ".join(ids)
     return f"{ids[0]}, {ids[1]} … {ids[-1]} ({len(ids)} in all)"
 
 
-def by_note(notes: Iterable[tuple[str, str]]) -> list[str]:
+def group_messages(notes: Iterable[tuple[str, str]]) -> list[str]:
     """Return a sentence for each different note, beginning with the names of its items."""
     about: dict[str, list[str]] = {}
     for name, note in notes:
         if note:
             about.setdefault(note, []).append(name)
-    return [f"{abridge(list(dict.fromkeys(names)))}: {note}" for note, names in about.items()]
+    return [f"{join_names(list(dict.fromkeys(names)))}: {note}" for note, names in about.items()]
 
 
 def subscript(n: int) -> str:

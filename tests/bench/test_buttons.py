@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.bench.acquire import acquire
-from pipeline.bench.events import Anomalies, Buttons, RunOutcome, Stopped, Wish
+from pipeline.bench.events import Action, Anomalies, Buttons, RunOutcome, Stopped
 from pipeline.bench.experiments import readings_of
 from pipeline.bench.live_state import LiveState
 from pipeline.bench.raw import read_raw
@@ -25,7 +25,7 @@ NEAR = PlanLimits(input=0.5, travel=0.1)  # cm: a dwell of 0.01 V passes it with
 class Finger(Notes):
     """An observer that presses a button half a second into a recording, or at its end."""
 
-    def __init__(self, *wishes: Wish, at_end: bool = False) -> None:
+    def __init__(self, *wishes: Action, at_end: bool = False) -> None:
         super().__init__()
         self.buttons = Buttons()
         self.heeded: list[bool] = []

@@ -11,7 +11,7 @@ from pipeline.checks.carts import check_carts, check_vanishing
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.resources import EXAMPLES
 from pipeline.results import ChainFit, Check
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.analysis_factory import make_analysis
@@ -70,7 +70,7 @@ def test_a_part_that_may_not_exist_fails_a_check(name, value, std, found):
     symbol, _, number = name.partition("_")
     values[symbol][int(number) - 1] = value
     (check,) = check_vanishing(
-        fitted(Chain(**values), **{name: std}), bench=Bench(springs=(True,) * 3)
+        fitted(Chain(**values), **{name: std}), bench=Setup(springs=(True,) * 3)
     )
     assert (check.id, check.outcome) == (f"vanishing.{name}", "fail")
     assert found in check.message
@@ -84,7 +84,7 @@ def test_a_vanishing_damping_is_taken_from_a_decay_that_exists():
     analysis = make_analysis(2)
     plant = PRESETS["throne-2dof"]
     fit = fitted(Chain(m=plant.m, c=np.array([plant.c[0], 1e-7]), k=plant.k), c_2=1e-7)
-    bench = Bench(springs=(False, True, True))
+    bench = Setup(springs=(False, True, True))
     (check,) = check_vanishing(fit, decays=analysis.log_decrements, bench=bench)
     assert check.parameter == "c_2"
     assert "add one" not in check.message
@@ -94,7 +94,7 @@ def test_a_vanishing_damping_is_taken_from_a_decay_that_exists():
 def test_the_residual_of_a_failed_fit_is_not_judged():
     """A fit that failed is not said to explain the data, whatever its χ²."""
     fit = fitted(PRESETS["throne-2dof"], converged=False)
-    outcomes = {c.id: c.outcome for c in check_carts(fit, bench=Bench(springs=(True,) * 3))}
+    outcomes = {c.id: c.outcome for c in check_carts(fit, bench=Setup(springs=(True,) * 3))}
     assert outcomes == {"fit.converged": "fail", "fit.explains_data": "skip"}
 
 
@@ -106,12 +106,12 @@ def test_a_spring_declared_as_missing_is_not_asked_about(preset):
     """
     chain = PRESETS[preset]
     springs = tuple(bool(k > 0) for k in chain.k)
-    assert check_vanishing(fitted(chain), bench=Bench(springs=springs)) == []
+    assert check_vanishing(fitted(chain), bench=Setup(springs=springs)) == []
     assert (
-        check_vanishing(fitted(chain, converged=False), bench=Bench(springs=(True,) * len(springs)))
+        check_vanishing(fitted(chain, converged=False), bench=Setup(springs=(True,) * len(springs)))
         == []
     )
-    found = check_vanishing(fitted(chain), bench=Bench(springs=(True,) * len(springs)))
+    found = check_vanishing(fitted(chain), bench=Setup(springs=(True,) * len(springs)))
     assert [check.id for check in found] == ([] if chain.n == 1 else ["vanishing.k_1"])
 
 

@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 from pipeline.checks.estimates import check_rows, check_steps
 from pipeline.cli import app
 from pipeline.results import Estimate, ParameterRow, StepGain
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.examples import analysed
@@ -28,7 +28,7 @@ def test_gain_intervals_of_a_sticking_cart_may_be_disjoint():
         )
         for i, interval in enumerate([(29.33, 30.55), (27.85, 28.75)])
     ]
-    checks = check_steps(steps, bench=Bench(springs=(True, True)))
+    checks = check_steps(steps, bench=Setup(springs=(True, True)))
     assert [check.outcome for check in checks] == ["fail", "fail"]
     assert all("the true gain may be outside this range" in check.message for check in checks)
 
@@ -64,7 +64,7 @@ def test_one_edge_does_not_show_whether_a_cart_sticks():
     (gain, *_) = analysed("one-cart").step_gains
     both, one = check_steps(
         [gain, replace(gain, edges=gain.edges[:1], rest_shift=None)],
-        bench=Bench(springs=(True, True)),
+        bench=Setup(springs=(True, True)),
     )
     assert (both.outcome, one.outcome) == ("pass", "skip")
     assert "at both edges" in both.message

@@ -9,7 +9,7 @@ import pytest
 from pipeline.desk.app import DeskServer
 from pipeline.desk.users import read_users
 from pipeline.errors import ConfigError
-from pipeline.grading.gradebook.request_book import RequestBook
+from pipeline.grading.gradebook.request_gradebook import RequestGradebook
 from pipeline.grading.gradebook.requests import MOST_LETTERS, MOST_OPEN
 from pipeline.grading.gradings import Batch
 from pipeline.grading.rubric_file import load_rubric
@@ -19,7 +19,7 @@ from tests.helpers.grades import failed_grade, make_outcome, two_cart_rubric, wr
 from tests.helpers.hostile import SECRET
 
 pytestmark = pytest.mark.usefixtures("all_work_here")
-HERE, ROOM, QUEUE = "/feedback/0/", "/grades/0/", "/grades/0/again"
+HERE, ROOM, QUEUE = "/feedback/0/", "/grades/0/", "/grades/0/requests"
 USERS = """
 [[users]]
 name = "s4"
@@ -79,7 +79,7 @@ def released(lab):
 @pytest.fixture
 def book(tmp_path, lab):
     """Return the class's gradebook."""
-    with RequestBook(tmp_path / "grades") as book:
+    with RequestGradebook(tmp_path / "grades") as book:
         yield book
 
 
@@ -186,7 +186,7 @@ def test_a_request_goes_from_the_student_to_the_ta_and_back(released, book):
     Both see every step, and each page of the TA shows the number of requests.
     """
     student, ta = released("s4"), released("Ada")
-    assert 'href="/grades/0/again">0' not in ta.get(ROOM).text
+    assert 'href="/grades/0/requests">0' not in ta.get(ROOM).text
     assert ask(student).status == 303
     assert "waits for an answer" in student.get(HERE).text
     assert "1 request waits" in ta.get(ROOM).text
@@ -339,7 +339,7 @@ def test_students_who_must_find_the_numbers_see_none(tmp_path, by_class):
     user = USERS.replace("[[users]]", '[[users]]\nrubric = "lab.toml"', 1)
     if by_class:
         user, rubric = USERS, load_rubric(lab)
-        with RequestBook(tmp_path / "grades", assignment="lab") as book:
+        with RequestGradebook(tmp_path / "grades", assignment="lab") as book:
             keys = tuple(entry.key for entry in book.entries())
             book.finish(Batch(keys=keys, shared={}), rubric=rubric)
     with DeskServer(users=write_users(tmp_path, user)) as server:
@@ -362,7 +362,7 @@ def test_a_student_reads_that_a_stopped_submission_is_not_graded_yet(tmp_path):
     a_submission(tmp_path / "five")
     stopped = failed_grade("team-04", "stopped after 120 s").model_copy(update={"unsettled": True})
     outcome = make_outcome(stopped, key="stopped", authors=("s4",), settled=False)
-    with RequestBook(tmp_path / "grades", assignment="lab") as book:
+    with RequestGradebook(tmp_path / "grades", assignment="lab") as book:
         book.put(outcome)
         others = (entry.key for entry in book.entries() if entry.submission != "team-04")
         book.finish(Batch(keys=(*others, "stopped"), shared={}), rubric=two_cart_rubric())

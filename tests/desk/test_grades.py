@@ -15,9 +15,9 @@ import pytest
 
 from pipeline.desk.app import DeskServer
 from pipeline.desk.grades.criteria import point_steps
-from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.gradebook.open_book import OpenBook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.schema import FILE
+from pipeline.grading.gradebook.shared_gradebook import SharedGradebook
 from pipeline.grading.publish.export import export
 from pipeline.resources import RUBRICS
 from pipeline.words.text import capital
@@ -445,7 +445,7 @@ def test_only_one_of_two_simultaneous_changes_counts(two_desks, database):
             one = pool.submit(give, ada, f"a{number}")
             other = pool.submit(give, bob, f"b{number}")
             assert sorted([one.result(), other.result()]) == [303, 409]
-    with OpenBook(database) as book:
+    with SharedGradebook(database) as book:
         assert len([o for _, o in book.changes_since(0) if o.criterion == "pieces"]) == 20
 
 
@@ -580,15 +580,19 @@ def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
 
 def test_each_line_of_a_class_equals_its_grade(grades):
     """Each line of the class page equals its team's grade; only changed lines are made again."""
-    from pipeline.grading.gradebook.class_lines import Line
+    from pipeline.grading.gradebook.class_lines import GradeSummary
 
-    with OpenBook(grades) as book:
+    with SharedGradebook(grades) as book:
         first = book.class_now()
-        assert [one.line for one in first.listings] == [Line.of(e.grade) for e in book.entries()]
+        assert [one.line for one in first.rows] == [
+            GradeSummary.of(e.grade) for e in book.entries()
+        ]
         book.override("team-03", "laws", 0.25, why="x", by="y")
         second = book.class_now(first)
-        assert [one.line for one in second.listings] == [Line.of(e.grade) for e in book.entries()]
-        same = [a is b for a, b in zip(first.listings, second.listings, strict=True)]
+        assert [one.line for one in second.rows] == [
+            GradeSummary.of(e.grade) for e in book.entries()
+        ]
+        same = [a is b for a, b in zip(first.rows, second.rows, strict=True)]
         assert same.count(False) == 1
 
 
@@ -604,14 +608,14 @@ def test_an_older_gradebook_gets_what_it_lacks(grades):
         before = [(e.submission, e.grade) for e in book.entries()]
         with closing(sqlite3.connect(grades / FILE)) as raw:
             raw.executescript("DROP TABLE looks")
-        with OpenBook(grades) as opened, OpenBook(grades) as again:
-            listings = opened.class_now().listings
+        with SharedGradebook(grades) as opened, SharedGradebook(grades) as again:
+            listings = opened.class_now().rows
             assert [(n.line.submission, n.line.points) for n in listings] == [
                 (name, grade.points) for name, grade in before
             ]
             assert again.class_now() == opened.class_now()
-            opened.mark("team-01", by="Ada", seen=True)
-            assert {one.seen for one in again.class_now().listings} - {""} == {"Ada"}
+            opened.set_reviewed("team-01", by="Ada", reviewed=True)
+            assert {one.reviewed_by for one in again.class_now().rows} - {""} == {"Ada"}
         assert [(e.submission, e.grade) for e in book.entries()] == before
 
 

@@ -234,7 +234,7 @@ def test_an_exception_that_ends_a_process_is_reported(module, line):
         process.send(line)
         while process.line(timeout=PATIENCE):
             pass
-        said = process.last_words()
+        said = process.exit_message()
     finally:
         process.close()
     assert re.match(r"the process ended \(exit status 1\) \S*Error", said), said

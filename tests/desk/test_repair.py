@@ -10,15 +10,8 @@ import pytest
 from pipeline.desk.app import DeskServer
 from pipeline.grading.batch.grade_class import Options
 from pipeline.grading.grade import Grade
-from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.intake.repairs import (
-    FOLDER,
-    Run,
-    read_original,
-    read_run,
-    save_run,
-    text_key,
-)
+from pipeline.grading.gradebook.gradebook import Gradebook
+from pipeline.grading.intake.repairs import FOLDER, Run, read_original, read_run, save_run, text_key
 from pipeline.simulated.submission import write_submission
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.desks import Visitor

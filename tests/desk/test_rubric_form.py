@@ -10,7 +10,7 @@ from urllib.parse import urlencode
 import pytest
 
 from pipeline.desk.app import DeskServer
-from pipeline.desk.instructor.rubric_shelf import own_rubrics
+from pipeline.desk.instructor.rubric_list import own_rubrics
 from pipeline.desk.users import User
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.resources import RUBRICS

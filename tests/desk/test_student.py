@@ -17,14 +17,14 @@ from urllib.parse import unquote, urlencode
 import pytest
 
 from pipeline.desk.app import DeskServer
-from pipeline.desk.ask import Desk
 from pipeline.desk.jobs import WorkerPool
 from pipeline.desk.last_report import stat_sources
+from pipeline.desk.page_request import Desk
 from pipeline.desk.student import files as uploads
 from pipeline.desk.student.files import take_uploads
 from pipeline.desk.tasks import TASKS, make_report
 from pipeline.errors import SubmissionError
-from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.intake.find import find_hand_ins
 from pipeline.ingest.formats.recognise import parse_table
 from pipeline.lock import lock_when_free
 from pipeline.processes import Failed
@@ -528,7 +528,7 @@ def change(document):
     print("changing", flush=True)
     sys.stdin.readline()
     document["title"] = title
-edit_submission(folder, change, seen=text_digest(submission_text(folder)))
+edit_submission(folder, change, version=text_digest(submission_text(folder)))
 """
 
 

@@ -14,7 +14,7 @@ from pipeline.estimation.parametrisation import (
     physical_start,
 )
 from pipeline.plant.chain import PRESETS, Chain
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 
 
 @st.composite
@@ -33,7 +33,7 @@ def chains(draw: st.DrawFn) -> Chain:
 @given(chain=chains())
 def test_pack_and_unpack_are_inverse(chain):
     """A chain converted to the fit's vector and back is the same up to rounding."""
-    P = Parametrisation(bench=Bench(springs=(True,) * (chain.n + 1)))
+    P = Parametrisation(bench=Setup(springs=(True,) * (chain.n + 1)))
 
     back = P.unpack(P.pack(chain))
 
@@ -44,7 +44,7 @@ def test_pack_and_unpack_are_inverse(chain):
 @given(chain=chains())
 def test_matrices_are_the_sum_of_the_directions(chain):
     """Parameters times their derivative matrices give M, C and K."""
-    P = Parametrisation(bench=Bench(springs=(True,) * (chain.n + 1)))
+    P = Parametrisation(bench=Setup(springs=(True,) * (chain.n + 1)))
 
     for derivative, matrix in zip(P.matrix_derivatives, chain.matrices()[:3], strict=True):
         built = np.einsum("pij,p->ij", derivative, P.physical(chain))
@@ -55,7 +55,7 @@ def test_matrices_are_the_sum_of_the_directions(chain):
 def test_dp_dtheta_is_the_derivative_of_the_physical_parameters():
     """The matrix dp/dtheta agrees with a central difference."""
     chain = PRESETS["throne-3dof"]
-    P = Parametrisation(bench=Bench(springs=(True,) * 4))
+    P = Parametrisation(bench=Setup(springs=(True,) * 4))
     theta, h = P.pack(chain), 1e-6
 
     for i, e in enumerate(np.eye(theta.size)):
@@ -66,8 +66,8 @@ def test_dp_dtheta_is_the_derivative_of_the_physical_parameters():
 
 def test_only_a_spring_that_may_be_missing_has_no_logarithm():
     """The vector has the logarithm of k_1, or k_1 itself if it may be missing."""
-    both = Parametrisation(bench=Bench(springs=(True, True, True)))
-    near = Parametrisation(bench=Bench(springs=(True, True, False)))
+    both = Parametrisation(bench=Setup(springs=(True, True, True)))
+    near = Parametrisation(bench=Setup(springs=(True, True, False)))
 
     assert [n for n, log in zip(both.names, both.logarithmic, strict=True) if not log] == ["k_1"]
     assert near.logarithmic.all()
@@ -76,7 +76,7 @@ def test_only_a_spring_that_may_be_missing_has_no_logarithm():
 
 def test_zero_parameters_leave_the_vector():
     """If a parameter is held at zero, the vector has no entry for it, and it stays zero."""
-    P = Parametrisation(bench=Bench(springs=(True,) * 3)).holding_at_zero("c_2", "k_1")
+    P = Parametrisation(bench=Setup(springs=(True,) * 3)).holding_at_zero("c_2", "k_1")
 
     chain = P.unpack(P.pack(PRESETS["throne-2dof"]))
 
@@ -87,14 +87,14 @@ def test_zero_parameters_leave_the_vector():
 
 def test_one_cart_has_one_stiffness():
     """One cart has a single stiffness k_1 in the vector, and none if no spring holds it."""
-    assert Parametrisation(bench=Bench(springs=(False, True))).names == ("m_1", "c_1", "k_1")
-    assert Parametrisation(bench=Bench(springs=(False, False))).names == ("m_1", "c_1")
+    assert Parametrisation(bench=Setup(springs=(False, True))).names == ("m_1", "c_1", "k_1")
+    assert Parametrisation(bench=Setup(springs=(False, False))).names == ("m_1", "c_1")
 
 
 def test_a_missing_spring_between_carts_is_refused():
     """If the spring between two carts is missing, the error names the two carts."""
     with pytest.raises(DataError, match="between carts 2 and 3, found none"):
-        Parametrisation(bench=Bench(springs=(True, True, False, True)))
+        Parametrisation(bench=Setup(springs=(True, True, False, True)))
 
 
 def test_standard_errors_of_one_cart_follow_its_formulas():
@@ -120,7 +120,7 @@ def test_standard_errors_of_one_cart_follow_its_formulas():
 def test_standard_errors_agree_with_a_sample():
     """In 1000 random chains, the named parameters scatter as much as their standard errors say."""
     chain = PRESETS["throne-3dof"]
-    P = Parametrisation(bench=Bench(springs=(True,) * 4))
+    P = Parametrisation(bench=Setup(springs=(True,) * 4))
     p = P.physical(chain)
     std = 1e-3 * np.where(p > 0, p, 0.05)
     got = named_estimates(chain, names=P.names, covariance=np.diag(std**2), source="bode_fit")
@@ -143,7 +143,7 @@ def test_a_start_is_a_possible_chain():
     """
     found = Chain(m=np.array([3e-4, 2e-4]), c=np.array([-1.0, 1.0]), k=np.array([-0.01, 0.1, 0.05]))
 
-    got = physical_start(found, bench=Bench(springs=(True, True, False)))
+    got = physical_start(found, bench=Setup(springs=(True, True, False)))
 
     assert np.all(got.k[:2] > 0)
     assert got.k[2] == 0
@@ -155,7 +155,7 @@ def test_a_start_is_a_possible_chain():
 @given(n=st.integers(1, 4), gain=st.floats(0.1, 1e4), omega=st.floats(0.5, 300.0))
 def test_an_even_chain_has_the_given_gain_and_frequency(n, gain, omega):
     """The chain of equal carts has the given gain of cart 1 and the given lowest frequency."""
-    got = even_chain({"K_1": gain, "omega_a": omega}, bench=Bench(springs=(True,) * (n + 1)))
+    got = even_chain({"K_1": gain, "omega_a": omega}, bench=Setup(springs=(True,) * (n + 1)))
 
     values = got.parameters()
     # The solution has about ten rounding errors; the added damping does not change omega_a.
@@ -166,4 +166,4 @@ def test_an_even_chain_has_the_given_gain_and_frequency(n, gain, omega):
 def test_an_even_chain_needs_a_gain_and_a_resonance():
     """A chain of equal carts can be guessed only from a gain and a resonance."""
     with pytest.raises(DataError, match="gain of cart 1 and a resonance"):
-        even_chain({"K_1": 1.0}, bench=Bench(springs=(True,) * 3))
+        even_chain({"K_1": 1.0}, bench=Setup(springs=(True,) * 3))

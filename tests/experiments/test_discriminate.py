@@ -22,18 +22,18 @@ from pipeline.experiments.next_recordings import plan_next
 from pipeline.experiments.plan import Plan, PlanLimits, Recording
 from pipeline.experiments.plan_file import load_plan, save_plan
 from pipeline.gap.explain import investigate
-from pipeline.gap.types import Contender, Gap, Trace, read_gap
+from pipeline.gap.types import AlternativeModel, Gap, Trace, read_gap
 from pipeline.ingest.read import read_data
 from pipeline.json_files import json_text
 from pipeline.plant.augmented import simulate_augmented
 from pipeline.plant.catalogue import find_effect
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import AugmentedChain
-from pipeline.report.gap.story import build_gap_document
+from pipeline.report.gap.gap_report import build_gap_document
 from pipeline.report.render.html import render_html
 from pipeline.resources import EXAMPLES
 from pipeline.results import Provenance
-from pipeline.set_up import Bench, Units
+from pipeline.setup import Setup, Units
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import Submission, load_submission
 from pipeline.words.progress import silent
@@ -43,7 +43,7 @@ from tests.helpers.effects import make_term
 from tests.helpers.virtual import VirtualBench, VirtualSession
 from tests.report.test_gap import make_gap, two_cart_analysis
 
-BENCH = Bench(springs=(True, True, True))
+BENCH = Setup(springs=(True, True, True))
 LIMITS = PlanLimits(input=0.5, travel=2.5)
 CHAIN = Chain(m=np.array([3e-4, 1.8e-4]), c=np.array([6e-4, 4e-4]), k=np.array([0.0, 0.127, 0.061]))
 
@@ -86,7 +86,8 @@ def disputed(*models: AugmentedChain) -> Gap:
         held_out=("step-a",),
         traces=traces,
         contenders=tuple(
-            Contender(chain=one.chain, terms=one.terms, weight=1 / len(models)) for one in models
+            AlternativeModel(chain=one.chain, terms=one.terms, weight=1 / len(models))
+            for one in models
         ),
     )
 

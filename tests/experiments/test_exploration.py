@@ -14,7 +14,7 @@ from pipeline.experiments.choice import choose_recordings
 from pipeline.experiments.discriminate import propose_for
 from pipeline.experiments.exploration import Exploration, Recorded
 from pipeline.experiments.goal import ErrorGoal, find_goal, read_error_goal, read_time
-from pipeline.experiments.information import Knowledge
+from pipeline.experiments.information import FisherInformation
 from pipeline.experiments.plan import PlanLimits, session_time, time_words
 from pipeline.experiments.plan_file import load_plan, save_plan
 from pipeline.experiments.propose import propose_plan
@@ -341,7 +341,7 @@ def test_a_large_step_is_proposed_after_all_else_was_refused(tmp_path):
     analysis = analyse(submission)
     plan = propose_plan(submission)
     plan = plan.model_copy(update={"limits": PlanLimits(input=100.0, travel=100.0)})
-    goal = find_goal("zeta", known := Knowledge.of(analysis), feedback=None)
+    goal = find_goal("zeta", known := FisherInformation.of(analysis), feedback=None)
     refused = propose_candidates(known, limits=plan.limits, commands=frozenset("c"), goal=goal)
     (step,), why = choose_recordings(
         analysis,

@@ -15,12 +15,12 @@ from pipeline.experiments.candidates import (
     schroeder_phases,
 )
 from pipeline.experiments.goal import Goal, choose, find_goal
-from pipeline.experiments.information import Knowledge
+from pipeline.experiments.information import FisherInformation
 from pipeline.experiments.next_recordings import (
     STATISTICAL,
     _doubt,
     choose_next,
-    weigh,
+    compare_recordings,
     why_useless,
 )
 from pipeline.experiments.plan import Plan, PlanLimits, Recording
@@ -63,10 +63,10 @@ def analysis():
 
 @pytest.fixture(scope="module")
 def known(analysis):
-    return Knowledge.of(analysis)
+    return FisherInformation.of(analysis)
 
 
-def multisine(known: Knowledge, goal: Goal) -> Recording:
+def multisine(known: FisherInformation, goal: Goal) -> Recording:
     tones = optimal_tones(known, base=0.1, seconds=20.0, travel=2.0, goal=goal)
     return Recording(
         id="multisine-1",
@@ -209,7 +209,7 @@ def test_each_choice_serves_its_own_goal(analysis):
         found = choose_next(analysis, plan, n=1, goal=goal, commands=COMMANDS)
         (left[goal],) = found.recordings
         assert found.recordings[0].aim == goal
-    known = Knowledge.of(analysis)
+    known = FisherInformation.of(analysis)
     for goal, other in (("K_1", "zeta_2"), ("zeta_2", "K_1")):
         of = find_goal(goal, known, feedback=None).of
         own, theirs = (
@@ -224,7 +224,7 @@ def test_no_choice_passes_a_limit(analysis):
         found = choose_next(analysis, Plan(limits=LIMITS), n=3, goal="mean", commands=commands)
         assert {r.wave for r in found.recordings} <= {"square", "chirp", "multisine"}
         assert ("m" in commands) or all(r.wave != "multisine" for r in found.recordings)
-        known = Knowledge.of(analysis)
+        known = FisherInformation.of(analysis)
         for recording in found.recordings:
             t, u = known.input(recording)
             x = simulate_linear(known.chain, t, recording.amplitude * u)
@@ -238,7 +238,7 @@ def test_a_users_proposal_is_compared_with_the_choice(analysis, known):
     mine = Recording(id="mine", kind="sweep", carts=(1, 2), wave="square", amplitude=0.02,
                      frequency=0.4, cycles=8)  # fmt: skip
     plan = Plan(limits=LIMITS)
-    found = weigh(analysis, mine, plan, goal="zeta_2", commands=COMMANDS)
+    found = compare_recordings(analysis, mine, plan, goal="zeta_2", commands=COMMANDS)
     alone = choose_next(analysis, plan, n=1, goal="zeta_2", commands=COMMANDS)
     assert (found.now, found.best) == (alone.now, alone.errors[-1])
     assert found.chosen == alone.recordings[0]
@@ -252,7 +252,7 @@ def test_a_proposal_that_makes_the_fit_worse_is_reported(analysis):
     """If a proposed recording would make the fit worse, the answer says so."""
     mine = Recording(id="mine", kind="step", carts=(1, 2), wave="square", amplitude=0.005,
                      frequency=2 / 120, cycles=4)  # fmt: skip
-    found = weigh(analysis, mine, Plan(limits=LIMITS), goal="worst", commands=COMMANDS)
+    found = compare_recordings(analysis, mine, Plan(limits=LIMITS), goal="worst", commands=COMMANDS)
     assert found.proposed > 1.01 * found.now
     assert "the fit would be worse" in found.why
 
@@ -284,7 +284,7 @@ def test_only_dwells_are_chosen_if_dwells_identified_the_carts():
 
 def test_a_new_dwell_has_the_misfit_of_earlier_ones():
     """If earlier dwells lie off the fitted curve, a new dwell is expected to lie off it as much."""
-    known = Knowledge.of(analysed("two-cart"))
+    known = FisherInformation.of(analysed("two-cart"))
     dwell = Recording(
         id="sine-new", kind="sine", carts=(1, 2), wave="sine", amplitude=0.05, frequency=2.0,
         cycles=40,
@@ -297,7 +297,7 @@ def test_a_new_dwell_has_the_misfit_of_earlier_ones():
 
 def test_carts_that_hardly_settle_get_no_dwells():
     """For carts that take too long to settle, no dwell is chosen, and a message says so."""
-    known = Knowledge.of(analysed("two-cart"))
+    known = FisherInformation.of(analysed("two-cart"))
     slow = replace(known, chain=replace(known.chain, c=0.2 * known.chain.c))
     goal = find_goal("worst", slow, feedback=None)
     with pytest.raises(DataError, match="too long to settle"):
@@ -309,7 +309,7 @@ def test_a_predicted_error_below_calibration_is_reported(analysis):
     found = choose_next(analysis, Plan(limits=LIMITS), n=1, goal="worst", commands=COMMANDS)
     assert (STATISTICAL in found.summary) == (found.errors[-1] < CALIBRATION)
     assert (STATISTICAL in found.recordings[0].note) == (found.errors[-1] < CALIBRATION)
-    known = Knowledge.of(analysis)
+    known = FisherInformation.of(analysis)
     worst, names = find_goal("worst", known, feedback=None), list(known.chain.parameters())
     after = known.information + known.of_recording(found.recordings[0])
     assert names[worst.worst(known.information)] in found.words

@@ -13,7 +13,7 @@ from pipeline.errors import ConfigError, DataError
 from pipeline.experiments.by_hand import add_recording
 from pipeline.experiments.plan import PidLoop, Plan, PlanLimits, Recording, StateLoop
 from pipeline.experiments.plan_file import load_plan, plan_path, plan_text, save_plan
-from pipeline.experiments.propose import AIM, extend_plan, let_go, make_plan, propose_plan
+from pipeline.experiments.propose import AIM, extend_plan, make_plan, propose_plan, release_by_hand
 from pipeline.plant.chain import PRESETS, quadratic_factors
 from pipeline.plant.simulate import SETTLED_DWELL, settling_wait, simulate_linear
 from pipeline.protocol import FULL_SCALE, Description, Start, Wave, target_at
@@ -325,7 +325,7 @@ def test_a_recording_added_meanwhile_is_kept(tmp_path):
     submission = load_submission(work)
     old = propose_plan(submission)
     save_plan(old, submission)
-    mine = let_go(1, name="mine", seconds=10.0)
+    mine = release_by_hand(1, name="mine", seconds=10.0)
 
     def meanwhile(stage: str) -> None:
         add_recording(work, mine)

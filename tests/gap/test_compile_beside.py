@@ -8,7 +8,7 @@ import psutil
 import pytest
 
 from pipeline.gap.compile_beside import follower_compiled
-from pipeline.gap.follow.track import compile_follower
+from pipeline.gap.pem.run import compile_follower
 from tests.helpers.places import ROOT
 
 SCRIPT = """

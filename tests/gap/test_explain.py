@@ -15,14 +15,14 @@ from pipeline.gap.fit.levenberg_marquardt import Fitting, fit_model
 from pipeline.gap.fit.linearise import linearise
 from pipeline.gap.fit.structure import Structure
 from pipeline.gap.types import Gap
-from pipeline.gap.verdict.account import repeatability
+from pipeline.gap.verdict.summary import repeatability
 from pipeline.json_files import plain
 from pipeline.plant.augmented import simulate_augmented
 from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import AugmentedChain
 from pipeline.results import Record
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from tests.helpers.effects import make_term
 from tests.truth.bench import Hidden, simulate_truth
 from tests.truth.cases import COUNT, make_case
@@ -30,7 +30,7 @@ from tests.truth.cases import COUNT, make_case
 
 def explain(case, **options) -> Gap:
     """Run the workflow on a case."""
-    return explain_gap(case.records, Bench(springs=case.springs), **options)
+    return explain_gap(case.records, Setup(springs=case.springs), **options)
 
 
 def names(gap: Gap) -> list[tuple[str, int]]:
@@ -173,7 +173,7 @@ def test_a_cart_held_in_all_runs_is_a_wall(said):
         alone.append(replace(alone[0], id=f"step-{number}", kind="step", t=t, u=u, y=y))
     records = [replace(r, free=said) if r.kind == "step" else r for r in alone]
 
-    gap = explain_gap(records, Bench(springs=(True, True, True)))
+    gap = explain_gap(records, Setup(springs=(True, True, True)))
 
     assert gap.verdict == "named"
     assert names(gap) == [("coulomb_friction", 1)]
@@ -232,7 +232,7 @@ def test_a_run_listed_twice_is_used_once():
     twin = case.records[0]
     copy = Record(**{**vars(twin), "id": "copy-of-a"})
 
-    gap = explain_gap([*case.records, copy], Bench(springs=case.springs))
+    gap = explain_gap([*case.records, copy], Setup(springs=case.springs))
 
     assert "copy-of-a" not in (*gap.training, *gap.held_out)
     assert any("duplicate" in note for note in gap.notes)
@@ -242,7 +242,7 @@ def test_single_run_is_cut_in_time():
     """If there is only one run, its last 40 % are held out, and a note says so."""
     case = make_case(seed=47, n=1, effects=["coulomb_friction"], rate=113.1)
 
-    gap = explain_gap(case.records[:1], Bench(springs=case.springs))
+    gap = explain_gap(case.records[:1], Setup(springs=case.springs))
 
     assert gap.held_out
     assert any("40 %" in note for note in gap.notes)
@@ -263,7 +263,7 @@ def test_no_motion_is_one_clear_error():
     )
 
     with pytest.raises(DataError, match="free cart moves, found none"):
-        explain_gap([still], Bench(springs=(True, False)))
+        explain_gap([still], Setup(springs=(True, False)))
 
 
 def positioning_stage(*, friction: float, seed: int, reference, push: float = 0.0) -> Record:
@@ -318,7 +318,7 @@ def test_friction_of_a_rigid_body_is_found_under_feedback(friction):
         positioning_stage(friction=friction, seed=i, reference=r) for i, r in enumerate(REFERENCES)
     ]
 
-    gap = explain_gap(records, Bench(springs=(False, False)))
+    gap = explain_gap(records, Setup(springs=(False, False)))
 
     assert any("as a whole" in note for note in gap.notes)
     assert [run.experiment for run in gap.free_run] == [record.id for record in records]
@@ -339,7 +339,7 @@ def test_a_constant_force_without_springs_is_found():
         for i, r in enumerate(REFERENCES)
     ]
 
-    gap = explain_gap(records, Bench(springs=(False, False)))
+    gap = explain_gap(records, Setup(springs=(False, False)))
 
     assert gap.verdict == "named"
     assert sorted(names(gap)) == [("coulomb_friction", 1), ("force_offset", 1)]
@@ -353,7 +353,7 @@ def test_a_single_decay_is_cut_where_it_still_moves():
     case = make_case(seed=47, n=1, effects=["coulomb_friction"], rate=113.1)
     (decay, *_) = (r for r in case.records if r.kind == "decay")
 
-    gap = explain_gap([decay], Bench(springs=case.springs))
+    gap = explain_gap([decay], Setup(springs=case.springs))
 
     assert 0.0 < gap.noise_floor < 0.5  # the noise is less than half of the motion
     assert all(r.noise_floor < 0.5 for r in gap.by_record)
@@ -364,7 +364,7 @@ def test_a_cart_without_recordings_does_not_change_the_verdict():
     case = make_case(seed=48, n=2, effects=[], rate=113.1)
     decays = [r for r in case.records if r.kind == "decay" and r.free == (2,)]
 
-    gap = explain_gap(decays, Bench(springs=case.springs))
+    gap = explain_gap(decays, Setup(springs=case.springs))
 
     assert gap.verdict == "none"
 
@@ -375,7 +375,7 @@ def test_a_run_without_its_input_is_left_out_with_a_message():
     first, *others = case.records
     unknown = Record(**{**vars(first), "u": None})
 
-    gap = explain_gap([unknown, *others], Bench(springs=case.springs))
+    gap = explain_gap([unknown, *others], Setup(springs=case.springs))
 
     assert first.id not in (*gap.training, *gap.held_out)
     assert any(first.id in note for note in gap.notes)
@@ -404,7 +404,7 @@ def test_an_effect_only_in_the_held_out_data_is_found():
 
     The held-out part is exchanged with the fitted one, and a note says so.
     """
-    gap = explain_gap([_late(seed=0)], Bench(springs=(True, False)))
+    gap = explain_gap([_late(seed=0)], Setup(springs=(True, False)))
     assert names(gap) == [("cubic_spring", 1)]
     assert gap.verdict == "named"
     assert gap.final < 1.05 * gap.noise_floor

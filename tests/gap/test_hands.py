@@ -6,7 +6,7 @@ import pytest
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.types import Gap
 from pipeline.json_files import plain
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from tests.truth.cases import Case, make_case
 
 
@@ -15,7 +15,7 @@ def explained(request) -> tuple[Case, Gap]:
     """Return the gap of a linear bench on which hands pluck, nudge and loosely hold the carts."""
     n = request.param
     case = make_case(seed=8999 + n, n=n, rate=200.0, handled=True)
-    return case, explain_gap(case.records, Bench(springs=case.springs))
+    return case, explain_gap(case.records, Setup(springs=case.springs))
 
 
 def test_a_hand_on_a_linear_bench_is_not_an_effect(explained):

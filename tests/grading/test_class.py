@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.grading.grade import Grade
-from pipeline.grading.gradebook.class_lines import Line, wrong_springs
+from pipeline.grading.gradebook.class_lines import GradeSummary, wrong_springs
 from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.mistakes.state_model import own_chain
 from pipeline.grading.publish.class_page import class_page
@@ -145,7 +145,7 @@ def test_a_spring_that_the_rubric_lacks_flags_nobody():
     assert [flag.code for flag in grade.flags] == []
     assert grade.points >= 0.95 * grade.out_of
     assert "wall-1" in wrong_springs([grade.springs, ()])
-    lines = [Line.of(grade)]
+    lines = [GradeSummary.of(grade)]
     assert "1 of 1 submissions" in class_page(lines, rubric=team.rubric)
     assert wrong_springs([(), ()]) == ""
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.cli import main
-from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Batch
 from tests.grading.publish.test_survey import write_paper
 from tests.helpers.grades import make_grade, make_outcome, two_cart_rubric, write_class

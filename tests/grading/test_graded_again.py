@@ -11,12 +11,12 @@ import pytest
 from pipeline.grading.batch.runner import code_version, grade_batch
 from pipeline.grading.batch.task import Setup, Task
 from pipeline.grading.batch.worker import grade_task
-from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Example
 from pipeline.grading.intake.files import digest, packed, unpacked
-from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.grading.similarity.prints import fingerprint
+from pipeline.grading.similarity.fingerprints import fingerprint
 from pipeline.ingest.read import read_data
 from pipeline.simulated.submission import Students, write_submission
 from pipeline.submission import load_submission

@@ -29,7 +29,7 @@ from pipeline.results import (
     StepEdge,
     StepGain,
 )
-from pipeline.set_up import PAPER_UNITS, Bench
+from pipeline.setup import PAPER_UNITS, Setup
 
 NOTES = "## What we saw\n\nThe *dampings* differ, as `zeta_a` shows:\n\n- friction\n- play\n"
 _SAMPLE_TIME = 0.00884  # s, the controller of the ECP bench
@@ -54,7 +54,7 @@ def make_analysis(carts: int = 2, *, seed: int = 1, repeats: int = 2) -> Analysi
         title=f"The {carts}-cart system, bench 4",
         section="03",
         authors=(("s1024", "Ada Lovelace"), ("s1025", "Émilie du Châtelet")),
-        bench=Bench(springs=(True,) * (carts + 1)),
+        bench=Setup(springs=(True,) * (carts + 1)),
         records=records,
         log_decrements=tuple(decay for _, decay in decays),
         step_gains=gains,

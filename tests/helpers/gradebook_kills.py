@@ -17,8 +17,8 @@ import sys
 import time
 from collections.abc import Callable
 
-from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.gradebook.request_book import RequestBook
+from pipeline.grading.gradebook.gradebook import Gradebook
+from pipeline.grading.gradebook.request_gradebook import RequestGradebook
 from pipeline.grading.gradings import Batch
 from tests.helpers.grades import hertz_flag, make_grade, make_outcome, two_cart_rubric
 
@@ -43,17 +43,17 @@ def put_until_killed(place: str, first: int, pipe: int) -> None:
 
 def answer_until_killed(place: str, first: int, pipe: int) -> None:
     """Ask, answer with new points and reopen, again and again; confirm each round by its number."""
-    book, number = RequestBook(place), first
+    book, number = RequestGradebook(place), first
     while True:
         asked = book.queue().waiting
         if not asked:
             for done in book.queue().settled:
                 if done.request.state == "answered":
-                    book.reopen("team", "laws", by="Ada", seen=done.version)
+                    book.reopen("team", "laws", by="Ada", version=done.version)
             book.ask("team", "laws", why=f"reason {number}", by="s1")
             asked = book.queue().waiting
         points = number % 4 / 4  # multiples of the step, and less than all of the points
-        book.answer("team", "laws", points, text=f"{number}", by="Ada", seen=asked[0].version)
+        book.answer("team", "laws", points, text=f"{number}", by="Ada", version=asked[0].version)
         os.write(pipe, f"{number}\n".encode())
         number += 1
 
@@ -78,7 +78,7 @@ def kill_once(child_does: Callable[[int], None], rng: random.Random) -> list[byt
 def kill_answers(place: str, kills: int) -> None:
     """Kill a process that answers requests; each stored answer must have its points."""
     outcome = make_outcome(make_grade("team", share=0.5))
-    with RequestBook(place, assignment="lab", create=True) as book:
+    with RequestGradebook(place, assignment="lab", create=True) as book:
         book.put(outcome)
         book.finish(Batch(keys=(outcome.key,), shared={}), rubric=two_cart_rubric())
         book.release(True, by="prof")
@@ -88,7 +88,7 @@ def kill_answers(place: str, kills: int) -> None:
         lines = kill_once(lambda pipe, n=first: answer_until_killed(place, n, pipe), rng)
         killed_within += bool(lines)
         told = int(lines[-1]) + 1 if lines else told
-        with RequestBook(place) as book:
+        with RequestGradebook(place) as book:
             events = book.history("team")[1]
         answers = [(e.points, e.text) for e in events if e.what == "answered"]
         given = [(e.points, e.text) for e in events if e.what == "override"]
@@ -116,7 +116,7 @@ def main(place: str, kills: int) -> None:
             told += more is not None
             assert book.known(f"key of team-{told}") is None, told
     with Gradebook(place, assignment="lab", create=True) as book:
-        there = sum(1 for _ in book.prints())
+        there = sum(1 for _ in book.fingerprints())
     print(f"kills {kills} within {killed_within} told {told} there {there}")  # noqa: T201
 
 

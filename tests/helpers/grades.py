@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.grading.batch.task import Setup, Task
 from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.grade import Criterion, Flag, Grade, grade_text
-from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.schema import FILE
 from pipeline.grading.gradings import Batch, Grading
 from pipeline.grading.publish.outputs import write_outputs
@@ -26,7 +26,7 @@ from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import to_svg
 from pipeline.resources import RUBRICS
 from pipeline.results import FrequencyResponse
-from pipeline.set_up import PAPER_UNITS
+from pipeline.setup import PAPER_UNITS
 
 
 def two_cart_rubric() -> Rubric:
@@ -133,7 +133,7 @@ def write_class_of_two(folder: Path, *, anonymous: bool = False) -> None:
 
     The gradebook has the findings of the checks, as after a real grading.
     """
-    from pipeline.grading.judge.reweigh import findings_text
+    from pipeline.grading.judge.recompute import findings_text
     from tests.helpers.grading_students import student  # simulates a bench and analyses it
 
     honest = student(1)

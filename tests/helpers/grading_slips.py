@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.results import FrequencyResponse
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.stages.bode_fit import fit_bode
 from pipeline.submission import Reported, ReportedFeedback
 from tests.helpers.grading_class import Team, written
@@ -189,7 +189,7 @@ def transient_used(team: Team) -> Team:
         try:
             fit = fit_bode(
                 _early(team, float(cycles)),
-                bench=Bench(springs=team.bench.springs),
+                bench=Setup(springs=team.bench.springs),
                 initial=truth,
             )
         except DataError:  # no fit succeeds with such amplitudes; a student would try others

@@ -5,7 +5,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.plant.chain import Chain
 from pipeline.plant.simulate import simulate_linear
-from pipeline.results import Hold, Kind, Record
+from pipeline.results import ExperimentKind, Hold, Record
 
 COUNT = 0.00227  # cm, an ECP 210 encoder count
 RATE = 113.0  # Hz, the usual rate of the ECP 210
@@ -16,7 +16,7 @@ def measure(
     t: Array,
     u: Array | None,
     *,
-    kind: Kind,
+    kind: ExperimentKind,
     carts: tuple[int, ...],
     rng: np.random.Generator,
     noise: float,

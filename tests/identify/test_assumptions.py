@@ -10,7 +10,7 @@ import pytest
 from pipeline.ingest.fill import fill_submission
 from pipeline.json_files import file_model, json_text
 from pipeline.report.document import Table
-from pipeline.report.draft.content import build_document
+from pipeline.report.lab_report.content import build_document
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, Assumption

@@ -422,7 +422,7 @@ def test_an_outdated_change_is_refused(tmp_path):
     seen = text_digest(toml.read_text(encoding="utf-8"))
     toml.write_text(toml.read_text(encoding="utf-8") + "# from outside\n", encoding="utf-8")
     with pytest.raises(Outdated) as refused:
-        edit_submission(tmp_path / "team", lambda d: d.update(title="x"), seen=seen)
+        edit_submission(tmp_path / "team", lambda d: d.update(title="x"), version=seen)
     assert refused.value.text.endswith("# from outside\n")
     assert "from outside" in toml.read_text(encoding="utf-8")
 

@@ -13,7 +13,7 @@ from pipeline.errors import DataError
 from pipeline.names import read_name
 from pipeline.plant.chain import PRESETS, Chain, parameter_names, quadratic_factors
 from pipeline.plant.identities import recover_chain, recover_from_parameters
-from pipeline.set_up import PAPER_UNITS
+from pipeline.setup import PAPER_UNITS
 
 # The paper's final estimates. No real chain agrees with Table 3.
 TABLE_1 = {"K": 28.9, "omega_n": 13.2, "zeta": 0.10}
@@ -72,7 +72,7 @@ def test_chain_to_parameters_and_back(chain):
 @given(chains())
 def test_static_gains_and_polynomials_give_the_chain(chain):
     """Masses, dampings and springs of up to four carts follow from static gains and polynomials."""
-    got = recover_chain(chain.static_gains(), chain.tails()[:-1])
+    got = recover_chain(chain.static_gains(), chain.subchain_polynomials()[:-1])
 
     assert_same_chain(got, chain, rtol=1e-9)
     assert max(got.residuals.values(), default=0.0) < 1e-9
@@ -130,7 +130,7 @@ def test_poles_are_roots_of_the_common_denominator(chain):
     """All poles are stable roots of the common denominator."""
     got = chain.poles
 
-    T = chain.tails()[0]
+    T = chain.subchain_polynomials()[0]
     # An error of 1e-13 in a root changes |T| by about as much, relative to the terms of T.
     for pole in got:
         terms = np.abs(T * pole ** np.arange(T.size - 1, -1, -1))
@@ -195,7 +195,7 @@ def test_the_response_at_an_undamped_pole_is_infinite():
 def test_transfer_function_is_gain_and_tails(chain):
     """X_i/U = K_i T_{i+1}(s)/T_{i+1}(0) over T_1(s)/T_1(0)."""
     s = 1j * np.geomspace(2.0, 60.0, 7)
-    T, K = chain.tails(), chain.static_gains()
+    T, K = chain.subchain_polynomials(), chain.static_gains()
 
     expected = [
         K[i] * np.polyval(T[i + 1], s) / T[i + 1][-1] / (np.polyval(T[0], s) / T[0][-1])

@@ -78,11 +78,11 @@ def test_contacts_give_the_force_of_the_law(key):
     for column, value in effect.columns(named).items():
         row[0, column] = value
     if key == "slack_spring":
-        k, at, share = laws.slack_of(row, 0)
+        k, at, share = laws.bilinear_spring(row, 0)
         p, c, sign = np.array([0.5 * 0.1, 0.4]), 0.0, 1.0
         assert share == 0.5
     else:
-        k, c, at = laws.stop_of(row, 0)
+        k, c, at = laws.end_stop(row, 0)
         p, sign = np.array([2.0, 0.4, 0.1]), -1.0
     past = sign * (k * (0.6 - at) + c * 0.3)
     assert terms_of(kind, p, 0.6, 0.3, 0.0, 0.0)[0] == pytest.approx(past, rel=1e-12)
@@ -110,8 +110,8 @@ def test_hysteresis_settles_at_the_rate_of_its_law(v):
     cart = np.zeros((1, len(TABLES["cart"])))
     for column, value in effect.columns({"force": p[0], "distance": p[1]}).items():
         cart[0, column] = value
-    assert_allclose(laws.settling(cart, 0, v), out[:3], rtol=1e-12)
-    assert_allclose(laws.settling_slopes(cart, 0, v), out[3:5], rtol=1e-12)
+    assert_allclose(laws.hysteresis(cart, 0, v), out[:3], rtol=1e-12)
+    assert_allclose(laws.hysteresis_slopes(cart, 0, v), out[3:5], rtol=1e-12)
     step = 1e-6
     by_v = (settled(p, v + step) - settled(p, v - step)) / (2 * step)
     assert_allclose(out[3:5], by_v[1:3], atol=1e-8)
@@ -144,7 +144,7 @@ def test_simulator_and_follower_have_the_same_law(effect, state):
     elif effect.place == "input":
         got = laws.drive_force(row, x, v, u, on) + laws.motor_force(row, x, v, u, on)
     elif isinstance(effect.law, FrictionLaw):
-        got = laws.sliding(rows, 0, u) + laws.dropping(rows, 0, v, u) - sum(shared.values())
+        got = laws.sliding(rows, 0, u) + laws.stribeck(rows, 0, v, u) - sum(shared.values())
     else:
         got = laws.cart_force(rows, 0, x, v, u)
     assert_allclose(got, terms_of(kind, p, *state)[0], rtol=1e-12, atol=1e-15)
@@ -165,7 +165,7 @@ def test_dead_zone_and_saturation_shape_the_input():
         effect = find_effect(key)
         for column, value in effect.columns(SIZES[key]).items():
             drive[column] = value
-    got = [laws.arriving(drive, u) for u in (0.004, -0.015, 0.05, -0.05)]
+    got = [laws.shaped_input(drive, u) for u in (0.004, -0.015, 0.05, -0.05)]
     assert_allclose(got, [0.0, -0.010, 0.03, -0.03], atol=1e-18)
 
 
@@ -178,7 +178,7 @@ def test_friction_at_rest_is_that_of_the_law():
             for column, value in effect.columns(values).items():
                 row[0, column] = value
             symbols = {p.symbol: values[p.name] for p in effect.parameters}
-            held = laws.sliding(row, 0, 0.0) + laws.dropping(row, 0, 0.0, 0.0)
+            held = laws.sliding(row, 0, 0.0) + laws.stribeck(row, 0, 0.0, 0.0)
             assert held == pytest.approx(symbols[effect.law.at_rest], rel=1e-12)
 
 
@@ -220,7 +220,7 @@ def test_a_new_effect_needs_only_its_own_file(tmp_path, monkeypatch):
 
     assert new.cart_force(cart, 0, 0.3, -2.0, 0.0) == pytest.approx(4.0)
     assert new.cart_slopes(cart, 0, 0.3, -2.0, 0.0) == pytest.approx((0.0, -6.0))
-    assert new.arriving(drive, 1.0) == pytest.approx(0.8)
+    assert new.shaped_input(drive, 1.0) == pytest.approx(0.8)
     assert new.reach_of(cart, np.zeros((2, len(columns.Spring))), drive) == (inf, new.ON_CARTS)
     out = np.zeros(followed.TERMS)
     followed.terms(followed.Kind.CUBIC_DRAG, np.array([0.5]), 0, 0.3, -2.0, 0.0, 0.0, 0.0, out)

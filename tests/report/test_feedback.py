@@ -20,7 +20,7 @@ from pipeline.report.render.html import render_fragment
 from pipeline.report.sections.loops import feedback_blocks, margin_rows
 from pipeline.report.sections.page import Page
 from pipeline.results import Analysis, FeedbackDesign, Stage
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.stages.state_feedback import Method, design_feedback
 from pipeline.submission import Design
 from pipeline.words.numbers import significant
@@ -58,7 +58,7 @@ def with_design(chain: Chain, method: Method, pace: tuple[float | None, float]) 
     on_bench = partial(design_margins, chain, design, on_bench=True)
     design = replace(design, bench_margins=log.attempt(Stage.MARGINS, on_bench))
     assert all("unstable" in skip.reason for skip in log.skipped)
-    bench = Bench(springs=tuple(bool(k) for k in chain.k))
+    bench = Setup(springs=tuple(bool(k) for k in chain.k))
     return replace(analysis, bench=bench, fit=replace(analysis.fit, chain=chain), feedback=design)
 
 

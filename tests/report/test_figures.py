@@ -45,7 +45,7 @@ from pipeline.report.figures.time import (
 from pipeline.report.sections.measurements import response_blocks, step_blocks
 from pipeline.report.sections.page import Page
 from pipeline.results import FrequencyResponse
-from pipeline.set_up import PAPER_UNITS, Units
+from pipeline.setup import PAPER_UNITS, Units
 from pipeline.words.numbers import significant
 from pipeline.words.spans import plain
 from tests.helpers.analysis_factory import make_analysis

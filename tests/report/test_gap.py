@@ -16,7 +16,8 @@ from typer.main import get_command
 from pipeline.cli.commands import app
 from pipeline.errors import ConfigError
 from pipeline.gap.types import (
-    Contender,
+    Alternative,
+    AlternativeModel,
     ForceAgainst,
     ForceFormula,
     FormulaTerm,
@@ -29,7 +30,6 @@ from pipeline.gap.types import (
     Proposal,
     RecordGap,
     Residual,
-    Rival,
     Trace,
     Verdict,
     read_gap,
@@ -40,18 +40,18 @@ from pipeline.plant.augmented import simulate_augmented
 from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain, EffectTerm, chain_scales, input_steps
-from pipeline.plant.simulator.laws import arriving
+from pipeline.plant.simulator.laws import shaped_input
 from pipeline.report.document import Formula
-from pipeline.report.draft.content import build_document
 from pipeline.report.equations.effects import augmented_equations, in_order, law
 from pipeline.report.figures.gap import predicted_figure
-from pipeline.report.gap.beside import with_gap
-from pipeline.report.gap.story import LEGEND, build_gap_document, make_gap_files
+from pipeline.report.gap.gap_report import LEGEND, build_gap_document, make_gap_files
+from pipeline.report.gap.load_gap import with_gap
 from pipeline.report.gap.verdict import WORDS, kept_together, terminal_verdict
+from pipeline.report.lab_report.content import build_document
 from pipeline.report.render.folder import write_files
 from pipeline.report.render.html import render_html
 from pipeline.results import Provenance
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.submission import load_submission
 from pipeline.words.math import to_text
 from pipeline.workflow import analyse
@@ -116,11 +116,11 @@ def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
     ]  # fmt: skip
     errors = np.linspace(0.153, 0.041, len(terms) + 1)
     rivals = (
-        Rival(
+        Alternative(
             effect=find_effect("quadratic_drag"), where={"cart": 2}, nrmse_after=0.042,
             confidence=0.4,
         ),
-        Rival(
+        Alternative(
             effect=find_effect("stiction"), where={"cart": 2}, nrmse_after=0.3, confidence=0.001
         ),
     )  # fmt: skip
@@ -146,7 +146,7 @@ def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
     )  # fmt: skip
     return Gap(
         title="Two carts",
-        bench=Bench(springs=(True, True, True)),
+        bench=Setup(springs=(True, True, True)),
         provenance=Provenance(files={"data/step-a.csv": "0" * 64}),
         verdict=verdict,
         effects=effects,
@@ -247,7 +247,9 @@ def test_scattering_repeats_are_compared_with_the_models_error():
 
 def test_suspects_are_listed_with_their_errors():
     """If the verdict is unexplained, each suspect is listed with the error that would remain."""
-    suspect = Rival(effect=find_effect("backlash"), where={}, nrmse_after=0.12, confidence=0.9)
+    suspect = Alternative(
+        effect=find_effect("backlash"), where={}, nrmse_after=0.12, confidence=0.9
+    )
     gap = replace(make_gap("unexplained", ()), final=0.153, suspects=(suspect,))
     text = page_of(gap).text
 
@@ -434,7 +436,7 @@ PREDICTION = Prediction(
 def predicted(first, second) -> Gap:
     """Return a gap that proposes a recording to decide between two models with these effects."""
     contenders = tuple(
-        Contender(chain=CHAIN, terms=make_gap("named", keys).model.terms, weight=0.5)
+        AlternativeModel(chain=CHAIN, terms=make_gap("named", keys).model.terms, weight=0.5)
         for keys in (first, second)
     )
     proposal = Proposal(
@@ -563,7 +565,7 @@ def test_the_dead_zone_comes_before_the_saturation_in_the_simulator():
 
     # In the other order no input would remain, because the limit is below the width.
     expected = np.clip(np.sign(u) * np.maximum(np.abs(u) - width, 0.0), -limit, limit)
-    assert_allclose([arriving(drive, one) for one in u], expected, atol=1e-15)
+    assert_allclose([shaped_input(drive, one) for one in u], expected, atol=1e-15)
     assert [term.effect.key for term in input_steps(terms)] == ["dead_zone", "saturation"]
 
 

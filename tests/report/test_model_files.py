@@ -14,7 +14,7 @@ from pipeline.plant.export.description import describe
 from pipeline.plant.export.sources import c_sources
 from pipeline.report.model_files import FILES, clear_model, save_model
 from pipeline.results import Analysis
-from pipeline.set_up import Units
+from pipeline.setup import Units
 from tests.helpers.effects import SIZES, make_term
 from tests.helpers.examples import analysed
 from tests.helpers.exported import CompiledModel, no_compiler

@@ -9,7 +9,7 @@ import pypdf
 import pytest
 
 from pipeline.report.document import Document, Paragraph, Question, Section, paragraph
-from pipeline.report.draft.content import build_document
+from pipeline.report.lab_report.content import build_document
 from pipeline.report.render.html import render_html
 from pipeline.report.render.pdf import render_pdf
 from pipeline.report.sections.notes import discussion_blocks

@@ -28,10 +28,10 @@ from pipeline.report.document import (
     Tiles,
     cell,
 )
-from pipeline.report.draft.content import build_document
-from pipeline.report.draft.files import Files
-from pipeline.report.draft.make import make_draft
-from pipeline.report.draft.write import write_draft
+from pipeline.report.lab_report.content import build_document
+from pipeline.report.lab_report.files import Files
+from pipeline.report.lab_report.make import make_draft
+from pipeline.report.lab_report.write import write_draft
 from pipeline.report.render.html import render_html
 from pipeline.report.render.pdf import lay_out, missing_characters, render_pdf
 from pipeline.report.sections.housekeeping import file_table, provenance_blocks
@@ -39,7 +39,7 @@ from pipeline.report.sections.measurements import decay_blocks
 from pipeline.report.sections.page import Page as Shown
 from pipeline.report.sections.summary import summary, terminal_summary
 from pipeline.results import Analysis, Check, Estimate, LeftOut, ParameterRow, Skipped, Stage
-from pipeline.set_up import Bench, Units
+from pipeline.setup import Setup, Units
 from pipeline.words.spans import plain, spans
 from tests.helpers.analysis_factory import make_analysis
 
@@ -556,7 +556,7 @@ def test_unusual_chains_are_shown(name, tmp_path):
         change_percent=None, change_sigmas=None, consistent=None,
     )  # fmt: skip
     springs = tuple(bool(k != 0) for k in chain.k)
-    page, pdf = render(bare(analysis, bench=Bench(springs=springs), fit=fit, rows=(row,)), tmp_path)
+    page, pdf = render(bare(analysis, bench=Setup(springs=springs), fit=fit, rows=(row,)), tmp_path)
     assert "time-domain fit of the recordings" in page.text
     assert "The identified chain" in pdf
 

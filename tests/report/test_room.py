@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from pipeline.report.render.room import Choices, End, Pages, fill_pages
+from pipeline.report.render.page_filling import Choices, End, Pages, fill_pages
 
 TOP, BOTTOM = 50.0, 750.0
 

@@ -23,7 +23,7 @@ from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, shown, shown_with, value_term, work_out
 from pipeline.report.equations.derivation import work_state_model
 from pipeline.report.render.html import render_html
-from pipeline.report.sections.questions import Asked, Kind, ask
+from pipeline.report.sections.questions import Asked, QuestionKind, ask
 from pipeline.report.solution.design import work_design
 from pipeline.report.solution.expected import (
     check_carts,
@@ -34,7 +34,7 @@ from pipeline.report.solution.expected import (
 )
 from pipeline.report.solution.write import build_solution, model_answer
 from pipeline.resources import RUBRICS
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.stages.state_feedback import design_feedback
 from pipeline.submission import Design
 from pipeline.words.math import to_text
@@ -434,7 +434,7 @@ def test_the_solution_has_no_text_by_students(carts):
         assert f"Model answer: </strong>{answer[:30]}" in unescape(page)
 
 
-@pytest.mark.parametrize("kind", get_args(Kind))
+@pytest.mark.parametrize("kind", get_args(QuestionKind))
 def test_every_kind_of_question_has_a_model_answer(kind):
     """Each kind of question has a model answer, which is a text without a question."""
     answer = model_answer(Asked(kind=kind, id="x", section="x", text="x"))
@@ -460,7 +460,7 @@ def analyse_rigid():
     fit = replace(
         analysis.fit, chain=chain, names=("m_1", "c_1"), covariance=1e-12 * np.eye(2), parameters={}
     )
-    return replace(analysis, bench=Bench(springs=(False, False)), fit=fit, rows=(), feedback=None)
+    return replace(analysis, bench=Setup(springs=(False, False)), fit=fit, rows=(), feedback=None)
 
 
 def test_solution_json_is_the_reference_for_programs():

@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.grading.publish.feedback import feedback_page
 from pipeline.grading.publish.gradescope import results_text
-from pipeline.report.draft.content import build_document
+from pipeline.report.lab_report.content import build_document
 from pipeline.report.render.html import render_html
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.report.solution.write import build_solution

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.grading.batch.grade_class import Options, grade_class
-from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.simulated.examples import PRESET, write_class
 
 

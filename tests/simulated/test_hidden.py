@@ -21,7 +21,7 @@ from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain, EffectTerm
 from pipeline.plant.sampled_loop import StateFeedback
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.simulated.bench import COUNT, SAMPLE_TIME, BenchRun, ReleasingHand, SimulatedBench
 from pipeline.simulated.hidden import prepare_bench, preset_bench, usual_term
 from pipeline.simulated.submission import write_submission
@@ -338,7 +338,7 @@ def stored(prepared):
     """Return the `gap.json` of a bench, as the gap workflow writes it."""
     model = AugmentedChain(chain=prepared.chain, terms=prepared.effects)
     gap = Gap(
-        bench=Bench(springs=tuple(bool(k) for k in prepared.chain.k)),
+        bench=Setup(springs=tuple(bool(k) for k in prepared.chain.k)),
         verdict="named", effects=(), baseline=0.1, final=0.01, noise_floor=0.01,
         repeatability=None, by_record=(), where=(), next_experiment="", linear=model, model=model,
         training=(), held_out=(), traces=(),

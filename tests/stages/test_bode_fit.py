@@ -14,7 +14,7 @@ from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.results import Estimate, FrequencyResponse
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.stages.bode_fit import fit_bode
 
 BENCH_BAND = 2 * np.pi * np.geomspace(0.3, 7.0, 30)
@@ -62,7 +62,7 @@ def thinned(responses: tuple[FrequencyResponse, ...], points: slice) -> list[Fre
 @pytest.mark.parametrize("chain", [*PRESETS.values(), FOUR_CARTS], ids=lambda c: f"{c.n}-carts")
 def test_exact_magnitudes_give_the_chain_without_a_start(chain):
     """From exact magnitudes and without a start value, the fit finds every named parameter."""
-    got = fit_bode(exact(chain), bench=Bench(springs=(True,) * (chain.n + 1)))
+    got = fit_bode(exact(chain), bench=Setup(springs=(True,) * (chain.n + 1)))
 
     assert got.converged
     for name, value in chain.parameters().items():
@@ -91,7 +91,7 @@ def test_any_bench_is_found(chain):
     """From exact magnitudes of a random bench, the fit finds the bench without a start value."""
     omega = 2 * np.pi * np.geomspace(0.5, 10.0, 40)
 
-    got = fit_bode(exact(chain, omega), bench=Bench(springs=(True,) * (chain.n + 1)))
+    got = fit_bode(exact(chain, omega), bench=Setup(springs=(True,) * (chain.n + 1)))
 
     # Near the tolerance above; a wrong minimum would be off by several percent.
     assert_allclose(got.chain.m, chain.m, rtol=1e-4)
@@ -104,7 +104,7 @@ def test_the_position_unit_does_not_matter(unit):
     chain = PRESETS["throne-3dof"]
     scaled = Chain(m=chain.m / unit, c=chain.c / unit, k=chain.k / unit)
 
-    got = fit_bode(exact(scaled), bench=Bench(springs=(True,) * 4))
+    got = fit_bode(exact(scaled), bench=Setup(springs=(True,) * 4))
 
     truth = chain.parameters()
     assert_allclose(got.parameters["omega_c"].value, truth["omega_c"], rtol=1e-5)
@@ -115,7 +115,7 @@ def test_a_rigid_body_has_mass_and_damping():
     """If a single cart has no spring, the fit gives the cart's mass and damping."""
     cart = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.zeros(2))
 
-    got = fit_bode(exact(cart), bench=Bench(springs=(False, False)))
+    got = fit_bode(exact(cart), bench=Setup(springs=(False, False)))
 
     assert_allclose(got.parameters["mass"].value, 3e-4, rtol=1e-5)
     assert_allclose(got.parameters["damping"].value, 1e-3, rtol=1e-5)
@@ -126,7 +126,7 @@ def test_the_staged_fit_is_reported_as_well():
     """From exact data, the stage-by-stage fit finds all parameters, even the recomputed ones."""
     chain = PRESETS["throne-3dof"]
 
-    got = fit_bode(exact(chain), bench=Bench(springs=(True,) * 4), initial=PAPER_STARTS[3])
+    got = fit_bode(exact(chain), bench=Setup(springs=(True,) * 4), initial=PAPER_STARTS[3])
 
     truth = chain.parameters()
     assert set(got.staged) == set(truth)
@@ -161,7 +161,7 @@ def test_a_missing_spring_is_held_at_zero():
     The other fits find a small positive value.
     """
     fits = [
-        fit_bode(noisy("throne-2dof", seed=seed), bench=Bench(springs=(True,) * 3))
+        fit_bode(noisy("throne-2dof", seed=seed), bench=Setup(springs=(True,) * 3))
         for seed in range(20)
     ]
 
@@ -177,7 +177,7 @@ def test_a_missing_far_spring_and_damper_are_found_to_be_zero():
     chain = PRESETS["throne-2dof"]
     loose = Chain(m=chain.m, c=np.array([6e-4, 0.0]), k=np.array([0.05, 0.127, 0.0]))
 
-    got = fit_bode(exact(loose), bench=Bench(springs=(True,) * 3))
+    got = fit_bode(exact(loose), bench=Setup(springs=(True,) * 3))
 
     assert_allclose(got.chain.k, loose.k, atol=1e-5)
     assert_allclose(got.chain.c, loose.c, atol=1e-7)
@@ -194,7 +194,7 @@ def test_a_damping_at_its_bound_has_no_standard_error():
 
     Gain and frequency are still found.
     """
-    got = fit_bode(exact(SHARP, BESIDE), bench=Bench(springs=(True, True)))
+    got = fit_bode(exact(SHARP, BESIDE), bench=Setup(springs=(True, True)))
 
     assert got.at_bound == ("c_1",)
     zeta = got.parameters["zeta"]
@@ -209,7 +209,7 @@ def test_a_damping_at_its_bound_widens_the_modes_errors():
     This is because the true value of the held damping need not be zero.
     """
     chain = replace(PRESETS["throne-2dof"], c=np.array([6e-4, 0.0]))
-    got = fit_bode(exact(chain), bench=Bench(springs=(False, True, True)))
+    got = fit_bode(exact(chain), bench=Setup(springs=(False, True, True)))
 
     assert got.at_bound == ("c_2",)
     assert got.parameters["zeta_2"].at_bound
@@ -224,7 +224,7 @@ def test_a_damping_at_its_bound_widens_the_modes_errors():
 def test_a_damping_that_the_response_leaves_open_is_the_decays():
     """If points near a sharp peak do not determine the damping, the decay's damping is used."""
     decay = Estimate(value=0.017, std=0.0005, source="log_decrement")
-    got = fit_bode(exact(SHARP, BESIDE), bench=Bench(springs=(True, True)), decays={1: decay})
+    got = fit_bode(exact(SHARP, BESIDE), bench=Setup(springs=(True, True)), decays={1: decay})
 
     zeta = got.parameters["zeta"]
     assert zeta.std is not None
@@ -242,10 +242,10 @@ def test_if_one_damping_is_open_all_decays_are_used():
     }
     low = exact(replace(chain, c=np.array([0.0, 1.0]) * chain.c))
     vague = [replace(r, magnitude_std=0.3 * r.magnitude) for r in low]
-    alone = fit_bode(vague, bench=Bench(springs=(False, True, True)))
+    alone = fit_bode(vague, bench=Setup(springs=(False, True, True)))
     assert alone.at_bound == ("c_1",)
 
-    got = fit_bode(vague, bench=Bench(springs=(False, True, True)), decays=decays)
+    got = fit_bode(vague, bench=Setup(springs=(False, True, True)), decays=decays)
     assert got.at_bound == ("c_1", "c_2")
     # Two standard errors of the decays. A response with 30 % error adds no information.
     assert_allclose(got.chain.zeta_carts, chain.zeta_carts, rtol=0.04)
@@ -256,7 +256,7 @@ def test_a_decay_that_the_response_rules_out_is_not_used():
     """If a decay contradicts a clearly measured peak, the fit does not use the decay."""
     undamped = exact(SHARP, np.sqrt(300.0) * np.array([0.5, 0.9, 0.99, 0.998, 1.002, 1.01, 1.1]))
     decay = Estimate(value=0.05, std=0.001, source="log_decrement")
-    got = fit_bode(undamped, bench=Bench(springs=(True, True)), decays={1: decay})
+    got = fit_bode(undamped, bench=Setup(springs=(True, True)), decays={1: decay})
 
     assert got.parameters["zeta"].at_bound
     assert got.chain.c[0] == 0
@@ -270,7 +270,7 @@ def test_a_decay_is_not_used_if_the_response_gives_the_damping():
     responses = noisy("throne-1dof")
     decay = Estimate(value=0.3, std=1e-4, source="log_decrement")
     alone, given = (
-        fit_bode(responses, bench=Bench(springs=(True, True)), decays=decays)
+        fit_bode(responses, bench=Setup(springs=(True, True)), decays=decays)
         for decays in (None, {1: decay})
     )
     assert given.parameters == alone.parameters
@@ -280,8 +280,8 @@ def test_a_spring_known_to_be_missing_is_not_fitted():
     """A spring declared as missing is not fitted, and the other standard errors do not grow."""
     responses = noisy("throne-3dof")
 
-    free = fit_bode(responses, bench=Bench(springs=(True,) * 4))
-    known = fit_bode(responses, bench=Bench(springs=(False, True, True, True)))
+    free = fit_bode(responses, bench=Setup(springs=(True,) * 4))
+    known = fit_bode(responses, bench=Setup(springs=(False, True, True, True)))
 
     assert "k_1" not in known.names
     assert known.chain.k[0] == 0
@@ -302,10 +302,10 @@ def test_phases_that_contradict_the_magnitudes_are_left_out(change):
         if r.phase is not None
     ]
 
-    got = fit_bode(wrong, bench=Bench(springs=(True,) * 3))
+    got = fit_bode(wrong, bench=Setup(springs=(True,) * 3))
 
     bare = [replace(r, phase=None, phase_std=None) for r in responses]
-    expected = fit_bode(bare, bench=Bench(springs=(True,) * 3))
+    expected = fit_bode(bare, bench=Setup(springs=(True,) * 3))
     assert "the phases do not agree" in got.message
     assert got.parameters == expected.parameters
 
@@ -314,10 +314,10 @@ def test_good_phases_sharpen_the_dampings():
     """Phases as good as the magnitudes reduce the standard errors of the dampings."""
     responses = noisy("throne-3dof", phases=True)
 
-    both = fit_bode(responses, bench=Bench(springs=(True,) * 4))
+    both = fit_bode(responses, bench=Setup(springs=(True,) * 4))
     bare = fit_bode(
         [replace(r, phase=None, phase_std=None) for r in responses],
-        bench=Bench(springs=(True,) * 4),
+        bench=Setup(springs=(True,) * 4),
     )
 
     for name in ("zeta_a", "zeta_b", "zeta_c", "omega_b"):
@@ -340,11 +340,11 @@ def test_a_misfit_widens_the_errors():
         for r in exact(chain)
     ]
 
-    got = fit_bode(scattered, bench=Bench(springs=(True,) * 3))
+    got = fit_bode(scattered, bench=Setup(springs=(True,) * 3))
 
     honest = fit_bode(
         [replace(r, magnitude_std=1e-4 * r.magnitude) for r in exact(chain)],
-        bench=Bench(springs=(True,) * 3),
+        bench=Setup(springs=(True,) * 3),
     )
     assert "away from the model" in got.message
     assert got.chi_square_per_dof > 1e4
@@ -367,7 +367,7 @@ def test_a_table_is_judged_by_its_own_scatter():
         for r in exact(chain)
     ]
 
-    got = fit_bode(rounded, bench=Bench(springs=(True,) * 4))
+    got = fit_bode(rounded, bench=Setup(springs=(True,) * 4))
 
     gain = got.parameters["K_1"]
     assert gain.std is not None
@@ -380,7 +380,7 @@ def test_a_table_is_judged_by_its_own_scatter():
 def test_one_measured_cart_may_be_enough():
     """If the near spring is missing, the response of cart 1 alone determines both carts."""
     got = fit_bode(
-        noisy("throne-2dof")[:1], bench=Bench(springs=(False, True, True)), initial=PAPER_STARTS[2]
+        noisy("throne-2dof")[:1], bench=Setup(springs=(False, True, True)), initial=PAPER_STARTS[2]
     )
 
     for name, value in PRESETS["throne-2dof"].parameters().items():
@@ -396,14 +396,14 @@ def test_the_last_cart_alone_does_not_determine_two():
     The response has five coefficients, but the carts have seven parameters.
     """
     with pytest.raises(DataError, match="response of cart 2 does not determine all of m_1"):
-        fit_bode(noisy("throne-2dof")[1:], bench=Bench(springs=(True,) * 3))
+        fit_bode(noisy("throne-2dof")[1:], bench=Setup(springs=(True,) * 3))
 
 
 def test_few_points_are_refused():
     """Six points cannot determine seven parameters, and the error gives both numbers."""
     few = thinned(noisy("throne-2dof"), slice(0, 3))
     with pytest.raises(DataError, match=r"2 carts with 7 parameters .* found 6"):
-        fit_bode(few, bench=Bench(springs=(True,) * 3))
+        fit_bode(few, bench=Setup(springs=(True,) * 3))
 
 
 @pytest.mark.parametrize(
@@ -421,13 +421,13 @@ def test_impossible_responses_are_refused(change, message):
     """
     (response,) = noisy("throne-1dof")
     with pytest.raises(DataError, match=message):
-        fit_bode([replace(response, **change)], bench=Bench(springs=(True, True)))
+        fit_bode([replace(response, **change)], bench=Setup(springs=(True, True)))
 
 
 def test_no_response_is_refused():
     """If there is no frequency response, the fit is refused."""
     with pytest.raises(DataError, match="needs a frequency response, found none"):
-        fit_bode([], bench=Bench(springs=(True, True)))
+        fit_bode([], bench=Setup(springs=(True, True)))
 
 
 def test_residuals_belong_to_their_points():
@@ -437,7 +437,7 @@ def test_residuals_belong_to_their_points():
     raised[7] += 10 * responses[1].magnitude_std[7]
     responses[1] = replace(responses[1], magnitude=raised)
 
-    got = fit_bode(responses, bench=Bench(springs=(True,) * 4))
+    got = fit_bode(responses, bench=Setup(springs=(True,) * 4))
 
     assert {name: z.shape for name, z in got.standardised.items()} == {
         str(r.cart): r.omega.shape for r in responses
@@ -450,7 +450,7 @@ def test_the_same_data_give_the_same_fit():
     """Two fits to the same data agree to the last bit, even with random starts."""
     responses = thinned(noisy("throne-3dof"), slice(2, 30, 5))
 
-    first, second = (fit_bode(responses, bench=Bench(springs=(True,) * 4)) for _ in range(2))
+    first, second = (fit_bode(responses, bench=Setup(springs=(True,) * 4)) for _ in range(2))
 
     assert first.parameters == second.parameters
     assert first.n_starts == second.n_starts

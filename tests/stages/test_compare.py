@@ -11,7 +11,7 @@ from pipeline.checks.carts import check_carts
 from pipeline.checks.estimates import check_rows
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.results import ChainFit, Estimate
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.stages.compare import DAMPING_LIMIT, GAIN_AND_FREQUENCY_LIMIT, compare
 
 
@@ -24,7 +24,7 @@ def _row(before, after, *, name="K", std=None, source="step"):
         {name: _estimate(before, std, source)},
         final={name: _estimate(after, std, "bode_fit")},
         names=[name],
-        bench=Bench(springs=(True, True)),
+        bench=Setup(springs=(True, True)),
     )
     return rows[0]
 
@@ -79,7 +79,7 @@ def test_a_final_value_at_its_bound_is_not_used():
         {"zeta": _estimate(0.017, 1e-4, "log_decrement")},
         final={"zeta": final},
         names=["zeta"],
-        bench=Bench(springs=(True, True)),
+        bench=Setup(springs=(True, True)),
     )
     assert (row.final, row.consistent, row.change_percent) == (None, None, None)
     assert "puts it at zero" in row.note
@@ -105,7 +105,7 @@ def test_an_estimate_is_not_compared_with_itself():
         {"zeta": _estimate(0.017, 1e-4, "log_decrement")},
         final={"zeta": _estimate(0.017, 1e-4, "log_decrement")},
         names=["zeta"],
-        bench=Bench(springs=(True, True)),
+        bench=Setup(springs=(True, True)),
     )
     assert row.final is not None
     assert (row.consistent, row.change_percent) == (None, None)
@@ -138,7 +138,7 @@ def test_real_chains_pass_every_law(n, data):
     """Whatever the masses and springs, a real lightly damped chain breaks no law."""
     draw = lambda size: np.array(data.draw(st.lists(positive, min_size=size, max_size=size)))  # noqa: E731
     chain = Chain(m=draw(n), c=0.02 * draw(n), k=draw(n + 1))
-    checks = check_carts(_fit(chain), bench=Bench(springs=(True,) * (n + 1)))
+    checks = check_carts(_fit(chain), bench=Setup(springs=(True,) * (n + 1)))
     assert [check.id for check in checks if check.outcome == "fail"] == []
 
 
@@ -146,7 +146,7 @@ def test_a_negative_spring_is_named():
     """If a fitted spring is negative by more than its standard error, a failed check names it."""
     chain = PRESETS["throne-3dof"]
     negative = replace(chain, k=np.array([-0.003, *chain.k[1:]]))
-    checks = {c.id: c for c in check_carts(_fit(negative), bench=Bench(springs=(True,) * 4))}
+    checks = {c.id: c for c in check_carts(_fit(negative), bench=Setup(springs=(True,) * 4))}
     assert checks["physical.signs"].outcome == "fail"
     assert "k_1" in checks["physical.signs"].message
 
@@ -160,7 +160,7 @@ def test_the_papers_third_table_breaks_two_redundancies():
     carts = {"omega_1": 20.0, "omega_2": 27.2, "omega_3": 25.6}
     alone = {"zeta_1": 0.08, "zeta_2": 0.02, "zeta_3": 0.04}
     table = {**gains, **modes, **dampings, **nulls, **carts, **alone}
-    checks = check_carts(_fit(PRESETS["throne-3dof"], table), bench=Bench(springs=(True,) * 4))
+    checks = check_carts(_fit(PRESETS["throne-3dof"], table), bench=Setup(springs=(True,) * 4))
     assert all(c.outcome == "pass" for c in checks if c.id.startswith("order."))
     value = {c.id: c.value for c in checks if c.value is not None}
     assert value["redundancy.R4"] > 0.1

@@ -10,7 +10,7 @@ from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.simulate import simulate_linear
-from pipeline.results import FrequencyResponse, Hold, Kind, Record, SinePoint
+from pipeline.results import ExperimentKind, FrequencyResponse, Hold, Record, SinePoint
 from pipeline.stages.frequency_response import (
     collect_dwells,
     find_resonances,
@@ -44,7 +44,7 @@ def record(
     t: Array,
     u: Array,
     *,
-    kind: Kind = "step",
+    kind: ExperimentKind = "step",
     noise: float = 0.0,
     seed: int = 0,
     hold: Hold = "zero_order",

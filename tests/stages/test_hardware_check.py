@@ -17,7 +17,7 @@ from pipeline.errors import DataError
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.sampled_loop import Controller, LoopSetup, Pid, StateFeedback, simulate_loop
 from pipeline.plant.simulate import simulate_linear
-from pipeline.results import FeedbackDesign, HardwareCheck, Kind, Record
+from pipeline.results import ExperimentKind, FeedbackDesign, HardwareCheck, Record
 from pipeline.stages.hardware_check import check_hardware
 from pipeline.stages.state_feedback import design_feedback
 from pipeline.submission import Design
@@ -50,7 +50,7 @@ def record(
     u: Array | None,
     t: Array = CLOCK,
     reference: Array | None = None,
-    kind: Kind = "closed_loop",
+    kind: ExperimentKind = "closed_loop",
     free: tuple[int, ...] | None = None,
 ) -> Record:
     carts = tuple(range(1, len(y) + 1))

@@ -13,8 +13,8 @@ from pipeline.estimation.decay.ringing import Ringing
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear
-from pipeline.results import Kind, Record
-from pipeline.set_up import Bench
+from pipeline.results import ExperimentKind, Record
+from pipeline.setup import Setup
 from pipeline.stages.log_decrement import fit_log_decrement
 from pipeline.submission import load_submission
 from tests.helpers.ucsd import write_two_cart_submission
@@ -45,7 +45,7 @@ def held_then_free(t, *, zeta, omega_n=OMEGA, start=1.2, release=RELEASE, d=0.0)
     return y
 
 
-def record(t, y, *, u=None, kind: Kind = "decay", count=COUNT):
+def record(t, y, *, u=None, kind: ExperimentKind = "decay", count=COUNT):
     return Record(
         id="decay",
         kind=kind,
@@ -371,7 +371,7 @@ def test_a_decay_of_few_swings_is_not_called_exponential(periods, outcome):
     t = np.arange(0.0, periods * 2 * np.pi / OMEGA, 0.01)
     y = 1.2 * np.exp(-0.05 * OMEGA * t) * np.cos(OMEGA * t)
     decay = fit_log_decrement(record(t, y), cart=1)
-    (check,) = check_decays([decay], bench=Bench(springs=(True, True)))
+    (check,) = check_decays([decay], bench=Setup(springs=(True, True)))
     assert check.outcome == outcome
     assert ("too few swings" in check.message) == (outcome == "skip")
 
@@ -385,7 +385,7 @@ def test_drag_in_few_swings_does_not_pass_as_exponential(periods):
 
     moving = swinging(force, seed=5, duration=periods * 2 * np.pi / OMEGA)
     decay = fit_log_decrement(moving, cart=1)
-    (check,) = check_decays([decay], bench=Bench(springs=(True, True)))
+    (check,) = check_decays([decay], bench=Setup(springs=(True, True)))
     assert check.outcome != "pass"
 
 

@@ -16,7 +16,7 @@ from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import ChainFit, Record
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.stages.time_fit import fit_records
 from pipeline.submission import load_submission
 from tests.helpers.time_records import COUNT, decay_record, measure, random_chain, step_record
@@ -64,7 +64,7 @@ def test_modes_and_simulation_agree(free, jitter):
     chain, rng = PRESETS["throne-3dof"], np.random.default_rng(0)
     x0 = rng.standard_normal(2 * len(free))
     record = step_record(chain, rng=rng, free=free, jitter=jitter, noise=0.0, count=0.0, x0=x0)
-    parametrisation = Parametrisation(bench=Bench(springs=(True, True, True, True)))
+    parametrisation = Parametrisation(bench=Setup(springs=(True, True, True, True)))
     left = misfit(record, chain, parametrisation, at_rest=False)
     # The simulation rounds intervals to 1e-12 s; velocities are about 100 cm/s.
     sigma = open_window(record).sigma
@@ -78,7 +78,7 @@ def test_the_jacobian_is_that_of_the_misfit(zeta, at_rest):
     m, k = np.array([2e-4, 1e-4]), np.array([0.03, 0.04, 0.02])
     chain = Chain(m=m, c=2 * zeta * np.sqrt(m * (k[:-1] + k[1:])), k=k)
     record = step_record(chain, rng=np.random.default_rng(1), noise=0.01)
-    parametrisation = Parametrisation(bench=Bench(springs=(True, True, True)))
+    parametrisation = Parametrisation(bench=Setup(springs=(True, True, True)))
     theta = parametrisation.pack(chain) + 0.01
 
     def cost(theta):
@@ -108,7 +108,7 @@ def test_a_band_limited_input_is_used_as_such():
     record = measure(
         y, t, u, kind="sweep", carts=(1, 2), rng=rng, noise=0.0, count=0.0, hold="band_limited"
     )
-    parametrisation = Parametrisation(bench=Bench(springs=(True, True, True)))
+    parametrisation = Parametrisation(bench=Setup(springs=(True, True, True)))
 
     def off(record):
         left = misfit(record, chain, parametrisation)
@@ -128,7 +128,7 @@ def test_exact_records_give_the_chain(n):
     rng = np.random.default_rng(n)
     chain, springs = random_chain(n, rng)
     record = step_record(chain, rng=rng, noise=0.0, count=0.0)
-    fit = fit_records([record], bench=Bench(springs=springs))
+    fit = fit_records([record], bench=Setup(springs=springs))
     assert fit.converged
     assert fit.n_starts == 1
     # The search stops at 1e-9 of the cost; rounding times to 1e-12 s keeps the cost above zero.
@@ -149,7 +149,7 @@ def test_unseen_chains_are_found_from_noisy_records(n, all_springs):
             for swing in (1.0, 0.6, -1.0)
         ]
         fit = fit_records(
-            records, bench=Bench(springs=(True,) * (n + 1) if all_springs else springs)
+            records, bench=Setup(springs=(True,) * (n + 1) if all_springs else springs)
         )
         assert fit.converged
         # Of 3 × 4 × at most 17 errors, one exceeds 4.5 standard errors in only 1 of 700 such tests.
@@ -169,10 +169,10 @@ def test_held_carts_and_decays_are_fitted_together_with_steps():
         decay_record(chain, free=(2,), rng=rng, id="second"),
         decay_record(chain, free=(2, 3), rng=rng, id="last two"),
     ]
-    fit = fit_records(records, bench=Bench(springs=(True,) * 4))
+    fit = fit_records(records, bench=Setup(springs=(True,) * 4))
     assert fit.converged
     assert np.max(np.abs(errors(fit, chain))) < 4
-    alone = fit_records(records[:1], bench=Bench(springs=(True,) * 4))
+    alone = fit_records(records[:1], bench=Setup(springs=(True,) * 4))
     # Decays of cart 3 determine it better than a step that acts through two springs.
     assert std(fit, "zeta_3") < 0.8 * std(alone, "zeta_3")
 
@@ -186,7 +186,7 @@ def test_a_record_that_starts_in_motion_is_fitted_with_a_note():
         step_record(chain, rng=rng, id="quiet"),
         step_record(chain, rng=rng, x0=x0, id="cut"),
     ]
-    fit = fit_records(records, bench=Bench(springs=(True,) * 3))
+    fit = fit_records(records, bench=Setup(springs=(True,) * 3))
     assert "in motion at the start: cut" in fit.message
     assert np.max(np.abs(errors(fit, chain))) < 4
 
@@ -197,7 +197,7 @@ def test_a_cart_that_was_not_measured_is_still_found():
     chain = PRESETS["throne-3dof"]
     whole = [step_record(chain, rng=rng, swing=swing, id=f"{swing}") for swing in (1.0, 0.5)]
     records = [replace(r, y=r.y[[0, 2]], carts=(1, 3), resolution=r.resolution[:2]) for r in whole]
-    fit = fit_records(records, bench=Bench(springs=(False, True, True, True)))
+    fit = fit_records(records, bench=Setup(springs=(False, True, True, True)))
     assert fit.converged
     assert np.max(np.abs(errors(fit, chain))) < 4
 
@@ -210,7 +210,7 @@ def test_a_long_fast_sweep_is_fitted_whole():
     u = 0.02 * np.sin(2 * np.pi * (0.2 * t + 0.17 * t**2))  # from 0.2 to 7 Hz
     y = simulate_linear(chain, t, u)
     record = measure(y, t, u, kind="sweep", carts=(1, 2), rng=rng, noise=0.001)
-    fit = fit_records([record], bench=Bench(springs=(True,) * 3))
+    fit = fit_records([record], bench=Setup(springs=(True,) * 3))
     assert fit.converged
     assert fit.n_starts == 1
     assert fit.n_points == 2 * t.size
@@ -226,7 +226,7 @@ def test_a_body_on_no_spring_has_mass_and_damping():
     rng = np.random.default_rng(6)
     record = measure(y, t, u, kind="step", carts=(1,), rng=rng, noise=0.0005)
     for springs in ((False, False), (True, True)):
-        fit = fit_records([record], bench=Bench(springs=springs))
+        fit = fit_records([record], bench=Setup(springs=springs))
         assert np.max(np.abs(errors(fit, truth))) < 4
     assert "held at zero: k_1" in fit.message
 
@@ -236,7 +236,7 @@ def test_a_damping_at_its_bound_has_no_standard_error():
     chain = Chain(m=np.array([2e-3]), c=np.array([0.0]), k=np.array([0.6, 0.0]))
     fits = [
         fit_records(
-            [step_record(chain, rng=np.random.default_rng(seed))], bench=Bench(springs=(True,) * 2)
+            [step_record(chain, rng=np.random.default_rng(seed))], bench=Setup(springs=(True,) * 2)
         )
         for seed in range(6)
     ]
@@ -254,7 +254,7 @@ def test_a_missing_spring_is_held_at_zero():
     """A declared spring that is missing is zero within its error, or held at zero with a note."""
     rng = np.random.default_rng(1)
     chain = Chain(m=np.array([3e-4, 2e-4]), c=np.array([6e-4, 4e-4]), k=np.array([0.1, 0.06, 0]))
-    fit = fit_records([step_record(chain, rng=rng)], bench=Bench(springs=(True,) * 3))
+    fit = fit_records([step_record(chain, rng=rng)], bench=Setup(springs=(True,) * 3))
     assert fit.converged
     assert np.max(np.abs(errors(fit, chain))) < 4
     spring = fit.chain.k[2]
@@ -267,7 +267,7 @@ def test_a_missing_spring_is_held_at_zero():
 def test_the_same_records_give_the_same_fit():
     """Two fits to the same records agree to the last bit."""
     record = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(7))
-    first, second = (fit_records([record], bench=Bench(springs=(True,) * 3)) for _ in range(2))
+    first, second = (fit_records([record], bench=Setup(springs=(True,) * 3)) for _ in range(2))
     assert np.array_equal(first.chain.k, second.chain.k)
     assert np.array_equal(first.covariance, second.covariance)
 
@@ -279,7 +279,7 @@ def test_decays_alone_are_refused():
     """Decays alone cannot give a mass in units of the input, and the error says what is needed."""
     record = decay_record(PRESETS["throne-2dof"], free=(1, 2), rng=np.random.default_rng(8))
     with pytest.raises(DataError, match="needs a record that drives cart 1, found none"):
-        fit_records([record], bench=Bench(springs=(True,) * 3))
+        fit_records([record], bench=Setup(springs=(True,) * 3))
 
 
 def test_an_undetermined_parameter_is_named():
@@ -289,14 +289,14 @@ def test_an_undetermined_parameter_is_named():
     """
     record = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(9), free=(1,))
     with pytest.raises(DataError, match=r"the records do not determine \w_\d"):
-        fit_records([record], bench=Bench(springs=(True,) * 3))
+        fit_records([record], bench=Setup(springs=(True,) * 3))
 
 
 def test_a_broken_chain_is_refused():
     """If no spring joins two carts, the fit is refused, since the motor moves only the first."""
     record = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(9))
     with pytest.raises(DataError, match="spring between carts 1 and 2"):
-        fit_records([record], bench=Bench(springs=(True, False, True)))
+        fit_records([record], bench=Setup(springs=(True, False, True)))
 
 
 def test_a_record_without_motion_is_left_out_with_a_message():
@@ -305,7 +305,7 @@ def test_a_record_without_motion_is_left_out_with_a_message():
     chain = PRESETS["throne-1dof"]
     good = step_record(chain, rng=rng)
     still = replace(good, id="still", kind="decay", u=None, y=np.zeros_like(good.y))
-    fit = fit_records([good, still], bench=Bench(springs=(True, True)))
+    fit = fit_records([good, still], bench=Setup(springs=(True, True)))
     assert "left out: still: time fit needs a cart that moves" in fit.message
     assert np.max(np.abs(errors(fit, chain))) < 4
 
@@ -315,7 +315,7 @@ def test_records_that_no_chain_explains_give_no_fit():
     rng = np.random.default_rng(12)
     record = step_record(PRESETS["throne-1dof"], rng=rng)
     assert record.u is not None
-    fit = fit_records([replace(record, u=-record.u)], bench=Bench(springs=(True, True)))
+    fit = fit_records([replace(record, u=-record.u)], bench=Setup(springs=(True, True)))
     assert not fit.converged
     assert "no chain reproduces the recordings" in fit.message
 
@@ -326,7 +326,7 @@ def test_a_search_at_its_limit_returns_the_best_so_far():
     record = step_record(PRESETS["throne-1dof"], rng=rng)
     assert record.u is not None
     windows = [open_window(replace(record, u=-record.u))]
-    P = Parametrisation(bench=Bench(springs=(True, True)))
+    P = Parametrisation(bench=Setup(springs=(True, True)))
     whole, short = (
         search(windows, P, given=None),
         search(windows, P, given=None, most_comparisons=1),
@@ -381,12 +381,12 @@ def test_a_long_rest_before_the_step_is_one_reading():
         record = measure(
             y + COUNT * rng.uniform(), t, u, kind="step", carts=(1,), rng=rng, noise=0.0005
         )
-        fit = fit_records([record], bench=Bench(springs=(True, True)))
+        fit = fit_records([record], bench=Setup(springs=(True, True)))
         off.append(errors(fit, chain))
         moving = t >= 5.0 - 1.5 / rate  # without the rest before the step
         short = replace(record, t=t[moving] - t[moving][0], u=u[moving], y=record.y[:, moving])
         white.append(
-            std(fit, "K") / std(fit_records([short], bench=Bench(springs=(True, True))), "K")
+            std(fit, "K") / std(fit_records([short], bench=Setup(springs=(True, True))), "K")
         )
     # From 24 records, a spread is known to 14 %.
     assert 0.6 < np.sqrt(np.mean(np.square(off)[:, 0])) < 1.4
@@ -414,7 +414,7 @@ def test_real_steps_give_the_known_masses_and_springs(real_data, tmp_path):
     folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(2, 3, 4, 5))
     records = [r for r in read_data(load_submission(folder)).records if r.free == (1, 2)]
     steps = [record for record in records if record.kind == "step"]
-    fit = fit_records(steps, bench=Bench(springs=(True, True, False)))
+    fit = fit_records(steps, bench=Setup(springs=(True, True, False)))
     assert fit.converged
     # The reference values have two digits, and real carts have friction, unlike the chain.
     assert_allclose(fit.chain.m, [5.5e-6, 3.7e-6], rtol=0.1)

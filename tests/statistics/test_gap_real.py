@@ -10,7 +10,7 @@ from benchmarks.emps import emps_record, free_run
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.types import Gap
 from pipeline.results import Record
-from pipeline.set_up import Bench, Units
+from pipeline.setup import Setup, Units
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.ucsd import ecp_record, write_two_cart_submission
@@ -26,7 +26,7 @@ def explain_five(folder: Path, name: str, *, column: int, kind: str) -> Gap:
         ecp_record(folder / f"{name}_test{i}.csv", column=column, kind=kind) for i in range(1, 6)
     ]
     return explain_gap(
-        records, Bench(springs=(True, False), units=Units(position="count", input="V"))
+        records, Setup(springs=(True, False), units=Units(position="count", input="V"))
     )
 
 
@@ -90,7 +90,7 @@ def test_an_axis_on_no_spring_is_simulated_over_a_whole_record(real_data):
     assert real_data.exists()
     train, test = emps_record("train"), emps_record("test")
 
-    gap = explain_gap([train], Bench(springs=(False, False), units=Units(position="m", input="V")))
+    gap = explain_gap([train], Setup(springs=(False, False), units=Units(position="m", input="V")))
 
     assert gap.verdict in ("named", "partial")
     keys = {found.effect.key for found in gap.effects}
@@ -122,7 +122,7 @@ def test_silverbox_has_a_hardening_spring(real_data):
         )
 
     records = [piece("a", 40650, 6000), piece("b", 60000, 4000), piece("c", 105712, 4000)]
-    gap = explain_gap(records, Bench(springs=(True, False), units=Units(position="V", input="V")))
+    gap = explain_gap(records, Setup(springs=(True, False), units=Units(position="V", input="V")))
 
     assert gap.effects[0].effect.key == "cubic_spring"
     assert gap.effects[0].nrmse_after < 0.15 * gap.baseline

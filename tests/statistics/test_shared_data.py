@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from pipeline.grading.gradings import Member
-from pipeline.grading.similarity.prints import fingerprint
-from pipeline.grading.similarity.shared import find_shared
+from pipeline.grading.similarity.copies import find_copies
+from pipeline.grading.similarity.fingerprints import fingerprint
 from pipeline.ingest.read import read_data
 from pipeline.simulated.bench import COUNT
 from pipeline.simulated.hidden import prepare_bench
@@ -49,11 +49,11 @@ def test_copies_are_found_and_honest_teams_are_not_flagged(number, bench):
     for noise in (USUAL_NOISE, USUAL_NOISE / 5):
         teams = read_class(moved, seed=number, noise=noise)
         honest = [member(str(i), records) for i, records in enumerate(teams)]
-        assert find_shared(honest) == {}
+        assert find_copies(honest) == {}
 
         copied = [replace(r, id=f"{r.id} mine") for r in teams[0] if r.id in COPIED]
         mixed = [*(r for r in teams[1] if r.id not in COPIED), *copied]
-        found = find_shared([honest[0], member("1", mixed), *honest[2:]])
+        found = find_copies([honest[0], member("1", mixed), *honest[2:]])
         assert set(found) == {"0", "1"}
         assert len(found["1"]) >= len(COPIED) - 1
         assert all(r.experiment == f"{r.other_experiment} mine" for r in found["1"])
@@ -73,4 +73,4 @@ def test_teams_on_different_benches_are_not_flagged(tmp_path):
         bench = prepare_bench(preset="throne-3dof", hide=(effect,))
         write_submission(folder, bench, seed=seed)
         class_.append(member(str(seed), read_data(load_submission(folder)).records))
-    assert find_shared(class_) == {}
+    assert find_copies(class_) == {}

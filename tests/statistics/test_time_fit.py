@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.plant.chain import PRESETS
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.stages.time_fit import fit_records
 from tests.helpers.time_records import random_chain, step_record
 from tests.stages.test_time_fit import errors
@@ -31,7 +31,7 @@ def test_95_percent_intervals_contain_95_percent_of_the_true_values(preset, nois
             )
             for swing in (1.0, 0.6)
         ]
-        fit = fit_records(records, bench=Bench(springs=(True,) * (chain.n + 1)))
+        fit = fit_records(records, bench=Setup(springs=(True,) * (chain.n + 1)))
         assert fit.converged
         inside += np.abs(errors(fit, chain)) < 1.96
     # Each count is binomial, with 120 draws at 0.95 and a standard error of 0.02. The worst of 19
@@ -61,7 +61,7 @@ def test_every_random_chain_is_found():
             )
             for swing in (1.0, 0.6, -1.0)
         ]
-        fit = fit_records(records, bench=Bench(springs=springs))
+        fit = fit_records(records, bench=Setup(springs=springs))
         assert fit.converged
         # Of 200 × about 10 errors, one is beyond 5.5 standard errors once in 10 000 such tests.
         assert np.max(np.abs(errors(fit, chain))) < 5.5

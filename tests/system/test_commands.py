@@ -43,7 +43,7 @@ def test_help_imports_nothing_heavy():
 @pytest.mark.parametrize(
     ("module", "unneeded"),
     [
-        ("report.draft.write", ("pipeline.plant.catalogue", "scipy.ndimage", "control")),
+        ("report.lab_report.write", ("pipeline.plant.catalogue", "scipy.ndimage", "control")),
         ("grading.batch.grade_class", ("pipeline.workflow", "scipy.linalg", "pandas")),
     ],
 )

@@ -7,8 +7,8 @@ import pytest
 from playwright.sync_api import expect
 
 from pipeline.desk.app import DeskServer
-from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.gradebook.open_book import OpenBook
+from pipeline.grading.gradebook.gradebook import Gradebook
+from pipeline.grading.gradebook.shared_gradebook import SharedGradebook
 from tests.helpers import postgres
 from tests.helpers.grades import fill_book, write_class
 from tests.system import test_desk
@@ -116,7 +116,7 @@ def test_a_class_is_graded_by_keys(show, tmp_path):
         press(window, "Enter")
         expect(window.get_by_text("3 teams changed")).to_be_visible()
         assert fits(window)
-        with OpenBook(grades) as book:
+        with SharedGradebook(grades) as book:
             given = [book.entry(one).overrides.get("data") for one in teams]
         assert [one.points for one in given if one and one.why == REASON].count(0.75) == 3
         press(window, "u")
@@ -146,8 +146,8 @@ def test_a_class_is_graded_by_keys(show, tmp_path):
         expect(heading).to_have_text(teams[1])
         window.get_by_text("Keys", exact=True).click()
         window.get_by_label("Keys are on").check()
-    with OpenBook(grades) as book:
-        seen = [one.seen for one in book.class_now().listings if one.seen]
+    with SharedGradebook(grades) as book:
+        seen = [one.reviewed_by for one in book.class_now().rows if one.reviewed_by]
         assert seen == ["Ada"]
         given = {one: book.entry(one).overrides.get("data") for one in teams}
     (own,) = [one for one in given.values() if one]

@@ -19,9 +19,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.gradebook.open_book import OpenBook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.schema import FILE
+from pipeline.grading.gradebook.shared_gradebook import SharedGradebook
 from pipeline.grading.gradings import Batch
 from pipeline.resources import RUBRICS
 from pipeline.submission import load_submission
@@ -106,7 +106,7 @@ class _Override(_Save):
         assert answer.status == 303
 
     def check(self) -> None:
-        with OpenBook(self.folder) as book:
+        with SharedGradebook(self.folder) as book:
             given = {
                 int(one.why.removeprefix("change ")): one.points
                 for _, one in book.changes_since(0)
@@ -115,7 +115,7 @@ class _Override(_Save):
             assert list(given) == sorted(given)
             assert all(points == number % 3 / 2 for number, points in given.items())
             assert set(self.confirmed) <= set(given) <= set(range(1, self.sent + 1))
-            assert len(book.class_now().listings) == 16
+            assert len(book.class_now().rows) == 16
         _whole(self.folder)
 
 

@@ -17,9 +17,9 @@ from urllib.parse import urlsplit
 import html5lib
 import pytest
 
-from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.intake.files import digest, open_submission
-from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.intake.find import find_hand_ins
 from pipeline.simulated.submission import Students, write_submission
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.hostile import SECRET, write_hostile

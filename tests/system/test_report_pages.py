@@ -19,10 +19,10 @@ from pypdf import PdfReader
 from pypdf.generic import DictionaryObject
 
 from pipeline.plant.catalogue import CATALOGUE
-from pipeline.report.draft.make import make_draft
-from pipeline.report.draft.write import write_draft
 from pipeline.report.effects.gallery import render_effects
-from pipeline.report.gap.story import make_gap_files
+from pipeline.report.gap.gap_report import make_gap_files
+from pipeline.report.lab_report.make import make_draft
+from pipeline.report.lab_report.write import write_draft
 from pipeline.report.render.folder import write_files
 from pipeline.report.solution.write import render_solution
 from pipeline.results import Analysis

@@ -11,12 +11,12 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from pipeline.bench.live_page import live_view
-from pipeline.desk.ask import Ask
 from pipeline.desk.bench.plan_rows import plan_ids, read_plan
 from pipeline.desk.bench.ports import list_ports, read_port
 from pipeline.desk.benches import BenchSession
+from pipeline.desk.form_input import read_number, read_whole_number
+from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import serve_file
-from pipeline.desk.typed import read_number, read_whole_number
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.experiments.goal import read_error_goal
 from pipeline.experiments.plan import Recording
@@ -30,19 +30,19 @@ _KINDS = (("step", "Step"), ("sweep", "Sweep"), ("sine", "Dwell"), ("decay", "De
 _TYPED = ("kind", "amplitude", "frequency", "frequency_end", "seconds", "cart", "goal")
 
 
-def show(ask: Ask) -> Response:
+def show(ask: PageRequest) -> Response:
     """Show the plan and the forms, or the current session."""
     return _show_page(ask)
 
 
-def plan(ask: Ask) -> Response:
+def plan(ask: PageRequest) -> Response:
     """Start the task that makes a plan or adds recordings to it."""
     _note_plan(ask)
     ask.start("propose_recordings", title="The plan", stock=bool(ask.text("stock")))
     return ask.back(ask.here)
 
 
-def acquire(ask: Ask) -> Response:
+def acquire(ask: PageRequest) -> Response:
     """Start acquiring the ticked recordings, or the whole plan if no recording is ticked."""
     only = [value for value in ask.form.getlist("only") if isinstance(value, str)]
     port = read_port(ask)
@@ -51,7 +51,7 @@ def acquire(ask: Ask) -> Response:
     return ask.back(ask.here)
 
 
-def explore(ask: Ask) -> Response:
+def explore(ask: PageRequest) -> Response:
     """Start an exploration."""
     error = read_number(ask.text("error"), name="Accuracy to reach, ± %", above=0, below=100)
     minutes = read_number(ask.text("minutes"), name="minutes", above=0, below=10_000)
@@ -63,7 +63,7 @@ def explore(ask: Ask) -> Response:
     return ask.back(ask.here)
 
 
-def add(ask: Ask) -> Response:
+def add(ask: PageRequest) -> Response:
     """Add a recording to the plan; a running exploration records it next."""
     from pipeline.experiments.by_hand import add_recording
 
@@ -77,7 +77,7 @@ def add(ask: Ask) -> Response:
     return ask.back(ask.here, f"{new.id} is in the plan.")
 
 
-def weigh(ask: Ask) -> Response:
+def show_comparison(ask: PageRequest) -> Response:
     """Show how much a typed recording would reduce the error, and how much the best one would."""
     from pipeline.experiments.goal import WORST
 
@@ -97,12 +97,12 @@ def weigh(ask: Ask) -> Response:
     )
 
 
-def show_diary(ask: Ask) -> Response:
+def show_diary(ask: PageRequest) -> Response:
     """Return the diary of the last exploration; the browser may run only the diary's own script."""
     return serve_file(ask.folder(), DIARY)
 
 
-def press(ask: Ask) -> Response:
+def press(ask: PageRequest) -> Response:
     """Send a pressed button to the session; a page without scripts is then shown again."""
     session = _find_session(ask)
     if session.ended.is_set():
@@ -111,13 +111,13 @@ def press(ask: Ask) -> Response:
     return ask.back(ask.here) if ask.text("plain") else Response(status_code=status)
 
 
-async def stream(ask: Ask) -> Response:
+async def stream(ask: PageRequest) -> Response:
     """Return a stream of the session's events; if the session has ended, it reports only that."""
     return _find_session(ask).stream()
 
 
 def _show_page(
-    ask: Ask,
+    ask: PageRequest,
     *,
     status: int = 200,
     typed: Mapping[str, str] = {},
@@ -156,7 +156,7 @@ def _show_page(
     )
 
 
-def _note_plan(ask: Ask) -> None:
+def _note_plan(ask: PageRequest) -> None:
     """Remember the recordings of the current plan, so that later ones are shown as new."""
     ask.desk.benches.planned[ask.folder()] = plan_ids(ask.folder())
 
@@ -197,7 +197,7 @@ def _scale_bars(found: Mapping[str, Any]) -> list[dict[str, Any]]:
     ]
 
 
-def _find_session(ask: Ask) -> BenchSession:
+def _find_session(ask: PageRequest) -> BenchSession:
     session = ask.desk.benches.of(ask.folder())
     if session is None:
         raise HTTPException(404, "no session was started here")

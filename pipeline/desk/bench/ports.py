@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.bench.serial_line import port_names
-from pipeline.desk.ask import Ask
-from pipeline.desk.ending import find_log
+from pipeline.desk.crash_log import find_log
+from pipeline.desk.page_request import PageRequest
 from pipeline.errors import ConfigError
 from pipeline.output import write_file
 from pipeline.simulated.emulator.links import running_benches
@@ -29,7 +29,7 @@ class Port:
     name: str
 
 
-def list_ports(ask: Ask) -> list[Port]:
+def list_ports(ask: PageRequest) -> list[Port]:
     """Return the ports at which a person may record, the most likely first.
 
     The last port used in this folder comes first if it still exists. Ports with a device follow,
@@ -54,7 +54,7 @@ def list_ports(ask: Ask) -> list[Port]:
     return sorted(found, key=lambda port: port.address != used)
 
 
-def read_port(ask: Ask) -> str:
+def read_port(ask: PageRequest) -> str:
     """Return the port that was typed, or else the one that was chosen; remember it for this folder.
 
     Raises

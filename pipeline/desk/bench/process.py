@@ -14,12 +14,12 @@ from typing import Any
 from pipeline.bench.acquire import acquire
 from pipeline.bench.live_state import FRAME, LiveState
 from pipeline.errors import PipelineError
-from pipeline.processes import answering, lines_sent
+from pipeline.processes import lines_sent, reserve_stdout
 
 
 def main() -> None:
     """Acquire or explore as stdin says, and write the events to stdout."""
-    say = answering()
+    say = reserve_stdout()
     sent = lines_sent()
     request = json.loads(next(sent))
     folder = Path(request["folder"])
@@ -94,7 +94,7 @@ def _write_events(state: LiveState, say: Callable[..., None], is_over: threading
 
 def _press_buttons(sent: Iterator[bytes], state: LiveState) -> None:
     for line in sent:
-        state.heed(**json.loads(line))
+        state.apply(**json.loads(line))
     state.press("stop", turn=0)
 
 

@@ -10,9 +10,9 @@ from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
-from pipeline.desk.ask import Ask
-from pipeline.desk.grades.class_table import may_release, open_book, read_class
+from pipeline.desk.grades.class_table import may_release, open_gradebook, read_class
 from pipeline.desk.grades.team_page import sign
+from pipeline.desk.page_request import PageRequest
 from pipeline.desk.scratch import scratch_folder
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.override import read_wishes
@@ -22,7 +22,7 @@ from pipeline.grading.publish.export import export
 from pipeline.words.numbers import count
 
 
-def take_table(ask: Ask) -> Response:
+def take_table(ask: PageRequest) -> Response:
     """Change points from an uploaded table, either all of them or none."""
     shown = read_class(ask)
     by = sign(ask)
@@ -37,26 +37,26 @@ def take_table(ask: Ask) -> Response:
         if wish.submission not in teams:
             raise ConfigError(f"line {wish.line}: no submission of this class has this name")
         meant.append(replace(wish, submission=teams[wish.submission]))
-    done = open_book(ask).change_all(meant, by=by)
+    done = open_gradebook(ask).change_all(meant, by=by)
     message = f"{count(done.teams, 'change')} imported"
     if unchanged := len(meant) - done.teams:
         message += f"; {count(unchanged, 'row')} changed nothing"
     return ask.back(ask.here, f"{message}.")
 
 
-def release(ask: Ask) -> Response:
+def release(ask: PageRequest) -> Response:
     """Let students with accounts read their feedback, or hide it again."""
     if not may_release(ask):
         raise HTTPException(
             403, "only the instructor decides when students can read their feedback"
         )
     released = ask.text("do") == "release"
-    open_book(ask).release(released, by=sign(ask))
+    open_gradebook(ask).release(released, by=sign(ask))
     message = "Students can read their feedback." if released else "Students can no longer read it."
     return ask.back(f"{ask.here}#work", message)
 
 
-def export_class(ask: Ask) -> Response:
+def export_class(ask: PageRequest) -> Response:
     """Return the grades in the format of a learning platform: a table, or a zip with remarks."""
     platform = next((one for one in get_args(Platform) if one == ask.text("lms")), None)
     if platform is None:
@@ -64,7 +64,9 @@ def export_class(ask: Ask) -> Response:
     with scratch_folder() as scratch:
         roster = _store_upload(ask, "roster", scratch / "roster.csv")
         out = scratch / "export"
-        done = export(open_book(ask), platform, out, title=ask.text("title") or None, roster=roster)
+        done = export(
+            open_gradebook(ask), platform, out, title=ask.text("title") or None, roster=roster
+        )
         if len(done.files) == 1 and not done.remarks:
             return _download(done.files[0].read_bytes(), done.files[0].name, kind="text/csv")
         packed = BytesIO()
@@ -78,7 +80,7 @@ def export_class(ask: Ask) -> Response:
     return _download(packed.getvalue(), f"{platform}.zip", kind="application/zip")
 
 
-def regrade(ask: Ask) -> Response:
+def regrade(ask: PageRequest) -> Response:
     """Start the task that grades the class again; unchanged submissions keep their results."""
     shown = read_class(ask)
     if not ask.user.owns:
@@ -87,7 +89,7 @@ def regrade(ask: Ask) -> Response:
     typed = {name: ask.text(name) for name in ("paths", "rubric", "lateness")}
     if not typed["paths"] or not typed["rubric"]:
         raise ConfigError("enter the submissions and the rubric")
-    ask.desk.books.asked[folder] = typed
+    ask.desk.gradebooks.asked[folder] = typed
     run = read_run(folder)
     ask.start(
         "regrade_class",
@@ -107,7 +109,7 @@ def _find(typed: str) -> str:
     return str(path.resolve()) if typed and path.exists() else typed
 
 
-def _store_upload(ask: Ask, name: str, path: Path) -> Path | None:
+def _store_upload(ask: PageRequest, name: str, path: Path) -> Path | None:
     """Write an uploaded file to a path; return None if nothing was uploaded."""
     sent = ask.form.get(name)
     if not isinstance(sent, UploadFile) or not sent.filename:

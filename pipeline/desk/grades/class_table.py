@@ -9,20 +9,20 @@ from urllib.parse import urlencode
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
-from pipeline.desk.ask import Ask
-from pipeline.desk.books import Class
+from pipeline.desk.gradebooks import ClassView
 from pipeline.desk.grades.filters import Filter
+from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing, show_own_page
 from pipeline.desk.users import name_place
 from pipeline.grading.grade import CODES
 from pipeline.grading.gradebook.history import to_the_second
-from pipeline.grading.gradebook.open_book import Listing
 from pipeline.grading.gradebook.override import TOTAL
-from pipeline.grading.gradebook.request_book import RequestBook
+from pipeline.grading.gradebook.request_gradebook import RequestGradebook
+from pipeline.grading.gradebook.shared_gradebook import ClassRow
 from pipeline.grading.publish.anonymous import STRANGER, anonymise
 from pipeline.grading.publish.class_page import class_page, not_final
 from pipeline.grading.publish.feedback import feedback_page
-from pipeline.grading.publish.outputs import doubles_of
+from pipeline.grading.publish.outputs import repeated_authors_of
 from pipeline.grading.similarity.clusters import find_clusters, renamed
 from pipeline.grading.similarity.distant import find_distant, recomputed_numbers
 from pipeline.grading.words import WORDS, points_text, signed_points
@@ -46,17 +46,17 @@ class Counted:
     many: int
 
 
-def read_class(ask: Ask) -> Class:
+def read_class(ask: PageRequest) -> ClassView:
     """Return the class that the URL names."""
-    return ask.desk.books.of(ask.place_or_404())
+    return ask.desk.gradebooks.of(ask.place_or_404())
 
 
-def open_book(ask: Ask) -> RequestBook:
+def open_gradebook(ask: PageRequest) -> RequestGradebook:
     """Return the gradebook that the URL names."""
-    return ask.desk.books.book(ask.place_or_404())
+    return ask.desk.gradebooks.gradebook(ask.place_or_404())
 
 
-def find_team(shown: Class, name: str) -> Listing:
+def find_team(shown: ClassView, name: str) -> ClassRow:
     """Return a team by its name as pages show it."""
     team = shown.teams.get(name)
     if team is None:
@@ -64,17 +64,17 @@ def find_team(shown: Class, name: str) -> Listing:
     return team
 
 
-def find_signature(ask: Ask) -> str:
+def find_signature(ask: PageRequest) -> str:
     """Return the name with which a person's changes are signed; "" if it is not known yet."""
-    return ask.user.name or ask.desk.books.signed
+    return ask.user.name or ask.desk.gradebooks.signed
 
 
-def may_release(ask: Ask) -> bool:
+def may_release(ask: PageRequest) -> bool:
     """Return whether the person may decide when students read their feedback."""
     return ask.user.role in ("instructor", "owner")
 
 
-def show(ask: Ask) -> Response:
+def show(ask: PageRequest) -> Response:
     """Show one page of the table of teams."""
     shown, wanted = read_class(ask), Filter.read(ask.request.query_params)
     chosen = wanted.chosen(shown)
@@ -82,7 +82,7 @@ def show(ask: Ask) -> Response:
     page = min(max(_read_number(ask, "page"), 1), pages)
     graded = sorted(t.line.points for t in shown.teams.values() if t.line.status == "graded")
     titles = {asked.id: capital(asked.title or asked.id) for asked in shown.rubric.criteria}
-    unseen = (name for name, team in shown.teams.items() if not team.seen)
+    unseen = (name for name, team in shown.teams.items() if not team.reviewed_by)
     return ask.page(
         "grades",
         title=shown.rubric.title or name_place(ask.place_or_404()),
@@ -97,8 +97,8 @@ def show(ask: Ask) -> Response:
         next=next(unseen, ""),
         flags=count_flags(shown),
         lost=count_lost(shown, titles),
-        sets=open_book(ask).changed_together()[:_MOST_SETS],
-        seen=sum(bool(team.seen) for team in shown.teams.values()),
+        sets=open_gradebook(ask).changed_together()[:_MOST_SETS],
+        seen=sum(bool(team.reviewed_by) for team in shown.teams.values()),
         median=points_text(graded[len(graded) // 2]) if graded else "",
         out_of=points_text(shown.rubric.out_of),
         named=shown.names is None,
@@ -109,14 +109,14 @@ def show(ask: Ask) -> Response:
         to_page=lambda number: f"?{urlencode({'page': number})}&{wanted.query}",
         drawn="-".join(map(str, shown.state)),
         news=list_news(ask, shown, since=shown.state[1]),
-        asked=ask.desk.books.asked.get(ask.place_or_404(), {}),
-        n_requests=open_book(ask).n_waiting(),
-        released=open_book(ask).released,
+        asked=ask.desk.gradebooks.asked.get(ask.place_or_404(), {}),
+        n_requests=open_gradebook(ask).n_waiting(),
+        released=open_gradebook(ask).released,
         may_release=may_release(ask),
     )
 
 
-def count_flags(shown: Class) -> list[Counted]:
+def count_flags(shown: ClassView) -> list[Counted]:
     """Return the flags of a class, the most common first."""
     found = Counter(code for team in shown.teams.values() for code in team.line.codes)
     common = sorted(found, key=lambda code: (-found[code], CODES.index(code)))
@@ -124,13 +124,13 @@ def count_flags(shown: Class) -> list[Counted]:
     return [Counted(key=code, title=titles[code], many=found[code]) for code in common]
 
 
-def count_lost(shown: Class, titles: Mapping[str, str]) -> list[Counted]:
+def count_lost(shown: ClassView, titles: Mapping[str, str]) -> list[Counted]:
     """Return the criteria in which points were lost, those with most teams first."""
     found = [Counted(key=k, title=titles[k], many=len(v)) for k, v in shown.lost.items() if v]
     return sorted(found, key=lambda one: -one.many)
 
 
-def show_news(ask: Ask) -> Response:
+def show_news(ask: PageRequest) -> Response:
     """Show which points were changed since a page was loaded; empty if none were."""
     shown = read_class(ask)
     since, latest = (_read_number(ask, name) for name in ("since", "told"))
@@ -140,7 +140,7 @@ def show_news(ask: Ask) -> Response:
     return answer
 
 
-def list_news(ask: Ask, shown: Class, *, since: int) -> dict[str, Any]:
+def list_news(ask: PageRequest, shown: ClassView, *, since: int) -> dict[str, Any]:
     """Return the changes after a given one, as a page shows them.
 
     Parameters
@@ -152,7 +152,7 @@ def list_news(ask: Ask, shown: Class, *, since: int) -> dict[str, Any]:
     if latest != since:
         of_name = {team.submission: name for name, team in shown.teams.items()}
         titles = {asked.id: asked.title for asked in shown.rubric.criteria}
-        for submission, override in open_book(ask).changes_since(since):
+        for submission, override in open_gradebook(ask).changes_since(since):
             name = of_name.get(submission, STRANGER)
             points = "as graded" if override.points is None else points_text(override.points)
             points = "a comment" if override.comment else points
@@ -167,7 +167,7 @@ def list_news(ask: Ask, shown: Class, *, since: int) -> dict[str, Any]:
             "more": max(more, 0), "of": about}  # fmt: skip
 
 
-def _read_number(ask: Ask, name: str) -> int:
+def _read_number(ask: PageRequest, name: str) -> int:
     text = ask.query(name)
     return int(text) if text.isdecimal() and len(text) < 16 else 0
 
@@ -175,12 +175,14 @@ def _read_number(ask: Ask, name: str) -> int:
 # --------------------------------------------------------------------- what is drawn
 
 
-def draw_distribution(ask: Ask) -> Response:
+def draw_distribution(ask: PageRequest) -> Response:
     """Draw the distribution of points."""
-    return show_drawing(ask.desk.books.drawn(ask.place_or_404(), "distribution", _distribution))
+    return show_drawing(
+        ask.desk.gradebooks.drawn(ask.place_or_404(), "distribution", _distribution)
+    )
 
 
-def _distribution(shown: Class) -> str:
+def _distribution(shown: ClassView) -> str:
     points = [t.line.points for t in shown.teams.values() if t.line.status == "graded"]
     with drawing():
         figure = distribution_figure(points, out_of=shown.rubric.out_of)
@@ -188,18 +190,18 @@ def _distribution(shown: Class) -> str:
         return render_drawing(plain_svg(to_svg(figure, name="distribution", alt=alt)))
 
 
-def show_class_page(ask: Ask) -> Response:
+def show_class_page(ask: PageRequest) -> Response:
     """Show the class page of `cartlab grade`, made from the current gradebook."""
-    book = open_book(ask)
+    book = open_gradebook(ask)
 
-    def draw(shown: Class) -> str:
+    def draw(shown: ClassView) -> str:
         teams = shown.teams.values()
         own = {team.submission: team for team in teams}
         flags = {name: one.shared for name, one in sorted(own.items()) if one.shared}
         clusters = find_clusters(flags)
         if shown.names is not None:
             clusters = renamed(clusters, shown.names, other=STRANGER)
-        doubles = doubles_of(
+        doubles = repeated_authors_of(
             book,
             {name: one.line.authors for name, one in own.items()},
             gradings={name: one.grading for name, one in own.items()},
@@ -214,19 +216,19 @@ def show_class_page(ask: Ask) -> Response:
         return class_page(
             [team.line for team in teams],
             rubric=shown.rubric,
-            doubles=doubles,
+            repeated_authors=doubles,
             clusters=clusters,
             distant=find_distant(numbers),
         )
 
-    return show_own_page(ask.desk.books.drawn(ask.place_or_404(), "class", draw))
+    return show_own_page(ask.desk.gradebooks.drawn(ask.place_or_404(), "class", draw))
 
 
-def show_feedback(ask: Ask) -> Response:
+def show_feedback(ask: PageRequest) -> Response:
     """Show the feedback that a team reads, in its current state."""
     shown = read_class(ask)
     team = find_team(shown, ask.request.path_params["name"])
-    book = open_book(ask)
+    book = open_gradebook(ask)
     entry = book.entry(team.submission)
     grade = entry.grade if shown.names is None else anonymise(entry.grade, shown.names)
     figures = book.figures(entry)

@@ -7,15 +7,10 @@ from typing import Any
 
 from pipeline.desk.evidence import show_message, show_numbers
 from pipeline.grading.grade import Criterion, Flag, Grade
-from pipeline.grading.gradebook.open_book import TeamNow
 from pipeline.grading.gradebook.override import HandPoints
+from pipeline.grading.gradebook.shared_gradebook import TeamNow
 from pipeline.grading.judge.costs import is_about
-from pipeline.grading.publish.feedback import (
-    TONES,
-    alternative,
-    evidence_table,
-    sentence,
-)
+from pipeline.grading.publish.feedback import TONES, alternative, evidence_table, sentence
 from pipeline.grading.publish.feedback_figures import is_response, numbers_in
 from pipeline.grading.references.tolerance import exact, to_step
 from pipeline.grading.rubric import Criterion as Asked
@@ -23,7 +18,7 @@ from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import WORDS, points_text
 from pipeline.names import read_name
 from pipeline.report.render.html import render_blocks
-from pipeline.set_up import Units
+from pipeline.setup import Units
 from pipeline.words.numbers import NOTHING
 from pipeline.words.text import capital, name_span, with_symbols
 

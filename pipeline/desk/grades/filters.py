@@ -5,12 +5,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from urllib.parse import urlencode
 
-from pipeline.desk.books import Class
+from pipeline.desk.gradebooks import ClassView
 from pipeline.grading.grade import CODES
-from pipeline.grading.gradebook.open_book import Listing
+from pipeline.grading.gradebook.shared_gradebook import ClassRow
 from pipeline.grading.words import WORDS
 
-_STATES: Mapping[str, tuple[str, Callable[[Listing], bool]]] = {
+_STATES: Mapping[str, tuple[str, Callable[[ClassRow], bool]]] = {
     "failed": ("could not be graded", lambda team: team.line.status == "failed"),
     "late": ("late", lambda team: team.line.days_late > 0),
     "hand": ("changed by hand", lambda team: bool(team.line.by_hand)),
@@ -51,11 +51,11 @@ class Filter:
         """The query of an address that contains this filter."""
         return urlencode({name: value for name, value in asdict(self).items() if value})
 
-    def chosen(self, shown: Class) -> list[Listing]:
+    def chosen(self, shown: ClassView) -> list[ClassRow]:
         """Return the teams that pass the filter, in its order."""
         return [team for team in self.ordered(shown) if self._takes(team, shown)]
 
-    def beside(self, shown: Class, name: str) -> tuple[str, str]:
+    def beside(self, shown: ClassView, name: str) -> tuple[str, str]:
         """Return the names of the teams before and after a team, among those that pass the filter.
 
         The team itself need not pass. A name is "" if there is no team.
@@ -71,7 +71,7 @@ class Filter:
                 before = team.line.submission
         return before, after
 
-    def ordered(self, shown: Class) -> Sequence[Listing]:
+    def ordered(self, shown: ClassView) -> Sequence[ClassRow]:
         """Return the whole class in the order of the filter."""
         teams = list(shown.teams.values())
         if self.order == "points":
@@ -80,11 +80,11 @@ class Filter:
             teams.sort(key=lambda team: -team.line.days_late)
         return teams
 
-    def _takes(self, team: Listing, shown: Class) -> bool:
+    def _takes(self, team: ClassRow, shown: ClassView) -> bool:
         line = team.line
         if self.flag and self.flag not in line.codes:
             return False
-        if self.seen in _SEEN and bool(team.seen) != (self.seen == "yes"):
+        if self.seen in _SEEN and bool(team.reviewed_by) != (self.seen == "yes"):
             return False
         if self.state in _STATES and not _STATES[self.state][1](team):
             return False
@@ -95,12 +95,12 @@ class Filter:
             wanted in text.casefold() for text in (line.submission, *line.authors)
         )
 
-    def fields(self, shown: Class) -> list[dict]:
+    def fields(self, shown: ClassView) -> list[dict]:
         """Return the fields of the form, with their choices and the number of teams for each."""
         teams = list(shown.teams.values())
         flags = Counter(code for team in teams for code in team.line.codes)
         common = sorted(flags, key=lambda code: (-flags[code], CODES.index(code)))
-        seen = sum(bool(team.seen) for team in teams)
+        seen = sum(bool(team.reviewed_by) for team in teams)
         numbers = {"no": len(teams) - seen, "yes": seen}
         lost = {key: len(names) for key, names in shown.lost.items()}
         titles = {c.id: c.title or c.id for c in shown.rubric.criteria}

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from pipeline.desk.ask import Ask
-from pipeline.desk.books import Class
+from pipeline.desk.gradebooks import ClassView
 from pipeline.desk.last_report import PLOTS, PLOTS_OF
+from pipeline.desk.page_request import PageRequest
 from pipeline.grading.gradebook.rows import Entry
 from pipeline.grading.intake.files import digest
 from pipeline.output import LOCK
@@ -22,7 +22,7 @@ _ADDED = (PLOTS, PLOTS_OF, f"{Path(PLOTS).parent.name}/{LOCK}")
 _MOST_PAPERS = 20  # PDF files listed
 
 
-def show_notes(ask: Ask, folder: Path) -> Markup:
+def show_notes(ask: PageRequest, folder: Path) -> Markup:
     """Return a team's notes as HTML. A worker makes it, because the desk parses no such file."""
     return Markup(ask.desk.workers.do("render_notes", folder=str(folder)))
 
@@ -34,7 +34,7 @@ def list_papers(folder: Path) -> list[str]:
     return list(islice((n for n in names if file_problem(folder, n) is None), _MOST_PAPERS))
 
 
-def find_recordings(ask: Ask, shown: Class, entry: Entry) -> Path | None:
+def find_recordings(ask: PageRequest, shown: ClassView, entry: Entry) -> Path | None:
     """Return the folder that was graded; None if it is not found or not allowed.
 
     The folder's files must be those that were graded, because a later version would show other
@@ -51,11 +51,11 @@ def find_recordings(ask: Ask, shown: Class, entry: Entry) -> Path | None:
     return None
 
 
-def _list_candidates(ask: Ask, name: str) -> Iterator[Path]:
+def _list_candidates(ask: PageRequest, name: str) -> Iterator[Path]:
     """Yield folders that may be the submission: open ones, graded ones, or near the gradebook."""
     place = ask.place_or_404()
     yield from (folder for folder in ask.user.folders if folder.name == name)
-    for path in ask.desk.books.asked.get(place, {}).get("paths", "").splitlines():
+    for path in ask.desk.gradebooks.asked.get(place, {}).get("paths", "").splitlines():
         yield from (Path(path), Path(path) / name)
     if isinstance(place, Path):
         yield place.parent / name

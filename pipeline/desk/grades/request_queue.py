@@ -6,17 +6,17 @@ from urllib.parse import urlencode
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
-from pipeline.desk.ask import Ask
-from pipeline.desk.books import Class
-from pipeline.desk.grades.class_table import find_signature, find_team, open_book, read_class
+from pipeline.desk.gradebooks import ClassView
+from pipeline.desk.grades.class_table import find_signature, find_team, open_gradebook, read_class
 from pipeline.desk.grades.criteria import list_steps
 from pipeline.desk.grades.team_page import sign
+from pipeline.desk.page_request import PageRequest
 from pipeline.desk.request_steps import describe_steps
 from pipeline.errors import ConfigError
-from pipeline.grading.gradebook.open_book import Conflict
 from pipeline.grading.gradebook.override import read_points
-from pipeline.grading.gradebook.request_book import Queued
+from pipeline.grading.gradebook.request_gradebook import Queued
 from pipeline.grading.gradebook.requests import MOST_LETTERS, RequestRefused
+from pipeline.grading.gradebook.shared_gradebook import Conflict
 from pipeline.grading.publish.feedback import sentence
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import points_text
@@ -24,24 +24,24 @@ from pipeline.words.numbers import NOTHING
 from pipeline.words.text import capital, with_symbols
 
 
-def show(ask: Ask) -> Response:
+def show(ask: PageRequest) -> Response:
     """Show the requests of the class or of one team."""
     return _show_page(ask)
 
 
-def act(ask: Ask) -> Response:
+def act(ask: PageRequest) -> Response:
     """Answer a request or reopen it; if somebody else has answered it, show that answer."""
     shown = read_class(ask)
     team = find_team(shown, ask.text("team"))
-    book, name, what = open_book(ask), team.submission, ask.text("do")
+    book, name, what = open_gradebook(ask), team.submission, ask.text("do")
     criterion, seen, by = ask.text("criterion"), ask.text("seen"), sign(ask)
     try:
         if what == "reopen":
-            book.reopen(name, criterion, by=by, seen=seen)
+            book.reopen(name, criterion, by=by, version=seen)
             message = "Reopened: the team may ask once more."
         elif what == "answer":
             points = _read_points(ask.text("points"))
-            book.answer(name, criterion, points, text=ask.text("text"), by=by, seen=seen)
+            book.answer(name, criterion, points, text=ask.text("text"), by=by, version=seen)
             message = f"Answered: {team.line.submission}, {_find_title(shown.rubric, criterion)}."
         else:
             raise HTTPException(400, "there is no such button")
@@ -62,9 +62,9 @@ def _read_points(typed: str) -> float | None:
     return points
 
 
-def _show_page(ask: Ask, *, wrong: str = "", status: int = 200) -> Response:
+def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Response:
     shown, of = read_class(ask), ask.query("of")
-    book = open_book(ask)
+    book = open_gradebook(ask)
     queue = book.queue(find_team(shown, of).submission if of else "")
     called = {team.submission: name for name, team in shown.teams.items()}
     waiting, settled = (
@@ -87,7 +87,9 @@ def _show_page(ask: Ask, *, wrong: str = "", status: int = 200) -> Response:
     )
 
 
-def _describe(ask: Ask, queued: Queued, shown: Class, name: str, *, wrong: str) -> dict[str, Any]:
+def _describe(
+    ask: PageRequest, queued: Queued, shown: ClassView, name: str, *, wrong: str
+) -> dict[str, Any]:
     """Return a request as the page shows it.
 
     Parameters
@@ -124,10 +126,10 @@ def _find_title(rubric: Rubric, criterion: str) -> str:
     return capital(titles.get(criterion) or criterion)
 
 
-def _show_conflict(ask: Ask, shown: Class, conflict: Conflict) -> Response:
+def _show_conflict(ask: PageRequest, shown: ClassView, conflict: Conflict) -> Response:
     """Show the typed answer next to the current state; nothing was changed."""
     name, criterion = ask.text("team"), ask.text("criterion")
-    queue = open_book(ask).queue(shown.teams[name].submission)
+    queue = open_gradebook(ask).queue(shown.teams[name].submission)
     queued = next(
         (q for q in (*queue.waiting, *queue.settled) if q.request.criterion == criterion), None
     )
@@ -149,6 +151,6 @@ def _show_conflict(ask: Ask, shown: Class, conflict: Conflict) -> Response:
     )
 
 
-def _write_address(ask: Ask, of: str) -> str:
+def _write_address(ask: PageRequest, of: str) -> str:
     """Return the URL of the requests of the class or of one team."""
-    return f"{ask.here}again" + (f"?{urlencode({'of': of})}" if of else "")
+    return f"{ask.here}requests" + (f"?{urlencode({'of': of})}" if of else "")

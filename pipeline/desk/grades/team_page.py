@@ -11,13 +11,12 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from pipeline.desk import served_files
-from pipeline.desk.ask import Ask
-from pipeline.desk.books import Class
+from pipeline.desk.gradebooks import ClassView
 from pipeline.desk.grades.class_table import (
     find_signature,
     find_team,
     list_news,
-    open_book,
+    open_gradebook,
     read_class,
 )
 from pipeline.desk.grades.criteria import (
@@ -30,12 +29,13 @@ from pipeline.desk.grades.criteria import (
 from pipeline.desk.grades.filters import Filter
 from pipeline.desk.grades.recordings import find_recordings, list_papers, show_notes
 from pipeline.desk.jobs import Busy
+from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, Grade
 from pipeline.grading.gradebook.history import event_words, to_the_second
-from pipeline.grading.gradebook.open_book import Conflict, Listing, TeamNow
 from pipeline.grading.gradebook.override import TOTAL, read_points
+from pipeline.grading.gradebook.shared_gradebook import ClassRow, Conflict, TeamNow
 from pipeline.grading.intake.repairs import (
     Repair,
     read_original,
@@ -57,19 +57,19 @@ _POINTS = "points"  # part of the page where points are changed
 _TOTAL = "total"  # part of the page where the total is changed
 
 
-def show(ask: Ask) -> Response:
+def show(ask: PageRequest) -> Response:
     """Show a team."""
     return _show_page(ask)
 
 
-def act(ask: Ask) -> Response:
+def act(ask: PageRequest) -> Response:
     """Do what the pressed button says: sign, accept, unmark, change points, or undo."""
     shown = read_class(ask)
     team = find_team(shown, ask.query("of"))
-    book, name, what = open_book(ask), team.submission, ask.text("do")
+    book, name, what = open_gradebook(ask), team.submission, ask.text("do")
     by = sign(ask)
     if what in ("accept", "unsee"):
-        book.mark(name, by=by, seen=what == "accept")
+        book.set_reviewed(name, by=by, reviewed=what == "accept")
     if what in ("sign", "unsee"):
         return ask.back(write_address(ask, team.line.submission))
     if what == "accept":
@@ -83,12 +83,12 @@ def act(ask: Ask) -> Response:
     try:
         if what == "adjust":
             points = read_points(ask.text("points"))
-            book.change(name, TOTAL, points, why=ask.text("why"), by=by, seen=seen)
+            book.change(name, TOTAL, points, why=ask.text("why"), by=by, version=seen)
         elif what == "undo" and criterion != TOTAL:
-            book.undo(name, criterion, by=by, seen=seen)
+            book.undo(name, criterion, by=by, version=seen)
         elif what == "change":
             points = read_points(ask.text("other") or ask.text("points"))
-            book.change(name, criterion, points, why=ask.text("why"), by=by, seen=seen)
+            book.change(name, criterion, points, why=ask.text("why"), by=by, version=seen)
         else:
             raise HTTPException(400, "there is no such button")
     except Conflict as conflict:
@@ -103,7 +103,7 @@ def act(ask: Ask) -> Response:
     return ask.back(f"{to}#chosen", done, place=_POINTS)
 
 
-def _repair(ask: Ask, shown: Class, team: Listing, *, by: str) -> Response:
+def _repair(ask: PageRequest, shown: ClassView, team: ClassRow, *, by: str) -> Response:
     """Save a repaired `submission.toml` of a team, and grade the class again.
 
     The text is not parsed here, but by the grading process, which has limits.
@@ -124,7 +124,9 @@ def _repair(ask: Ask, shown: Class, team: Listing, *, by: str) -> Response:
     return ask.back(write_address(ask, team.line.submission), message)
 
 
-def _show_repair(ask: Ask, shown: Class, team: Listing, *, wrong: str) -> dict[str, str] | None:
+def _show_repair(
+    ask: PageRequest, shown: ClassView, team: ClassRow, *, wrong: str
+) -> dict[str, str] | None:
     """Return what the form for the repair of `submission.toml` shows; None if it is not offered."""
     place = ask.place_or_404()
     if not isinstance(place, Path) or shown.names is not None:
@@ -145,10 +147,10 @@ def _show_repair(ask: Ask, shown: Class, team: Listing, *, wrong: str) -> dict[s
     }
 
 
-def show_figure(ask: Ask) -> Response:
+def show_figure(ask: PageRequest) -> Response:
     """Show one of a team's figures."""
     team = find_team(read_class(ask), ask.query("of"))
-    book = open_book(ask)
+    book = open_gradebook(ask)
     drawn = dict(book.figures(book.entry(team.submission)))
     name = ask.query("figure")
     if name not in drawn:
@@ -156,21 +158,23 @@ def show_figure(ask: Ask) -> Response:
     return show_drawing(render_drawing(plain_svg(drawn[name])))
 
 
-def send_paper(ask: Ask) -> Response:
+def send_paper(ask: PageRequest) -> Response:
     """Send a PDF that a team submitted."""
     shown = read_class(ask)
     team = find_team(shown, ask.query("of"))
-    folder = find_recordings(ask, shown, open_book(ask).entry(team.submission))
+    folder = find_recordings(ask, shown, open_gradebook(ask).entry(team.submission))
     name = ask.query("file")
     if folder is None or name not in list_papers(folder):
         raise HTTPException(404, "there is no such file")
     return served_files.send_paper(folder, name)
 
 
-def _show_page(ask: Ask, *, wrong: str = "", wrong_repair: str = "", status: int = 200) -> Response:
+def _show_page(
+    ask: PageRequest, *, wrong: str = "", wrong_repair: str = "", status: int = 200
+) -> Response:
     shown = read_class(ask)
     team = find_team(shown, ask.query("of"))
-    book, name = open_book(ask), team.line.submission
+    book, name = open_gradebook(ask), team.line.submission
     now = book.team(team.submission)
     grade = now.entry.grade if shown.names is None else anonymise(now.entry.grade, shown.names)
     events = now.events
@@ -194,7 +198,7 @@ def _show_page(ask: Ask, *, wrong: str = "", wrong_repair: str = "", status: int
         points=points_text,
         person_lines=person_lines(grade),
         total=_describe_total(ask, now, wrong=wrong),
-        seen=now.seen,
+        seen=now.reviewed_by,
         items=_link_items(ask, name, items, chosen),
         doubts=sum(item.doubt for item in items),
         events=[(to_the_second(event.at), event_words(event)) for event in reversed(events)],
@@ -213,7 +217,7 @@ def _show_page(ask: Ask, *, wrong: str = "", wrong_repair: str = "", status: int
     )
 
 
-def _describe_total(ask: Ask, now: TeamNow, *, wrong: str) -> dict[str, str]:
+def _describe_total(ask: PageRequest, now: TeamNow, *, wrong: str) -> dict[str, str]:
     """Return what the form for an adjustment shows; a refused one is shown as it was typed."""
     refused = bool(wrong) and ask.text("do") == "adjust"
     return {
@@ -224,7 +228,7 @@ def _describe_total(ask: Ask, now: TeamNow, *, wrong: str) -> dict[str, str]:
     }
 
 
-def _find_chosen(ask: Ask, items: Sequence[Item], rubric: Rubric) -> Item:
+def _find_chosen(ask: PageRequest, items: Sequence[Item], rubric: Rubric) -> Item:
     """Return the criterion or flag that the URL or the form names.
 
     Without a name, return the first row that is in doubt or has a figure.
@@ -240,7 +244,7 @@ def _find_chosen(ask: Ask, items: Sequence[Item], rubric: Rubric) -> Item:
 
 
 def _link_items(
-    ask: Ask, name: str, items: Sequence[Item], chosen: Item
+    ask: PageRequest, name: str, items: Sequence[Item], chosen: Item
 ) -> list[tuple[Item, str, str]]:
     """Return each row of the list with its address, and the key that opens it."""
     at = items.index(chosen)
@@ -253,10 +257,10 @@ def _link_items(
 
 
 def _show_chosen(
-    ask: Ask, shown: Class, grade: Grade, now: TeamNow, *, chosen: Item, wrong: str
+    ask: PageRequest, shown: ClassView, grade: Grade, now: TeamNow, *, chosen: Item, wrong: str
 ) -> dict[str, Any]:
     """Return what is shown next to the list: the chosen criterion or flag, with its evidence."""
-    name, drawn = grade.submission, open_book(ask).figures(now.entry)
+    name, drawn = grade.submission, open_gradebook(ask).figures(now.entry)
     asked = next((c for c in now.rubric.criteria if c.id == chosen.id), None)
     if chosen.is_remark or asked is None:
         asked, one, flags = None, None, [flag for flag in grade.flags if flag.code == chosen.id]
@@ -267,7 +271,7 @@ def _show_chosen(
         flags = find_remarks(grade, asked, now.rubric)
     own = next((c for c in grade.criteria if asked and c.id == asked.id), None)
     figures = show_figures(drawn, asked, own, first=ask.query("figure")) if asked else []
-    reasons = open_book(ask).reasons().get(asked.id, [])[:30] if asked else []
+    reasons = open_gradebook(ask).reasons().get(asked.id, [])[:30] if asked else []
     return {
         "one": one,
         "chosen": chosen,
@@ -284,7 +288,7 @@ def _show_chosen(
 
 
 def _link_figures(
-    ask: Ask, name: str, figures: Sequence[dict[str, str]], chosen: Item
+    ask: PageRequest, name: str, figures: Sequence[dict[str, str]], chosen: Item
 ) -> list[dict[str, str]]:
     """Add two addresses to each figure: its own, and that of the page that shows it first."""
     found = []
@@ -296,14 +300,14 @@ def _link_figures(
     return found
 
 
-def _link_others(ask: Ask, shown: Class, flag: Flag) -> list[tuple[str, str]]:
+def _link_others(ask: PageRequest, shown: ClassView, flag: Flag) -> list[tuple[str, str]]:
     """Return the submissions that share a recording, with addresses for those in the class."""
     names = flag.evidence.get("submissions", ()) if flag.code == "shared_data" else ()
     return [(name, write_address(ask, name) if name in shown.teams else "") for name in names]
 
 
 def _link_together(
-    ask: Ask, shown: Class, grade: Grade, one: dict[str, Any], flags: Sequence[Flag]
+    ask: PageRequest, shown: ClassView, grade: Grade, one: dict[str, Any], flags: Sequence[Flag]
 ) -> list[tuple[str, str]]:
     """Return links, with their text, to apply the same points to all teams with the same flag."""
     lost = one["id"] if one["lost"] else ""
@@ -324,9 +328,11 @@ def _link_together(
     return found
 
 
-def _show_conflict(ask: Ask, shown: Class, team: Listing, conflict: Conflict) -> Response:
+def _show_conflict(
+    ask: PageRequest, shown: ClassView, team: ClassRow, conflict: Conflict
+) -> Response:
     """Show what a person typed next to the current state; nothing was changed."""
-    now = open_book(ask).team(team.submission)
+    now = open_gradebook(ask).team(team.submission)
     criterion = ask.text("criterion")
     titles = {asked.id: asked.title for asked in now.rubric.criteria}
     own = next((c for c in now.entry.grade.criteria if c.id == criterion), None)
@@ -350,7 +356,7 @@ def _show_conflict(ask: Ask, shown: Class, team: Listing, conflict: Conflict) ->
     )
 
 
-def sign(ask: Ask) -> str:
+def sign(ask: PageRequest) -> str:
     """Return the name that signs a change: from the proxy, or typed once by the person.
 
     Raises
@@ -359,14 +365,14 @@ def sign(ask: Ask) -> str:
     """
     if ask.user.name:
         return ask.user.name
-    typed = ask.text("by") or ask.desk.books.signed
+    typed = ask.text("by") or ask.desk.gradebooks.signed
     if not typed:
         raise ConfigError("enter your name first: every change by hand is signed")
-    ask.desk.books.signed = typed
+    ask.desk.gradebooks.signed = typed
     return typed
 
 
-def write_address(ask: Ask, name: str, **more: str) -> str:
+def write_address(ask: PageRequest, name: str, **more: str) -> str:
     """Return the URL of a team's page; it keeps the filter, so that next and previous work."""
     wanted = Filter.read(ask.request.query_params).query
     return f"{ask.here}team?{urlencode({'of': name, **more})}" + (f"&{wanted}" if wanted else "")

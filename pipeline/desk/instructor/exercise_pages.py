@@ -9,10 +9,10 @@ from urllib.parse import urlencode
 from starlette.exceptions import HTTPException
 from starlette.responses import RedirectResponse, Response
 
-from pipeline.desk.ask import Ask
 from pipeline.desk.exercises import SLIDE
+from pipeline.desk.form_input import read_path, read_whole_number
+from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing
-from pipeline.desk.typed import read_path, read_whole_number
 from pipeline.errors import ConfigError
 from pipeline.output import new_folder
 from pipeline.plant.catalogue import CATALOGUE
@@ -24,13 +24,17 @@ from pipeline.words.math import to_text
 _SHOWN_ON = "throne-2dof"  # the smallest bench with a spring between two carts
 
 
-def show(ask: Ask) -> Response:
+def show(ask: PageRequest) -> Response:
     """Show the form as filled in, with a picture of every chosen effect."""
     return _show_form(ask, *_check_exercise(ask), wrong={})
 
 
 def _show_form(
-    ask: Ask, bench: Mapping[str, str], found: Mapping[str, Any], *, wrong: Mapping[str, str]
+    ask: PageRequest,
+    bench: Mapping[str, str],
+    found: Mapping[str, Any],
+    *,
+    wrong: Mapping[str, str],
 ) -> Response:
     """Show the form as filled in.
 
@@ -59,13 +63,13 @@ def _show_form(
     )
 
 
-def draw(ask: Ask) -> Response:
+def draw(ask: PageRequest) -> Response:
     """Draw what an effect does."""
     svg = ask.desk.workers.do("draw_effect", bench=_read_bench(ask), hide=ask.text("hide"))
     return show_drawing(svg)
 
 
-def make(ask: Ask) -> Response:
+def make(ask: PageRequest) -> Response:
     """Start the task that makes an exercise, or one for each team of a class."""
     bench, found = _check_exercise(ask)
     wrong = {"found": found["wrong"]} if found["wrong"] else {}
@@ -92,7 +96,7 @@ def make(ask: Ask) -> Response:
     return RedirectResponse(f"/exercises/made?{urlencode({'out': out})}", status_code=303)
 
 
-def show_made(ask: Ask) -> Response:
+def show_made(ask: PageRequest) -> Response:
     """Show the progress of an exercise, or the exercise when it is finished."""
     out = _read_folder(ask)
     job = ask.desk.jobs.of(out)
@@ -123,14 +127,14 @@ def show_made(ask: Ask) -> Response:
     )
 
 
-def stop(ask: Ask) -> Response:
+def stop(ask: PageRequest) -> Response:
     """Stop making exercises."""
     out = _read_folder(ask)
     ask.stop(out)
     return RedirectResponse(f"/exercises/made?{urlencode({'out': out})}", status_code=303)
 
 
-def show_solution(ask: Ask) -> Response:
+def show_solution(ask: PageRequest) -> Response:
     """Show the solution of a folder, or the progress of making it."""
     folder = ask.folder()
     return ask.page(
@@ -140,7 +144,7 @@ def show_solution(ask: Ask) -> Response:
     )
 
 
-def show_catalogue(ask: Ask) -> Response:
+def show_catalogue(ask: PageRequest) -> Response:
     """Show the catalogue of effects."""
     bench = {"preset": _SHOWN_ON}
     entries = [
@@ -160,7 +164,7 @@ def _free_folder(root: Path) -> Path:
     return next(root / name for name in names if not (root / name).exists())
 
 
-def _check_exercise(ask: Ask) -> tuple[dict[str, str], dict[str, Any]]:
+def _check_exercise(ask: PageRequest) -> tuple[dict[str, str], dict[str, Any]]:
     """Return the bench as typed, and the worker's check of the bench and its effects."""
     bench = _read_bench(ask)
     known = {effect.key: effect for effect in CATALOGUE}
@@ -182,7 +186,7 @@ def _check_exercise(ask: Ask) -> tuple[dict[str, str], dict[str, Any]]:
     return bench, ask.desk.workers.do("check_exercise", bench=bench, chosen=chosen)
 
 
-def _read_bench(ask: Ask) -> dict[str, str]:
+def _read_bench(ask: PageRequest) -> dict[str, str]:
     bench = {name: ask.text(name) for name in ("preset", "m", "c", "k")}
     if "preset" not in ask.sent:
         bench["preset"] = _SHOWN_ON
@@ -202,6 +206,6 @@ def _write_picture_url(bench: Mapping[str, str], hide: str) -> str:
     return f"/exercises/picture.svg?{urlencode({**bench, 'hide': hide})}"
 
 
-def _read_folder(ask: Ask) -> Path:
+def _read_folder(ask: PageRequest) -> Path:
     wanted = "enter a new or empty folder for the exercise"
     return read_path(ask.text("out"), wanted=wanted, inside=ask.user.workshop)

@@ -5,16 +5,16 @@ from urllib.parse import urlencode
 
 from starlette.responses import RedirectResponse, Response
 
-from pipeline.desk.ask import Ask
-from pipeline.desk.instructor.rubric_shelf import (
+from pipeline.desk.form_input import read_path
+from pipeline.desk.instructor.rubric_draft import RubricDraft, make_draft, read_draft
+from pipeline.desk.instructor.rubric_list import (
     free_name,
     own_rubrics,
     shipped_names,
     shipped_rubrics,
     work_folder,
 )
-from pipeline.desk.instructor.rubric_typed import TypedRubric, read_typed, typed_rubric
-from pipeline.desk.typed import read_path
+from pipeline.desk.page_request import PageRequest
 from pipeline.desk.users import name_place
 from pipeline.errors import ConfigError
 from pipeline.grading.rubric_file import rubric_source
@@ -27,7 +27,7 @@ from pipeline.submission.edit import text_digest
 _NEW = "new"  # version in a form whose file does not exist yet
 
 
-def show(ask: Ask) -> Response:
+def show(ask: PageRequest) -> Response:
     """Show a rubric in the editor, or the list of rubrics if the request names no rubric.
 
     A new file starts as a copy of a shipped rubric, or empty.
@@ -44,35 +44,35 @@ def show(ask: Ask) -> Response:
     path = read_rubric_path(ask)
     if path.exists():
         text = rubric_source(path)
-        return show_editor(ask, path, typed_rubric(text, {}), seen=text_digest(text))
+        return show_editor(ask, path, make_draft(text, {}), version=text_digest(text))
     text = rubric_source(RUBRICS / f"{start}.toml") if start in shipped_names() else ""
-    return show_editor(ask, path, typed_rubric(text, {}), seen=_NEW)
+    return show_editor(ask, path, make_draft(text, {}), version=_NEW)
 
 
-def check(ask: Ask) -> Response:
+def check(ask: PageRequest) -> Response:
     """Show what is wrong with the typed rubric; nothing is saved."""
-    return show_editor(ask, read_rubric_path(ask), read_typed(ask.form), seen=ask.text("seen"))
+    return show_editor(ask, read_rubric_path(ask), read_draft(ask.form), version=ask.text("seen"))
 
 
-def save(ask: Ask) -> Response:
+def save(ask: PageRequest) -> Response:
     """Save a valid rubric, unless the file has changed since it was shown."""
-    path, typed, seen = read_rubric_path(ask), read_typed(ask.form), ask.text("seen")
+    path, typed, seen = read_rubric_path(ask), read_draft(ask.form), ask.text("seen")
     now = rubric_source(path) if path.exists() else None
     if seen != (_NEW if now is None else text_digest(now)):
-        return show_editor(ask, path, typed, seen=seen, now=now or "", status=409)
+        return show_editor(ask, path, typed, version=seen, now=now or "", status=409)
     if typed.rubric is None:
-        return show_editor(ask, path, typed, seen=seen, status=422)
+        return show_editor(ask, path, typed, version=seen, status=422)
     write_file(path, typed.text)
     query = urlencode({"file": path, "saved": 1})
     return RedirectResponse(f"/rubric/?{query}", status_code=303)
 
 
 def show_editor(
-    ask: Ask,
+    ask: PageRequest,
     path: Path,
-    typed: TypedRubric,
+    typed: RubricDraft,
     *,
-    seen: str,
+    version: str,
     now: str | None = None,
     status: int = 200,
 ) -> Response:
@@ -80,7 +80,7 @@ def show_editor(
 
     Parameters
     ----------
-    seen : version of the file on which the typed text is based.
+    version : version of the file on which the typed text is based.
     now : current text of the file, if somebody has changed it since.
     """
     saved = "saved" in ask.request.query_params
@@ -91,8 +91,8 @@ def show_editor(
         file=path,
         typed=typed,
         form=typed.form,
-        seen=seen,
-        is_new=seen == _NEW,
+        seen=version,
+        is_new=version == _NEW,
         now=now,
         asks=rubric_text(typed.rubric) if typed.rubric else "",
         saved=saved,
@@ -103,20 +103,20 @@ def show_editor(
     )
 
 
-def _classes_of(ask: Ask, path: Path) -> list[tuple[int, str, dict[str, str]]]:
+def _classes_of(ask: PageRequest, path: Path) -> list[tuple[int, str, dict[str, str]]]:
     """Return the open classes graded by a rubric file, with the options of their last regrading."""
     found = []
     for n, place in enumerate(ask.user.gradebooks):
         try:
-            assignment = ask.desk.books.book(place).assignment
+            assignment = ask.desk.gradebooks.gradebook(place).assignment
         except ConfigError:  # nothing is graded there yet, or the gradebook is gone
             continue
         if assignment == path.stem and isinstance(place, Path):
-            found.append((n, name_place(place), ask.desk.books.asked.get(place, {})))
+            found.append((n, name_place(place), ask.desk.gradebooks.asked.get(place, {})))
     return found
 
 
-def read_rubric_path(ask: Ask) -> Path:
+def read_rubric_path(ask: PageRequest) -> Path:
     """Return the path of the rubric that the request names, or an unused one for a new rubric.
 
     Raises

@@ -6,9 +6,9 @@ from typing import Any
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
-from pipeline.desk.ask import Ask
+from pipeline.desk.instructor.rubric_draft import read_draft
 from pipeline.desk.instructor.rubric_editor import read_rubric_path, show_editor
-from pipeline.desk.instructor.rubric_typed import read_typed
+from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing
 from pipeline.desk.users import Place, name_place
 from pipeline.grading.words import points_text
@@ -21,11 +21,11 @@ _BARS = re.compile(r"[0-9]{1,5}(\.[0-9]{1,5}){1,49}")  # the bars in an address:
 _ROWS = 30  # rows shown at once; the other rows are folded
 
 
-def preview(ask: Ask) -> Response:
+def preview(ask: PageRequest) -> Response:
     """Show the points of a class under the typed rubric; nothing is saved."""
-    path, typed, seen = read_rubric_path(ask), read_typed(ask.form), ask.text("seen")
+    path, typed, seen = read_rubric_path(ask), read_draft(ask.form), ask.text("seen")
     if typed.rubric is None:
-        return show_editor(ask, path, typed, seen=seen, status=422)
+        return show_editor(ask, path, typed, version=seen, status=422)
     number, place = _find_class(ask)
     found = ask.desk.workers.do("preview_rubric", folder=str(place), text=typed.text)
     teams = _named(ask, place, found["teams"])
@@ -54,7 +54,7 @@ def preview(ask: Ask) -> Response:
     )
 
 
-def draw_preview(ask: Ask) -> Response:
+def draw_preview(ask: PageRequest) -> Response:
     """Draw two distributions, whose bars are in the URL."""
     before, after = (_read_bars(ask.query(key)) for key in ("before", "after"))
     if len(before) != len(after):
@@ -73,7 +73,7 @@ def _read_bars(text: str) -> list[int]:
     return [int(part) for part in text.split(".")]
 
 
-def _find_class(ask: Ask) -> tuple[int, Place]:
+def _find_class(ask: PageRequest) -> tuple[int, Place]:
     typed = ask.text("class")
     books = ask.user.gradebooks
     if not typed.isascii() or not typed.isdecimal() or len(typed) > 6 or int(typed) >= len(books):
@@ -81,9 +81,9 @@ def _find_class(ask: Ask) -> tuple[int, Place]:
     return int(typed), books[int(typed)]
 
 
-def _named(ask: Ask, place: Place, teams: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _named(ask: PageRequest, place: Place, teams: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the changes with the names that the class shows, the largest change first."""
-    names = ask.desk.books.of(place).names
+    names = ask.desk.gradebooks.of(place).names
     shown = [
         team
         | {

@@ -2,11 +2,11 @@
 
 from starlette.responses import Response
 
-from pipeline.desk.ask import Ask
-from pipeline.desk.student.room import read_room
+from pipeline.desk.page_request import PageRequest
+from pipeline.desk.student.submission_view import read_room
 
 
-def show(ask: Ask) -> Response:
+def show(ask: PageRequest) -> Response:
     """Show the last answer, and what the student can ask next."""
     folder = ask.folder()
     # Read the job before the answers. If a check ends in between, the page then shows it as running
@@ -19,7 +19,7 @@ def show(ask: Ask) -> Response:
     )
 
 
-def begin(ask: Ask) -> Response:
+def begin(ask: PageRequest) -> Response:
     """Start a check of all numbers, or ask where to look for one number."""
     number, rubric = ask.text("number"), ask.user.rubric
     ask.start(

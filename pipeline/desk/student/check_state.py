@@ -5,15 +5,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from pipeline.desk.student.way import Status
+from pipeline.desk.student.steps import Status
 from pipeline.errors import SubmissionError
 from pipeline.grading.self_check.log import CheckAnswer, find_basis, read_answers
-from pipeline.grading.self_check.words import (
-    asked_words,
-    hint_words,
-    number_words,
-    result_words,
-)
+from pipeline.grading.self_check.words import asked_words, hint_words, number_words, result_words
 from pipeline.submission import Submission, load_submission
 
 

@@ -10,8 +10,8 @@ from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
-from pipeline.desk.ask import Message
 from pipeline.desk.jobs import WorkerPool
+from pipeline.desk.page_request import Message
 from pipeline.desk.scratch import scratch_folder
 from pipeline.desk.student.handin import BESIDE
 from pipeline.errors import SubmissionError

@@ -180,7 +180,7 @@ def edit_file(
             remove_experiment(document, remove)
 
     try:
-        edit_submission(Path(folder), change, seen=seen or "nothing")
+        edit_submission(Path(folder), change, version=seen or "nothing")
     except Outdated as error:
         now = read_document(error.text)
         fault = asdict(Fault.of(error))

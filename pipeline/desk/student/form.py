@@ -17,7 +17,7 @@ from tomlkit.items import AoT, Comment, Null
 from pipeline.errors import SubmissionError
 from pipeline.ingest.fill import UNSURE
 from pipeline.names import parameter_names, read_name
-from pipeline.set_up import Units
+from pipeline.setup import Units
 from pipeline.submission import Submission
 from pipeline.submission.edit import comment_text, toml_item
 from pipeline.submission.load import InvalidSubmission, list_experiments, spring_names

@@ -2,13 +2,13 @@
 
 from starlette.responses import RedirectResponse, Response
 
-from pipeline.desk.ask import Ask
 from pipeline.desk.last_report import PLOTS, plots_are_current
+from pipeline.desk.page_request import PageRequest
 
 TASK = "make_plots"
 
 
-def show(ask: Ask) -> Response:
+def show(ask: PageRequest) -> Response:
     """Show the plots; if they are missing or out of date, show the job or a button to start it."""
     if not _is_busy(ask) and plots_are_current(ask.folder()):
         return _lead_to(ask, f"{ask.here}{PLOTS}")
@@ -17,19 +17,19 @@ def show(ask: Ask) -> Response:
     return ask.page("plots", title=f"Plots of {ask.folder().name}", failed=failed)
 
 
-def make(ask: Ask) -> Response:
+def make(ask: PageRequest) -> Response:
     """Start the task that makes the plots, unless they are up to date."""
     if not _is_busy(ask) and not plots_are_current(ask.folder()):
         ask.start(TASK, title="The plots")
     return ask.back(f"{ask.here}compare")
 
 
-def _is_busy(ask: Ask) -> bool:
+def _is_busy(ask: PageRequest) -> bool:
     job = ask.desk.jobs.of(ask.folder())
     return job is not None and not job.over
 
 
-def _lead_to(ask: Ask, address: str) -> Response:
+def _lead_to(ask: PageRequest, address: str) -> Response:
     """Return an answer that opens an address in the whole window, also after a request by htmx."""
     if ask.request.headers.get("hx-request"):
         return ask.go(address)

@@ -4,16 +4,16 @@ from collections.abc import Mapping
 
 from starlette.responses import Response
 
-from pipeline.desk.ask import Ask
 from pipeline.desk.last_report import NOTES, read_findings
+from pipeline.desk.page_request import PageRequest
 from pipeline.desk.student.form import sign_fields
-from pipeline.desk.student.room import Room, read_room
+from pipeline.desk.student.submission_view import SubmissionView, read_room
 from pipeline.processes import Failed
 from pipeline.submission.load import file_problem, list_experiments
-from pipeline.words.numbers import abridge
+from pipeline.words.numbers import join_names
 
 
-def show(ask: Ask) -> Response:
+def show(ask: PageRequest) -> Response:
     """Show the report in a window below the steps."""
     folder = ask.folder()
     return ask.page(
@@ -24,12 +24,12 @@ def show(ask: Ask) -> Response:
     )
 
 
-def show_questions(ask: Ask) -> Response:
+def show_questions(ask: PageRequest) -> Response:
     """Show the questions of the report with the answers so far."""
     return _show_questions(ask)
 
 
-def answer(ask: Ask) -> Response:
+def answer(ask: PageRequest) -> Response:
     """Write the answer to a question into `notes.md`; if it is refused, show it again as typed."""
     folder, id_, words = ask.folder(), ask.text("id"), ask.text("answer")
     try:
@@ -53,7 +53,7 @@ def answer(ask: Ask) -> Response:
     return ask.back(f"{ask.here}questions#{place}", "Written into notes.md.", place=place)
 
 
-def state_signs(ask: Ask) -> Response:
+def state_signs(ask: PageRequest) -> Response:
     """Write the sign of the input into the tables of runs whose sign the report reversed."""
     folder = ask.folder()
     found = ask.desk.workers.do(
@@ -69,7 +69,7 @@ def state_signs(ask: Ask) -> Response:
 
 
 def _show_questions(
-    ask: Ask,
+    ask: PageRequest,
     *,
     status: int = 200,
     refused: Mapping[str, tuple[str, str]] = {},
@@ -109,11 +109,11 @@ def _show_questions(
     )
 
 
-def _list_signs(room: Room) -> str:
+def _list_signs(room: SubmissionView) -> str:
     """Return, as text, the signs that one click writes and their runs; "" for no signs."""
     document, signs = room.document, room.findings["turned"]
     tables = list_experiments(document)
     open_: dict[str, list[str]] = {}
     for field in sign_fields(document, signs):
         open_.setdefault(field.value, []).append(tables[int(field.path.split(".")[1])]["id"])
-    return "; ".join(f"{sign} in {abridge(runs)}" for sign, runs in open_.items())
+    return "; ".join(f"{sign} in {join_names(runs)}" for sign, runs in open_.items())

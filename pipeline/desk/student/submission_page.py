@@ -14,7 +14,8 @@ from starlette.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
 from pipeline.desk import last_report
-from pipeline.desk.ask import Ask, Message
+from pipeline.desk.form_input import read_whole_number
+from pipeline.desk.page_request import Message, PageRequest
 from pipeline.desk.scratch import scratch_folder
 from pipeline.desk.student.files import take_uploads
 from pipeline.desk.student.form import (
@@ -25,22 +26,21 @@ from pipeline.desk.student.form import (
     find_changes,
     read_value,
 )
-from pipeline.desk.student.room import Room, read_room
-from pipeline.desk.student.rows import describe_all, gather_remarks, group_rows
-from pipeline.desk.typed import read_whole_number
+from pipeline.desk.student.recording_rows import describe_all, gather_remarks, group_rows
+from pipeline.desk.student.submission_view import SubmissionView, read_room
 from pipeline.processes import Failed
 from pipeline.submission.load import NAME, file_problem, list_experiments, posix
-from pipeline.words.numbers import by_note, count
+from pipeline.words.numbers import count, group_messages
 
 _FILES, _SET_UP = "files", "details"  # parts of pages, by their HTML ids
 
 
-def show(ask: Ask) -> Response:
+def show(ask: PageRequest) -> Response:
     """Show the room in its current state."""
     return _show_page(ask)
 
 
-def upload(ask: Ask) -> Response:
+def upload(ask: PageRequest) -> Response:
     """Store uploaded files, and add tables for them to `submission.toml`."""
     folder, items = ask.folder(), ask.form.getlist("files")
     sent = [(i.filename, i.file) for i in items if isinstance(i, UploadFile) and i.filename]
@@ -48,7 +48,7 @@ def upload(ask: Ask) -> Response:
     return _go_back(ask, [*messages, *_fill_tables(ask, folder)], _FILES)
 
 
-def set_aside(ask: Ask) -> Response:
+def set_aside(ask: PageRequest) -> Response:
     """Move a recording that no table names out of `data/`."""
     folder, file = ask.folder(), ask.text("file")
     message = ask.desk.workers.do("set_aside", folder=str(folder), file=file)
@@ -57,19 +57,19 @@ def set_aside(ask: Ask) -> Response:
     return _go_back(ask, [Message(message)], _FILES)
 
 
-def fill(ask: Ask) -> Response:
+def fill(ask: PageRequest) -> Response:
     """Add tables for data files without a table."""
     return _go_back(ask, _fill_tables(ask, ask.folder()), _FILES)
 
 
-def save(ask: Ask) -> Response:
+def save(ask: PageRequest) -> Response:
     """Write the form into `submission.toml`."""
     fields = [field for group in fill_form(_read_shown(ask)) for field in group.fields]
     changed = find_changes(fields, ask.form, ask.form.getlist)
     return _edit(ask, changed, place=_SET_UP)
 
 
-def save_experiment(ask: Ask) -> Response:
+def save_experiment(ask: PageRequest) -> Response:
     """Write one row of the list of recordings into `submission.toml`, or remove its table."""
     index = ask.request.path_params["index"]
     if ask.text("remove"):
@@ -81,7 +81,7 @@ def save_experiment(ask: Ask) -> Response:
     return _edit(ask, changed, place=_FILES, doubts=doubts)
 
 
-def answer_together(ask: Ask) -> Response:
+def answer_together(ask: PageRequest) -> Response:
     """Write the same answer about held carts into the tables of several recordings."""
     shown, carts = _read_shown(ask), ask.text("carts")
     most = len(list_experiments(shown)) - 1
@@ -99,14 +99,14 @@ def answer_together(ask: Ask) -> Response:
     return _edit(ask, changed, place=_FILES, doubts=doubts)
 
 
-def start_hand_in(ask: Ask) -> Response:
+def start_hand_in(ask: PageRequest) -> Response:
     """Make the report again if a source has changed; then show the hand-in page."""
     if not ask.sees_check and last_report.find_state(ask.folder()) != "current":
         ask.start("make_report", title="The report")
     return ask.back(f"{ask.here}hand-in")
 
 
-def show_hand_in(ask: Ask) -> Response:
+def show_hand_in(ask: PageRequest) -> Response:
     """Show what is done, what is missing, what was assumed, and the content of the zip."""
     folder, room = ask.folder(), read_room(ask)
     files = [] if room.keeps else _do(ask, "list_hand_in", report=not room.facts.check)
@@ -121,7 +121,7 @@ def show_hand_in(ask: Ask) -> Response:
     )
 
 
-def download_hand_in(ask: Ask) -> Response:
+def download_hand_in(ask: PageRequest) -> Response:
     """Return the zip."""
     folder = ask.folder()
     name = f"{folder.name}.zip"
@@ -154,12 +154,12 @@ class _Temporary(FileResponse):
             self._scratch.close()
 
 
-def _do(ask: Ask, task: str, **arguments: Any) -> Any:
+def _do(ask: PageRequest, task: str, **arguments: Any) -> Any:
     """Let a worker do a task in the folder that the URL names."""
     return ask.desk.workers.do(task, folder=str(ask.folder()), **arguments)
 
 
-def _read_shown(ask: Ask) -> dict[str, Any]:
+def _read_shown(ask: PageRequest) -> dict[str, Any]:
     """Return the version of `submission.toml` from which the form was filled in."""
     text = ask.desk.shown(ask.text("seen"), to=ask.user.name)
     if text is None:
@@ -167,20 +167,20 @@ def _read_shown(ask: Ask) -> dict[str, Any]:
     return _do(ask, "read_document", text=text)
 
 
-def _list_authors(room: Room) -> list[str]:
+def _list_authors(room: SubmissionView) -> list[str]:
     """Return the authors in the form."""
     who = [f.value for group in room.groups for f in group.fields if f.path == "authors"]
     return [line for value in who for line in value.splitlines() if line.strip()]
 
 
-def _list_doubts(ask: Ask, document: Mapping[str, Any], index: int) -> Sequence[str]:
+def _list_doubts(ask: PageRequest, document: Mapping[str, Any], index: int) -> Sequence[str]:
     """Return the doubts about the carts of an experiment."""
     files = [posix(str(table.get("file", ""))) for table in list_experiments(document)]
     looks = describe_all(ask, ask.folder(), document)
     return looks[files[index]]["unsure"] if index < len(files) and files[index] in looks else ()
 
 
-def _fill_tables(ask: Ask, folder: Path) -> list[Message]:
+def _fill_tables(ask: PageRequest, folder: Path) -> list[Message]:
     """Add tables for new files; return messages."""
     try:
         rows = ask.desk.workers.do("fill_tables", folder=str(folder))
@@ -189,17 +189,17 @@ def _fill_tables(ask: Ask, folder: Path) -> list[Message]:
     new = [row["file"] for row in rows if row["state"] in ("new", "completed")]
     messages = [Message(f"{count(len(new), 'file')} written into {NAME}.")] if new else []
     without = [row for row in rows if row["state"] in ("copy", "refused")]
-    notes = by_note((row["file"], note) for row in without for note in row["remarks"])
+    notes = group_messages((row["file"], note) for row in without for note in row["remarks"])
     return messages + [Message(note, "refused") for note in notes]
 
 
-def _go_back(ask: Ask, messages: Iterable[Message], place: str) -> Response:
+def _go_back(ask: PageRequest, messages: Iterable[Message], place: str) -> Response:
     """Return to the page from which the request came, and show messages at the same part of it."""
     return ask.back(f"{ask.here}#{place}", *messages, place=place)
 
 
 def _show_page(
-    ask: Ask,
+    ask: PageRequest,
     *,
     status: int = 200,
     changed: Sequence[Field] = (),
@@ -216,13 +216,13 @@ def _show_page(
         file_groups=group_rows(room.rows),
         often=gather_remarks(room.rows),
         not_read=_do(ask, "list_not_read", named=named),
-        keeps=room.keeps if room.facts.sound else [],
+        keeps=room.keeps if room.facts.is_valid else [],
         gap=file_problem(folder, "gap/gap.html") is None,
     )
 
 
 def _edit(
-    ask: Ask,
+    ask: PageRequest,
     changed: Sequence[Field],
     *,
     place: str,
@@ -248,7 +248,7 @@ def _edit(
 
 
 def _show_outdated(
-    ask: Ask, changed: Sequence[Field], *, text: str, document: Mapping[str, Any]
+    ask: PageRequest, changed: Sequence[Field], *, text: str, document: Mapping[str, Any]
 ) -> Response:
     """Show both versions: the current file, and what was typed."""
     # If the page is too old, nobody can tell which of its values were typed.

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.arrays import Array, ComplexArray
 from pipeline.estimation.decay.separable import fit_separable
-from pipeline.estimation.noise import colour
+from pipeline.estimation.noise import relative_psd
 
 _MAX_EVALUATIONS = 100
 _MOST_GROWTH = 50.0  # bound of an exponent, against overflow
@@ -78,7 +78,9 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
     inverse = np.linalg.pinv(np.linalg.qr(full, mode="r"))[kept]
     angle = float(np.median(fit.p[n_modes:])) * float(tau[-1] / (t.size - 1))
     variance = (
-        float(residual @ residual) / max(t.size - full.shape[1], 1) * colour(residual, angle=angle)
+        float(residual @ residual)
+        / max(t.size - full.shape[1], 1)
+        * relative_psd(residual, angle=angle)
     )
     covariance = variance * (inverse @ inverse.T)
     if not drift:

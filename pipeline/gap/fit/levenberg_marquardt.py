@@ -151,7 +151,7 @@ def fit_model(start: GapModel, runs: Sequence[GapRun], how: Fitting) -> GapFit:
     """
     structure = start.structure
     low, high = structure.bounds()
-    bounds = low, high, structure.reach()
+    bounds = low, high, structure.largest_step()
     goes_on = start if isinstance(start, GapFit) else None
     # At first, friction is assumed to differ by 5 % between runs.
     best = evaluate(

@@ -9,7 +9,7 @@ from pipeline.arrays import Array
 from pipeline.gap.data.runs import GapRun
 from pipeline.gap.fit.levenberg_marquardt import Fitting, GapFit, Mapper, evaluate, fit_model
 from pipeline.gap.fit.linearise import Nuisance, residual_points
-from pipeline.plant.simulator.laws import dropping, settling, sliding
+from pipeline.plant.simulator.laws import hysteresis, sliding, stribeck
 from pipeline.plant.simulator.tables import Drive, Tables
 
 _BAD_RUN, _BAD_SHARE = 1.5, 2.0  # limits of a run's chi-square: absolute, and times the median
@@ -67,7 +67,7 @@ def _rest_band(fit: GapFit) -> Array:
 def holding_force(tables: Tables) -> Array:
     """Return the largest force (n,) that friction or cogging can hold on each cart."""
     cart, _, drive = tables
-    dry = [sliding(cart, i, 0.0) + dropping(cart, i, 0.0, 0.0) for i in range(len(cart))]
-    force = np.array(dry) + [settling(cart, i, 0.0)[0] for i in range(len(cart))]
+    dry = [sliding(cart, i, 0.0) + stribeck(cart, i, 0.0, 0.0) for i in range(len(cart))]
+    force = np.array(dry) + [hysteresis(cart, i, 0.0)[0] for i in range(len(cart))]
     force[0] += drive[Drive.COGGING_FORCE]
     return force

@@ -170,7 +170,7 @@ class Structure:
             )
         return np.concatenate(steps)
 
-    def reach(self) -> Array:
+    def largest_step(self) -> Array:
         """Return the largest step of each parameter in one iteration."""
         reach = [np.full(self.base_size, 0.3)]
         for c in self.effects:

@@ -1,1 +1,1 @@
-"""Turn the laws that `gap.follow` found into effects, fit them to whole runs, and judge them."""
+"""Turn the laws that `gap.pem` found into effects, fit them to whole runs, and judge them."""

@@ -59,7 +59,7 @@ class Hypothesis:
         return len({c.effect.key if c.effect.family else c.key for c in effects})
 
     @property
-    def sound(self) -> bool:
+    def is_credible(self) -> bool:
         """Whether every effect deserves its name, and no estimate is at a bound."""
         structure, theta = self.fit.structure, self.fit.theta
         low, high = structure.bounds()

@@ -7,9 +7,9 @@ import numpy as np
 from pipeline.gap.fit.levenberg_marquardt import GapFit
 from pipeline.gap.fit.structure import Candidate
 from pipeline.gap.limits import SURE
+from pipeline.gap.search.free_run_fit import finish, fit_on
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge, lowers_error, worth_it
 from pipeline.gap.search.translate import make_candidate
-from pipeline.gap.search.whole import finish, fit_on
 from pipeline.plant.catalogue import find_effect
 
 _FEW = 4  # effects to try at a time; certainty is only a rough guide to which are needed
@@ -33,13 +33,15 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
                 plainer = _plainer(chosen, effects[index], study)
                 if plainer is not None:
                     found.append(plainer)
-                    needless += [plainer] if plainer.sound and plainer.bic < chosen.bic else []
+                    needless += (
+                        [plainer] if plainer.is_credible and plainer.bic < chosen.bic else []
+                    )
                 without = found[0]
                 if len(effects) > 1:
                     without = _without(chosen, effects[index], study)
                     found.append(without)
                 nothing = sure[index] < SURE  # may be zero, so it must go
-                if nothing or (without.sound and _as_good(without, best, study)):
+                if nothing or (without.is_credible and _as_good(without, best, study)):
                     needless.append(without)
             if needless:
                 chosen = min(needless, key=lambda h: h.bic)

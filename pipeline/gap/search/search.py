@@ -12,11 +12,11 @@ from pipeline.gap.fit.restart import holding_force
 from pipeline.gap.fit.structure import Candidate
 from pipeline.gap.search.deadline import Deadline, OutOfTime
 from pipeline.gap.search.find import find_hypotheses
+from pipeline.gap.search.free_run_fit import finish, fit_free_run
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
 from pipeline.gap.search.offset import find_offset
 from pipeline.gap.search.prune import steps_to, without_zero_effect
 from pipeline.gap.search.verdict import reach_verdict
-from pipeline.gap.search.whole import finish, fit_whole
 from pipeline.gap.types import Verdict
 from pipeline.words.phrases import phrases
 
@@ -169,8 +169,10 @@ class Search:
         candidate = Candidate(
             effect=effect, place=offset.cart, signs=(1.0,), scales=(abs(offset.force),)
         )
-        without = tuple(judge(fit_whole(h.fit.without_nuisance, pinned), pinned) for h in self.path)
-        fit = fit_whole(chosen.fit.with_effect(candidate, (offset.force,)), loose)
+        without = tuple(
+            judge(fit_free_run(h.fit.without_nuisance, pinned), pinned) for h in self.path
+        )
+        fit = fit_free_run(chosen.fit.with_effect(candidate, (offset.force,)), loose)
         final = judge(fit, loose)
         as_good = limits.OFFSET_AS_FREE * chosen.error
         if final.error > min(limits.OFFSET_GAIN * without[-1].error, as_good):

@@ -1,4 +1,4 @@
-"""Translate the laws that `gap.follow` found into effects of the catalogue, with values."""
+"""Translate the laws that `gap.fit` found into effects of the catalogue, with values."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from enum import IntEnum
@@ -7,8 +7,8 @@ import numpy as np
 
 from pipeline.gap.data.runs import GapRun
 from pipeline.gap.fit.structure import Candidate, GapModel, Structure, bench_scales
-from pipeline.gap.follow.fit import Follow
-from pipeline.gap.follow.laws import Column, column_set
+from pipeline.gap.pem.fit import PemFit
+from pipeline.gap.pem.laws import Column, column_set
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import Effect
 from pipeline.plant.simulator.tables import Cart, Drive, Spring
@@ -38,14 +38,14 @@ def values_of(effect: Effect, columns: Mapping[IntEnum, float]) -> tuple[float, 
 
 
 def as_model(
-    follow: Follow, *, springs: Sequence[bool], catalogue: Iterable[Effect], runs: Sequence[GapRun]
+    fit: PemFit, *, springs: Sequence[bool], catalogue: Iterable[Effect], runs: Sequence[GapRun]
 ) -> GapModel:
     """Return the model whose effects express the found laws; richer effects are tried first."""
     by_size = sorted(catalogue, key=lambda effect: -len(filled(effect)))
-    chain = follow.laws.chain(follow.p)
+    chain = fit.laws.chain(fit.p)
     candidates: list[Candidate] = []
     values: list[tuple[float, ...]] = []
-    for (table, row), columns in follow.laws.columns(follow.p).items():
+    for (table, row), columns in fit.laws.columns(fit.p).items():
         left = dict(columns)
         for effect in by_size:
             mine = filled(effect)

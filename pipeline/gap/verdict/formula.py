@@ -18,7 +18,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.gap.limits import BIC_DROP
-from pipeline.gap.types import ForceFormula, FormulaTerm, LeftForce
+from pipeline.gap.types import ForceFormula, FormulaTerm, WindowedResidualForce
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ LIBRARY = (
 
 
 def find_formula(
-    forces: Sequence[LeftForce], *, on_springs: bool, position: str, drive: str
+    forces: Sequence[WindowedResidualForce], *, on_springs: bool, position: str, drive: str
 ) -> tuple[ForceFormula | None, Array]:
     """Return the formula for the force on one cart, and its value in every window (n,).
 

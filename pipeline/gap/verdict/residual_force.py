@@ -14,7 +14,7 @@ from pipeline.estimation.modulating import bump_integral, window_weights
 from pipeline.estimation.noise import high_frequency_noise
 from pipeline.gap.types import Gap, Trace
 from pipeline.plant.effect import AugmentedChain
-from pipeline.plant.simulator.laws import arriving
+from pipeline.plant.simulator.laws import shaped_input
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -29,8 +29,8 @@ class ResidualForce:
     model : the force according to the motion of the model with effects. It agrees with `measured`
         if the effects are right.
     u : the logged input for cart 1; zero for other carts.
-    arriving : the input after the model's dead zone and saturation, which is subtracted from the
-        forces.
+    shaped_input : the input after the model's dead zone and saturation, which is subtracted from
+        the forces.
     velocity, position : measured motion of the cart, without the encoder zero.
     neighbours : positions (2, n) of the carts before and after; zero for a wall or a held cart.
     neighbours_velocity : velocities (2, n) of the neighbours.
@@ -43,7 +43,7 @@ class ResidualForce:
     measured: Array
     model: Array
     u: Array
-    arriving: Array
+    shaped_input: Array
     velocity: Array
     position: Array
     neighbours: Array
@@ -77,7 +77,7 @@ def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> Residu
     measured = np.array([zero if c is None else c.measured - c.zero for c in around])
     simulated = np.array([zero if c is None else c.final - c.zero for c in around])
     u = trace.u if cart == 1 else zero
-    inputs = np.array([u, _arriving(u, model)])
+    inputs = np.array([u, _shaped_input(u, model)])
     noise = high_frequency_noise(trace.measured - trace.final)
     i, chain = cart - 1, model.chain
     before, after = chain.k[i], chain.k[i + 1]
@@ -108,7 +108,7 @@ def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> Residu
             measured=means[0],
             model=means[1],
             u=pushes[0],
-            arriving=pushes[1],
+            shaped_input=pushes[1],
             velocity=velocity[1],
             position=position[1],
             neighbours=position[[0, 2]],
@@ -120,10 +120,10 @@ def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> Residu
     return best
 
 
-def _arriving(u: Array, model: AugmentedChain) -> Array:
+def _shaped_input(u: Array, model: AugmentedChain) -> Array:
     """Return the input after dead zone and saturation; delays and lags are ignored."""
     drive = model.tables().drive
-    return np.array([arriving(drive, float(one)) for one in u])
+    return np.array([shaped_input(drive, float(one)) for one in u])
 
 
 def _cut(t: Array, *, length: float) -> np.ndarray | None:

@@ -5,12 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.gap.types import ForceAgainst, LeftForce, Quantity, Residual
+from pipeline.gap.types import ForceAgainst, Quantity, Residual, WindowedResidualForce
 from pipeline.gap.verdict.formula import find_formula
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 
 
-def map_residual(forces: Sequence[LeftForce], bench: Bench) -> tuple[Residual, ...]:
+def map_residual(forces: Sequence[WindowedResidualForce], bench: Setup) -> tuple[Residual, ...]:
     """Return the unexplained force on each cart, in the order of the carts."""
     found, position, drive = [], bench.units.position, bench.units.input
     for cart in sorted({force.cart for force in forces}):
@@ -32,7 +32,7 @@ def map_residual(forces: Sequence[LeftForce], bench: Bench) -> tuple[Residual, .
 
 
 def _binned(
-    forces: Sequence[LeftForce],
+    forces: Sequence[WindowedResidualForce],
     values: Sequence[Array],
     said: Array | None,
     *,

@@ -11,23 +11,18 @@ from pathlib import Path
 
 import pipeline
 from pipeline.errors import ConfigError
-from pipeline.grading.batch.so_far import class_so_far
+from pipeline.grading.batch.class_changes import find_class_changes
 from pipeline.grading.batch.task import OUT_OF_MEMORY, Setup, Task, failed, read_grading
 from pipeline.grading.grade import Flag, read_grade
-from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Batch, Example, Grading, Member
 from pipeline.grading.intake.files import digest
-from pipeline.grading.intake.hand_ins import HandIn
+from pipeline.grading.intake.find import HandIn
 from pipeline.grading.intake.repairs import FOLDER, Repair, keep_original, read_repairs
 from pipeline.grading.rubric import Rubric
+from pipeline.grading.similarity.copies import find_copies, same_recordings, same_team
 from pipeline.grading.similarity.flag import shared_flag
-from pipeline.grading.similarity.shared import find_shared, same_recordings, same_team
-from pipeline.grading.similarity.tables import (
-    Key,
-    TypedNumber,
-    find_shared_tables,
-    typed_numbers,
-)
+from pipeline.grading.similarity.tables import Key, TypedNumber, find_shared_tables, typed_numbers
 from pipeline.processes import Ended, Failed, Supervisor
 from pipeline.resources import TEMPLATES
 
@@ -80,7 +75,7 @@ def grade_batch(
             no_room.add(outcome.submission)
         progress(len(rows), total, outcome.submission)
     progress(total, total, "comparing the recordings")
-    before = class_so_far(rows, book)
+    before = find_class_changes(rows, book)
     rows |= before.kept
     in_order = [rows[name] for name in sorted(rows)]
     return Batch(
@@ -292,17 +287,17 @@ def _shared(
     here = {(prints.authors, prints.fingerprints) for prints in batch}
     earlier = [
         prints
-        for prints in book.prints()
+        for prints in book.fingerprints()
         if prints.fingerprints
         and (prints.authors, prints.fingerprints) not in here
         and not _is_earlier_version(prints, names.get(prints.submission))
     ]
     reported = {row.submission: _typed_numbers(row, book, rubric=rubric) for row in rows}
-    found = find_shared(batch, earlier=earlier)
+    found = find_copies(batch, earlier=earlier)
     tables = find_shared_tables(rows, reported)
     if (found or tables) and (handed_out := tuple(examples())):
         given = [one.fingerprints for one in handed_out]
-        found = find_shared(batch, earlier=earlier, examples=given)
+        found = find_copies(batch, earlier=earlier, examples=given)
         numbers = frozenset[tuple[str, float]]().union(*(one.numbers for one in handed_out))
         tables = find_shared_tables(rows, reported, given=numbers)
     return {

@@ -15,11 +15,11 @@ from pipeline.grading.grade import grade_text
 from pipeline.grading.gradings import Grading
 from pipeline.grading.intake.files import Changed, open_submission
 from pipeline.grading.intake.repairs import Repair, text_key
-from pipeline.grading.judge.reweigh import findings_text
+from pipeline.grading.judge.recompute import findings_text
 from pipeline.grading.judge.run import Graded, grade_submission
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.self_check.words import asked_note
-from pipeline.grading.similarity.prints import fingerprint
+from pipeline.grading.similarity.fingerprints import fingerprint
 from pipeline.ingest.formats.recognise import OF_STRANGERS
 from pipeline.processes import serve
 from pipeline.submission import Submission, load_submission

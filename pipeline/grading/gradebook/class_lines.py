@@ -41,7 +41,7 @@ class Flagged(TypedDict):
     code: Code
 
 
-class Line(GradeTable):
+class GradeSummary(GradeTable):
     """The parts of one `grade.json` that the pages and tables of a class need.
 
     Numbers and messages of the criteria are left out, because reading them takes a third of a
@@ -65,11 +65,11 @@ class Line(GradeTable):
     open: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, grade: Grade) -> "Line":
+    def of(cls, grade: Grade) -> "GradeSummary":
         """Return the line of a grade."""
         return cls.model_validate(grade.model_dump(include=set(cls.model_fields)))
 
-    def sharing(self) -> "Line":
+    def sharing(self) -> "GradeSummary":
         """Return the line with the flag `shared_data`.
 
         The flag says that other submissions contain the same recordings.
@@ -116,7 +116,7 @@ def wrong_springs(graded: Iterable[tuple[str, ...]]) -> str:
     )
 
 
-def class_frame(lines: Iterable[Line], *, rubric: Rubric) -> "pd.DataFrame":
+def class_frame(lines: Iterable[GradeSummary], *, rubric: Rubric) -> "pd.DataFrame":
     """Return the class as a table with one row per submission and criterion.
 
     Columns about the submission: `submission`, `authors`, `status`, `days_late`, `total` (after the

@@ -11,9 +11,9 @@ from pipeline.grading.gradebook.schema import (
     figures,
     findings,
     gradings,
-    looks,
     overrides,
     request_events,
+    reviews,
     submissions,
 )
 
@@ -27,7 +27,7 @@ def erase_rows(connection: Connection, gone: Mapping[int, str]) -> None:
     """
     numbers = list(gone)
     graded = select(gradings.c.id).where(gradings.c.submission_id.in_(numbers))
-    for table in (looks, figures, findings):
+    for table in (reviews, figures, findings):
         connection.execute(delete(table).where(table.c.grading_id.in_(graded)))
     for table in (entries, overrides, request_events, gradings):
         connection.execute(delete(table).where(table.c.submission_id.in_(numbers)))

@@ -8,7 +8,7 @@ from pathlib import Path
 from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
 from pipeline.grading.grade import Adjustment, Criterion, Grade, GradeOverride
-from pipeline.grading.gradings import go_with
+from pipeline.grading.gradings import same_people
 from pipeline.grading.references.tolerance import exact, with_total
 from pipeline.grading.rubric import Rubric
 
@@ -40,7 +40,7 @@ class HandPoints:
 
     def concerns(self, authors: tuple[str, ...]) -> bool:
         """Return whether the points apply to a submission of these authors."""
-        return go_with(self.authors, authors)
+        return same_people(self.authors, authors)
 
 
 def read_points(text: str) -> float | None:
@@ -85,7 +85,7 @@ class WantedPoints:
     points : requested points; None for the automatic points.
     comment : whether `why` is only a comment for the team.
     line : line number in the table that requests the change; 0 without a table.
-    seen : version of the points that the person saw, from `TeamNow.versions`; "" to change any
+    version : version of the points that the person saw, from `TeamNow.versions`; "" to change any
         version.
     at : time of the change; "" for now. Points given together have the same time.
     """
@@ -96,7 +96,7 @@ class WantedPoints:
     why: str
     comment: bool = False
     line: int = 0
-    seen: str = ""
+    version: str = ""
     at: str = ""
 
     def beside(self, earlier: Iterable[HandPoints]) -> "WantedPoints":

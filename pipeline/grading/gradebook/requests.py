@@ -15,7 +15,7 @@ from pipeline.grading.gradebook.schema import (
     request_events,
     submissions,
 )
-from pipeline.grading.gradings import go_with
+from pipeline.grading.gradings import same_people
 from pipeline.words.text import clean
 
 MOST_LETTERS = 1_000  # characters of a reason or an answer: about one paragraph
@@ -88,7 +88,7 @@ def read_all_requests(
     found: dict[int, dict[str, Request]] = {submission: {} for submission in authors}
     for row in connection.execute(mine.order_by(request_events.c.id)):
         event = RequestEvent(**{column.name: row._mapping[column.name] for column in EVENT})
-        if go_with(event.authors, authors[row.submission_id]):
+        if same_people(event.authors, authors[row.submission_id]):
             theirs = found[row.submission_id]
             known = theirs.get(event.criterion)
             theirs[event.criterion] = Request(
@@ -110,7 +110,7 @@ def find_requests(connection: Connection, batch: Row) -> tuple[list[Row], list[R
     found = connection.execute(
         _in_class(batch).where(request_events.c.id.in_(newest)).order_by(request_events.c.id)
     ).all()
-    theirs = [row for row in found if go_with(row.asked_by, row.authors)]
+    theirs = [row for row in found if same_people(row.asked_by, row.authors)]
     waiting = [row for row in theirs if row.what == "asked"]
     return waiting, [row for row in reversed(theirs) if row.what != "asked"]
 

@@ -216,7 +216,7 @@ def final_entries(
         given[values.pop("submission_id")].append(HandPoints(**values))
     keys = first_keys(connection, numbers)
     return [
-        as_it_counts(
+        current_entry(
             row,
             given[row.submission_id],
             shared=shared,
@@ -235,7 +235,7 @@ def first_keys(connection: Connection, submitted: Iterable[int] | Select) -> dic
     return {row.submission_id: row.key for row in connection.execute(keys)}
 
 
-def as_it_counts(
+def current_entry(
     row: Row,
     ever: Iterable[HandPoints],
     *,

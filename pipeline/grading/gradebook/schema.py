@@ -213,7 +213,7 @@ overrides = Table(
 )
 
 # Marks of gradings as reviewed or not; the newest row counts, so a mark can be undone.
-looks = Table(
+reviews = Table(
     "looks",
     metadata,
     Column("id", Integer, primary_key=True),

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
-from pipeline.grading.intake.hand_ins import HandIn
+from pipeline.grading.intake.find import HandIn
 from pipeline.grading.rubric import Late
 from pipeline.submission.complaints import quote
 

@@ -5,8 +5,8 @@ from fractions import Fraction
 
 from pipeline.grading import rubric as asked
 from pipeline.grading.grade import Criterion, Flag, Outcome
-from pipeline.grading.judge.costs import assign, charge, unnamed
-from pipeline.grading.judge.work import Judgement, Verdict
+from pipeline.grading.judge.context import Judgement, Verdict
+from pipeline.grading.judge.costs import apply_flag_cost, assign, unnamed
 from pipeline.grading.references.tolerance import exact, to_step
 from pipeline.grading.rubric import Rubric
 
@@ -30,11 +30,13 @@ def award(
         failed = next((p for p in waits_for if p.outcome in ("fail", "skip")), None)
         one = Judgement.plain(_waiting(failed)) if failed else judgements[wanted.id]
         judged[wanted.id] = one
-        verdict = charge(one, unnamed(one, wanted), wanted, flags, rubric=rubric)
+        verdict = apply_flag_cost(one, unnamed(one, wanted), wanted, flags, rubric=rubric)
         ready[wanted.id] = _result(wanted, verdict, rubric)
     charges = assign(criteria, judged, flags, rubric=rubric)
     return tuple(
-        _result(one, charge(judged[one.id], charges[one.id], one, flags, rubric=rubric), rubric)
+        _result(
+            one, apply_flag_cost(judged[one.id], charges[one.id], one, flags, rubric=rubric), rubric
+        )
         for one in criteria
     )
 

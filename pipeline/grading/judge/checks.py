@@ -12,18 +12,18 @@ from pipeline.grading.judge.checks_loop import (
     judge_hardware,
     judge_prefilter,
 )
-from pipeline.grading.judge.earned import ALL, NONE, Deviation, earned, earned_by
-from pipeline.grading.judge.laws import MOST_WIDENING, judge_laws
-from pipeline.grading.judge.work import (
+from pipeline.grading.judge.context import (
+    GradingContext,
     Judgement,
     Verdict,
-    Work,
     lacking,
     pieces_for,
     say_missing,
     share_sound,
     share_there,
 )
+from pipeline.grading.judge.laws import MOST_WIDENING, judge_laws
+from pipeline.grading.judge.points import ALL, NONE, Deviation, points_for, points_for_one
 from pipeline.grading.mistakes.state_model import model_harm, order_names
 from pipeline.grading.mistakes.undo import Number
 from pipeline.grading.references.reference import OFF_SCALE, Reference, is_linear, off_scale
@@ -31,25 +31,25 @@ from pipeline.grading.references.tolerance import NO_CREDIT, as_typed
 from pipeline.grading.rubric import matching
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
-from pipeline.words.numbers import by_note, first_few
+from pipeline.words.numbers import first_few, group_messages
 
 _NAMED = 4  # largest number of parameters or laws in one message
 
 
-def judge(criterion: asked.Criterion, work: Work) -> Verdict:
+def judge(criterion: asked.Criterion, context: GradingContext) -> Verdict:
     """Judge one criterion, without regard to the criteria that it requires; see `award.py`."""
-    return _JUDGES[criterion.check](criterion, work)
+    return _JUDGES[criterion.check](criterion, context)
 
 
-def judge_with_undoing(criterion: asked.Criterion, work: Work) -> Judgement:
+def judge_with_undoing(criterion: asked.Criterion, context: GradingContext) -> Judgement:
     """Judge one criterion as typed, and again with the mistakes of the student undone."""
-    typed, slips = judge(criterion, work), work.slips(criterion.check)
+    typed, slips = judge(criterion, context), context.slips(criterion.check)
     # No law can judge numbers that were left out; those that cannot be read cost only themselves.
-    if not slips or (criterion.check == "laws" and work.omits_final):
+    if not slips or (criterion.check == "laws" and context.omits_final):
         return Judgement.plain(typed)
-    undone = judge(criterion, work.leaving(()))
+    undone = judge(criterion, context.leaving(()))
     only = {
-        slip: typed if len(slips) == 1 else judge(criterion, work.leaving((slip,)))
+        slip: typed if len(slips) == 1 else judge(criterion, context.leaving((slip,)))
         for slip in slips
     }
     matters = {
@@ -63,15 +63,15 @@ def judge_with_undoing(criterion: asked.Criterion, work: Work) -> Judgement:
 # ------------------------------------------------------------------- pieces and data
 
 
-def _required(criterion: asked.RequiredPieces, work: Work) -> Verdict:
-    pieces = pieces_for(criterion, work.pieces, work.rubric)
+def _required(criterion: asked.RequiredPieces, context: GradingContext) -> Verdict:
+    pieces = pieces_for(criterion, context.pieces, context.rubric)
     if not pieces:
         return Verdict(share=ALL, message="Nothing in particular is required.")
     missing = [piece for piece in pieces if piece.share < 1]
-    unread = first_few(list(work.analysis.unreadable), _NAMED)
+    unread = first_few(list(context.analysis.unreadable), _NAMED)
     said = say_missing(missing, most=_NAMED) or "Everything required is here."
-    if any(piece.kind is None for piece in pieces) and work.strange:
-        unknown = "; ".join(work.strange[:_NAMED])
+    if any(piece.kind is None for piece in pieces) and context.strange:
+        unknown = "; ".join(context.strange[:_NAMED])
         said += f" Cannot be read: {unknown}{'' if unknown.endswith('?') else '.'}"
     return Verdict(
         share=share_there(pieces),
@@ -81,10 +81,10 @@ def _required(criterion: asked.RequiredPieces, work: Work) -> Verdict:
     )
 
 
-def _data(_: asked.DataQuality, work: Work) -> Verdict:
-    bad, runs = work.bad, len(work.submission.experiments)
-    share = share_sound(work)
-    said = by_note((run, why.rstrip(".")) for run, why in bad.items())[:_NAMED]
+def _data(_: asked.DataQuality, context: GradingContext) -> Verdict:
+    bad, runs = context.bad, len(context.submission.experiments)
+    share = share_sound(context)
+    said = group_messages((run, why.rstrip(".")) for run, why in bad.items())[:_NAMED]
     faults = " ".join(text if text.endswith("?") else f"{text}." for text in said)
     if not runs:
         faults = "There are no recordings."
@@ -98,30 +98,30 @@ def _data(_: asked.DataQuality, work: Work) -> Verdict:
 # ------------------------------------------------------------------------ parameters
 
 
-def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
+def _parameters(criterion: asked.Parameters, context: GradingContext) -> Verdict:
     """Judge the reported parameters against those from the recordings.
 
     A parameter that is not reported earns nothing.
     """
-    table = work.numbers(criterion.check)
-    known: Mapping[str, Reference] = getattr(work.references, criterion.check)
-    names = matching(criterion.parameters, work.rubric.names)
+    table = context.numbers(criterion.check)
+    known: Mapping[str, Reference] = getattr(context.references, criterion.check)
+    names = matching(criterion.parameters, context.rubric.names)
     impossible = [name for name, number in table.items() if number.value <= 0]
     judged = [n for n in names if n in known or n in impossible]
     guessed = [n for n in names if n not in known and n not in judged]
-    needs = lacking(work) if criterion.check == "initial" else {}
+    needs = lacking(context) if criterion.check == "initial" else {}
     unproved = {n: f"no usable {needs[n]}" for n in judged if n in needs and n in table}
     if unproved and len(unproved) == len(judged):
-        why = "; ".join(by_note(unproved.items()))
+        why = "; ".join(group_messages(unproved.items()))
         return Verdict(share=None, message=f"Not checked, so it earns no points. {why}.")
     if not judged:
-        reasons = [s.reason for s in work.analysis.skipped]
-        if off_scale(work.analysis):
+        reasons = [s.reason for s in context.analysis.skipped]
+        if off_scale(context.analysis):
             reasons = [OFF_SCALE]
         why = reasons[0] if reasons else "these are first guesses that no recording can confirm"
         return Verdict(share=None, message=f"Not checked: {why}.")
-    unread = {name: work.why_unread(criterion.check, name) for name in judged}
-    said = by_note(unread.items())
+    unread = {name: context.why_unread(criterion.check, name) for name in judged}
+    said = group_messages(unread.items())
     off = [f"Cannot be read: {'; '.join(said)}"] if said else []
     deviations, wrong = [], set()
     for name in judged:
@@ -139,7 +139,7 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
             else NO_CREDIT
         )
         deviations.append(_deviation(error, name))
-        if earned_by(criterion, deviations[-1]) < 1:
+        if points_for_one(criterion, deviations[-1]) < 1:
             wrong.add(name)
             there = f", but your recordings give {known[name].text}" if name in known else ""
             off.append(f"{name}: you report {table[name].text}{there}")
@@ -148,17 +148,17 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
         if guessed and criterion.check == "final"
         else ""
     )
-    loose = any(n in known for n in judged) and not is_linear(work.analysis)
+    loose = any(n in known for n in judged) and not is_linear(context.analysis)
     right = WORDS.text("agrees_loosely" if loose else "agrees")
     message = f"{'; '.join(off[:_NAMED])}." if off else right
     if unproved:
-        left += f" Not checked, so without points: {'; '.join(by_note(unproved.items()))}."
+        left += f" Not checked, so without points: {'; '.join(group_messages(unproved.items()))}."
     look = f" {WORDS.text('judged_loosely')}" if loose else ""
     return Verdict(
-        share=earned(criterion, deviations),
+        share=points_for(criterion, deviations),
         models=(tuple(deviations),),
         message=message + left + look,
-        explained=bool(wrong or unproved) and wrong <= work.named[criterion.check],
+        explained=bool(wrong or unproved) and wrong <= context.named[criterion.check],
         expected={n: known[n].value for n in judged if n in known},
         found={n: float(table[n].value) for n in judged if n in table},
         agrees={n: n not in wrong for n in judged if n in table and n not in unproved},
@@ -169,30 +169,30 @@ def _deviation(error: Fraction, name: str) -> Deviation:
     return Deviation(error=error, by="damping" if read_name(name).is_damping else "number")
 
 
-def _initial_final(criterion: asked.InitialFinal, work: Work) -> Verdict:
+def _initial_final(criterion: asked.InitialFinal, context: GradingContext) -> Verdict:
     """Judge how well the initial and the final table agree, after allowing for rounding.
 
     Dampings that the recordings do not determine are left out, because students can only guess
     them.
     """
-    initial, final = work.numbers("initial"), work.numbers("final")
-    names = matching(criterion.parameters, work.rubric.names)
+    initial, final = context.numbers("initial"), context.numbers("final")
+    names = matching(criterion.parameters, context.rubric.names)
     both = [
         n
         for n in names
         if n in initial
         and n in final
-        and not (read_name(n).is_damping and n not in work.references.initial)
+        and not (read_name(n).is_damping and n not in context.references.initial)
     ]
     if not both:
         return Verdict(share=None, message="Not checked: no parameter is in both tables.")
     deviations, apart = [], []
     for name in both:
         deviations.append(_deviation(between(initial[name], final[name]), name))
-        if earned_by(criterion, deviations[-1]) < 1:
+        if points_for_one(criterion, deviations[-1]) < 1:
             apart.append(f"{name}: first {initial[name].text}, then {final[name].text}")
     return Verdict(
-        share=earned(criterion, deviations),
+        share=points_for(criterion, deviations),
         models=(tuple(deviations),),
         message=f"{'; '.join(apart[:_NAMED])}." if apart else "Both estimates agree.",
         expected={n: float(initial[n].value) for n in both},
@@ -213,16 +213,16 @@ def between(initial: Number, final: Number) -> Fraction:
     return size.percent_off(reference, sigmas=1.0)
 
 
-def _laws(criterion: asked.Laws, work: Work) -> Verdict:
+def _laws(criterion: asked.Laws, context: GradingContext) -> Verdict:
     laws = judge_laws(
-        work.numbers("final"),
-        n=work.rubric.system.carts,
+        context.numbers("final"),
+        n=context.rubric.system.carts,
         frequency_percent=criterion.frequency_percent,
         damping_percent=criterion.damping_percent,
     )
     if laws is None:
-        missing = (n for n in work.rubric.names if n not in work.reported.final)
-        why = next(filter(None, (work.because_unread("final", n) for n in missing)), "")
+        missing = (n for n in context.rubric.names if n not in context.reported.final)
+        why = next(filter(None, (context.because_unread("final", n) for n in missing)), "")
         return Verdict(share=None, message=f"Not checked: the final table is not complete.{why}")
     broken = [law for law in laws if law.widening > 0]
     said = dict.fromkeys(law.broken for law in broken)
@@ -240,35 +240,37 @@ def _laws(criterion: asked.Laws, work: Work) -> Verdict:
 # ------------------------------------------------------------- state model and controller
 
 
-def _state_space(criterion: asked.StateModel, work: Work) -> Verdict:
-    space = work.reported.state_space
+def _state_space(criterion: asked.StateModel, context: GradingContext) -> Verdict:
+    space = context.reported.state_space
     if space is None or not (space.A and space.B):
-        why = [work.because_unread("state_space", n) for n in "AB"]
+        why = [context.because_unread("state_space", n) for n in "AB"]
         told = "".join(dict.fromkeys(why))
         return Verdict(share=NONE, message=f"A and B are not both reported.{told}")
-    if not (entries := work.entries):
+    if not (entries := context.entries):
         return Verdict(share=None, message="Not checked: there is no table or fit to compare with.")
     deviations = tuple(
         Deviation(error=e.error, by="number" if e.kind == "stiffness" else e.kind) for e in entries
     )
-    shares = [earned_by(criterion, deviation) for deviation in deviations]
+    shares = [points_for_one(criterion, deviation) for deviation in deviations]
     off = [e for e, share in zip(entries, shares, strict=True) if share < 1]
     named = "; ".join(
         f"{e.name} = {as_typed(e.typed)}, expected {e.right[0]:.4g}" for e in off[:_NAMED]
     )
     message = f"{named}." if off else "A and B follow from the table."
-    springs = work.analysis.bench.springs
+    springs = context.analysis.bench.springs
     n, tied = len(springs) - 1, springs[0] or springs[-1]
-    harm = model_harm(space, entries, models=work.state_models, n=n, tied=tied, order=work.order)
+    harm = model_harm(
+        space, entries, models=context.state_models, n=n, tied=tied, order=context.order
+    )
     most = limits.KEPT_IF_HARMFUL if harm else ALL
     if harm:
         message = f"{WORDS.text(f'model_{harm}')} {message}"
-    if (order := order_names(work.order)) != (
+    if (order := order_names(context.order)) != (
         ", ".join(criterion.states) or order_names(range(2 * n))
     ):
         message = f"{message} {WORDS.text('other_order', order=order)}"
     return Verdict(
-        share=min(earned(criterion, deviations), most),
+        share=min(points_for(criterion, deviations), most),
         models=(deviations,),
         most=most,
         message=message,
@@ -278,11 +280,11 @@ def _state_space(criterion: asked.StateModel, work: Work) -> Verdict:
     )
 
 
-def _manual(_criterion: asked.Manual, _work: Work) -> Verdict:
+def _manual(_criterion: asked.Manual, _work: GradingContext) -> Verdict:
     return Verdict(share=None, message="Graded by a person; not yet.")
 
 
-_JUDGES: Mapping[str, Callable[[Any, Work], Verdict]] = {
+_JUDGES: Mapping[str, Callable[[Any, GradingContext], Verdict]] = {
     "required": _required,
     "data": _data,
     "initial": _parameters,

@@ -9,8 +9,8 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.grading import limits
 from pipeline.grading import rubric as asked
-from pipeline.grading.judge.earned import ALL, NONE, Deviation, earned, earned_by
-from pipeline.grading.judge.work import Verdict, Work
+from pipeline.grading.judge.context import GradingContext, Verdict
+from pipeline.grading.judge.points import ALL, NONE, Deviation, points_for, points_for_one
 from pipeline.grading.mistakes.controller import Controller, does, same_gains
 from pipeline.grading.mistakes.loop_numbers import LoopNumbers
 from pipeline.grading.mistakes.state_model import order_names
@@ -22,15 +22,15 @@ from pipeline.results import Stage
 Judged = Callable[[LoopNumbers], tuple[Deviation, ...]]
 
 
-def _loop(work: Work) -> tuple[Controller, Array] | Verdict:
+def _loop(context: GradingContext) -> tuple[Controller, Array] | Verdict:
     """Return the controller and its gains, or a verdict that says why they cannot be judged."""
-    feedback = work.reported.feedback
+    feedback = context.reported.feedback
     if feedback is None or not feedback.gains:
-        why = work.because_unread("feedback", "gains")
+        why = context.because_unread("feedback", "gains")
         return Verdict(share=NONE, message=f"No gains are reported.{why}")
-    if work.controller is None or work.controller.gains is None:
+    if context.controller is None or context.controller.gains is None:
         return Verdict(share=None, message="Not checked: the carts were not identified.")
-    return work.controller, work.controller.gains
+    return context.controller, context.controller.gains
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,19 +52,21 @@ def _best(
 ) -> _Best | None:
     every = controller.numbers(gains)
     models = tuple(map(judged, every))
-    found = [(earned(criterion, one), numbers) for one, numbers in zip(models, every, strict=True)]
+    found = [
+        (points_for(criterion, one), numbers) for one, numbers in zip(models, every, strict=True)
+    ]
     if not found:
         return None
     share, numbers = max(found, key=lambda one: one[0])
     return _Best(share=share, numbers=numbers, models=models)
 
 
-def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
+def judge_gains(criterion: asked.Gains, context: GradingContext) -> Verdict:
     """Judge the gains by simulation against the design goal.
 
     If several models are acceptable, the one with the best result counts.
     """
-    loop = _loop(work)
+    loop = _loop(context)
     if isinstance(loop, Verdict):
         return loop
     controller, gains = loop
@@ -81,8 +83,8 @@ def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
     if best is None:
         return Verdict(share=NONE, message="These gains cannot be simulated.")
     numbers, most, only_on_paper, ordered = best.numbers, ALL, "", ""
-    if work.gains_order:
-        said = WORDS.text("other_order_of_gains", order=order_names(work.gains_order))
+    if context.gains_order:
+        said = WORDS.text("other_order_of_gains", order=order_names(context.gains_order))
         ordered = f" {said}"
     if runaway := controller.runaway(gains):
         if numbers.stable:
@@ -112,9 +114,9 @@ def _claimable(numbers: LoopNumbers) -> dict[str, float | None]:
     return {"overshoot_percent": overshoot, "settling_time": numbers.settling_time}
 
 
-def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
+def judge_claims(criterion: asked.Claims, context: GradingContext) -> Verdict:
     """Judge the reported overshoot and settling time by a simulation with the reported gains."""
-    loop = _loop(work)
+    loop = _loop(context)
     if isinstance(loop, Verdict):
         return loop
     controller, gains = loop
@@ -134,7 +136,7 @@ def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
     if best is None:
         return Verdict(share=NONE, message="These gains cannot be simulated.")
     share, expected = best.share, _claimable(best.numbers)
-    unread = "".join(work.because_unread("feedback", name) for name in claims)
+    unread = "".join(context.because_unread("feedback", name) for name in claims)
     return Verdict(
         share=share,
         models=best.models,
@@ -144,22 +146,22 @@ def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
         expected=expected,
         found={name: float(v) for name, v in claims.items() if v is not None},
         agrees={
-            name: earned_by(criterion, off) == 1
+            name: points_for_one(criterion, off) == 1
             for (name, claim), off in zip(claims.items(), judged(best.numbers), strict=True)
             if claim is not None
         },
     )
 
 
-def judge_prefilter(criterion: asked.Prefilter, work: Work) -> Verdict:
+def judge_prefilter(criterion: asked.Prefilter, context: GradingContext) -> Verdict:
     """Judge the prefilter against the reciprocal of the loop's static gain."""
-    loop = _loop(work)
+    loop = _loop(context)
     if isinstance(loop, Verdict):
         return loop
     controller, gains = loop
     typed = controller.prefilter
     if typed is None:
-        why = work.because_unread("feedback", "prefilter")
+        why = context.because_unread("feedback", "prefilter")
         return Verdict(share=NONE, message=f"No prefilter is reported.{why}")
 
     def judged(numbers: LoopNumbers) -> tuple[Deviation, ...]:
@@ -183,25 +185,25 @@ def judge_prefilter(criterion: asked.Prefilter, work: Work) -> Verdict:
     )
 
 
-def judge_hardware(criterion: asked.Hardware, work: Work) -> Verdict:
+def judge_hardware(criterion: asked.Hardware, context: GradingContext) -> Verdict:
     """Judge the recorded closed loop against its simulation.
 
     The run with the best result counts.
     """
-    runs = {e.id for e in work.submission.experiments if e.kind == "closed_loop"}
+    runs = {e.id for e in context.submission.experiments if e.kind == "closed_loop"}
     if not runs:
         return Verdict(share=NONE, message="No closed-loop run was submitted.")
-    if off_scale(work.analysis) or clock_units(work.analysis) != 1.0:
+    if off_scale(context.analysis) or clock_units(context.analysis) != 1.0:
         return Verdict(share=None, message=f"Not checked: {OFF_SCALE}.")
     closed: dict[str, list[float]] = {}
-    for check in work.analysis.hardware:
+    for check in context.analysis.hardware:
         if check.experiment in runs and check.loop == "closed":
             closed.setdefault(check.experiment, []).append(check.nrmse)
     if not closed:
-        skipped = work.analysis.skipped
+        skipped = context.analysis.skipped
         reasons = [one.reason for one in skipped if one.stage is Stage.HARDWARE_CHECK]
         why = reasons[0] if reasons else "the controller that ran or its gains are not stated"
-        fit = work.analysis.fit
+        fit = context.analysis.fit
         if fit is None or not fit.converged:  # this proves nothing about the loop
             return Verdict(share=None, message=f"Not checked: {why}.")
         return Verdict(share=NONE, message=f"The loop cannot be compared: {why}.")
@@ -209,17 +211,17 @@ def judge_hardware(criterion: asked.Hardware, work: Work) -> Verdict:
     run = min(errors, key=lambda name: errors[name])
     deviation = Deviation(error=exact(errors[run]))
     return Verdict(
-        share=earned(criterion, [deviation]),
+        share=points_for(criterion, [deviation]),
         models=((deviation,),),
         message=f"{run}: model and measurement differ by {errors[run]:.3g} % of the motion."
-        + (" The gains used in the run are not the reported ones." if _others_ran(work) else ""),
+        + (" The gains used in the run are not the reported ones." if _others_ran(context) else ""),
         expected={"nrmse_percent": criterion.full_percent},
         found={"nrmse_percent": errors[run]},
     )
 
 
-def _others_ran(work: Work) -> bool:
-    controller = work.controller
+def _others_ran(context: GradingContext) -> bool:
+    controller = context.controller
     if controller is None or controller.ran is None or controller.gains is None:
         return False
     return not same_gains(controller.ran, controller.gains)

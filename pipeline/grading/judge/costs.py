@@ -11,8 +11,8 @@ from fractions import Fraction
 
 from pipeline.grading import rubric as asked
 from pipeline.grading.grade import CODES, Code, Flag, Grade
-from pipeline.grading.judge.earned import ALL, NONE
-from pipeline.grading.judge.work import Judgement, Verdict
+from pipeline.grading.judge.context import Judgement, Verdict
+from pipeline.grading.judge.points import ALL, NONE
 from pipeline.grading.mistakes.undo import Slip
 from pipeline.grading.references.tolerance import exact
 from pipeline.grading.rubric import Rubric, matching
@@ -110,7 +110,7 @@ def loss_in(judgement: Judgement, slip: Slip) -> Fraction:
     return max((judgement.undone.share or NONE) - (only.share or NONE), NONE)
 
 
-def charge(
+def apply_flag_cost(
     judgement: Judgement,
     charges: Charges,
     criterion: asked.Criterion,

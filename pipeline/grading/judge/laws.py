@@ -26,7 +26,7 @@ _REDUNDANT = (2, 3)  # numbers of carts whose parameters are redundant
 
 
 @dataclass(frozen=True, kw_only=True)
-class Law:
+class ParameterLaw:
     """One law, and how much the box of rounding must be widened for the law to hold.
 
     Attributes
@@ -42,7 +42,7 @@ class Law:
 
 def judge_laws(
     final: Mapping[str, Number], *, n: int, frequency_percent: float, damping_percent: float
-) -> list[Law] | None:
+) -> list[ParameterLaw] | None:
     """Judge every law of a final table; return None if the table is incomplete.
 
     Parameters
@@ -75,7 +75,7 @@ def judge_laws(
         if not failing:
             break
     return [
-        Law(name=name, broken=broken, widening=Fraction(needed[name], _PER_TOLERANCE))
+        ParameterLaw(name=name, broken=broken, widening=Fraction(needed[name], _PER_TOLERANCE))
         for name, (broken, _) in results.items()
     ]
 

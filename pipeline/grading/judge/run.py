@@ -13,7 +13,7 @@ from pipeline.errors import SubmissionError
 from pipeline.grading.grade import CODES, Flag, Grade
 from pipeline.grading.judge.award import award
 from pipeline.grading.judge.checks import judge_with_undoing
-from pipeline.grading.judge.work import Judgement, Work, data_flag, missing_flag
+from pipeline.grading.judge.context import GradingContext, Judgement, data_flag, missing_flag
 from pipeline.grading.mistakes.controller import diagnose_controller, reported_controller
 from pipeline.grading.mistakes.no_fit import copied_final
 from pipeline.grading.mistakes.reduced import diagnose_reduced
@@ -27,22 +27,15 @@ from pipeline.grading.references.reference import (
     recompute,
     trusted_chain,
 )
-from pipeline.grading.references.signs import turned_round
+from pipeline.grading.references.signs import accept_reversed_signs
 from pipeline.grading.references.springs import with_all_springs
 from pipeline.grading.references.tolerance import rounding, with_total
 from pipeline.grading.rubric import Rubric
+from pipeline.identify.bad_recordings import find_bad_recordings
 from pipeline.ingest.columns import is_count
 from pipeline.ingest.formats.headings import conversion
 from pipeline.results import Analysis
-from pipeline.soundness.bad_recordings import find_bad_recordings
-from pipeline.submission import (
-    Experiment,
-    InputScale,
-    PositionScale,
-    Reported,
-    Submission,
-    System,
-)
+from pipeline.submission import Experiment, InputScale, PositionScale, Reported, Submission, System
 from pipeline.words.progress import Progress, silent
 from pipeline.workflow import analyse
 
@@ -171,13 +164,13 @@ def grade_analysis(
 
 def prepare_work(
     submission: Submission, analysis: Analysis, *, rubric: Rubric
-) -> tuple[Work, tuple[Flag, ...], tuple[str, ...]]:
+) -> tuple[GradingContext, tuple[Flag, ...], tuple[str, ...]]:
     """Return the input to the checks, all flags in the order of `CODES`, and notes.
 
     The notes say whether reported signs were reversed, because the recordings have the opposite
     sign, and whether the recordings contradict a stated unit.
     """
-    reported, signed = turned_round(submission.reported or Reported(), analysis.records)
+    reported, signed = accept_reversed_signs(submission.reported or Reported(), analysis.records)
     submission = submission.model_copy(update={"reported": reported})
     work, flags_so_far = _prepare(submission, analysis, rubric=rubric)
     more, meant = _flags(work)
@@ -188,7 +181,7 @@ def prepare_work(
 
 def _prepare(
     submission: Submission, analysis: Analysis, *, rubric: Rubric
-) -> tuple[Work, tuple[Flag, ...]]:
+) -> tuple[GradingContext, tuple[Flag, ...]]:
     """Return the input to the checks, and the flags of the parameter tables."""
     reported, n = submission.reported or Reported(), rubric.system.carts
     measured, chain = in_scale(
@@ -221,7 +214,7 @@ def _prepare(
         tables=tables,
         orders=[order, *swapped_order(diagnosis.slipped["final"], n=n)],
     )
-    work = Work(
+    work = GradingContext(
         submission=submission,
         analysis=analysis,
         rubric=rubric,
@@ -305,26 +298,26 @@ def _under_calibration(experiment: Experiment, system: System) -> Experiment:
 # ------------------------------------------------------------------------------- flags
 
 
-def _flags(work: Work) -> tuple[list[Flag], Array | None]:
+def _flags(context: GradingContext) -> tuple[list[Flag], Array | None]:
     """Return the flags that do not concern the parameter tables, and the gains that were meant.
 
     On a nonlinear bench, no single chain reproduces all recordings. Then only the zeros and ones of
     A and B are judged, and the controller is not.
     """
-    flags, space, linear = [], work.reported.state_space, is_linear(work.analysis)
+    flags, space, linear = [], context.reported.state_space, is_linear(context.analysis)
     meant = None
     if space is not None and space.A:
-        n = work.rubric.system.carts
-        entries = [entry for entry in work.entries if linear or entry.kind == "exact"]
+        n = context.rubric.system.carts
+        entries = [entry for entry in context.entries if linear or entry.kind == "exact"]
         flags += diagnose_state_space(
-            space, entries, models=work.state_models, n=n, order=work.order
+            space, entries, models=context.state_models, n=n, order=context.order
         )
-    if work.controller is not None and linear:
-        of_loop, meant = diagnose_controller(work.controller)
+    if context.controller is not None and linear:
+        of_loop, meant = diagnose_controller(context.controller)
         flags += of_loop
-    flags += diagnose_reduced(work.analysis)
-    if work.missing:
-        flags.append(missing_flag(work.missing, work.rubric))
-    if work.bad:
-        flags.append(data_flag(work.bad))
+    flags += diagnose_reduced(context.analysis)
+    if context.missing:
+        flags.append(missing_flag(context.missing, context.rubric))
+    if context.bad:
+        flags.append(data_flag(context.bad))
     return flags, meant

@@ -26,7 +26,7 @@ _COUNTS = [pair for k in range(1, 11) for pair in ((k + 1, k), (k, k + 1))]
 _POWERS = [pair for p in (10, 100, 1000) for pair in ((p, 1), (1, p))]
 
 Numbers = Mapping[str, Reference]
-Kind = tuple[tuple[str, ...], tuple[int, int]]  # the keys of the advice, and the ratio
+ExplanationKey = tuple[tuple[str, ...], tuple[int, int]]  # the keys of the advice, and the ratio
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +65,7 @@ class Mistake:
     base: "Mistake | None" = None
 
     @property
-    def kind(self) -> Kind:
+    def kind(self) -> ExplanationKey:
         """What is the same for all variants of a mistake; they concern different numbers."""
         return self.advice_keys, self.ratio
 

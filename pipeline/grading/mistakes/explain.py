@@ -8,7 +8,7 @@ from typing import Literal
 
 from pipeline.grading import limits
 from pipeline.grading.grade import Code
-from pipeline.grading.mistakes.catalogue import Kind, Mistake
+from pipeline.grading.mistakes.catalogue import ExplanationKey, Mistake
 from pipeline.grading.references.reference import Reference
 from pipeline.grading.references.tolerance import Typed
 from pipeline.names import read_name
@@ -208,7 +208,7 @@ class _Tried:
 
 def _by_way(tried: Sequence[_Tried]) -> list[list[_Tried]]:
     """Group the variants of each mistake; they concern different numbers."""
-    ways: dict[Kind, list[_Tried]] = {}
+    ways: dict[ExplanationKey, list[_Tried]] = {}
     for one in tried:
         ways.setdefault(one.mistake.kind, []).append(one)
     return [*ways.values()]

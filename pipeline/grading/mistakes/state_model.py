@@ -21,7 +21,7 @@ from pipeline.plant.chain import Chain
 from pipeline.plant.identities import recover_from_parameters
 from pipeline.submission import ReportedStateSpace
 
-Kind = Literal["exact", "stiffness", "damping"]
+EntryKind = Literal["exact", "stiffness", "damping"]
 
 _NAMED = 3  # largest number of carts whose named parameters determine the chain
 _MODES = ("omega_a", "omega_b", "omega_c")
@@ -57,7 +57,7 @@ class MatrixEntry:
 
     name: str
     at: tuple[int, int]
-    kind: Kind
+    kind: EntryKind
     typed: Decimal
     right: tuple[float, ...]
     error: Fraction
@@ -315,8 +315,8 @@ def own_chain(values: Mapping[str, float], *, n: int) -> Chain | None:
     return chain if finite and np.all(chain.m > 0) else None
 
 
-def _kinds(n: int) -> list[list[Kind]]:
-    kinds: list[list[Kind]] = [["exact"] * (2 * n + 1) for _ in range(2 * n)]
+def _kinds(n: int) -> list[list[EntryKind]]:
+    kinds: list[list[EntryKind]] = [["exact"] * (2 * n + 1) for _ in range(2 * n)]
     for i in range(n):
         for j in (i - 1, i, i + 1):
             if 0 <= j < n:
@@ -335,7 +335,7 @@ def _matrix(space: ReportedStateSpace, n: int) -> dict[tuple[int, int], Decimal]
     return typed | {(i, 2 * n): value for i, value in enumerate(space.B)}
 
 
-def _entry_error(typed: Decimal, right: float, kind: Kind, *, slack: float = 0.0) -> Fraction:
+def _entry_error(typed: Decimal, right: float, kind: EntryKind, *, slack: float = 0.0) -> Fraction:
     if kind == "exact":
         return Fraction(0) if abs(float(typed) - right) <= limits.EXACT else Fraction(10**6)
     if right == 0:
@@ -468,7 +468,7 @@ def _slip(
 
 
 def _met(
-    typed: Mapping[tuple[int, int], Decimal], slipped: Array, kinds: Sequence[Sequence[Kind]]
+    typed: Mapping[tuple[int, int], Decimal], slipped: Array, kinds: Sequence[Sequence[EntryKind]]
 ) -> bool:
     """Return whether all typed entries match the [A B] that a mistake gives."""
     return all(

@@ -6,7 +6,7 @@ from decimal import Decimal
 
 from pipeline.grading import limits
 from pipeline.grading.grade import Code, Flag
-from pipeline.grading.mistakes.catalogue import Kind, Mistake, known_mistakes
+from pipeline.grading.mistakes.catalogue import ExplanationKey, Mistake, known_mistakes
 from pipeline.grading.mistakes.explain import ExplainedNumbers, Explanation, Label, Table, explain
 from pipeline.grading.mistakes.impossible import BrokenOrder, broken_orders, not_positive
 from pipeline.grading.mistakes.table_flags import (
@@ -284,7 +284,7 @@ def _judge(
     references: References,
     analysis: Analysis,
     copied: Sequence[str],
-    before: Collection[Kind] = (),
+    before: Collection[ExplanationKey] = (),
 ) -> _Judged:
     """Compare one table with the recordings.
 

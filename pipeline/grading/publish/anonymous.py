@@ -9,8 +9,8 @@ from dataclasses import replace
 from typing import Any
 
 from pipeline.grading.grade import Flag, Grade
-from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.gradebook.class_lines import Line
+from pipeline.grading.gradebook.class_lines import GradeSummary
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.history import FAILED, Event
 from pipeline.grading.similarity.flag import shared_message
 from pipeline.output import csv_text
@@ -66,12 +66,12 @@ def anonymise(grade: Grade, names: Mapping[str, str]) -> Grade:
     return grade.model_copy(update=hidden)
 
 
-def anonymous_line(line: Line, names: Mapping[str, str]) -> Line:
+def anonymous_line(line: GradeSummary, names: Mapping[str, str]) -> GradeSummary:
     """Return the line of a submission under its pseudonym, without authors."""
     return line.model_copy(update=_hidden_names(line, names))
 
 
-def _hidden_names(grade: Grade | Line, names: Mapping[str, str]) -> dict[str, object]:
+def _hidden_names(grade: Grade | GradeSummary, names: Mapping[str, str]) -> dict[str, object]:
     own = names[grade.submission]
     reason = hidden_reason(grade.reason, grade.submission, own)
     return {"submission": own, "authors": (), "reason": reason}
@@ -109,7 +109,7 @@ def key_text(names: Mapping[str, str], authors: Mapping[str, tuple[str, ...]]) -
     return csv_text(("anonymous", "submission", "authors"), rows)
 
 
-def meant(book: Gradebook, team: str) -> str:
+def resolve_pseudonym(book: Gradebook, team: str) -> str:
     """Return the submission that a pseudonym stands for; any other name is returned unchanged."""
     if not is_pseudonym(team):
         return team
@@ -125,7 +125,7 @@ def history_of(book: Gradebook, team: str) -> tuple[str, list[Event]]:
     ------
     ConfigError : there is no such submission, or there are several.
     """
-    name = meant(book, team)
+    name = resolve_pseudonym(book, team)
     submission, events = book.history(name, named=not is_pseudonym(team))
     return (submission, events) if name == team else (team, renamed_events(events, name, team))
 

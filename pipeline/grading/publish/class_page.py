@@ -11,12 +11,12 @@ import numpy as np
 
 from pipeline import __version__
 from pipeline.grading.grade import CODES, Code
-from pipeline.grading.gradebook.class_lines import Line, class_frame, wrong_springs
+from pipeline.grading.gradebook.class_lines import GradeSummary, class_frame, wrong_springs
 from pipeline.grading.references.tolerance import exact
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.clusters import Cluster
 from pipeline.grading.similarity.distant import Distant
-from pipeline.grading.similarity.doubles import Double
+from pipeline.grading.similarity.repeated_authors import RepeatedAuthors
 from pipeline.grading.words import WORDS, on_one_line, points_text, signed_points
 from pipeline.report.document import (
     Block,
@@ -45,10 +45,10 @@ _NAMED = 8  # largest number of submissions or recordings in one row
 
 
 def class_page(
-    lines: Sequence[Line],
+    lines: Sequence[GradeSummary],
     *,
     rubric: Rubric,
-    doubles: Sequence[Double] = (),
+    repeated_authors: Sequence[RepeatedAuthors] = (),
     clusters: Sequence[Cluster] = (),
     distant: Sequence[Distant] = (),
 ) -> str:
@@ -63,7 +63,7 @@ def class_page(
             lambda page: [
                 *_board(lines, points, rubric),
                 *_points(page, points, rubric),
-                *_to_look_at(lines, doubles, distant),
+                *_to_look_at(lines, repeated_authors, distant),
             ],
         ),
         ("mistakes", "Most common mistakes", lambda page: _mistakes(page, lines)),
@@ -81,7 +81,7 @@ def class_page(
     return render_html(document)
 
 
-def _board(lines: Sequence[Line], points: "pd.Series", rubric: Rubric) -> list[Block]:
+def _board(lines: Sequence[GradeSummary], points: "pd.Series", rubric: Rubric) -> list[Block]:
     failed = [line for line in lines if line.status == "failed"]
     tiles = [
         Tile(spans("Submissions"), spans(str(len(lines))), url="#class" if lines else ""),
@@ -104,7 +104,7 @@ def _board(lines: Sequence[Line], points: "pd.Series", rubric: Rubric) -> list[B
 
 
 def _to_look_at(
-    lines: Sequence[Line], doubles: Sequence[Double], distant: Sequence[Distant]
+    lines: Sequence[GradeSummary], doubles: Sequence[RepeatedAuthors], distant: Sequence[Distant]
 ) -> list[Block]:
     """Return what to look at: springs, failures, authors in several teams, unusual carts."""
     failed = [line for line in lines if line.status == "failed"]
@@ -131,7 +131,7 @@ def _to_look_at(
     return blocks
 
 
-def not_final(lines: Sequence[Line]) -> str:
+def not_final(lines: Sequence[GradeSummary]) -> str:
     """Return how many submissions a person has yet to grade, and where; "" if all are final."""
     waiting = Counter(id_ for line in lines for id_ in line.open)
     if not waiting:
@@ -141,7 +141,7 @@ def not_final(lines: Sequence[Line]) -> str:
     return WORDS.text("not_final", submissions=n, criteria=named)
 
 
-def _by_hand(line: Line) -> str:
+def _by_hand(line: GradeSummary) -> str:
     return f" ({points_text(line.points)} points by hand)" if line.by_hand else ""
 
 
@@ -195,7 +195,7 @@ def _criteria(page: PageBuilder, graded: "pd.DataFrame", rubric: Rubric) -> list
     return [page.picture("difficulty", figure, WORDS, "difficulty", **told), table]
 
 
-def _mistakes(page: PageBuilder, lines: Sequence[Line]) -> list[Block]:
+def _mistakes(page: PageBuilder, lines: Sequence[GradeSummary]) -> list[Block]:
     """Return the table of flags, the most common first."""
     import pandas as pd
 
@@ -221,7 +221,9 @@ def _mistakes(page: PageBuilder, lines: Sequence[Line]) -> list[Block]:
     return [page.table(WORDS, "class_remarks", rows, "lrrl")]
 
 
-def _shared(page: PageBuilder, lines: Sequence[Line], clusters: Sequence[Cluster]) -> list[Block]:
+def _shared(
+    page: PageBuilder, lines: Sequence[GradeSummary], clusters: Sequence[Cluster]
+) -> list[Block]:
     """Return the table of what is shared, grouped by clusters of submissions."""
     if not clusters:
         return []
@@ -242,14 +244,14 @@ def _listed(links: Sequence[Span]) -> list[str | Span]:
     return [*text, f" and {more} more"] if more > 0 else text
 
 
-def _everybody(page: PageBuilder, lines: Sequence[Line]) -> list[Block]:
+def _everybody(page: PageBuilder, lines: Sequence[GradeSummary]) -> list[Block]:
     if not lines:
         return []
     table = page.table(WORDS, "everybody", map(_row, lines), "llrrrll")
     return [replace(table, finder=True)]
 
 
-def _row(line: Line) -> list[Cell | str | Spans]:
+def _row(line: GradeSummary) -> list[Cell | str | Spans]:
     failed = line.status == "failed"
     share = 100 * exact(line.points) / exact(line.out_of) if line.out_of else 0
     return [
@@ -265,7 +267,7 @@ def _row(line: Line) -> list[Cell | str | Spans]:
     ]
 
 
-def _hand_text(line: Line) -> str:
+def _hand_text(line: GradeSummary) -> str:
     """Return what a person has changed, and what a person still has to grade."""
     given = [own.criterion for own in line.overrides]
     given += [f"total {signed_points(one.points)} ({clean(one.why)})" for one in line.adjustments]

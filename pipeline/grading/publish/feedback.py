@@ -31,7 +31,7 @@ from pipeline.report.document import (
     paragraph,
 )
 from pipeline.report.render.html import render_html
-from pipeline.set_up import Units
+from pipeline.setup import Units
 from pipeline.words.numbers import NOTHING, percent, significant, typeset, unit_text
 from pipeline.words.numbers import count as counted
 from pipeline.words.spans import Span, spans

@@ -11,15 +11,19 @@ from pathlib import Path
 
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, grade_text
-from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.gradebook.class_lines import Line
+from pipeline.grading.gradebook.class_lines import GradeSummary
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.publish.anonymous import KEY_FILE, STRANGER, anonymise, key_text, pseudonyms
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.feedback import feedback_page
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.clusters import find_clusters, renamed
 from pipeline.grading.similarity.distant import Quantity, find_distant, recomputed_numbers
-from pipeline.grading.similarity.doubles import Double, find_doubles, with_recordings
+from pipeline.grading.similarity.repeated_authors import (
+    RepeatedAuthors,
+    find_repeated_authors,
+    with_recordings,
+)
 from pipeline.grading.words import on_one_line
 from pipeline.output import csv_text, own_folder, write_file
 from pipeline.resources import TEMPLATES
@@ -34,7 +38,9 @@ _BEFORE = ("submission", "authors", "status", "points", "out_of", "days_late", "
 _AFTER = ("remarks", "by_hand", "reason", "adjusted", "open")
 
 
-def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) -> list[Double]:
+def write_outputs(
+    book: Gradebook, out: Path, *, progress: Progress = silent
+) -> list[RepeatedAuthors]:
     """Write the output files of a gradebook into a folder.
 
     Returns the people who are authors of several submissions. If the rubric is `anonymous`, all
@@ -47,7 +53,7 @@ def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) ->
     folder.mkdir(parents=True, exist_ok=True)
     made_of = _read_made(folder)
     layout = _digest_layout(rubric)
-    lines: list[Line] = []
+    lines: list[GradeSummary] = []
     now_of: dict[str, str] = {}
     gradings: dict[str, int] = {}
     authors: dict[str, tuple[str, ...]] = {}
@@ -58,7 +64,7 @@ def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) ->
             (entry.submission, flag) for flag in entry.grade.flags if flag.code == "shared_data"
         )
         grade = anonymise(entry.grade, names) if names is not None else entry.grade
-        lines.append(Line.of(grade))
+        lines.append(GradeSummary.of(grade))
         numbers[grade.submission] = recomputed_numbers(grade, rubric=rubric)
         gradings[entry.submission], authors[entry.submission] = entry.grading, entry.grade.authors
         now_of[grade.submission] = _digest(layout, entry.key, repr(grade))
@@ -82,7 +88,7 @@ def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) ->
         lines.sort(key=lambda line: line.submission)
     _remove_stale(folder, keep=set(now_of))
     write_file(out / "grades.csv", grades_csv(lines, rubric=rubric))
-    doubles = doubles_of(book, authors, gradings=gradings, names=names)
+    doubles = repeated_authors_of(book, authors, gradings=gradings, names=names)
     clusters = find_clusters(shared)
     if names is not None:
         clusters = renamed(clusters, names, other=STRANGER)
@@ -90,7 +96,9 @@ def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) ->
     whole = lines, doubles, clusters, distant
     now_of[_WHOLE] = _digest(layout, repr(whole), *now_of.values())
     if made_of.get(_WHOLE) != now_of[_WHOLE] or not (out / _CLASS).is_file():
-        page = class_page(lines, rubric=rubric, doubles=doubles, clusters=clusters, distant=distant)
+        page = class_page(
+            lines, rubric=rubric, repeated_authors=doubles, clusters=clusters, distant=distant
+        )
         write_file(out / _CLASS, page)
     write_file(
         folder / _MADE, json.dumps(now_of, indent=0, ensure_ascii=False, sort_keys=True) + "\n"
@@ -98,13 +106,13 @@ def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) ->
     return doubles
 
 
-def doubles_of(
+def repeated_authors_of(
     book: Gradebook,
     authors: Mapping[str, Sequence[str]],
     *,
     gradings: Mapping[str, int],
     names: Mapping[str, str] | None,
-) -> list[Double]:
+) -> list[RepeatedAuthors]:
     """Return the people who are authors of several submissions.
 
     Parameters
@@ -112,9 +120,9 @@ def doubles_of(
     authors, gradings : for each submission, its authors and the number of its grading.
     names : pseudonyms by submission; None to show real names.
     """
-    found = find_doubles(authors)
+    found = find_repeated_authors(authors)
     concerned = dict.fromkeys(name for double in found for name in double.submissions)
-    found = with_recordings(found, book.prints([gradings[name] for name in concerned]))
+    found = with_recordings(found, book.fingerprints([gradings[name] for name in concerned]))
     if names is None:
         return found
     return sorted(
@@ -130,7 +138,7 @@ def doubles_of(
     )
 
 
-def grades_csv(lines: Sequence[Line], *, rubric: Rubric) -> str:
+def grades_csv(lines: Sequence[GradeSummary], *, rubric: Rubric) -> str:
     """Return `grades.csv`: one row per submission, one column per criterion."""
     taken = {*_BEFORE, *_AFTER}
     ids = [criterion.id for criterion in rubric.criteria]

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.grading.grade import Grade
-from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.override import with_overrides
 from pipeline.grading.gradebook.rows import Entry
-from pipeline.grading.judge.reweigh import needs_recordings, read_findings, reweigh
-from pipeline.grading.judge.work import Judgement
+from pipeline.grading.judge.context import Judgement
+from pipeline.grading.judge.recompute import needs_recordings, read_findings, recompute_points
 from pipeline.grading.rubric import Rubric
 from pipeline.words.progress import Progress, silent
 
@@ -128,7 +128,7 @@ def _usable(text: str, before: Rubric, now: Rubric) -> Mapping[str, Judgement]:
 
 
 def _compared(entry: Entry, found: Mapping[str, Judgement], rubric: Rubric) -> TeamChange:
-    weighed = reweigh(entry.grade, found, rubric=rubric)
+    weighed = recompute_points(entry.grade, found, rubric=rubric)
     after = with_overrides(weighed, entry.overrides, rubric=rubric, adjustments=entry.adjustments)
     had, has = _points(entry.grade), _points(after)
     return TeamChange(

@@ -14,7 +14,9 @@ _NOTE = (
 )
 
 
-def turned_round(reported: Reported, records: Sequence[Record]) -> tuple[Reported, tuple[str, ...]]:
+def accept_reversed_signs(
+    reported: Reported, records: Sequence[Record]
+) -> tuple[Reported, tuple[str, ...]]:
     """Return the numbers as reported on a bench that is not reversed, and a note if any changed.
 
     On a reversed bench, gains, B and the controller have the opposite sign in the log. Students may

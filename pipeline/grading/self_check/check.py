@@ -6,24 +6,12 @@ from dataclasses import dataclass
 from pipeline.errors import SubmissionError
 from pipeline.grading.grade import Flag
 from pipeline.grading.judge.checks import judge
+from pipeline.grading.judge.context import GradingContext
 from pipeline.grading.judge.run import analyse_under, prepare_work
-from pipeline.grading.judge.work import Work
-from pipeline.grading.rubric import (
-    Claims,
-    Gains,
-    Parameters,
-    Prefilter,
-    Rubric,
-    StateModel,
-)
+from pipeline.grading.rubric import Claims, Gains, Parameters, Prefilter, Rubric, StateModel
 from pipeline.grading.rubric_file import shipped_rubric
 from pipeline.grading.self_check.hints import find_hint
-from pipeline.grading.self_check.log import (
-    CheckAnswer,
-    find_basis,
-    read_answers,
-    write_answer,
-)
+from pipeline.grading.self_check.log import CheckAnswer, find_basis, read_answers, write_answer
 from pipeline.lock import lock_when_free
 from pipeline.results import Analysis
 from pipeline.submission import Reported, Submission
@@ -82,7 +70,7 @@ def check_numbers(
 class JudgedNumbers:
     """The reported numbers by outcome, and what is needed for hints."""
 
-    work: Work
+    context: GradingContext
     flags: Sequence[Flag]
     disagree: tuple[str, ...]
     agree: tuple[str, ...]
@@ -109,7 +97,7 @@ def judge_numbers(submission: Submission, analysis: Analysis, *, rubric: Rubric)
     entries = [number for number in agrees if number.startswith("state_space.")]
     listed = [n for n in reported if n != "state_space" or not entries] + entries
     return JudgedNumbers(
-        work=work,
+        context=work,
         flags=flags,
         disagree=tuple(n for n in listed if agrees.get(n) is False),
         agree=tuple(n for n in listed if agrees.get(n)),

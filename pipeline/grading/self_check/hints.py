@@ -9,18 +9,18 @@ from collections.abc import Iterator, Sequence
 from typing import get_args
 
 from pipeline.grading.grade import CODES, Flag
-from pipeline.grading.judge.work import Work
-from pipeline.grading.self_check.log import Hint, Part, Slip, Stretch
+from pipeline.grading.judge.context import GradingContext
+from pipeline.grading.self_check.log import Hint, MistakeKind, Part, RecordingPart
 from pipeline.names import read_name
-from pipeline.results import Analysis, Kind
+from pipeline.results import Analysis, ExperimentKind
 
 _TABLES = ("initial", "final")
 # Mistakes in reading a decay or a step. If a final table has one, the hint names decays and steps.
-_OF_TIME_RECORDS: tuple[Slip, ...] = ("peak_count", "log10_for_ln", "peak_for_steady_state")
+_OF_TIME_RECORDS: tuple[MistakeKind, ...] = ("peak_count", "log10_for_ln", "peak_for_steady_state")
 # Mistakes that no part of a recording can show.
-_OF_NO_RECORD: tuple[Slip, ...] = ("physically_impossible", "no_fit_done")
-_IN_FREQUENCY: tuple[Kind, ...] = ("sine", "sweep", "bode")
-_OF_LOOP: dict[str, Slip] = {
+_OF_NO_RECORD: tuple[MistakeKind, ...] = ("physically_impossible", "no_fit_done")
+_IN_FREQUENCY: tuple[ExperimentKind, ...] = ("sine", "sweep", "bode")
+_OF_LOOP: dict[str, MistakeKind] = {
     "gains": "wrong_gains",
     "prefilter": "wrong_prefilter",
     "overshoot_percent": "claims_off",
@@ -28,7 +28,7 @@ _OF_LOOP: dict[str, Slip] = {
 }
 
 
-def find_hint(number: str, work: Work, flags: Sequence[Flag]) -> Hint:
+def find_hint(number: str, context: GradingContext, flags: Sequence[Flag]) -> Hint:
     """Return a hint for a number that disagrees.
 
     Parameters
@@ -46,11 +46,13 @@ def find_hint(number: str, work: Work, flags: Sequence[Flag]) -> Hint:
         number=number,
         slip=slip,
         or_else=or_else,
-        stretches=tuple(_find_stretches(table, name, slip, work.analysis)),
+        stretches=tuple(_find_stretches(table, name, slip, context.analysis)),
     )
 
 
-def _find_slip(table: str, name: str, flags: Sequence[Flag]) -> tuple[Slip, tuple[Slip, ...]]:
+def _find_slip(
+    table: str, name: str, flags: Sequence[Flag]
+) -> tuple[MistakeKind, tuple[MistakeKind, ...]]:
     mine = [flag for flag in flags if _is_about(flag, table, name)]
     # A mistake in one table is a better hint than a difference between the tables.
     mine.sort(key=lambda flag: flag.code == "initial_final_disagree")
@@ -67,7 +69,9 @@ def _is_about(flag: Flag, table: str, name: str) -> bool:
     return table in tables or flag.code == "initial_final_disagree"
 
 
-def _find_stretches(table: str, name: str, slip: Slip, analysis: Analysis) -> Iterator[Stretch]:
+def _find_stretches(
+    table: str, name: str, slip: MistakeKind, analysis: Analysis
+) -> Iterator[RecordingPart]:
     """Yield the parts of recordings in which a mistake in a number can be seen."""
     if slip in _OF_NO_RECORD:
         return
@@ -78,11 +82,13 @@ def _find_stretches(table: str, name: str, slip: Slip, analysis: Analysis) -> It
             return
     part: Part = "beginning" if slip == "transient_used" else "whole"
     kinds = _find_kinds(analysis)
-    every: list[tuple[str, Kind, Part]] = [(run, kind, part) for run, kind in kinds.items()]
+    every: list[tuple[str, ExperimentKind, Part]] = [
+        (run, kind, part) for run, kind in kinds.items()
+    ]
     yield from _gather([one for one in every if one[1] in _IN_FREQUENCY] or every)
 
 
-def _list_readings(name: str, analysis: Analysis) -> Iterator[tuple[str, Kind, Part]]:
+def _list_readings(name: str, analysis: Analysis) -> Iterator[tuple[str, ExperimentKind, Part]]:
     """Yield experiment, kind and part of each recording from which a first estimate is read."""
     read = read_name(name)
     if read.is_by_eye and read.suffix != "n":
@@ -102,9 +108,9 @@ def _list_readings(name: str, analysis: Analysis) -> Iterator[tuple[str, Kind, P
                 yield run, kinds.get(run, "decay"), _name_part(run, window, analysis)
 
 
-def _find_kinds(analysis: Analysis) -> dict[str, Kind]:
+def _find_kinds(analysis: Analysis) -> dict[str, ExperimentKind]:
     """Return the kind of every recording, and of each table that the students reduced."""
-    kinds: dict[str, Kind] = {}
+    kinds: dict[str, ExperimentKind] = {}
     for response in analysis.frequency_responses:
         kinds |= dict.fromkeys(response.experiments, "bode")
     for record in analysis.records:
@@ -130,10 +136,10 @@ def _name_part(run: str, window: tuple[float, float], analysis: Analysis) -> Par
     return "middle" if start >= 0.2 and end <= 0.8 else "whole"
 
 
-def _gather(parts: Sequence[tuple[str, Kind, Part]]) -> Iterator[Stretch]:
+def _gather(parts: Sequence[tuple[str, ExperimentKind, Part]]) -> Iterator[RecordingPart]:
     """Yield the parts; recordings of the same kind and part are named together."""
-    order = [(kind, part) for kind in get_args(Kind) for part in get_args(Part)]
+    order = [(kind, part) for kind in get_args(ExperimentKind) for part in get_args(Part)]
     for kind, part in order:
         runs = tuple(dict.fromkeys(run for run, k, p in parts if (k, p) == (kind, part)))
         if runs:
-            yield Stretch(kind=kind, recordings=runs, part=part)
+            yield RecordingPart(kind=kind, recordings=runs, part=part)

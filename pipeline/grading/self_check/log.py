@@ -13,7 +13,7 @@ from pydantic import ConfigDict, Field, ValidationError
 from pipeline.errors import SubmissionError
 from pipeline.grading.grade import Code, GradeTable
 from pipeline.output import write_file
-from pipeline.results import Kind
+from pipeline.results import ExperimentKind
 from pipeline.submission import Submission
 from pipeline.submission.load import file_problem
 
@@ -21,16 +21,16 @@ FILE = "checks.jsonl"
 MAX_BYTES = 5_000_000  # bytes; enough for several thousand requests
 
 Part = Literal["whole", "beginning", "first_half", "middle", "second_half", "end"]
-Slip = Code | Literal["claims_off"]
+MistakeKind = Code | Literal["claims_off"]
 
 
-class Stretch(GradeTable):
+class RecordingPart(GradeTable):
     """A part of a recording, or the same part of several recordings of one kind.
 
     All sine dwells are named, because a single one would reveal a resonance.
     """
 
-    kind: Kind
+    kind: ExperimentKind
     recordings: tuple[str, ...]
     part: Part
 
@@ -39,11 +39,11 @@ class Hint(GradeTable):
     """Where to look for one number."""
 
     number: str
-    slip: Annotated[Slip, Field(description="the kind of mistake")]
+    slip: Annotated[MistakeKind, Field(description="the kind of mistake")]
     or_else: Annotated[
-        tuple[Slip, ...], Field(description="another mistake that explains it equally well")
+        tuple[MistakeKind, ...], Field(description="another mistake that explains it equally well")
     ] = ()
-    stretches: tuple[Stretch, ...] = ()
+    stretches: tuple[RecordingPart, ...] = ()
 
 
 class CheckAnswer(GradeTable):

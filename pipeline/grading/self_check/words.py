@@ -5,7 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import SubmissionError
-from pipeline.grading.self_check.log import CheckAnswer, Hint, Slip, Stretch, read_answers
+from pipeline.grading.self_check.log import (
+    CheckAnswer,
+    Hint,
+    MistakeKind,
+    RecordingPart,
+    read_answers,
+)
 from pipeline.grading.words import WORDS as GRADING
 from pipeline.words.numbers import count
 from pipeline.words.phrases import phrases
@@ -62,12 +68,12 @@ def hint_words(hint: Hint) -> HintWords:
     return HintWords(title=_slip_text("title", hint.slip), look=tuple(look))
 
 
-def _slip_text(what: str, slip: Slip) -> str:
+def _slip_text(what: str, slip: MistakeKind) -> str:
     key = f"{what}_{slip}"
     return (WORDS if key in WORDS.by_key else GRADING).text(key)
 
 
-def _stretch_text(stretch: Stretch) -> str:
+def _stretch_text(stretch: RecordingPart) -> str:
     part = WORDS.text(f"part_{stretch.part}")
     if len(stretch.recordings) == 1:
         return WORDS.text("stretch_one", runs=stretch.recordings[0], part=part)

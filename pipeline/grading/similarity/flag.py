@@ -5,7 +5,7 @@ from dataclasses import asdict
 from typing import Any
 
 from pipeline.grading.grade import Flag
-from pipeline.grading.similarity.shared import SharedRecord
+from pipeline.grading.similarity.copies import SharedRecord
 from pipeline.grading.similarity.tables import SharedTable
 from pipeline.words.numbers import first_few, listing
 

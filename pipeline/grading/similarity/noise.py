@@ -18,8 +18,8 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.grading.similarity.likeness import Likeness
-from pipeline.grading.similarity.prints import EVERY, Print
+from pipeline.grading.similarity.fingerprints import EVERY, Fingerprint
+from pipeline.grading.similarity.matching import Match
 from pipeline.grading.similarity.releases import Delay, is_decay
 
 _BANDS = ((0.2, 0.3), (0.3, 0.4), (0.4, 0.5))  # cycles per sample, above the fingerprint's corner
@@ -52,7 +52,7 @@ class Heard:
         first band are omitted.
     """
 
-    print: Print
+    print: Fingerprint
     length: int
 
     @property
@@ -93,7 +93,7 @@ class Agreement:
     delay : the same for two decays that are one motion, to a part of a sample.
     """
 
-    prints: tuple[Print, Print]
+    fingerprints: tuple[Fingerprint, Fingerprint]
     sigmas: Array
     shift: int
     delay: Delay | None = None
@@ -101,14 +101,14 @@ class Agreement:
     @property
     def is_decay(self) -> bool:
         """Whether a hand released the cart."""
-        return is_decay(self.prints[0].group)
+        return is_decay(self.fingerprints[0].group)
 
-    def likeness_of(self, sigmas: float) -> Likeness:
+    def match_of(self, sigmas: float) -> Match:
         """Return the agreement as a similarity of two recordings."""
-        a, b = self.prints
+        a, b = self.fingerprints
         first = max(0, -self.shift)
         last = min(a.residual.shape[1], b.residual.shape[1] - self.shift)
-        return Likeness(
+        return Match(
             experiments=(a.experiment, b.experiment),
             times=(a.times(first, last), b.times(first + self.shift, last + self.shift)),
             sigmas=sigmas,
@@ -116,20 +116,20 @@ class Agreement:
         )
 
     @property
-    def likeness(self) -> float:
+    def match_strength(self) -> float:
         """How likely it is that the two recordings correspond."""
         return float(self.sigmas @ self.sigmas) + 2 * _ANYWHERE * (self.delay is not None)
 
     def of(self, side: int) -> str:
         """Return the name of one of the recordings."""
-        return self.prints[side].experiment
+        return self.fingerprints[side].experiment
 
 
 def _first_line(length: int) -> int:
     return int(_BANDS[0][0] * length)
 
 
-def padded_length(prints: Sequence[Print]) -> int:
+def padded_length(prints: Sequence[Fingerprint]) -> int:
     """Return the length to which recordings of one group are padded."""
     from scipy.fft import next_fast_len
 
@@ -145,7 +145,7 @@ def agreements(
     ----------
     delays : the decays of the two that are one motion.
     """
-    released = {tuple(map(id, one.prints)): one for one in delays}
+    released = {tuple(map(id, one.fingerprints)): one for one in delays}
     found: list[Agreement] = []
     for group in sorted(a.keys() & b.keys()):
         pairs = [
@@ -154,9 +154,9 @@ def agreements(
             for other in b[group][:_MOST_EACH]
         ]
         used: set[int] = set()
-        for pair in sorted(pairs, key=lambda pair: -pair.likeness):
-            if used.isdisjoint(map(id, pair.prints)):
-                used.update(map(id, pair.prints))
+        for pair in sorted(pairs, key=lambda pair: -pair.match_strength):
+            if used.isdisjoint(map(id, pair.fingerprints)):
+                used.update(map(id, pair.fingerprints))
                 found.append(pair)
     return found
 
@@ -183,7 +183,7 @@ def _compared(a: Heard, b: Heard, delay: Delay | None) -> Agreement:
     if not is_decay(a.print.group) and total.max() > total[at] + _ANYWHERE:
         at = int(np.argmax(total))
     return Agreement(
-        prints=(a.print, b.print),
+        fingerprints=(a.print, b.print),
         sigmas=np.clip(sigmas[:, at].astype(float), -_MOST, _MOST),
         shift=int(shifts[at]),
         delay=delay,

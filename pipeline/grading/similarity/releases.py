@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.grading.similarity.prints import EVERY, Print
+from pipeline.grading.similarity.fingerprints import EVERY, Fingerprint
 
 _LEAST_OVERLAP = 0.6  # of the shorter decay
 _AT_REST = 8  # stored values at the end of a decay that give its rest point
@@ -42,7 +42,7 @@ class Delay:
     samples : sample i of the first corresponds to sample i + `samples` of the second.
     """
 
-    prints: tuple[Print, Print]
+    fingerprints: tuple[Fingerprint, Fingerprint]
     samples: float
 
     @property
@@ -54,7 +54,7 @@ class Delay:
 class Motion:
     """The motion of a decay, which is read between the stored values."""
 
-    def __init__(self, print_: Print):
+    def __init__(self, print_: Fingerprint):
         self.print = print_
         self.at = np.arange(print_.motion.size) * float(EVERY)
         self.values = print_.motion - print_.motion[-_AT_REST:].mean()
@@ -73,7 +73,7 @@ class Motion:
         for start in self._near(other, scale=scale)[:_MOST_DELAYS]:
             delay, at_scale, alike = self._refined(other, start)
             if alike > _SAME_MOTION and abs(abs(at_scale) / scale - 1) < _SAME_SCALE:
-                found.append(Delay(prints=(self.print, other.print), samples=delay))
+                found.append(Delay(fingerprints=(self.print, other.print), samples=delay))
         return found
 
     def _near(self, other: "Motion", *, scale: float) -> list[float]:
@@ -131,7 +131,7 @@ class Releases:
     prints : the submission's recordings by group.
     """
 
-    def __init__(self, prints: Mapping[str, Sequence[Print]]):
+    def __init__(self, prints: Mapping[str, Sequence[Fingerprint]]):
         self.decays = {
             group: [Motion(one) for one in found]
             for group, found in prints.items()
@@ -161,7 +161,11 @@ class Releases:
         ]
         chosen: list[Delay] = []
         for delay in sorted(found, key=lambda delay: np.min(delay.parts)):
-            if not any(x is y for c in chosen for x, y in zip(c.prints, delay.prints, strict=True)):
+            if not any(
+                x is y
+                for c in chosen
+                for x, y in zip(c.fingerprints, delay.fingerprints, strict=True)
+            ):
                 chosen.append(delay)
         return chosen
 

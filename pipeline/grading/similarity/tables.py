@@ -17,7 +17,7 @@ import numpy as np
 from pipeline.grading.grade import Grade
 from pipeline.grading.gradings import Member
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.similarity.shared import same_team
+from pipeline.grading.similarity.copies import same_team
 from pipeline.names import read_name
 
 _FEWEST_TEAMS = 5  # from which the spread of honest numbers is known

@@ -24,8 +24,8 @@ from pipeline.plant.law import (
     InputLaw,
     names_in,
 )
-from pipeline.plant.simulator.laws import settling
-from pipeline.set_up import Units
+from pipeline.plant.simulator.laws import hysteresis
+from pipeline.setup import Units
 
 _PHASE = 0.05  # rad of the fastest oscillation per step, for an error of 1e-4 in its period
 _LONGEST = 2e-4  # s
@@ -432,7 +432,7 @@ def _longest_step(model: AugmentedChain, free: Sequence[int]) -> float:
     step = 0.25 * SteppedBench(model, free=free).shortest_step
     cart = model.tables().cart
     for i, mass in enumerate(model.chain.m):
-        holds, _, pace = settling(cart, i, 1.0)
+        holds, _, pace = hysteresis(cart, i, 1.0)
         if holds > 0.0:
             step = min(step, _PHASE / np.sqrt(holds * pace / mass))
     return float(min(step, _LONGEST))

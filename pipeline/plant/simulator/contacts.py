@@ -1,12 +1,12 @@
 """Switching inside a step: end stops, springs past a stretch, both sides of a backlash."""
 
 from pipeline.plant.simulator.columns import Drive
-from pipeline.plant.simulator.laws import slack_of, stop_of
+from pipeline.plant.simulator.laws import bilinear_spring, end_stop
 
 # isort: off
 from pipeline.plant.simulator.compiler import jit
 from pipeline.plant.simulator.state import (
-    D2, D3, D4, D5, D6, FIX, PAST, V, X, pair, tie)  # fmt: skip
+    D2, D3, D4, D5, D6, FIX, PAST, V, X, pair, add_spring)  # fmt: skip
 
 
 @jit
@@ -43,7 +43,7 @@ def contact(which, tables):
     """
     n = tables.cart.shape[0]
     if which < n:
-        k, c, at = stop_of(tables.cart, which)
+        k, c, at = end_stop(tables.cart, which)
         return which, -1, 1.0 if at > 0.0 else -1.0, k, c, abs(at)
     side, drive = 1.0 if which == 2 * n + 1 else -1.0, tables.drive
     k, c = drive[Drive.BACKLASH_CONTACT_STIFFNESS], drive[Drive.BACKLASH_CONTACT_DAMPING]
@@ -51,7 +51,7 @@ def contact(which, tables):
 
 
 @jit
-def guard(which, active, tables, s, h):
+def contact_gap(which, active, tables, s, h):
     """Return how far past its switching point a switch is after a time h; it switches if > 0.
 
     Switches n to 2n are springs past a stretch, the others are contacts. A contact begins when the
@@ -61,7 +61,7 @@ def guard(which, active, tables, s, h):
     if n <= which <= 2 * n:
         j = which - n
         reach = (position(s, j, h) if j < n else 0.0) - (position(s, j - 1, h) if j > 0 else 0.0)
-        _, at, _ = slack_of(tables.spring, j)
+        _, at, _ = bilinear_spring(tables.spring, j)
         beyond = reach - at if at >= 0.0 else at - reach
         return -beyond if active else beyond
     body, other, side, k, c, reach = contact(which, tables)
@@ -75,14 +75,14 @@ def guard(which, active, tables, s, h):
 
 
 @jit
-def switch(which, sign, tables, s, K, C):
+def toggle_contact(which, sign, tables, s, K, C):
     """Add a contact or slack spring to the linear matrices (sign 1) or remove it (sign -1)."""
     n = tables.cart.shape[0]
     if n <= which <= 2 * n:
         j = which - n
-        more, at, _ = slack_of(tables.spring, j)
+        more, at, _ = bilinear_spring(tables.spring, j)
         k = sign * more
-        tie(K, j, n, k)
+        add_spring(K, j, n, k)
         s[PAST, j] += sign
         if j < n:
             s[FIX, j] += k * at

@@ -24,17 +24,19 @@ from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 from pipeline.plant.simulator.columns import DRY, Cart, Drive, Spring
-from pipeline.plant.simulator.contacts import guard, switch
-from pipeline.plant.simulator.sensitivity import bend_presliding, make_lanes, restart
+from pipeline.plant.simulator.contacts import contact_gap, toggle_contact
+from pipeline.plant.simulator.sensitivity import bend_presliding, make_sensitivities, restart
 from pipeline.plant.simulator.step import advance, smooth_forces
 from pipeline.plant.simulator.tables import Tables
 
 # isort: off
 from pipeline.plant.simulator.laws import (
-    arriving, cart_matrix, reach_of, settling, slack_of, spring_matrix, stop_of)  # fmt: skip
+    shaped_input, cart_matrix, longest_step, hysteresis, bilinear_spring,
+    spring_matrix, end_stop)  # fmt: skip
 from pipeline.plant.simulator.compiler import inlined, jit
 from pipeline.plant.simulator.state import (
-    ACC, FIX, FORCE, INV, MID_V, MID_X, ROWS, V, X, Z, Bodies, Push, pair, tie)  # fmt: skip
+    ACC, FIX, FORCE, INV, MID_V, MID_X, ROWS, V, X, Z, Bodies, Push,
+    pair, add_spring)  # fmt: skip
 
 _SERIES_REACH = 0.2  # omega h; with it, the sixth-order series has an error of 1e-8 after seconds
 _CONTACT_REACH = 0.4  # omega h inside a contact
@@ -129,8 +131,8 @@ def _assemble(tables, free, s, K, C, parent, switches):
         C[i, i] += cart[i, Cart.DAMPING] + damping
     for j in range(n + 1):
         stiffness, damping = spring_matrix(spring, j)
-        tie(K, j, n, spring[j, Spring.STIFFNESS] + stiffness)
-        tie(C, j, n, damping)
+        add_spring(K, j, n, spring[j, Spring.STIFFNESS] + stiffness)
+        add_spring(C, j, n, damping)
     N = n
     motor = -1
     if drive[Drive.BACKLASH_GAP] > 0.0 and free[0]:
@@ -150,9 +152,9 @@ def _assemble(tables, free, s, K, C, parent, switches):
     count = 0
     for which in range(2 * n + 3):
         if which < n:
-            there = stop_of(cart, which)[0] > 0.0
+            there = end_stop(cart, which)[0] > 0.0
         elif which <= 2 * n:
-            there = slack_of(spring, which - n)[0] != 0.0
+            there = bilinear_spring(spring, which - n)[0] != 0.0
         else:
             there = motor >= 0
         if there:
@@ -213,17 +215,17 @@ def _steps(tables, bodies, refine):
             row += abs(bodies.K[i, j])
         fastest = max(fastest, row * s[INV, i])
     for i in range(n):
-        presliding += settling(tables.cart, i, 0.0)[0]
+        presliding += hysteresis(tables.cart, i, 0.0)[0]
         for column in DRY:
             rubbing += tables.cart[i, column]
-        contact = max(contact, stop_of(tables.cart, i)[0] * s[INV, i])
+        contact = max(contact, end_stop(tables.cart, i)[0] * s[INV, i])
     for j in range(n + 1):
-        extra = slack_of(tables.spring, j)[0]
+        extra = bilinear_spring(tables.spring, j)[0]
         if extra > 0.0:
             # A spring that gets stiffer beyond its gap has the higher frequency.
             heavier = max(s[INV, j] if j < n else 0.0, s[INV, j - 1] if j > 0 else 0.0)
             fastest += extra * heavier
-    reach, smooth = reach_of(tables.cart, tables.spring, tables.drive)
+    reach, smooth = longest_step(tables.cart, tables.spring, tables.drive)
     # Springs, dampers and dry friction are exact for any step, so the limit is 4.5 ms.
     longest = min(4.5e-3, reach, _SERIES_REACH / sqrt(fastest + 1e-12))
     if motor >= 0:
@@ -265,7 +267,7 @@ def _bend(tables, bodies, lanes, scatter, u, smooth):
         s[MID_X, i], s[MID_V, i], s[FORCE, i] = s[X, i], s[V, i], s[FIX, i]
     smooth_forces(tables, bodies, u, 0.0, smooth)
     for i in range(n):
-        most, _, _ = settling(tables.cart, i, 0.0)
+        most, _, _ = hysteresis(tables.cart, i, 0.0)
         if most > 0.0:
             net = s[FORCE, i] + (u if i == 0 else 0.0)
             for j in range(N):
@@ -290,7 +292,7 @@ def _simulate(tables, bodies, run, start, lanes, y, dy):
     longest, contact_step, rubbing, presliding, smooth = _steps(tables, bodies, run.refine)
     dry = rubbing > 0.0
     for i in range(run.command.size):
-        held[0, i] = arriving(tables.drive, run.command[i])
+        held[0, i] = shaped_input(tables.drive, run.command[i])
         if i > 0:
             span = knots[i] - knots[i - 1]
             held[1, i] = held[1, i - 1] + held[0, i - 1] * span
@@ -305,10 +307,10 @@ def _simulate(tables, bodies, run, start, lanes, y, dy):
         _start_shot(bodies, run, start, lanes, shot)
         for e in range(bodies.switches.size):
             # A contact may be open or closed at the start.
-            if guard(bodies.switches[e], bodies.active[e], tables, s, 0.0) > 0.0:
+            if contact_gap(bodies.switches[e], bodies.active[e], tables, s, 0.0) > 0.0:
                 bodies.active[e] = not bodies.active[e]
                 sign = 1.0 if bodies.active[e] else -1.0
-                switch(bodies.switches[e], sign, tables, s, bodies.K, bodies.C)
+                toggle_contact(bodies.switches[e], sign, tables, s, bodies.K, bodies.C)
         past, past2, at = _integral(run, t[first] - delay, at)
         if shot == 0 and presliding > 0.0:
             _bend(tables, bodies, lanes, start.scatter, held[0, 0], smooth)
@@ -392,7 +394,7 @@ def simulate(
         tables = Tables(*(_plain(table, np.float64) for table in tables))
         start = StartState(*(_plain(array, np.float64) for array in start))
         bodies = assemble(tables, run.free)
-        if not _simulate(tables, bodies, run, start, make_lanes(of, bodies.N), y[b], dy):
+        if not _simulate(tables, bodies, run, start, make_sensitivities(of, bodies.N), y[b], dy):
             y[b] = dy[:] = np.nan
         of, dy = NO_LANES, dy[:0]
     return y, derivatives

@@ -113,7 +113,7 @@ def sliding(cart, i, u):
 
 
 @inlined
-def dropping(cart, i, v, u):
+def stribeck(cart, i, v, u):
     """Return the part of the dry friction that changes with the speed."""
     size = 0.0
     if cart[i, Cart.STICTION_STATIC_FORCE] > cart[i, Cart.COULOMB_FRICTION_FORCE]:
@@ -124,8 +124,8 @@ def dropping(cart, i, v, u):
 
 
 @inlined
-def drop_slope(cart, i, v, u):
-    """Return the derivative of `dropping`, d/dv."""
+def stribeck_slope(cart, i, v, u):
+    """Return the derivative of `stribeck`, d/dv."""
     slope = 0.0
     if cart[i, Cart.STICTION_STATIC_FORCE] > cart[i, Cart.COULOMB_FRICTION_FORCE]:
         slope += (
@@ -139,7 +139,7 @@ def drop_slope(cart, i, v, u):
 
 
 @inlined
-def settling(cart, i, v):
+def hysteresis(cart, i, v):
     """Return the largest force of hysteresis, and limit and rate (1/s) of its state."""
     if cart[i, Cart.PRESLIDING_FRICTION_FORCE] != 0.0:
         return (
@@ -151,7 +151,7 @@ def settling(cart, i, v):
 
 
 @inlined
-def settling_slopes(cart, i, v):
+def hysteresis_slopes(cart, i, v):
     """Return the derivatives d/dv of the limit and rate of the state."""
     if cart[i, Cart.PRESLIDING_FRICTION_FORCE] != 0.0:
         return 0, (1.0 if v > 0.0 else -1.0) / cart[i, Cart.PRESLIDING_FRICTION_DISTANCE]
@@ -159,7 +159,7 @@ def settling_slopes(cart, i, v):
 
 
 @inlined
-def stop_of(cart, i):
+def end_stop(cart, i):
     """Return stiffness, damping and (signed) position of the end stop of cart i."""
     if cart[i, Cart.END_STOP_STIFFNESS] != 0.0:
         return (
@@ -171,7 +171,7 @@ def stop_of(cart, i):
 
 
 @inlined
-def slack_of(spring, j):
+def bilinear_spring(spring, j):
     """Return extra stiffness of spring j, where it begins, and its d/dk."""
     if spring[j, Spring.SLACK_SPRING_STIFFNESS_CHANGE] != 0.0:
         return (
@@ -183,7 +183,7 @@ def slack_of(spring, j):
 
 
 @inlined
-def arriving(drive, u):
+def shaped_input(drive, u):
     """Return the input after dead zone, saturation and similar laws."""
     if drive[Drive.DEAD_ZONE_WIDTH] != 0.0:
         u = (1.0 if u > 0.0 else -1.0) * max(0, -drive[Drive.DEAD_ZONE_WIDTH] + abs(u))
@@ -196,7 +196,7 @@ ON_CARTS, ON_SPRINGS, ON_DRIVE = 1, 2, 4  # flags for the places of smooth force
 
 
 @jit
-def reach_of(cart, spring, drive):
+def longest_step(cart, spring, drive):
     """Return the longest step for the laws, in s, and flags such as `ON_CARTS`."""
     longest, smooth = inf, 0
     for i in range(cart.shape[0]):

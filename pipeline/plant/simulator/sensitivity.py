@@ -24,8 +24,8 @@ from pipeline.arrays import Array
 
 # isort: off
 from pipeline.plant.simulator.laws import (
-    ON_CARTS, ON_DRIVE, ON_SPRINGS, cart_slopes, drive_slopes, drop_slope, motor_slopes,
-    settling, settling_slopes, slack_of, spring_slopes)  # fmt: skip
+    ON_CARTS, ON_DRIVE, ON_SPRINGS, cart_slopes, drive_slopes, stribeck_slope, motor_slopes,
+    hysteresis, hysteresis_slopes, bilinear_spring, spring_slopes)  # fmt: skip
 from pipeline.plant.simulator.compiler import jit
 from pipeline.plant.simulator.state import (
     ACC, BEFORE, D2, D3, DECAY, GRIP, HALF_A, HALF_V, HALF_X, MID_V, MID_X, PAST, RUB, SIDE,
@@ -37,7 +37,7 @@ BY_MASS, BY_DAMPING, BY_STIFFNESS, BY_FRICTION, BY_POSITION, BY_VELOCITY = range
 _BLOCK = 4  # lanes that a processor computes at once, along the last axis
 
 
-class Lanes(NamedTuple):
+class Sensitivities(NamedTuple):
     """Derivatives of the state of N bodies, each in its own lane, with work arrays.
 
     Attributes
@@ -56,14 +56,14 @@ class Lanes(NamedTuple):
     work: Array
 
 
-def make_lanes(of: NDArray[np.int64], N: int) -> Lanes:
+def make_sensitivities(of: NDArray[np.int64], N: int) -> Sensitivities:
     """Return the lanes for the variables `of` (2, lanes) and N bodies, in whole blocks."""
     wanted = of.shape[1]
     blocks = (wanted + _BLOCK - 1) // _BLOCK
     padded = np.full((2, blocks * _BLOCK), BY_VELOCITY + 1)  # not a kind: fills up the last block
     padded[:, :wanted] = of
     T, phi = np.zeros((5 * N + 2, blocks, _BLOCK)), np.full((2 * N + 1, 2 * N), -1.0)
-    return Lanes(padded, T, phi, np.empty((7, N)))
+    return Sensitivities(padded, T, phi, np.empty((7, N)))
 
 
 @jit
@@ -75,7 +75,7 @@ def _add(T, row, factor, other):
 
 
 @jit
-def carry(tables, bodies, push, lanes, whole, step):
+def propagate(tables, bodies, push, lanes, whole, step):
     """Advance the derivatives by `step`, before the state moves.
 
     Forces are those in the middle of the `whole` step.
@@ -102,7 +102,7 @@ def carry(tables, bodies, push, lanes, whole, step):
             continue
         force = _force(of[0, lane], of[1, lane], s, n, tables.spring)
         T[3 * N + 1, lane // _BLOCK, lane % _BLOCK] = force
-    _kick(tables, bodies, push, lanes, whole, 0.5 * step)
+    _impulse(tables, bodies, push, lanes, whole, 0.5 * step)
     for row in range(2 * N):
         for block in range(T.shape[1]):
             a = b = c = d = 0.0
@@ -117,7 +117,7 @@ def carry(tables, bodies, push, lanes, whole, step):
             T[moved + row, block, 2] = c
             T[moved + row, block, 3] = d
     for i in range(n):
-        most, target, pace = settling(cart, i, s[MID_V, i])
+        most, target, pace = hysteresis(cart, i, s[MID_V, i])
         if most > 0.0:
             decay = exp(-pace * step)
             slope = _settled(cart, i, s, target, decay, step)
@@ -128,7 +128,7 @@ def carry(tables, bodies, push, lanes, whole, step):
         for block in range(T.shape[1]):
             for q in range(_BLOCK):
                 T[row, block, q] = T[moved + row, block, q]
-    _kick(tables, bodies, push, lanes, whole, 0.5 * step)
+    _impulse(tables, bodies, push, lanes, whole, 0.5 * step)
 
 
 @jit
@@ -171,13 +171,13 @@ def _force(kind, at, s, n, spring):
         return s[RUB, at]
     reach = stretch(s, HALF_X, at, n)
     if s[PAST, at] != 0.0:
-        _, past, share = slack_of(spring, at)
+        _, past, share = bilinear_spring(spring, at)
         reach += share * (reach - past)
     return -reach
 
 
 @jit
-def _kick(tables, bodies, push, lanes, whole, span):
+def _impulse(tables, bodies, push, lanes, whole, span):
     """Add to each lane the impulse, over `span` s, of its small force and of nonlinear forces."""
     s, n, N, driven, T, of = bodies.s, bodies.n, bodies.N, bodies.driven, lanes.T, lanes.of
     cart, drive, scatter = tables.cart, tables.drive, push.scatter
@@ -209,8 +209,8 @@ def _kick(tables, bodies, push, lanes, whole, span):
         if smooth & ON_CARTS:
             by_x, by_v = cart_slopes(cart, i, s[MID_X, i], s[MID_V, i], u)
         if s[SIDE, i] != 0.0 and s[V, i] != 0.0:
-            by_v -= scatter[i] * drop_slope(cart, i, abs(s[MID_V, i]), u)
-        most, target, _ = settling(cart, i, s[MID_V, i])
+            by_v -= scatter[i] * stribeck_slope(cart, i, abs(s[MID_V, i]), u)
+        most, target, _ = hysteresis(cart, i, s[MID_V, i])
         if most > 0.0:
             by_v -= scatter[i] * most * _settled(cart, i, s, target, s[DECAY, i], 0.5 * whole)
             _add(T, N + i, -s[GRIP, i] * span * scatter[i] * most * s[DECAY, i], 2 * N + i)
@@ -220,7 +220,7 @@ def _kick(tables, bodies, push, lanes, whole, span):
 @jit
 def _settled(cart, i, s, target, decay, span):
     """Return d/dv of cart i's presliding state after `span` s at constant velocity v."""
-    by_target, by_pace = settling_slopes(cart, i, s[MID_V, i])
+    by_target, by_pace = hysteresis_slopes(cart, i, s[MID_V, i])
     return by_target * (1.0 - decay) - (s[Z, i] - target) * decay * span * by_pace
 
 
@@ -245,7 +245,7 @@ def stop(T, s, N, i):
 
 
 @jit
-def meet(T, bodies, body, other, stiffness, damping):
+def saltation(T, bodies, body, other, stiffness, damping):
     """For each lane, store the derivative of the time at which a contact begins or ends.
 
     `other` is the other body, or -1 for a wall. A contact ends when its push, given by stiffness

@@ -75,7 +75,7 @@ class Push(NamedTuple):
 
 
 @jit
-def tie(M, j, n, value):
+def add_spring(M, j, n, value):
     """Add `value` for a spring j (0 to n) of n carts to a symmetric matrix."""
     if j < n:
         M[j, j] += value

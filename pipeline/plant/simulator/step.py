@@ -4,12 +4,18 @@ from math import exp
 
 import numpy as np
 
-from pipeline.plant.simulator.contacts import contact, guard, position, switch, velocity
-from pipeline.plant.simulator.sensitivity import carry, meet, stop
+from pipeline.plant.simulator.contacts import (
+    contact,
+    contact_gap,
+    position,
+    toggle_contact,
+    velocity,
+)
+from pipeline.plant.simulator.sensitivity import propagate, saltation, stop
 
 # isort: off
 from pipeline.plant.simulator.laws import (
-    ON_CARTS, ON_DRIVE, ON_SPRINGS, cart_force, drive_force, dropping, motor_force, settling,
+    ON_CARTS, ON_DRIVE, ON_SPRINGS, cart_force, drive_force, stribeck, motor_force, hysteresis,
     sliding, spring_force)  # fmt: skip
 from pipeline.plant.simulator.compiler import inlined
 from pipeline.plant.simulator.state import (
@@ -39,12 +45,12 @@ def smooth_forces(tables, bodies, u, on, smooth):
 
 
 @inlined
-def rub(cart, bodies, push, step):
+def dry_friction(cart, bodies, push, step):
     """Add dry friction to the forces; a cart held by friction gets the inverse mass 0."""
     s, n, scatter, u = bodies.s, bodies.n, push.scatter, push.u
     for i in range(n):
         s[RUB, i] = 0.0
-        most, target, pace = settling(cart, i, s[MID_V, i])
+        most, target, pace = hysteresis(cart, i, s[MID_V, i])
         if most > 0.0 and s[INV, i] > 0.0:
             s[DECAY, i] = exp(-0.5 * pace * step)
             s[RUB, i] -= most * (target + (s[Z, i] - target) * s[DECAY, i])
@@ -54,7 +60,7 @@ def rub(cart, bodies, push, step):
         if s[INV, i] == 0.0:
             continue
         slide = sliding(cart, i, u)
-        size = slide + dropping(cart, i, abs(s[MID_V, i]) if s[V, i] != 0.0 else 0.0, u)
+        size = slide + stribeck(cart, i, abs(s[MID_V, i]) if s[V, i] != 0.0 else 0.0, u)
         if size <= 0.0:
             continue
         if s[V, i] != 0.0:
@@ -68,7 +74,7 @@ def rub(cart, bodies, push, step):
                 continue
             s[SIDE, i] = 1.0 if net > 0.0 else -1.0
             speed = 0.5 * step * (abs(net) - scatter[i] * slide) * s[INV, i]
-            size = slide + dropping(cart, i, speed, u)
+            size = slide + stribeck(cart, i, speed, u)
         s[RUB, i] -= size * s[SIDE, i]
     for i in range(n):
         s[FORCE, i] += scatter[i] * s[RUB, i]
@@ -123,15 +129,15 @@ def first_switch(tables, bodies, step, none):
     """Return when the first contact or slack spring switches, and its index (or `none`)."""
     switching, switches, active, s = none, bodies.switches, bodies.active, bodies.s
     for e in range(switches.size):
-        end = guard(switches[e], active[e], tables, s, step)
+        end = contact_gap(switches[e], active[e], tables, s, step)
         if end > 0.0:
             low, high = 0.0, step
-            g_low = guard(switches[e], active[e], tables, s, 0.0)
+            g_low = contact_gap(switches[e], active[e], tables, s, 0.0)
             g_low, g_high = min(g_low, -1e-300), end
             # Root by the Illinois method; the later end of the final bracket is taken.
             for _ in range(8):
                 guess = low + (high - low) * g_low / (g_low - g_high)
-                value = guard(switches[e], active[e], tables, s, guess)
+                value = contact_gap(switches[e], active[e], tables, s, guess)
                 if value > 0.0:
                     high, g_high, g_low = guess, value, 0.5 * g_low
                 else:
@@ -167,7 +173,7 @@ def advance(tables, bodies, push, lanes):
             smooth_forces(tables, bodies, push.u, push.on, push.smooth)
         s[FORCE, bodies.driven] += push.u
         if push.dry:
-            rub(tables.cart, bodies, push, step)
+            dry_friction(tables.cart, bodies, push, step)
         # Because the usual sizes are constants here, the compiler unrolls the loops.
         if N == 1:
             taylor(s, K, C, np.int64(1))
@@ -186,13 +192,13 @@ def advance(tables, bodies, push, lanes):
             if switching != none:
                 stopping = none
         if lanes.of.size > 0:
-            carry(tables, bodies, push, lanes, whole, step)
+            propagate(tables, bodies, push, lanes, whole, step)
         for i in range(N):
             s[X, i], s[V, i] = position(s, i, step), velocity(s, i, step)
             s[ACC, i] = s[D2, i] + step * (s[D3, i] + 0.5 * step * s[D4, i])
         if push.dry:
             for i in range(n):
-                most, target, pace = settling(tables.cart, i, s[MID_V, i])
+                most, target, pace = hysteresis(tables.cart, i, s[MID_V, i])
                 if most > 0.0:
                     decay = s[DECAY, i] * s[DECAY, i] if step == whole else exp(-pace * step)
                     s[Z, i] = target + (s[Z, i] - target) * decay
@@ -207,10 +213,10 @@ def advance(tables, bodies, push, lanes):
             which, ends = switches[switching], 1.0 if active[switching] else 0.0
             if not n <= which <= 2 * n:
                 body, other, _, k, c, _ = contact(which, tables)
-                meet(lanes.T, bodies, body, other, k, ends * c)
+                saltation(lanes.T, bodies, body, other, k, ends * c)
             active[switching] = not active[switching]
             sign = 1.0 if active[switching] else -1.0
             lanes.phi[2 * N, 0] = -1.0  # the carts' equations change here
-            switch(which, sign, tables, s, K, C)
+            toggle_contact(which, sign, tables, s, K, C)
             events += 1
         left -= step

@@ -9,7 +9,7 @@ from math import cos, exp, pi, sin
 from pipeline.plant.simulator.compiler import jit
 
 
-class Kind(IntEnum):
+class EffectKind(IntEnum):
     """The effects, in the order of the catalogue."""
 
     COULOMB_FRICTION = 0
@@ -56,16 +56,16 @@ COEFFICIENTS = (
     (0,),
 )
 ON_SPRING = (
-    Kind.CUBIC_SPRING,
-    Kind.SLACK_SPRING,
-    Kind.COUPLING_DAMPER,
+    EffectKind.CUBIC_SPRING,
+    EffectKind.SLACK_SPRING,
+    EffectKind.COUPLING_DAMPER,
 )
 FRICTION = (
-    Kind.COULOMB_FRICTION,
-    Kind.STICTION,
-    Kind.LOAD_FRICTION,
+    EffectKind.COULOMB_FRICTION,
+    EffectKind.STICTION,
+    EffectKind.LOAD_FRICTION,
 )
-HYSTERESIS = (Kind.PRESLIDING_FRICTION,)
+HYSTERESIS = (EffectKind.PRESLIDING_FRICTION,)
 # Largest count of numbers that `terms` or `settle` write.
 TERMS = 11
 
@@ -77,13 +77,13 @@ def terms(kind, p, o, x, v, k, u, on, out):
     The derivatives are d/dx, d/dv and d/du, then d/d(coordinate) for each coordinate.
     `x` and `v` belong to a cart or a spring's stretch; `k` is the spring's stiffness.
     """
-    if kind == Kind.COULOMB_FRICTION:
+    if kind == EffectKind.COULOMB_FRICTION:
         out[0] = p[o]
         out[1] = 0
         out[2] = 0
         out[3] = 0
         out[4] = 1
-    elif kind == Kind.STICTION:
+    elif kind == EffectKind.STICTION:
         x0 = p[o + 1] ** (-2)
         x1 = v**2
         x2 = exp(-x0 * x1)
@@ -95,14 +95,14 @@ def terms(kind, p, o, x, v, k, u, on, out):
         out[3] = 0
         out[4] = x2
         out[5] = x1 * x4 / p[o + 1] ** 3
-    elif kind == Kind.LOAD_FRICTION:
+    elif kind == EffectKind.LOAD_FRICTION:
         x0 = abs(u)
         out[0] = p[o] * x0
         out[1] = 0
         out[2] = 0
         out[3] = p[o] * (1.0 if u > 0.0 else -1.0)
         out[4] = x0
-    elif kind == Kind.QUADRATIC_DRAG:
+    elif kind == EffectKind.QUADRATIC_DRAG:
         x0 = abs(v)
         x1 = v * x0
         out[0] = -p[o] * x1
@@ -110,20 +110,20 @@ def terms(kind, p, o, x, v, k, u, on, out):
         out[2] = -2 * p[o] * x0
         out[3] = 0
         out[4] = -x1
-    elif kind == Kind.FORCE_OFFSET:
+    elif kind == EffectKind.FORCE_OFFSET:
         out[0] = p[o]
         out[1] = 0
         out[2] = 0
         out[3] = 0
         out[4] = 1
-    elif kind == Kind.CUBIC_SPRING:
+    elif kind == EffectKind.CUBIC_SPRING:
         x0 = x**3
         out[0] = p[o] * x0
         out[1] = 3 * p[o] * x**2
         out[2] = 0
         out[3] = 0
         out[4] = x0
-    elif kind == Kind.SLACK_SPRING:
+    elif kind == EffectKind.SLACK_SPRING:
         x0 = -p[o + 1] + x
         if (x - p[o + 1]) * p[o + 1] > 0.0:
             out[0] = p[o] * x0
@@ -134,20 +134,20 @@ def terms(kind, p, o, x, v, k, u, on, out):
             out[5] = -p[o]
         else:
             out[:6] = 0.0
-    elif kind == Kind.COUPLING_DAMPER:
+    elif kind == EffectKind.COUPLING_DAMPER:
         out[0] = p[o] * v
         out[1] = 0
         out[2] = p[o]
         out[3] = 0
         out[4] = v
-    elif kind == Kind.DRIVE_DAMPING:
+    elif kind == EffectKind.DRIVE_DAMPING:
         x0 = on * p[o]
         out[0] = -v * x0
         out[1] = 0
         out[2] = -x0
         out[3] = 0
         out[4] = -on * v
-    elif kind == Kind.COGGING:
+    elif kind == EffectKind.COGGING:
         x0 = 2 * pi / p[o + 2]
         x1 = x * x0
         x2 = cos(x1)
@@ -160,7 +160,7 @@ def terms(kind, p, o, x, v, k, u, on, out):
         out[4] = x3
         out[5] = x2
         out[6] = 2 * pi * x * x4 / p[o + 2] ** 2
-    elif kind == Kind.END_STOP:
+    elif kind == EffectKind.END_STOP:
         x0 = p[o + 1] - x
         if (x - p[o + 1]) * p[o + 1] > 0.0 and (-p[o + 2] * v + p[o] * x0) * p[o + 1] <= 0.0:
             out[0] = -p[o + 2] * v + p[o] * x0
@@ -176,8 +176,8 @@ def terms(kind, p, o, x, v, k, u, on, out):
 
 @jit
 def settle(kind, p, o, v, out):
-    """Fill `out` with `settling`, its slopes, and its derivatives by coordinate."""
-    if kind == Kind.PRESLIDING_FRICTION:
+    """Fill `out` with `hysteresis`, its slopes, and its derivatives by coordinate."""
+    if kind == EffectKind.PRESLIDING_FRICTION:
         out[0] = p[o]
         out[1] = 1.0 if v > 0.0 else -1.0
         out[2] = abs(v) / p[o + 1]

@@ -243,7 +243,7 @@ def unnamed(chain: Chain) -> dict[str, float]:
     """Return the coefficients that four carts need in addition to the named parameters."""
     found = {}
     for i in range(2, chain.n) if chain.n > 3 else ():
-        falling = chain.tails()[i - 1]
+        falling = chain.subchain_polynomials()[i - 1]
         degree = falling.size - 1
         found |= {
             f"{_LETTERS[i - 1]}_{degree - j}": float(falling[j]) for j in range(1, degree + 1)

@@ -15,7 +15,7 @@ from pipeline.report.document import Block, Heading, Tile, Tiles, Tone, paragrap
 from pipeline.report.exploration import NAME
 from pipeline.report.figures.colours import QUIET, SECOND
 from pipeline.report.figures.style import legend_above, panels
-from pipeline.report.gap.story import before_after_picture
+from pipeline.report.gap.gap_report import before_after_picture
 from pipeline.report.gap.verdict import error_board, verdict_blocks, verdict_title
 from pipeline.report.render.html import render_html
 from pipeline.report.sections.page import Page

@@ -14,7 +14,7 @@ from pipeline.report.figures.colours import CARTS, MEASURED, MODEL, QUIET
 from pipeline.report.figures.style import legend_above, log_frequency_axis, panels, plot_line
 from pipeline.report.figures.svg import attach_data
 from pipeline.results import FrequencyResponse
-from pipeline.set_up import Units
+from pipeline.setup import Units
 from pipeline.words.numbers import subscript
 
 _DB_PER_NEPER = 20 / np.log(10)

@@ -175,7 +175,7 @@ def force_figure(
         ax.set_ylabel(f"extra force [{drive}]")
     elif axis == "input":
         own = [f for f in forces if f.cart == 1]
-        shown = [(f.u, f.measured + f.arriving, f.model + f.arriving) for f in own]
+        shown = [(f.u, f.measured + f.shaped_input, f.model + f.shaped_input) for f in own]
         what = f"input u [{drive}]"
         ax.set_ylabel(f"force that arrives [{drive}]")
     else:
@@ -243,10 +243,10 @@ def timing_figure(
     at = float(force.t[int(np.argmax(np.abs(np.diff(force.u))))])
     kept = (force.t > at - 0.15) & (force.t < at + 0.5)
     figure, (ax,) = panels(1.8)
-    measured = (force.measured + force.arriving)[kept]
+    measured = (force.measured + force.shaped_input)[kept]
     ax.plot(force.t[kept], measured, ".", color=MEASURED, ms=4.0, mew=0, label="measured")
     ax.plot(force.t[kept], force.u[kept], color=SECOND, ls="--", lw=1.1, label="logged input")
-    ax.plot(force.t[kept], (force.model + force.arriving)[kept], color=MODEL, lw=1.1,
+    ax.plot(force.t[kept], (force.model + force.shaped_input)[kept], color=MODEL, lw=1.1,
             label=added)  # fmt: skip
     ax.set_ylabel(f"force on cart 1 [{drive}]")
     ax.set_xlabel("time [s]")

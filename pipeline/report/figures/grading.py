@@ -15,7 +15,7 @@ from pipeline.report.figures.style import legend_above, panels, plot_line, short
 from pipeline.report.figures.svg import attach_data
 from pipeline.report.figures.time import decay_figure, step_figure
 from pipeline.results import FrequencyResponse, LogDecrement, Record, StepGain
-from pipeline.set_up import Units
+from pipeline.setup import Units
 from pipeline.words.text import clean
 
 

@@ -31,7 +31,7 @@ from pipeline.results import (
     SinePoint,
     StepGain,
 )
-from pipeline.set_up import Units
+from pipeline.setup import Units
 from pipeline.words.numbers import subscript
 from pipeline.words.text import clean
 

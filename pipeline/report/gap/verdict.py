@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.gap.limits import AS_REPEATS, AT_FLOOR, NOTHING
-from pipeline.gap.types import FoundEffect, Gap, NamedValue, RecordGap, Rival
+from pipeline.gap.types import Alternative, FoundEffect, Gap, NamedValue, RecordGap
 from pipeline.plant.effect import Effect, effect_name, place_name
 from pipeline.report.document import Block, Tile, Tiles, Tone, bullet_list, paragraph, plain_lines
 from pipeline.words.numbers import count, listing, significant, unit_text, with_error
@@ -239,7 +239,7 @@ def _times_left(times: float) -> str:
     return f"The error is still {significant(times, digits=2)} times that"
 
 
-def contenders(gap: Gap) -> tuple[FoundEffect, Rival | None]:
+def contenders(gap: Gap) -> tuple[FoundEffect, Alternative | None]:
     """Return the chosen effect, and the rival (if any) that the data cannot distinguish from it."""
     close = [
         (rival.confidence, i, found, rival)

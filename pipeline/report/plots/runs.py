@@ -18,7 +18,7 @@ from pipeline.gap.data.runs import GapRun
 from pipeline.gap.replay import Replay, prepare_run, replay_driven, replay_fitted
 from pipeline.gap.types import Gap
 from pipeline.plant.chain import Chain
-from pipeline.results import Analysis, HardwareCheck, Kind, Record
+from pipeline.results import Analysis, ExperimentKind, HardwareCheck, Record
 from pipeline.stages.hardware_check import check_hardware
 from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress
@@ -62,7 +62,7 @@ class ComparedRun:
     """
 
     id: str
-    kind: Kind
+    kind: ExperimentKind
     t: Array
     u: Array | None
     carts: tuple[ComparedCart, ...]

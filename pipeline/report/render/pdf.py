@@ -12,7 +12,7 @@ from matplotlib.ft2font import FT2Font
 
 from pipeline.report.document import Document, Picture, as_json
 from pipeline.report.figures.svg import plain_svg
-from pipeline.report.render.room import Choices, End, Pages, fill_pages
+from pipeline.report.render.page_filling import Choices, End, Pages, fill_pages
 from pipeline.resources import TEMPLATES
 from pipeline.words.numbers import unbroken
 from pipeline.words.text import clean

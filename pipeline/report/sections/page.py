@@ -7,7 +7,7 @@ from functools import cached_property
 from pipeline.report.document import Block, Document, Section, bullet_list
 from pipeline.report.render.builder import PageBuilder
 from pipeline.results import Analysis, Record
-from pipeline.set_up import Units
+from pipeline.setup import Units
 from pipeline.words.numbers import count
 from pipeline.words.text import clean, rich
 

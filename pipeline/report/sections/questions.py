@@ -29,7 +29,7 @@ _MOST = 6  # most questions in a report; more would turn it into a questionnaire
 _LISTED = 4  # most runs that a question lists
 
 
-Kind = Literal[
+QuestionKind = Literal[
     "sign", "springs", "damping", "damping_same", "signs_differ", "gain", "frequency", "response",
     "assumed", "friction", "sticking", "misfit", "level", "overshoot", "hardware",
 ]  # fmt: skip
@@ -44,7 +44,7 @@ class Asked:
     section : the section with the figures that the question is about.
     """
 
-    kind: Kind
+    kind: QuestionKind
     id: str
     section: str
     text: str
@@ -101,7 +101,7 @@ def _damping(analysis: Analysis) -> Iterator[Asked]:
     if off:
         row, *others = off
         also = listing([f"{other.name} by {_change(other)}" for other in others])
-        key: Kind = "damping_same" if row.independent is False else "damping"
+        key: QuestionKind = "damping_same" if row.independent is False else "damping"
         yield _of_row(row, analysis, key, also=f" ({also})" if also else "")
 
 
@@ -110,7 +110,7 @@ def _gains_and_frequencies(analysis: Analysis) -> Iterator[Asked]:
         name = read_name(row.name)
         if name.is_ratio or row.initial is None or row.final is None:
             continue
-        key: Kind
+        key: QuestionKind
         if row.initial.value * row.final.value < 0:
             key = "signs_differ"
         elif row.initial.source == "frequency_response":
@@ -121,7 +121,7 @@ def _gains_and_frequencies(analysis: Analysis) -> Iterator[Asked]:
         return  # ask only about the largest change
 
 
-def _of_row(row: ParameterRow, analysis: Analysis, key: Kind, **values: str) -> Asked:
+def _of_row(row: ParameterRow, analysis: Analysis, key: QuestionKind, **values: str) -> Asked:
     """Return the question why two estimates differ."""
     initial, final = (source_text(one, steps=analysis.steps) for one in (row.initial, row.final))
     text = _WORDS.text(
@@ -235,7 +235,7 @@ def _hardware(analysis: Analysis) -> Iterator[Asked]:
         yield _of_run(far, "hardware", share=percent(100 * far.nrmse))
 
 
-def _of_run(check: HardwareCheck, key: Kind, **values: str) -> Asked:
+def _of_run(check: HardwareCheck, key: QuestionKind, **values: str) -> Asked:
     text = _WORDS.text(key, run=check.experiment, cart=check.cart, **values)
     return Asked(kind=key, id=key, section="hardware", text=text)
 

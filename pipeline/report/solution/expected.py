@@ -30,7 +30,7 @@ from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, work_out
 from pipeline.report.sections.page import Page
 from pipeline.results import Analysis, FeedbackDesign, Provenance
-from pipeline.set_up import Units
+from pipeline.setup import Units
 from pipeline.submission import InputScale, System
 from pipeline.words.numbers import NOTHING, count, percent, significant, unit_text
 from pipeline.words.phrases import phrases

@@ -105,7 +105,7 @@ class VirtualCarts:
             held += self._period
             left -= self._period * self._started
             yield self._carry(cart, hand.hold(held)[0])
-        force = self._plant.let_go(cart, velocity=float(hand.hold(held)[1][0]))
+        force = self._plant.release(cart, velocity=float(hand.hold(held)[1][0]))
         ticks = math.ceil(hand.fade / self._period)
         for tick in range(ticks):
             # The force of a tick is the mean of the linear fall over this tick.
@@ -115,7 +115,7 @@ class VirtualCarts:
             self._plant.push(cart, -push)
 
     def _carry(self, cart: int, to: Array) -> None:
-        self._plant.carry(cart, to=float(to[0]), interval=self._period)
+        self._plant.move_by_hand(cart, to=float(to[0]), interval=self._period)
 
 
 def input_per_count(bench: SimulatedBench) -> float:

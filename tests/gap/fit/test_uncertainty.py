@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.experiments.propose import propose_plan
+from pipeline.gap.data.holdout import prepare
 from pipeline.gap.data.runs import make_run
-from pipeline.gap.data.sides import prepare
 from pipeline.gap.fit.baseline import measure_noise
 from pipeline.gap.fit.levenberg_marquardt import Fitting, evaluate, fit_model
 from pipeline.gap.fit.structure import Structure

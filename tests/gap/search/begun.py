@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
+from pipeline.gap.data.holdout import split
 from pipeline.gap.data.runs import make_run
-from pipeline.gap.data.sides import split
 from pipeline.gap.fit.baseline import fit_baseline
 from pipeline.gap.fit.levenberg_marquardt import GapFit
 from pipeline.gap.search.hypothesis import Study

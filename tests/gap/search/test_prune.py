@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.gap.search.free_run_fit import fit_free_run
 from pipeline.gap.search.hypothesis import judge
 from pipeline.gap.search.prune import SURE, prune, significance
 from pipeline.gap.search.translate import make_candidate
-from pipeline.gap.search.whole import fit_whole
 from pipeline.plant.catalogue import find_effect
 from tests.gap.search.begun import COULOMB, DAHL, DELAY, begun
 from tests.truth.bench import Hidden
@@ -27,7 +27,7 @@ def test_a_richer_law_that_explains_no_more_is_replaced():
         place = 0 if effect.place == "input" else 1
         candidate = make_candidate(effect, place, values, runs=study.training, chain=chain)
         start = start.with_effect(candidate, values)
-    rich = judge(fit_whole(start, study), study)
+    rich = judge(fit_free_run(start, study), study)
 
     pruned = prune(rich, study, [judge(fit, study)])
 

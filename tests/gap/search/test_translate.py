@@ -5,11 +5,11 @@ import pytest
 
 from pipeline.gap.data.runs import make_run
 from pipeline.gap.fit.structure import Structure
-from pipeline.gap.follow.laws import COLUMNS, DRIVE_COLUMNS, FollowedBench, column_set, smooth_laws
+from pipeline.gap.pem.laws import COLUMNS, DRIVE_COLUMNS, PemSetup, column_set, smooth_laws
 from pipeline.gap.search.translate import filled, make_candidate, values_of
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import PRESETS
-from pipeline.plant.simulator.terms import Kind
+from pipeline.plant.simulator.terms import EffectKind
 from tests.truth.cases import make_case
 
 ALL = frozenset().union(*(filled(effect) for effect in CATALOGUE))
@@ -18,15 +18,15 @@ ALL = frozenset().union(*(filled(effect) for effect in CATALOGUE))
 @pytest.mark.parametrize(
     ("kind", "free", "places"),
     [
-        (Kind.COULOMB_FRICTION, [(True, True)], [0, 1]),
-        (Kind.COULOMB_FRICTION, [(False, True), (False, True)], [1]),  # cart 1 is always held
-        (Kind.CUBIC_SPRING, [(True, True)], [0, 1, 2]),
-        (Kind.CUBIC_SPRING, [(True, False)], [0]),  # springs 1, 2 stretch equally
+        (EffectKind.COULOMB_FRICTION, [(True, True)], [0, 1]),
+        (EffectKind.COULOMB_FRICTION, [(False, True), (False, True)], [1]),  # cart 1 is always held
+        (EffectKind.CUBIC_SPRING, [(True, True)], [0, 1, 2]),
+        (EffectKind.CUBIC_SPRING, [(True, False)], [0]),  # springs 1, 2 stretch equally
     ],
 )
 def test_an_effect_is_tried_only_where_it_would_show(kind, free, places):
     """An effect is tried only where it would show, and on one of springs that stretch equally."""
-    bench = FollowedBench(
+    bench = PemSetup(
         chain=PRESETS["throne-2dof"], springs=(True,) * 3, largest=1.0, free=tuple(free)
     )
     laws = smooth_laws(bench, columns=ALL)

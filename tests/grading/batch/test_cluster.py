@@ -12,8 +12,8 @@ from pipeline.errors import ConfigError
 from pipeline.grading.batch.cluster import run_on
 from pipeline.grading.batch.runner import grade_batch, run_here
 from pipeline.grading.batch.task import Setup, Task
-from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.gradebook.gradebook import Gradebook
+from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.simulated.submission import Students, write_submission
 

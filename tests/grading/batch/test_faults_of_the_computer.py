@@ -14,7 +14,7 @@ import pytest
 
 from pipeline.grading.batch.task import Task
 from pipeline.grading.batch.worker import grade_task
-from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.intake.unpack import HAND_IN, unpack
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.simulated.submission import Students, write_submission

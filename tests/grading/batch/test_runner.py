@@ -17,8 +17,8 @@ from pipeline.grading.batch.runner import Grader, grade_batch, run_here
 from pipeline.grading.batch.task import Setup, Task
 from pipeline.grading.batch.worker import grade_task, named_authors, read_authors
 from pipeline.grading.grade import grade_text, read_grade
-from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.gradebook.gradebook import Gradebook
+from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.publish import feedback_figures
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.publish.students import students_of

@@ -7,14 +7,14 @@ import re
 import pytest
 
 from pipeline.grading.grade import Criterion, Grade, read_grade
-from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.gradebook.class_lines import Line
+from pipeline.grading.gradebook.class_lines import GradeSummary
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.history import history_text
-from pipeline.grading.gradebook.open_book import OpenBook
 from pipeline.grading.gradebook.override import TOTAL, read_wishes
-from pipeline.grading.gradebook.request_book import points_lost
+from pipeline.grading.gradebook.request_gradebook import points_lost
+from pipeline.grading.gradebook.shared_gradebook import SharedGradebook
 from pipeline.grading.gradings import Batch
-from pipeline.grading.judge.reweigh import findings_text, read_findings, reweigh
+from pipeline.grading.judge.recompute import findings_text, read_findings, recompute_points
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.export import export
 from pipeline.grading.publish.gradescope import results_text
@@ -59,10 +59,10 @@ def test_a_manual_criterion_is_open_until_a_person_grades_it(honest, tmp_path):
     assert graded.grade.open == ("discussion",)
     assert graded.grade.points == rubric.out_of - 4
     grade = graded.grade.model_copy(update={"submission": "team-1"})
-    with OpenBook(tmp_path, assignment="lab", create=True) as book:
+    with SharedGradebook(tmp_path, assignment="lab", create=True) as book:
         put(book, grade, rubric=rubric)
         seen = book.team("team-1").versions["discussion"]
-        book.change("team-1", "discussion", 0.0, why="none handed in", by="Ada", seen=seen)
+        book.change("team-1", "discussion", 0.0, why="none handed in", by="Ada", version=seen)
         assert book.entry("team-1").grade.open == ()
         assert book.entry("team-1").grade.criteria[-1].outcome == "fail"
         book.override("team-1", "discussion", 3, why="no word on damping", by="Ada")
@@ -81,7 +81,7 @@ def test_another_rubric_leaves_a_manual_criterion_open(honest):
     """The preview of other points keeps the criterion open, and gives it no points."""
     rubric, graded = honest
     found = read_findings(findings_text(graded.judgements))
-    again = reweigh(graded.grade, found, rubric=rubric)
+    again = recompute_points(graded.grade, found, rubric=rubric)
     assert (again.points, again.open) == (graded.grade.points, ("discussion",))
 
 
@@ -122,7 +122,7 @@ def test_an_open_criterion_has_no_points_yet(tmp_path):
         for outcome in outcomes:
             book.put(outcome)
         book.finish(Batch(keys=tuple(one.key for one in outcomes), shared={}), rubric=rubric)
-        page = class_page([Line.of(one.grade) for one in book.entries()], rubric=rubric)
+        page = class_page([GradeSummary.of(one.grade) for one in book.entries()], rubric=rubric)
         assert "lowest: discussion" not in page
         book.override("a", "discussion", 3, why="no word on damping", by="Ada")
         book.override("b", "discussion", 0, why="none handed in", by="Ada")
@@ -143,7 +143,7 @@ def test_an_open_criterion_has_no_points_yet(tmp_path):
 def test_adjustments_add_up_and_survive_regrading(place):
     """Every adjustment counts; the total never falls below 0, and a bonus may exceed the points."""
     rubric = two_cart_rubric()
-    with OpenBook(place, assignment="lab", create=True) as book:
+    with SharedGradebook(place, assignment="lab", create=True) as book:
         put(book, make_grade("team-1"), rubric=rubric)
         book.adjust("team-1", 1.5, why="a fine plot", by="Ada")
         assert book.entry("team-1").grade.points == 21.5
@@ -155,7 +155,7 @@ def test_adjustments_add_up_and_survive_regrading(place):
             (1.5, "a fine plot"),
             (-100, "copied from another team"),
         ]
-        assert book.class_now().listings[0].line.points == 0
+        assert book.class_now().rows[0].line.points == 0
         text = history_text(*book.history("team-1"))
         assert "adjusted  total -100 points, by Bob: copied from another team" in text
         book.adjust("team-1", 100, why="it was not", by="Bob")
@@ -192,12 +192,12 @@ def test_an_adjustment_is_a_number_other_than_0(tmp_path, points):
 
 def test_the_desk_refuses_an_adjustment_sent_twice(tmp_path):
     """A form is valid once, so that a double click does not deduct twice."""
-    with OpenBook(tmp_path, assignment="lab", create=True) as book:
+    with SharedGradebook(tmp_path, assignment="lab", create=True) as book:
         put(book, make_grade("team-1"), rubric=two_cart_rubric())
         seen = book.team("team-1").versions[TOTAL]
-        book.change("team-1", TOTAL, -2.0, why="late notes", by="Ada", seen=seen)
+        book.change("team-1", TOTAL, -2.0, why="late notes", by="Ada", version=seen)
         with pytest.raises(Exception, match="was changed"):
-            book.change("team-1", TOTAL, -2.0, why="late notes", by="Ada", seen=seen)
+            book.change("team-1", TOTAL, -2.0, why="late notes", by="Ada", version=seen)
         assert book.entry("team-1").grade.points == 18
 
 

@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.changes import points_changes, rubric_changes
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Batch
 from pipeline.simulated.submission import Students, write_submission
 from tests.helpers.commandline import cartlab_here

@@ -7,10 +7,10 @@ import pytest
 from sqlalchemy import create_engine, text
 
 from pipeline.grading.gradebook.history import history_text
-from pipeline.grading.gradebook.open_book import OpenBook
 from pipeline.grading.gradebook.override import WantedPoints
-from pipeline.grading.gradebook.request_book import RequestBook
+from pipeline.grading.gradebook.request_gradebook import RequestGradebook
 from pipeline.grading.gradebook.schema import FILE
+from pipeline.grading.gradebook.shared_gradebook import SharedGradebook
 from pipeline.grading.gradings import Batch
 from tests.helpers.grades import make_grade, make_outcome, two_cart_rubric
 
@@ -20,7 +20,7 @@ RUBRIC = two_cart_rubric()
 @pytest.fixture
 def book(place):
     """Return a gradebook with a team that has half of all points."""
-    with OpenBook(place, assignment="lab", create=True) as opened:
+    with SharedGradebook(place, assignment="lab", create=True) as opened:
         grade(opened, share=0.5)
         yield opened
 
@@ -35,7 +35,7 @@ def grade(book, *, share):
 def change(book, points, why="Mind the unit.", criterion="pieces"):
     """Save the form of a criterion as the desk does."""
     seen = book.team("team-1").versions[criterion]
-    book.change("team-1", criterion, points, why=why, by="Ada", seen=seen)
+    book.change("team-1", criterion, points, why=why, by="Ada", version=seen)
 
 
 def comment_all(book, why="Mind the unit."):
@@ -77,7 +77,7 @@ def test_undo_brings_back_the_earlier_comment(book):
     """Undo removes a comment; if it had replaced an earlier comment, the earlier one returns."""
 
     def undo():
-        book.undo("team-1", "pieces", by="Ada", seen=book.team("team-1").versions["pieces"])
+        book.undo("team-1", "pieces", by="Ada", version=book.team("team-1").versions["pieces"])
 
     comment_all(book)
     undo()
@@ -103,11 +103,11 @@ def test_a_preview_shows_what_a_comment_changes(book):
 
 def test_an_answer_with_the_same_points_leaves_them_automatic(book, place):
     """If an answer confirms the automatic points, a later regrade may still change these points."""
-    with RequestBook(place) as shared:
+    with RequestGradebook(place) as shared:
         shared.release(True, by="prof")
         shared.ask("team-1", "pieces", why="please", by="s1")
         (queued,) = shared.queue().waiting
-        shared.answer("team-1", "pieces", 0.5, text="right", by="Ada", seen=queued.version)
+        shared.answer("team-1", "pieces", 0.5, text="right", by="Ada", version=queued.version)
     grade(book, share=1.0)
     assert pieces(book).points == 1.0
 
@@ -124,7 +124,7 @@ def test_a_gradebook_without_comments_gets_them(book, place):
     else:
         with closing(sqlite3.connect(f"{place}/{FILE}")) as old:
             old.execute("ALTER TABLE overrides DROP COLUMN comment")
-    with OpenBook(place) as opened:
+    with SharedGradebook(place) as opened:
         assert opened.entry("team-1").overrides["laws"].points == 0.0
         comment_all(opened)
         assert pieces(opened).message == "omega_1 is off. Mind the unit."

@@ -9,8 +9,8 @@ import pytest
 from sqlalchemy import create_engine, text
 from sqlalchemy.exc import DBAPIError
 
-from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.gradebook.request_book import RequestBook
+from pipeline.grading.gradebook.gradebook import Gradebook
+from pipeline.grading.gradebook.request_gradebook import RequestGradebook
 from pipeline.grading.gradebook.schema import FILE
 from pipeline.grading.gradings import Batch
 from pipeline.grading.publish.export import export
@@ -32,7 +32,7 @@ def _fill(place: str, *, folder: Path | None = None) -> None:
 
     One team asks a question, gets points by hand and is marked as reviewed.
     """
-    with RequestBook(place, create=True, assignment="lab") as book:
+    with RequestGradebook(place, create=True, assignment="lab") as book:
         gone = make_grade(GONE, share=0.5)
         first = gone.criteria[0].model_copy(update={"found": {"omega_1": 31.41592}})
         gone = gone.model_copy(update={"criteria": (first, *gone.criteria[1:])})
@@ -45,7 +45,7 @@ def _fill(place: str, *, folder: Path | None = None) -> None:
         book.finish(Batch(keys=keys, shared=shared), rubric=two_cart_rubric())
         book.release(by="Ada", released=True)
         book.ask(GONE, first.id, why="quagga: it is right", by="s-zebra")
-        book.mark(GONE, by="Ada", seen=True)
+        book.set_reviewed(GONE, by="Ada", reviewed=True)
         book.override(GONE, gone.criteria[1].id, 0.5, why="quagga", by="Ada")
         book.finish(Batch(keys=keys, shared=shared), rubric=two_cart_rubric())
         if folder:

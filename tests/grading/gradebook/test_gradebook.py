@@ -18,10 +18,10 @@ from sqlalchemy.exc import DBAPIError
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import CODES
 from pipeline.grading.gradebook import rows
-from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.history import history_dict, history_text
 from pipeline.grading.gradebook.override import with_overrides
-from pipeline.grading.gradebook.request_book import RequestBook
+from pipeline.grading.gradebook.request_gradebook import RequestGradebook
 from pipeline.grading.gradebook.schema import FILE, metadata
 from pipeline.grading.gradings import Batch
 from tests.helpers.grades import (
@@ -128,7 +128,7 @@ def test_fingerprints_are_those_of_the_newest_outcomes(open_book):
     book.put(make_outcome(make_grade("team-1"), key="2", fingerprints=b"first"))
     book.put(make_outcome(make_grade("team-1"), key="3", fingerprints=b"second"))
 
-    found = {(p.submission, p.authors): p.fingerprints for p in book.prints()}
+    found = {(p.submission, p.authors): p.fingerprints for p in book.fingerprints()}
 
     assert found == {("team-1", ("old",)): b"o", ("team-1", ("s-team-1",)): b"second"}
 
@@ -139,7 +139,7 @@ def test_reading_fingerprints_does_not_keep_a_writer_waiting(open_book, monkeypa
     book = open_book()
     for n in range(15):  # the fingerprints fill more than one page
         book.put(make_outcome(make_grade(f"team-{n}")))
-    prints = book.prints()
+    prints = book.fingerprints()
     next(prints)
 
     book.put(make_outcome(make_grade("another")))
@@ -396,8 +396,8 @@ def test_rows_are_only_added(open_book, place):
     finish(book, make_outcome(graded, figures=figures, findings="{}"))
     book.override("team-1", "pieces", 0.0, why="x", by="y")
     book.close()
-    with closing(RequestBook(place)) as shared:
-        shared.mark("team-1", by="y", seen=True)
+    with closing(RequestGradebook(place)) as shared:
+        shared.set_reviewed("team-1", by="y", reviewed=True)
         shared.release(True, by="y")
         shared.ask("team-1", "pieces", why="x", by="z")
 

@@ -13,10 +13,10 @@ import pytest
 
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.history import history_text
-from pipeline.grading.gradebook.open_book import Conflict, OpenBook
-from pipeline.grading.gradebook.request_book import RequestBook
+from pipeline.grading.gradebook.request_gradebook import RequestGradebook
 from pipeline.grading.gradebook.requests import MOST_LETTERS, MOST_OPEN, RequestRefused
 from pipeline.grading.gradebook.schema import FILE
+from pipeline.grading.gradebook.shared_gradebook import Conflict, SharedGradebook
 from pipeline.grading.gradings import Batch
 from pipeline.grading.publish.anonymous import history_of, pseudonyms_in
 from tests.helpers.grades import failed_grade, make_grade, make_outcome, two_cart_rubric
@@ -29,7 +29,7 @@ CRITERIA = [criterion.id for criterion in RUBRIC.criteria]
 @pytest.fixture
 def book(place):
     """Return a class of two teams that lost half of all points; the grades are released."""
-    with RequestBook(place, assignment="lab", create=True) as book:
+    with RequestGradebook(place, assignment="lab", create=True) as book:
         finish(book, *(make_grade(name, share=0.5) for name in ("team-1", "team-2")))
         book.release(True, by="prof")
         yield book
@@ -54,7 +54,7 @@ def answer(book, points, text="looked", by="Ada"):
         points,
         text=text,
         by=by,
-        seen=asked.version,
+        version=asked.version,
     )
 
 
@@ -112,7 +112,7 @@ def test_a_criterion_is_asked_for_once_unless_reopened(book):
     book.ask("team-1", "pieces", why="other criterion", by="s1")
     book.ask("team-2", "laws", why="other team", by="s9")
     (settled,) = book.queue("team-1").settled
-    book.reopen("team-1", "laws", by="Bob", seen=settled.version)
+    book.reopen("team-1", "laws", by="Bob", version=settled.version)
     book.ask("team-1", "laws", why="two", by="s2")
     order = [(one.entry.submission, one.request.criterion) for one in book.queue().waiting]
     assert order == [("team-1", "pieces"), ("team-2", "laws"), ("team-1", "laws")]
@@ -163,7 +163,7 @@ def test_few_requests_wait_at_once(book):
 
 def test_students_can_read_and_ask_only_while_released(place):
     """Students can read and ask only while their class is released."""
-    with RequestBook(place, assignment="lab", create=True) as book:
+    with RequestGradebook(place, assignment="lab", create=True) as book:
         assert book.own_feedback("team-1") is None
         finish(book, make_grade("team-1", share=0.5))
         for released in (None, True, False):
@@ -180,7 +180,7 @@ def test_students_can_read_and_ask_only_while_released(place):
             book.own_feedback("s-team-1")  # s1 is an author
         with pytest.raises(ConfigError, match="no such submission"):
             book.own_feedback("team-9")
-    with RequestBook(place, assignment="lab-2", create=True) as other:
+    with RequestGradebook(place, assignment="lab-2", create=True) as other:
         finish(other, make_grade("team-1", share=0.5), key="2 ")
         assert other.own_feedback("team-1") is None
 
@@ -194,24 +194,24 @@ def test_an_answer_to_a_changed_request_is_refused(book):
         book.ask("team-1", criterion, why="x", by="s1")
     laws, pieces = book.queue().waiting
     give = {"text": "mine", "by": "Bob"}
-    book.answer("team-1", "laws", 1.0, text="hers", by="Ada", seen=laws.version)
+    book.answer("team-1", "laws", 1.0, text="hers", by="Ada", version=laws.version)
     with pytest.raises(Conflict) as conflict:
-        book.answer("team-1", "laws", 0.0, seen=laws.version, **give)
+        book.answer("team-1", "laws", 0.0, version=laws.version, **give)
     now = conflict.value.now
     assert now is not None
     assert (now.points, now.by) == (1.0, "Ada")
     book.override("team-1", "pieces", 0.75, why="seen", by="Ada")
     with pytest.raises(Conflict):
-        book.answer("team-1", "pieces", 0.0, seen=pieces.version, **give)
+        book.answer("team-1", "pieces", 0.0, version=pieces.version, **give)
     (pieces,) = book.queue().waiting
     finish(book, make_grade("team-1", share=0.25), key="again ")
     with pytest.raises(Conflict):
-        book.answer("team-1", "pieces", 0.0, seen=pieces.version, **give)
+        book.answer("team-1", "pieces", 0.0, version=pieces.version, **give)
     (settled,) = book.queue().settled
     with pytest.raises(RequestRefused, match="has an answer already"):
-        book.answer("team-1", "laws", 0.0, seen=settled.version, **give)
+        book.answer("team-1", "laws", 0.0, version=settled.version, **give)
     with pytest.raises(RequestRefused, match="only an answered request"):
-        book.reopen("team-1", "pieces", by="Bob", seen=book.queue().waiting[0].version)
+        book.reopen("team-1", "pieces", by="Bob", version=book.queue().waiting[0].version)
     with pytest.raises(ConfigError, match="expected 0 to 1 points"):
         answer(book, 99.0)
     with pytest.raises(RequestRefused, match="write an answer"):
@@ -226,7 +226,7 @@ def test_only_one_of_two_simultaneous_answers_counts(book, place):
 
     The other answer is refused as a conflict.
     """
-    with RequestBook(place) as other:
+    with RequestGradebook(place) as other:
         for number in range(10):
             book.ask("team-1", "laws", why=f"round {number}", by="s1")
             seen = book.queue().waiting[0].version
@@ -237,7 +237,7 @@ def test_only_one_of_two_simultaneous_answers_counts(book, place):
             def give(who, by, *, seen=seen, ready=ready, points=points):
                 ready.wait()
                 try:
-                    who.answer("team-1", "laws", points, text=f"from {by}", by=by, seen=seen)
+                    who.answer("team-1", "laws", points, text=f"from {by}", by=by, version=seen)
                 except Conflict:
                     return "conflict"
                 return "taken"
@@ -245,14 +245,14 @@ def test_only_one_of_two_simultaneous_answers_counts(book, place):
             with ThreadPoolExecutor(2) as pool:
                 one, two = pool.submit(give, book, "Ada"), pool.submit(give, other, "Bob")
                 assert sorted([one.result(), two.result()]) == ["conflict", "taken"]
-            book.reopen("team-1", "laws", by="Ada", seen=book.queue().settled[0].version)
+            book.reopen("team-1", "laws", by="Ada", version=book.queue().settled[0].version)
     what = [event.what for event in book.history("team-1")[1]]
     assert (what.count("answered"), what.count("override")) == (10, 10)
 
 
 def test_only_one_of_two_simultaneous_requests_is_stored(book, place):
     """If two members of a team ask at the same moment, one request is stored, the other refused."""
-    with RequestBook(place) as other:
+    with RequestGradebook(place) as other:
         ready = Barrier(2)
 
         def ask(who, by):
@@ -310,13 +310,13 @@ def test_an_anonymous_history_hides_who_asked(book):
 
 def test_a_gradebook_without_requests_gets_them(tmp_path):
     """A gradebook written before requests existed gets the missing tables and keeps its rows."""
-    with OpenBook(tmp_path, assignment="lab", create=True) as book:
+    with SharedGradebook(tmp_path, assignment="lab", create=True) as book:
         finish(book, make_grade("team-1", share=0.5))
     with closing(sqlite3.connect(tmp_path / FILE)) as old:
         for table in ("request_events", "releases"):
             old.execute(f"DROP TABLE {table}")
         old.commit()
-    with RequestBook(tmp_path) as book:
+    with RequestGradebook(tmp_path) as book:
         assert (book.n_waiting(), book.released) == (0, False)
         book.release(True, by="prof")
         book.ask("team-1", "laws", why="x", by="s1")

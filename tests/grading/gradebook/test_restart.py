@@ -13,7 +13,7 @@ from sqlalchemy.event import listen, remove
 from sqlalchemy.exc import OperationalError
 
 from pipeline.grading.batch import grade_class
-from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.schema import Lost
 from pipeline.grading.gradings import Batch, Grading
 from tests.helpers import postgres

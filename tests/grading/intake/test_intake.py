@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.grading.intake.files import digest, open_submission, packed, unpacked
-from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.intake.lms_names import parse_name
 from pipeline.grading.intake.unpack import HAND_IN
 from pipeline.submission.load import MAX_DATA_BYTES, NAME, file_problem
@@ -490,7 +490,7 @@ def test_an_empty_or_missing_folder_is_an_error(tmp_path):
 @given(st.lists(st.text(min_size=1, max_size=30), min_size=1, max_size=6))
 def test_any_name_gives_a_valid_id(tmp_path_factory, names):
     """For any name, the id is unique, printable, not too long, and stays inside its folder."""
-    from pipeline.grading.intake.hand_ins import HandIn, _with_ids
+    from pipeline.grading.intake.find import HandIn, _with_ids
 
     found = [HandIn(id=name, parent="p") for name in names]
     ids = [hand_in.id for hand_in in _with_ids(found)]

@@ -5,7 +5,7 @@ from datetime import datetime
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.grading.intake.hand_ins import HandIn
+from pipeline.grading.intake.find import HandIn
 from pipeline.grading.intake.late_table import read_late_table, settle_lateness
 from pipeline.grading.rubric import Late
 from pipeline.grading.rubric_file import load_rubric

@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.grading.mistakes.transient import early_readings
 from pipeline.results import FrequencyResponse
-from pipeline.set_up import Bench
+from pipeline.setup import Setup
 from pipeline.stages.bode_fit import fit_bode
 from pipeline.submission import ReportedStateSpace
 from tests.helpers.grading_students import Student, student, typed
@@ -101,7 +101,7 @@ def too_early(one: Student, places: Places) -> Student:
             )
         )
     assert one.analysis.fit is not None
-    bench = Bench(springs=one.rubric.system.springs)
+    bench = Setup(springs=one.rubric.system.springs)
     fit = fit_bode(responses, bench=bench, near=one.analysis.fit.chain)
     return one.reporting(final={n: e.value for n, e in fit.parameters.items()})
 

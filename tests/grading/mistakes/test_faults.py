@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from pipeline.arrays import Array
-from pipeline.estimation.record_fit import find_misread, follow
+from pipeline.estimation.record_fit import find_correction, record_fits
 from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.rubric_file import load_rubric
+from pipeline.identify.bad_recordings import find_bad_recordings
 from pipeline.plant.chain import PRESETS
 from pipeline.results import Analysis
 from pipeline.simulated.hidden import preset_bench
 from pipeline.simulated.submission import write_submission
-from pipeline.soundness.bad_recordings import find_bad_recordings
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 
@@ -442,7 +442,7 @@ def test_sticking_carts_are_not_in_another_unit_of_time(bench):
     )
     creep = 0.02 * dwell.t / dwell.t[-1]  # in cm; nine encoder steps in total
     stuck = replace(dwell, y=np.array([creep, 0.7 * creep]))
-    assert find_misread(stuck, chain, follow([stuck], chain)[stuck.id]) is None
+    assert find_correction(stuck, chain, record_fits([stuck], chain)[stuck.id]) is None
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Batch
 from pipeline.grading.publish.export import export
 from pipeline.grading.publish.students import students_of

@@ -17,8 +17,8 @@ from pipeline.errors import ConfigError
 from pipeline.grading.batch.grade_class import Options, grade_class
 from pipeline.grading.csv_table import read_table
 from pipeline.grading.grade import CODES, Adjustment, Criterion, Flag
-from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.gradebook.class_lines import Line
+from pipeline.grading.gradebook.class_lines import GradeSummary
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.override import HandPoints, read_points, with_overrides
 from pipeline.grading.gradings import Batch
 from pipeline.grading.publish.anonymous import KEY_FILE, anonymise, pseudonyms
@@ -27,7 +27,7 @@ from pipeline.grading.publish.feedback import evidence_table, feedback_page, num
 from pipeline.grading.publish.gradescope import results_text
 from pipeline.grading.publish.outputs import grades_csv, write_outputs
 from pipeline.grading.words import WORDS
-from pipeline.set_up import Units
+from pipeline.setup import Units
 from pipeline.words.spans import plain
 from tests.helpers.grades import (
     failed_grade,
@@ -432,7 +432,7 @@ def test_only_full_points_are_100_percent(points, percent):
 
     So only full points are shown as 100 %.
     """
-    page = class_page([Line.of(make_grade("a", points=points))], rubric=RUBRIC)
+    page = class_page([GradeSummary.of(make_grade("a", points=points))], rubric=RUBRIC)
     cells = re.sub(r"<[^>]+>", " ", page.split("All submissions.")[-1]).split()
     assert cells[cells.index(str(points)) + 1] == percent
 
@@ -441,8 +441,8 @@ def test_the_class_page_shows_statistics():
     """The class page shows mean and median, outcomes per criterion, and teams per mistake."""
     grades = [make_grade("a"), make_grade("b", share=0.5, flags=(hertz_flag(),)),
               make_grade("c", share=0.0, flags=(hertz_flag(), missing_flag()))]  # fmt: skip
-    lines = [Line.of(grade) for grade in grades]
-    lines.append(Line.of(failed_grade("d", "broken")))
+    lines = [GradeSummary.of(grade) for grade in grades]
+    lines.append(GradeSummary.of(failed_grade("d", "broken")))
     html = re.sub(r"<[^>]+>", " ", class_page(lines, rubric=RUBRIC))
     text = " ".join(html.split())
 
@@ -556,7 +556,7 @@ def test_points_by_hand_need_no_new_submission():
 @pytest.mark.parametrize("grades", [[], [failed_grade("a", "broken")]])
 def test_a_class_without_grades_has_a_page(grades):
     """A class has a page even if nobody submitted or nothing could be graded."""
-    html = class_page([Line.of(grade) for grade in grades], rubric=RUBRIC)
+    html = class_page([GradeSummary.of(grade) for grade in grades], rubric=RUBRIC)
     assert "Submissions" in html
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from pipeline.grading.batch.runner import grade_batch
 from pipeline.grading.batch.task import Setup
-from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.gradebook.gradebook import Gradebook
+from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.publish.rubric_preview import preview_rubric
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric

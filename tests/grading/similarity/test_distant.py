@@ -5,11 +5,11 @@ import re
 import numpy as np
 import pytest
 
-from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Batch
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.similarity.distant import find_distant, recomputed_numbers
-from pipeline.set_up import PAPER_UNITS
+from pipeline.setup import PAPER_UNITS
 from tests.helpers.grades import make_grade, make_outcome, two_cart_rubric
 
 RUBRIC = two_cart_rubric()

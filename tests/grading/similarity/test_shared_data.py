@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from pipeline.grading.gradings import Member
-from pipeline.grading.similarity import shared
+from pipeline.grading.similarity import copies
+from pipeline.grading.similarity.copies import find_copies, same_recordings
+from pipeline.grading.similarity.fingerprints import fingerprint, unpack
 from pipeline.grading.similarity.flag import shared_flag
-from pipeline.grading.similarity.prints import fingerprint, unpack
-from pipeline.grading.similarity.shared import find_shared, same_recordings
 from pipeline.ingest.read import read_data
 from pipeline.simulated.bench import COUNT
 from pipeline.simulated.hidden import preset_bench
@@ -98,7 +98,7 @@ def of_kind(records, kind):
 
 def test_honest_teams_on_one_bench_share_nothing(teams):
     """Teams that drive one bench with the same inputs are not flagged, as their noise differs."""
-    assert find_shared([prints(str(i), records) for i, records in enumerate(teams)]) == {}
+    assert find_copies([prints(str(i), records) for i, records in enumerate(teams)]) == {}
 
 
 @pytest.mark.parametrize(
@@ -110,11 +110,11 @@ def test_agreement_by_rounding_is_not_flagged(quiet_teams, per_cm):
         rounded(records, count=1 / per_cm, seed=seed) for seed, records in enumerate(quiet_teams)
     ]
     batch = [prints(str(seed), records) for seed, records in enumerate(honest)]
-    assert find_shared(batch) == {}
+    assert find_copies(batch) == {}
     rng = np.random.default_rng(4)
     if per_cm >= 100:  # with fewer steps per cm, a whole submission has too many zeros in common
         copied = [disguised(r, rng, keep=0.8, later=2.0) for r in honest[0]]
-        assert set(find_shared([*batch, prints("copy", copied)])) == {"0", "copy"}
+        assert set(find_copies([*batch, prints("copy", copied)])) == {"0", "copy"}
 
 
 @pytest.mark.parametrize("per_cm", [5, pytest.param(20, marks=LONG)])
@@ -134,7 +134,7 @@ def test_honest_teams_with_coarse_encoders_share_nothing(tmp_path, per_cm):
         prints(str(seed), read_data(load_submission(tmp_path / str(seed))).records)
         for seed in (1, 2, 7)
     ]
-    assert find_shared(batch) == {}
+    assert find_copies(batch) == {}
 
 
 @pytest.mark.parametrize("kind", ["decay", "step", "sweep", "closed_loop"])
@@ -151,7 +151,7 @@ def test_a_disguised_copy_of_one_recording_is_found(teams, others, kind, disguis
     """One copied recording is found among honest ones; each finding names the other submission."""
     rng = np.random.default_rng(7)
     copied = disguised(of_kind(teams[0], kind), rng, **disguise)
-    found = find_shared([prints("a", teams[0]), prints("b", [*teams[1], copied]), *others])
+    found = find_copies([prints("a", teams[0]), prints("b", [*teams[1], copied]), *others])
     (mine,), (theirs,) = found["b"], found["a"]
     assert (mine.submission, mine.other_experiment) == ("a", theirs.experiment)
     assert (theirs.submission, theirs.other_experiment) == ("b", mine.experiment)
@@ -228,13 +228,13 @@ def test_a_whole_copy_is_found_without_equal_rows(teams, others, disguise):
     """
     rng = np.random.default_rng(8)
     made = WHOLE[disguise](teams[0], teams[1], rng)
-    found = find_shared([prints("a", teams[0]), prints("copy", made), *others])
+    found = find_copies([prints("a", teams[0]), prints("copy", made), *others])
     assert set(found) == {"a", "copy"}
     assert {record.submission for record in found["a"]} == {"copy"}
     if disguise in ("blended", "cross-faded"):
         again = [disguised(r, rng, noise=0.3) for r in teams[2]]  # a copy of the first other team
         batch = [prints("a", teams[0]), prints("b", teams[1]), prints("copy", made), *others]
-        found = find_shared([*batch, prints("again", again)])
+        found = find_copies([*batch, prints("again", again)])
         assert {name: {r.submission for r in records} for name, records in found.items()} == {
             "a": {"copy"},
             "b": {"copy"},
@@ -263,14 +263,14 @@ def test_a_bench_that_releases_by_itself_proves_nothing(teams):
         return replace(like, y=COUNT * np.round(noisy / COUNT))
 
     same = [[read(record) for record in records] for records in teams]
-    assert find_shared([prints(str(i), records) for i, records in enumerate(same)]) == {}
+    assert find_copies([prints(str(i), records) for i, records in enumerate(same)]) == {}
 
 
 def test_one_noisy_recording_proves_nothing(teams, others):
     """The noise of a single recording is no evidence, since a bench may repeat it."""
     rng = np.random.default_rng(7)
     copied = disguised(of_kind(teams[0], "sweep"), rng, noise=0.3)
-    assert find_shared([prints("a", teams[0]), prints("b", [*teams[1], copied]), *others]) == {}
+    assert find_copies([prints("a", teams[0]), prints("b", [*teams[1], copied]), *others]) == {}
 
 
 def test_teammates_and_repeats_are_not_flagged(teams):
@@ -278,7 +278,7 @@ def test_teammates_and_repeats_are_not_flagged(teams):
     twice = [*teams[0], replace(of_kind(teams[0], "step"), id="again")]
     a = prints("a", twice, authors=("ann", "bob"))
     b = prints("b", teams[0], authors=("bob", "carl"))
-    assert find_shared([a, b]) == {}
+    assert find_copies([a, b]) == {}
 
 
 def test_recordings_that_were_handed_out_are_not_flagged(teams):
@@ -286,9 +286,9 @@ def test_recordings_that_were_handed_out_are_not_flagged(teams):
     given, own = teams[0][:-1], teams[0][-1]
     example = fingerprint(given)
     batch = [prints("a", teams[0]), prints("b", [*teams[1][:3], *given])]
-    assert find_shared(batch, examples=[example]) == {}
+    assert find_copies(batch, examples=[example]) == {}
     batch.append(prints("c", [own]))
-    found = find_shared(batch, examples=[example])
+    found = find_copies(batch, examples=[example])
     assert {name: [r.experiment for r in records] for name, records in found.items()} == {
         "a": [own.id],
         "c": [own.id],
@@ -300,8 +300,8 @@ def test_a_whole_class_may_use_a_handed_out_recording(teams):
     rng = np.random.default_rng(11)
     copies = [[disguised(r, rng, scale=2.0, later=1.0) for r in teams[0][:2]] for _ in range(20)]
     batch = [prints(f"t{number:02d}", records) for number, records in enumerate(copies)]
-    assert len(find_shared(batch)) == 20
-    assert find_shared(batch, examples=[fingerprint(teams[0][:2])]) == {}
+    assert len(find_copies(batch)) == 20
+    assert find_copies(batch, examples=[fingerprint(teams[0][:2])]) == {}
 
 
 def test_a_copy_from_an_earlier_batch_is_found(teams):
@@ -310,7 +310,7 @@ def test_a_copy_from_an_earlier_batch_is_found(teams):
     Copies within the earlier batch are not reported again.
     """
     old = [prints("x", teams[0]), prints("y", teams[0])]
-    found = find_shared([prints("a", teams[0][:4])], earlier=old)
+    found = find_copies([prints("a", teams[0][:4])], earlier=old)
     assert set(found) == {"a"}
     assert {r.submission for r in found["a"]} == {"x (an earlier batch)", "y (an earlier batch)"}
     flag = shared_flag(found["a"])
@@ -321,13 +321,13 @@ def test_a_copy_from_an_earlier_batch_is_found(teams):
 @pytest.fixture
 def compared(monkeypatch):
     """Return a list to which each comparison at one time shift adds its pair of recordings."""
-    pairs, compare = [], shared.compare
+    pairs, compare = [], copies.compare
 
     def counted(a, b, **how):
         pairs.append((a.experiment, b.experiment))
         return compare(a, b, **how)
 
-    monkeypatch.setattr(shared, "compare", counted)
+    monkeypatch.setattr(copies, "compare", counted)
     return pairs
 
 
@@ -338,7 +338,7 @@ def test_a_recording_under_many_names_is_compared_once(teams, compared):
     a, b = prints("a", many), prints("b", many)
     assert len(unpack(a.fingerprints)) == 1_000
     assert sum(one.residual.size for one in unpack(a.fingerprints)) <= 2_000_000
-    found = find_shared([a, b])
+    found = find_copies([a, b])
     assert set(compared) == {("decay-0", "decay-0")}
     assert [r.experiment for r in found["a"]] == ["decay-0"]
 
@@ -354,7 +354,7 @@ def test_the_cost_grows_with_the_recordings_not_their_square(teams, alike, compa
         hum = np.resize(3 * COUNT * rng.standard_normal(37), record.t.size)
         made = lambda: disguised(replace(record, y=record.y + hum), rng, noise=1.0)  # noqa: E731
     batch = [prints(name, [replace(made(), id=str(k)) for k in range(50)]) for name in "ab"]
-    find_shared(batch)
+    find_copies(batch)
     assert 0 < len(compared) <= 10 * 100  # there would be 2,500 pairs, each with many time shifts
 
 
@@ -364,9 +364,9 @@ def test_repeats_on_a_real_bench_are_not_flagged(real_data, tmp_path, kind):
     folder = write_two_cart_submission(tmp_path / "s", real_data, steps=(1, 2, 3, 4, 5))
     records = [r for r in read_data(load_submission(folder)).records if r.kind == kind]
     teams = [prints(str(i), [record]) for i, record in enumerate(records)]
-    assert find_shared(teams) == {}
+    assert find_copies(teams) == {}
     copy = disguised(records[2], np.random.default_rng(3), scale=0.5, keep=0.8)
-    found = find_shared([*teams, prints("copy", [copy])])
+    found = find_copies([*teams, prints("copy", [copy])])
     assert {r.submission for r in found["copy"]} == {"2"}
 
 
@@ -385,13 +385,13 @@ def test_the_impacts_of_a_bench_are_not_flagged(knocking):
     This also holds if two teams used this bench, and the others a bench without impacts.
     """
     honest = [prints(str(number), records) for number, records in enumerate(knocking)]
-    assert find_shared(honest) == {}
+    assert find_copies(honest) == {}
     rng = np.random.default_rng(1)
     copied = [disguised(r, rng, noise=0.5) for r in knocking[0]]
-    assert set(find_shared([honest[0], prints("1", copied), *honest[2:]])) == {"0", "1"}
+    assert set(find_copies([honest[0], prints("1", copied), *honest[2:]])) == {"0", "1"}
     quiet = read_class(move_class("throne-1dof", seeds=range(20, 26), dwells=4), seed=4)
     two = [prints(f"quiet-{number}", records) for number, records in enumerate(quiet)]
-    assert find_shared([*honest[:2], *two]) == {}
+    assert find_copies([*honest[:2], *two]) == {}
 
 
 @pytest.mark.parametrize("members", [2, 3])
@@ -406,7 +406,7 @@ def test_in_a_small_class_only_equal_rows_are_flagged(teams, members):
     for noise, told in ((0.0, {"a", "b"}), (0.4, set())):
         copied = disguised(record, rng, noise=noise, keep=0.8, later=2.0)
         b = prints("b", [*teams[1], copied])
-        assert set(find_shared([prints("a", teams[0]), b, *others])) == told
+        assert set(find_copies([prints("a", teams[0]), b, *others])) == told
 
 
 def test_three_equal_copies_among_six_teams_are_flagged(teams):
@@ -421,7 +421,7 @@ def test_three_equal_copies_among_six_teams_are_flagged(teams):
         prints(f"copy-{number}", [*teams[number], disguised(record, rng, noise=0.0)])
         for number in (1, 2)
     ]
-    found = find_shared([prints("a", teams[0]), *copies, *rest])
+    found = find_copies([prints("a", teams[0]), *copies, *rest])
     assert {name: len(records) for name, records in found.items()} == {
         "a": 2,
         "copy-1": 2,
@@ -432,7 +432,7 @@ def test_three_equal_copies_among_six_teams_are_flagged(teams):
 def test_a_flag_says_which_rows_are_equal(teams):
     """The flag's evidence and message say how many rows are equal, and at which times."""
     copied = disguised(of_kind(teams[0], "step"), np.random.default_rng(6), scale=10.0, later=3.0)
-    (record,) = find_shared([prints("a", teams[0]), prints("b", [copied])])["b"]
+    (record,) = find_copies([prints("a", teams[0]), prints("b", [copied])])["b"]
     (evidence,) = shared_flag([record]).evidence["recordings"]
     first, last = evidence["time"]
     rows = (copied.t >= first - 0.001) & (copied.t <= last + 0.001)
@@ -450,7 +450,7 @@ def test_fingerprints_of_an_older_version_are_not_compared(teams):
     assert unpack(old) == ()
     before = Member(submission="a", authors=("ann",), fingerprints=old)
     assert not same_recordings(before, prints("a", teams[0][:1]))
-    assert find_shared([prints("a", teams[0][:1])], earlier=[before]) == {}
+    assert find_copies([prints("a", teams[0][:1])], earlier=[before]) == {}
 
 
 def test_still_or_short_recordings_have_no_fingerprint(teams):

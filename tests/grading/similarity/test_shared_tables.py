@@ -5,13 +5,13 @@ import pytest
 
 from pipeline.grading.batch.runner import grade_batch
 from pipeline.grading.batch.task import Setup
-from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Example, Member
-from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.publish.anonymous import anonymise
 from pipeline.grading.similarity.clusters import find_clusters
+from pipeline.grading.similarity.copies import SharedRecord
 from pipeline.grading.similarity.flag import shared_flag, student_message
-from pipeline.grading.similarity.shared import SharedRecord
 from pipeline.grading.similarity.tables import TypedNumber, find_shared_tables
 from tests.helpers.grades import make_grade, make_outcome, two_cart_rubric
 

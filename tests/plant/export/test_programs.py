@@ -31,7 +31,7 @@ from pipeline.plant.export.description import describe
 from pipeline.plant.export.fmu import fmu
 from pipeline.plant.export.motion import EquationsOfMotion
 from pipeline.plant.export.sources import matlab_source
-from pipeline.set_up import PAPER_UNITS
+from pipeline.setup import PAPER_UNITS
 from tests.helpers.effects import SIZES, make_term
 from tests.helpers.exported import OCTAVE, CompiledModel, no_compiler, no_octave
 

@@ -1,0 +1,256 @@
+"""Give several teams the same points or comment: preview first, then change all or none."""
+
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlencode
+
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from pipeline.desk.gradebooks import ClassView
+from pipeline.desk.grades.class_table import find_signature, open_gradebook, read_class
+from pipeline.desk.grades.criteria import list_steps
+from pipeline.desk.grades.filters import Filter
+from pipeline.desk.grades.team_page import sign, write_address
+from pipeline.desk.page_request import PageRequest
+from pipeline.errors import ConfigError
+from pipeline.grading.gradebook.override import WantedPoints, read_points
+from pipeline.grading.gradebook.shared_gradebook import Conflict, Preview
+from pipeline.grading.publish.anonymous import STRANGER
+from pipeline.grading.publish.feedback import sentence
+from pipeline.grading.rubric import Criterion
+from pipeline.grading.words import WORDS, points_text
+from pipeline.words.numbers import count
+from pipeline.words.text import capital, with_symbols
+
+_SAME = "same"  # value of the choice to leave points unchanged and only comment
+_DONE = "together"  # part of a page where the result is reported
+
+
+@dataclass(frozen=True, kw_only=True)
+class TeamRow:
+    """A team in the list, now and after the change.
+
+    Attributes
+    ----------
+    ticked : whether the team will be changed.
+    version : version of the criterion's points, which is sent along with the change.
+    moved : whether somebody has changed the points since the list was shown.
+    now, after : points of the criterion before and after the change.
+    total_now, total_after : points of the submission before and after the change.
+    message : the current message of the criterion.
+    """
+
+    name: str
+    address: str
+    ticked: bool
+    version: str
+    moved: bool
+    now: str
+    after: str
+    total_now: str
+    total_after: str
+    message: str
+
+
+def show(ask: PageRequest) -> Response:
+    """Show the teams with their points before and after the change."""
+    return _show_page(ask)
+
+
+def apply(ask: PageRequest) -> Response:
+    """Change all ticked teams, or undo a set of changes."""
+    if ask.text("do") == "undo":
+        return _undo(ask)
+    shown, by = read_class(ask), sign(ask)
+    asked = _find_criterion(ask, shown)
+    ticked = ask.form.getlist("team")
+    try:
+        if not ticked:
+            raise ConfigError("tick at least one team")
+        typed = _read_typed(ask)
+        wishes = [_wish(ask, shown, asked, str(name), typed=typed) for name in ticked]
+        done = open_gradebook(ask).change_all(wishes, by=by)
+    except Conflict:
+        text = "Some of these teams have changed since this list was shown. Nothing was changed."
+        return _show_page(ask, wrong=text, status=409)
+    except ConfigError as error:
+        text = capital(str(error).replace(" (--why)", "").replace(" (--by)", ""))
+        return _show_page(ask, wrong=f"{text}. Nothing was changed.", status=422)
+    message = f"{count(done.teams, 'team')} changed in “{capital(asked.title or asked.id)}”."
+    if unchanged := len(wishes) - done.teams:
+        message += f" {unchanged} had these points already."
+    return ask.back(_address(ask, done=done.at if done.teams else ""), message, place=_DONE)
+
+
+def _undo(ask: PageRequest) -> Response:
+    """Undo a set of changes. Teams that were changed again since keep theirs and are named."""
+    shown, book = read_class(ask), open_gradebook(ask)
+    if ask.text("set") not in [one.at for one in book.changed_together(least=1)]:
+        raise HTTPException(404, "there is no such change in this class")
+    undone = book.undo_all(ask.text("set"), by=sign(ask))
+    message = f"{count(undone.back, 'team')} undone."
+    if undone.kept:
+        names = {team.submission: name for name, team in shown.teams.items()}
+        kept = ", ".join(sorted(names.get(one, STRANGER) for one in undone.kept))
+        message += f" Kept, because they changed since: {kept}."
+    if not ask.query("criterion"):  # the button was in the list on the class page
+        return ask.back(f"{ask.here}#sets", message, place=_DONE)
+    return ask.back(_address(ask, done=undone.at if undone.back else ""), message, place=_DONE)
+
+
+def _address(ask: PageRequest, *, done: str) -> str:
+    """Return the URL of the page after a change; the page then offers to undo it.
+
+    Parameters
+    ----------
+    done : time that identifies the set of changes.
+    """
+    kept = {key: ask.query(key) for key in ("criterion", "of")} | {"done": done}
+    wanted = Filter.read(ask.request.query_params).query
+    return f"{ask.here}together?{urlencode({k: v for k, v in kept.items() if v})}&{wanted}"
+
+
+def _find_criterion(ask: PageRequest, shown: ClassView) -> Criterion:
+    """Return the criterion that the URL names."""
+    for asked in shown.rubric.criteria:
+        if asked.id == ask.query("criterion"):
+            return asked
+    raise HTTPException(404, "the rubric has no such criterion")
+
+
+def _read_typed(ask: PageRequest) -> str:
+    """Return the points that were typed or chosen, as text."""
+    return ask.text("other") or ask.text("points") or _SAME
+
+
+def _wish(
+    ask: PageRequest, shown: ClassView, asked: Criterion, name: str, *, typed: str
+) -> WantedPoints:
+    """Return the change that the form requests for one team.
+
+    Raises
+    ------
+    ConfigError : the team is not in the class, or cannot have these points.
+    """
+    if name not in shown.teams:
+        raise ConfigError("a team is no longer in the class")
+    team = shown.teams[name]
+    points = None if typed == _SAME else read_points(typed)
+    if typed == _SAME and asked.id not in team.line.judged:
+        raise ConfigError(f"{name}: has no points here yet; give points with the comment")
+    if points is not None and not 0 <= points <= asked.points:
+        raise ConfigError(f"expected 0 to {asked.points:g} points, found {points:g}")
+    return WantedPoints(
+        submission=team.submission,
+        criterion=asked.id,
+        points=points,
+        why=ask.text("why"),
+        comment=typed == _SAME,
+        version=ask.text(f"seen.{name}"),
+    )
+
+
+def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Response:
+    shown = read_class(ask)
+    asked = _find_criterion(ask, shown)
+    wanted = Filter.read(ask.request.query_params)
+    typed = _read_typed(ask)
+    try:
+        rows = _list_rows(ask, shown, asked, typed=typed)
+    except ConfigError as error:
+        wrong, status = wrong or f"{capital(str(error))}.", 422
+        rows = _list_rows(ask, shown, asked, typed=_SAME)
+    steps = list_steps(asked.points, shown.rubric)
+    team = ask.query("of")
+    return ask.page(
+        "together",
+        status=status,
+        title=_name_set(wanted),
+        action=_address(ask, done=""),
+        done=ask.query("done"),
+        criterion=capital(asked.title or asked.id),
+        out_of=points_text(asked.points),
+        steps=steps,
+        chosen=typed if typed in (*steps, _SAME) else "",
+        other="" if typed in (*steps, _SAME) else typed,
+        why=ask.text("why"),
+        usual=next(iter(open_gradebook(ask).reasons().get(asked.id, [])), ""),
+        rows=rows,
+        ticked=sum(row.ticked for row in rows),
+        wrong=wrong,
+        signature=find_signature(ask),
+        back=_back(ask, team, asked) if team in shown.teams else f"{ask.here}?{wanted.query}",
+        team=team if team in shown.teams else "",
+        wider=_widen(ask, shown, wanted),
+    )
+
+
+def _back(ask: PageRequest, team: str, asked: Criterion) -> str:
+    return f"{ask.here}team?{urlencode({'of': team, 'criterion': asked.id})}"
+
+
+def _name_set(wanted: Filter) -> str:
+    """Return the title of the page, from its filter."""
+    if wanted.flag:
+        return capital(WORDS.text(f"title_{wanted.flag}"))
+    return "Points lost" if wanted.lost else "Several teams"
+
+
+def _widen(ask: PageRequest, shown: ClassView, wanted: Filter) -> tuple[str, int] | None:
+    """Return a link to all teams with the flag, and their number.
+
+    Returns None if the page already shows all teams with the flag.
+    """
+    if not (wanted.flag and wanted.lost):
+        return None
+    wide = Filter(flag=wanted.flag)
+    many = len(wide.chosen(shown))
+    if many == len(wanted.chosen(shown)):
+        return None
+    about = {key: ask.query(key) for key in ("criterion", "of") if ask.query(key)}
+    return f"{ask.here}together?{urlencode(about)}&{wide.query}", many
+
+
+def _list_rows(
+    ask: PageRequest, shown: ClassView, asked: Criterion, *, typed: str
+) -> list[TeamRow]:
+    """Return the teams that pass the filter or were in the form, with points before and after."""
+    sent = ask.sent.getlist("team")
+    names = [team.line.submission for team in Filter.read(ask.request.query_params).chosen(shown)]
+    names += [str(name) for name in sent if name in shown.teams and name not in names]
+    if ask.query("done"):  # the change is done, so nothing is left to preview
+        names = []
+    if typed == _SAME:  # a criterion that was never judged has no points to keep
+        names = [name for name in names if asked.id in shown.teams[name].line.judged]
+    wishes = [_wish(ask, shown, asked, name, typed=typed) for name in names]
+    tried = {one.submission: one for one in open_gradebook(ask).try_all(wishes)}
+    began = ask.text("listed") == "1"
+    rows = []
+    for name in names:
+        one = tried.get(shown.teams[name].submission)
+        if one is not None:
+            ticked = name in sent if began else True
+            rows.append(_row(ask, name, one, asked=asked, ticked=ticked))
+    return rows
+
+
+def _row(ask: PageRequest, name: str, one: Preview, *, asked: Criterion, ticked: bool) -> TeamRow:
+    def own(grade: Any) -> str:
+        found = (points_text(c.points) for c in grade.criteria if c.id == asked.id)
+        return next(found, "not judged")
+
+    sent = ask.text(f"seen.{name}")
+    messages = (sentence(c.message) for c in one.now.criteria if c.id == asked.id)
+    return TeamRow(
+        name=name,
+        address=write_address(ask, name, criterion=asked.id),
+        ticked=ticked,
+        version=one.version,
+        moved=ask.request.method == "POST" and bool(sent) and sent != one.version,
+        now=own(one.now),
+        after=own(one.after),
+        total_now=points_text(one.now.points),
+        total_after=points_text(one.after.points),
+        message=with_symbols(next(messages, "")),
+    )

@@ -1,0 +1,187 @@
+"""A student's own feedback at the desk, and their requests for a review."""
+
+from typing import Any
+
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from pipeline.desk.evidence import show_evidence
+from pipeline.desk.page_request import PageRequest
+from pipeline.desk.request_steps import describe_steps
+from pipeline.desk.served_files import show_own_page
+from pipeline.desk.users import OwnGrade
+from pipeline.desk.visibility import REFUSED, hides_values
+from pipeline.errors import ConfigError
+from pipeline.grading.grade import Criterion, Grade
+from pipeline.grading.gradebook.request_gradebook import OwnFeedback, RequestGradebook, points_lost
+from pipeline.grading.gradebook.requests import MOST_LETTERS, RequestRefused
+from pipeline.grading.judge.costs import find_remarks
+from pipeline.grading.publish.anonymous import anonymise
+from pipeline.grading.publish.feedback import TONES, feedback_page, sentence
+from pipeline.grading.rubric import Criterion as Asked
+from pipeline.grading.words import WORDS, person_lines, points_text, waiting_text
+from pipeline.report.document import paragraph
+from pipeline.report.render.html import render_blocks
+from pipeline.words.numbers import NOTHING
+from pipeline.words.text import capital, rich
+
+
+def show(ask: PageRequest) -> Response:
+    """Show the points, then each criterion with its requests."""
+    return _show_page(ask)
+
+
+def send(ask: PageRequest) -> Response:
+    """Ask for a review of a criterion; a reason that is refused is shown again as typed."""
+    own, criterion, why = _find_own(ask), ask.text("criterion"), ask.text("why")
+    try:
+        book = _open_book(ask)
+        book.ask(own.submission, criterion, why=why, by=ask.user.name, assignment=own.assignment)
+    except RequestRefused as refused:
+        return _show_page(ask, refused={criterion: (why, str(refused))}, status=422)
+    except ConfigError:
+        raise ConfigError(_UNREADABLE) from None
+    return ask.back(f"{ask.here}#criterion-{criterion}", "Sent. The answer will be on this page.")
+
+
+def show_whole(ask: PageRequest) -> Response:
+    """Show the complete feedback page of the team, with its figures."""
+    own, found = _find_own(ask), _read(ask)
+    if found is None:
+        raise HTTPException(404, "your feedback is not published yet")
+    if hides_values(ask.user, found.rubric):
+        raise HTTPException(403, REFUSED)
+    figures = _open_book(ask).figures(found.entry)
+    grade = _hide_others(found, own)
+    page = feedback_page(grade, rubric=found.rubric, figures=figures, name=own.submission)
+    return show_own_page(page)
+
+
+_UNREADABLE = "your grade cannot be read at the moment; tell your instructor"
+
+
+def _find_own(ask: PageRequest) -> OwnGrade:
+    """Return the grade that the URL names, if it belongs to the user."""
+    number = ask.request.path_params["n"]
+    if number >= len(ask.user.grades):
+        raise HTTPException(404, "you have no access to anything here")
+    return ask.user.grades[number]
+
+
+def _open_book(ask: PageRequest) -> RequestGradebook:
+    return ask.desk.gradebooks.gradebook(_find_own(ask).gradebook)
+
+
+def _read(ask: PageRequest) -> OwnFeedback | None:
+    """Return the feedback; None before it is released.
+
+    Raises
+    ------
+    ConfigError : the feedback cannot be read. The message gives no reason, because the reason may
+        contain paths of the server.
+    """
+    own = _find_own(ask)
+    try:
+        return _open_book(ask).own_feedback(own.submission, assignment=own.assignment)
+    except ConfigError:
+        raise ConfigError(_UNREADABLE) from None
+
+
+def _hide_others(found: OwnFeedback, own: OwnGrade) -> Grade:
+    """Return the grade; in an anonymous class it names no other submission."""
+    grade = found.entry.grade
+    return anonymise(grade, {own.submission: own.submission}) if found.rubric.anonymous else grade
+
+
+def _show_page(
+    ask: PageRequest, *, refused: dict[str, tuple[str, str]] | None = None, status: int = 200
+) -> Response:
+    own, found = _find_own(ask), _read(ask)
+    if found is None:
+        return ask.page(
+            "feedback", status=status, title="Feedback", submission=own.submission, found=None
+        )
+    grade = _hide_others(found, own)
+    hidden = hides_values(ask.user, found.rubric)
+    criteria = _describe_criteria(found, grade, refused=refused or {}, hidden=hidden)
+    if grade.awaits_grading:
+        criteria = []
+    return ask.page(
+        "feedback",
+        status=status,
+        title=found.rubric.title or "Feedback",
+        submission=own.submission,
+        found=found,
+        grade=grade,
+        points=points_text,
+        waits=waiting_text(grade) if grade.awaits_grading else "",
+        lost=[one for one in criteria if one["lost"]],
+        kept=[one for one in criteria if not one["lost"] and one["id"] not in grade.open],
+        waiting=[one for one in criteria if not one["lost"] and one["id"] in grade.open],
+        by_person=person_lines(grade),
+        n_waiting=sum(request.state == "asked" for request in found.requests.values()),
+        n_answered=sum(request.state == "answered" for request in found.requests.values()),
+        most=MOST_LETTERS,
+        hidden=hidden,
+    )
+
+
+def _describe_criteria(
+    found: OwnFeedback, grade: Grade, *, refused: dict[str, tuple[str, str]], hidden: bool
+) -> list[dict[str, Any]]:
+    """Return every criterion of the rubric, including those that were never judged.
+
+    Parameters
+    ----------
+    refused : by criterion, the typed reason and why it was refused.
+    hidden : whether to hide numbers that the student must find.
+    """
+    judged = {own.id: own for own in grade.criteria if own.id not in grade.open}
+    lost = points_lost(grade, found.rubric)
+    described = []
+    for asked in found.rubric.criteria:
+        request = found.requests.get(asked.id)
+        typed, wrong = refused.get(asked.id, ("", ""))
+        described.append(
+            {
+                "id": asked.id,
+                "title": capital(asked.title or asked.id),
+                "out_of": points_text(asked.points),
+                **_describe_judged(judged.get(asked.id)),
+                "evidence": _show_why(asked, grade, found, hidden=hidden),
+                "lost": asked.id in lost or request is not None,
+                "request": request,
+                "steps": describe_steps(request.events if request else ()),
+                "may_ask": asked.id in lost and (request is None or request.state == "reopened"),
+                "typed": typed,
+                "wrong": wrong,
+            }
+        )
+    return described
+
+
+def _describe_judged(own: Criterion | None) -> dict[str, Any]:
+    if own is None:
+        return {"points": NOTHING, "outcome": "not judged", "tone": "quiet"}
+    return {
+        "points": points_text(own.points),
+        "outcome": WORDS.text(f"outcome_{own.outcome}"),
+        "tone": TONES[own.outcome],
+    }
+
+
+def _show_why(asked: Asked, grade: Grade, found: OwnFeedback, *, hidden: bool) -> str:
+    """Return the evidence for a criterion as HTML.
+
+    Parameters
+    ----------
+    hidden : whether to show only the titles of flags and the reasons for points given by hand.
+    """
+    own = next((c for c in grade.criteria if c.id == asked.id), None)
+    if own is None or not hidden:
+        return show_evidence(own, asked.check, grade.units) if own else ""
+    remarks = find_remarks(grade, asked, found.rubric)
+    sentences = [capital(WORDS.text(f"title_{flag.code}")) for flag in remarks]
+    by_hand = found.entry.overrides.get(asked.id) or found.entry.comments.get(asked.id)
+    sentences += [by_hand.why] if by_hand else []
+    return render_blocks([paragraph(rich(sentence(one))) for one in dict.fromkeys(sentences)])

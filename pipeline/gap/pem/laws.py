@@ -1,0 +1,349 @@
+"""The laws of a model that follows a record, with its parameters as one physical vector."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.gap.pem import forces
+from pipeline.plant.catalogue import CATALOGUE
+from pipeline.plant.chain import Chain
+from pipeline.plant.law import ForceLaw, FrictionLaw
+from pipeline.plant.simulator.tables import TABLES, Drive
+from pipeline.plant.simulator.terms import COEFFICIENTS, EffectKind
+
+_CHAIN = (0.005, 20.0)  # limits of masses and springs, times the largest first estimate
+_REACH = 0.3  # largest relative step of a mass or spring
+_SMALL = 0.1  # share of the largest first estimate; smaller ones are not trusted
+_DELAY = (-0.05, 0.1)  # limits of a delay, s
+_SHORT = 0.01  # largest step of a delay or lag, s
+# For each kind, in the order of the catalogue: the coordinates in which a law grows from zero.
+GROWTHS = tuple(effect.grown for effect in CATALOGUE)
+SIZES = tuple(len(growth.coordinates) for growth in GROWTHS)
+POSITIVE = {kind for kind, growth in enumerate(GROWTHS) if not growth.signed}
+DRY = tuple(kind for kind, effect in enumerate(CATALOGUE) if effect.dry)
+SIDED = (
+    EffectKind.END_STOP,
+    EffectKind.SLACK_SPRING,
+)  # laws with a position whose sign selects the side
+# The columns that each law fills in the simulator's tables.
+COLUMNS = tuple(
+    tuple(effect.columns(dict.fromkeys((p.name for p in effect.own), 1.0))) for effect in CATALOGUE
+)
+# The laws that need no shape, so that they can start from zero.
+PLAIN = tuple(
+    kind
+    for kind, effect in enumerate(CATALOGUE)
+    if isinstance(effect.law, ForceLaw | FrictionLaw) and len(COEFFICIENTS[kind]) == SIZES[kind]
+)
+Column = tuple[type[IntEnum], int]  # table and number, because tables share numbers
+DRIVE_COLUMNS = (
+    Drive.DEAD_ZONE_WIDTH,
+    Drive.SATURATION_LIMIT,
+    Drive.INPUT_DELAY_DELAY,
+    Drive.ACTUATOR_LAG_TIME_CONSTANT,
+)
+DEAD_ZONE, LIMIT, DELAY, LAG = range(forces.DRIVE)
+
+
+def column_set(columns: Iterable[IntEnum]) -> frozenset[Column]:
+    """Return columns as a set, each with its table."""
+    return frozenset((type(column), int(column)) for column in columns)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialLaw:
+    """A law at a cart or spring (from 0), with the values of its parameters."""
+
+    kind: int
+    place: int
+    values: tuple[float, ...]
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """Kind and place."""
+        return self.kind, self.place
+
+    @property
+    def sided(self) -> tuple[int, int, float]:
+        """Kind, place, and the side (1 or -1; 0 for a law without sides)."""
+        return self.kind, self.place, float(np.sign(self.values[1]) if self.kind in SIDED else 0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PemSetup:
+    """The properties of a bench that decide which laws are possible.
+
+    Attributes
+    ----------
+    chain : the first estimate of the chain.
+    springs : whether each spring exists (n + 1,).
+    largest : the largest input; zero without an input.
+    free : for each run, whether each cart moves.
+    pinned : the cart whose mass is fixed at its first estimate, if no input sets a scale.
+    """
+
+    chain: Chain
+    springs: tuple[bool, ...]
+    largest: float
+    free: tuple[tuple[bool, ...], ...]
+    pinned: int | None = None
+
+    @cached_property
+    def shown(self) -> tuple[bool, ...]:
+        """Whether each cart moves in some run (n,)."""
+        return tuple(any(moves) for moves in zip(*self.free, strict=True))
+
+    @cached_property
+    def rows(self) -> tuple[int, ...]:
+        """The springs that are stretched in some run; of springs with equal stretch, only one."""
+        shown: dict[tuple, int] = {}
+        for j in (j for j, there in enumerate(self.springs) if there):
+            ends = [i for i in (j - 1, j) if 0 <= i < self.n]
+            moving = tuple(tuple(i for i in ends if run[i]) for run in self.free)
+            if any(moving):
+                shown.setdefault(moving, j)
+        return tuple(shown.values())
+
+    @property
+    def n(self) -> int:
+        """The number of carts."""
+        return self.chain.n
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LawSet:
+    """The laws that act; they determine the shape of the vector `p`.
+
+    The vector holds masses, dampings, springs (n + 1), the four values of the drive, then each
+    law's parameters.
+    """
+
+    bench: PemSetup
+    keys: tuple[tuple[int, int], ...]
+    drive: tuple[bool, ...]  # which of the drive's laws are free
+
+    @cached_property
+    def kinds(self) -> np.ndarray:
+        """The kinds of the laws (laws,)."""
+        return np.array([kind for kind, _ in self.keys], dtype=np.int64)
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """The carts or springs of the laws (laws,), from 0."""
+        return np.array([place for _, place in self.keys], dtype=np.int64)
+
+    @cached_property
+    def base(self) -> int:
+        """The number of parameters of chain and drive."""
+        return 3 * self.bench.n + 1 + forces.DRIVE
+
+    @cached_property
+    def first(self) -> np.ndarray:
+        """The index of each law's first parameter (laws,)."""
+        sizes = [SIZES[kind] for kind, _ in self.keys]
+        return self.base + np.cumsum([0, *sizes])[:-1].astype(np.int64)
+
+    @cached_property
+    def size(self) -> int:
+        """The length of the vector."""
+        return self.base + sum(SIZES[kind] for kind, _ in self.keys)
+
+    @cached_property
+    def dry(self) -> np.ndarray:
+        """Whether dry friction acts on each cart (n,)."""
+        there = {place for kind, place in self.keys if kind in DRY}
+        return np.array([i in there for i in range(self.bench.n)])
+
+    @property
+    def drive_at(self) -> int:
+        """Index of the drive's first value."""
+        return 3 * self.bench.n + 1
+
+    def neutral_drive(self) -> Array:
+        """The values of a drive without any law."""
+        return np.array([0.0, self.bench.largest, 0.0, 0.0])
+
+    def start(self, chain: Chain) -> Array:
+        """Return the vector of a chain without laws; masses and springs near zero are raised."""
+        p = np.zeros(self.size)
+        n = self.bench.n
+        p[:n] = np.maximum(chain.m, _SMALL * chain.m.max())
+        p[n : 2 * n] = chain.c
+        p[2 * n : 3 * n + 1] = np.maximum(chain.k, _SMALL * chain.k.max())
+        p[2 * n + np.flatnonzero(~np.array(self.bench.springs))] = 0.0
+        p[self.drive_at : self.base] = self.neutral_drive()
+        return p
+
+    def chain(self, p: Array) -> Chain:
+        """Return the chain that a vector describes."""
+        n = self.bench.n
+        k = p[2 * n : 3 * n + 1].copy()
+        return Chain(m=p[:n].copy(), c=np.maximum(p[n : 2 * n], 0.0), k=k)
+
+    def bounds(self) -> tuple[Array, Array, Array]:
+        """Return lower bounds, upper bounds, and largest steps."""
+        n, chain = self.bench.n, self.bench.chain
+        low, high = np.full(self.size, -np.inf), np.full(self.size, np.inf)
+        reach = np.full(self.size, np.inf)
+        for at, value in ((slice(0, n), chain.m), (slice(2 * n, 3 * n + 1), chain.k)):
+            most = value.max()
+            low[at], high[at] = _CHAIN[0] * most, _CHAIN[1] * most
+            reach[at] = _REACH * np.maximum(value, _SMALL * most)
+        missing = 2 * n + np.flatnonzero(~np.array(self.bench.springs))
+        low[missing] = high[missing] = 0.0
+        if self.bench.pinned is not None:
+            low[self.bench.pinned] = high[self.bench.pinned] = chain.m[self.bench.pinned]
+        if n == 1 and all(self.bench.springs):  # both wall springs act as one
+            low[3] = high[3] = chain.k[1]
+        low[n : 2 * n] = 0.0
+        d, largest = self.drive_at, max(self.bench.largest, 1e-12)
+        low[d : d + 4] = (0.0, 0.2 * largest, _DELAY[0], 0.0)
+        high[d : d + 4] = (0.9 * largest, largest, _DELAY[1], 0.3)
+        reach[d : d + 4] = (0.1 * largest, 0.1 * largest, _SHORT, _SHORT)
+        neutral = self.neutral_drive()
+        for q, free in enumerate(self.drive):
+            if not free:
+                low[d + q] = high[d + q] = neutral[q]
+        for (kind, place), o in zip(self.keys, self.first, strict=True):
+            if kind in POSITIVE:
+                low[[o + q for q in COEFFICIENTS[kind]]] = 0.0
+            if kind == EffectKind.SLACK_SPRING:
+                # A slack spring keeps at least a twentieth of its stiffness.
+                low[o] = -0.95 * max(chain.k[place], _SMALL * chain.k.max())
+            elif kind == EffectKind.SENSOR_GAIN:
+                low[o], high[o] = -0.5, 0.5
+        return low, high, reach
+
+    def steps_of_shape(self, p: Array) -> tuple[Array, Array, Array]:
+        """Return bounds and steps that keep the shapes of the laws near their values."""
+        low, high, reach = self.bounds()
+        for (kind, _), o in zip(self.keys, self.first, strict=True):
+            for q in range(SIZES[kind]):
+                if q in COEFFICIENTS[kind]:
+                    continue
+                value = abs(p[o + q])
+                reach[o + q] = 0.15 * value
+                side = 1.0 if p[o + q] >= 0 else -1.0
+                low[o + q], high[o + q] = sorted((side * 0.02 * value, side * 50.0 * value))
+        return low, high, reach
+
+    def with_laws(self, p: Array, extra: Sequence[TrialLaw]) -> tuple["LawSet", Array]:
+        """Return laws and vector with additional laws."""
+        laws = LawSet(
+            bench=self.bench, keys=(*self.keys, *(law.key for law in extra)), drive=self.drive
+        )
+        return laws, np.concatenate([p, *(law.values for law in extra)])
+
+    def without(self, p: Array, groups: Sequence[int]) -> tuple["LawSet", Array]:
+        """Return laws and vector without some groups.
+
+        The group of a law is its index; the laws of the drive are the groups -1 to -4.
+        """
+        kept = [i for i in range(len(self.keys)) if i not in groups]
+        drive = tuple(free and -1 - q not in groups for q, free in enumerate(self.drive))
+        laws = LawSet(bench=self.bench, keys=tuple(self.keys[i] for i in kept), drive=drive)
+        base = p[: self.base].copy()
+        for q, value in enumerate(self.neutral_drive()):
+            if not drive[q]:
+                base[self.drive_at + q] = value
+        parts = [p[self.first[i] : self.first[i] + SIZES[self.keys[i][0]]] for i in kept]
+        return laws, np.concatenate([base, *parts])
+
+    def groups(self) -> dict[int, np.ndarray]:
+        """Return the groups that may be dropped, each with the indices of its coefficients."""
+        out = {-1 - q: np.array([self.drive_at + q]) for q, free in enumerate(self.drive) if free}
+        for i, ((kind, _), o) in enumerate(zip(self.keys, self.first, strict=True)):
+            out[i] = np.array([o + q for q in COEFFICIENTS[kind]])
+        return out
+
+    def whole_group(self, group: int) -> np.ndarray:
+        """Return the indices of all parameters of a group."""
+        if group < 0:
+            return np.array([self.drive_at - 1 - group])
+        o = self.first[group]
+        return np.arange(o, o + SIZES[self.keys[group][0]])
+
+    def neutral(self) -> Array:
+        """Return the neutral values of the vector, 0 except for the input limit."""
+        out = np.zeros(self.size)
+        out[self.drive_at + LIMIT] = self.bench.largest
+        return out
+
+    def _shared(self, kind: int, place: int, p: Array) -> dict[str, float]:
+        """Return, by symbol, the parameters of the friction that a law extends, at the same place.
+
+        They are 0 if that friction does not act, and missing if the law extends none.
+        """
+        law = CATALOGUE[kind].law
+        if not (isinstance(law, FrictionLaw) and law.beyond):
+            return {}
+        within = next(i for i, effect in enumerate(CATALOGUE) if effect.key == law.beyond)
+        there = dict(zip(self.keys, self.first, strict=True)).get((within, place))
+        symbols = GROWTHS[within].coordinates
+        return {s: 0.0 if there is None else float(p[there + q]) for q, s in enumerate(symbols)}
+
+    def columns(self, p: Array) -> dict[tuple[type[IntEnum], int], dict[IntEnum, float]]:
+        """Return the values of the laws in the simulator's tables.
+
+        The keys are table and row (0 for a drive).
+        """
+        n = self.bench.n
+        out: dict[tuple[type[IntEnum], int], dict[IntEnum, float]] = {}
+        for q, column in enumerate(DRIVE_COLUMNS):
+            if self.drive[q]:
+                out.setdefault((Drive, 0), {})[column] = float(p[self.drive_at + q])
+        for (kind, place), o in zip(self.keys, self.first, strict=True):
+            effect, own = CATALOGUE[kind], self._shared(kind, place, p)
+            if effect.place == "spring":
+                own["k"] = float(p[2 * n + place])
+            own |= zip(GROWTHS[kind].coordinates, p[o : o + SIZES[kind]].tolist(), strict=True)
+            table = TABLES[effect.place]
+            row = out.setdefault((table, 0 if table is Drive else place), {})
+            row.update(effect.columns(effect.grown_values(own)))
+            if kind == EffectKind.BACKLASH:
+                firm, damping = self._contact(p, motor=own["m_m"], bounce=own["e"])
+                row[Drive.BACKLASH_CONTACT_STIFFNESS] = firm
+                row[Drive.BACKLASH_CONTACT_DAMPING] = damping
+        return out
+
+    def _contact(self, p: Array, *, motor: float, bounce: float) -> tuple[float, float]:
+        """Return stiffness and damping of a contact with a given coefficient of restitution.
+
+        The contact in this package is rigid, but the simulator's contact is slightly soft. See W.
+        Goldsmith, Impact (1960), chapter 4.
+        """
+        firm = 40.0 * float(p[2 * self.bench.n] + p[2 * self.bench.n + 1])
+        fall = -float(np.log(np.clip(bounce, 0.02, 0.9)))
+        both = motor * max(1.0 - motor / float(p[0]), 0.0)
+        return firm, 2.0 * fall / float(np.hypot(np.pi, fall)) * float(np.sqrt(firm * both))
+
+
+def smooth_laws(bench: PemSetup, *, columns: frozenset[Column]) -> LawSet:
+    """Return every law that needs no shape, at every place, as the start of a fit.
+
+    `columns` are those that the effects of the catalogue may fill.
+    """
+    n, driven = bench.n, bench.largest > 0.0
+
+    def here(place: str) -> list[int]:
+        """Return the kinds of law that the runs can show at a place."""
+        return [
+            kind
+            for kind in PLAIN
+            if (effect := CATALOGUE[kind]).place == place
+            and (driven or not effect.needs_drive)
+            and not (effect.only_rest and any(bench.springs))
+        ]
+
+    keys = [(kind, i) for i in range(n) if bench.shown[i] for kind in here("cart")]
+    for j in bench.rows:
+        ends = 0 < j < n
+        keys += [(kind, j) for kind in here("spring") if ends or not CATALOGUE[kind].between_carts]
+    keys += [(kind, 0) for kind in here("input")]
+    kept = tuple(key for key in keys if column_set(COLUMNS[key[0]]) <= columns)
+    drive = tuple(driven and (Drive, int(column)) in columns for column in DRIVE_COLUMNS)
+    return LawSet(bench=bench, keys=kept, drive=drive)

@@ -1,0 +1,275 @@
+"""Describe a search in numbers: effects with their errors, rivals, traces, errors by record."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.gap.data.runs import GapRun
+from pipeline.gap.fit.levenberg_marquardt import GapFit
+from pipeline.gap.fit.linearise import Nuisance, simulate_run
+from pipeline.gap.limits import AT_FLOOR
+from pipeline.gap.search.hypothesis import Hypothesis, Study
+from pipeline.gap.types import (
+    Alternative,
+    AlternativeModel,
+    FoundEffect,
+    NamedValue,
+    RecordGap,
+    Trace,
+)
+from pipeline.plant.catalogue import find_effect
+from pipeline.plant.effect import EffectTerm
+from pipeline.setup import Units
+
+_MOST_RIVALS = 4  # rivals to list
+_SAME_LENGTH, _SAME_LEVEL = 0.9, 0.01  # by these shares of samples and of input, repeats agree
+
+
+def list_effects(
+    path: Sequence[Hypothesis], final: GapFit, found: Sequence[Hypothesis], units: Units
+) -> tuple[FoundEffect, ...]:
+    """Return the effects of the final fit, each with its step on the path and its rivals."""
+    structure, chosen = final.structure, path[-1]
+    same_size = {h.key: h for h in found if len(h.key) == len(chosen.key)} | {chosen.key: chosen}
+    lowest = min(h.bic for h in same_size.values())
+    weight = {key: float(np.exp(-0.5 * (h.bic - lowest))) for key, h in same_size.items()}
+    total, std = sum(weight.values()), None
+    if final.covariance is not None:
+        std = np.sqrt(np.diag(final.covariance)) * structure.physical_derivative(final.theta)
+    places = [candidate.key for candidate in structure.effects]
+    out = []
+    for before, after in pairwise(path):
+        (added,) = after.key - before.key
+        index = places.index(added)
+        term, rest = final.terms[index], chosen.key - {added}
+        # A rival has one other effect in place of this one, or shares no effect with the chosen
+        # hypothesis.
+        rivals = [
+            h
+            for key, h in same_size.items()
+            if key != chosen.key and (rest < key or not key & chosen.key)
+        ]
+        # Each effect is listed once, with the best hypothesis in which it takes this one's place.
+        by_name: dict[tuple[str, int], Hypothesis] = {}
+        for h in sorted(rivals, key=lambda h: h.bic):
+            by_name.setdefault(_stand_in(added, h.key - rest), h)
+        # If the cost has many narrow minima, its curvature does not give the standard error.
+        rugged = term.effect.contact and final.chi > AT_FLOOR
+        known = None if std is None or rugged else std[structure.span(index)]
+        values = _named_values(term, known, units)
+        reported = {p.name for p in term.effect.parameters if p.reported}
+        out.append(
+            FoundEffect(
+                effect=term.effect,
+                where=term.where,
+                parameters={k: v for k, v in values.items() if k in reported},
+                details={k: v for k, v in values.items() if k not in reported},
+                confidence=sum(w for key, w in weight.items() if added in key) / total,
+                nrmse_before=before.error,
+                nrmse_after=after.error,
+                rivals=tuple(
+                    _rival(key, h, weight[h.key] / total)
+                    for key, h in list(by_name.items())[:_MOST_RIVALS]
+                ),
+            )
+        )
+    return tuple(out)
+
+
+def _stand_in(effect: tuple[str, int], others: frozenset[tuple[str, int]]) -> tuple[str, int]:
+    """Return the rival's effect at the same place, or else its first effect."""
+    return min(others, key=lambda other: (other[1] != effect[1], other))
+
+
+def list_suspects(
+    found: Sequence[Hypothesis], effects: Sequence[FoundEffect]
+) -> tuple[Alternative, ...]:
+    """Return the effects that help most when used alone, the best first, except for `effects`."""
+    baseline = next(h for h in found if not h.key)
+    listed = {(f.effect.key, next(iter(f.where.values()), 0)) for f in effects}
+    singles = sorted(
+        (h for h in found if len(h.key) == 1 and h.bic < baseline.bic and not h.key <= listed),
+        key=lambda h: h.bic,
+    )
+    weights = [float(np.exp(-0.5 * (h.bic - singles[0].bic))) for h in singles]
+    return tuple(
+        _rival(next(iter(h.key)), h, weight / sum(weights))
+        for h, weight in zip(singles[:_MOST_RIVALS], weights, strict=False)
+    )
+
+
+def _rival(key: tuple[str, int], hypothesis: Hypothesis, confidence: float) -> Alternative:
+    effect = find_effect(key[0])
+    where = effect.where(key[1])
+    return Alternative(
+        effect=effect, where=where, nrmse_after=hypothesis.error, confidence=confidence
+    )
+
+
+def _named_values(term: EffectTerm, std: np.ndarray | None, units: Units) -> dict[str, NamedValue]:
+    return {
+        p.name: NamedValue(
+            value=float(value),
+            std=None if std is None else float(std[i]),
+            unit=p.unit_text(position=units.position, input=units.input),
+        )
+        for i, (p, value) in enumerate(zip(term.effect.parameters, term.values, strict=True))
+    }
+
+
+def chain_std(fit: GapFit) -> dict[str, float]:
+    """Return the standard error of every mass, damping and spring by its name."""
+    if fit.covariance is None:
+        return {}
+    structure, chain = fit.structure, fit.structure.chain(fit.theta)
+    values = {f"{letter}_{i}": v for letter, row in (("m", chain.m), ("c", chain.c))
+              for i, v in enumerate(row, start=1)}  # fmt: skip
+    values |= {f"k_{j + 1}": chain.k[j] for j in structure.rows}
+    # The vector holds logarithms, so its standard errors are relative.
+    relative = np.sqrt(np.diag(fit.covariance))[: structure.base_size]
+    return {name: float(v * r) for (name, v), r in zip(values.items(), relative, strict=True)}
+
+
+def chain_covariance(fit: GapFit) -> Array | None:
+    """Return the covariance of the parameters in `chain_std`."""
+    if fit.covariance is None:
+        return None
+    size, std = fit.structure.base_size, np.array(list(chain_std(fit).values()))
+    relative = fit.covariance[:size, :size]
+    scale = std / np.sqrt(np.diag(relative))
+    return relative * np.outer(scale, scale)
+
+
+def _sides_of(hypothesis: Hypothesis, study: Study) -> list[tuple[GapRun, Nuisance, bool]]:
+    """Return every run with its nuisance parameters, and whether it was held out."""
+    training = zip(study.training, hypothesis.fit.nuisance, strict=True)
+    held_out = zip(study.held_out, hypothesis.held.nuisance, strict=True)
+    return [(run, nuisance, False) for run, nuisance in training] + [
+        (run, nuisance, True) for run, nuisance in held_out
+    ]
+
+
+def make_traces(before: Hypothesis, after: Hypothesis, study: Study) -> tuple[Trace, ...]:
+    """Return the measured and simulated motion of every cart in every run, for both models."""
+    out = []
+    for (run, nuisance_before, held), (_, nuisance_after, _) in zip(
+        _sides_of(before, study), _sides_of(after, study), strict=True
+    ):
+        linear = simulate_run(before.fit, run, nuisance_before)
+        final = simulate_run(after.fit, run, nuisance_after)
+        u = run.record.u[-run.t.size :] if run.record.u is not None else np.zeros(run.t.size)
+        out += [
+            Trace(
+                experiment=run.id,
+                cart=row + 1,
+                held_out=held,
+                t=run.t,
+                u=u,
+                measured=run.y[j],
+                baseline=linear[j],
+                final=final[j],
+                zero=float(nuisance_after.zero[row]),
+            )
+            for j, row in enumerate(run.rows)
+        ]
+    return tuple(out)
+
+
+def compare_by_record(traces: Sequence[Trace], study: Study) -> tuple[RecordGap, ...]:
+    """Return the relative error of every cart in every record, without and with effects.
+
+    The held-out part of a record is listed separately. Runs of the same record, between
+    interventions, are pooled.
+    """
+    order = (*study.training, *study.held_out)
+    rows = [(run, j) for run in order for j in range(len(run.rows))]
+    pooled: dict[tuple[str, int, bool], list[Array]] = {}
+    for trace, (run, j) in zip(traces, rows, strict=True):
+        squares = [
+            np.sum((trace.measured - trace.baseline) ** 2),
+            np.sum((trace.measured - trace.final) ** 2),
+            trace.t.size * run.sigma[j] ** 2,
+            trace.t.size * max(float(run.swing[j]), 1e-12) ** 2,
+        ]
+        of = trace.experiment, trace.cart, trace.held_out
+        pooled.setdefault(of, []).append(np.array(squares))
+    out = []
+    for (experiment, cart, held_out), parts in pooled.items():
+        *errors, size = np.sum(parts, axis=0)
+        baseline, final, noise = np.sqrt(np.array(errors) / size).tolist()
+        out.append(
+            RecordGap(
+                experiment=experiment,
+                cart=cart,
+                held_out=held_out,
+                baseline=baseline,
+                final=final,
+                noise_floor=noise,
+            )
+        )
+    return tuple(out)
+
+
+def repeatability(runs: Sequence[GapRun]) -> float | None:
+    """Return the relative difference of runs with the same input, or None without repeats.
+
+    The second of two runs is interpolated at the times of the first, after the first edges of their
+    inputs are aligned. Two pieces of one record are not repeats, because the later piece begins in
+    motion.
+    """
+    squares, sizes = 0.0, 0.0
+    for i, a in enumerate(runs):
+        for b in runs[:i]:
+            if a.id == b.id or a.free != b.free or a.rows != b.rows or not np.any(a.command):
+                continue
+            t = a.t - _edge(a) + _edge(b)
+            inside = (t >= b.t[0]) & (t <= b.t[-1])
+            if not _same_input(a, b, a.t[inside], t[inside]):
+                continue
+            difference = [
+                x[inside] - np.interp(t[inside], b.t, y) for x, y in zip(a.y, b.y, strict=True)
+            ]
+            # Encoders are zeroed before every run, so a constant difference does not count.
+            squares += sum(float(((d - d.mean()) ** 2).sum()) for d in difference) / 2.0
+            sizes += float((a.swing**2).sum()) * np.count_nonzero(inside)
+    return float(np.sqrt(squares / sizes)) if sizes else None
+
+
+def _edge(run: GapRun) -> float:
+    """Return the time at which the input first changes, or the run's start."""
+    return float(run.knots[int(np.argmax(run.command != run.command[0]))])
+
+
+def _same_input(a: GapRun, b: GapRun, t_a: Array, t_b: Array) -> bool:
+    """Return whether two inputs agree over most of the runs, except for samples at their edges."""
+    if t_a.size < _SAME_LENGTH * max(a.t.size, b.t.size):
+        return False
+    u, v = (
+        run.command[np.searchsorted(run.knots, t, side="right") - 1]
+        for run, t in ((a, t_a), (b, t_b))
+    )
+    # 2 % of the samples may differ, because an edge may be one sample off.
+    return bool(np.mean(np.abs(u - v) > _SAME_LEVEL * np.abs(u).max()) < 0.02)
+
+
+def list_contenders(
+    chosen: Hypothesis, others: Sequence[Hypothesis]
+) -> tuple[AlternativeModel, ...]:
+    """Return the models that may be true: the chosen one, then the likeliest others.
+
+    A model with only some of the chosen effects is not an alternative. Nor is one with additional
+    effects, if the chosen model leaves only noise.
+    """
+    rivals = [one for one in others if one.key and not one.key <= chosen.key]
+    if chosen.at_floor:
+        rivals = [one for one in rivals if not one.key > chosen.key]
+    # At most three models, so that an experiment can distinguish them.
+    kept = [chosen, *sorted(rivals, key=lambda one: one.bic)[:2]]
+    likely = np.exp(-0.5 * np.array([one.bic - min(k.bic for k in kept) for one in kept]))
+    return tuple(
+        AlternativeModel(chain=model.chain, terms=model.terms, weight=float(weight))
+        for one, weight in zip(kept, likely / likely.sum(), strict=True)
+        for model in [one.fit.structure.model(one.fit.theta)]
+    )

@@ -1,0 +1,79 @@
+"""A fault of a recording, with its sentence from `templates/words/soundness.toml`.
+
+`tests/statistics/test_honest_records.py` shows that good records are not accused, even with
+sticking carts and coarse encoders. `tests/grading/mistakes/test_faults.py` shows that wrong records
+are found.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from pipeline.results import Check, CheckKind, LeftOut, Record
+from pipeline.words.phrases import phrases
+
+_WORDS = phrases("soundness")
+
+# Independent records, or kinds of record, that must agree. A single one may be wrong by chance.
+WITNESSES = 2
+SIGMAS = 4.0  # standard errors; by chance, one number in 16,000 is as far off
+# Relative difference up to which encoder steps, clocks or lengths are equal, if a program sets them
+# for all recordings.
+SAME = 0.02
+SAME_SIZE = 0.2  # relative difference up to which friction affects two step sizes equally
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingFault:
+    """A fault of a recording, or a contradiction between it and other recordings.
+
+    Attributes
+    ----------
+    code : kind of the fault, which is also the key of its sentence.
+    run, cart : the recording and the cart. Without a cart, the fault concerns the whole recording.
+    details : values for the sentence, as text.
+    value, limit : the number that shows the fault, and its largest allowed value. None if there is
+        no such number.
+    is_wrong : whether the recording does not show what happened. Otherwise it only differs from
+        others.
+    """
+
+    code: str
+    run: str
+    cart: int | None = None
+    details: Mapping[str, str] = field(default_factory=dict)
+    value: float | None = None
+    limit: float | None = None
+    is_wrong: bool = True
+
+    @property
+    def reason(self) -> str:
+        """The fault in words that follow the recording's name."""
+        return _WORDS.text(self.code, cart=self.cart, **self.details)
+
+    @property
+    def left_out(self) -> LeftOut:
+        """The entry in the list of recordings that were not used."""
+        return LeftOut(experiment=self.run, reason=self.reason, is_wrong=self.is_wrong)
+
+    def check(self, kind: CheckKind) -> Check:
+        """Return the failed check that reports this fault."""
+        return Check(
+            kind=kind,
+            run=self.run,
+            cart=self.cart if kind == "held" else None,
+            outcome="fail",
+            value=self.value,
+            limit=self.limit,
+            message=f"{self.run}: {self.reason}",
+        )
+
+
+def say(key: str, **values: str) -> str:
+    """Return the sentence, or part of a sentence, with this key."""
+    return _WORDS.text(key, **values)
+
+
+def valid_records(records: Sequence[Record], left_out: Sequence[LeftOut]) -> list[Record]:
+    """Return the records that show what happened, even if they differ from others."""
+    wrong = {one.experiment for one in left_out if one.is_wrong}
+    return [record for record in records if record.id not in wrong]

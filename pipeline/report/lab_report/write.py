@@ -1,0 +1,60 @@
+"""Write the report of a submission into a folder, for `cartlab report` and for the desk."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.json_files import json_text
+from pipeline.output import clear_files, own_folder, write_file
+from pipeline.report.gap.load_gap import with_gap
+from pipeline.report.lab_report.files import NAME, PAGE_AND_PDF, Draft, Files
+from pipeline.report.plots import NAME as PLOTS
+from pipeline.report.render.folder import Made, write_files
+from pipeline.results import Analysis
+from pipeline.submission import Submission
+from pipeline.words.progress import Progress
+from pipeline.workflow import analyse
+
+if TYPE_CHECKING:
+    from pipeline.report.lab_report.changes import DraftChanges
+
+
+def make_report(
+    submission: Submission,
+    out: Path,
+    *,
+    compared: "Callable[[Analysis], DraftChanges | None]",
+    make: Callable[..., Draft],
+    files: Files = PAGE_AND_PDF,
+    progress: Progress,
+) -> tuple[Analysis, "DraftChanges | None", Draft]:
+    """Analyse a submission and write its report; return the analysis, the changes and the report.
+
+    Parameters
+    ----------
+    compared : function that returns the differences from an earlier draft; called before
+        `results.json` is overwritten.
+    make : `make_draft`, or a function that calls it in another process.
+    """
+    analysis, gap = with_gap(analyse(submission, progress=progress), submission.folder)
+    changes = compared(analysis)
+    tables = own_folder(out, "tables")
+    draft = make(analysis, gap=gap, changes=changes, files=files, progress=progress)
+    write_draft(draft.files, out)
+    write_file(out / "results.json", json_text(analysis))
+    clear_files(out, "results.mat")  # left by an earlier report
+    clear_files(tables, "*.csv")
+    if files.tables:
+        from pipeline.report.saved_tables import (
+            save_tables,
+        )  # imported late, because it loads pandas
+
+        save_tables(analysis, out)
+    return analysis, changes, draft
+
+
+def write_draft(made: Made, out: Path) -> None:
+    """Write the files of a report in place of those of an earlier one."""
+    if PLOTS not in made:
+        clear_files(out, PLOTS)
+    write_files(made, out, name=NAME)

@@ -1,1 +1,0 @@
-"""Find faults of recordings, and contradictions between recordings, and describe them."""

@@ -1,0 +1,516 @@
+"""A visitor enters the desk with a secret that works once, or through a proxy."""
+
+import re
+import socket
+import sys
+import time
+from contextlib import ExitStack
+from html import unescape
+from pathlib import Path
+from urllib.parse import quote, urlencode, urlsplit
+
+import psutil
+import pytest
+from starlette.datastructures import FormData
+from starlette.requests import Request
+
+from pipeline.desk.app import ROUTES, DeskServer
+from pipeline.desk.home import show_home
+from pipeline.desk.login import MOST_FORM
+from pipeline.desk.page_request import Desk, PageRequest
+from pipeline.desk.users import Role, User, read_users
+from pipeline.errors import ConfigError
+from pipeline.resources import RUBRICS
+from pipeline.submission import load_submission
+from pipeline.submission.edit import edit_submission
+from tests.helpers.desks import PROXY, Visitor, a_submission, through_proxy, write_users
+from tests.helpers.grades import write_class
+from tests.helpers.waiting import PATIENCE, until
+
+pytestmark = pytest.mark.usefixtures("all_work_here")
+PATHS = [re.sub(r"\{\w+:nth\}", "0", re.sub(r"\{name(:path)?\}", "x.json", p)) for p, *_ in ROUTES]
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    """Start a desk with one submission."""
+    folder = a_submission(tmp_path_factory.mktemp("desk") / "team")
+    with DeskServer(folder=folder) as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def visitor(server):
+    """Return a visitor who opened the printed address."""
+    return Visitor.of(server.url)
+
+
+def test_the_secret_opens_once_and_leaves_the_address(server, visitor):
+    """The secret address works once and sets a cookie.
+
+    No script can read the cookie, and no other site can send it. A second visitor with the same
+    address is refused.
+    """
+    assert visitor.get("/").status == 200
+    assert Visitor(port=visitor.port).get(urlsplit(server.url).path).status == 403
+    again = visitor.get(urlsplit(server.url).path)
+    assert (again.status, again.headers["location"]) == (303, "/student/0/")
+    cookie = again.headers["set-cookie"].lower()
+    assert "httponly" in cookie
+    assert "samesite=strict" in cookie
+    assert again.headers["referrer-policy"] == "no-referrer"
+    secret = urlsplit(server.url).path.strip("/")
+    assert secret not in visitor.headers["Cookie"]
+    assert len(secret) >= 32
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_nobody_gets_in_without_the_cookie(visitor, path):
+    """Without the right cookie every address answers 403."""
+    for cookie in ("", f"cartlab-{visitor.port}=guess", "cartlab=x"):
+        stranger = Visitor(port=visitor.port, headers={"Cookie": cookie})
+        assert stranger.get(path).status == 403
+        assert stranger.post(path).status == 403
+
+
+def test_another_cookie_of_the_same_name_locks_nobody_out(visitor):
+    """A second cookie of the same name does not lock the visitor out.
+
+    Any page on this computer could set such a cookie.
+    """
+    real = visitor.headers["Cookie"]
+    other = f"cartlab-{visitor.port}=guess"
+    for sent in (f"{other}; {real}", f"{real}; {other}", f"a=b; {other}; {other}x; {real}"):
+        assert Visitor(port=visitor.port, headers={"Cookie": sent}).get("/").status == 200
+    sent = f"{other}; {other}x"
+    assert Visitor(port=visitor.port, headers={"Cookie": sent}).get("/").status == 403
+
+
+def test_other_pages_cannot_ask(visitor):
+    """A request with another host, a foreign origin or a cross-site mark is refused."""
+    port = visitor.port
+    for wrong in (
+        {"Host": f"evil.example:{port}"}, {"Host": "127.0.0.1"}, {"Origin": "http://evil.example"},
+        {"Origin": "null"}, {"Origin": f"http://127.0.0.1:{port + 1}"},
+        {"Sec_Fetch_Site": "cross-site"}, {"Sec_Fetch_Site": "same-site"},
+    ):  # fmt: skip
+        assert visitor.get("/", **wrong).status == 403, wrong
+        form = visitor.send("/open", b"folder=/", kind="application/x-www-form-urlencoded", **wrong)
+        assert form.status == 403, wrong
+    silent = visitor.ask("POST", "/open", b"", {"Content-Type": "text/plain"})
+    assert silent.status == 403  # a browser sends the form's origin
+    assert visitor.get("/", Host=f"localhost:{port}").status == 200
+
+
+@pytest.mark.parametrize("path", ["/", "/nowhere", "/static/desk.js", "/student/7/"])
+def test_every_answer_has_its_policy(visitor, path):
+    """Each page's policy allows only the desk's own scripts and styles, and no frame around it."""
+    for who in (visitor, Visitor(port=visitor.port)):
+        policy = who.get(path).headers["content-security-policy"]
+        assert "unsafe" not in policy
+        assert "default-src 'none'" in policy
+        assert "frame-ancestors 'none'" in policy
+        assert who.get(path).headers["x-content-type-options"] == "nosniff"
+
+
+@pytest.mark.parametrize(
+    "length", [f"Content-Length: {MOST_FORM + 1}", "Transfer-Encoding: chunked"]
+)
+def test_a_request_that_is_too_long_is_refused(visitor, length):
+    """A request that is too long is refused, whether it states its length or not.
+
+    The desk still serves other requests.
+    """
+    host = f"127.0.0.1:{visitor.port}"
+    head = (
+        f"POST /open HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\n{length}\r\n"
+        f"Cookie: {visitor.headers['Cookie']}\r\n"
+        "Content-Type: application/x-www-form-urlencoded\r\n\r\n"
+    )
+    with socket.create_connection(("127.0.0.1", visitor.port), timeout=PATIENCE) as line:
+        line.sendall(head.encode())
+        if "chunked" in length:
+            for _ in range(MOST_FORM // 100_000 + 1):
+                line.sendall(b"186A0\r\n&a=" + b"x" * 99_997 + b"\r\n")
+        assert line.recv(12) == b"HTTP/1.1 413"
+    assert visitor.get("/").status == 200
+
+
+def test_idle_connections_are_few_and_short(visitor, monkeypatch):
+    """Of 300 connections without a request the desk holds only some, for a short time.
+
+    A visitor with the cookie is still served.
+    """
+
+    def held() -> int:
+        mine = psutil.Process().net_connections("tcp")
+        here = (c.laddr[1:] == (visitor.port,) and c.status == "ESTABLISHED" for c in mine)
+        return sum(here)
+
+    monkeypatch.setattr("pipeline.web.server._STRANGER_STAYS", 0.5)
+    with ExitStack() as opened:
+        for number in range(300):
+            stranger = socket.create_connection(("127.0.0.1", visitor.port), timeout=PATIENCE)
+            opened.enter_context(stranger)
+            if number % 30 == 0:
+                until(lambda: held() <= 140)
+        assert visitor.get("/").status == 200
+        until(lambda: held() <= 3)
+
+
+def test_a_port_that_is_taken_is_one_line(server):
+    """If the port is in use, the command ends with an error of one line."""
+    with pytest.raises(ConfigError, match="the desk cannot listen at port"):
+        DeskServer(port=urlsplit(server.url).port or 0)
+
+
+# ------------------------------------------------------------------------- a lab server
+
+USERS = """
+[[users]]
+name = "s1"
+role = "student"
+folders = ["one"]
+[[users]]
+name = "s2"
+role = "student"
+folders = ["two", "three"]
+[[users]]
+name = "t"
+role = "ta"
+gradebooks = ["grades"]
+[[users]]
+name = "i"
+role = "instructor"
+folders = ["one"]
+gradebooks = ["grades"]
+[[users]]
+name = "w"
+role = "instructor"
+folders = ["one"]
+gradebooks = ["grades"]
+workshop = "shop"
+ports = ["/dev/ttyACM9"]
+"""
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """Write the folders of a lab server."""
+    return tmp_path_factory.mktemp("lab")
+
+
+@pytest.fixture(scope="module")
+def lab(root):
+    """Start a desk for four people behind a proxy; return a visitor for each name."""
+    for name in ("one", "two", "three", "four"):
+        a_submission(root / name)
+    write_class(root / "grades")
+    (root / "shop").mkdir()
+    (root / "shop" / "out").symlink_to(root)
+    with DeskServer(users=write_users(root, USERS)) as server:
+        port = urlsplit(server.url).port or 0
+        yield lambda name, **given: through_proxy(port, name, **given)
+
+
+@pytest.mark.parametrize("name", ["José Müller", "学生七"])
+def test_a_name_may_come_in_utf_8_or_in_latin_1(name, tmp_path):
+    """The proxy may send a user's name in UTF-8 or Latin-1; unknown names are refused."""
+    a_submission(tmp_path / "one")
+    users = f'[[users]]\nname = "{name}"\nrole = "student"\nfolders = ["one"]\n'
+    with DeskServer(users=write_users(tmp_path, users)) as server:
+        port = urlsplit(server.url).port or 0
+        utf_8 = name.encode().decode("latin-1")
+        for sent in {utf_8, name} if name.isascii() or "é" in name else {utf_8}:
+            assert through_proxy(port, sent).get("/student/0/").status == 200
+        for other in (f"{utf_8}x", utf_8[:-1], "Jos\xc3", utf_8.encode().decode("latin-1")):
+            assert through_proxy(port, other).get("/student/0/").status == 403
+
+
+def test_students_see_only_their_own_folder(lab):
+    """Students who open the same address each see their own folder and no other."""
+    assert "one" in lab("s1").get("/student/0/").text
+    assert "two" in lab("s2").get("/student/0/").text
+    assert lab("s1").get("/student/1/").status == 404
+    assert lab("s2").get("/student/1/").status == 200
+    for path in ("/student/-1/", "/student/00000001/", "/student/1/report", "/student/../two/",
+                 "/student/%2e%2e/", "/student/1/hand-in.zip"):  # fmt: skip
+        assert lab("s1").get(path).status == 404, path
+    assert lab("s1").post("/student/1/save", title="mine", seen="").status == 404
+    assert lab("s1").upload("/student/1/files", [("a.csv", b"x")]).status == 404
+    assert lab("s1").get("/").headers["location"] == "/student/0/"
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_a_form_can_be_saved_after_many_other_changes(lab, root):
+    """Many changes in another student's folder do not make the desk forget a form that it showed.
+
+    If the form is outdated, only the field that was typed into it counts as a conflict.
+    """
+    page = lab("s1").get("/student/0/")
+    shown, seen = {name: page.value(name) for name in ("title", "section")}, page.value("seen")
+    saved = lab("s1").post("/student/0/save", seen=seen, **shown | {"section": "07"})
+    assert saved.status == 303
+    for number in range(40):
+        edit_submission(
+            root / "two", lambda document, n=number: document.update(title=f"state {n}")
+        )
+        assert lab("s2").get("/student/0/").status == 200
+    answer = lab("s1").post("/student/0/save", seen=seen, **shown | {"title": "Mine"})
+    rows = re.findall(r'<tr><th scope="row">.*?<pre>(.*?)</pre>.*?<pre>(.*?)</pre>', answer.text)
+    assert (answer.status, rows) == (409, [("Mine", shown["title"])])
+
+
+def test_students_and_tas_see_no_path_of_the_server(lab, root):
+    """Students and TAs never see the path of a folder on the server.
+
+    This holds for pages, refusals and progress messages. An instructor sees the paths.
+    """
+    plain = (root / "three" / "submission.toml").read_bytes()
+    (root / "three" / "report").symlink_to(root)  # a link as report folder is refused
+    try:
+        said = [lab(name).get(path).text
+                for name, paths in (("s1", ("", "report")), ("s2", ("", "report")))
+                for path in (f"/student/0/{path}" for path in paths)]  # fmt: skip
+        said += [lab("s2").get("/").text, lab("t").get("/grades/0/").text, lab("t").get("/").text]
+        assert lab("s2").post("/student/1/make-report").status == 303
+        news = lab("s2").get("/student/1/events").text
+        assert "is a link" in news
+        said += [news, lab("s2").get("/student/1/").text]
+        (root / "three" / "submission.toml").write_bytes(b"x = [")
+        said += [lab("s2").get("/student/1/").text]
+        said += [lab("s2").post("/student/1/fill").text, lab("s2").get("/student/1/").text]
+    finally:
+        (root / "three" / "report").unlink()
+        (root / "three" / "submission.toml").write_bytes(plain)
+    assert not [text for text in said if str(root) in text or str(root.resolve()) in text]
+    assert '<p class="kicker">one</p>' in said[0]
+    assert str(root / "one") in lab("i").get("/student/0/").text
+
+
+def test_a_ta_sees_the_gradebooks_they_are_listed_for(lab):
+    """A TA sees only the gradebooks in the file of users, and no student's page."""
+    assert "team-07" in lab("t").get("/grades/0/").text
+    assert lab("t").get("/grades/1/").status == 404
+
+
+# For each kind of page, the users of a lab server who may open it.
+ENTER = {"": "s t i w", "static": "s t i w", "student": "s i w", "grades": "t i w",
+         "solution": "i w", "effects": "i w", "open": "", "exercises": "w", "rubric": "w",
+         "bench": "w", "feedback": "s"}  # fmt: skip
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_each_role_has_its_pages(lab, path):
+    """A user who asks for a page of another role is refused, whatever the request contains."""
+    for role, name in {"s": "s1", "t": "t", "i": "i", "w": "w"}.items():
+        let_in = role in ENTER[path.split("/")[1]].split()
+        if not let_in:
+            answers = {lab(name).get(path).status, lab(name).post(path).status}
+            assert 403 in answers <= {403, 405}, name
+        elif path.endswith("/") and path != "/feedback/0/":  # none of these has a grade
+            assert lab(name).get(path).status in (200, 303, 405), name
+
+
+def test_a_link_from_another_site_opens_only_whole_pages(lab):
+    """A link from another site may open a whole page, but no part of a page and no form."""
+    led = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"}
+    page = led | {"Sec_Fetch_Dest": "document"}
+    assert lab("s1").get("/student/0/", **page).status == 200
+    for other in (led | {"Sec_Fetch_Dest": "iframe"}, page | {"Sec_Fetch_Mode": "no-cors"}, led):
+        assert lab("s1").get("/student/0/", **other).status == 403
+    kind = "application/x-www-form-urlencoded"
+    assert lab("s1").send("/student/0/fill", b"", kind=kind, **page).status == 403
+
+
+def test_opening_a_page_writes_nothing(lab, root):
+    """A GET request for any page changes no file."""
+
+    def files() -> dict:
+        return {
+            path: path.read_bytes()
+            for path in root.rglob("*")
+            if path.is_file() and not path.name.startswith("gradebook.sqlite-")
+        }
+
+    before = files()
+    for path in (p for p, (_, method, _) in zip(PATHS, ROUTES, strict=True) if method == "GET"):
+        for name in ("s1", "t", "i", "w"):
+            lab(name).get(path)
+    assert files() == before
+
+
+def test_nobody_names_a_folder_of_the_server(lab, tmp_path):
+    """On a lab server nobody can open a folder by typing its path."""
+    for name in ("s1", "t", "w"):
+        assert lab(name).post("/open", folder=str(tmp_path)).status == 403
+
+
+def test_an_instructor_writes_only_in_the_workshop(lab, root):
+    """An instructor writes exercises and rubrics only in the workshop.
+
+    Only the ports in the file of users can be used.
+    """
+    who = lab("w")
+    bench = {"preset": "throne-1dof", "folders": "1", "seed": "0"}
+    made = who.post("/exercises/make", out="first", **bench)
+    assert made.status == 303
+    until(lambda: "The exercise is ready" in who.get(made.headers["location"]).text)
+    assert load_submission(root / "shop" / "first").experiments
+    rubric = (RUBRICS / "throne-1dof.toml").read_text(encoding="utf-8")
+    assert who.post("/rubric/save", file="a.toml", text=rubric, seen="new").status == 303
+    assert (root / "shop" / "a.toml").read_text(encoding="utf-8") == rubric.rstrip() + "\n"
+    (root / "b.toml").write_text(rubric, encoding="utf-8")
+    for out in ("../b", str(root / "b"), "~/b", "out/b", "first/../../b"):
+        answer = who.post("/exercises/make", out=out, **bench)
+        assert answer.status == 422, out
+        page = who.get(f"/rubric/?{urlencode({'file': f'{out}.toml'})}")
+        assert rubric.splitlines()[0] not in unescape(page.text), out
+        assert who.post("/rubric/save", file=f"{out}.toml", text=rubric, seen="new").status == 422
+    assert not (root / "b").exists()
+    for port in ("/dev/ttyACM8", "socket://127.0.0.1:9", ""):
+        assert who.post("/bench/0/acquire", port=port).status == 422
+    assert "/dev/ttyACM9" in who.get("/bench/0/").text
+    assert "/bench/0/" in who.get("/").text
+    assert "/bench/0/" not in lab("i").get("/").text
+
+
+def test_forged_names_are_refused(lab):
+    """Only a request from the proxy with exactly one known name is accepted."""
+    assert lab("").get("/").status == 403
+    assert lab("root").get("/").status == 403
+    assert lab("s1", source="127.0.0.2").get("/student/0/").status == 403
+    guessed = lab("s1")
+    for secret in ("", "the-proxy-and-the-desk-know-i", "wrong"):
+        assert guessed.get("/student/0/", X_Proxy_Secret=secret).status == 403
+    del guessed.headers["X-Proxy-Secret"]  # the user who logged in at the proxy
+    assert guessed.get("/student/0/").status == 403
+    double = "GET /student/0/ HTTP/1.1\r\nHost: lab.example.edu\r\n"
+    double += "X-Proxy-Secret: the-proxy-and-the-desk-know-it\r\n"
+    double += "X-Remote-User: s1\r\nX-Remote-User: s2\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", lab("").port), timeout=PATIENCE) as line:
+        line.sendall(double.encode())
+        assert line.recv(12) == b"HTTP/1.1 403"
+    assert lab("s1").get("/", X_Forwarded_For="127.0.0.2").status == 303
+    assert lab("s1").get("/", Host="127.0.0.1").status == 403
+    port = lab("").port
+    assert Visitor(port=port, headers={"X-Remote-User": "s1"}).get("/").status == 403
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "proxy: is required"),
+        ((PROXY + USERS).replace('"ta"', '"boss"', 1), "role"),
+        ((PROXY + USERS).replace('secret = "the', 'secrets = "the'), "secret"),
+        ((PROXY + USERS).replace("the-proxy-and-the-desk-know-it", "short"), "secret"),
+        ((PROXY + USERS).replace("X-Proxy-Secret", "x-remote-user"), "a header other than"),
+        ((PROXY + USERS).replace("127.0.0.1", "proxy.lab"), "proxy.address"),
+        ((PROXY + USERS).replace('"student"', '"ta"', 1), "a ta cannot have folders"),
+        ((PROXY + USERS).replace('"ta"', '"student"'), "a student cannot have gradebooks"),
+        ((PROXY + USERS).replace('"two"', '"twoo"'), "does not exist"),
+        ((PROXY + USERS).replace('"shop"', '"shops"'), "does not exist"),
+        (
+            PROXY + '[[users]]\nname = "t"\nrole = "ta"\nworkshop = "one"\n',
+            "a ta cannot have workshop",
+        ),
+        (
+            PROXY + '[[users]]\nname = "s"\nrole = "student"\nports = ["COM3"]\n',
+            "cannot have ports",
+        ),
+        ((PROXY + USERS).replace('"s2"', '"s1"'), "listed twice"),
+        (
+            (PROXY + USERS).replace('"s1"', '"ü"').replace('"s2"', '"Ã¼"'),
+            "in UTF-8 equals 'Ã¼' in Latin-1, which is also listed",
+        ),
+        ((PROXY + USERS).replace("folders", "folder", 1), "did you mean 'folders'"),
+        ((PROXY + USERS).replace("https://Lab.example.edu", "lab"), "site"),
+    ],
+)
+def test_a_wrong_list_is_one_line(text, why, tmp_path):
+    """An error in the file of users is refused with a message that names it."""
+    for name in ("one", "two", "three", "grades", "shop"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "users.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "users.toml").chmod(0o600)
+    with pytest.raises(ConfigError, match=why):
+        read_users(tmp_path / "users.toml")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
+def test_a_file_of_users_that_others_can_read_is_refused(tmp_path):
+    """The file of users is refused if others can read it."""
+    path = write_users(tmp_path, '[[users]]\nname = "s1"\nrole = "student"\n')
+    assert read_users(path)[0].site == "https://lab.example.edu"
+    path.chmod(0o644)
+    with pytest.raises(ConfigError, match="chmod o-r"):
+        read_users(path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
+def test_a_file_of_users_that_others_can_write_is_refused(tmp_path):
+    """The file of users is refused if others can write to it or to its folder."""
+    folder = tmp_path / "desk"
+    folder.mkdir()
+    path = write_users(folder, '[[users]]\nname = "s1"\nrole = "student"\n')
+    path.chmod(0o602)
+    with pytest.raises(ConfigError, match=r"users.toml: everybody .* can write it.*chmod o-w"):
+        read_users(path)
+    path.chmod(0o600)
+    folder.chmod(0o777)
+    with pytest.raises(ConfigError, match=r"can replace users\.toml there"):
+        read_users(path)
+    folder.chmod(0o1777)  # as in /tmp, only its owner can replace a file there
+    assert read_users(path)[0].header == "X-Remote-User"
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_a_connection_without_the_secret_times_out(server):
+    """A connection that sends no secret is closed after a time limit."""
+    began = time.monotonic()
+    with socket.create_connection(("127.0.0.1", urlsplit(server.url).port or 0)) as line:
+        line.settimeout(PATIENCE)
+        try:
+            assert line.recv(1) == b""
+        except ConnectionResetError:
+            pass
+    assert time.monotonic() - began >= 1
+
+
+@pytest.mark.parametrize("top", ["/", "/static", "/student", "/grades"])
+def test_pages_are_whole_wherever_the_data_lie(top):
+    """Folders with the names of the desk's own addresses leave all links of a page as they are."""
+    user = User(name="s", role="student", folders=[Path(top) / "team-a", Path(top) / "team-b"])
+    desk = Desk()
+    try:
+        scope = {"type": "http", "method": "GET", "path": "/", "headers": [], "query_string": b""}
+        request = Request({**scope, "path_params": {}})
+        home = show_home(PageRequest(desk=desk, user=user, request=request, form=FormData()))
+        page = bytes(home.body).decode()
+    finally:
+        desk.close()
+    for address in ("/student/0/", "/student/1/", "/static/desk.css"):
+        assert f'="{address}' in page
+    assert f'"{top}"' not in page or top == "/"
+
+
+def test_a_message_names_places_only_by_their_names(tmp_path):
+    """A message for students and TAs holds no path of their folders; an instructor sees it."""
+    folder = tmp_path / "grades"
+    of_role: dict[Role, str] = {
+        "ta": "grades/gradebook.sqlite", "instructor": f"{folder}/gradebook"
+    }  # fmt: skip
+    for role, shown in of_role.items():
+        user = User(name="x", role=role, gradebooks=[folder])
+        assert shown in user.name_places(f"{folder}/gradebook.sqlite: is a link")
+
+
+def test_a_number_of_thousands_of_digits_is_no_address(lab):
+    """An address with a number that no list reaches is answered with 404, whatever its length."""
+    for digits in ("9", "9" * 9, "9" * 10, "1" * 4_300, "1" * 9_000, "٣"):
+        for name, path in (("s1", "/student/{}/"), ("t", "/grades/{}/"), ("s1", "/feedback/{}/")):
+            assert lab(name).get(quote(path.format(digits))).status == 404, digits[:12]
+        path = "/student/0/experiments/{}"
+        assert lab("s1").post(quote(path.format(digits)), remove="1").status in (303, 404, 409, 422)
