@@ -161,7 +161,7 @@ class LivePage(LiveState):
 class _SecretPath:
     """Admit visitors whose address begins with the secret."""
 
-    arrivals = False
+    allows_arrivals = False
 
     def __init__(self, secret: str, *, port: int) -> None:
         self._sites = list_own_names(port)

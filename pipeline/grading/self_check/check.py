@@ -133,9 +133,9 @@ def next_answer(
         disagree=found.disagree,
         agree=found.agree,
         not_checked=found.not_checked,
-        unread=tuple(part.message for part in found.work.submission.unread),
-        doubtful=tuple(found.work.bad),
-        hints=tuple(find_hint(number, found.work, found.flags) for number in hinted),
+        unread=tuple(part.message for part in found.context.submission.unread),
+        doubtful=tuple(found.context.bad),
+        hints=tuple(find_hint(number, found.context, found.flags) for number in hinted),
     )
 
 
