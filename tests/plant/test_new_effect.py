@@ -103,6 +103,6 @@ def test_only_its_own_file_names_an_effect(effect):
         for path in (ROOM / room).rglob("*.py")
         if re.search(rf"\b({effect.key}|{effect.key.upper()}\w*)\b", path.read_text("utf-8"))
     }
-    allowed = {f"plant/simulator/{name}" for name in MADE} | {"gap/follow/score.py"}
-    allowed |= {"gap/follow/choose.py"}  # keeps one of two dry frictions
+    allowed = {f"plant/simulator/{name}" for name in MADE} | {"gap/pem/score.py"}
+    allowed |= {"gap/pem/choose.py"}  # keeps one of two dry frictions
     assert files - {"plant/catalogue.py"} <= allowed
