@@ -10,7 +10,7 @@ from pathlib import Path
 from pipeline.plant.simulator.compiler import is_compiled, kept_in
 from pipeline.threads import with_one_thread
 
-_ROOM = Path(__file__).parent / "follow"
+_ROOM = Path(__file__).parent / "pem"
 _SCRIPT = "from pipeline.gap.pem.run import compile_follower; compile_follower()"
 
 
@@ -21,7 +21,7 @@ def follower_compiled() -> Iterator[None]:
     So the first search on a computer with two cores begins eight seconds earlier. If the second
     process fails, the follower is compiled when it is needed.
     """
-    stored = kept_in(_ROOM) is None or is_compiled(_ROOM, function="follow_run")
+    stored = kept_in(_ROOM) is None or is_compiled(_ROOM, function="predict_run")
     if stored or (os.cpu_count() or 1) == 1:
         yield
         return

@@ -15,10 +15,10 @@ SCRIPT = """
 from pipeline.gap import compile_beside as beside
 from pipeline.plant.simulator.compiler import is_compiled
 
-print(is_compiled(beside._ROOM, function="follow_run"))
+print(is_compiled(beside._ROOM, function="predict_run"))
 with beside.follower_compiled():
     pass
-print(is_compiled(beside._ROOM, function="follow_run"))
+print(is_compiled(beside._ROOM, function="predict_run"))
 """
 
 

@@ -105,4 +105,4 @@ def test_the_folders_name_covers_each_file_that_a_compiled_function_uses():
         for name in (f"{node.module}" for node in nodes):
             if name.startswith("pipeline."):
                 assert (ROOT / f"{name.replace('.', '/')}.py") in covered, (path, name)
-    assert {"simulator", "follow"} <= rooms
+    assert {"simulator", "pem"} <= rooms

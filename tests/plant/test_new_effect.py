@@ -73,8 +73,8 @@ def test_columns_force_and_derivatives_are_generated(made):
 def test_the_fit_gets_the_new_law(made):
     """The fit gets the new law and its derivatives, also with respect to its coefficient."""
     source = made["terms.py"]
-    kinds = kinds_of(source, "Kind")
-    terms = function_of("terms", source, Kind=type("Kind", (), kinds))
+    kinds = kinds_of(source, "EffectKind")
+    terms = function_of("terms", source, EffectKind=type("EffectKind", (), kinds))
     out = np.zeros(11)
 
     terms(kinds["CUBIC_DRAG"], np.array([2.0]), 0, 0.3, 0.5, 0.0, 0.1, 1.0, out)
