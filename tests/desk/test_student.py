@@ -448,15 +448,31 @@ def test_an_essay_and_an_empty_file_do_not_count_as_recordings(filled):
     assert f"{before[1]} recordings, 2 files need you" in visitor.get(HERE).text
 
 
-def test_a_recording_that_was_cut_short_is_not_green(filled):
-    """If a recording is truncated, its row says so, and its group of rows is not folded."""
+def spoil(file: Path) -> None:
+    """Break every fifth row of a table, so that it cannot be used."""
+    lines = file.read_bytes().splitlines(keepends=True)
+    lines[5::5] = [b"broken\n" for _ in lines[5::5]]
+    file.write_bytes(b"".join(lines))
+
+
+def test_a_recording_that_is_broken_is_not_green(filled):
+    """If a recording has broken rows, its row says so, and its group of rows is not folded."""
     visitor, folder = filled
     assert 'id="kind-decay" open' not in visitor.get(HERE).text
+    spoil(folder / "data" / "decay-1b.csv")
+    page = visitor.get(HERE).text
+    assert 'id="kind-decay" open' in page
+    assert "line 6" in page
+
+
+def test_a_last_row_that_was_cut_off_is_only_a_note(filled):
+    """If the last row of a recording is cut off, the recording is used; its row names the line."""
+    visitor, folder = filled
     file = folder / "data" / "decay-1b.csv"
     file.write_bytes(file.read_bytes()[:-3].rpartition(b",")[0])
     page = visitor.get(HERE).text
-    assert 'id="kind-decay" open' in page
-    assert "the file is truncated: export it again" in page
+    assert 'id="kind-decay" open' not in page
+    assert "is cut off" in page
 
 
 def test_edits_from_outside_are_shown_and_not_overwritten(filled):
@@ -1052,8 +1068,7 @@ def test_recordings_that_need_the_student_come_first(filled):
     """In each group, recordings that need the student come first, and the others are folded."""
     visitor, folder = filled
     assert "rest-decay" not in visitor.get(HERE).text
-    file = folder / "data" / "decay-1b.csv"
-    file.write_bytes(file.read_bytes()[:-3].rpartition(b",")[0])
+    spoil(folder / "data" / "decay-1b.csv")
     group = visitor.get(HERE).text.partition('id="kind-decay"')[2].partition("</section>")[0]
     first, _, rest = group.partition('<details class="kind" id="rest-decay"><summary>')
     assert ("decay-1b.csv" in first, "decay-1b.csv" in rest) == (True, False)

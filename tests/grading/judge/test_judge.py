@@ -208,14 +208,19 @@ def test_a_submission_for_another_bench_fails_with_its_reason(folder):
     assert "is for 1 cart, the rubric for 2" in failed.reason
 
 
-def test_a_cut_file_costs_its_own_run_only(folder, tmp_path):
-    """If a file is cut off, its run is flagged with the line number; the other runs are graded."""
-    cut = tmp_path / "team-07"
-    shutil.copytree(folder, cut)
-    path = cut / "data" / "sine-05.csv"
+def test_a_broken_file_costs_its_own_run_only(folder, tmp_path):
+    """A run with many broken rows is flagged with a line number; the other runs are graded.
+
+    A last row that was cut off costs nothing.
+    """
+    spoilt = tmp_path / "team-07"
+    shutil.copytree(folder, spoilt)
+    path = spoilt / "data" / "sine-05.csv"
     text = path.read_text("utf-8")
     path.write_text(text[: len(text) // 2].rsplit(",", 1)[0], "utf-8", newline="\n")
-    found = grade(cut)
+    assert grade(spoilt).flags == ()
+    path.write_text(text.replace(".1", ".x"), "utf-8", newline="\n")
+    found = grade(spoilt)
     (flag,) = found.flags
     assert (flag.code, flag.parameters) == ("data_problem", ("sine-05",))
     assert "line" in flag.message
