@@ -19,7 +19,7 @@ Other packages have further types:
 
 - `Ingested` (`ingest/read.py`). The data read.
 - `Identified` and `Fitted` (`identify/`). Results of the stages up to the fit.
-- `Repeats` (`soundness/repeated_numbers.py`). Steps and decays in repeated recordings.
+- `Repeats` (`identify/repeats.py`). Steps and decays in repeated recordings.
 - `Gap` (`gap/types.py`). The gap of the linear carts and its explanation.
 - `Grade` (`grading/grade.py`). The points of a submission, with reasons.
 - `Grading` (`grading/gradings.py`). The place of a grade in a class.

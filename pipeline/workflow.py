@@ -1,26 +1,35 @@
 """The workflow from a submission to its analysis.
 
-`identify/carts.py` lists the stages that measure the carts, and `identify/fit.py` lists the fits.
+`identify/identify.py` lists the stages that measure the carts, and `identify/fit.py` the fits.
 The later steps are in this module.
 """
 
 from dataclasses import replace
 from functools import partial
 
-from pipeline.checks.carts import check_carts
-from pipeline.checks.estimates import check_coverage, check_decays, check_rows, check_steps
-from pipeline.checks.loops import check_loops, design_margins, verify_design
-from pipeline.checks.recordings import check_recordings
 from pipeline.errors import DataError
 from pipeline.estimation.interventions import find_interventions
 from pipeline.identify.assumptions import list_assumptions
-from pipeline.identify.carts import compare_estimates
-from pipeline.identify.fault import valid_records
-from pipeline.identify.groups import check_groups, find_groups
-from pipeline.identify.late_channels import find_late_channels
-from pipeline.identify.log import Log
-from pipeline.identify.rejection import identify_with_rejection
-from pipeline.identify.remarks import gain_sign_warning, hand_remarks, reading_remarks
+from pipeline.identify.findings import Log, valid_records
+from pipeline.identify.fit import check_groups, find_groups
+from pipeline.identify.identify import compare_estimates, identify_with_rejection
+from pipeline.identify.model_checks import (
+    check_carts,
+    check_coverage,
+    check_decays,
+    check_loops,
+    check_rows,
+    check_steps,
+    design_margins,
+    verify_design,
+)
+from pipeline.identify.recording_checks import (
+    check_recordings,
+    gain_sign_warning,
+    hand_remarks,
+    reading_remarks,
+)
+from pipeline.identify.recording_faults import find_late_channels
 from pipeline.identify.springs import check_springs
 from pipeline.ingest.read import Ingested, read_data
 from pipeline.plant.chain import Chain
@@ -74,7 +83,11 @@ def analyse(
         records=used,
         bench=bench,
     )
-    groups = () if springs else find_groups(found, records=used, rows=rows, bench=bench)
+    groups = (
+        ()
+        if springs
+        else find_groups(found.fitted, decays=found.decays, records=used, rows=rows, bench=bench)
+    )
     checks = (
         *springs,
         *check_groups(groups),

@@ -23,7 +23,7 @@ READERS = {
 MESSAGES = {"message", "reason", "stage", "id", "about", "note", "parameter", "warning",
         "partial"}  # fmt: skip
 # In these packages the variables in PARAMETERS hold names of parameters, never names of files.
-ROOMS = ("checks", "identify", "report/equations", "grading/mistakes", "grading/judge",
+ROOMS = ("identify", "report/equations", "grading/mistakes", "grading/judge",
          "grading/references")  # fmt: skip
 PARAMETERS = {"name", "omega", "zeta", "worst"}
 # A reason may be split into lines, since each line is a separate fault.

@@ -24,7 +24,7 @@ LEVELS = (
     ("results", "submission", "words.phrases"),
     ("estimation", "ingest"),
     ("stages",),
-    ("checks", "identify", "workflow"),
+    ("identify", "workflow"),
     ("gap", "experiments"),
     (
         *("bench", "report", "simulated", "grading", "desk", "schemas", "cli", "notebook"),
@@ -49,7 +49,7 @@ HOMES = {
     "tomlkit": ("submission", "ingest", "bench", "desk.student"),
     "starlette": ("web", "bench", "desk"),
     "uvicorn": ("web",),
-    "control": ("plant", "checks", "notebook"),
+    "control": ("plant", "notebook"),
     "sqlalchemy": ("grading.gradebook",),
     "pandas": ("report", "grading", "notebook"),
 }
@@ -134,15 +134,15 @@ def test_each_outside_package_has_one_place():
 
 
 def test_no_module_of_the_analysis_is_long():
-    """No module of the analysis has over 400 lines, except lists of effects or types."""
+    """No module of the analysis has over 650 lines, except the list of types."""
     rooms = ("plant", "estimation", "stages", "identify", "gap")
     files = [
         *PIPELINE.glob("*.py"),
         *(path for room in rooms for path in (PIPELINE / room).rglob("*.py")),
     ]
     files = [path for path in files if path.parent.name != "export"]
-    long = [f.name for f in files if len(f.read_text(encoding="utf-8").splitlines()) > 400]
-    assert sorted(long) == ["catalogue.py", "laws.py", "results.py", "types.py"]  # these are lists
+    long = [f.name for f in files if len(f.read_text(encoding="utf-8").splitlines()) > 650]
+    assert long == ["results.py"]
 
 
 def test_test_folders_are_named_after_what_they_test():

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.checks.carts import physical_values
+from pipeline.identify.model_checks import physical_values
 from pipeline.ingest.channels import little_motion
 from pipeline.ingest.columns import is_count
 from pipeline.ingest.read import DUTY_COUNT, Ingested

@@ -1,19 +1,48 @@
-"""Find records that follow the carts only after a correction, and decide which of them are wrong.
+"""Find recordings that contradict the identified carts, and the correction that some of them need.
+
+The faults are a dead or swapped channel, a wrong clock or unit, or a truncated file. A constant
+reading is not always a fault: friction may hold a cart, a held cart should not move, and a coarse
+encoder does not show a small motion. So a channel is called dead only if the identified carts would
+have moved it far. In addition, the records that follow these carts must show too little friction to
+hold it.
 
 A wrong unit or clock applies to everything that one program logged. A single record with a tenth of
 the motion is only odd, because an amplifier at its limit, a dead zone or friction can cause this
 too.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.estimation.record_fit import Correction, RecordFit, find_correction
-from pipeline.identify.fault import SAME, SAME_SIZE, WITNESSES, RecordingFault
+from pipeline.estimation.record_fit import (
+    FASTEST,
+    TIME_FACTORS,
+    Correction,
+    RecordFit,
+    find_correction,
+    fit_detuned,
+    force_on,
+    is_driven,
+    measured,
+    most_are_consistent,
+)
+from pipeline.estimation.time_search import FOLLOWED
+from pipeline.identify.findings import SAME, SAME_SIZE, SIGMAS, WITNESSES, RecordingFault
 from pipeline.plant.chain import Chain
-from pipeline.results import Record
+from pipeline.plant.simulate import simulate_linear
+from pipeline.results import Record, StepGain
+
+# A reading is suspicious if it is constant while the input changes by half its range, and for this
+# share of the record afterwards. It is a fault if the identified carts meanwhile move by this many
+# encoder steps and by three tenths of their motion. A delay or play holds a cart only briefly.
+_STILL, _SEEN_COUNTS = 0.2, 5.0
+# Least ratio of the mean square change from sample to sample to twice the variance. It is 1 for
+# noise. A motion with this ratio has a period of at most five samples. (J. von Neumann, Annals of
+# Mathematical Statistics 12, 1941.)
+_WHITE = 0.8
+_FEWEST_CYCLES = 1.5  # cycles of a dwell; with fewer there is no steady state at any damping
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,3 +162,297 @@ def _is_sampled_so(record: Record, records: Sequence[Record], *, factor: float) 
 def _odd(name: str, *, scale: float) -> RecordingFault:
     code = "moves_too_little" if scale < 1 else "moves_too_far"
     return RecordingFault(code=code, run=name, details={"scale": f"{scale:.3g}"}, is_wrong=False)
+
+
+def standing_still(records: Sequence[Record]) -> set[str]:
+    """Return the driven records in which the reading of a free cart may show nothing.
+
+    It is constant while the input changes, or only noise.
+    """
+    return {
+        record.id
+        for record in records
+        if is_driven(record)
+        and any(_is_noise(record, cart) or any(_still(record, cart)) for cart in measured(record))
+    }
+
+
+def find_faults(
+    records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, RecordFit]
+) -> dict[str, RecordingFault]:
+    """Return the records that do not show what happened, by id, each with its fault.
+
+    Parameters
+    ----------
+    chain : the carts identified from records that are not in doubt. None if this failed;
+        then only faults are found that no carts could cause.
+    fits : how each record follows the chain, from `follow`.
+    """
+    readings = find_other_readings(records, chain=chain, fits=fits)
+    misread = readings.mistaken
+    everywhere = len({m.words for m in misread.values()}) == 1 and misread.keys() == fits.keys()
+    copied = _copies(records)
+    steps: dict[int, float] = {}  # the largest of all records, as a dead channel shows no step
+    moving: set[int] = set()
+    for record in records:
+        for cart in measured(record):
+            steps[cart] = max(steps.get(cart, 0.0), record.encoder_step(cart))
+            y = record.position(cart)
+            if is_driven(record) and np.ptp(y) > 0 and not _is_noise(record, cart):
+                moving.add(cart)
+    allowed: dict[int, list[float]] = {}  # noise shows no friction
+    for record in (record for record in records if record.id in fits):
+        fit = fits[record.id]
+        for cart in (cart for cart in fit.unexplained_share if not _is_noise(record, cart)):
+            allowed.setdefault(cart, []).append(fit.friction.get(cart, np.inf))
+    friction = {cart: float(np.median(values)) for cart, values in allowed.items()}
+    # All records are compared here, because no bench samples some of them a thousand times more
+    # slowly.
+    clocks = [record.sample_time for record in records]
+    usual_clock = min((dt for dt in clocks if dt >= FASTEST), default=0.0)
+    found: dict[str, RecordingFault] = {}
+    for record in records:
+        legal = record.id in misread and misread[record.id].legal
+        for fault in (
+            *_wrong_clock(record, usual=usual_clock),
+            *_short_dwell(record),
+            *([copied[record.id]] if record.id in copied else ()),
+            *(
+                [_correction_fault(record, misread[record.id], everywhere)]
+                if record.id in misread
+                else ()
+            ),
+            *(
+                _frozen(record, fits[record.id], chain, friction=friction, steps=steps)
+                if chain and record.id in fits
+                else ()
+            ),
+            *_dead_channels(record, chain=chain, friction=friction, steps=steps, moving=moving),
+        ):
+            found.setdefault(record.id, replace(fault, is_wrong=not legal))
+    for name, one in readings.odd.items():
+        found.setdefault(name, one)
+    for stray in _strays(records, chain=chain, fits=fits):
+        found.setdefault(stray.run, stray)
+    return found
+
+
+def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, RecordingFault]:
+    """Return the steps in which a cart moves further than the cart that pulls it, by id.
+
+    The input acts on cart 1, and springs pull the other carts. So a cart's static gain is at most
+    that of the cart before it.
+    """
+    found: dict[str, RecordingFault] = {}
+    by_cart = {(gain.experiment, gain.cart): gain for gain in gains if gain.interval is None}
+    for (run, cart), gain in by_cart.items():
+        before = by_cart.get((run, cart - 1))
+        if before is None:
+            continue
+        least = abs(gain.gain) - SIGMAS * gain.gain_std
+        # The difference must exceed the amount by which friction may hold the carts off.
+        if least > 1.3 * (abs(before.gain) + SIGMAS * before.gain_std):
+            details = {"times": f"{abs(gain.gain / before.gain):.3g}", "before": str(cart - 1)}
+            found[run] = RecordingFault(code="too_far", run=run, cart=cart, details=details)
+    return found
+
+
+# ------------------------------------------------------------------ single channels
+
+
+def _is_noise(record: Record, cart: int) -> bool:
+    """Return whether the reading of a cart changes from sample to sample like noise."""
+    y = record.position(cart)
+    change = float(np.mean(np.diff(y) ** 2))
+    return change > 0 and change >= 2 * _WHITE * float(np.var(y))
+
+
+def _edges(y: np.ndarray) -> np.ndarray:
+    """Return the starts of stretches of constant reading, and the end of the last one."""
+    return np.concatenate([[0], np.flatnonzero(np.diff(y)) + 1, [y.size]])
+
+
+def _still(record: Record, cart: int) -> Iterator[slice]:
+    """Yield stretches of constant reading while the input changes by half its range."""
+    u, y = record.u, record.position(cart)
+    if u is None:
+        return
+    edges = _edges(y)
+    long = _STILL * y.size
+    for i in np.flatnonzero(np.diff(edges) >= long):
+        part = slice(int(edges[i]), int(edges[i + 1]))
+        changed = np.abs(u[part] - u[part.start]) >= 0.5 * np.ptp(u)
+        if changed.any() and changed.size - np.argmax(changed) >= long:
+            yield part
+
+
+def _dead_channels(
+    record: Record,
+    *,
+    chain: Chain | None,
+    friction: Mapping[int, float],
+    steps: Mapping[int, float],
+    moving: Set[int],
+) -> Iterator[RecordingFault]:
+    """Yield a fault for each free cart that must have moved, although its reading shows no motion.
+
+    The reading is constant, or only noise. For each cart, `friction` is the largest friction that
+    the records allow, and `steps` the encoder step. `moving` are the carts that any input ever
+    moved.
+    """
+    for cart in measured(record):
+        y = record.position(cart)
+        never = is_driven(record) and cart not in moving
+        noise = _is_noise(record, cart)
+        if noise and (record.kind == "decay" or cart not in moving):
+            yield RecordingFault(code="only_noise", run=record.id, cart=cart)
+        elif np.ptp(y) == 0 and (record.kind == "decay" or never):
+            others = [free for free in record.free if free != cart]
+            code = "never_changes_held" if others else "never_changes"
+            yield RecordingFault(
+                code=code, run=record.id, cart=cart, details={"others": str(others)}
+            )
+        if chain is None or record.u is None or not is_driven(record):
+            continue
+        force = force_on(record, chain, cart=cart)
+        for still in [slice(None)] if noise else _still(record, cart):
+            # Friction holds a cart equally in both directions.
+            if force is None or 2 * friction.get(cart, np.inf) >= np.ptp(force[still]):
+                continue
+            if not _must_move(record, chain, still, cart=cart, step=steps[cart]):
+                continue
+            if noise:
+                yield RecordingFault(code="only_noise", run=record.id, cart=cart)
+                continue
+            code = "dead" if np.ptp(y) == 0 else "froze_at_input"
+            yield RecordingFault(code=code, run=record.id, cart=cart, details=_span(record, still))
+
+
+def _frozen(
+    record: Record,
+    fit: RecordFit,
+    chain: Chain,
+    *,
+    friction: Mapping[int, float],
+    steps: Mapping[int, float],
+) -> Iterator[RecordingFault]:
+    """Yield a fault for each reading that is constant for a while although the carts moved it far.
+
+    The reading is constant for ten samples or more. Meanwhile the identified cart moves by at least
+    a fifth of the recorded range, and the force on it exceeds any friction. At other times the
+    reading follows the identified cart.
+    """
+    for cart, missed in fit.residual.items():
+        y = record.position(cart)
+        far = max(_SEEN_COUNTS * steps[cart], 0.2 * float(np.ptp(y)))
+        edges = _edges(y)
+        for i in np.flatnonzero(np.diff(edges) >= 10):
+            part = slice(int(edges[i]), int(edges[i + 1]))
+            moved = float(np.ptp(missed[part]))
+            if moved < far:
+                continue
+            rest, force = np.delete(missed, part), force_on(record, chain, cart=cart)
+            if not rest.size or force is None:
+                continue
+            # A cart at rest stays there for a moment after the input steps, so only the first half
+            # counts.
+            early = force[part][: (part.stop - part.start) // 2]
+            if 2 * friction.get(cart, np.inf) >= np.ptp(early):
+                continue
+            elsewhere = float(np.mean(rest**2))
+            follows = elsewhere < FOLLOWED * float(np.var(np.delete(y, part)))
+            # The reading follows the carts if its error elsewhere is below a quarter of the missed
+            # motion.
+            if follows and np.sqrt(elsewhere) < 0.25 * moved:
+                details = _span(record, part)
+                yield RecordingFault(
+                    code="froze_in_motion", run=record.id, cart=cart, details=details
+                )
+
+
+def _span(record: Record, part: slice) -> dict[str, str]:
+    first, last = record.t[part.start], record.t[part.stop - 1]
+    return {"first": f"{first:.4g}", "last": f"{last:.4g}"}
+
+
+def _must_move(record: Record, chain: Chain, still: slice, *, cart: int, step: float) -> bool:
+    """Whether the cart moves far in a simulation while its reading stands `still`.
+
+    In a dwell, it must also move far in steady state.
+    """
+    assert record.u is not None
+    free = tuple(sorted(record.free))
+    y = simulate_linear(chain, record.t, record.u, free=free, hold=record.hold)[free.index(cart)]
+    far = float(np.ptp(y[still]))
+    if record.kind == "sine" and record.omega is not None:  # a dwell may start in motion
+        G = chain.frequency_response(np.array([record.omega]))[cart - 1, 0]
+        far = min(far, float(abs(G) * np.ptp(record.u)))
+    return far >= max(_SEEN_COUNTS * step, 0.3 * float(np.ptp(y)))
+
+
+def _copies(records: Sequence[Record]) -> dict[str, RecordingFault]:
+    """Return the records with exactly the samples of an earlier record of their kind."""
+    first: dict[tuple[object, ...], str] = {}
+    copies = {}
+    for record in records:
+        what = (record.kind, record.free, record.t.tobytes(), record.y.tobytes())
+        if first.setdefault(what, record.id) != record.id:
+            details = {"original": first[what]}
+            copies[record.id] = RecordingFault(
+                code="copied_samples", run=record.id, details=details
+            )
+    return copies
+
+
+def _short_dwell(record: Record) -> Iterator[RecordingFault]:
+    if record.kind == "sine" and record.omega is not None:
+        duration = float(record.t[-1] - record.t[0]) + record.sample_time
+        cycles = record.omega * duration / (2 * np.pi)
+        if cycles < _FEWEST_CYCLES:
+            details = {"cycles": f"{_FEWEST_CYCLES:g}"}
+            yield RecordingFault(code="short_dwell", run=record.id, details=details)
+
+
+def _wrong_clock(record: Record, *, usual: float) -> Iterator[RecordingFault]:
+    """Yield a fault if the time column of a record is in an unusual unit.
+
+    That is so if its sample interval, converted from this unit, is the usual one.
+    """
+    for factor, words in TIME_FACTORS.items():
+        # A factor of 100 or more is another unit of time; a factor of 2 may be another setting.
+        is_unit = max(factor, 1 / factor) >= 100.0
+        if is_unit and abs(record.sample_time - factor * usual) < SAME * factor * usual:
+            details = {"apart": f"{record.sample_time:.3g}", "usual": f"{usual:.3g}", "look": words}
+            yield RecordingFault(code="other_clock", run=record.id, details=details)
+
+
+# ------------------------------------------------------- records that follow no carts
+
+
+def _correction_fault(record: Record, correction: Correction, everywhere: bool) -> RecordingFault:
+    code = "misread_everywhere" if everywhere else "misread"
+    details = {"look": correction.words, "remedy": correction.remedy}
+    return RecordingFault(code=code, run=record.id, details=details)
+
+
+def _strays(
+    records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, RecordFit]
+) -> Iterator[RecordingFault]:
+    """Yield the records that follow neither the chain nor a slightly slower or faster one.
+
+    It is enough if one cart follows, because another one may be near its null and hardly move. A
+    cart that moves less than it should proves nothing, because friction may hold it.
+    """
+    if chain is None or not most_are_consistent(fits):
+        return
+    for record in records:
+        fit = fits.get(record.id)
+        # Friction makes no cart move further, so a record whose carts all move less is not judged.
+        if fit is None or fit.is_consistent or max(fit.amplitude_ratio.values()) < 0.8:
+            continue
+        # More than half of the power of every cart must be unexplained.
+        if all(
+            min(near_by.unexplained_share.values()) > 0.5 for near_by in fit_detuned(record, chain)
+        ):
+            details = {"percent": f"{100 * min(fit.share, 1.0):.0f}"}
+            yield RecordingFault(code="stray", run=record.id, details=details, is_wrong=False)

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.checks.carts import NEGLIGIBLE, check_vanishing
 from pipeline.errors import DataError, SubmissionError
+from pipeline.identify.model_checks import NEGLIGIBLE, check_vanishing
 from pipeline.ingest.fill import (
     Found,
     fill_submission,

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from pipeline.arrays import Array
-from pipeline.checks.recordings import check_channels
 from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.identify.bad_recordings import find_bad_recordings
-from pipeline.identify.late_channels import find_late_channels, late_experiments
+from pipeline.identify.recording_checks import check_channels, find_bad_recordings
+from pipeline.identify.recording_faults import find_late_channels, late_experiments
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import propagate, simulate_linear

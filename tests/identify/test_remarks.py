@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.identify.remarks import reading_remarks
+from pipeline.identify.recording_checks import reading_remarks
 from pipeline.ingest.read import read_data
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission

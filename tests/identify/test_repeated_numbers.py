@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from pipeline.identify.repeated_numbers import Repeats, compare_repeats
+from pipeline.identify.repeats import Repeats, compare_repeats
 from pipeline.results import Estimate, LogDecrement, StepEdge, StepGain
 from tests.helpers.analysis_factory import make_analysis
 

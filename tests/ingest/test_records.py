@@ -8,8 +8,8 @@ import pytest
 import scipy.io
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.checks.recordings import check_signs, check_units
 from pipeline.errors import SubmissionError
+from pipeline.identify.recording_checks import check_signs, check_units
 from pipeline.ingest.read import DUTY_COUNT, Ingested, read_data
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear

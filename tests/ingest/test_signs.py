@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.arrays import Array
-from pipeline.checks.recordings import check_signs
+from pipeline.identify.recording_checks import check_signs
 from pipeline.ingest.input_sign import find_signs
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS

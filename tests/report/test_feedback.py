@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.checks.loops import design_margins
-from pipeline.identify.log import Log
+from pipeline.identify.findings import Log
+from pipeline.identify.model_checks import design_margins
 from pipeline.json_files import json_text
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.report.document import Table

@@ -16,7 +16,7 @@ import numpy as np
 import pypdf
 import pytest
 
-from pipeline.checks.recordings import check_files, check_left_out
+from pipeline.identify.recording_checks import check_files, check_left_out
 from pipeline.plant.chain import Chain
 from pipeline.report.document import (
     Block,

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.checks.carts import check_carts
-from pipeline.checks.estimates import check_rows
+from pipeline.identify.model_checks import check_carts, check_rows
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.results import ChainFit, Estimate
 from pipeline.setup import Setup

@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose
 
 from pipeline import submission
 from pipeline.arrays import Array
-from pipeline.checks.loops import check_loops
 from pipeline.errors import DataError
+from pipeline.identify.model_checks import check_loops
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.sampled_loop import Controller, LoopSetup, Pid, StateFeedback, simulate_loop
 from pipeline.plant.simulate import simulate_linear

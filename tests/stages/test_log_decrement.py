@@ -7,9 +7,9 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
-from pipeline.checks.estimates import check_decays
 from pipeline.errors import DataError
 from pipeline.estimation.decay.ringing import Ringing
+from pipeline.identify.model_checks import check_decays
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear

@@ -31,7 +31,7 @@ from pipeline.grading.references.signs import accept_reversed_signs
 from pipeline.grading.references.springs import with_all_springs
 from pipeline.grading.references.tolerance import rounding, with_total
 from pipeline.grading.rubric import Rubric
-from pipeline.identify.bad_recordings import find_bad_recordings
+from pipeline.identify.recording_checks import find_bad_recordings
 from pipeline.ingest.columns import is_count
 from pipeline.ingest.formats.headings import conversion
 from pipeline.results import Analysis

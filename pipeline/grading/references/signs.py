@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
 
-from pipeline.identify.remarks import is_reversed
+from pipeline.identify.recording_checks import is_reversed
 from pipeline.names import read_name
 from pipeline.results import Record
 from pipeline.submission import Reported, ReportedFeedback, ReportedStateSpace

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.checks.decays import name_law
+from pipeline.identify.model_checks import name_law
 from pipeline.names import mode_suffixes, omega_names
 from pipeline.report.document import Block, Details, Table, cell, paragraph
 from pipeline.report.figures.bode import bode_figure, overview_figure

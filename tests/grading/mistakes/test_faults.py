@@ -15,7 +15,7 @@ from pipeline.arrays import Array
 from pipeline.estimation.record_fit import find_correction, record_fits
 from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.identify.bad_recordings import find_bad_recordings
+from pipeline.identify.recording_checks import find_bad_recordings
 from pipeline.plant.chain import PRESETS
 from pipeline.results import Analysis
 from pipeline.simulated.hidden import preset_bench

@@ -1,34 +1,58 @@
 """Check that the recordings were read, match their description, and were used."""
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from itertools import groupby
+from math import ceil
 
 import numpy as np
 
-from pipeline.identify.fault import valid_records
-from pipeline.identify.late_channels import late_fault
-from pipeline.identify.stated import (
+from pipeline.estimation.interventions import without_releases
+from pipeline.identify.findings import RecordingFault, say, valid_records
+from pipeline.identify.recording_faults import (
     LEAST_SHARE,
     OTHER_DWELL,
     find_loose_holds,
     find_other_scales,
     find_other_steps,
+    find_other_units,
     find_wrong_setups,
+    late_experiments,
+    late_fault,
     swings,
     why_other_frequency,
 )
+from pipeline.ingest.channels import saturation
 from pipeline.ingest.columns import input_units, is_count, is_known, position_units
+from pipeline.ingest.formats.headings import conversion
 from pipeline.ingest.input_sign import FEW_NAMES, Signs
+from pipeline.ingest.inspect import line_frequency
 from pipeline.ingest.read import Ingested
-from pipeline.results import Check, CheckKind, HeadingUnit, LateChannel, LeftOut, Record, SinePoint
+from pipeline.results import (
+    Analysis,
+    Check,
+    CheckKind,
+    HeadingUnit,
+    Intervention,
+    LateChannel,
+    LeftOut,
+    Record,
+    SinePoint,
+)
 from pipeline.setup import Setup
-from pipeline.words.numbers import join_names
+from pipeline.words.numbers import group_messages, join_names
 from pipeline.words.phrases import phrases
 from pipeline.words.text import capital
 
 _WORDS = phrases("checks")
 _SPELT_OUT = 3  # up to so many records are listed by name, even if they are a whole kind
 _PLURAL = {"sine": "dwells", "step": "steps", "decay": "decays", "sweep": "sweeps"}
+# Relative difference between a stated frequency and that of the input. A larger one means that the
+# file belongs to another run.
+_OTHER_RUN = 0.08
+_REMARKS = phrases("skipped")
+# m/s. The carts of a bench reach 0.4, and those of inverted pendulums 3. Centimetres read as metres
+# give 15 to 40.
+_FASTEST = 10.0
 
 
 def check_recordings(
@@ -286,3 +310,126 @@ def check_dwells(records: Sequence[Record], points: Sequence[SinePoint]) -> list
             message=message,
         )
     ]
+
+
+def find_bad_recordings(analysis: Analysis) -> dict[str, str]:
+    """Return the recordings with a fault, each with the fault in words."""
+    found = dict(analysis.unreadable)
+    found |= {one.experiment: one.reason for one in analysis.left_out if one.is_wrong}
+    sound = valid_records(analysis.records, analysis.left_out)
+    setups = {
+        fault.run: fault.reason
+        for fault in (
+            *find_other_scales(sound, bench=analysis.bench),
+            *find_wrong_setups(analysis.records),
+        )
+    }
+    late = late_experiments(analysis.late_channels)
+    # A cart that sticks rests at its turning points, which looks like a clipped reading.
+    sticky = analysis.fit is not None and not analysis.fit.explains_data
+    for record in analysis.records:
+        if record.id in setups:
+            found[record.id] = setups[record.id]
+            continue
+        here = [late[record.id]] if record.id in late else []
+        reasons = (fault.reason for fault in _channels_at_fault(record, sticky=sticky))
+        for problem in (*reasons, *here):
+            found.setdefault(record.id, problem)
+    return found
+
+
+def _channels_at_fault(record: Record, *, sticky: bool) -> Iterator[RecordingFault]:
+    """Yield a fault for each clipped channel, and for an input with a wrong frequency."""
+    for cart in record.carts:
+        if cart not in record.free or sticky or record.kind not in ("sine", "sweep"):
+            continue
+        if (limit := saturation(record.position(cart))) is not None:
+            details = {"limit": f"{limit:.4g}"}
+            yield RecordingFault(code="clipped_position", run=record.id, cart=cart, details=details)
+    u = record.u
+    if u is None or record.kind == "closed_loop":
+        return
+    if (limit := saturation(u)) is not None:
+        yield RecordingFault(code="clipped_input", run=record.id, details={"limit": f"{limit:.4g}"})
+    if record.kind == "sine" and record.omega is not None and np.ptp(u) > 0:
+        hertz, stated = line_frequency(record.t, u), record.omega / (2 * np.pi)
+        resolution = 1.0 / float(record.t[-1] - record.t[0])
+        if hertz is not None and abs(hertz - stated) > max(_OTHER_RUN * stated, resolution):
+            look = why_other_frequency(stated / hertz) or say("frequency_of_another")
+            details = {"found": f"{hertz:.3g}", "stated": f"{stated:.3g}", "look": look}
+            yield RecordingFault(code="other_frequency", run=record.id, details=details)
+
+
+def reading_remarks(data: Ingested, *, unit: str) -> list[str]:
+    """Return the notes from reading the files, with warnings about units.
+
+    There is one if `unit` seems wrong, and one for decays in other units. Their unit does not
+    affect their results.
+    """
+    units = find_other_units(data.records, decays=True)
+    return [
+        *data.warnings,
+        *_too_fast(data.records, unit=unit),
+        *group_messages((record.id, note) for record in data.records for note in record.notes),
+        *group_messages(
+            (name, _REMARKS.text("decay_in_other_unit", reason=one.reason))
+            for name, one in units.items()
+        ),
+    ]
+
+
+def hand_remarks(interventions: Sequence[Intervention], *, records: Sequence[Record]) -> list[str]:
+    """Return in which records and when a hand moves a cart, except for releases of decays."""
+    return group_messages(
+        (
+            one.experiment,
+            _REMARKS.text(
+                "hand",
+                cart=one.cart,
+                what=one.what,
+                start=f"{one.start:.2f}",
+                end=f"{one.end:.2f}",
+            ),
+        )
+        for one in without_releases(interventions, records)
+    )
+
+
+def _too_fast(records: Sequence[Record], *, unit: str) -> list[str]:
+    """Return a warning if the carts are impossibly fast in two kinds of experiments.
+
+    If only one kind of experiment is too fast, it may be an accident.
+    """
+    metres = conversion(unit, "m")
+    fastest: dict[str, tuple[float, str]] = {}
+    for record in records if metres else ():
+        there = fastest.get(record.kind, (0.0, ""))
+        fastest[record.kind] = max(there, (_speed(record), record.id))
+    speed, run = sorted(fastest.values())[-2] if len(fastest) > 1 else (0.0, "")
+    if not metres or speed * metres <= _FASTEST:
+        return []
+    return [_REMARKS.text("too_fast", run=run, speed=f"{speed:.2g}", unit=unit)]
+
+
+def _speed(record: Record) -> float:
+    """Return the speed of the fastest cart, position units/s, without momentary jumps."""
+    span = max(1, ceil(0.02 / record.sample_time))
+    moved, took = record.y[:, span:] - record.y[:, :-span], record.t[span:] - record.t[:-span]
+    if not took.size:
+        return 0.0
+    # The speed is taken over 20 ms and without the fastest hundredth, because a jump of the encoder
+    # is not a speed.
+    return float(np.quantile(np.abs(moved) / took, 0.99, axis=1).max())
+
+
+def is_reversed(records: Sequence[Record]) -> bool:
+    """Whether a positive input, with the bench's sign, pushes cart 1 towards negative x."""
+    signs = [r.input_scale for r in records if r.u is not None and r.kind != "closed_loop"]
+    return sum(1 if sign > 0 else -1 for sign in signs) < 0
+
+
+def gain_sign_warning(records: Sequence[Record]) -> list[str]:
+    """Return a warning if the bench's input has the opposite sign of the designed gains."""
+    if not is_reversed(records):
+        return []
+    return [_REMARKS.text("reversed")]

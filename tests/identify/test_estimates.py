@@ -4,8 +4,8 @@ from dataclasses import replace
 
 from typer.testing import CliRunner
 
-from pipeline.checks.estimates import check_rows, check_steps
 from pipeline.cli import app
+from pipeline.identify.model_checks import check_rows, check_steps
 from pipeline.results import Estimate, ParameterRow, StepGain
 from pipeline.setup import Setup
 from pipeline.submission import load_submission

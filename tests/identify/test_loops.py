@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.checks.loops import design_margins, verify_design
 from pipeline.errors import DataError
+from pipeline.identify.model_checks import design_margins, verify_design
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.margins import closed_loop, stability_margins
 from pipeline.plant.sampled_loop import StateFeedback, broken_loop

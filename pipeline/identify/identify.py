@@ -1,23 +1,36 @@
-"""Estimate the carts from single recordings, then fit all recordings together."""
+"""Identify the carts from the records that show what happened.
 
-from collections.abc import Sequence, Set
+Single recordings give estimates, then all recordings are fitted together. Records that contradict
+the fitted carts or their own repeats are left out.
+"""
+
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import Any
 
 from pipeline.errors import DataError
 from pipeline.estimation.interventions import between
+from pipeline.estimation.record_fit import RecordFit, most_are_consistent, record_fits
+from pipeline.identify.corrections import (
+    find_faults,
+    find_impossible_gains,
+    standing_still,
+)
+from pipeline.identify.findings import Log
 from pipeline.identify.fit import Fitted, Runs, fit_carts
-from pipeline.identify.log import Log
-from pipeline.identify.repeated_numbers import Repeats, compare_repeats
+from pipeline.identify.recording_faults import find_other_kinds, find_other_units, find_stuck
+from pipeline.identify.repeats import Repeats, compare_repeats, find_outlier_repeats
 from pipeline.ingest.read import Ingested
 from pipeline.names import parameter_names
+from pipeline.plant.chain import Chain
 from pipeline.results import (
     ChainFit,
     Estimate,
     FrequencyResponse,
     Intervention,
+    LeftOut,
     LogDecrement,
     ParameterRow,
     Record,
@@ -27,6 +40,7 @@ from pipeline.results import (
     StepGain,
 )
 from pipeline.setup import Setup
+from pipeline.stages.bode_fit import fit_bode
 from pipeline.stages.compare import compare, undetermined_reason
 from pipeline.stages.frequency_response import (
     collect_dwells,
@@ -43,6 +57,7 @@ from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress
 
 _WORDS = phrases("skipped")
+_ROUNDS = 4  # In each round, the used records may show that others are wrong
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -299,3 +314,89 @@ def _resonances(
         return {}
     find = partial(find_resonances, responses, n=bench.n)
     return log.attempt(Stage.RESONANCES, find) or {}
+
+
+def identify_with_rejection(
+    data: Ingested,
+    *,
+    interventions: Sequence[Intervention],
+    bench: Setup,
+    progress: Progress,
+) -> tuple[Identified, list[LeftOut]]:
+    """Identify the carts; leave out records that contradict these carts or their own repeats.
+
+    A record with a constant reading is used only if carts identified from the other records would
+    have this reading too.
+    """
+    driven = [r for r in data.records if r.kind in ("step", "sweep")]
+    # Faults that input or encoder show by themselves are kept, because later rounds do not see
+    # their records.
+    shown = {
+        **find_other_units(data.records),
+        **find_stuck(data.records),
+        **find_other_kinds(data.records, files=data.files),
+    }
+    contradicted = []
+    chain: Chain | None = None
+    fits: Mapping[str, RecordFit] = {}
+    left_out = find_outlier_repeats(driven, unit=bench.units.position) | shown
+    without = left_out.keys() | standing_still(data.records)
+    again = partial(
+        identify,
+        data,
+        interventions=interventions,
+        bench=bench,
+        progress=progress,
+        measured={},
+    )
+    found = again(without=without)
+    for _ in range(_ROUNDS):
+        # If too few records remain to identify the carts, the earlier result is kept.
+        chain, fits = _reference_chain(found, data, bench=bench) or (chain, fits)
+        faults = find_faults(data.records, chain=chain, fits=fits)
+        shown |= find_impossible_gains(found.gains)
+        shown |= {**found.repeats.odd, **found.fitted.conflict}
+        # Search for odd repeats only among good records, because otherwise most repeats may be
+        # wrong.
+        sound = [record for record in driven if record.id not in faults]
+        odd = find_outlier_repeats(sound, unit=bench.units.position)
+        # A fault that says how a record is wrong has priority over a fault that only calls it odd.
+        doubted = {name: one for name, one in faults.items() if not one.is_wrong}
+        left_out = {**odd, **doubted, **shown, **{n: f for n, f in faults.items() if f.is_wrong}}
+        if left_out.keys() == without:
+            break
+        without = left_out.keys()
+        contradicted += [
+            check
+            for check in found.repeats.checks
+            if check.outcome == "fail" and check.parameter not in found.repeats.undecided
+        ]
+        found = again(without=without)
+    checks = {check.id: check for check in (*found.repeats.checks, *contradicted)}
+    repeats = replace(found.repeats, checks=tuple(checks.values()))
+    return (
+        replace(found, repeats=repeats),
+        [left_out[record.id].left_out for record in data.records if record.id in left_out],
+    )
+
+
+def _reference_chain(
+    found: Identified, data: Ingested, *, bench: Setup
+) -> tuple[Chain, Mapping[str, RecordFit]] | None:
+    """Return the chain that the records follow, and how each record follows it.
+
+    If a chain explains the data only after two columns are swapped, it is returned.
+    """
+    if found.fit and found.fit.converged and most_are_consistent(found.fitted.fits):
+        return found.fit.chain, found.fitted.fits
+    for i, j in combinations(sorted(response.cart for response in found.responses), 2):
+        turned = [replace(r, cart={i: j, j: i}.get(r.cart, r.cart)) for r in found.responses]
+        try:
+            fit = fit_bode(sorted(turned, key=lambda response: response.cart), bench=bench)
+        except DataError:
+            continue
+        if fit.explains_data:
+            return fit.chain, record_fits(data.records, fit.chain)
+    if found.fit is None or not found.fit.converged:
+        return None
+    return found.fit.chain, found.fitted.fits

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.checks.carts import check_carts, check_vanishing
+from pipeline.identify.model_checks import check_carts, check_vanishing
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.resources import EXAMPLES
 from pipeline.results import ChainFit, Check

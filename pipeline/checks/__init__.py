@@ -1,1 +1,0 @@
-"""Consistency checks of the data, the estimates, the carts and the loops."""

@@ -1,0 +1,619 @@
+"""Check the estimates, the decays, the steps, the fitted carts and the loops.
+
+Two estimates of one number must agree, the fit must explain the data, the chain must be possible,
+and loops must be those that were requested or logged.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import solve_discrete_are
+
+from pipeline.arrays import Array
+from pipeline.errors import DataError
+from pipeline.names import gain_name, own_zeta, read_name, toml_flags
+from pipeline.plant.chain import Chain
+from pipeline.plant.identities import brackets, recover_from_parameters
+from pipeline.plant.limits import HEAVY_DAMPING
+from pipeline.plant.margins import Margins, stability_margins
+from pipeline.plant.sampled_loop import discretise
+from pipeline.results import (
+    EXPLAINED,
+    ChainFit,
+    Check,
+    CheckOutcome,
+    Coverage,
+    DecayLaw,
+    FeedbackDesign,
+    HardwareCheck,
+    LogDecrement,
+    ParameterRow,
+    Record,
+    StepGain,
+    passed,
+)
+from pipeline.setup import Setup
+from pipeline.stages.compare import SIGMA_LIMIT, change_limit
+from pipeline.words.numbers import join_names, listing, significant, with_error
+from pipeline.words.phrases import phrases
+
+_REDUNDANCY = 1e-9  # relative difference of one number computed in two ways, without rounding
+_BELOW_ZERO = 2.0  # standard errors by which a mass, damping or spring may be below zero
+# A parameter below this share of its larger neighbour may not exist: on no bench do masses, dampers
+# or springs differ by a factor of 50. If a spring is missing, dry friction and loose screws look
+# like a spring of up to 1 % of its neighbour.
+NEGLIGIBLE = 0.02
+_WORDS = phrases("checks")
+_LAWS = phrases("decays")
+# Largest difference between the polynomials of two loops that count as the same. Rounding leaves
+# 1e-13 on realistic plants, and gains from another program up to 1e-8.
+_SAME_LOOP = 1e-6
+_LAST_DIGIT = 12  # decimals; rounding beyond them depends on the linear algebra library
+
+
+def check_carts(
+    fit: ChainFit | None, *, decays: Sequence[LogDecrement] = (), bench: Setup
+) -> list[Check]:
+    """Check the fit, and whether the chain has the signs, redundancies and orders of real carts."""
+    if fit is None:
+        message = "No model was identified. The list of what was skipped has the reasons."
+        return [Check(kind="fit", part="identified", outcome="fail", message=message)]
+    if not fit.converged:
+        return _fit_checks(fit)
+    chain = fit.chain
+    values = {name: estimate.value for name, estimate in fit.parameters.items()}
+    checks = [*_fit_checks(fit), _sign_check(fit, bench=bench)]
+    checks += check_vanishing(fit, decays=decays, bench=bench)
+    if chain.n in (2, 3) and "omega_a" in values and all(bench.springs[1:-1]):
+        checks += _redundancy_checks(values)
+    if chain.n >= 2 and "omega_a" in values:
+        checks.append(_gain_order_check(values, chain=chain))
+        checks += _frequency_order_checks(values, n=chain.n)
+    return checks
+
+
+def _fit_checks(fit: ChainFit) -> list[Check]:
+    if not fit.converged:
+        found = "not judged, because the fit failed."
+    elif fit.explains_data:
+        found = "the linear carts and the noise explain the data."
+    else:
+        found = (
+            "the linear carts leave a residual above the noise; look where model and measurement "
+            "differ."
+        )
+    return [
+        Check(
+            kind="fit",
+            part="converged",
+            outcome=passed(fit.converged),
+            message="The fit converged." if fit.converged else f"The fit failed: {fit.message}.",
+        ),
+        Check(
+            kind="fit",
+            part="explains_data",
+            outcome=passed(fit.explains_data) if fit.converged else "skip",
+            message=f"χ² per degree of freedom is {fit.chi_square_per_dof:.3g}: {found}",
+            value=fit.chi_square_per_dof,
+            limit=EXPLAINED,
+        ),
+    ]
+
+
+def _sign_check(fit: ChainFit, *, bench: Setup) -> Check:
+    """Check that no mass, damping or spring is negative by more than its standard error allows."""
+    values, std = physical_values(fit.chain, bench=bench), fit.std
+    below = {
+        name: -value / std[name] if std.get(name) else np.inf
+        for name, value in values.items()
+        if value < 0
+    }
+    worst = float(max(below.values(), default=0.0))
+    names = ", ".join(f"{name} = {values[name]:.3g}" for name in below)
+    message = (
+        f"Not positive: {names}; up to {worst:.1f} standard errors below zero."
+        if below
+        else "No mass, damping or spring is below zero."
+    )
+    return Check(
+        kind="physical",
+        part="signs",
+        outcome=passed(worst <= _BELOW_ZERO),
+        value=worst if np.isfinite(worst) else None,
+        limit=_BELOW_ZERO,
+        message=message,
+    )
+
+
+def physical_values(chain: Chain, *, bench: Setup) -> dict[str, float]:
+    """Return the masses, dampings and springs that the bench has, by name."""
+    values = {f"m_{i}": float(m) for i, m in enumerate(chain.m, start=1)}
+    values |= {f"c_{i}": float(c) for i, c in enumerate(chain.c, start=1)}
+    springs = enumerate(zip(chain.k, bench.stiff, strict=True), start=1)
+    return values | {f"k_{i}": float(k) for i, (k, there) in springs if there}
+
+
+def check_vanishing(
+    fit: ChainFit, *, decays: Sequence[LogDecrement] = (), bench: Setup
+) -> list[Check]:
+    """Return a failed check for each mass, damping or spring that may not exist.
+
+    A parameter may not exist if its value is zero within its standard error, or small compared with
+    its larger neighbour of the same kind.
+    """
+    if not fit.converged:
+        return []
+    values, std = physical_values(fit.chain, bench=bench), fit.std
+    checks = []
+    for name, value in values.items():
+        sigmas = value / std[name] if std.get(name) else None
+        beside = _larger_neighbour(name, values)
+        share = value / values[beside] if beside else 1.0
+        if value == 0 or (sigmas is not None and abs(sigmas) <= SIGMA_LIMIT):
+            found = f"{name} ends at zero"
+            if sigmas:
+                found = f"{name} = {value:.2g} ± {std[name]:.1g} is zero within its error"
+            measured, limit = sigmas, SIGMA_LIMIT
+        elif 0 < share < NEGLIGIBLE:
+            found = f"{name} = {value:.2g} is {100 * share:.2g} % of {beside}, almost nothing"
+            measured, limit = share, NEGLIGIBLE
+        else:
+            continue
+        checks.append(
+            Check(
+                kind="vanishing",
+                parameter=name,
+                outcome="fail",
+                value=measured or 0.0,
+                limit=limit,
+                message=f"{found}. {_ask_if_there(name, decays=decays, bench=bench)}",
+            )
+        )
+    return checks
+
+
+def _larger_neighbour(name: str, values: Mapping[str, float]) -> str:
+    """Return the larger of the two neighbouring parameters of the same kind, by name.
+
+    Only positive neighbours count. Without one the result is "".
+    """
+    read = read_name(name)
+    assert read.cart is not None
+    beside = [f"{read.symbol}_{read.cart + step}" for step in (-1, 1)]
+    return max((o for o in beside if values.get(o, 0.0) > 0), key=lambda o: values[o], default="")
+
+
+def _ask_if_there(name: str, *, decays: Sequence[LogDecrement], bench: Setup) -> str:
+    """Return a question to the student about a vanishing parameter, with the line to change."""
+    read, n = read_name(name), bench.n
+    assert read.cart is not None
+    i = read.cart
+    if read.symbol == "c" and (alike := [one for one in decays if one.cart == i]):
+        runs = join_names(list(dict.fromkeys(one.experiment for one in alike)))
+        return (
+            f"The fit does not determine this damping. Use that of {runs}: "
+            f"{own_zeta(i, n=n)} = {alike[0].zeta:.2g}."
+        )
+    if read.symbol == "c":
+        alone = f", carts = [{i}]" if n > 1 else ""
+        return (
+            f"Do the recordings show the damping of cart {i}? A decay of that cart would show "
+            f'it: add one to submission.toml, [[experiments]] with kind = "decay"{alone}.'
+        )
+    if read.symbol == "m":
+        fewer = f"carts = {n - 1}, or " if n > 1 else ""
+        return (
+            f"Is there a cart {i}, and does its column hold its position? If not, write "
+            f"{fewer}columns = {{ x{i} = … }} in submission.toml."
+        )
+    if n == 1:
+        return (
+            "Is there a spring at all? If not, write "
+            f"springs = {toml_flags([False, False])} in submission.toml."
+        )
+    if 1 < i <= n:
+        return (
+            f"Does a spring tie cart {i} to cart {i - 1}? If not, the motor does not move cart "
+            f"{i}: write carts = {i - 1} in submission.toml."
+        )
+    ends = f"wall-{i}" if i == 1 else f"{n}-wall"
+    fewer = [flag and j != i for j, flag in enumerate(bench.springs, start=1)]
+    return (
+        f"Is there a spring {ends}? If not, write springs = {toml_flags(fewer)} in submission.toml."
+    )
+
+
+def _redundancy_checks(values: Mapping[str, float]) -> list[Check]:
+    meaning = "two computations of the same physical number from the transfer functions"
+    return [
+        Check(
+            kind="redundancy",
+            parameter=name,
+            outcome=passed(residual <= _REDUNDANCY),
+            value=float(residual),
+            limit=_REDUNDANCY,
+            message=f"Redundancy {name}: {meaning} differ by {residual:.1e} (relative).",
+        )
+        for name, residual in recover_from_parameters(values).residuals.items()
+    ]
+
+
+def _gain_order_check(values: Mapping[str, float], *, chain: Chain) -> Check:
+    """Check that a constant input moves no cart further than the cart before it."""
+    names = [gain_name(cart, n=chain.n) for cart in range(1, chain.n + 1)]
+    gains = [values[name] for name in names]
+    # If no spring holds the far end, all static gains are equal and rounding decides which is
+    # larger.
+    rise = max(later / earlier - 1 for earlier, later in pairwise(gains))
+    good = rise <= _REDUNDANCY and min(gains) >= 0
+    return Check(
+        kind="order",
+        part="gains",
+        outcome=passed(good),
+        value=max(float(rise), 0.0),
+        limit=_REDUNDANCY,
+        message=f"Static gains fall along the chain ({' ≥ '.join(names)} > 0): {_yes(good)}.",
+    )
+
+
+def _frequency_order_checks(values: Mapping[str, float], *, n: int) -> list[Check]:
+    """Check the order of resonances, nulls, and frequencies of single carts.
+
+    With heavy damping, a wrong order is no failure, because damping may change the order.
+    """
+    damped = any(v > HEAVY_DAMPING for name, v in values.items() if read_name(name).is_ratio)
+    checks = []
+    for low, middle, high, _ in brackets(n):
+        # Distance of the frequency from its allowed range, in percent of the frequency.
+        excess = max(values[low] / values[middle], values[middle] / values[high]) - 1
+        good = excess <= _REDUNDANCY
+        reason = " (not exact where a damping ratio is above 0.3)" if damped and not good else ""
+        ends = f"in_{read_name(low).suffix}{read_name(high).suffix}" if n == 3 else ""
+        checks.append(
+            Check(
+                kind="order",
+                parameter=middle,
+                part=ends,
+                outcome="pass" if good else ("skip" if damped else "fail"),
+                value=100 * max(float(excess), 0.0),
+                limit=0.0,
+                message=f"{low} < {middle} < {high}: {_yes(good)}{reason}.",
+            )
+        )
+    return checks
+
+
+def _yes(good: bool) -> str:
+    return "yes" if good else "no"
+
+
+def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
+    """Check that two estimates of each parameter agree.
+
+    Estimates that are too uncertain to compare are skipped.
+    """
+    verdicts: dict[bool | None, tuple[CheckOutcome, str]] = {
+        True: ("pass", "agree"),
+        False: ("fail", "disagree"),
+        None: ("skip", "are too uncertain to compare"),
+    }
+    checks = []
+    for row in rows:
+        if row.change_percent is None or (row.consistent is None and row.change_sigmas is None):
+            continue
+        limit = change_limit(row.name)
+        outcome, verdict = verdicts[row.consistent]
+        sigmas = (
+            "" if row.change_sigmas is None else f", or {row.change_sigmas:.1f} standard errors"
+        )
+        advice = _advice(row) if outcome == "fail" else ""
+        same = "" if row.independent is not False else " Both use the same recordings."
+        checks.append(
+            Check(
+                kind="initial_final",
+                parameter=row.name,
+                outcome=outcome,
+                value=abs(row.change_percent),
+                limit=limit,
+                message=f"Initial and final {row.name} {verdict} (limit {limit:.0f} %): the "
+                f"difference is {row.change_percent:+.1f} %{sigmas}.{same}{advice}",
+            )
+        )
+    return checks
+
+
+def check_coverage(rows: Sequence[ParameterRow]) -> list[Check]:
+    """Check that a measurement determines every resonance and null that is claimed."""
+    checks = []
+    for row in rows:
+        near = row.final.coverage if row.final else None
+        if near is None or near.of != row.name:
+            continue
+        found = sorted({w for w in (near.below, near.above) if w is not None})
+        nearest = found[int(np.argmin(np.abs(np.array(found) - near.omega)))] if found else 0.0
+        key = f"determined_by_{row.determined_by}"
+        message = _WORDS.text(
+            key if found else "extrapolated_from_nothing",
+            name=row.name,
+            zeta=read_name(row.name).damping,
+            omega=significant(near.omega, digits=3),
+            near=listing([significant(w, digits=3) for w in found]),
+            nearest=significant(nearest, digits=3),
+            wanted=wanted_dwells(near),
+        )
+        checks.append(
+            Check(
+                kind="covered",
+                parameter=row.name,
+                outcome=passed(not row.extrapolated),
+                value=near.distance,
+                limit=near.limit,
+                message=message,
+            )
+        )
+    return checks
+
+
+def wanted_dwells(coverage: Coverage) -> str:
+    """Return the frequencies of dwells that would determine a resonance or null, in words."""
+    # Without damping in the fit, 2 % on both sides.
+    apart = max(coverage.half_width, 0.02 * coverage.omega)
+    omegas = [coverage.omega + side * apart for side in (-1, 0, 1)]
+    by_unit = [
+        listing([significant(omega / scale, digits=3) for omega in omegas])
+        for scale in (1.0, 2 * np.pi)
+    ]
+    return f"{by_unit[0]} rad/s ({by_unit[1]} Hz)"
+
+
+def _advice(row: ParameterRow) -> str:
+    """Return advice on where to look in the recordings that the two estimates use."""
+    name, before, after = read_name(row.name), row.initial, row.final
+    assert before is not None
+    assert after is not None
+    if before.value * after.value < 0:
+        return " Their signs differ: is the sign of the input in submission.toml right?"
+    response = after.source == "bode_fit"
+    if name.is_ratio:
+        seen = (
+            "a steady sine of amplitude A gives ζ + 2d/(πA)"
+            if response
+            else "it raises them more for small swings"
+        )
+        return (
+            f" Dry friction makes damping ratios differ: {seen}. Check which of the two methods "
+            "used the larger amplitude."
+        )
+    looks = {
+        "step": "the rest and settled levels of {runs}",
+        "log_decrement": "the peaks of {runs}",
+        "frequency_response": "the points near this frequency",
+    }
+    if name.is_gain:
+        looks["frequency_response"] = "the points at the lowest frequencies"
+    look = looks.get(before.source, "{runs}").format(runs=join_names(before.experiments))
+    beside = (
+        ", and at the points of the response near this frequency"
+        if response and name.is_frequency
+        else ""
+    )
+    lowest = ", and at the lowest frequencies" if response and before.source == "step" else ""
+    return f" Look at {look}{beside}{lowest}."
+
+
+def check_decays(
+    decays: Sequence[LogDecrement], *, records: Sequence[Record] = (), bench: Setup
+) -> list[Check]:
+    """Check for every decay whether it is exponential within the noise."""
+    checks, kinds = [], {record.id: record.kind for record in records}
+    for decay in decays:
+        what = f"the decay of cart {decay.cart}"
+        if kinds.get(decay.experiment) == "step":
+            what = f"the ringing of cart {decay.cart} after the step"
+        said = say_law(decay, unit=bench.units.position)
+        checks.append(
+            Check(
+                kind="decay",
+                run=decay.experiment,
+                cart=decay.cart,
+                part=str(decay.number or ""),
+                outcome="skip" if decay.law.is_untested else passed(decay.law.is_exponential),
+                value=decay.law.statistic,
+                limit=decay.law.limit,
+                message=f"{decay.name}: {what} {said}",
+            )
+        )
+    return checks
+
+
+def check_steps(
+    steps: Sequence[StepGain], *, decays: Sequence[LogDecrement] = (), bench: Setup
+) -> list[Check]:
+    """Check whether every step has one static gain, or only an interval because the cart sticks.
+
+    If friction makes the cart stop equally short on the way out and back, all edges agree on a
+    wrong gain. So the check passes only if several edges agree and nothing shows dry friction on
+    that cart.
+    """
+    rubs: dict[int, list[str]] = {}
+    for decay in decays:
+        if decay.law.is_friction:
+            rubs.setdefault(decay.cart, []).append(decay.experiment)
+    for step in steps:
+        if step.interval:
+            rubs.setdefault(step.cart, []).append(step.experiment)
+    return [_step_check(step, shown=rubs.get(step.cart, ()), bench=bench) for step in steps]
+
+
+def _step_check(step: StepGain, *, shown: Sequence[str], bench: Setup) -> Check:
+    outcome: CheckOutcome
+    edges, width = len(step.edges), None
+    if step.interval:
+        low, high = step.interval
+        width = high - low
+        outcome, found = (
+            "fail",
+            (  # the shift of the rest points gives the least friction that can hold the cart
+                f"sticks: its rest positions give static gains from {low:.4g} to {high:.4g} "
+                f"{bench.units.gain}, but the true gain may be outside this range."
+            ),
+        )
+    elif shown:
+        runs = join_names(list(dict.fromkeys(shown)))
+        outcome, found = (
+            "skip",
+            (
+                f"has the same gain at every edge, but shows dry friction in {runs}. Friction may "
+                "stop it short of its level here too, by the same distance at every edge."
+            ),
+        )
+    elif edges < 2:
+        outcome, found = (
+            "skip",
+            (
+                "settles after one edge of the input only, so it is unknown whether friction holds "
+                "it off its level. A step on and off again would show it."
+            ),
+        )
+    else:
+        back = "" if step.rest_shift is None else " and returns to its initial rest position"
+        all_edges = "both edges" if edges == 2 else f"all {edges} edges"
+        outcome, found = "pass", f"has the same gain at {all_edges} of the input{back}."
+    return Check(
+        kind="step",
+        run=step.experiment,
+        cart=step.cart,
+        outcome=outcome,
+        value=width,
+        limit=None,
+        message=f"{step.experiment}: cart {step.cart} {found}",
+    )
+
+
+def say_law(decay: LogDecrement, *, unit: str) -> str:
+    """Return the law with its numbers, as the end of a sentence about the decay."""
+    law, said = decay.law, _numbers(decay, unit=unit)
+    numbers = _LAWS.text("numbers", zeta=said["zeta"], omega_n=said["omega_n"])
+    return _LAWS.text(_key(law), numbers=numbers, **said)
+
+
+def name_law(decay: LogDecrement, *, unit: str) -> str:
+    """Return the law in a few words, with the size of its cause."""
+    law = decay.law
+    said = _numbers(decay, unit=unit) | {"size": with_error(law.size, law.size_std)}
+    return _LAWS.text(f"short_{_key(law)}", **said)
+
+
+def _key(law: DecayLaw) -> str:
+    return "untested" if law.is_untested else law.name
+
+
+def _numbers(decay: LogDecrement, *, unit: str) -> dict[str, str]:
+    law = decay.law
+    return {
+        "statistic": f"{law.statistic:.1f}",
+        "limit": f"{law.limit:.1f}",
+        "size": significant(law.size, digits=3),
+        "percent": f"{100 * abs(law.size):.2g}",
+        "side": "higher" if law.size > 0 else "lower",
+        "zeta": significant(law.zeta, digits=3),
+        "omega_n": significant(law.omega_n, digits=4),
+        "apparent": significant(decay.zeta, digits=3),
+        "unit": unit,
+    }
+
+
+def design_margins(chain: Chain, design: FeedbackDesign, *, on_bench: bool = False) -> Margins:
+    """Return the margins of the designed loop, including its observer and delay.
+
+    The observer predicts with the chain or, `on_bench`, with constant velocities.
+
+    Raises
+    ------
+    DataError : the loop is not stable, a mode of the carts is undamped, or the numbers of the chain
+        differ by too many orders of magnitude.
+    """
+    controller = design.controller(None if on_bench else chain)
+    try:
+        found = stability_margins(chain, controller, sample_time=design.sample_time)
+    except np.linalg.LinAlgError:
+        raise DataError("no margins: the numbers of this loop differ too much in size") from None
+    if found is None:
+        where = "on cartlab's bench, whose observer has no model," if on_bench else ""
+        raise DataError(f"no margins: {'the loop ' + where if where else 'the loop'} is unstable")
+    return found
+
+
+def verify_design(chain: Chain, design: FeedbackDesign) -> Check:
+    """Check that the designed gains give the requested loop.
+
+    The check's value is the largest difference between coefficients of two polynomials in z, or the
+    relative error of the static gain if that is larger. One polynomial belongs to the designed
+    loop. The other one belongs to the requested poles or, with LQR, to the loop that scipy's
+    Riccati solver gives.
+    """
+    asked = "the requested poles" if design.Q is None else "the same loop as scipy's Riccati solver"
+    try:
+        ours, wanted, level = _loops(chain, design)
+    except (np.linalg.LinAlgError, ValueError, ZeroDivisionError):
+        return _check("skip", None, "not verified: the plant's numbers differ too much in size")
+    value = float(np.max(np.append(np.abs(ours - wanted), abs(level - 1))).round(_LAST_DIGIT))
+    if not np.isfinite(value):
+        return _check("fail", None, "the designed loop has no finite polynomial: do not run it")
+    if value > _SAME_LOOP:
+        return _check("fail", value, f"the gains do not give {asked}: do not run them")
+    return _check("pass", value, f"the gains give {asked}")
+
+
+def check_loops(hardware: Sequence[HardwareCheck]) -> list[Check]:
+    """Return a failed check for each run whose log or stated controller is wrong."""
+    notes: dict[str, list[str]] = {}
+    for check in hardware:
+        if check.contradicted:
+            notes.setdefault(check.experiment, []).extend([check.note] if check.note else [])
+    return [
+        Check(kind="hardware", run=run, outcome="fail", message=f"{run}: {'; '.join(texts)}.")
+        for run, texts in notes.items()
+    ]
+
+
+def _check(outcome: CheckOutcome, value: float | None, message: str) -> Check:
+    return Check(
+        kind="feedback",
+        part="gains",
+        outcome=outcome,
+        value=value,
+        limit=_SAME_LOOP,
+        message=message,
+    )
+
+
+def _loops(chain: Chain, design: FeedbackDesign) -> tuple[Array, Array, float]:
+    """Return the polynomials of the designed and the requested loop, and the static gain."""
+    phi, gamma = discretise(chain, design.sample_time)
+
+    def fed_back(gains: Array) -> Array:
+        return phi - np.outer(gamma, gains)
+
+    ours = fed_back(design.gains)
+    settled = np.linalg.solve(np.eye(gamma.size) - ours, design.prefilter * gamma)
+    if design.requested_poles is not None:
+        z = np.exp(design.sample_time * design.requested_poles)
+    else:
+        assert design.Q is not None
+        assert design.R is not None
+        z = np.linalg.eigvals(fed_back(_riccati_gains(phi, gamma, Q=design.Q, R=design.R)))
+    level = float(settled[2 * (design.cart - 1)])
+    return _from_roots(np.linalg.eigvals(ours)), _from_roots(z), level
+
+
+def _riccati_gains(phi: Array, gamma: Array, *, Q: Array, R: float) -> Array:
+    """Return the LQR gains from scipy's Riccati solver, independently of the design."""
+    cost = solve_discrete_are(phi, gamma[:, None], Q, R)
+    return (gamma @ cost @ phi) / (R + gamma @ cost @ gamma)
+
+
+def _from_roots(z: ArrayLike) -> Array:
+    return np.poly(z).real.astype(np.float64)
