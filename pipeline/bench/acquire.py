@@ -36,7 +36,7 @@ from pipeline.experiments.propose import extend_plan, propose_plan
 from pipeline.lock import lock_or_refuse
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME
-from pipeline.submission.toml_file import Value
+from pipeline.submission.toml import Value
 
 _USUAL_BAUD = 115_200
 _TRIES = 3  # attempts per recording; a fault that occurs three times is no accident

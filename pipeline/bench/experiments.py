@@ -13,8 +13,7 @@ from pipeline.protocol import FULL_SCALE, Description, Reading
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.edit import append_experiment, edit_submission
 from pipeline.submission.load import NAME, spring_names
-from pipeline.submission.toml_file import Value
-from pipeline.submission.toml_section import toml_section
+from pipeline.submission.toml import Value, toml_section
 
 DATA = "data"
 

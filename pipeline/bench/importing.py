@@ -12,14 +12,14 @@ from pipeline.bench.experiments import add_experiment
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.experiments.plan import Plan, Recording, hold_words
 from pipeline.experiments.plan_file import load_plan, plan_path
+from pipeline.ingest.files import ENDINGS
 from pipeline.ingest.fill import experiment_entry, free_carts, free_id
-from pipeline.ingest.formats.recognise import ENDINGS
 from pipeline.ingest.inspect import Inspection, inspect_file
 from pipeline.output import own_folder
 from pipeline.results import ExperimentKind
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import MAX_DATA_BYTES
-from pipeline.submission.toml_file import Value
+from pipeline.submission.toml import Value
 
 LOOK_EVERY = 0.5  # s between two scans of the folder
 

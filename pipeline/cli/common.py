@@ -74,7 +74,7 @@ def _misuse(error: TyperException) -> str:
     """Return what is wrong with an option or an argument, and which help to read."""
     from pydantic import ValidationError
 
-    from pipeline.submission.complaints import refusal
+    from pipeline.submission.toml import refusal
 
     if isinstance(error.__cause__, ValidationError):
         error.message = refusal(error.__cause__.errors()[0])

@@ -44,7 +44,7 @@ def inspect(
 
     For a folder (its data/, if there is one) it shows a table with one line per file.
     """
-    from pipeline.ingest.folder import data_files_in, files_not_read, not_read_notes
+    from pipeline.ingest.files import data_files_in, files_not_read, not_read_notes
     from pipeline.ingest.inspect import (
         format_inspection,
         format_inspections,

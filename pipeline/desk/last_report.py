@@ -9,7 +9,7 @@ from typing import Any
 
 from pipeline.errors import SubmissionError
 from pipeline.submission.load import MAX_NOTES_BYTES, NAME, file_problem, list_experiments
-from pipeline.submission.toml_file import find_deep_key, read_text
+from pipeline.submission.toml import find_deep_key, read_text
 
 # A file next to the report: its questions, assumptions, findings, and state of its sources.
 FINDINGS = "questions.json"

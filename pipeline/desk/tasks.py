@@ -25,6 +25,7 @@ from pipeline.errors import ConfigError, SubmissionError
 from pipeline.identify.springs import fill as fill_folder
 from pipeline.ingest.channels import never_changes
 from pipeline.ingest.columns import assign_columns
+from pipeline.ingest.files import OF_STRANGERS, read_table
 from pipeline.ingest.fill import (
     Found,
     data_files,
@@ -33,7 +34,6 @@ from pipeline.ingest.fill import (
     has_fractions,
     passed_over,
 )
-from pipeline.ingest.formats.recognise import OF_STRANGERS, read_table
 from pipeline.ingest.read import read_data
 from pipeline.lock import lock_or_refuse
 from pipeline.output import own_folder, write_file

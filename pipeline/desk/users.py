@@ -13,9 +13,8 @@ from pydantic import Field, StringConstraints, ValidationError
 
 from pipeline.errors import ConfigError
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.submission.complaints import explain
 from pipeline.submission.models import TomlTable
-from pipeline.submission.toml_file import parse_toml, read_text
+from pipeline.submission.toml import explain, parse_toml, read_text
 
 Place = Path | str  # a folder, or the address of a database
 Role = Literal["owner", "student", "ta", "instructor"]

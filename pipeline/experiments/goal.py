@@ -13,7 +13,7 @@ from pipeline.names import names_beginning
 from pipeline.plant.chain import Chain
 from pipeline.plant.sampled_loop import LoopSetup, simulate_loop
 from pipeline.results import FeedbackDesign
-from pipeline.submission.complaints import nearest
+from pipeline.submission.toml import nearest
 
 GAP = "gap"  # the goal of distinguishing the explanations of a gap
 DESIGN, WORST, MEAN, VOLUME = "design", "worst", "mean", "volume"

@@ -23,7 +23,7 @@ from pipeline.names import parameter_names
 from pipeline.plant.limits import CALIBRATION
 from pipeline.results import Analysis
 from pipeline.submission import Submission
-from pipeline.submission.toml_file import read_text
+from pipeline.submission.toml import read_text
 from pipeline.words.numbers import count, first_few
 from pipeline.words.progress import Progress
 from pipeline.workflow import analyse

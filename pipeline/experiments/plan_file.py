@@ -14,16 +14,17 @@ from pipeline.lock import lock_when_free
 from pipeline.output import write_file
 from pipeline.protocol import FREQUENCIES, MOST_TONES
 from pipeline.submission import Submission, System, load_submission
-from pipeline.submission.complaints import (
+from pipeline.submission.toml import (
     Location,
     dotted,
     explain,
     list_faults,
+    parse_toml,
     quote,
+    read_text,
     relevant_errors,
+    toml_section,
 )
-from pipeline.submission.toml_file import parse_toml, read_text
-from pipeline.submission.toml_section import toml_section
 
 NAME = "plan.toml"
 LONGEST_RUN = 600.0  # s; limits the time of a simulation and the size of a file

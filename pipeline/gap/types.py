@@ -13,7 +13,7 @@ from pipeline.plant.chain import Chain
 from pipeline.plant.effect import AugmentedChain, Effect
 from pipeline.results import ChainWithUnits, Intervention, LeftOut, Provenance, RecordingGroup
 from pipeline.setup import Setup, Units
-from pipeline.submission.complaints import first_refusal, quote
+from pipeline.submission.toml import first_refusal, quote
 
 Quantity = Literal["position", "velocity", "input"]
 Verdict = Literal["named", "partial", "none", "ambiguous", "unexplained"]

@@ -19,8 +19,8 @@ from pipeline.grading.grade import CODES, Code
 from pipeline.names import parameter_names
 from pipeline.results import ExperimentKind
 from pipeline.submission import Design, Students, System
-from pipeline.submission.complaints import quote
 from pipeline.submission.models import TomlTable
+from pipeline.submission.toml import quote
 
 Points = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
 Percent = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]

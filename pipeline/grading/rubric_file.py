@@ -24,17 +24,21 @@ from pipeline.grading.rubric import (
 )
 from pipeline.names import read_name
 from pipeline.resources import RUBRICS
-from pipeline.submission.complaints import (
+from pipeline.submission.load import spring_names
+from pipeline.submission.toml import (
     Location,
+    TomlSlip,
+    at_line,
     dotted,
     explain,
+    key_lines,
     nearest,
     quote,
+    read_text,
+    read_toml,
     relevant_errors,
     without_tag,
 )
-from pipeline.submission.load import spring_names
-from pipeline.submission.toml_file import TomlSlip, at_line, key_lines, read_text, read_toml
 
 _MAX_BYTES = 1_000_000
 _CHECKS: dict[str, type[BaseModel]] = {

@@ -17,8 +17,7 @@ from pipeline.grading import rubric as asked
 from pipeline.grading.rubric import Rubric, matching
 from pipeline.names import read_name
 from pipeline.submission import Students
-from pipeline.submission.complaints import quote
-from pipeline.submission.toml_file import key_lines
+from pipeline.submission.toml import key_lines, quote
 
 Unit = Literal["points", "percent", "share", "days", "percentage points", "choice"]
 Key = tuple[str | int, ...]  # path of a value: ("criteria", 3, "points")

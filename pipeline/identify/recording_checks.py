@@ -22,11 +22,10 @@ from pipeline.identify.recording_faults import (
     why_other_frequency,
 )
 from pipeline.ingest.channels import saturation
-from pipeline.ingest.columns import input_units, is_count, is_known, position_units
-from pipeline.ingest.formats.headings import conversion
-from pipeline.ingest.input_sign import FEW_NAMES, Signs
+from pipeline.ingest.columns import conversion, input_units, is_count, is_known, position_units
 from pipeline.ingest.inspect import line_frequency
 from pipeline.ingest.read import Ingested
+from pipeline.ingest.sign import FEW_NAMES, Signs
 from pipeline.results import (
     Analysis,
     Check,

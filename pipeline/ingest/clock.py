@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
-from pipeline.ingest.columns import Column
-from pipeline.ingest.formats.headings import conversion
-from pipeline.ingest.formats.table import FileTable
+from pipeline.ingest.columns import Column, conversion
+from pipeline.ingest.table import FileTable
 
 SLOW = 0.5  # s between samples; no bench records more slowly
 FEWEST_SAMPLES = 8  # fewest samples for any estimate

@@ -17,15 +17,17 @@ import tomlkit
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest.channels import little_motion, never_changes
 from pipeline.ingest.columns import is_count, is_known, position_units
-from pipeline.ingest.folder import (
+from pipeline.ingest.files import (
+    ENDINGS,
     NotRead,
+    choose_run,
     data_files_in,
     files_not_read,
     not_read_notes,
+    read_tables,
     recordings_beside,
     refused,
 )
-from pipeline.ingest.formats.recognise import ENDINGS, choose_run, read_tables
 from pipeline.ingest.inspect import NO_CLOCK, Inspection, inspect_runs
 from pipeline.results import ExperimentKind
 from pipeline.submission.edit import (
@@ -34,11 +36,11 @@ from pipeline.submission.edit import (
     edit_submission,
     submission_text,
     toml_item,
+    write_templates,
 )
 from pipeline.submission.load import NAME, file_problem, path_problem, posix, stated_columns
 from pipeline.submission.models import MOST_CARTS, MOST_EXPERIMENTS
-from pipeline.submission.template import write_templates
-from pipeline.submission.toml_file import Value, parse_toml
+from pipeline.submission.toml import Value, parse_toml
 from pipeline.words.numbers import first_few, group_messages
 
 UNSURE = "unsure: "  # begins a comment below a table; a person who knows the answer removes it

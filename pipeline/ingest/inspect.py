@@ -12,10 +12,17 @@ from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
 from pipeline.ingest.clock import FEWEST_SAMPLES, Clock, clock_notes, read_clock, unroll
-from pipeline.ingest.columns import Column, assign_columns, holds_counts, refuse_unknown_unit
-from pipeline.ingest.formats.headings import conversion, parse_heading, plain_name
-from pipeline.ingest.formats.recognise import FORM_TITLES, choose_run, read_tables
-from pipeline.ingest.formats.table import FileTable, Variable
+from pipeline.ingest.columns import (
+    Column,
+    assign_columns,
+    conversion,
+    holds_counts,
+    parse_heading,
+    plain_name,
+    refuse_unknown_unit,
+)
+from pipeline.ingest.files import FORM_TITLES, choose_run, read_tables
+from pipeline.ingest.table import FileTable, Variable
 from pipeline.ingest.unnamed import Roles, find_roles
 from pipeline.results import ExperimentKind
 from pipeline.words.numbers import count, first_few, group_messages

@@ -10,21 +10,20 @@ from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
-from pipeline.ingest.bode import Points, frequency_responses, read_points
-from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
+from pipeline.ingest.bode_table import Points, frequency_responses, read_points
+from pipeline.ingest.channels import channel_problems, encoder_step, mirrors, repair_positions
 from pipeline.ingest.clock import FEWEST_SAMPLES, Clock, clock_notes, read_clocks, time_stamps
 from pipeline.ingest.columns import (
     Column,
     assign_columns,
+    conversion,
     holds_counts,
     is_count,
     refuse_unknown_unit,
 )
-from pipeline.ingest.formats.headings import conversion
-from pipeline.ingest.formats.recognise import choose_run, read_tables
-from pipeline.ingest.formats.table import FileTable, refuse_extreme
-from pipeline.ingest.input_sign import Signs, with_signs
-from pipeline.ingest.repairs import repair_positions
+from pipeline.ingest.files import choose_run, read_tables
+from pipeline.ingest.sign import Signs, with_signs
+from pipeline.ingest.table import FileTable, refuse_extreme
 from pipeline.results import FrequencyResponse, HeadingUnit, Record
 from pipeline.submission import Experiment, Submission, System
 

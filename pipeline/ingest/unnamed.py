@@ -14,7 +14,7 @@ from pipeline.arrays import Array
 from pipeline.estimation.modulating import motion_period, window_weights
 from pipeline.ingest.channels import encoder_step, mirrors
 from pipeline.ingest.clock import SLOW, read_clock
-from pipeline.ingest.formats.table import FileTable
+from pipeline.ingest.table import FileTable
 from pipeline.submission.models import MOST_CARTS
 
 # Change between two samples, as a share of the column's range; no cart moves so fast.

@@ -15,8 +15,7 @@ from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.effect import Effect, EffectParameter, EffectTerm, PlaceScales, chain_scales
 from pipeline.plant.simulate import simulate_linear
 from pipeline.simulated.bench import COUNT, SAMPLE_TIME, SimulatedBench
-from pipeline.submission.complaints import nearest, quote
-from pipeline.submission.toml_file import read_text
+from pipeline.submission.toml import nearest, quote, read_text
 
 _PER_CM = {"cm": 1.0, "mm": 10.0, "m": 0.01, "in": 1 / 2.54, "count": 1 / COUNT}
 _SLOWEST, _FASTEST = 0.01, 1e4  # rad/s: periods from ten minutes to far below any sample time

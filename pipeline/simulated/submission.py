@@ -17,8 +17,7 @@ from pipeline.simulated.bench import BenchRun, SimulatedBench, TrueMotion
 from pipeline.simulated.hidden import preset_bench
 from pipeline.stages.state_feedback import design_feedback
 from pipeline.submission import Design
-from pipeline.submission.toml_file import Value
-from pipeline.submission.toml_section import TypedNumber, toml_section
+from pipeline.submission.toml import TypedNumber, Value, toml_section
 
 
 @dataclass(frozen=True, kw_only=True)

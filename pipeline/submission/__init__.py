@@ -1,5 +1,6 @@
 """Read `submission.toml`: the measurements, the system, and the students' reported numbers."""
 
+from pipeline.submission.edit import new_submission
 from pipeline.submission.load import load_submission
 from pipeline.submission.models import (
     Author,
@@ -18,7 +19,6 @@ from pipeline.submission.models import (
     Submission,
     System,
 )
-from pipeline.submission.template import new_submission
 
 __all__ = [
     "Author",

@@ -1,4 +1,4 @@
-"""Change `submission.toml` in place; comments, order and all other digits are kept."""
+"""Make and change `submission.toml`; comments, order and all other digits are kept."""
 
 import hashlib
 import re
@@ -10,12 +10,20 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Array
 
-from pipeline.errors import SubmissionError
+from pipeline.errors import ConfigError, SubmissionError
 from pipeline.lock import lock_when_free
+from pipeline.names import parameter_names
 from pipeline.output import write_file
-from pipeline.submission.load import MAX_TOML_BYTES, NAME, file_problem, parse_submission
-from pipeline.submission.models import Submission
-from pipeline.submission.toml_file import Value, read_text
+from pipeline.resources import TEMPLATES
+from pipeline.submission.load import (
+    MAX_TOML_BYTES,
+    NAME,
+    file_problem,
+    parse_submission,
+    spring_names,
+)
+from pipeline.submission.models import MOST_CARTS, Submission
+from pipeline.submission.toml import Value, read_text
 
 
 class Outdated(SubmissionError):
@@ -136,3 +144,62 @@ def toml_item(value: Value) -> Any:
             array.append(toml_item(item))
         return array
     return tomlkit.item(value)
+
+
+# --------------------------------------------------------------------------------- a new submission
+
+_NOTES = """\
+<!-- What you write here becomes the discussion of the report (Markdown). Comments like this do not.
+
+     `cartlab report` asks the questions that your data raise, for example about zeta_b. Answer
+     under a heading with that name; the report shows the answer below the question:
+
+     ## zeta_b
+     The decay saw …
+
+     Everything else is free text: what limits the model? What would you record next? -->
+"""
+
+
+def new_submission(folder: Path, *, carts: int) -> None:
+    """Write `submission.toml`, `notes.md` and an empty `data/` for a bench with `carts` carts.
+
+    Raises
+    ------
+    ConfigError : the folder is not empty, or the number of carts is too large.
+    """
+    if not 1 <= carts <= MOST_CARTS:
+        raise ConfigError(f"carts: expected 1 to {MOST_CARTS}, found {carts}")
+    folder = Path(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ConfigError(f"{folder}: exists already and is not empty; choose a new folder")
+    write_templates(folder, carts=carts)
+
+
+def write_templates(folder: Path, *, carts: int) -> None:
+    """Write the files of `new_submission` into a folder that may already hold recordings.
+
+    An existing `submission.toml` or `notes.md` stays as it is.
+    """
+    # Imported late, because this takes 50 ms.
+    import jinja2
+
+    source = (TEMPLATES / f"{NAME}.j2").read_text(encoding="utf-8")
+    environment = jinja2.Environment(
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    text = environment.from_string(source).render(
+        carts=carts,
+        springs=["true"] * (carts + 1),
+        spring_names=spring_names(carts),
+        ratio_names=[f"x{i}" for i in range(1, carts + 1)],
+        zeros=["0.0"] * (2 * carts),
+        names=parameter_names(carts),
+    )
+    (folder / "data").mkdir(parents=True, exist_ok=True)
+    for name, content in ((NAME, text), ("notes.md", _NOTES)):
+        if not (folder / name).exists():
+            write_file(folder / name, content)

@@ -16,19 +16,6 @@ from pydantic import ValidationError
 
 from pipeline.errors import SubmissionError, is_file_fault
 from pipeline.names import parameter_names
-from pipeline.submission.complaints import (
-    MOST_LISTED,
-    Location,
-    dotted,
-    explain,
-    list_faults,
-    list_keys,
-    merge_equal,
-    nearest,
-    quote,
-    relevant_errors,
-    without_tag,
-)
 from pipeline.submission.models import (
     Experiment,
     Reported,
@@ -36,18 +23,29 @@ from pipeline.submission.models import (
     Submission,
     Unread,
 )
-from pipeline.submission.toml_file import (
+from pipeline.submission.toml import (
+    MOST_LISTED,
     MOST_SPOILT,
+    Location,
     ReadApart,
     TomlSlip,
     UnusableNumber,
     at_line,
     backslash_words,
     check_number,
+    dotted,
+    explain,
+    list_faults,
+    list_keys,
     mend_number,
+    merge_equal,
+    nearest,
     parse_toml,
+    quote,
     read_apart,
     read_text,
+    relevant_errors,
+    without_tag,
 )
 
 NAME = "submission.toml"

@@ -25,7 +25,7 @@ from pipeline.desk.student.files import take_uploads
 from pipeline.desk.tasks import TASKS, make_report
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.find import find_hand_ins
-from pipeline.ingest.formats.recognise import parse_table
+from pipeline.ingest.files import parse_table
 from pipeline.lock import lock_when_free
 from pipeline.processes import Failed
 from pipeline.submission import load_submission

@@ -13,13 +13,12 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest import columns
-from pipeline.ingest.formats import recognise, text, workbook
-from pipeline.ingest.formats.recognise import parse_table, read_table
+from pipeline.ingest import columns, files, text, workbook
+from pipeline.ingest.files import parse_table, read_table
 from pipeline.ingest.read import read_data
 from pipeline.processes import limited_memory
 from pipeline.resources import EXAMPLES
-from pipeline.submission import load_submission, toml_file
+from pipeline.submission import load_submission, toml
 from pipeline.submission.load import NAME
 
 
@@ -71,11 +70,11 @@ def test_a_bomb_costs_its_recording(fill, apart, tmp_path):
     assert named != toml
     (tmp_path / "team" / NAME).write_text(named, encoding="utf-8")
     begin = time.process_time()
-    before = recognise.OF_STRANGERS.set(apart)
+    before = files.OF_STRANGERS.set(apart)
     try:
         data = read_data(load_submission(tmp_path / "team"))
     finally:
-        recognise.OF_STRANGERS.reset(before)
+        files.OF_STRANGERS.reset(before)
     assert len(data.unreadable) == 1
     reason = next(iter(data.unreadable.values()))
     assert re.search("damaged|more than .* (memory|processor time)", reason)
@@ -107,7 +106,7 @@ def test_the_time_to_read_one_file_is_limited(tmp_path, monkeypatch):
     """A file that takes too long is refused by itself, and the next one is read."""
     (tmp_path / "long.csv").write_text("time,x1\n" + "0.001,12\n" * 400_000, encoding="utf-8")
     (tmp_path / "short.csv").write_text("time,x1\n0,1\n1,2\n", encoding="utf-8")
-    monkeypatch.setattr(recognise, "MOST_SECONDS", 0.02)  # s; the long file takes ten times that
+    monkeypatch.setattr(files, "MOST_SECONDS", 0.02)  # s; the long file takes ten times that
     gc.disable()  # an exception in one of its callbacks would be dropped, and be raised a second on
     try:
         with pytest.raises(SubmissionError, match=r"long\.csv: takes more than 0\.02 s"):
@@ -124,7 +123,7 @@ def test_the_memory_to_read_one_file_is_limited(tmp_path, monkeypatch):
     """A file that takes too much memory is refused by itself, and the next one is read."""
     (tmp_path / "long.csv").write_text("time,x1\n" + "0.001,12\n" * 1_000_000, encoding="utf-8")
     (tmp_path / "short.csv").write_text("time,x1\n0,1\n1,2\n", encoding="utf-8")
-    monkeypatch.setattr(recognise, "MOST_MEMORY", 10_000_000)
+    monkeypatch.setattr(files, "MOST_MEMORY", 10_000_000)
     with pytest.raises(SubmissionError, match=r"long\.csv: needs more than 0\.01 GB"):
         read_table(tmp_path, "long.csv")
     assert read_table(tmp_path, "short.csv")[0].values.shape == (2, 2)
@@ -137,7 +136,7 @@ def test_the_memory_to_read_one_file_is_limited(tmp_path, monkeypatch):
 # The patterns that are applied to text of any length, and how.
 PATTERNS = {
     f"{module.__name__}.{name}": pattern
-    for module in (text, workbook, columns, toml_file)
+    for module in (text, workbook, columns, toml)
     for name, pattern in vars(module).items()
     if isinstance(pattern, re.Pattern)
     and isinstance(pattern.pattern, str)
@@ -174,8 +173,8 @@ def test_a_key_of_many_parts_is_refused_at_once(part, between):
     """A key of thousands of parts is refused before TOML is parsed, however its parts are typed."""
     text = "x = 1\n" + between.join([part] * 50_000) + " = 1\n"
     begin = time.process_time()
-    assert toml_file.find_deep_key(text) == 2
-    with pytest.raises(toml_file.TomlSlip, match="nest too deeply"):
-        toml_file.read_toml(text)
+    assert toml.find_deep_key(text) == 2
+    with pytest.raises(toml.TomlSlip, match="nest too deeply"):
+        toml.read_toml(text)
     assert time.process_time() - begin < 5  # s; it takes 0.1, parsing takes minutes
-    assert not toml_file.find_deep_key('a.b.c = "1.2.3.4' + ".5" * 100 + '"\n')
+    assert not toml.find_deep_key('a.b.c = "1.2.3.4' + ".5" * 100 + '"\n')

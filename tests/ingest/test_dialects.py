@@ -6,10 +6,9 @@ from numpy.testing import assert_allclose
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.clock import unroll
-from pipeline.ingest.columns import assign_columns, refuse_unknown_unit
-from pipeline.ingest.formats.headings import conversion, parse_heading
-from pipeline.ingest.formats.recognise import parse_table, parse_tables
-from pipeline.ingest.formats.table import FileTable
+from pipeline.ingest.columns import assign_columns, conversion, parse_heading, refuse_unknown_unit
+from pipeline.ingest.files import parse_table, parse_tables
+from pipeline.ingest.table import FileTable
 
 N = 200
 T = 0.005 * np.arange(N)

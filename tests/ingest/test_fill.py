@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.errors import ConfigError, SubmissionError
+from pipeline.ingest.files import files_not_read, not_read_notes
 from pipeline.ingest.fill import data_files, fill_submission
-from pipeline.ingest.folder import files_not_read, not_read_notes
 from pipeline.ingest.read import read_data
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission, new_submission

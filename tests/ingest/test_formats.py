@@ -11,8 +11,8 @@ import scipy.io
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.formats.recognise import OF_STRANGERS, parse_table, parse_tables, read_table
-from pipeline.ingest.formats.table import FileTable
+from pipeline.ingest.files import OF_STRANGERS, parse_table, parse_tables, read_table
+from pipeline.ingest.table import FileTable
 
 N = 50
 TIME = np.round(0.00884 * np.arange(N), 3)

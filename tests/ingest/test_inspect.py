@@ -9,7 +9,7 @@ import pytest
 import scipy.io
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.folder import data_files_in
+from pipeline.ingest.files import data_files_in
 from pipeline.ingest.inspect import (
     Inspection,
     format_inspection,

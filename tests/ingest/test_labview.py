@@ -13,9 +13,9 @@ from nptdms import ChannelObject
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.formats import tdms as tdms_module
-from pipeline.ingest.formats.recognise import parse_table
-from pipeline.ingest.formats.table import FileTable
+from pipeline.ingest import labview as tdms_module
+from pipeline.ingest.files import parse_table
+from pipeline.ingest.table import FileTable
 from tests.helpers.places import ROOT
 from tests.helpers.recordings import lvm, lvm_segment, tdms, tdms_of
 
@@ -299,7 +299,7 @@ def test_a_damaged_tdms_is_a_table_or_one_line(hits):
 def test_other_forms_do_not_load_the_readers():
     """Reading text files does not load the libraries for other formats."""
     code = (
-        "import sys; from pipeline.ingest.formats.recognise import parse_table; "
+        "import sys; from pipeline.ingest.files import parse_table; "
         "parse_table(b'time,x1\\n0,1\\n1,2\\n', source='a'); "
         "print(*[m for m in ('nptdms', 'h5py', 'openpyxl') if m in sys.modules])"
     )

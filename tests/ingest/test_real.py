@@ -8,7 +8,7 @@ import pytest
 import scipy.io
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.ingest.formats.recognise import read_table
+from pipeline.ingest.files import read_table
 from pipeline.ingest.inspect import inspect_file
 from pipeline.ingest.read import Ingested, read_data
 from pipeline.submission import Experiment, load_submission

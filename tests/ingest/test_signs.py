@@ -10,8 +10,8 @@ import pytest
 
 from pipeline.arrays import Array
 from pipeline.identify.recording_checks import check_signs
-from pipeline.ingest.input_sign import find_signs
 from pipeline.ingest.read import read_data
+from pipeline.ingest.sign import find_signs
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear
 from pipeline.report.sections.questions import ask

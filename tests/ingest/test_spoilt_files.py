@@ -13,11 +13,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import PipelineError
-from pipeline.ingest.formats.recognise import OF_STRANGERS, parse_table
+from pipeline.ingest.files import OF_STRANGERS, parse_table
 from pipeline.ingest.inspect import format_inspection, inspect_file
 from pipeline.ingest.read import read_data
 from pipeline.submission import Submission, load_submission
-from pipeline.submission.complaints import MOST_LISTED
+from pipeline.submission.toml import MOST_LISTED
 from tests.helpers.places import ROOT
 from tests.helpers.recordings import lvm, tdms_of, xlsx
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pipeline.arrays import Array
-from pipeline.ingest.formats.recognise import read_table
-from pipeline.ingest.formats.table import FileTable
+from pipeline.ingest.files import read_table
 from pipeline.ingest.read import read_data
+from pipeline.ingest.table import FileTable
 from pipeline.ingest.unnamed import Roles, find_roles
 from pipeline.resources import EXAMPLES
 from pipeline.results import Record

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.formats import workbook
-from pipeline.ingest.formats.recognise import parse_table, parse_tables
-from pipeline.ingest.formats.table import FileTable
+from pipeline.ingest import workbook
+from pipeline.ingest.files import parse_table, parse_tables
+from pipeline.ingest.table import FileTable
 from tests.helpers.recordings import package, saved, sheet_xml, xlsx
 
 N = 40

@@ -17,7 +17,7 @@ from unittest.mock import patch
 import tomlkit
 
 from pipeline.cli import main
-from pipeline.ingest.formats.recognise import read_table
+from pipeline.ingest.files import read_table
 from pipeline.ingest.read import read_data
 from pipeline.submission import load_submission
 from tests.helpers.places import REAL_DATA, ROOT

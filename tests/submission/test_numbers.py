@@ -22,7 +22,7 @@ from pipeline.resources import EXAMPLES, RUBRICS
 from pipeline.submission import load_submission
 from pipeline.submission.edit import edit_submission
 from pipeline.submission.load import NAME, parse_submission
-from pipeline.submission.toml_file import parse_toml
+from pipeline.submission.toml import parse_toml
 
 EXAMPLE = EXAMPLES / "two-cart"
 SUBMISSION = (EXAMPLE / NAME).read_text(encoding="utf-8")

@@ -18,8 +18,8 @@ from pipeline.submission import (
     load_submission,
     new_submission,
 )
-from pipeline.submission.complaints import nearest
 from pipeline.submission.load import InvalidSubmission
+from pipeline.submission.toml import nearest
 
 FULL = """\
 version = 1

@@ -19,7 +19,7 @@ from pipeline.cli import main
 from pipeline.errors import SubmissionError
 from pipeline.ingest.read import read_data
 from pipeline.submission import load_submission
-from pipeline.submission.complaints import MOST_LISTED
+from pipeline.submission.toml import MOST_LISTED
 
 HEAD = """\
 version = 1

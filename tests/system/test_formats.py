@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.ingest.formats.recognise import read_table
+from pipeline.ingest.files import read_table
 from pipeline.json_files import json_text
 from pipeline.resources import RUBRICS
 from pipeline.simulated.submission import Students, write_submission

@@ -26,7 +26,7 @@ from pipeline.report.lab_report.changes import compare_drafts, read_results
 from pipeline.resources import RUBRICS
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission
-from pipeline.submission.complaints import MOST_LISTED
+from pipeline.submission.toml import MOST_LISTED
 from tests.grading.publish.test_survey import write_paper
 from tests.helpers.acquisitions import Notes, write_work
 from tests.helpers.grades import make_grade

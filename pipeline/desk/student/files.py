@@ -16,11 +16,10 @@ from pipeline.desk.scratch import scratch_folder
 from pipeline.desk.student.handin import BESIDE
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.unpack import HAND_IN, is_debris, unpack
-from pipeline.ingest.formats.recognise import ENDINGS
+from pipeline.ingest.files import ENDINGS
 from pipeline.lock import lock_when_free
 from pipeline.output import own_folder, write_file
 from pipeline.processes import Failed
-from pipeline.submission.complaints import quote
 from pipeline.submission.load import (
     MAX_DATA_BYTES,
     MAX_NOTES_BYTES,
@@ -28,7 +27,7 @@ from pipeline.submission.load import (
     NAME,
     file_problem,
 )
-from pipeline.submission.toml_file import decoded, parse_toml
+from pipeline.submission.toml import decoded, parse_toml, quote
 
 # Text files that an uploaded zip may contain, with their largest size in bytes. They do not
 # overwrite an existing valid file.

@@ -39,7 +39,7 @@ from pipeline.submission.load import (
     parse_submission,
     posix,
 )
-from pipeline.submission.toml_file import TomlSlip, find_deep_key, read_apart
+from pipeline.submission.toml import TomlSlip, find_deep_key, read_apart
 from pipeline.words.progress import Progress, silent
 
 _DEEPEST = 50  # tables and lists inside each other that a form can show

@@ -30,8 +30,8 @@ from pipeline.output import OWNERS_FOLDER, named_folder, own_folder
 from pipeline.resources import EXAMPLES
 from pipeline.results import Record
 from pipeline.submission import Reported, Submission, load_submission
-from pipeline.submission.complaints import quote
 from pipeline.submission.load import NAME
+from pipeline.submission.toml import quote
 from pipeline.words.numbers import count, listing
 
 _SCRATCH = re.compile(r"\.scratch(-\d+)?")

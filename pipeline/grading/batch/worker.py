@@ -20,11 +20,11 @@ from pipeline.grading.judge.run import Graded, grade_submission
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.self_check.words import asked_note
 from pipeline.grading.similarity.fingerprints import fingerprint
-from pipeline.ingest.formats.recognise import OF_STRANGERS
+from pipeline.ingest.files import OF_STRANGERS
 from pipeline.processes import serve
 from pipeline.submission import Submission, load_submission
-from pipeline.submission.complaints import quote
 from pipeline.submission.load import MAX_TOML_BYTES, NAME
+from pipeline.submission.toml import quote
 
 _DETAIL = 20_000  # most characters of a traceback that are kept
 _TABLE = re.compile(r"\s*\[+\s*([\w.-]+)")

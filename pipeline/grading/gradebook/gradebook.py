@@ -55,7 +55,7 @@ from pipeline.grading.gradebook.schema import (
 )
 from pipeline.grading.gradings import Batch, Grading, Member, person
 from pipeline.grading.rubric import Rubric
-from pipeline.submission.complaints import nearest
+from pipeline.submission.toml import nearest
 from pipeline.words.progress import silent
 
 if TYPE_CHECKING:

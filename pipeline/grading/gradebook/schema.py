@@ -53,7 +53,7 @@ from sqlalchemy.schema import CreateColumn
 
 from pipeline.errors import ConfigError
 from pipeline.output import OWNER_ONLY
-from pipeline.submission.complaints import quote
+from pipeline.submission.toml import quote
 from pipeline.words.progress import silent
 
 T = TypeVar("T")

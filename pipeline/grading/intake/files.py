@@ -23,8 +23,8 @@ from pipeline.grading.intake.unpack import (
     is_debris,
     unpack,
 )
-from pipeline.submission.complaints import quote
 from pipeline.submission.load import NAME
+from pipeline.submission.toml import quote
 from pipeline.words.numbers import first_few
 
 _DEEPEST = 12  # levels of folders that are searched in a hand-in

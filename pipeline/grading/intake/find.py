@@ -25,8 +25,8 @@ from pipeline.grading.intake.unpack import (
     names_in_pieces,
     unpack,
 )
-from pipeline.submission.complaints import quote
 from pipeline.submission.load import NAME
+from pipeline.submission.toml import quote
 from pipeline.words.progress import Progress, silent
 
 _DAYS_OF_A_LATE_MARK = 1.0  # Canvas marks a late file without saying how late; it counts as one day

@@ -13,7 +13,7 @@ from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
 from pipeline.grading.intake.find import HandIn
 from pipeline.grading.rubric import Late
-from pipeline.submission.complaints import quote
+from pipeline.submission.toml import quote
 
 _DAY = 86_400.0  # s
 _HEADS = ["submission", "days_late"]

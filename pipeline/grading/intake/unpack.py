@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from pipeline.errors import SubmissionError, is_name_fault
-from pipeline.submission.complaints import quote
+from pipeline.submission.toml import quote
 
 _CHUNK = 1 << 16
 _RATIO_FROM = 1_000_000  # bytes; the ratio of smaller files is not limited

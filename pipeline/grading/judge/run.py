@@ -32,8 +32,7 @@ from pipeline.grading.references.springs import with_all_springs
 from pipeline.grading.references.tolerance import rounding, with_total
 from pipeline.grading.rubric import Rubric
 from pipeline.identify.recording_checks import find_bad_recordings
-from pipeline.ingest.columns import is_count
-from pipeline.ingest.formats.headings import conversion
+from pipeline.ingest.columns import conversion, is_count
 from pipeline.results import Analysis
 from pipeline.submission import Experiment, InputScale, PositionScale, Reported, Submission, System
 from pipeline.words.progress import Progress, silent

@@ -14,7 +14,7 @@ from pipeline.grading.intake.lms_names import Platform
 from pipeline.grading.publish.platforms import FORMS
 from pipeline.grading.publish.students import Remark, Student, not_exported, one_of
 from pipeline.output import csv_text
-from pipeline.submission.complaints import quote
+from pipeline.submission.toml import quote
 from pipeline.words.numbers import first_few
 
 if TYPE_CHECKING:

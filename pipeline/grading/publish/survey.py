@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
-from pipeline.submission.complaints import quote
+from pipeline.submission.toml import quote
 from pipeline.words.numbers import NOTHING
 
 if TYPE_CHECKING:

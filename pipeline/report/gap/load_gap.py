@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.errors import ConfigError
 from pipeline.results import Analysis
-from pipeline.submission.toml_file import read_text
+from pipeline.submission.toml import read_text
 
 if TYPE_CHECKING:
     from pipeline.gap.types import Gap

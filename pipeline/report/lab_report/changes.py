@@ -17,7 +17,7 @@ from pipeline.report.document import Block, Cell, bullet_list, cell, paragraph
 from pipeline.report.sections.page import Page
 from pipeline.results import Analysis
 from pipeline.setup import Setup, Units
-from pipeline.submission.complaints import first_refusal
+from pipeline.submission.toml import first_refusal
 from pipeline.words.numbers import NOTHING, count, percent, significant, unit_text, with_error
 from pipeline.words.phrases import phrases
 from pipeline.words.text import capital, clean, name_span, rich

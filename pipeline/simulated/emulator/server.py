@@ -15,7 +15,7 @@ from pipeline.simulated.bench import SimulatedBench
 from pipeline.simulated.emulator.carts import TRUE_PERIOD, VirtualCarts
 from pipeline.simulated.emulator.core import CommandReader, Core, ReferenceCore
 from pipeline.simulated.emulator.links import open_link
-from pipeline.submission.complaints import nearest
+from pipeline.submission.toml import nearest
 
 HOLD = 0.05  # s of the bench's clock for which a late chunk is held back
 

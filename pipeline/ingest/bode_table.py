@@ -6,9 +6,8 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
-from pipeline.ingest.columns import Column
-from pipeline.ingest.formats.headings import conversion
-from pipeline.ingest.formats.table import FileTable, refuse_extreme
+from pipeline.ingest.columns import Column, conversion
+from pipeline.ingest.table import FileTable, refuse_extreme
 from pipeline.results import FrequencyResponse
 
 # relative standard error of a ratio read off two plots, assumed if there are no repeats

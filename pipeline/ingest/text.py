@@ -16,8 +16,8 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
-from pipeline.ingest.formats.headings import are_units, is_time, join_unit, parse_heading
-from pipeline.ingest.formats.table import FileTable, checked_names, refuse_unusable
+from pipeline.ingest.columns import are_units, is_time, join_unit, parse_heading
+from pipeline.ingest.table import FileTable, checked_names, refuse_unusable
 from pipeline.words.numbers import first_few
 
 _FEW_LINES, _SNIFFED_LINES = 40, 400

@@ -1,7 +1,7 @@
 """Read a `.mat` file: its variables, which of them form the recording, and their columns.
 
 scipy reads version 5, h5py version 7.3. A few changed bytes can crash scipy's reader and its whole
-process, so `recognise` reads files of strangers in a process of their own.
+process, so `files` reads files of strangers in a process of their own.
 """
 
 import warnings
@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.formats.headings import is_time
-from pipeline.ingest.formats.table import (
+from pipeline.ingest.columns import is_time
+from pipeline.ingest.table import (
     MOST_COLUMNS,
     FileTable,
     Variable,

@@ -10,8 +10,8 @@ from io import BytesIO
 from typing import Any
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.formats.table import FileTable
-from pipeline.ingest.formats.text import Layout, find_blocks, is_bench_log, read_runs
+from pipeline.ingest.table import FileTable
+from pipeline.ingest.text import Layout, find_blocks, is_bench_log, read_runs
 from pipeline.words.numbers import first_few
 
 _PARTS = (b"[Content_Types].xml", b"docProps/", b"xl/")  # one of these occurs early in the archive
