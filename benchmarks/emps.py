@@ -7,10 +7,10 @@ from scipy.io import loadmat
 
 from benchmarks.free_runs import LINEAR_CART, OURS, left_out, start_at, words_of
 from benchmarks.page import Table, significant
-from pipeline.gap.data.holdout import prepare
 from pipeline.gap.explain import explain_gap
-from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
-from pipeline.gap.pem.run import compile_follower
+from pipeline.gap.parameters import fresh_nuisance, simulate_run
+from pipeline.gap.pem.model import compile_follower
+from pipeline.gap.runs import prepare
 from pipeline.plant.augmented import compile_simulator
 from pipeline.plant.effect import AugmentedChain
 from pipeline.results import Record

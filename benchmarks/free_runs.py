@@ -9,10 +9,9 @@ import numpy as np
 from benchmarks.black_boxes import TOOLS, Model, Part, best, error
 from benchmarks.page import installed, significant
 from pipeline.arrays import Array
-from pipeline.gap.data.runs import make_run
-from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
-from pipeline.gap.fit.structure import Candidate, Structure
-from pipeline.gap.fit.structure import GapModel as FitModel
+from pipeline.gap.parameters import Candidate, Structure, fresh_nuisance, simulate_run
+from pipeline.gap.parameters import GapModel as FitModel
+from pipeline.gap.runs import make_run
 from pipeline.gap.types import Gap
 from pipeline.plant.effect import AugmentedChain
 from pipeline.results import Record

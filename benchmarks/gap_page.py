@@ -27,13 +27,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.free_runs import start_at
 from pipeline.estimation.interventions import find_interventions
-from pipeline.gap.data.holdout import prepare, split_holdout
 from pipeline.gap.explain import explain_gap
-from pipeline.gap.fit.baseline import fit_baseline
-from pipeline.gap.search.free_run_fit import fit_free_run
-from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
+from pipeline.gap.fit import fit_baseline
+from pipeline.gap.judge import Hypothesis, Study, fit_free_run, judge
+from pipeline.gap.runs import prepare, split_holdout
+from pipeline.gap.summary import make_traces
 from pipeline.gap.types import Gap, Trace
-from pipeline.gap.verdict.summary import make_traces
 from pipeline.output import write_file
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.effect import AugmentedChain

@@ -13,7 +13,7 @@ from pipeline.words.progress import Progress, silent
 
 def find_hidden(out: Path, *, progress: Progress) -> list[str]:
     """Write a bench with hidden friction and its gap analysis; return the messages to print."""
-    from pipeline.gap.compile_beside import follower_compiled
+    from pipeline.gap.explain import follower_compiled
     from pipeline.simulated.hidden import prepare_bench
     from pipeline.simulated.submission import write_submission
 

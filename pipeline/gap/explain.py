@@ -1,45 +1,188 @@
 """The gap workflow: split the runs, fit the chain, find effects, describe the remaining error."""
 
-from collections.abc import Sequence
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, partial
+from pathlib import Path
+from threading import Condition, Thread
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pipeline.estimation.interventions import find_interventions
-from pipeline.gap.compile_beside import follower_compiled
-from pipeline.gap.data.holdout import drop_left_out, prepare, split_holdout
-from pipeline.gap.fit.baseline import fit_baseline
-from pipeline.gap.fit.levenberg_marquardt import Fitting, GapFit
-from pipeline.gap.pem.run import compile_follower
-from pipeline.gap.search.deadline import Deadline
-from pipeline.gap.search.hypothesis import Study
-from pipeline.gap.search.search import Search
-from pipeline.gap.types import Cause, FoundEffect, Gap
-from pipeline.gap.verdict.free_run import free_runs
-from pipeline.gap.verdict.residual_map import map_residual
-from pipeline.gap.verdict.summary import (
+from pipeline.gap.fit import Fitting, GapFit, Mapper, fit_baseline
+from pipeline.gap.judge import Study
+from pipeline.gap.pem.model import compile_follower
+from pipeline.gap.residual import map_residual, windowed_residual_forces
+from pipeline.gap.runs import drop_left_out, prepare, split_holdout
+from pipeline.gap.search import Deadline, Search
+from pipeline.gap.summary import (
     chain_covariance,
     chain_std,
+    choose_experiment,
     compare_by_record,
+    find_windows,
+    free_runs,
     list_contenders,
     list_effects,
     list_suspects,
     make_traces,
     repeatability,
 )
-from pipeline.gap.verdict.where import choose_experiment, find_windows
-from pipeline.gap.verdict.windowed_force import windowed_residual_forces
-from pipeline.gap.workers import two_workers
+from pipeline.gap.types import Cause, FoundEffect, Gap
 from pipeline.plant.augmented import compile_simulator
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import Effect, EffectTerm
+from pipeline.plant.simulator.compiler import is_compiled, kept_in
 from pipeline.results import Analysis, Record
 from pipeline.setup import Setup
+from pipeline.threads import with_one_thread
 from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress, silent
+
+# ---------------------------------------------------------------------- two threads
+
+
+@contextmanager
+def two_workers() -> Iterator[Mapper]:
+    """Give a function that maps like the built-in `map`, with this thread and a helper.
+
+    The first error ends a map. A thread that waits for the other one takes over some of its work.
+    """
+    crew = _Crew()
+    helper = Thread(target=crew.help, daemon=True)
+    helper.start()
+    try:
+        yield crew.map
+    finally:
+        crew.close()
+        helper.join()
+
+
+class _Closed(Exception):
+    """The work is no longer wanted."""
+
+
+class _Map:
+    """One call of the mapper, with the results so far."""
+
+    def __init__(self, work: Callable[..., Any], jobs: list[tuple[Any, ...]]) -> None:
+        self.work, self.jobs = work, jobs
+        self.results: list[Any] = [None] * len(jobs)
+        self.begun = self.ended = 0
+        self.error: BaseException | None = None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a thread can begin a job."""
+        return self.error is None and self.begun < len(self.jobs)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether no thread has, or can begin, a job."""
+        return self.begun == self.ended and not self.is_open
+
+    def do(self, at: int) -> None:
+        """Do one job."""
+        try:
+            self.results[at] = self.work(*self.jobs[at])
+        except BaseException as error:
+            self.error = self.error or error
+
+
+class _Crew:
+    """Two threads and their maps; a map that a job opens comes after the job's own map."""
+
+    def __init__(self) -> None:
+        self._maps: list[_Map] = []
+        self._change = Condition()
+        self._closed = False
+
+    def map(self, work: Callable[..., Any], *items: Iterable[Any]) -> list[Any]:
+        """Map like the built-in `map`."""
+        mine = _Map(work, list(zip(*items, strict=False)))
+        with self._change:
+            if self._closed:
+                raise _Closed
+            self._maps.append(mine)
+            self._change.notify_all()
+        try:
+            # Work of an older map could last much longer than this one.
+            self._work(lambda: mine.is_over, lambda: self._maps[self._maps.index(mine) :])
+        finally:
+            with self._change:
+                self._maps.remove(mine)
+        if mine.error:
+            raise mine.error
+        return mine.results
+
+    def help(self) -> None:
+        """Work until the crew is closed; the oldest map comes first, because its jobs are long."""
+        self._work(lambda: self._closed, lambda: self._maps)
+
+    def close(self) -> None:
+        """Refuse further maps, which ends the helper's work."""
+        with self._change:
+            self._closed = True
+            self._change.notify_all()
+
+    def _work(self, over: Callable[[], bool], maps: Callable[[], list[_Map]]) -> None:
+        while True:
+            with self._change:
+                one = None
+                while not over() and (one := _first_open(maps())) is None:
+                    self._change.wait()
+                if one is None or over():
+                    return
+                at = one.begun
+                one.begun += 1
+            one.do(at)
+            with self._change:
+                one.ended += 1
+                # After Ctrl-C nobody wants the other thread's work either.
+                self._closed |= isinstance(one.error, KeyboardInterrupt)
+                self._change.notify_all()
+
+
+def _first_open(maps: Iterable[_Map]) -> _Map | None:
+    return next((one for one in maps if one.is_open), None)
+
+
+# ----------------------------------------------------------------- compiling in a second process
+
+_ROOM = Path(__file__).parent / "pem"
+_SCRIPT = "from pipeline.gap.pem.model import compile_follower; compile_follower()"
+
+
+@contextmanager
+def follower_compiled() -> Iterator[None]:
+    """Compile the follower during this block, unless compiled code is stored or cannot be.
+
+    So the first search on a computer with two cores begins eight seconds earlier. If the second
+    process fails, the follower is compiled when it is needed.
+    """
+    stored = kept_in(_ROOM) is None or is_compiled(_ROOM, function="predict_run")
+    if stored or (os.cpu_count() or 1) == 1:
+        yield
+        return
+    command, none = [sys.executable, "-P", "-c", _SCRIPT], subprocess.DEVNULL
+    with subprocess.Popen(
+        command, stdin=none, stdout=none, stderr=none, env=with_one_thread()
+    ) as beside:
+        try:
+            yield
+        except BaseException:
+            beside.kill()
+            raise
+
+
+# ---------------------------------------------------------------------- the workflow
 
 
 def investigate(analysis: Analysis, *, progress: Progress, budget: float | None = None) -> Gap:

@@ -8,8 +8,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.measured_run import measured_run
-from pipeline.gap.data.holdout import prepare
-from pipeline.gap.data.runs import GapRun
+from pipeline.gap.runs import GapRun, prepare
 from pipeline.plant.effect import AugmentedChain
 from pipeline.results import HardwareCheck, Record
 
@@ -87,10 +86,8 @@ def replay_fitted(run: GapRun, model: AugmentedChain, *, springs: tuple[bool, ..
     ------
     DataError : the simulation diverges.
     """
-    from pipeline.gap.fit.baseline import fit_nuisance
-    from pipeline.gap.fit.levenberg_marquardt import evaluate
-    from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
-    from pipeline.gap.fit.structure import Candidate, Structure
+    from pipeline.gap.fit import evaluate, fit_nuisance
+    from pipeline.gap.parameters import Candidate, Structure, fresh_nuisance, simulate_run
 
     structure = Structure(
         springs=springs,

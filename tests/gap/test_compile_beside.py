@@ -7,12 +7,12 @@ import sys
 import psutil
 import pytest
 
-from pipeline.gap.compile_beside import follower_compiled
-from pipeline.gap.pem.run import compile_follower
+from pipeline.gap.explain import follower_compiled
+from pipeline.gap.pem.model import compile_follower
 from tests.helpers.places import ROOT
 
 SCRIPT = """
-from pipeline.gap import compile_beside as beside
+from pipeline.gap import explain as beside
 from pipeline.plant.simulator.compiler import is_compiled
 
 print(is_compiled(beside._ROOM, function="predict_run"))

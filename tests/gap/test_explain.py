@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from pipeline.errors import DataError
-from pipeline.gap.data.runs import make_run
 from pipeline.gap.explain import explain_gap
-from pipeline.gap.fit.levenberg_marquardt import Fitting, fit_model
-from pipeline.gap.fit.linearise import linearise
-from pipeline.gap.fit.structure import Structure
+from pipeline.gap.fit import Fitting, fit_model
+from pipeline.gap.parameters import Structure, linearise
+from pipeline.gap.runs import make_run
+from pipeline.gap.summary import repeatability
 from pipeline.gap.types import Gap
-from pipeline.gap.verdict.summary import repeatability
 from pipeline.json_files import plain
 from pipeline.plant.augmented import simulate_augmented
 from pipeline.plant.catalogue import CATALOGUE, find_effect
@@ -413,7 +412,7 @@ def test_an_effect_only_in_the_held_out_data_is_found():
 
 def test_an_overflow_in_the_derivatives_ends_a_fit(monkeypatch):
     """If the derivatives overflow, the fit keeps its start."""
-    module = "pipeline.gap.fit.levenberg_marquardt.linearise"
+    module = "pipeline.gap.fit.linearise"
     monkeypatch.setattr(
         module,
         lambda *of, **how: replace(part := linearise(*of, **how), reduced=1e200 * part.reduced),

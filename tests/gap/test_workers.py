@@ -4,7 +4,7 @@ from threading import Barrier, Event, get_ident
 
 import pytest
 
-from pipeline.gap.workers import two_workers
+from pipeline.gap.explain import two_workers
 
 LIMIT = 60.0  # s; a thread that waits longer waits for ever
 

@@ -38,7 +38,7 @@ def compile_all() -> None:
     """Compile the workflow's simulators and the tests' independent one."""
     import numpy as np
 
-    from pipeline.gap.compile_beside import follower_compiled
+    from pipeline.gap.explain import follower_compiled
     from pipeline.plant.augmented import compile_simulator
     from tests.truth.bench import simulate_truth
 

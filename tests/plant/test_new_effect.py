@@ -95,7 +95,7 @@ PLAIN = [
 def test_only_its_own_file_names_an_effect(effect):
     """Only an effect's own file names it, except for effects whose law has its own state.
 
-    Laws that need trial shapes are also named in `gap.pem.score`.
+    Laws that need trial shapes are also named in `gap.pem.fit`.
     """
     files = {
         path.relative_to(ROOM).as_posix()

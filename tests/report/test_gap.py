@@ -15,6 +15,7 @@ from typer.main import get_command
 
 from pipeline.cli.commands import app
 from pipeline.errors import ConfigError
+from pipeline.gap.residual import residual_forces
 from pipeline.gap.types import (
     Alternative,
     AlternativeModel,
@@ -34,7 +35,6 @@ from pipeline.gap.types import (
     Verdict,
     read_gap,
 )
-from pipeline.gap.verdict.residual_force import residual_forces
 from pipeline.json_files import json_text
 from pipeline.plant.augmented import simulate_augmented
 from pipeline.plant.catalogue import CATALOGUE, find_effect

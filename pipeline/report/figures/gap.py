@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipeline.arrays import Array
+from pipeline.gap.residual import ResidualForce
 from pipeline.gap.types import FoundEffect, Prediction, RecordGap, Residual, Trace
-from pipeline.gap.verdict.residual_force import ResidualForce
 from pipeline.report.figures.colours import MEASURED, MODEL, QUIET, SECOND, SECOND_LINE, SHADE
 from pipeline.report.figures.style import (
     legend_above,

@@ -6,8 +6,8 @@ from dataclasses import replace
 from pipeline import __version__
 from pipeline.arrays import Array
 from pipeline.estimation.interventions import without_releases
+from pipeline.gap.residual import ResidualForce, residual_forces
 from pipeline.gap.types import FoundEffect, Gap, RecordGap, Trace
-from pipeline.gap.verdict.residual_force import ResidualForce, residual_forces
 from pipeline.plant.effect import AugmentedChain, effect_name, place_name
 from pipeline.report.document import Block, Document, bullet_list, paragraph
 from pipeline.report.equations.effects import augmented_equations, in_order, law

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pipeline.errors import DataError
-from pipeline.gap.data.holdout import prepare
 from pipeline.gap.explain import investigate
+from pipeline.gap.runs import prepare
 from pipeline.gap.types import read_gap
 from pipeline.json_files import json_text
 from pipeline.plant.chain import PRESETS, Chain

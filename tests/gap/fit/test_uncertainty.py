@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 
 from pipeline.experiments.propose import propose_plan
-from pipeline.gap.data.holdout import prepare
-from pipeline.gap.data.runs import make_run
-from pipeline.gap.fit.baseline import measure_noise
-from pipeline.gap.fit.levenberg_marquardt import Fitting, evaluate, fit_model
-from pipeline.gap.fit.structure import Structure
-from pipeline.gap.fit.uncertainty import covariance
-from pipeline.gap.search.translate import make_candidate
+from pipeline.gap.fit import Fitting, covariance, evaluate, fit_model, measure_noise
+from pipeline.gap.judge import make_candidate
+from pipeline.gap.parameters import Structure
+from pipeline.gap.runs import make_run, prepare
 from pipeline.plant.catalogue import find_effect
 from pipeline.plant.chain import Chain
 from pipeline.simulated.hidden import prepare_bench

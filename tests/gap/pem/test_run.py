@@ -5,10 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.gap.data.runs import make_run
-from pipeline.gap.pem import forces
-from pipeline.gap.pem.laws import DRY, LawSet, PemSetup, TrialLaw
-from pipeline.gap.pem.run import RunParameters, errors_of, make_track
+from pipeline.gap.pem import kernel as forces
+from pipeline.gap.pem.model import (
+    DRY,
+    LawSet,
+    PemSetup,
+    RunParameters,
+    TrialLaw,
+    errors_of,
+    make_track,
+)
+from pipeline.gap.runs import make_run
 from pipeline.plant.chain import Chain
 from pipeline.plant.simulator.terms import EffectKind
 from tests.truth.cases import make_case

@@ -2,11 +2,9 @@
 
 from dataclasses import replace
 
-from pipeline.gap.data.holdout import split
-from pipeline.gap.data.runs import make_run
-from pipeline.gap.fit.baseline import fit_baseline
-from pipeline.gap.fit.levenberg_marquardt import GapFit
-from pipeline.gap.search.hypothesis import Study
+from pipeline.gap.fit import GapFit, fit_baseline
+from pipeline.gap.judge import Study
+from pipeline.gap.runs import make_run, split
 from pipeline.plant.catalogue import CATALOGUE
 from tests.truth.bench import Hidden
 from tests.truth.cases import make_case

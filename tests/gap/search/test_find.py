@@ -1,8 +1,8 @@
 """The search tries the right laws and hypotheses."""
 
+from pipeline.gap.judge import judge
 from pipeline.gap.limits import BIC_DROP
-from pipeline.gap.search.find import find_hypotheses
-from pipeline.gap.search.hypothesis import judge
+from pipeline.gap.search import find_hypotheses
 from tests.gap.search.begun import COULOMB, DELAY, begun
 from tests.truth.bench import Hidden
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.gap.search.hypothesis import Hypothesis, Study, worth_it
+from pipeline.gap.judge import Hypothesis, Study, worth_it
 from pipeline.plant.catalogue import find_effect
 from tests.gap.search.begun import CUBIC, DELAY
 

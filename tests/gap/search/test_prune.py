@@ -5,10 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.gap.search.free_run_fit import fit_free_run
-from pipeline.gap.search.hypothesis import judge
-from pipeline.gap.search.prune import SURE, prune, significance
-from pipeline.gap.search.translate import make_candidate
+from pipeline.gap.judge import SURE, fit_free_run, judge, make_candidate, prune, significance
 from pipeline.plant.catalogue import find_effect
 from tests.gap.search.begun import COULOMB, DAHL, DELAY, begun
 from tests.truth.bench import Hidden

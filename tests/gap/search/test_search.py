@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.gap.search.deadline import Deadline
-from pipeline.gap.search.search import Search
+from pipeline.gap.search import Deadline, Search
 from tests.gap.search.begun import COULOMB, DELAY, begun
 from tests.truth.bench import Hidden
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from pipeline.gap.data.runs import make_run
-from pipeline.gap.fit.structure import Structure
-from pipeline.gap.pem.laws import COLUMNS, DRIVE_COLUMNS, PemSetup, column_set, smooth_laws
-from pipeline.gap.search.translate import filled, make_candidate, values_of
+from pipeline.gap.judge import filled, make_candidate, values_of
+from pipeline.gap.parameters import Structure
+from pipeline.gap.pem.model import COLUMNS, DRIVE_COLUMNS, PemSetup, column_set, smooth_laws
+from pipeline.gap.runs import make_run
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulator.terms import EffectKind

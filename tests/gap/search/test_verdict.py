@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.gap.search.verdict import reach_verdict
+from pipeline.gap.judge import reach_verdict
 from pipeline.plant.catalogue import find_effect
 
 FLOOR = 0.01

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from pipeline.arrays import Array
-from pipeline.gap.data.holdout import prepare, split_holdout
 from pipeline.gap.explain import explain_gap
-from pipeline.gap.fit.baseline import fit_baseline, fit_nuisance
+from pipeline.gap.fit import fit_baseline, fit_nuisance
+from pipeline.gap.residual import map_residual, windowed_residual_forces
+from pipeline.gap.runs import prepare, split_holdout
 from pipeline.gap.types import Residual
-from pipeline.gap.verdict.residual_map import map_residual
-from pipeline.gap.verdict.windowed_force import windowed_residual_forces
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import Chain
 from pipeline.results import ExperimentKind, Record

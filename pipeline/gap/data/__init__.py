@@ -1,1 +1,0 @@
-"""Prepare records for fitting: which are used, which are held out, where a run begins."""

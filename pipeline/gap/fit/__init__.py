@@ -1,1 +1,0 @@
-"""Fit a model to all runs at once: parameter vector, derivatives, steps and first estimate."""

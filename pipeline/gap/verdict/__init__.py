@@ -1,1 +1,0 @@
-"""Describe the result of a search: the verdict, the errors, and where the model fits badly."""
