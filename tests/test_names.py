@@ -44,18 +44,3 @@ def test_real_chains_obey_the_inequalities(preset):
         assert values[low] < values[middle] < values[high]
     for lesser, greater, _ in orders(list(values)):
         assert values[lesser] <= values[greater]
-
-
-def test_names_are_given_in_words():
-    """`read_name` gives parameter names in words."""
-    said = {name: read_name(name).words for name in ("zeta", "zeta_1", "omega_n", "omega_b",
-            "omega_x", "K_2", "mass")}  # fmt: skip
-    assert said == {
-        "zeta": "damping ratio ζ",
-        "zeta_1": "damping ratio ζ of cart 1",
-        "omega_n": "frequency ω",
-        "omega_b": "frequency ω of resonance b",
-        "omega_x": "frequency ω of null x",
-        "K_2": "static gain K of cart 2",
-        "mass": "mass",
-    }

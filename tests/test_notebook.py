@@ -164,20 +164,6 @@ def test_a_missing_folder_is_one_clear_error(tmp_path):
         analyse(tmp_path / "nowhere")
 
 
-def test_the_style_sheet_stays_inside(lab):
-    """Every style rule is nested under the class `cartlab`, so the notebook keeps its own style."""
-    html = lab._repr_html_()
-    style = html[html.index("<style>") + 7 : html.index("</style>")].strip()
-    assert style.startswith(".cartlab {")
-    depth, closed_at = 0, []
-    for at, letter in enumerate(style):
-        depth += (letter == "{") - (letter == "}")
-        if depth == 0 and letter == "}":
-            closed_at.append(at)
-    assert closed_at == [len(style) - 1]
-    assert ":root" not in style
-
-
 def test_the_example_notebook_runs(monkeypatch):
     """Every code cell of the example runs, in order, and displays its last value."""
     mpl.use("agg")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from benchmarks.black_boxes import CELLS, STATES, Model, Part, _recurrent, best, error
+from benchmarks.black_boxes import Model, Part, error
 from benchmarks.bode import judged, modes_named, multisine
 from benchmarks.bode_tools import (
     Dwells,
@@ -15,7 +15,6 @@ from benchmarks.bode_tools import (
     factors,
     modes_of,
     rational,
-    realised,
     responses_of,
     start_of,
 )
@@ -69,15 +68,6 @@ def test_the_responses_for_a_modal_analysis_are_those_of_the_chain():
     assert np.all(np.abs(G[:, band] - true) < 0.01 * np.abs(true).max())
 
 
-def test_subspaces_find_the_truth_in_a_record_without_noise():
-    """From a record without noise, python-control's realisation finds the true resonances."""
-    chain = PRESETS["throne-1dof"]
-    found = realised(multisine(chain, rng=np.random.default_rng(0), noise=1e-9))
-
-    truth = modes_named(chain, list(chain.parameters().values()))
-    assert_allclose(found.omega, truth.omega, rtol=1e-3)
-
-
 def test_a_missing_answer_counts_as_infinitely_wrong():
     """If a method gives no answer or too few resonances, its error counts as infinite."""
     chain = PRESETS["throne-1dof"]
@@ -99,23 +89,6 @@ def test_a_free_run_is_judged_after_its_start_and_divergence_is_infinite():
 
     assert_allclose(error(Model(run=lambda _: near, every=1, words=""), [part]), 0.1)
     assert error(Model(run=lambda _: 1e9 * y, every=1, words=""), [part]) == np.inf
-
-
-def test_the_sparser_of_nearly_equal_models_is_kept():
-    """Of models with nearly equal errors, the one with fewest terms is kept.
-
-    If all models diverge, no model is kept.
-    """
-    part = Part(dt=0.01, u=np.zeros(100), y=np.ones(100), first=0)
-
-    def off_by(value: float, terms: int) -> Model:
-        return Model(run=lambda p: p.y * value, every=1, words=str(terms), terms=("x",) * terms)
-
-    chosen = best(iter([off_by(1.1, 5), off_by(1.105, 2), off_by(1.2, 1)]), [part])
-
-    assert chosen is not None
-    assert chosen.words == "2"
-    assert best(iter([off_by(1e9, 1)]), [part]) is None
 
 
 def test_new_records_are_from_the_same_bench():
@@ -156,30 +129,3 @@ def test_effects_count_only_under_the_verdict_named(verdict, hidden, named):
     gap: Any = SimpleNamespace(verdict=verdict, effects=effects)
 
     assert is_named(Bench(hidden=hidden, noise=0.1, gap=gap, answers={})) is named
-
-
-def test_a_recurrent_network_without_cells_is_a_linear_system():
-    """A recurrent network without nonlinear cells moves as a linear system."""
-    rng = np.random.default_rng(3)
-    A, B = 0.4 * rng.standard_normal((STATES, STATES)), rng.standard_normal((STATES, 1))
-    C, x0, u = (
-        rng.standard_normal((1, STATES)),
-        rng.standard_normal(STATES),
-        rng.standard_normal(20),
-    )
-    cells = [
-        np.ones((CELLS, STATES)),
-        np.ones((CELLS, 1)),
-        np.ones(CELLS),
-        np.zeros((STATES, CELLS)),
-    ]
-
-    found = _recurrent([A, B, C, *cells], x0, u)
-
-    powers = [np.linalg.matrix_power(A, k) for k in range(20)]
-    markov = [(C @ power @ B).item() for power in powers]
-    expected = [
-        (C @ powers[k] @ x0).item() + sum(markov[k - 1 - i] * u[i] for i in range(k))
-        for k in range(20)
-    ]
-    assert_allclose(found, expected, rtol=1e-9, atol=1e-12)

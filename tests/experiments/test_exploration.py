@@ -1,7 +1,9 @@
 """A bench explores itself, with the emulator's carts and over a real line."""
 
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -15,18 +17,48 @@ from pipeline.experiments.discriminate import propose_for
 from pipeline.experiments.exploration import Exploration, Recorded
 from pipeline.experiments.goal import ErrorGoal, find_goal, read_error_goal, read_time
 from pipeline.experiments.information import FisherInformation
-from pipeline.experiments.plan import PlanLimits, session_time, time_words
+from pipeline.experiments.plan import PlanLimits, Recording, session_time, time_words
 from pipeline.experiments.plan_file import load_plan, save_plan
 from pipeline.experiments.propose import propose_plan
 from pipeline.report.exploration.diary import NAME, write_diary
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission
-from pipeline.words.progress import silent
+from pipeline.words.progress import Progress, silent
 from pipeline.workflow import analyse
 from tests.helpers.benches import emulator
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.desks import a_recorded_cart
 from tests.helpers.virtual import VirtualBench, VirtualSession, new_folder
+
+
+def exploration(
+    folder: Path,
+    record: Callable[[Sequence[str]], Recorded],
+    *,
+    goal: ErrorGoal | None = None,
+    seconds: float = 400.0,
+    announce: Callable[[str], object] = silent,
+    progress: Progress = silent,
+    vetoes: Callable[[Recording], bool] = lambda recording: False,
+) -> Exploration:
+    """Return an exploration that wants errors of 1e-7, unless told otherwise."""
+    return Exploration(
+        write_diary=write_diary,
+        known_commands=known_commands,
+        folder=folder,
+        record=record,
+        goal=goal or ErrorGoal(error=1e-7),
+        seconds=seconds,
+        announce=announce,
+        progress=progress,
+        vetoes=vetoes,
+    )
+
+
+def linear_session(folder: Path) -> VirtualSession:
+    """Return a session on a bench of one cart without hidden effects."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    return VirtualSession(folder, VirtualBench(bench, seed=1))
 
 
 @pytest.mark.parametrize(
@@ -73,15 +105,7 @@ def explored(tmp_path_factory):
     folder = tmp_path_factory.mktemp("explored") / "work"
     said: list[str] = []
     session = VirtualSession(folder, VirtualBench(bench, seed=2))
-    turns = Exploration(
-        write_diary=write_diary,
-        known_commands=known_commands,
-        folder=folder,
-        record=session,
-        goal=read_error_goal("all 1%"),
-        seconds=400.0,
-        announce=said.append,
-    ).run()
+    turns = exploration(folder, session, goal=read_error_goal("all 1%"), announce=said.append).run()
     return folder, turns, said, bench
 
 
@@ -119,17 +143,6 @@ def test_an_exploration_writes_a_submission_and_a_diary(explored):
         assert f"{turn.seconds:.0f} s" in diary
 
 
-@pytest.mark.slow
-@pytest.mark.sample
-def test_an_exploration_keeps_only_runs_that_its_diary_shows(explored):
-    """Each earlier decision keeps one run, for its picture; the last decision keeps all runs."""
-    folder, turns, _, _ = explored
-    *earlier, last = [turn.gap for turn in turns]
-    assert earlier
-    assert [len(gap.traces) for gap in earlier] == [1] * len(earlier)
-    assert len(last.traces) == len(load_submission(folder).experiments)
-
-
 @pytest.fixture
 def no_gap(monkeypatch):
     """Make the search for the gap fail, so that only the carts are identified."""
@@ -148,17 +161,8 @@ def test_an_exploration_ends_before_it_exceeds_its_time(tmp_path):
 
     If the gap analysis fails, the carts are still identified, and no effect is named.
     """
-    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
-    session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
-    (turn,) = Exploration(
-        write_diary=write_diary,
-        known_commands=known_commands,
-        folder=tmp_path / "work",
-        record=session,
-        goal=ErrorGoal(error=1e-7),
-        seconds=90.0,
-        announce=silent,
-    ).run()
+    session = linear_session(tmp_path / "work")
+    (turn,) = exploration(tmp_path / "work", session, seconds=90.0).run()
     assert turn.seconds <= 90.0
     assert (turn.verdict, turn.reached) == ("", False)
     assert turn.errors
@@ -171,15 +175,7 @@ def test_too_little_time_for_the_sweep_moves_no_cart(tmp_path):
     virtual = VirtualBench(bench, seed=1)
     session = VirtualSession(tmp_path / "work", virtual)
     with pytest.raises(ConfigError, match="the first sweep alone takes"):
-        Exploration(
-            write_diary=write_diary,
-            known_commands=known_commands,
-            folder=tmp_path / "work",
-            record=session,
-            goal=ErrorGoal(),
-            seconds=10.0,
-            announce=silent,
-        ).run()
+        exploration(tmp_path / "work", session, goal=ErrorGoal(), seconds=10.0).run()
     assert virtual.seconds == 0.0
 
 
@@ -195,34 +191,10 @@ def test_a_goal_for_an_unknown_parameter_is_refused(tmp_path):
     known = a_recorded_cart(tmp_path / "known")
     for folder in (known, tmp_path / "unknown"):  # with known carts, and with unknown ones
         with pytest.raises(ConfigError, match="did you mean 'zeta'"):
-            Exploration(
-                write_diary=write_diary,
-                known_commands=known_commands,
-                folder=folder,
-                record=record,
-                goal=wish,
-                seconds=900.0,
-                announce=silent,
-            ).run()
+            exploration(folder, record, goal=wish, seconds=900.0).run()
     assert not asked
     with pytest.raises(ConfigError, match="no such parameter"):
         ErrorGoal(prefix="zeta_7").missing({"zeta_1": 0.1, "zeta_2": None})
-
-
-def test_a_goal_for_a_rigid_cart_is_accepted(tmp_path):
-    """A goal for a rigid cart is accepted, as cartlab cannot know yet whether there are springs."""
-    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
-    session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
-    with pytest.raises(ConfigError, match="the first sweep alone takes"):
-        Exploration(
-            write_diary=write_diary,
-            known_commands=known_commands,
-            folder=tmp_path / "work",
-            record=session,
-            goal=ErrorGoal(prefix="mass"),
-            seconds=10.0,
-            announce=silent,
-        ).run()
 
 
 @pytest.mark.usefixtures("no_gap")
@@ -234,15 +206,7 @@ def test_an_exploration_ends_after_three_failures(tmp_path):
         asked.extend(ids)
         return Recorded(ids=(), seconds=20.0, why="the line is silent: is it plugged in?")
 
-    turns = Exploration(
-        write_diary=write_diary,
-        known_commands=known_commands,
-        folder=a_recorded_cart(tmp_path / "work"),
-        record=record,
-        goal=ErrorGoal(error=1e-7),
-        seconds=900.0,
-        announce=silent,
-    ).run()
+    turns = exploration(a_recorded_cart(tmp_path / "work"), record, seconds=900.0).run()
     assert len(set(asked)) == 3
     assert [turn.summary.split("? ")[0] for turn in turns[1:]] == [
         f"{name} failed: the line is silent: is it plugged in" for name in asked
@@ -257,9 +221,8 @@ def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
 
     gap.json is then written again with a new proposal in place of the vetoed one.
     """
-    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     folder, offered, said = tmp_path / "work", [], []
-    session = VirtualSession(folder, VirtualBench(bench, seed=1))
+    session = linear_session(folder)
 
     def proposed(gap, submission, *, without=()):
         found = propose_for(gap, submission, without=without)
@@ -279,16 +242,7 @@ def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
 
     monkeypatch.setattr("pipeline.experiments.exploration.propose_for", proposed)
     with pytest.raises(Stopped):
-        Exploration(
-            write_diary=write_diary,
-            known_commands=known_commands,
-            folder=folder,
-            record=session,
-            goal=ErrorGoal(error=1e-7),
-            seconds=400.0,
-            announce=said.append,
-            vetoes=vetoes,
-        ).run()
+        exploration(folder, session, announce=said.append, vetoes=vetoes).run()
     first, mine, other = offered
     assert mine.id == "mine"
     assert not other.resembles(first)
@@ -321,17 +275,7 @@ def test_an_added_recording_comes_next_whatever_its_id(tmp_path):
         raise Stopped("by hand")
 
     with pytest.raises(Stopped):
-        Exploration(
-            write_diary=write_diary,
-            known_commands=known_commands,
-            folder=folder,
-            record=session,
-            goal=ErrorGoal(error=1e-7),
-            seconds=400.0,
-            announce=silent,
-            progress=add,
-            vetoes=enough,
-        ).run()
+        exploration(folder, session, progress=add, vetoes=enough).run()
     assert offered == [step]
 
 
@@ -407,19 +351,10 @@ def test_a_series_ends_when_a_person_intervenes(tmp_path, monkeypatch, ends):
             raise Stopped("by hand")
         return len(asked) == 3 and ends == "vetoed"
 
-    exploration = Exploration(
-        write_diary=write_diary,
-        known_commands=known_commands,
-        folder=folder,
-        record=session,
-        goal=ErrorGoal(error=1e-7),
-        seconds=600.0,
-        announce=silent,
-        vetoes=vetoes,
-    )
+    series = exploration(folder, session, seconds=600.0, vetoes=vetoes)
     with pytest.raises(Stopped):
-        exploration.run()
-    first, second = exploration.turns
+        series.run()
+    first, second = series.turns
     assert f"The next recordings are {asked[0]}, {asked[1]} and " in first.summary
     assert second.recorded == tuple(asked[:3] if ends == "not" else asked[:2])
     assert second.summary.startswith(f"{asked[2]} was vetoed. " if ends == "vetoed" else "")
@@ -428,22 +363,14 @@ def test_a_series_ends_when_a_person_intervenes(tmp_path, monkeypatch, ends):
 
 def test_thinking_can_be_ended(tmp_path):
     """An exception in the progress display ends the exploration, and the recordings stay."""
-    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
-    session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
+    session = linear_session(tmp_path / "work")
 
     def enough(stage):
         raise Stopped("by hand")
 
     with pytest.raises(Stopped):
-        Exploration(
-            write_diary=write_diary,
-            known_commands=known_commands,
-            folder=tmp_path / "work",
-            record=session,
-            goal=ErrorGoal(),
-            seconds=90.0,
-            announce=silent,
-            progress=enough,
+        exploration(
+            tmp_path / "work", session, goal=ErrorGoal(), seconds=90.0, progress=enough
         ).run()
     assert len(load_submission(tmp_path / "work").experiments) == 3
 
@@ -471,14 +398,6 @@ def test_the_large_step_and_the_far_sweep_are_made_only_once(tmp_path):
     """If drag keeps carts from the wanted distance, the recordings for it are still made once."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=["quadratic_drag"])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=13))
-    turns = Exploration(
-        write_diary=write_diary,
-        known_commands=known_commands,
-        folder=tmp_path / "work",
-        record=session,
-        goal=ErrorGoal(),
-        seconds=300.0,
-        announce=silent,
-    ).run()
+    turns = exploration(tmp_path / "work", session, goal=ErrorGoal(), seconds=300.0).run()
     assert [turn.verdict for turn in turns] == ["named"] * 3
     assert [turn.recorded for turn in turns[1:]] == [("step-3",), ("sweep-2",)]

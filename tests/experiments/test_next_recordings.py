@@ -9,16 +9,12 @@ import pytest
 
 from pipeline.errors import ConfigError, DataError
 from pipeline.experiments.candidates import (
-    low_peak_phases,
     optimal_tones,
     propose_candidates,
-    schroeder_phases,
 )
 from pipeline.experiments.goal import Goal, choose, find_goal
 from pipeline.experiments.information import FisherInformation
 from pipeline.experiments.next_recordings import (
-    STATISTICAL,
-    _doubt,
     choose_next,
     compare_recordings,
     why_useless,
@@ -26,8 +22,6 @@ from pipeline.experiments.next_recordings import (
 from pipeline.experiments.plan import Plan, PlanLimits, Recording
 from pipeline.experiments.plan_file import load_plan
 from pipeline.experiments.propose import extend_plan, propose_plan, renamed
-from pipeline.plant.chain import PRESETS
-from pipeline.plant.limits import CALIBRATION
 from pipeline.plant.sampled_loop import LoopSetup, simulate_loop
 from pipeline.plant.simulate import simulate_linear
 from pipeline.protocol import (
@@ -117,32 +111,6 @@ def test_fit_reaches_the_predicted_errors(tmp_path):
     true = bench.carts._bench.chain.parameters()
     off = [abs(e.value - true[name]) / (e.std or np.inf) for name, e in fit.parameters.items()]
     assert max(off) < 4
-
-
-def test_twice_the_length_gives_twice_the_information(known):
-    """A record of a steady sine that is twice as long has twice the information."""
-    omega = known.chain.omega_carts
-    once = known.of_lines(omega, amplitude=np.full(2, 0.05), seconds=10.0)
-    twice = known.of_lines(omega, amplitude=np.full(2, 0.05), seconds=20.0)
-    np.testing.assert_allclose(twice, 2 * once, rtol=1e-12)
-    hertz = float(omega[0] / (2 * np.pi))
-    short, long = (
-        known.of_recording(
-            Recording(
-                id="x",
-                kind="sweep",
-                carts=(1, 2),
-                wave="multisine",
-                amplitude=0.05,
-                frequency=hertz,
-                cycles=cycles,
-                tones=((1, 1.0, 0.0),),
-            )
-        )[0]
-        for cycles in (100, 200)
-    )
-    expected = known.of_lines(omega[:1], amplitude=np.full(1, 0.05), seconds=100 / hertz)[0, 0]
-    np.testing.assert_allclose(np.diag(long - short), np.diag(expected), rtol=0.02)
 
 
 # ---------------------------------------------------------------------------- the choice
@@ -304,35 +272,7 @@ def test_carts_that_hardly_settle_get_no_dwells():
         propose_candidates(slow, limits=LIMITS, commands=COMMANDS, goal=goal)
 
 
-def test_a_predicted_error_below_calibration_is_reported(analysis):
-    """If the predicted error is below what any calibration allows, the message says so."""
-    found = choose_next(analysis, Plan(limits=LIMITS), n=1, goal="worst", commands=COMMANDS)
-    assert (STATISTICAL in found.summary) == (found.errors[-1] < CALIBRATION)
-    assert (STATISTICAL in found.recordings[0].note) == (found.errors[-1] < CALIBRATION)
-    known = FisherInformation.of(analysis)
-    worst, names = find_goal("worst", known, feedback=None), list(known.chain.parameters())
-    after = known.information + known.of_recording(found.recordings[0])
-    assert names[worst.worst(known.information)] in found.words
-    assert names[worst.worst(after)] in found.words
-
-
 # --------------------------------------------------------------------------- multisines
-
-
-def test_clipped_phases_keep_the_swing_low():
-    """With optimised phases the motion under twelve sines peaks lower than with random ones."""
-    lines = np.arange(10, 70, 5)
-    omega = np.asarray(2 * np.pi * 0.1 * lines, dtype=np.float64)
-    G = PRESETS["throne-3dof"].frequency_response(omega)
-    size = 1 / np.abs(G).max(axis=0)
-    turning = np.exp(1j * omega[:, None] * np.linspace(0, 10, 2048, endpoint=False))
-
-    def peak(phases) -> float:
-        return float(np.abs(((size * G * np.exp(1j * phases)) @ turning).imag).max())
-
-    found, rng = peak(low_peak_phases(lines, size, G)), np.random.default_rng(0)
-    assert found < min(peak(rng.uniform(0, 2 * np.pi, 12)) for _ in range(500))
-    assert found < 0.9 * peak(schroeder_phases(np.ones(12)))
 
 
 def test_the_tones_of_a_multisine_peak_at_its_amplitude(known):
@@ -406,25 +346,6 @@ def test_the_command_adds_its_choice_to_the_plan(work):
     # The next prediction counts what is already planned.
     assert again["next"]["errors"][0] == pytest.approx(data["next"]["errors"][2], rel=1e-9)
     assert again["next"]["now"] == pytest.approx(data["next"]["now"], rel=1e-9)
-
-
-def test_added_recordings_are_counted(work):
-    """The message counts the recordings that were added, including those of a new plan."""
-    done = cartlab_here("plan", work, "--next", 2, "--for", "zeta")
-    usual = len(propose_plan(load_submission(work)).recordings)
-    usual_words = f"the {usual} recordings that every plan begins with"
-    assert f"{usual_words}, and 2 chosen recordings" in done.stderr
-    done = cartlab_here("plan", work, "--next", 1, "--for", "zeta")
-    assert "plan.toml: 1 recording added" in done.stderr
-    assert ", 1 new (+); " in done.stdout
-    assert done.stdout.count("\n + ") == 1
-
-
-def test_a_misfit_makes_the_predicted_errors_doubtful(analysis, tmp_path):
-    """If the fit's misfit is larger than the noise, a message doubts the predicted errors."""
-    for chi_square, doubted in ((556.0, True), (1.0, False)):
-        fit = replace(analysis.fit, chi_square_per_dof=chi_square)
-        assert bool(_doubt(replace(analysis, fit=fit), tmp_path)) == doubted
 
 
 @pytest.mark.parametrize("words", [("--for", "zeta"), ("--next", 1, "--for", "omega_x")])

@@ -240,11 +240,6 @@ def test_data_that_identify_nothing_give_a_reason():
         extend_plan(propose_plan(submission), submission)
 
 
-def test_counts_in_the_plural_are_counts():
-    """For positions in "counts" the travel limit is that of an ECP 210, not 2.5 counts."""
-    assert propose_plan(bare(position=PositionScale(unit="counts"))).limits.travel == 1100.0
-
-
 # --------------------------------------------------------------------- the file
 
 finite = st.floats(-1e6, 1e6, allow_nan=False).map(lambda x: round(x, 6))

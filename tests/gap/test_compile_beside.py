@@ -4,11 +4,8 @@ import os
 import subprocess
 import sys
 
-import psutil
 import pytest
 
-from pipeline.gap.explain import follower_compiled
-from pipeline.gap.pem.model import compile_follower
 from tests.helpers.places import ROOT
 
 SCRIPT = """
@@ -20,14 +17,6 @@ with beside.follower_compiled():
     pass
 print(is_compiled(beside._ROOM, function="predict_run"))
 """
-
-
-def test_nothing_is_compiled_again():
-    """If compiled code is stored, no process is started."""
-    compile_follower()
-    before = psutil.Process().children()
-    with follower_compiled():
-        assert psutil.Process().children() == before
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """Two threads map work, also from inside such work, and stop at the first error."""
 
-from threading import Barrier, Event, get_ident
+from threading import Event
 
 import pytest
 
@@ -16,18 +16,6 @@ def test_results_keep_the_order_of_the_items():
         assert mapper(abs, []) == []
 
 
-def test_both_threads_work():
-    """Two jobs that wait for each other both end, so they run side by side."""
-    meeting = Barrier(2)
-
-    def meet(_: int) -> int:
-        meeting.wait(LIMIT)
-        return get_ident()
-
-    with two_workers() as mapper:
-        assert len(set(mapper(meet, range(2)))) == 2
-
-
 def test_work_may_map_its_own_items():
     """A job that maps gets its own results, at every depth."""
     with two_workers() as mapper:
@@ -36,18 +24,6 @@ def test_work_may_map_its_own_items():
             return sum(mapper(total, [depth - 1] * 3)) if depth else 1
 
         assert mapper(total, [4, 3, 2]) == [81, 27, 9]
-
-
-def test_a_thread_without_work_helps_with_the_maps_of_the_other():
-    """While one job maps two items that wait for each other, the idle thread does one of them."""
-    meeting = Barrier(2)
-
-    with two_workers() as mapper:
-
-        def spread(items: int) -> int:
-            return len(list(mapper(lambda _: meeting.wait(LIMIT), range(items))))
-
-        assert mapper(spread, [0, 2]) == [0, 2]
 
 
 def test_the_first_error_ends_a_map():

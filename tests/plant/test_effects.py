@@ -10,7 +10,6 @@ from pipeline.plant.augmented import simulate_augmented
 from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.effect import AugmentedChain, Effect, EffectTerm, chain_scales
-from pipeline.words.math import to_tex
 from tests.helpers.effects import SIZES, make_term
 
 
@@ -18,16 +17,6 @@ def test_catalogue_has_the_agreed_names():
     """The catalogue has the effects and parameters whose names files and users rely on."""
     found = {e.key: {p.name for p in e.parameters if p.reported} for e in CATALOGUE}
     assert found == {key: set(sizes) for key, sizes in SIZES.items()}
-
-
-@pytest.mark.parametrize("effect", CATALOGUE, ids=lambda e: e.key)
-def test_an_entry_has_all_texts_a_student_needs(effect):
-    """Every effect has a sentence, an equation, a fingerprint, a deciding run and a reference."""
-    for text in (effect.sentence, to_tex(effect.formula), effect.fingerprint, effect.deciding_run):
-        assert len(text) >= len("f = F")
-    assert effect.reference
-    for parameter in effect.parameters:
-        assert parameter.unit.count("position") + parameter.unit.count("input") <= 2
 
 
 def faint_term(effect: Effect, *, share: float, chain: Chain) -> EffectTerm:
@@ -105,9 +94,3 @@ def test_a_word_of_a_name_finds_the_effects_that_have_it(typed, meant):
     """A word of an effect's name finds the effects with it; a misspelt name finds the nearest."""
     with pytest.raises(ConfigError, match=rf"did you mean {meant}\?"):
         find_effect(typed)
-
-
-def test_unknown_effect_is_refused():
-    """The name of an unknown effect gives one error that lists the known names."""
-    with pytest.raises(ConfigError, match="no effect 'glue'; known: coulomb_friction"):
-        find_effect("glue")

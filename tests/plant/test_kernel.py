@@ -163,27 +163,6 @@ def test_every_effect_agrees_with_the_fine_step_simulator(key):
     assert np.sqrt(np.mean((linear - truth) ** 2)) > 2.0 * limit * COUNT
 
 
-DISSIPATIVE = ("coulomb_friction", "stiction", "presliding_friction", "quadratic_drag", "end_stop")
-
-
-@pytest.mark.parametrize("key", DISSIPATIVE)
-def test_energy_never_grows_without_input(key):
-    """With a dissipative effect and no input, the peaks become smaller and smaller."""
-    chain = PRESETS["throne-1dof"]
-    effect = find_effect(key)
-    term = make_term(effect, place=1, values=SIZES[key], chain=chain)
-    t = sample_times(4000, 1e-3)
-
-    y = simulate(AugmentedChain(chain=chain, terms=(term,)).tables(), t, 0 * t, x0=[1.5])[0]
-
-    v = np.gradient(y, t)
-    peaks = np.abs(y[1:-1][np.diff(np.sign(v[1:])) != 0])
-    # An end stop stores energy beyond its position, so peaks on its side are not comparable.
-    peaks = peaks[::2] if key == "end_stop" else peaks
-    assert peaks.size > 3
-    assert np.all(np.diff(peaks) < 1e-3)
-
-
 def test_delay_shifts_the_response():
     """A delay of n samples shifts the readings n samples later, or earlier if it is negative."""
     chain = PRESETS["throne-2dof"]
@@ -216,24 +195,6 @@ def test_diverging_model_is_reported_as_nan():
 
     assert np.all(np.isnan(readings))
     assert np.all(np.isnan(derivatives))
-
-
-def test_batch_gives_what_single_runs_give():
-    """Variants simulated together do not influence each other."""
-    chain = PRESETS["throne-1dof"]
-    t = sample_times(300, 0.005)
-    u = np.where(t > 0.1, 0.03, 0.0)
-    still = StartState(np.zeros((1, 1)), np.zeros((1, 1)), np.ones(1))
-    variants = [linear_tables(chain) for _ in range(3)]
-    for tables, force in zip(variants, (0.0, 0.001, 0.003), strict=True):
-        tables.cart[0, Cart.COULOMB_FRICTION_FORCE] = force
-
-    together, _ = kernel.simulate(
-        [(tables, still) for tables in variants], describe_run(t, u, free=[True])
-    )
-
-    for tables, y in zip(variants, together, strict=True):
-        assert np.array_equal(y, simulate(tables, t, u))
 
 
 def test_a_hidden_mass_starts_at_the_given_position():
@@ -292,24 +253,6 @@ assert [dict(one.cache_misses) for one in stats] == before
 def test_after_compile_simulator_nothing_is_compiled():
     """After `compile_simulator`, no later call of the simulator compiles anything."""
     subprocess.run([sys.executable, "-c", _NOTHING_LEFT], check=True)
-
-
-def test_arrays_of_any_kind_use_the_same_compiled_code():
-    """Views, integer arrays and read-only arrays use the code that is compiled already."""
-    tables = linear_tables(PRESETS["throne-2dof"])
-    t = sample_times(50, 0.005)
-    command = np.zeros(50, dtype=int)
-    command.flags.writeable = False
-    whole = simulate(tables, t, np.zeros(50), x0=(1.0, 0.5))
-    run = describe_run(
-        np.repeat(t, 2)[::2], command, free=(1, 1), knots=t, shots=np.array([0, 50], dtype=np.int32)
-    )
-    start = StartState(
-        np.array([[1.0, 0.5]]), np.broadcast_to(0.0, (1, 2)), np.broadcast_to(1.0, 2)
-    )
-    fixed, _ = kernel.simulate([(Tables(*map(np.asfortranarray, tables)), start)], run)
-    assert np.array_equal(fixed[0], whole)
-    assert len(kernel._simulate.signatures) == len(kernel._assemble.signatures) == 1
 
 
 def test_compiled_code_counts_no_references():

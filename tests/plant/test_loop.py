@@ -31,14 +31,6 @@ def feedback(chain: Chain, gains: Array = GAINS, prefilter: float = 0.07) -> Sta
     return StateFeedback(gains=gains, prefilter=prefilter, model=chain)
 
 
-def test_without_gains_the_prefilter_drives_the_open_loop():
-    """With zero gains, a run is the open-loop response to prefilter times r, a sample late."""
-    run = simulate_loop(TWO, feedback(TWO, np.zeros(4)), t=CLOCK, reference=1.0)
-
-    assert_allclose(run.u[:2], [0.0, 0.07])
-    assert_allclose(run.x, simulate_linear(TWO, CLOCK, run.u), atol=ROUNDING)
-
-
 @pytest.mark.parametrize("delay", [0, 1])
 def test_with_an_exact_prediction_a_delay_only_shifts_the_motion(delay):
     """With the true model, a loop with delay moves as without delay, only later."""
@@ -67,16 +59,6 @@ def test_the_loop_matrix_gives_the_motion_of_the_loop(model):
         state = matrix @ state
 
 
-def test_an_exact_observer_moves_no_pole():
-    """The eigenvalues of Phi - Gamma G are poles of the whole loop (separation principle)."""
-    phi, gamma = discretise(TWO, T)
-    wanted = np.linalg.eigvals(phi - np.outer(gamma, GAINS))
-    found = np.linalg.eigvals(loop_matrix(TWO, feedback(TWO), sample_time=T))
-
-    # A simple eigenvalue errs by rounding times its condition number, which is below 1e4.
-    assert_allclose(np.abs(wanted[:, None] - found[None, :]).min(axis=1), 0.0, atol=1e-10)
-
-
 def test_the_input_stays_within_its_limit():
     """An input limit clips the input; a limit that is never reached changes nothing."""
     free = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=1.0)
@@ -94,17 +76,6 @@ def test_the_input_stays_within_its_limit():
     assert_allclose(tight.x, simulate_linear(TWO, CLOCK, tight.u), atol=ROUNDING)
 
 
-def test_proportional_control_holds_a_share_of_the_reference():
-    """Under proportional control the cart rests at K kp / (1 + K kp) of the reference."""
-    chain, kp = PRESETS["throne-1dof"], 0.02
-    t = T * np.arange(1200.0)
-    run = simulate_loop(chain, Pid(kp=kp), t=t, reference=2.0, setup=LoopSetup(delay=0))
-
-    share = 28.9 * kp / (1 + 28.9 * kp)  # K of the preset is 28.9
-    # The slowest poles have a real part of -1.2 rad/s, so exp(-12) = 6e-6 is left at the end.
-    assert_allclose(run.x[0, -1], 2.0 * share, rtol=1e-4)
-
-
 def test_the_pid_uses_sums_and_differences():
     """The first two inputs of a PID follow from sums and differences of the error."""
     pid = Pid(kp=0.3, ki=2.0, kd=0.004, scale=0.1)
@@ -116,15 +87,6 @@ def test_the_pid_uses_sums_and_differences():
     kick = 0.1 * (0.3 * error[0] + 2.0 * error[0] * T + 0.004 * error[0] / T)
     second = 0.3 * error[1] + 2.0 * error.sum() * T + 0.004 * (error[1] - error[0]) / T
     assert_allclose(run.u[:2], [kick, 0.1 * second], rtol=1e-12)
-
-
-def test_integral_action_removes_the_error():
-    """With integral action, the controlled cart ends at the reference."""
-    t = T * np.arange(4000.0)
-    run = simulate_loop(TWO, Pid(kp=0.002, ki=0.02, cart=2), t=t, reference=1.0)
-
-    # The slowest pole is near -ki K = -0.3 rad/s: exp(-0.3 * 35) is 3e-5.
-    assert_allclose(run.x[1, -1], 1.0, atol=1e-3)
 
 
 def test_the_controller_sees_whole_encoder_steps():

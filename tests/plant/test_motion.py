@@ -84,20 +84,6 @@ def test_without_effects_it_is_the_linear_chain():
     assert system.params == {"stop": STOP_TIME}
 
 
-def test_some_effects_have_their_own_states():
-    """A hidden mass, presliding friction, and an input with memory add named states."""
-    own = {
-        "extra_mode": ["x2_hidden", "v2_hidden"],
-        "presliding_friction": ["z2"],
-        "backlash": ["x_motor", "v_motor"],
-        "actuator_lag": ["u_lag"],
-        "input_delay": [f"u_delay_{i}" for i in (1, 2, 3, 4)],
-        "coulomb_friction": [],
-    }
-    for key, names in own.items():
-        assert EquationsOfMotion(usual(find_effect(key))).states[4:] == names
-
-
 def test_a_drive_that_leads_its_log_has_no_system():
     """A negative delay would need future input, so there is no system, and the error says so."""
     term = make_term(find_effect("input_delay"), place=0, values={"delay": -0.01}, chain=CHAIN)

@@ -3,8 +3,6 @@
 import control
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.plant.chain import PRESETS, Chain
@@ -71,39 +69,6 @@ def test_agrees_with_python_control():
     assert_allclose(simulate_linear(THREE, t, u), expected, atol=1e-10 * np.abs(expected).max())
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(1, 3))
-@settings(max_examples=25)
-def test_a_sample_between_two_others_changes_nothing(seed, carts):
-    """Sampling a held input more often does not change the motion."""
-    rng = np.random.default_rng(seed)
-    chain = PRESETS[f"throne-{carts}dof"]
-    t = irregular_times(rng, 60)
-    u = 0.05 * rng.standard_normal(t.size)
-    between = t[:-1] + rng.uniform(0.1, 0.9, size=t.size - 1) * np.diff(t)
-    order = np.argsort(np.concatenate([t, between]))
-    finer_t = np.concatenate([t, between])[order]
-    finer_u = np.concatenate([u, u[:-1]])[order]
-
-    x = simulate_linear(chain, t, u)
-
-    finer = simulate_linear(chain, finer_t, finer_u)[:, order < t.size]
-    # Intervals that differ by less than 1e-12 s count as equal: 60 steps at up to 50 cm/s add at
-    # most 60 x 5e-11 cm.
-    assert_allclose(finer, x, atol=3e-9 * np.abs(x).max())
-
-
-def test_responses_add():
-    """The response to a sum of inputs and starts is the sum of the responses."""
-    rng = np.random.default_rng(4)
-    t = irregular_times(rng, 200)
-    u, x0 = 0.05 * rng.standard_normal((2, t.size)), rng.standard_normal((2, 6))
-
-    parts = [simulate_linear(THREE, t, u[i], x0=x0[i]) for i in range(2)]
-
-    whole = simulate_linear(THREE, t, u[0] + u[1], x0=x0[0] + x0[1])
-    assert_allclose(whole, parts[0] + parts[1], atol=1e-12 * np.abs(whole).max())
-
-
 def test_held_carts_are_walls():
     """If cart 3 is held, carts 1 and 2 move as a chain of two with a wall in its place."""
     short = Chain(m=THREE.m[:2], c=THREE.c[:2], k=THREE.k[:3])
@@ -121,36 +86,6 @@ def test_the_motor_does_not_reach_past_a_held_first_cart():
 
     assert x.shape == (2, 50)
     assert_array_equal(x, 0.0)
-
-
-@given(st.integers(0, 2**32 - 1))
-@settings(max_examples=25)
-def test_energy_never_grows_without_input(seed):
-    """Kinetic and potential energy of a free decay fall from sample to sample."""
-    rng = np.random.default_rng(seed)
-    A, B, _, _ = THREE.state_space()
-    t = irregular_times(rng, 200)
-
-    states = propagate(A, B, t, np.zeros(t.size), x0=rng.standard_normal(6))
-
-    x, v = states[0::2], states[1::2]
-    energy = 0.5 * (np.sum(x * (THREE.stiffness @ x), axis=0) + THREE.m @ v**2)
-    assert np.all(np.diff(energy) <= 1e-12 * energy[0])
-
-
-def test_steady_state_of_a_held_sine():
-    """A held sine moves the carts half a sample late and with a slightly smaller amplitude."""
-    omega = 2 * np.pi * 4.0
-    t = clock(1500)
-    x = simulate_linear(THREE, t, np.sin(omega * t))
-
-    # This is the first harmonic of the held samples; the images are 28 times faster and 28^-3 as
-    # large.
-    half = omega * SAMPLE_TIME / 2
-    response = THREE.frequency_response(np.array([omega]))[:, 0] * np.sin(half) / half
-    expected = np.imag(response[:, None] * np.exp(1j * (omega * t - half)))
-    late = t > 12.0  # after 13 time constants, 2e-6 is left
-    assert_allclose(x[:, late], expected[:, late], atol=1e-4 * np.abs(response).max())
 
 
 def test_steady_state_of_a_band_limited_sine():
@@ -186,34 +121,3 @@ def test_a_linearly_rising_input_is_exact():
     x = C @ propagate(A, B, t, t, x0=np.zeros(2), linear=True)
 
     assert_allclose(x[0], t**3 / 12, atol=1e-12)
-
-
-@pytest.mark.parametrize("n", [2, 3, 4, 10, 101])
-def test_even_and_uneven_times_agree(n):
-    """Records with even times are simulated in blocks, with the same result as sample by sample."""
-    rng = np.random.default_rng(n)
-    t, u, x0 = clock(n), rng.standard_normal(n), rng.standard_normal(6)
-    uneven = t.copy()
-    uneven[-1] += 1e-11
-    ours, others = (simulate_linear(THREE, at, u, x0=x0) for at in (t, uneven))
-    assert_allclose(ours, others, rtol=0, atol=1e-8 * np.abs(others).max())
-
-
-def test_the_last_input_has_no_effect():
-    """The input at the last sample acts only after the end of the record."""
-    t = clock(20)
-    u = np.ones(t.size)
-
-    changed = simulate_linear(THREE, t, np.append(u[:-1], 99.0))
-
-    assert_array_equal(changed, simulate_linear(THREE, t, u))
-
-
-def test_arguments_are_not_changed():
-    """The simulator does not change the arrays of times, input and start."""
-    t, u, x0 = clock(20), np.ones(20), np.ones(6)
-    for array in (t, u, x0):
-        array.flags.writeable = False
-
-    for hold in ("zero_order", "band_limited"):
-        assert simulate_linear(THREE, t, u, x0=x0, hold=hold).shape == (3, 20)

@@ -16,7 +16,7 @@ from pipeline.errors import ConfigError, DataError
 from pipeline.gap.types import Gap
 from pipeline.ingest.read import read_data
 from pipeline.json_files import plain
-from pipeline.plant.augmented import SteppedBench, rest_positions, simulate_augmented
+from pipeline.plant.augmented import rest_positions
 from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain, EffectTerm
@@ -146,39 +146,6 @@ def test_the_linear_path_compiles_nothing():
     assert done.stdout.strip() == "False"
 
 
-# --------------------------------------------------------------------- the limit
-
-
-@pytest.mark.parametrize("key", KEYS)
-@pytest.mark.parametrize("make_run", [step, decay, control], ids=lambda f: f.__name__)
-def test_a_tiny_effect_gives_the_linear_bench(key, make_run):
-    """At a hundred-thousandth of its usual size, an effect changes a run by at most a count."""
-    term = usual(key)
-    # These parameters grow with the effect too, but have no neutral value.
-    further = {
-        "stiction": ("static_force",),
-        "end_stop": ("damping",),
-        "extra_mode": ("stiffness", "damping"),
-    }.get(key, ())
-    values = [
-        (p.neutral or 0.0) + 1e-5 * (value - (p.neutral or 0.0))
-        if p.neutral is not None or p.name in further
-        else value
-        for p, value in zip(term.effect.parameters, term.values, strict=True)
-    ]
-    if key == "saturation":
-        values = [1e3]  # a limit that is never reached
-    if key == "backlash":
-        values[0] = 0.0  # the contact keeps its stiffness, however small the gap
-    small = replace(term, values=tuple(values))
-
-    moved, plain = bench(small).move(make_run()), bench().move(make_run())
-
-    # An effect that grows in proportion with its size stays below a count. Other differences are
-    # single roundings of an encoder in the loop.
-    assert_allclose(moved.x, plain.x, atol=COUNT)
-
-
 # ------------------------------------------------------------ against the truth
 
 
@@ -247,21 +214,6 @@ def test_releases_agree_with_the_independent_simulator(key):
     # The phase of the 50-µs simulator errs by omega h / 2. At the spring's stiffest that is 1e-3 of
     # 1.5 cm.
     assert_allclose(x[0, start:], np.interp(samples, fine, truth[0]), atol=0.6 * COUNT)
-
-
-@pytest.mark.parametrize("key", KEYS)
-def test_sample_by_sample_equals_the_whole_run(key):
-    """A bench simulated sample by sample gives the same run as one simulated all at once."""
-    term = usual(key)
-    model, run = AugmentedChain(chain=TWO, terms=(term,)), step()
-    stepped = SteppedBench(model)
-    x = [stepped.readings]
-    for now, following in zip(run.u[:-1], run.u[1:], strict=True):
-        stepped.step(float(now), following=float(following), interval=SAMPLE_TIME)
-        x.append(stepped.readings)
-
-    # The two differ in their substeps, and so in when forces act: some hundredths of a count.
-    assert_allclose(np.transpose(x), simulate_augmented(model, run.t, run.u), atol=0.1 * COUNT)
 
 
 # ------------------------------------------------------------------ what is special
@@ -493,17 +445,6 @@ def test_one_place_can_have_only_one_dry_friction():
         prepare_bench(preset="throne-2dof", hide=["coulomb_friction", "stiction"])
     hide = ["coulomb_friction", "stiction:cart=2"]
     assert len(prepare_bench(preset="throne-2dof", hide=hide).effects) == 2
-
-
-def test_defaults_are_reported():
-    """A size that is not given gets a clearly visible default, and a note says so."""
-    prepared = prepare_bench(preset="throne-3dof", hide=["presliding_friction:force=0.002"])
-
-    assert prepared.effect_sentences == (
-        "presliding_friction on cart 1: force 0.002 V, distance 0.0258 cm (default)",
-    )
-    (spring,) = prepare_bench(preset="throne-3dof", hide=["cubic_spring"]).effects
-    assert spring.place == 2
 
 
 def test_a_bench_needs_one_source(tmp_path):

@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.stats import binom
 
@@ -71,33 +69,6 @@ def test_exact_magnitudes_give_the_chain_without_a_start(chain):
         assert_allclose(got.parameters[name].value, value, rtol=1e-5)
 
 
-@st.composite
-def chains(draw: st.DrawFn) -> Chain:
-    """Draw benches of one to three carts with modes between about 1 and 8 Hz."""
-    n = draw(st.integers(1, 3))
-    size = st.floats(0.5, 2.0)
-    m, zeta, k = (
-        np.array(draw(st.lists(size, min_size=length, max_size=length))) for length in (n, n, n + 1)
-    )
-    m, k = 2.5e-4 * m, 0.08 * k
-    if n == 1:
-        k[1] = 0.0
-    return Chain(m=m, c=2 * 0.05 * zeta * np.sqrt(m * (k[:-1] + k[1:])), k=k)
-
-
-@settings(max_examples=25, deadline=None)
-@given(chain=chains())
-def test_any_bench_is_found(chain):
-    """From exact magnitudes of a random bench, the fit finds the bench without a start value."""
-    omega = 2 * np.pi * np.geomspace(0.5, 10.0, 40)
-
-    got = fit_bode(exact(chain, omega), bench=Setup(springs=(True,) * (chain.n + 1)))
-
-    # Near the tolerance above; a wrong minimum would be off by several percent.
-    assert_allclose(got.chain.m, chain.m, rtol=1e-4)
-    assert_allclose(got.chain.k, chain.k, rtol=1e-4)
-
-
 @pytest.mark.parametrize("unit", [1.0, 440.0, 0.01], ids=["cm", "count", "m"])
 def test_the_position_unit_does_not_matter(unit):
     """In counts or metres, the fit finds the same frequencies, and gains scaled by the unit."""
@@ -153,23 +124,6 @@ def test_intervals_contain_the_true_values(preset, phases):
 
 
 # ------------------------------------------------------------------ hard cases
-
-
-def test_a_missing_spring_is_held_at_zero():
-    """If the true k_1 is zero, about half of the noisy fits hold it at zero, with a note.
-
-    The other fits find a small positive value.
-    """
-    fits = [
-        fit_bode(noisy("throne-2dof", seed=seed), bench=Setup(springs=(True,) * 3))
-        for seed in range(20)
-    ]
-
-    held = [fit for fit in fits if "k_1" not in fit.names]
-    # For a binomial of 20 with probability 1/2, this fails once in 2000 tries.
-    assert 3 <= len(held) <= 17
-    assert all(fit.chain.k[0] >= 0 for fit in fits)
-    assert all(fit.chain.k[0] == 0 and "k_1 is held at zero" in fit.message for fit in held)
 
 
 def test_a_missing_far_spring_and_damper_are_found_to_be_zero():
@@ -274,22 +228,6 @@ def test_a_decay_is_not_used_if_the_response_gives_the_damping():
         for decays in (None, {1: decay})
     )
     assert given.parameters == alone.parameters
-
-
-def test_a_spring_known_to_be_missing_is_not_fitted():
-    """A spring declared as missing is not fitted, and the other standard errors do not grow."""
-    responses = noisy("throne-3dof")
-
-    free = fit_bode(responses, bench=Setup(springs=(True,) * 4))
-    known = fit_bode(responses, bench=Setup(springs=(False, True, True, True)))
-
-    assert "k_1" not in known.names
-    assert known.chain.k[0] == 0
-    for name, estimate in known.parameters.items():
-        free_std, std = free.parameters[name].std, estimate.std
-        assert std is not None
-        assert free_std is not None
-        assert std <= free_std * 1.02  # the fits differ by a few percent
 
 
 @pytest.mark.parametrize("change", ["delay", "sign"])
@@ -399,35 +337,23 @@ def test_the_last_cart_alone_does_not_determine_two():
         fit_bode(noisy("throne-2dof")[1:], bench=Setup(springs=(True,) * 3))
 
 
-def test_few_points_are_refused():
-    """Six points cannot determine seven parameters, and the error gives both numbers."""
-    few = thinned(noisy("throne-2dof"), slice(0, 3))
-    with pytest.raises(DataError, match=r"2 carts with 7 parameters .* found 6"):
-        fit_bode(few, bench=Setup(springs=(True,) * 3))
+(ONE,) = noisy("throne-1dof")
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("responses", "message"),
     [
-        ({"magnitude": np.full(20, np.nan)}, "must be finite"),
-        ({"omega": np.linspace(-1, 1, 20)}, "must be finite"),
-        ({"cart": 2}, "found a response of cart 2, but the system has 1"),
+        ([replace(ONE, magnitude=np.full(20, np.nan))], "must be finite"),
+        ([replace(ONE, omega=np.linspace(-1, 1, 20))], "must be finite"),
+        ([replace(ONE, cart=2)], "found a response of cart 2, but the system has 1"),
+        (thinned((ONE,), slice(0, 2)), "found 2"),
+        ([], "needs a frequency response, found none"),
     ],
 )
-def test_impossible_responses_are_refused(change, message):
-    """Infinite values, negative frequencies and impossible cart numbers are refused.
-
-    The error names the cause.
-    """
-    (response,) = noisy("throne-1dof")
+def test_impossible_responses_are_refused(responses, message):
+    """Infinite values, negative frequencies, impossible carts and too few points are refused."""
     with pytest.raises(DataError, match=message):
-        fit_bode([replace(response, **change)], bench=Setup(springs=(True, True)))
-
-
-def test_no_response_is_refused():
-    """If there is no frequency response, the fit is refused."""
-    with pytest.raises(DataError, match="needs a frequency response, found none"):
-        fit_bode([], bench=Setup(springs=(True, True)))
+        fit_bode(responses, bench=Setup(springs=(True, True)))
 
 
 def test_residuals_belong_to_their_points():
@@ -444,13 +370,3 @@ def test_residuals_belong_to_their_points():
     }
     # The point pulls the fit towards itself, but only a little, as 90 points share 10 parameters.
     assert 5 < got.standardised["2"][7] < 13
-
-
-def test_the_same_data_give_the_same_fit():
-    """Two fits to the same data agree to the last bit, even with random starts."""
-    responses = thinned(noisy("throne-3dof"), slice(2, 30, 5))
-
-    first, second = (fit_bode(responses, bench=Setup(springs=(True,) * 4)) for _ in range(2))
-
-    assert first.parameters == second.parameters
-    assert first.n_starts == second.n_starts

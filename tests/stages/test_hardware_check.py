@@ -320,22 +320,6 @@ def test_a_pid_reads_the_controlled_cart_unless_it_names_one():
         assert of(checks, "closed")[2].nrmse < 2 * noise_floor(y[1])
 
 
-def test_only_the_controlled_cart_has_a_set_point():
-    """Only the controlled cart is compared with the set point.
-
-    If no controlled cart is stated, it is the one that the controller reads.
-    """
-    y, u = bench(TWO, Pid(kp=0.008, kd=0.0008, cart=2))
-    run = record(y, u=u, reference=STEPS)
-    unnamed = submission.PidController(type="pid", kp=0.008, kd=0.0008)
-    for stated in (2, None):
-        checks = check_hardware(run, TWO, controller=unnamed, controlled_cart=stated)
-        told = {check.cart for check in checks if check.set_point is not None}
-        assert told == {stated or unnamed.cart}
-    checks = check_hardware(run, TWO, controller=None)
-    assert all(check.set_point is None for check in checks)
-
-
 def test_a_pid_acts_on_the_files_own_counts():
     """A PID's gains refer to the unit of the file, so gains per count need no conversion."""
     law = Pid(kp=0.008, kd=0.0008, cart=2)
@@ -478,22 +462,6 @@ def test_gains_that_make_the_loop_unstable_are_noted():
     checks = check_hardware(record(y, u=u, reference=STEPS), TWO, controller=wild)
     assert all(np.isfinite(check.nrmse) for check in checks)
     assert {check.loop for check in checks} >= {"open"}
-
-
-def test_with_the_wrong_number_of_gains_only_the_open_loop_is_simulated():
-    """If the number of gains does not fit the carts, the closed loop is not simulated.
-
-    A note on the simulation with the measured input gives the reason.
-    """
-    y, u = bench(TWO, Pid(kp=0.02, kd=0.001))
-    short = submission.StateFeedbackController(
-        type="state_feedback", gains=(0.1, 0.01), prefilter=0.1
-    )
-
-    checks = check_hardware(record(y, u=u, reference=STEPS), TWO, controller=short)
-
-    assert [check.loop for check in checks] == ["open", "open"]
-    assert "the loop is not simulated: state feedback of 2 carts needs 4 gains" in checks[0].note
 
 
 @pytest.mark.parametrize(

@@ -88,17 +88,6 @@ def test_lqr_gains_agree_with_control(name, weight):
     assert_allclose(got, np.asarray(expected)[0], rtol=1e-8, atol=1e-10 * np.abs(got).max())
 
 
-def test_lqr_gains_of_many_weights_are_those_of_each():
-    """Gains computed for several weights at once equal those computed one by one."""
-    phi, gamma = discretise(PRESETS["throne-3dof"], T)
-    weights = np.array([scale * np.eye(6) for scale in (1e-4, 1e-2, 1.0)])
-
-    together = lqr_gains(phi, gamma, weights)
-
-    for gains, Q in zip(together, weights, strict=True):
-        assert_allclose(gains, lqr_gains(phi, gamma, Q), rtol=1e-10)
-
-
 @pytest.mark.parametrize("name", PLANTS)
 @pytest.mark.parametrize("sample_time", [T, 0.001])
 def test_placed_poles_are_the_requested_ones(name, sample_time):
@@ -116,17 +105,6 @@ def test_placed_poles_are_the_requested_ones(name, sample_time):
     rows, columns = linear_sum_assignment(away)
     # Poles at least 0.4 T apart: eight such poles have a condition number up to 1e8 at 1 ms.
     assert away[rows, columns].max() < 1e-7
-
-
-def test_placed_gains_agree_with_control():
-    """Gains by pole placement equal those of python-control, since the solution is unique."""
-    phi, gamma = discretise(PRESETS["throne-2dof"], T)
-    gamma = gamma / np.abs(gamma).max()
-    wanted = np.exp(T * np.array([-5 + 6j, -5 - 6j, -8 + 30j, -8 - 30j]))
-
-    expected = control.place(phi, gamma[:, None], wanted)  # scipy's, inside
-
-    assert_allclose(place_poles(phi, gamma, wanted), np.asarray(expected)[0], rtol=1e-7)
 
 
 @pytest.mark.parametrize("name", ["throne-2dof", "throne-3dof", "four"])

@@ -10,8 +10,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.modal_response import find_modes
 from pipeline.estimation.noise import long_run_variance, score_covariance
 from pipeline.estimation.parametrisation import Parametrisation
-from pipeline.estimation.time_search import search
-from pipeline.estimation.time_window import compare, open_window, usable_segment, weighed
+from pipeline.estimation.time_window import compare, open_window, usable_segment
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.simulate import simulate_linear
@@ -52,23 +51,6 @@ def misfit(record: Record, chain: Chain, parametrisation: Parametrisation, *, at
 
 
 # ------------------------------------------------------- response and Jacobian
-
-
-@pytest.mark.parametrize("jitter", [0.0, 0.5])
-@pytest.mark.parametrize("free", [(1, 2, 3), (1, 3), (1,)])
-def test_modes_and_simulation_agree(free, jitter):
-    """The response computed from the modes equals the simulated one.
-
-    This holds for any free carts and sample times.
-    """
-    chain, rng = PRESETS["throne-3dof"], np.random.default_rng(0)
-    x0 = rng.standard_normal(2 * len(free))
-    record = step_record(chain, rng=rng, free=free, jitter=jitter, noise=0.0, count=0.0, x0=x0)
-    parametrisation = Parametrisation(bench=Setup(springs=(True, True, True, True)))
-    left = misfit(record, chain, parametrisation, at_rest=False)
-    # The simulation rounds intervals to 1e-12 s; velocities are about 100 cm/s.
-    sigma = open_window(record).sigma
-    assert np.max(np.abs(left.residual * sigma[:, None])) < 1e-9
 
 
 @pytest.mark.parametrize("zeta", [0.1, 1.0, 1.5])
@@ -264,14 +246,6 @@ def test_a_missing_spring_is_held_at_zero():
         assert spring < 4 * np.sqrt(variance)
 
 
-def test_the_same_records_give_the_same_fit():
-    """Two fits to the same records agree to the last bit."""
-    record = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(7))
-    first, second = (fit_records([record], bench=Setup(springs=(True,) * 3)) for _ in range(2))
-    assert np.array_equal(first.chain.k, second.chain.k)
-    assert np.array_equal(first.covariance, second.covariance)
-
-
 # ------------------------------------------------------------- what cannot be done
 
 
@@ -318,24 +292,6 @@ def test_records_that_no_chain_explains_give_no_fit():
     fit = fit_records([replace(record, u=-record.u)], bench=Setup(springs=(True, True)))
     assert not fit.converged
     assert "no chain reproduces the recordings" in fit.message
-
-
-def test_a_search_at_its_limit_returns_the_best_so_far():
-    """If a search reaches its limit on comparisons with records, it returns the best so far."""
-    rng = np.random.default_rng(12)
-    record = step_record(PRESETS["throne-1dof"], rng=rng)
-    assert record.u is not None
-    windows = [open_window(replace(record, u=-record.u))]
-    P = Parametrisation(bench=Setup(springs=(True, True)))
-    whole, short = (
-        search(windows, P, given=None),
-        search(windows, P, given=None, most_comparisons=1),
-    )
-    assert not whole.cut_short
-    assert not whole.best.follows
-    assert short.cut_short
-    assert short.n_starts == 1 < whole.n_starts
-    assert short.best.cost >= whole.best.cost
 
 
 def test_a_decay_is_used_from_its_release_on():
@@ -391,19 +347,6 @@ def test_a_long_rest_before_the_step_is_one_reading():
     # From 24 records, a spread is known to 14 %.
     assert 0.6 < np.sqrt(np.mean(np.square(off)[:, 0])) < 1.4
     assert 0.5 < np.median(white) < 1.1
-
-
-def test_readings_of_a_rest_share_an_error():
-    """Readings of the first rest share an error, so their total weight stays limited."""
-    chain, rng = PRESETS["throne-2dof"], np.random.default_rng(19)
-    window = open_window(step_record(chain, rng=rng, noise=0.0))
-    n = window.n_resting
-    assert window.t[n - 1] <= 0.1 < window.t[n + 1]
-    informed = window.informed(np.zeros_like(window.y), at_rest=True)
-    ones = weighed(np.ones_like(window.y), informed)[:, :n] * informed.sigma[:, None]
-    assert_allclose(np.sum(ones**2, axis=1), n / (1 + n * informed.shared))
-    for plain in (window, window.informed(np.zeros_like(window.y), at_rest=False)):
-        assert_allclose(weighed(window.y, plain), window.y / plain.sigma[:, None])
 
 
 # -------------------------------------------------------------------- real carts

@@ -2,15 +2,12 @@
 
 import math
 import re
-from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.plant.margins import Margins
-from pipeline.report.sections.loops import margin_rows
-from pipeline.words.numbers import listing, percent, significant, with_error, with_errors
+from pipeline.words.numbers import percent, significant, with_error, with_errors
 
 _SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻−", "0123456789--")
 
@@ -87,32 +84,6 @@ def test_only_changes_in_percent_have_a_sign():
     assert percent(-148.2, signed=True) == "−148 %"
     assert percent(5.14) == "5.1 %"
     assert percent(None) == "–"
-
-
-def test_listing_reads_as_english():
-    """A list has commas, and an "and" before its last item."""
-    assert [listing(list("abc")[:n]) for n in range(4)] == ["", "a", "a and b", "a, b and c"]
-    assert [listing("abcd"[:n], most=2) for n in (2, 3, 4)] == [
-        "a and b",
-        "a, b and 1 more",
-        "a, b and 2 more",
-    ]
-
-
-def test_margins_distinguish_lag_lead_and_no_limit():
-    """A negative phase margin is called a lead; without a critical gain there is no limit."""
-    lag = Margins(gain=4.0, phase_deg=60.0, modulus=0.7, omega_gain=0.0, omega_phase=20.0)
-    assert margin_rows(lag) == [
-        ("gain margin", "4.00 (12.0 dB) at 0 rad/s"),
-        ("phase margin", "60.0° of lag at 20.0 rad/s"),
-        ("modulus margin", "0.700"),
-    ]
-    lead = replace(lag, phase_deg=-60.0, gain=None, omega_gain=None)
-    assert margin_rows(lead)[0][1] == "no limit"
-    assert margin_rows(lead)[1][1] == "60.0° of lead at 20.0 rad/s"
-    none = replace(lag, phase_deg=None, omega_phase=None)
-    assert margin_rows(none)[1][1] == "no limit"
-    assert {text for _, text in margin_rows(None)} == {"unstable"}
 
 
 def test_a_column_has_one_form():

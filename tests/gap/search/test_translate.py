@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.gap.judge import filled, make_candidate, values_of
+from pipeline.gap.judge import filled, make_candidate
 from pipeline.gap.parameters import Structure
-from pipeline.gap.pem.model import COLUMNS, DRIVE_COLUMNS, PemSetup, column_set, smooth_laws
+from pipeline.gap.pem.model import PemSetup, smooth_laws
 from pipeline.gap.runs import make_run
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import PRESETS
@@ -31,21 +31,6 @@ def test_an_effect_is_tried_only_where_it_would_show(kind, free, places):
     )
     laws = smooth_laws(bench, columns=ALL)
     assert [place for one, place in laws.keys if one == kind] == places
-
-
-@pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
-def test_values_are_recovered_from_the_columns(effect):
-    """The values of an effect are recovered from the simulator's columns."""
-    values = tuple(0.3 * (1.0 + i) for i in range(len(effect.names)))
-    columns = effect.columns(effect.named(values))
-    np.testing.assert_allclose(values_of(effect, columns), values, rtol=1e-12)
-
-
-@pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
-def test_every_effect_has_its_law(effect):
-    """Each column of the simulator that an effect uses belongs to a law of the fit."""
-    laws = column_set([column for columns in COLUMNS for column in columns])
-    assert filled(effect) <= laws | column_set(DRIVE_COLUMNS)
 
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)

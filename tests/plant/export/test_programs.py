@@ -10,9 +10,7 @@ import subprocess
 import zipfile
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any
 
-import control
 import numpy as np
 import pytest
 from fmpy import extract, read_model_description
@@ -29,7 +27,6 @@ from pipeline.plant.effect import AugmentedChain, Effect
 from pipeline.plant.export import fmu as fmu_module
 from pipeline.plant.export.description import describe
 from pipeline.plant.export.fmu import fmu
-from pipeline.plant.export.motion import EquationsOfMotion
 from pipeline.plant.export.sources import matlab_source
 from pipeline.setup import PAPER_UNITS
 from tests.helpers.effects import SIZES, make_term
@@ -118,19 +115,6 @@ def test_a_cart_that_was_always_held_does_not_move(free, tmp_path):
 
 
 @no_compiler
-def test_a_force_below_the_friction_moves_no_cart(tmp_path):
-    """A force below the friction does not move a cart, and a moving cart eventually stops."""
-    model = model_of("coulomb_friction", last=False)
-    in_c = compiled(model, tmp_path)
-    held = in_c.simulate(T, np.full(T.size, 0.99e-3), x0=np.zeros(2))
-    assert_array_equal(held, np.zeros((2, T.size)))
-    long = np.arange(0.0, 20.0, 0.01)
-    stopped = in_c.simulate(long, np.zeros(long.size), x0=np.array([0.3, 0.2]))
-    assert np.ptp(stopped[0, -100:]) == 0.0
-    assert abs(stopped[0, -1]) > 1e-4
-
-
-@no_compiler
 @pytest.mark.parametrize("interval", [1e-5, 1e-3, 7e-3])
 def test_a_delay_is_right_at_any_step_length(interval, tmp_path):
     """A delay shifts the whole motion by the same time, at any step length.
@@ -151,25 +135,6 @@ def test_a_delay_is_right_at_any_step_length(interval, tmp_path):
     shifted = np.array([np.interp(t - delay, t, y, left=0.0) for y in prompt])
     # Linear interpolation is off by up to a interval² / 8, with the acceleration a = 160 cm/s².
     assert_allclose(late, shifted, atol=160 * interval**2 / 8 + 2e-5)
-
-
-@pytest.mark.parametrize("name", RUNS)
-def test_python_control_moves_as_the_simulator_does(name):
-    """python-control's system agrees with the simulator within 0.5 %.
-
-    Its friction and delay are approximations (`motion`), and it interpolates the input linearly, so
-    the simulator gets the mean of two samples.
-    """
-    u, x0 = RUNS[name]
-    t, u = T[T < 1.0], u[T < 1.0]
-    motion = EquationsOfMotion(HARD)
-    respond: Any = control.input_output_response
-    found = respond(
-        motion.to_control(), t, u, motion.start(list(x0)),
-        solve_ivp_method="LSODA", solve_ivp_kwargs={"rtol": 1e-6, "atol": 1e-9, "max_step": 0.02},
-    )  # fmt: skip
-    midway = np.append(0.5 * (u[1:] + u[:-1]), 0.0)
-    assert off(found.outputs, simulate_augmented(HARD, t, midway, x0=x0)) < 5e-3
 
 
 # --------------------------------------------------------------- MATLAB, Octave
@@ -216,33 +181,6 @@ def test_octave_moves_as_c_does_with_every_effect(tmp_path):
         in_c = compiled(model, tmp_path / f"c-{name}")
         y = in_c.simulate(t, np.where(t > 0.01, 0.05, 0.0), x0=np.array([0.9, 0.2]))
         assert_allclose(found[name], y, atol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.sample
-@no_octave
-def test_octave_moves_as_the_simulator_does(tmp_path):
-    """With friction, play and delay, Octave's model agrees with the simulator step by step."""
-    u = {name: run[0][T < 0.4] for name, run in RUNS.items()}
-    np.savetxt(tmp_path / "u.txt", np.column_stack(list(u.values())), fmt="%.17g")
-    lines = (
-        f"u = load('{tmp_path / 'u.txt'}');",
-        "y = zeros(rows(u), 6);",
-        "x0 = {{[0 0], [0 0], [1.5 0.5]}};",
-        "for k = 1:3",
-        "  s = model('start', model('parameters'), x0{{k}});",
-        "  y(1, 2*k-1:2*k) = s.y;",
-        "  for i = 2:rows(u)",
-        "    [y(i, 2*k-1:2*k), s] = model('step', s, u(i - 1, k), 0.002);",
-        "  end",
-        "end",
-        "save('-ascii', '-double', '{out}', 'y')",
-    )
-    runs = "".join(f"{line}\n" for line in lines)
-    found = in_octave({"hard": HARD}, runs, tmp_path)["hard"]
-    for k, (name, (_, x0)) in enumerate(RUNS.items()):
-        expected = simulate_augmented(HARD, T[T < 0.4], u[name], x0=x0)
-        assert off(found[2 * k : 2 * k + 2], expected) < KNOCKS
 
 
 # -------------------------------------------------------------------------- FMU
