@@ -26,27 +26,6 @@ def test_a_command_rarely_collects_garbage():
     assert int(done.stderr.split()[-1]) < 40
 
 
-ENDS = """
-from pipeline.garbage import collect_seldom
-class Cycle:
-    def __init__(self):
-        self.own = self
-    def __del__(self):
-        print("found")
-collect_seldom()
-Cycle()
-"""
-
-
-def test_no_garbage_is_collected_at_exit():
-    """At exit no garbage is collected, since the system frees the memory anyway.
-
-    Python would otherwise search all loaded objects twice.
-    """
-    done = subprocess.run([sys.executable, "-c", ENDS], capture_output=True, text=True, check=True)
-    assert done.stdout == ""
-
-
 SERVES = """
 from pipeline.garbage import collect_for_hours, collect_seldom
 class Cycle:

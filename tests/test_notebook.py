@@ -17,7 +17,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import linear_sum_assignment
 
 import pipeline
-from pipeline.errors import ConfigError, DataError, SubmissionError
+from pipeline.errors import DataError
 from pipeline.json_files import json_text, plain
 from pipeline.notebook import Lab, analyse
 from pipeline.resources import EXAMPLES
@@ -61,13 +61,6 @@ def test_the_system_is_the_identified_chain(lab):
     assert (system.input_labels, system.output_labels) == (["u"], ["x1", "x2"])
     for own, letter in zip(lab.chain.state_space(), "ABCD", strict=True):
         assert_array_equal(getattr(system, letter), own)
-
-
-def test_holding_a_cart_leaves_a_smaller_system(lab):
-    """With cart 1 held the system has only cart 2, and the input does not drive it."""
-    alone = lab.chain.to_control(free=(2,))
-    assert (alone.state_labels, alone.output_labels) == (["x2", "v2"], ["x2"])
-    assert_array_equal(alone.B, np.zeros((2, 1)))
 
 
 def test_transfer_functions_are_those_of_the_system(lab):
@@ -145,23 +138,6 @@ def test_an_analysis_shows_its_summary_and_its_table(lab):
     alts = page.values("alttext")
     assert {"K_1", "ω_a", "ζ_2"} <= set(alts)
     assert repr(lab).startswith("A chain of 2 carts was identified")
-
-
-def test_each_section_shows_itself(lab):
-    """Each section of the report can be displayed alone, with figures; other names are refused."""
-    for section in lab.sections:
-        page = Page(lab.show(section)._repr_html_())
-        assert len(page.text) > 20, section
-    assert "<svg" in lab.show("feedback")._repr_html_()
-    assert repr(lab.show("feedback")) == "Shown('State feedback')"
-    with pytest.raises(ConfigError, match="no section 'feedbak'; there are summary, "):
-        lab.show("feedbak")
-
-
-def test_a_missing_folder_is_one_clear_error(tmp_path):
-    """A missing folder gives the same message as on the command line."""
-    with pytest.raises(SubmissionError, match="no such folder"):
-        analyse(tmp_path / "nowhere")
 
 
 def test_the_example_notebook_runs(monkeypatch):

@@ -79,16 +79,6 @@ def test_the_systems_are_those_of_the_models(gap):
     assert abs(x[-1]) <= FORCE / gap.results.model.chain.k.sum()
 
 
-def test_residual_forces_are_a_table(gap):
-    """Residual forces are a table with units; with the right model the forces are small."""
-    assert list(gap.residual.columns) == [
-        "experiment", "time", "cart", "position", "velocity", "input", "force",
-    ]  # fmt: skip
-    assert set(gap.residual["experiment"]) <= set(gap.records)
-    assert gap.residual.attrs["units"]["velocity"] == "cm/s"
-    assert gap.residual["force"].std() < 0.2 * FORCE
-
-
 def test_the_plots_show_what_the_gap_found(gap):
     """The plots show the gap's own curves and errors for the held-out runs."""
     runs = {run.id: run for run in compare_runs(gap.analysis, gap=gap.results, progress=silent)}

@@ -1,16 +1,14 @@
 """The JSON files and their schemas: the shipped schemas describe the files we write."""
 
 import json
-from dataclasses import replace
 from typing import Any
 
 import jsonschema
-import numpy as np
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.gap.types import RecordGap, read_gap
-from pipeline.json_files import DIALECT, json_text, read_json
+from pipeline.gap.types import read_gap
+from pipeline.json_files import DIALECT, json_text
 from pipeline.report.solution.expected import solution_text
 from pipeline.schemas import MODELS, schema_text
 from tests.helpers.analysis_factory import make_analysis
@@ -63,15 +61,6 @@ def test_real_results_obey_the_schema(example):
     assert_fits("solution", solution_text(example))
 
 
-@pytest.mark.parametrize("carts", [1, 2, 3])
-def test_results_with_gaps_obey_the_schema(carts):
-    """A number that could not be determined is null, and the schema allows that."""
-    analysis = make_analysis(carts)
-    for poorer in (analysis, replace(analysis, fit=None, rows=(), feedback=None, hardware=())):
-        assert_fits("results", json_text(poorer))
-        assert_fits("solution", solution_text(poorer))
-
-
 @pytest.mark.parametrize("verdict", ["named", "partial", "none", "ambiguous", "unexplained"])
 def test_gaps_obey_the_schema(verdict):
     """gap.json obeys the schema for every verdict, with effects, rivals and windows."""
@@ -115,19 +104,6 @@ def test_a_file_of_an_earlier_version_is_read():
     del document["model"]["effects"]
     with pytest.raises(ConfigError, match=r"model\.effects"):
         read_gap(json.dumps(document))
-
-
-def test_a_number_that_is_not_finite_is_null_and_comes_back():
-    """NaN is null in the file, and NaN again in the value that is read."""
-    row = RecordGap(
-        experiment="step", cart=1, held_out=True, baseline=0.1, final=np.nan, noise_floor=-0.0
-    )
-    text = json_text(row)
-    assert json.loads(text)["final"] is None
-    assert "-0.0" not in text
-    again = read_json(RecordGap, text)
-    assert np.isnan(again.final)
-    assert json_text(again) == text
 
 
 def test_the_command_prints_the_schema():

@@ -32,13 +32,6 @@ def test_another_process_does_the_work_and_reports_its_stages():
     assert HELPER not in sys.modules
 
 
-def test_no_second_process_loads_what_is_loaded_here_already():
-    """A function whose module is loaded here already is called in this process."""
-    __import__(HELPER)
-    with SecondProcess(HELPER, "where") as second:
-        assert second.do(progress=silent)[0] == os.getpid()
-
-
 def test_this_process_takes_over_when_the_second_one_dies():
     """If the second process dies during its work, this process does the work."""
     with SecondProcess(HELPER, "die_elsewhere") as second:
@@ -50,12 +43,6 @@ def test_this_process_takes_over_when_no_second_one_can_start(monkeypatch, tmp_p
     monkeypatch.setattr(sys, "executable", str(tmp_path / "missing"))
     with SecondProcess(HELPER, "where") as second:
         assert second.do(progress=silent)[0] == os.getpid()
-
-
-def test_what_cannot_be_sent_stays_in_this_process():
-    """If an argument cannot be sent to another process, this process does the work."""
-    with SecondProcess(HELPER, "where") as second:
-        assert second.do(pickle.PicklingError, lambda_here, progress=silent)[0] == os.getpid()
 
 
 def test_an_error_of_the_work_is_raised_here():
@@ -87,7 +74,3 @@ def test_an_interrupt_ends_the_second_process():
 def test_every_effect_can_be_sent_to_another_process(effect):
     """An effect is equal to itself after a journey to another process."""
     assert pickle.loads(pickle.dumps(effect)) == effect
-
-
-lambda_here = lambda: None  # noqa: E731
-lambda_here.__qualname__ = "elsewhere"

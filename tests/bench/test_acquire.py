@@ -27,7 +27,6 @@ from pipeline.cli import app
 from pipeline.errors import ConfigError, HardwareError
 from pipeline.experiments.gains import CountScales
 from pipeline.experiments.plan import Plan, PlanLimits, Recording, StateLoop
-from pipeline.experiments.plan_file import load_plan
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS
 from pipeline.protocol import Description, Reading
@@ -37,14 +36,6 @@ from tests.helpers.acquisitions import LIMITS, Notes, host, sine, until_bytes, w
 from tests.helpers.benches import emulator
 
 NEAR = PlanLimits(input=0.5, travel=0.1)  # cm: a dwell of 0.01 V passes it within its first swing
-
-
-class Alone(Notes):
-    """A session without a person at the bench, in which every instruction is refused."""
-
-    def confirm(self, instruction: str) -> None:
-        """Refuse the instruction."""
-        raise ConfigError(f"{instruction}: nobody")
 
 
 def decay(name: str, cart: int = 1) -> Recording:
@@ -124,19 +115,6 @@ def test_a_plan_becomes_a_submission(tmp_path, fast):
     assert controller.gains == pytest.approx((0.01, 0.002, 0.0, 0.0), rel=1e-5)
 
 
-def test_a_folder_without_a_submission_gets_one(tmp_path):
-    """An empty folder gets a submission with the bench's description, and a plan."""
-    with emulator("--speed", "20", "--period", "5.003", preset="throne-1dof") as bench:
-        outcomes = acquire(
-            tmp_path / "new", port=bench.address, observers=[Notes()], only=["step-1"]
-        )
-    assert outcomes[-1].partial == ""
-    submission = load_submission(tmp_path / "new")
-    assert submission.system.carts == 1
-    assert submission.system.input.sign == 1
-    assert {"decay-1a", "step-2", "sweep"} <= {r.id for r in load_plan(submission).recordings}
-
-
 def test_existing_recordings_are_skipped(tmp_path, fast):
     """A second session records only what is missing."""
     work = write_work(tmp_path, [sine("a", seconds=1), sine("b", seconds=1)])
@@ -163,16 +141,6 @@ def test_a_stock_bench_is_driven_by_people(tmp_path):
     assert any("no watchdog" in remark for remark in notes.remarks)
     (record,) = read_data(load_submission(work)).records
     assert record.input_scale == 5 / 4096
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
-def test_a_pty_is_a_port_like_any_other(tmp_path):
-    """A plan can be recorded through a pseudo-terminal as well as through a socket."""
-    work = write_work(tmp_path, [sine("dwell", seconds=1)])
-    with emulator("--port", "pty", "--speed", "5") as bench:
-        *_, outcome = acquire(work, port=bench.address, observers=[Notes()], only=["dwell"])
-    assert outcome.partial == ""
-    assert outcome.lines == pytest.approx(1000 / 1.0024, abs=2)
 
 
 @pytest.mark.slow
@@ -252,18 +220,6 @@ def test_a_run_that_breaks_off_is_saved_as_partial_and_recorded_again(tmp_path, 
     assert [e.file for e in load_submission(work).experiments] == ["data/dwell.txt"]
     partial = readings_of(read_raw(work / "raw" / "dwell-1.raw"))
     assert partial[-1].ms == pytest.approx(600, abs=20)
-
-
-def test_a_run_that_passes_the_travel_limit_is_stopped_at_once(tmp_path, real):
-    """A run that passes the travel limit is stopped at once and not added as an experiment."""
-    work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=NEAR)
-    (outcome,) = acquire(work, port=real.address, observers=[Alone()], only=["dwell"])
-    assert last_run(real)["ended"] == "stopped"
-    run = readings_of(read_raw(work / "raw" / "dwell-1.raw"))
-    offending = next(r.ms for r in run if max(map(abs, r.counts)) > NEAR.travel / 0.00227)
-    assert re.match(r"stopped: cart 1 was -?0.1\d* cm from its zero, the limit", outcome.partial)
-    assert_stopped_at_once(work / "raw" / "dwell-1.raw", offending)
-    assert load_submission(work).experiments == ()
 
 
 def test_a_run_that_passes_the_input_limit_is_stopped_at_once(tmp_path, real):
@@ -357,27 +313,6 @@ def test_a_port_without_a_bench_is_reported():
         open_line("socket://127.0.0.1:9", baud=115_200)
 
 
-def test_a_missing_device_gets_the_list_of_ports():
-    """If a device does not exist, one line names the ports of this machine."""
-    with pytest.raises(HardwareError, match=r"no such port; is the bench plugged in\?; .*port"):
-        open_line("/dev/ttyNONE7", baud=115_200)
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
-def test_a_port_in_use_is_reported():
-    """If another program has the port open, the message says so."""
-    controller, device = os.openpty()
-    import fcntl
-
-    fcntl.flock(device, fcntl.LOCK_EX)
-    try:
-        with pytest.raises(HardwareError, match="another program has this port open"):
-            open_line(os.ttyname(device), baud=115_200)
-    finally:
-        os.close(controller)
-        os.close(device)
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 def test_a_device_that_is_not_a_bench_is_reported():
     """If a device does not answer like a bench, the message says so."""
@@ -438,27 +373,12 @@ def test_an_unknown_scale_is_asked_for(tmp_path, stock):
         prepare_submission(tmp_path, BENCH, stock=stock)
 
 
-def test_more_carts_than_encoders_is_refused(tmp_path):
-    """A submission of three carts is refused on a bench with two encoders."""
-    text = 'version = 1\n[system]\ncarts = 3\nposition = { unit = "cm" }\n'
-    (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigError, match="has 3 carts, but the bench has 2 encoders"):
-        prepare_submission(tmp_path, BENCH, stock=False)
-
-
 @pytest.mark.parametrize("options", [[], ["--port", "x", "--import", "y"]])
 def test_a_port_and_a_folder_exclude_each_other(tmp_path, options):
     """`acquire` with both a port and a folder to import, or with neither, is refused."""
     result = CliRunner().invoke(app, ["acquire", str(tmp_path), *options])
     assert isinstance(result.exception, ConfigError)
     assert "either --port or --import" in str(result.exception)
-
-
-def test_an_unknown_id_gets_the_list_of_the_plan(tmp_path, real):
-    """`--only` with an unknown name gives the list of the plan's recordings."""
-    work = write_work(tmp_path, [sine("a", seconds=1)])
-    with pytest.raises(ConfigError, match=r"--only nine: no such recording; plan.toml has a$"):
-        acquire(work, port=real.address, observers=[Notes()], only=["nine"])
 
 
 # ----------------------------------------------------------------- the terminal
@@ -512,11 +432,3 @@ def test_without_a_keyboard_nothing_is_confirmed(monkeypatch):
     view, out = shown(terminal=False, yes=True)
     view.confirm("Hold cart 2")
     assert out.getvalue() == "Hold cart 2: confirmed by --yes, continuing\n"
-
-
-@pytest.mark.parametrize(
-    ("values", "bars"), [([5, 5], "▁▁"), ([0, 7], "▁█"), (range(8), "▁▂▃▄▅▆▇█")]
-)
-def test_a_sparkline_has_a_bar_for_each_value(values, bars):
-    """A sparkline has one bar per value, scaled from lowest to highest; equal values are low."""
-    assert sparkline(values) == bars

@@ -141,21 +141,6 @@ def test_late_lines_of_the_previous_run_do_not_count(tmp_path):
     assert (again.partial, again.lines, str(again.anomalies)) == ("", RUN, "none")
 
 
-@pytest.mark.parametrize("share", [0.1, 0.3, 0.6])
-def test_any_number_of_lost_lines_is_counted(tmp_path, share):
-    """If the bench states its period, any number of missing lines is counted as lost and noted."""
-    lost = np.random.default_rng(5).random(RUN) < share
-
-    def thinned(lines: list[Reading]) -> Iterator[Reading]:
-        return (r for r in lines if not lost[r.ms])
-
-    work = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)])
-    (outcome,) = acquire(work, port=OddBench(thinned).address, observers=[Notes()], only=["dwell"])
-    assert outcome.partial == ""
-    assert outcome.anomalies.lost == pytest.approx(lost.sum(), rel=0.02)
-    assert f"{outcome.anomalies.lost} lines lost" in load_submission(work).experiments[0].note
-
-
 @pytest.mark.parametrize("lost", [(), (500, 1700, 1701)])
 def test_a_clock_slower_than_stated_loses_nothing(tmp_path, lost):
     """A period of 1.3 ms instead of 1 ms is noted once, and only missing lines count as lost."""

@@ -4,7 +4,6 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from pipeline.errors import DataError
 from pipeline.protocol import (
     STOCK_STOP,
     ChirpEnd,
@@ -71,15 +70,6 @@ def test_commands_are_read_as_sent(sent, chunk):
     assert reader.rejected == 0
 
 
-@given(st.binary(max_size=80), st.integers(1, 9))
-def test_noise_may_be_cut_anywhere(data, chunk):
-    """Noise gives the same commands and the same number of rejects, however it is cut."""
-    whole, pieces = CommandReader(encoders=ENCODERS), CommandReader(encoders=ENCODERS)
-    expected = whole.feed(data)
-    got = [c for at in range(0, len(data), chunk) for c in pieces.feed(data[at : at + chunk])]
-    assert (got, pieces.rejected) == (expected, whole.rejected)
-
-
 @st.composite
 def garbled(draw):
     """Draw a few commands in which bytes are lost, changed or inserted."""
@@ -139,14 +129,6 @@ def test_a_malformed_command_does_nothing(data):
     assert read(data) == []
 
 
-def test_a_stock_bench_knows_three_commands():
-    """A stock bench ignores the extensions' letters and fields, and knows no chirp."""
-    data = b"?;s;k;f;1;2;3;4;5;c;20;h;1;0;d;c;o;o;1;100;1;"
-    assert read(data, extensions=()) == []
-    known = [Start(wave=Wave.SINE, frequency=1.0, amplitude=5), PidGains(kp=1, ki=0, kd=0)]
-    assert read(b"".join(map(encode, known)), extensions=()) == known
-
-
 counts = st.integers(-(10**10) + 1, 10**10 - 1)
 readings = st.builds(
     Reading,
@@ -200,22 +182,3 @@ def test_descriptions_are_read_as_sent(bench):
     line = format_description(bench)
     assert parse_description(line) == bench
     assert parse_description(line.rstrip() + b" colour=red\n") == bench
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        (b"0:0:0:0:0\n", "not a description"),
-        (b"?cartlab/2 name=x\n", "not a description"),
-        (b"?cartlab/1 name=x carts=2 encoders=2\n", "'input' is wrong"),
-        (
-            b"?cartlab/1 name=x encoders=2 carts=two period=1 baud=9600 commands= input=1V "
-            b"position=1cm\n",
-            "'two' is wrong",
-        ),
-    ],
-)
-def test_another_answer_is_refused(line, message):
-    """A text that is not a description, or that lacks a field, gives one clear message."""
-    with pytest.raises(DataError, match=message):
-        parse_description(line)

@@ -2,7 +2,6 @@
 
 import re
 import signal
-import socket
 import time
 from collections.abc import Sequence
 
@@ -11,13 +10,10 @@ from typer.testing import CliRunner
 
 from pipeline.bench.acquire import acquire
 from pipeline.bench.events import Anomalies
-from pipeline.bench.experiments import cart_remarks, prepare_submission
-from pipeline.bench.serial_line import open_line
+from pipeline.bench.experiments import prepare_submission
 from pipeline.cli import app
-from pipeline.errors import ConfigError, HardwareError
-from pipeline.experiments.plan import PlanLimits
+from pipeline.errors import ConfigError
 from pipeline.protocol import EXTENSIONS, WATCHDOG, Description, Reading
-from pipeline.simulated.emulator.links import open_link
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import Notes, host, sine, until_bytes, write_work
 from tests.helpers.benches import emulator
@@ -32,15 +28,6 @@ def test_a_bench_with_too_few_carts_is_refused(tmp_path):
         ):
             acquire(work, port=bench.address, observers=[Notes()])
     assert not (work / "raw").exists()
-
-
-def test_a_bench_with_more_carts_is_reported(tmp_path):
-    """If the bench has more carts than the submission, a message says so and the run goes on."""
-    submission = load_submission(write_work(tmp_path, []))
-    bench = Description(name="three", encoders=3, carts=3, commands=EXTENSIONS)
-    (remark,) = cart_remarks(submission, bench)
-    assert "carts = 2, but the bench 'three' has 3: if it is the right bench" in remark
-    assert cart_remarks(submission, Description(name="stock", encoders=3, carts=3)) == []
 
 
 def test_a_run_in_which_nothing_moves_is_not_recorded(tmp_path):
@@ -110,26 +97,6 @@ def test_an_interrupt_after_the_last_line_keeps_the_run(tmp_path):
     assert not (work / "data" / "first.partial.txt").exists()
 
 
-def test_a_network_port_typed_as_a_device_is_corrected():
-    """If a network port is typed as a device, the message shows the right notation."""
-    for port in ("41001", "127.0.0.1:41001"):
-        with pytest.raises(HardwareError, match=r"is written socket://HOST:PORT"):
-            open_line(port, baud=115_200)
-
-
-def test_a_port_that_is_taken_says_what_to_choose():
-    """If a port is taken, a second emulator's message says that port 0 picks a free one."""
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        with pytest.raises(ConfigError, match="choose another port, or 0 for any"):
-            open_link(f"socket://127.0.0.1:{taken.getsockname()[1]}")
-
-
-def test_nouns_agree_with_their_numbers():
-    """In messages the noun agrees with its number: one line, one encoder, two resets."""
-    assert str(Anomalies(lost=1, stuck=1, resets=2)) == "1 line lost, 2 resets, 1 encoder stuck"
-    assert str(Anomalies(lost=2, stuck=2, resets=1)) == "2 lines lost, 1 reset, 2 encoders stuck"
-
-
 def test_a_new_submission_says_what_the_bench_does_not_know(tmp_path):
     """A new submission asks to check its springs, and has authors and design as comments."""
     bench = Description(name="two", encoders=2, carts=2, commands=EXTENSIONS, position_unit="cm")
@@ -142,18 +109,6 @@ def test_a_new_submission_says_what_the_bench_does_not_know(tmp_path):
     submission = load_submission(folder)
     assert [author.id for author in submission.authors] == ["s1024"]
     assert submission.design is not None
-
-
-def test_no_report_is_offered_if_nothing_was_recorded(tmp_path, fast):
-    """If every run passes a limit, the message says what to change and offers no report."""
-    near = PlanLimits(input=0.5, travel=0.05)
-    work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=near)
-    with host(work, fast.address, "--only", "dwell", "--yes") as process:
-        _, said = process.communicate()
-    assert process.returncode == 1
-    assert "divide the amplitude in plan.toml by four. If the bench" in said
-    assert "again: confirmed by --yes" not in said
-    assert "cartlab report" not in said
 
 
 def test_files_are_imported_only_into_a_submission(tmp_path):

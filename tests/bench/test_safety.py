@@ -87,18 +87,6 @@ def test_a_plan_for_a_stronger_bench_moves_nothing(tmp_path, real):
     assert not (work / "raw").exists()
 
 
-def test_the_limits_are_printed_before_anything_moves(tmp_path, fast):
-    """Before anything moves, the limits and the bench's full scale are printed.
-
-    At 0.00227 cm per count, the travel limit of 2.5 cm is 1101 counts.
-    """
-    work = write_work(tmp_path, [sine("dwell", seconds=1)])
-    notes = Notes()
-    acquire(work, port=fast.address, observers=[notes], only=["dwell"])
-    said = "limits: 0.5 V of the 0.5 V that the bench can give, and 2.5 cm (1101 counts) from each"
-    assert any(remark.startswith(said) for remark in notes.remarks)
-
-
 def test_an_impossible_recording_is_skipped_with_a_reason(tmp_path):
     """A chirp on a stock bench, or an amplitude below one count, is skipped with a reason.
 
@@ -302,27 +290,6 @@ def test_a_run_starts_only_after_both_answers():
         time.sleep(0.3)
         assert line.receive() == b""
         line.clear()
-
-
-def test_a_stock_bench_may_take_half_a_second_to_begin(monkeypatch):
-    """A stock bench is recognised even if the lines of its trial run come half a second late."""
-    monkeypatch.setattr("pipeline.bench.serial_line._ANSWER", 0.05)  # no answer comes
-    door = socket.create_server(("127.0.0.1", 0))
-
-    def late() -> None:
-        peer, _ = door.accept()
-        with door, peer:
-            heard = b""
-            while not heard.endswith(b"d;d;o;o;10;0;1;"):
-                heard += peer.recv(4096)
-            time.sleep(0.5)
-            peer.sendall(b"".join(b"0:0:0:0:0:%d\n" % ms for ms in range(100)))
-            while peer.recv(4096):
-                pass
-
-    threading.Thread(target=late, daemon=True).start()
-    with open_line(f"socket://127.0.0.1:{door.getsockname()[1]}", baud=115_200) as line:
-        assert (line.bench.name, line.bench.encoders) == ("stock", 3)
 
 
 @pytest.fixture

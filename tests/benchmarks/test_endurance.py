@@ -6,7 +6,7 @@ import sys
 import pytest
 from numpy.testing import assert_allclose
 
-from benchmarks.endurance import SETTLING, Memory, page_table
+from benchmarks.endurance import SETTLING, Memory
 from benchmarks.endurance_checks import Found, check_book, check_folders
 from benchmarks.endurance_people import Change, Journal, digest
 from pipeline.grading.gradebook.request_gradebook import RequestGradebook
@@ -113,14 +113,6 @@ def test_the_slope_of_memory_is_found():
 
     assert_allclose(seen["slope"], 10.0, rtol=1e-6)
     assert_allclose(seen["std"], 0.0, atol=1e-6)
-
-
-def test_the_table_has_a_row_for_each_page():
-    row = {"count": 1200, "median": 0.1, "p99": 0.456, "most": 1.5, "over": 300}
-
-    assert page_table({"team": row}).splitlines()[-1] == (
-        "| team | 1,200 | 0.10 s | 0.46 s | 1.50 s | 300 |"
-    )
 
 
 @pytest.mark.slow

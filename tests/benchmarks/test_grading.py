@@ -1,6 +1,5 @@
 """The comparison of graders is fair: the notebook's reference and the mistakes are right."""
 
-import json
 from functools import partial
 
 import pytest
@@ -73,50 +72,12 @@ def test_a_grader_is_judged_by_lost_points_and_named_mistakes():
     ]  # fmt: skip
 
 
-def test_the_table_of_mistakes_counts_every_grading_in_one_line():
-    """Each kind of mistake has one line; an honest team with a flag counts as wrong."""
-
-    def row(kind, codes, found):
-        return {
-            "seed": 1, "kind": kind, "codes": codes, "found": found, "or_else": [], "seconds": 1.0,
-            "friction": True,
-        }  # fmt: skip
-
-    table = grading.named_mistakes(
-        [
-            row("honest, 2 carts", [], []),
-            row("honest, 3 carts", [], ["final_off"]),
-            row("peak_count", ["peak_count"], ["peak_count"]),
-            row("one number: hz_for_rad_s", ["hz_for_rad_s"], ["peak_count"]),
-            row("a + b", ["a", "b"], ["a", "b", "c"]),
-        ]
-    )
-
-    lines = {cells[0]: cells[1:] for cells in table.rows}
-    assert lines["honest"][0].startswith("50 % (1 of 2)")
-    assert lines["one mistake"][0].startswith("100 % (1 of 1)")
-    assert lines["one mistake in one number"][0].startswith("0 % (0 of 1)")
-    assert lines["two mistakes in a table"][2] == "1"
-    assert lines["**all mistakes**"][0].startswith("67 % (2 of 3)")
-    assert "Not always right: 2 kinds once." in " ".join(table.note.split())
-    assert "1 of them slightly nonlinear" in table.note
-
-
 def test_records_of_many_sessions_are_all_different_and_can_be_read(tmp_path):
     report.write_records(tmp_path / "many", 40)
     data = read_data(load_submission(tmp_path / "many"))
     assert len(data.records) == 40
     assert len(set(data.files.values())) == 40
     assert not data.unreadable
-
-
-def test_the_drawn_document_is_cells_that_a_kernel_can_run(tmp_path):
-    cells = report._DOCUMENT.read_text(encoding="utf-8").split("# %%\n")[1:]
-    report._write_notebook(tmp_path / "lab.ipynb", cells)
-    notebook = json.loads((tmp_path / "lab.ipynb").read_text(encoding="utf-8"))
-    assert len(notebook["cells"]) == len(cells) > 3
-    for cell in notebook["cells"]:
-        compile(cell["source"], "cell", "exec")
 
 
 def _dwells(team):

@@ -4,11 +4,10 @@ import sys
 from importlib import import_module
 
 import pytest
-from matplotlib.figure import Figure
 
 from benchmarks import __main__ as command
 from benchmarks import page
-from benchmarks.page import Table, section, significant, spread, version, write_page
+from benchmarks.page import Table, section, write_page
 
 CHEAP = ("feedback", "time_stages")
 
@@ -38,30 +37,6 @@ def test_making_one_section_again_keeps_the_others(tmp_path):
     assert text.count("## Speed") == 2
 
 
-def test_a_section_states_the_versions_of_its_tools():
-    """A section states the versions of the compared tools, and names those not installed."""
-    text = _section("first", "1.0")
-
-    assert f"numpy {version('numpy')}" in text
-    assert f"no-such-tool {page.NOT_INSTALLED}" in text
-
-
-def test_a_figure_is_written_beside_the_page_and_shown(tmp_path):
-    """A figure is written beside the page, in the style of the reports."""
-
-    def draw() -> Figure:
-        figure = Figure()
-        figure.add_subplot().plot([1.0, 2.0], [3.0, 4.0], label="ours")
-        return figure
-
-    table = Table(title="Times", head=["what", "s"], rows=[["ours", "1.0"]], picture=draw)
-
-    text = section("first", _Module, [table], seconds=1.0, figures=tmp_path)  # type: ignore[arg-type]
-
-    assert "![Times](figures/first-1.svg)" in text
-    assert (tmp_path / "first-1.svg").read_text(encoding="utf-8").startswith("<svg")
-
-
 def test_rows_may_be_in_a_file_beside_the_figure(tmp_path):
     """With a folder, the page links to a CSV file of the rows; without one it has the table."""
     table = Table(
@@ -79,15 +54,6 @@ def test_rows_may_be_in_a_file_beside_the_figure(tmp_path):
     assert "[first-1.csv](figures/first-1.csv)" in text
     assert "| ours, new |" not in text
     assert printed.index("Theirs.") < printed.index("| ours, new | 1.0 |")
-
-
-def test_text_is_wrapped_to_the_width_of_the_page():
-    """Wrapped text keeps its paragraphs apart, and the lines of its list items are indented."""
-    text = page.wrapped("\none\ntwo\n\n- " + "word " * 40 + "\n- end\n")
-
-    assert text.startswith("one two\n\n- word")
-    assert text.endswith("\n  " + "word " * 16 + "word\n- end")
-    assert max(map(len, text.split("\n"))) <= page.WIDTH
 
 
 @pytest.mark.parametrize("name", CHEAP)
@@ -113,28 +79,3 @@ def test_a_stored_section_has_the_words_of_its_module(name):
     stored = text.split(f"<!-- {name} -->")[1].split(f"<!-- end of {name} -->")[0]
     assert stored.strip().startswith(f"## {module.TITLE}\n\n{page.wrapped(module.WORDS)}\n")
     assert all(f"{tool} " in stored for tool in module.TOOLS)
-
-
-def test_an_unknown_name_is_refused(monkeypatch, capsys):
-    """An unknown name of a benchmark is refused with the known names."""
-    monkeypatch.setattr(sys, "argv", ["benchmarks", "no-such-benchmark"])
-
-    with pytest.raises(SystemExit) as refused:
-        command.main()
-
-    assert refused.value.code == 2
-    assert f"choose from {', '.join(command.BENCHMARKS)}" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(0.01234, "0.012"), (12.34, "12"), (123.4, "123"), (1e7, "1e+07")]
-)
-def test_numbers_keep_two_digits(value, text):
-    """`significant` shows as many digits as asked, with a power of ten only for extreme values."""
-    assert significant(value) == text
-
-
-def test_spread_is_median_and_quartiles():
-    """A single value has no spread."""
-    assert spread([1.0, 2.0, 3.0, 4.0, 5.0]) == "3.0 (2.0–4.0)"
-    assert spread([2.0]) == "2.0"

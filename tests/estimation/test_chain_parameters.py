@@ -52,18 +52,6 @@ def test_matrices_are_the_sum_of_the_directions(chain):
         assert_allclose(built, matrix, rtol=1e-14, atol=1e-14 * np.max(np.abs(matrix)))
 
 
-def test_dp_dtheta_is_the_derivative_of_the_physical_parameters():
-    """The matrix dp/dtheta agrees with a central difference."""
-    chain = PRESETS["throne-3dof"]
-    P = Parametrisation(bench=Setup(springs=(True,) * 4))
-    theta, h = P.pack(chain), 1e-6
-
-    for i, e in enumerate(np.eye(theta.size)):
-        ends = [P.physical(P.unpack(theta + sign * h * e)) for sign in (1, -1)]
-        # The difference has errors of h²/6, and of 1e-16 / h from rounding.
-        assert_allclose((ends[0] - ends[1])[i] / (2 * h), P.dp_dtheta(theta)[i], rtol=1e-9)
-
-
 def test_only_a_spring_that_may_be_missing_has_no_logarithm():
     """The vector has the logarithm of k_1, or k_1 itself if it may be missing."""
     both = Parametrisation(bench=Setup(springs=(True, True, True)))
@@ -95,26 +83,6 @@ def test_a_missing_spring_between_carts_is_refused():
     """If the spring between two carts is missing, the error names the two carts."""
     with pytest.raises(DataError, match="between carts 2 and 3, found none"):
         Parametrisation(bench=Setup(springs=(True, True, False, True)))
-
-
-def test_standard_errors_of_one_cart_follow_its_formulas():
-    """The standard errors of one cart's K, ω_n and ζ equal those derived by hand."""
-    m, c, k = 2e-4, 5e-4, 0.035
-    relative = np.array([0.02, 0.05, 0.01])  # relative errors of m, c, k, independent
-    covariance = np.diag((relative * [m, c, k]) ** 2)
-
-    got = named_estimates(
-        Chain(m=np.array([m]), c=np.array([c]), k=np.array([k, 0.0])),
-        names=("m_1", "c_1", "k_1"),
-        covariance=covariance,
-        source="bode_fit",
-    )
-
-    std = np.array([estimate.std for estimate in got.values()])
-    value = np.array([estimate.value for estimate in got.values()])
-    expected = [0.01, np.hypot(0.02, 0.01) / 2, np.sqrt(0.05**2 + (0.02**2 + 0.01**2) / 4)]
-    # The forward difference has an error of about its step, 1e-6.
-    assert_allclose(std / value, expected, rtol=1e-5)
 
 
 def test_standard_errors_agree_with_a_sample():
@@ -161,9 +129,3 @@ def test_an_even_chain_has_the_given_gain_and_frequency(n, gain, omega):
     # The solution has about ten rounding errors; the added damping does not change omega_a.
     assert_allclose(values["K" if n == 1 else "K_1"], gain, rtol=1e-12)
     assert_allclose(np.min(np.abs(got.poles)), omega, rtol=1e-6)
-
-
-def test_an_even_chain_needs_a_gain_and_a_resonance():
-    """A chain of equal carts can be guessed only from a gain and a resonance."""
-    with pytest.raises(DataError, match="gain of cart 1 and a resonance"):
-        even_chain({"K_1": 1.0}, bench=Setup(springs=(True,) * 3))

@@ -3,7 +3,6 @@
 import numpy as np
 
 from pipeline.estimation.decay.separable import fit_separable
-from pipeline.estimation.minimise import evaluated_once
 
 
 class _Decay:
@@ -18,21 +17,6 @@ class _Decay:
 
     def derivatives(self, linear):
         return -self.t[:, None] * self.columns * linear
-
-
-def test_a_stored_result_is_unaffected_by_later_changes_of_its_argument():
-    once = evaluated_once(lambda p: p)
-    p = np.array([1.0, 2.0])
-    first = once(p)
-    p[0] = 5.0
-    assert first[0] == 1.0
-    assert once(p)[0] == 5.0
-
-
-def test_the_same_point_is_computed_once():
-    seen = []
-    once = evaluated_once(lambda p: seen.append(p) or len(seen))
-    assert [once(np.ones(2)), once(np.ones(2)), once(np.zeros(2))] == [1, 1, 2]
 
 
 def test_a_separable_fit_finds_a_rate_and_an_amplitude_to_rounding():

@@ -37,7 +37,7 @@ def exploration(
     *,
     goal: ErrorGoal | None = None,
     seconds: float = 400.0,
-    announce: Callable[[str], object] = silent,
+    announce: Progress = silent,
     progress: Progress = silent,
     vetoes: Callable[[Recording], bool] = lambda recording: False,
 ) -> Exploration:

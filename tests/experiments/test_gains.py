@@ -184,15 +184,6 @@ def test_a_reversed_input_reverses_the_gains(identified):
         gains_of((submission, reversed_), PidLoop(kp=0.5, ki=10.0))
 
 
-def test_the_scale_of_the_submission_replaces_that_of_the_bench(identified):
-    """If the submission states `per_count`, the gains are scaled by it, not by the bench's."""
-    submission, analysis = identified
-    stated = submission.system.input.model_copy(update={"per_count": 2 * DUTY})
-    system = submission.system.model_copy(update={"input": stated})
-    other = submission.model_copy(update={"system": system})
-    assert bench_scales(other, bench=BENCH, analysis=analysis).input == 2 * DUTY
-
-
 @pytest.mark.parametrize(
     ("loop", "limits", "amplitude", "message"),
     [
@@ -257,17 +248,3 @@ def test_a_proposed_pid_brings_cart_1_to_the_level(example):
     weak = PlanLimits(input=0.001, travel=2.5)
     with pytest.raises(DataError, match=r"no PID is proposed: .*input"):
         propose_pid(recording, submission=submission, analysis=analysis, bench=bench, limits=weak)
-
-
-def test_an_unstated_scale_is_asked_for(identified):
-    """If the scale from the bench's counts to centimetres is not stated, cartlab asks for it."""
-    submission, analysis = identified
-    with pytest.raises(DataError, match=r"state system\.position\.per_count in cm"):
-        bench_scales(submission, bench=replace(BENCH, position_unit="count"), analysis=analysis)
-
-
-def test_without_a_model_no_loop_is_closed(identified):
-    """Without identified carts there are no gains."""
-    submission, analysis = identified
-    with pytest.raises(DataError, match="needs identified carts"):
-        gains_of((submission, replace(analysis, fit=None)), StateLoop())

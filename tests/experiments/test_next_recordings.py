@@ -2,15 +2,13 @@
 
 import itertools
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pipeline.errors import ConfigError, DataError
+from pipeline.errors import ConfigError
 from pipeline.experiments.candidates import (
     optimal_tones,
-    propose_candidates,
 )
 from pipeline.experiments.goal import Goal, choose, find_goal
 from pipeline.experiments.information import FisherInformation
@@ -216,15 +214,6 @@ def test_a_users_proposal_is_compared_with_the_choice(analysis, known):
     assert not found.why
 
 
-def test_a_proposal_that_makes_the_fit_worse_is_reported(analysis):
-    """If a proposed recording would make the fit worse, the answer says so."""
-    mine = Recording(id="mine", kind="step", carts=(1, 2), wave="square", amplitude=0.005,
-                     frequency=2 / 120, cycles=4)  # fmt: skip
-    found = compare_recordings(analysis, mine, Plan(limits=LIMITS), goal="worst", commands=COMMANDS)
-    assert found.proposed > 1.01 * found.now
-    assert "the fit would be worse" in found.why
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -248,28 +237,6 @@ def test_only_dwells_are_chosen_if_dwells_identified_the_carts():
     found = choose_next(analysis, Plan(limits=LIMITS), n=2, goal="zeta_2", commands=COMMANDS)
     assert {r.kind for r in found.recordings} == {"sine"}
     assert found.errors[2] < found.errors[1] < found.errors[0]
-
-
-def test_a_new_dwell_has_the_misfit_of_earlier_ones():
-    """If earlier dwells lie off the fitted curve, a new dwell is expected to lie off it as much."""
-    known = FisherInformation.of(analysed("two-cart"))
-    dwell = Recording(
-        id="sine-new", kind="sine", carts=(1, 2), wave="sine", amplitude=0.05, frequency=2.0,
-        cycles=40,
-    )  # fmt: skip
-    exact, off = (replace(known, misfit=share).of_recording(dwell)[0] for share in (0.0, 0.1))
-    twice = replace(known, misfit=0.2).of_recording(dwell)[0]
-    assert np.trace(off) < 0.1 * np.trace(exact)
-    assert off == pytest.approx(4 * twice, rel=0.05, abs=1e-3 * np.abs(off).max())
-
-
-def test_carts_that_hardly_settle_get_no_dwells():
-    """For carts that take too long to settle, no dwell is chosen, and a message says so."""
-    known = FisherInformation.of(analysed("two-cart"))
-    slow = replace(known, chain=replace(known.chain, c=0.2 * known.chain.c))
-    goal = find_goal("worst", slow, feedback=None)
-    with pytest.raises(DataError, match="too long to settle"):
-        propose_candidates(slow, limits=LIMITS, commands=COMMANDS, goal=goal)
 
 
 # --------------------------------------------------------------------------- multisines
@@ -346,12 +313,3 @@ def test_the_command_adds_its_choice_to_the_plan(work):
     # The next prediction counts what is already planned.
     assert again["next"]["errors"][0] == pytest.approx(data["next"]["errors"][2], rel=1e-9)
     assert again["next"]["now"] == pytest.approx(data["next"]["now"], rel=1e-9)
-
-
-@pytest.mark.parametrize("words", [("--for", "zeta"), ("--next", 1, "--for", "omega_x")])
-def test_a_wrong_goal_is_one_line(work, words, monkeypatch):
-    """A goal without a number, or an unknown goal, is refused before data are read."""
-    monkeypatch.setattr("pipeline.experiments.next_recordings.analyse", None)
-    done = cartlab_here("plan", work, *words)
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1

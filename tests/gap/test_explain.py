@@ -10,8 +10,6 @@ import pytest
 
 from pipeline.errors import DataError
 from pipeline.gap.explain import explain_gap
-from pipeline.gap.runs import make_run
-from pipeline.gap.summary import repeatability
 from pipeline.gap.types import Gap
 from pipeline.json_files import plain
 from pipeline.plant.augmented import simulate_augmented
@@ -96,31 +94,6 @@ def test_one_of_two_effects_is_called_partial():
     assert gap.next_experiment
 
 
-@pytest.mark.parametrize("irregular", [False, True])
-def test_fast_samples_are_combined_into_readings(irregular):
-    """Four samples at 1 kHz become one reading, taken from a curve through the samples."""
-    t = np.arange(4001) / 1000.0
-    if irregular:
-        t = t + np.random.default_rng(0).uniform(-2e-4, 2e-4, t.size)
-    omega = 2 * np.pi * 4.0
-    record = Record(
-        id="fast", kind="sweep", t=t, u=np.cos(t), y=np.cos(omega * t)[None], carts=(1,),
-        free=(1,), resolution=np.array([1e-9]),
-    )  # fmt: skip
-
-    run = make_run(record, n=1)
-    thin = run.thin
-
-    assert run.block == 4
-    assert thin.shots == (0, thin.t.size) == (0, 1001)
-    assert thin.t[0] == run.t[0]
-    assert not thin.weight[0, 0]
-    # The fourth derivative of the motion causes an error of (omega h)⁴ / 1000, or 1e-7. At
-    # irregular times, the third causes (omega h)³ / 100. A plain mean would have an error of 4e-4.
-    limit = 2e-5 if irregular else 1e-6
-    np.testing.assert_allclose(thin.y[0, 2:-1], np.cos(omega * thin.t[2:-1]), atol=limit)
-
-
 def test_without_time_the_linear_model_is_returned():
     """Without any time for the search, the linear model is returned and marked as incomplete."""
     case = make_case(seed=45, n=1, effects=["dead_zone"], rate=113.1)
@@ -129,28 +102,6 @@ def test_without_time_the_linear_model_is_returned():
 
     assert (gap.verdict, gap.complete, gap.effects) == ("unexplained", False, ())
     assert gap.final == gap.baseline
-
-
-def test_repeats_are_aligned_at_the_edge_of_their_input():
-    """Repeats are aligned at the edge of their input, so they differ only by noise."""
-    case = make_case(seed=49, n=1, rate=113.1)
-    first = next(record for record in case.records if record.kind == "step")
-    assert first.u is not None
-    rest = np.zeros(20)
-    u = np.append(rest, first.u[:-20])
-    later = replace(
-        first,
-        id="later",
-        t=first.t + 1e-4,
-        u=u,
-        y=np.append(rest[None], first.y[:, :-20], axis=1),
-    )
-
-    runs = [make_run(record, n=1) for record in (first, later)]
-
-    assert repeatability(runs) == pytest.approx(0.0, abs=1e-3)
-    assert repeatability([runs[0], make_run(replace(later, u=0.5 * u), n=1)]) is None
-    assert repeatability([runs[0], replace(runs[1], id=runs[0].id)]) is None  # of one record
 
 
 @pytest.mark.parametrize(
@@ -364,18 +315,6 @@ def test_a_cart_without_recordings_does_not_change_the_verdict():
     gap = explain_gap(decays, Setup(springs=case.springs))
 
     assert gap.verdict == "none"
-
-
-def test_a_run_without_its_input_is_left_out_with_a_message():
-    """A step without a logged input is left out of fit and test, and a note says so."""
-    case = make_case(seed=49, n=1, rate=113.1)
-    first, *others = case.records
-    unknown = Record(**{**vars(first), "u": None})
-
-    gap = explain_gap([unknown, *others], Setup(springs=case.springs))
-
-    assert first.id not in (*gap.training, *gap.held_out)
-    assert any(first.id in note for note in gap.notes)
 
 
 def _late(*, seed: int) -> Record:

@@ -72,14 +72,6 @@ def test_the_properties_of_an_effect_follow_from_its_law():
     assert those(lambda e: e.needs_input) == idle
 
 
-def test_single_cart_has_one_spring_place():
-    """For one cart, only the sum of the springs matters, so an effect has only one place."""
-    assert find_effect("cubic_spring").places((True, True)) == (1,)
-    assert find_effect("cubic_spring").places((False, True)) == (2,)
-    assert find_effect("cubic_spring").places((True, True, False)) == (1, 2)
-    assert find_effect("coupling_damper").places((True, True, True)) == (2,)
-
-
 @pytest.mark.parametrize(
     ("typed", "meant"),
     [

@@ -2,14 +2,12 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.arrays import Array
-from pipeline.plant.augmented import compile_simulator
 from pipeline.plant.catalogue import find_effect
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.effect import AugmentedChain
@@ -56,18 +54,6 @@ def test_linear_chain_is_exact(preset, irregular):
     # The series is cut off at (omega h)^6 / 720, or 1e-7 per step for omega h <= 0.2. These errors
     # change sign with the motion; 1e-6 is promised.
     assert_allclose(got, simulate_linear(chain, t, u), atol=1e-6 * np.abs(got).max())
-
-
-def test_held_cart_is_a_wall():
-    """A held cart does not move, and the others move as if it were a wall."""
-    chain = PRESETS["throne-2dof"]
-    t = sample_times(400, 0.005)
-
-    got = simulate(linear_tables(chain), t, 0 * t, x0=[0.0, 1.0], free=(2,))
-
-    assert np.all(got[0] == 0.0)
-    exact = simulate_linear(chain, t, 0 * t, free=(2,), x0=np.array([1.0, 0.0]))
-    assert_allclose(got[1:], exact, atol=1e-6)
 
 
 def friction_decay(m, k, force, x0, t):
@@ -163,20 +149,6 @@ def test_every_effect_agrees_with_the_fine_step_simulator(key):
     assert np.sqrt(np.mean((linear - truth) ** 2)) > 2.0 * limit * COUNT
 
 
-def test_delay_shifts_the_response():
-    """A delay of n samples shifts the readings n samples later, or earlier if it is negative."""
-    chain = PRESETS["throne-2dof"]
-    t = sample_times(500, 0.005)
-    u = np.where(t > 0.1, 0.03, 0.0)
-    plain = simulate(linear_tables(chain), t, u)
-    for delay, shift in ((0.02, 4), (-0.02, -4)):
-        term = make_term(find_effect("input_delay"), place=0, values={"delay": delay}, chain=chain)
-
-        late = simulate(AugmentedChain(chain=chain, terms=(term,)).tables(), t, u)
-
-        assert_allclose(late[:, 100:400], plain[:, 100 - shift : 400 - shift], atol=1e-6)
-
-
 def test_diverging_model_is_reported_as_nan():
     """If a softening spring gives way, the readings become NaN, without a crash or endless run."""
     chain = PRESETS["throne-1dof"]
@@ -255,16 +227,6 @@ def test_after_compile_simulator_nothing_is_compiled():
     subprocess.run([sys.executable, "-c", _NOTHING_LEFT], check=True)
 
 
-def test_compiled_code_counts_no_references():
-    """Compiled code counts no references to arrays, since counting makes threads wait."""
-    compile_simulator()
-    folder = kernel._simulate.stats.cache_path
-    assert folder is not None
-    stored = list(Path(folder).glob("kernel._simulate*.nbc"))
-    assert stored
-    assert not any(b"NRT_incref" in file.read_bytes() for file in stored)
-
-
 @pytest.mark.parametrize("preset", list(PRESETS))
 def test_an_input_that_changes_within_a_step_is_exact(preset):
     """If the input changes within a simulation step, the motion is still right to 1e-4.
@@ -294,14 +256,6 @@ def test_a_jump_within_a_step_frees_a_held_cart_at_once():
         return simulate(tables, t, command, knots=knots, refine=refine)
 
     assert np.abs(run(1.0) - run(64.0)).max() < 0.02 * COUNT
-
-
-def test_memory_behind_the_last_sample_is_not_read():
-    """A run ends with its last sample, and memory beyond the array of times is not read."""
-    chain = Chain(m=np.array([1e-4]), c=np.zeros(1), k=np.zeros(2))
-    t = np.append(sample_times(100, 4e-3), 2e4)[:-1]  # a view, followed in memory by a wrong time
-    x = simulate(linear_tables(chain), t, np.full(t.size, 0.02))
-    assert_allclose(x[0], 0.5 * (0.02 / 1e-4) * t**2, rtol=1e-6, atol=1e-12)
 
 
 @pytest.mark.parametrize(

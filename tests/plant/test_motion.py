@@ -4,15 +4,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
-from pipeline.errors import DataError
 from pipeline.plant.augmented import simulate_augmented
-from pipeline.plant.catalogue import CATALOGUE, find_effect
+from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain, Effect, chain_scales
-from pipeline.plant.export.motion import STOP_TIME, EquationsOfMotion
+from pipeline.plant.export.motion import EquationsOfMotion
 from tests.helpers.effects import make_term
 
 CHAIN = PRESETS["throne-2dof"]
@@ -68,25 +66,3 @@ def test_the_system_moves_as_the_simulator_does(effect, driven):
 
     off = respond(model, x0, driven=driven) - expected
     assert np.sqrt(np.mean(off**2) / np.mean(expected**2)) < 5e-3
-
-
-def test_without_effects_it_is_the_linear_chain():
-    """Without effects the system is the linear state model A x + B u."""
-    rng = np.random.default_rng(1)
-    system = EquationsOfMotion(AugmentedChain(chain=CHAIN)).to_control()
-    A, B, *_ = CHAIN.state_space()
-
-    for _ in range(5):
-        x, u = rng.normal(size=4), rng.normal(size=1)
-        assert_allclose(system.dynamics(0.0, x, u), A @ x + B[:, 0] * u, rtol=1e-12, atol=1e-12)
-    assert system.state_labels == ["x1", "v1", "x2", "v2"]
-    assert (system.input_labels, system.output_labels) == (["u"], ["x1", "x2"])
-    assert system.params == {"stop": STOP_TIME}
-
-
-def test_a_drive_that_leads_its_log_has_no_system():
-    """A negative delay would need future input, so there is no system, and the error says so."""
-    term = make_term(find_effect("input_delay"), place=0, values={"delay": -0.01}, chain=CHAIN)
-
-    with pytest.raises(DataError, match="leads its log"):
-        EquationsOfMotion(AugmentedChain(chain=CHAIN, terms=(term,)))

@@ -103,16 +103,6 @@ def test_steady_state_of_a_band_limited_sine():
     assert rms(held[:, inner] - expected[:, inner]) > 0.2 * rms(expected[:, inner])
 
 
-def test_a_band_limited_constant_is_a_constant():
-    """The interpolation of equal samples is constant up to its ends."""
-    t = clock(100)
-    u = np.full(t.size, 0.03)
-
-    x = simulate_linear(THREE, t, u, hold="band_limited")
-
-    assert_allclose(x, simulate_linear(THREE, t, u), atol=1e-12)
-
-
 def test_a_linearly_rising_input_is_exact():
     """For a linearly rising input, a free mass moves as x = t³ / 6m at any sample times."""
     A, B, C, _ = Chain(m=np.array([2.0]), c=np.zeros(1), k=np.zeros(2)).state_space()

@@ -39,22 +39,6 @@ def test_settling_time_is_the_last_entry_into_the_band():
     assert_allclose(got, np.log(50) / 4.0, atol=np.pi / 20)
 
 
-def test_responses_of_an_array_are_judged_separately():
-    """Each response of an array gets its own results; one that never settles gets NaN."""
-    y = np.stack([second_order(20.0, 0.5), second_order(20.0, 0.1), np.zeros(T.size)])
-    level = np.ones(3)
-
-    settled = settling_time(T, y, before=0.0, level=level)
-
-    assert_allclose(settled[0], settling_time(T, y[0], before=0.0, level=1.0))
-    assert_allclose(settled[1], settling_time(T, y[1], before=0.0, level=1.0))
-    assert np.isnan(settled[2])
-    assert_allclose(
-        overshoot_percent(y, before=0.0, level=level)[:2],
-        [overshoot_percent(row, before=0.0, level=1.0) for row in y[:2]],
-    )
-
-
 def test_noise_widens_the_band():
     """A response that is outside the band only because of noise counts as settled."""
     y = second_order(20.0, 0.5) + 0.03 * np.sin(2000 * T)

@@ -13,7 +13,7 @@ from pipeline.plant.simulate import simulate_linear
 from pipeline.resources import EXAMPLES
 from pipeline.simulated.bench import COUNT, SAMPLE_TIME, BenchRun, ReleasingHand, SimulatedBench
 from pipeline.simulated.examples import CATALOGUE, write_examples
-from pipeline.simulated.submission import Students, write_submission
+from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
 
 PRESET_NAMES = list(PRESETS)
@@ -166,20 +166,6 @@ def test_a_hand_holds_then_lets_go_softly():
     assert x[1].max() > 1.2  # then it swings to the other side
 
 
-def test_after_the_hand_the_decay_is_free():
-    """After the hand has let go, each sample follows from the two before as in a free decay."""
-    chain, hand, run, bench = release_by_hand()
-
-    x = bench.move(run).x[1, run.t > hand.release + hand.fade + SAMPLE_TIME]
-
-    sigma = chain.zeta_carts[1] * chain.omega_carts[1]
-    omega_d = np.sqrt(chain.omega_carts[1] ** 2 - sigma**2)
-    decay = np.exp(-sigma * SAMPLE_TIME)
-    expected = 2 * decay * np.cos(omega_d * SAMPLE_TIME) * x[1:-1] - decay**2 * x[:-2]
-    assert_allclose(x[2:], expected, atol=1e-12)
-    assert x.size > 400
-
-
 # -------------------------------------------------------------- what they claim
 
 
@@ -197,18 +183,6 @@ def test_honest_claims_are_near_the_truth(sessions, preset):
             assert reported["initial"][name] == 0.10
 
 
-def test_reported_state_space_and_feedback(sessions):
-    """The reported A and B have the right shapes, and the reported gains are those that ran."""
-    document = toml(sessions / "throne-3dof")
-    reported = document["reported"]
-    (control,) = [e for e in document["experiments"] if e["kind"] == "closed_loop"]
-
-    assert np.shape(reported["state_space"]["A"]) == (6, 6)
-    assert np.shape(reported["state_space"]["B"]) == (6,)
-    assert reported["feedback"]["gains"] == control["controller"]["gains"]
-    assert reported["feedback"]["prefilter"] == control["controller"]["prefilter"]
-
-
 def test_the_controlled_cart_follows(sessions):
     """The controlled cart ends within 5 % of its reference.
 
@@ -224,39 +198,10 @@ def test_the_controlled_cart_follows(sessions):
 # ------------------------------------------------------------- other benches
 
 
-def test_four_carts(tmp_path):
-    """The simulation works for four carts too."""
-    chain = Chain(
-        m=np.full(4, 2.5e-4), c=np.full(4, 4e-4), k=np.array([0.0, 0.12, 0.1, 0.08, 0.06])
-    )
-
-    write_submission(
-        tmp_path,
-        SimulatedBench(chain=chain),
-        seed=4,
-        reported=True,
-        students=Students(title="Four"),
-    )
-
-    assert load_submission(tmp_path).system.springs == (False, True, True, True, True)
-    assert set(toml(tmp_path)["reported"]["final"]) == set(parameter_names(4))
-
-
 def test_an_unknown_preset_names_the_known_ones(tmp_path):
     """A misspelt preset gives an error that lists the known presets."""
     with pytest.raises(ConfigError, match=r"no preset 'throne-4dof': there are throne-1dof, "):
         write_submission(tmp_path, "throne-4dof", seed=0)
-
-
-def test_a_cart_without_damping_of_its_own(tmp_path):
-    """The decay of a cart without damping is cut where a student would stop the recording."""
-    chain = Chain(m=np.array([3e-4, 2e-4]), c=np.array([8e-4, 0.0]), k=np.array([0.05, 0.1, 0.05]))
-
-    write_submission(tmp_path, SimulatedBench(chain=chain), seed=7, compact=True)
-
-    last = experiments(tmp_path, "decay")[-1]
-    assert last["carts"] == [2]
-    assert 8.0 < table(tmp_path, last)["time"][-1] < 9.0
 
 
 def test_carts_that_never_settle_are_refused(tmp_path):

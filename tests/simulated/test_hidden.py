@@ -19,7 +19,7 @@ from pipeline.json_files import plain
 from pipeline.plant.augmented import rest_positions
 from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.plant.chain import PRESETS
-from pipeline.plant.effect import AugmentedChain, EffectTerm
+from pipeline.plant.effect import AugmentedChain
 from pipeline.plant.sampled_loop import StateFeedback
 from pipeline.setup import Setup
 from pipeline.simulated.bench import COUNT, SAMPLE_TIME, BenchRun, ReleasingHand, SimulatedBench
@@ -259,15 +259,6 @@ def test_a_hand_stops_before_the_end_stop():
     )
 
 
-def test_a_held_cart_stays_held():
-    """With effects on both carts, a held cart still reads zero."""
-    terms = (usual("coulomb_friction"), replace(usual("force_offset"), place=2))
-
-    x = bench(*terms).move(decay()).x
-
-    assert_array_equal(x[1], 0.0)
-
-
 def test_carts_that_run_away_are_refused():
     """A spring that softens until carts run away gives one clear error, in any run."""
     soft = usual("cubic_spring", coefficient=-20.0)
@@ -445,26 +436,3 @@ def test_one_place_can_have_only_one_dry_friction():
         prepare_bench(preset="throne-2dof", hide=["coulomb_friction", "stiction"])
     hide = ["coulomb_friction", "stiction:cart=2"]
     assert len(prepare_bench(preset="throne-2dof", hide=hide).effects) == 2
-
-
-def test_a_bench_needs_one_source(tmp_path):
-    """A bench is made from either a preset or a model: both, or neither, is an error."""
-    with pytest.raises(ConfigError, match="either --preset or --model"):
-        prepare_bench()
-    with pytest.raises(ConfigError, match="either --preset or --model"):
-        prepare_bench(preset="throne-1dof", model=tmp_path)
-
-
-def test_an_effect_that_equals_the_linear_chain_is_reported():
-    """A note says if no data of this bench can distinguish a hidden effect from the chain."""
-    prepared = prepare_bench(preset="throne-1dof", hide=["coupling_damper"])
-
-    assert prepared.effect_sentences[0].endswith("here the linear chain can do the same")
-    (term,) = prepared.effects
-    assert isinstance(term, EffectTerm)
-    # It acts as the cart's own damping.
-    chain = PRESETS["throne-1dof"]
-    damped = replace(chain, c=chain.c + term.values[0])
-    assert_allclose(
-        bench(term, chain=chain).move(step(1)).x, bench(chain=damped).move(step(1)).x, atol=1e-6
-    )

@@ -82,17 +82,6 @@ def test_the_position_unit_does_not_matter(unit):
     assert_allclose(got.parameters["K_2"].value, unit * truth["K_2"], rtol=1e-5)
 
 
-def test_a_rigid_body_has_mass_and_damping():
-    """If a single cart has no spring, the fit gives the cart's mass and damping."""
-    cart = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.zeros(2))
-
-    got = fit_bode(exact(cart), bench=Setup(springs=(False, False)))
-
-    assert_allclose(got.parameters["mass"].value, 3e-4, rtol=1e-5)
-    assert_allclose(got.parameters["damping"].value, 1e-3, rtol=1e-5)
-    assert got.staged == {}
-
-
 def test_the_staged_fit_is_reported_as_well():
     """From exact data, the stage-by-stage fit finds all parameters, even the recomputed ones."""
     chain = PRESETS["throne-3dof"]
@@ -126,18 +115,6 @@ def test_intervals_contain_the_true_values(preset, phases):
 # ------------------------------------------------------------------ hard cases
 
 
-def test_a_missing_far_spring_and_damper_are_found_to_be_zero():
-    """If the far spring and the damper of cart 2 are missing, the fit finds both to be zero."""
-    chain = PRESETS["throne-2dof"]
-    loose = Chain(m=chain.m, c=np.array([6e-4, 0.0]), k=np.array([0.05, 0.127, 0.0]))
-
-    got = fit_bode(exact(loose), bench=Setup(springs=(True,) * 3))
-
-    assert_allclose(got.chain.k, loose.k, atol=1e-5)
-    assert_allclose(got.chain.c, loose.c, atol=1e-7)
-    assert_allclose(got.parameters["K_1"].value, got.parameters["K_2"].value, rtol=1e-4)
-
-
 # All points are beside the sharp peak, so they do not show its damping.
 SHARP = Chain(m=np.array([2e-3]), c=np.array([0.0]), k=np.array([0.6, 0.0]))
 BESIDE = np.sqrt(300.0) * np.array([0.4, 0.6, 0.8, 1.25, 1.5, 2.0])
@@ -155,24 +132,6 @@ def test_a_damping_at_its_bound_has_no_standard_error():
     assert (zeta.value, zeta.std, zeta.at_bound) == (0.0, None, True)
     assert not got.parameters["K"].at_bound
     assert_allclose(got.parameters["omega_n"].value, np.sqrt(300.0), rtol=1e-4)
-
-
-def test_a_damping_at_its_bound_widens_the_modes_errors():
-    """If one of two dampings is held at zero, the modes' dampings get larger standard errors.
-
-    This is because the true value of the held damping need not be zero.
-    """
-    chain = replace(PRESETS["throne-2dof"], c=np.array([6e-4, 0.0]))
-    got = fit_bode(exact(chain), bench=Setup(springs=(False, True, True)))
-
-    assert got.at_bound == ("c_2",)
-    assert got.parameters["zeta_2"].at_bound
-    row = got.names.index("c_2")
-    damping_std = float(np.sqrt(got.covariance[row, row]))
-    # c_2 causes over a third of the second mode's damping rate, by its share of kinetic energy.
-    std = got.parameters["zeta_b"].std
-    assert std is not None
-    assert std > 0.3 * damping_std / (2 * chain.m[1] * got.parameters["omega_b"].value)
 
 
 def test_a_damping_that_the_response_leaves_open_is_the_decays():
@@ -246,23 +205,6 @@ def test_phases_that_contradict_the_magnitudes_are_left_out(change):
     expected = fit_bode(bare, bench=Setup(springs=(True,) * 3))
     assert "the phases do not agree" in got.message
     assert got.parameters == expected.parameters
-
-
-def test_good_phases_sharpen_the_dampings():
-    """Phases as good as the magnitudes reduce the standard errors of the dampings."""
-    responses = noisy("throne-3dof", phases=True)
-
-    both = fit_bode(responses, bench=Setup(springs=(True,) * 4))
-    bare = fit_bode(
-        [replace(r, phase=None, phase_std=None) for r in responses],
-        bench=Setup(springs=(True,) * 4),
-    )
-
-    for name in ("zeta_a", "zeta_b", "zeta_c", "omega_b"):
-        sharp, blunt = both.parameters[name].std, bare.parameters[name].std
-        assert sharp is not None
-        assert blunt is not None
-        assert sharp < blunt
 
 
 def test_a_misfit_widens_the_errors():

@@ -10,7 +10,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.modal_response import find_modes
 from pipeline.estimation.noise import long_run_variance, score_covariance
 from pipeline.estimation.parametrisation import Parametrisation
-from pipeline.estimation.time_window import compare, open_window, usable_segment
+from pipeline.estimation.time_window import compare, open_window
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.simulate import simulate_linear
@@ -18,7 +18,7 @@ from pipeline.results import ChainFit, Record
 from pipeline.setup import Setup
 from pipeline.stages.time_fit import fit_records
 from pipeline.submission import load_submission
-from tests.helpers.time_records import COUNT, decay_record, measure, random_chain, step_record
+from tests.helpers.time_records import decay_record, measure, random_chain, step_record
 from tests.helpers.ucsd import write_two_cart_submission
 
 
@@ -184,21 +184,6 @@ def test_a_cart_that_was_not_measured_is_still_found():
     assert np.max(np.abs(errors(fit, chain))) < 4
 
 
-def test_a_long_fast_sweep_is_fitted_whole():
-    """All samples of a sweep of 20 s at 1 kHz are fitted, from a single start."""
-    rng = np.random.default_rng(17)
-    chain = PRESETS["throne-2dof"]
-    t = np.arange(20_000) / 1000.0
-    u = 0.02 * np.sin(2 * np.pi * (0.2 * t + 0.17 * t**2))  # from 0.2 to 7 Hz
-    y = simulate_linear(chain, t, u)
-    record = measure(y, t, u, kind="sweep", carts=(1, 2), rng=rng, noise=0.001)
-    fit = fit_records([record], bench=Setup(springs=(True,) * 3))
-    assert fit.converged
-    assert fit.n_starts == 1
-    assert fit.n_points == 2 * t.size
-    assert np.max(np.abs(errors(fit, chain))) < 4
-
-
 def test_a_body_on_no_spring_has_mass_and_damping():
     """A cart without springs is fitted as a rigid body, even if springs were declared."""
     truth = Chain(m=np.array([2e-4]), c=np.array([5e-4]), k=np.zeros(2))
@@ -294,14 +279,6 @@ def test_records_that_no_chain_explains_give_no_fit():
     assert "no chain reproduces the recordings" in fit.message
 
 
-def test_a_decay_is_used_from_its_release_on():
-    """A decay is used from less than a quarter of a period after its release."""
-    record = decay_record(PRESETS["throne-1dof"], free=(1,), rng=np.random.default_rng(13))
-    start = record.t[usable_segment(record)][0]
-    # The release is at 1.5 s; a quarter of the period of 0.48 s later, half the swing is lost.
-    assert 1.5 < start < 1.5 + 0.12
-
-
 # ------------------------------------------------------------- standard errors
 
 
@@ -322,31 +299,6 @@ def test_correlated_residuals_widen_the_error():
     # of the spectrum: one ratio errs by sqrt(2/5.5) = 0.6, and the mean of 60 by 0.08.
     assert_allclose(ratios / runs, 1.0, atol=0.3)
     assert long_run_variance(fast[0]) == 1.0  # not below the mean square
-
-
-@pytest.mark.slow
-@pytest.mark.sample
-def test_a_long_rest_before_the_step_is_one_reading():
-    """A long rest before the step does not make the gain more certain."""
-    chain, rng, runs, rate = PRESETS["throne-1dof"], np.random.default_rng(18), 24, 500.0
-    t = np.arange(int(10 * rate)) / rate
-    u = np.where(t > 5.0, 1.0 / chain.static_gains()[0], 0.0)
-    y = simulate_linear(chain, t, u)
-    off, white = [], []
-    for _ in range(runs):
-        record = measure(
-            y + COUNT * rng.uniform(), t, u, kind="step", carts=(1,), rng=rng, noise=0.0005
-        )
-        fit = fit_records([record], bench=Setup(springs=(True, True)))
-        off.append(errors(fit, chain))
-        moving = t >= 5.0 - 1.5 / rate  # without the rest before the step
-        short = replace(record, t=t[moving] - t[moving][0], u=u[moving], y=record.y[:, moving])
-        white.append(
-            std(fit, "K") / std(fit_records([short], bench=Setup(springs=(True, True))), "K")
-        )
-    # From 24 records, a spread is known to 14 %.
-    assert 0.6 < np.sqrt(np.mean(np.square(off)[:, 0])) < 1.4
-    assert 0.5 < np.median(white) < 1.1
 
 
 # -------------------------------------------------------------------- real carts

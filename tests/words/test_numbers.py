@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.words.numbers import percent, significant, with_error, with_errors
+from pipeline.words.numbers import significant, with_error
 
 _SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻−", "0123456789--")
 
@@ -76,18 +76,3 @@ def test_rounding_is_small_beside_the_error(value, ratio):
 def test_significant_digits(value, expected):
     """A number has four digits, a power of ten if it is very long, a dash if it is missing."""
     assert significant(value) == expected
-
-
-def test_only_changes_in_percent_have_a_sign():
-    """A percentage has a sign only if it is a change; a missing percentage is a dash."""
-    assert percent(5.14, signed=True) == "+5.1 %"
-    assert percent(-148.2, signed=True) == "−148 %"
-    assert percent(5.14) == "5.1 %"
-    assert percent(None) == "–"
-
-
-def test_a_column_has_one_form():
-    """If one number of a column needs a power of ten, all its numbers have one."""
-    small, large = (3.12812e-4, 1.2e-6), (0.1274769, 3.9e-6)
-    assert with_errors([large]) == ["0.1274769 ± 0.0000039"]
-    assert with_errors([small, large]) == ["(3.128 ± 0.012) × 10⁻⁴", "(1.274769 ± 0.000039) × 10⁻¹"]

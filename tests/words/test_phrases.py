@@ -1,18 +1,14 @@
 """The sentences that an instructor may edit: found by key, with values and markup."""
 
 import ast
-import re
-import tomllib
 from pathlib import Path
 
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.report.effects import gallery
 from pipeline.resources import TEMPLATES
 from pipeline.words.phrases import Phrases, phrases
 from pipeline.words.spans import Span
-from tests.helpers.commandline import cartlab_here
 from tests.helpers.places import ROOT
 
 PIPELINE = ROOT / "pipeline"
@@ -69,16 +65,6 @@ def test_values_in_a_sentence_are_never_markup(tmp_path):
     assert words.spans("a", name=name)[1:3] == (Span("K", "em"), Span(", see "))
 
 
-@pytest.mark.parametrize("subject", SUBJECTS)
-def test_a_catalogue_is_plain_toml(subject):
-    """A catalogue is one table of strings, and braces in them only enclose values."""
-    found = tomllib.loads((TEMPLATES / "words" / f"{subject}.toml").read_text(encoding="utf-8"))
-    for key, text in found.items():
-        assert isinstance(text, str), key
-        shown = re.sub(r"\{ [^{}]* \}", "", re.sub(r"\{\w+\}", "", text))
-        assert shown.count("{") == 0, key
-
-
 @pytest.mark.parametrize(
     ("text", "named"),
     [
@@ -99,13 +85,3 @@ def test_a_mistake_in_a_sentence_is_reported_in_one_line(tmp_path, text, named):
             say("a", share="3 %", cart="1")
         assert named in str(error.value)
         assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("text", ['effects = "{shaer}"', 'effects = "All', 'made = "By hand"'])
-def test_a_slip_ends_a_command_in_one_line(tmp_path, monkeypatch, text):
-    """A mistake in a sentence ends a command with exit status 2 and without a traceback."""
-    monkeypatch.setattr(gallery, "_WORDS", written(tmp_path, text))
-    done = cartlab_here("effects", "coulomb_friction", "--out", tmp_path / "out")
-    assert done.returncode == 2
-    (line,) = done.stderr.strip().splitlines()
-    assert "templates/words/gap.toml" in line

@@ -6,13 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.errors import DataError
 from pipeline.gap.explain import investigate
 from pipeline.gap.runs import prepare
 from pipeline.gap.types import read_gap
 from pipeline.json_files import json_text
 from pipeline.plant.chain import PRESETS, Chain
-from pipeline.results import Intervention, LeftOut
+from pipeline.results import Intervention
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.time_records import decay_record, step_record
@@ -63,13 +62,6 @@ def test_a_run_that_the_report_leaves_out_is_not_used(analysis):
     assert read_gap(text).left_out == (odd,)
 
 
-def test_an_older_gap_file_is_still_read(analysis):
-    """An older `gap.json` without `left_out` is read as if no recording had been left out."""
-    document = json.loads(json_text(investigate(analysis, progress=lambda text: None)))
-    del document["left_out"]
-    assert read_gap(json.dumps(document)).left_out == ()
-
-
 def test_a_cart_at_rest_before_a_release_is_not_a_run():
     """If a cart rests before a hand pulls and releases it, only the decay counts as a run."""
     decay = decay_record(CHAIN, free=(1,), rng=np.random.default_rng(6))
@@ -87,13 +79,3 @@ def test_a_cart_at_rest_before_a_release_is_not_a_run():
     (run,) = prepare([record], springs=(True, True), interventions=[hand], notes=[])
 
     assert run.t[0] > hand.end
-
-
-def test_without_any_recording_the_error_gives_the_reasons(analysis):
-    """If every recording is left out, the error gives the reasons."""
-    out = tuple(
-        LeftOut(experiment=record.id, reason="its clock stood still", is_wrong=True)
-        for record in analysis.records
-    )
-    with pytest.raises(DataError, match=r"left out, as in the report: step-1.*: its clock stood"):
-        investigate(replace(analysis, left_out=out), progress=lambda text: None)

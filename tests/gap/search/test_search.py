@@ -52,15 +52,6 @@ def test_hidden_effects_are_named(hidden, verdict, found):
     }
 
 
-def test_without_time_the_linear_model_is_the_answer():
-    """After the time limit, no effect is tried, and the linear model is returned."""
-    search = searched(FRICTION, seconds=0.0)
-
-    assert search.deadline.cut
-    assert search.chosen.key == set()
-    assert search.verdict == "unexplained"
-
-
 @pytest.mark.slow
 @pytest.mark.sample
 def test_overestimated_noise_is_measured_again():

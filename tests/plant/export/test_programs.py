@@ -87,17 +87,6 @@ def test_c_moves_as_the_simulator_does(effect: Effect, tmp_path):
 
 
 @no_compiler
-@pytest.mark.parametrize("run", RUNS)
-def test_c_moves_as_the_simulator_does_with_friction_play_and_delay(run, tmp_path):
-    """With friction, play and delay together, or without effects, C agrees with the simulator."""
-    u, x0 = RUNS[run]
-    for name, model, limit in (("hard", HARD, KNOCKS), ("linear", model_of(), SMOOTH)):
-        (tmp_path / name).mkdir()
-        found = compiled(model, tmp_path / name).simulate(T, u, x0=x0)
-        assert off(found, simulate_augmented(model, T, u, x0=x0)) < limit
-
-
-@no_compiler
 @pytest.mark.parametrize("free", [1, 2])
 def test_a_cart_that_was_always_held_does_not_move(free, tmp_path):
     """A cart that is held in all runs does not move and adds no parameters to the model."""
@@ -283,15 +272,6 @@ def test_an_fmu_refuses_unsupported_calls(hard_fmu):
     with pytest.raises(FMICallException, match="DoStep"):
         run(instance, refer, STEP, {"k3": -1e6})
     instance.freeInstance()
-
-
-@no_compiler
-def test_the_same_model_gives_the_same_bytes(hard_fmu):
-    """The same model gives an FMU with the same bytes; a different model has a different GUID."""
-    assert fmu(describe(HARD, units=PAPER_UNITS))[0] == hard_fmu.read_bytes()
-    other, _ = fmu(describe(model_of("coulomb_friction"), units=PAPER_UNITS))
-    guids = {read_model_description(f).guid for f in (io.BytesIO(other), str(hard_fmu))}
-    assert len(guids) == 2
 
 
 def test_without_a_compiler_the_fmu_has_only_sources(monkeypatch):

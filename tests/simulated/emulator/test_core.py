@@ -152,15 +152,6 @@ def test_a_reset_forgets_and_a_stop_does_not():
     assert {line.duty for line in lines} == {0}
 
 
-def test_a_start_during_a_run_restarts_it():
-    """A start during a run sets the stamps and the PID's sum to zero."""
-    core = make_core()
-    first = run(core, b"g;0;1;0;d;q;c;o;10;500;9;", lambda k: (-100, 0), ticks=80)
-    again = run(core, b"d;q;c;o;10;500;9;", lambda k: (-100, 0), ticks=80, first=80)
-    assert [line.ms for line in again] == list(range(80))
-    assert first == again
-
-
 def test_silence_after_a_heartbeat_cuts_the_motor():
     """100 ms after the last heartbeat the run ends, and no other run starts without a heartbeat.
 
@@ -190,10 +181,3 @@ def test_a_query_is_answered_during_a_run():
     assert answer.startswith(b"?cartlab/1 name=x ")
     assert parse_reading(reading) == Reading(counts=(0, 0), target=0, duty=0, ms=0)
     assert run(make_core(commands=frozenset()), b"?;s;k;", still, ticks=3) == []
-
-
-def test_a_bench_of_three_encoders_sends_three_counts():
-    """On a bench of three encoders a line has three counts, and state feedback six gains."""
-    core = make_core(encoders=3, carts=3)
-    lines = run(core, b"f;0;0;0;0;1;0;0;d;q;c;o;100;9;1;", lambda k: (0, 0, k), ticks=5)
-    assert lines[-1] == Reading(counts=(0, 0, 4), target=0, duty=-4, ms=4)

@@ -24,12 +24,9 @@ from pipeline.protocol import (
     parse_description,
     parse_reading,
 )
-from pipeline.results import Record
 from pipeline.simulated.emulator.carts import TRUE_PERIOD, VirtualCarts
-from pipeline.simulated.emulator.links import open_link
 from pipeline.simulated.emulator.server import Faults, read_fault
 from pipeline.simulated.hidden import prepare_bench
-from pipeline.stages.log_decrement import fit_log_decrement
 from tests.helpers.benches import Emulator, emulator
 from tests.helpers.waiting import started
 
@@ -124,35 +121,6 @@ def test_a_step_gives_the_static_gain(fast_bench):
     np.testing.assert_allclose(gain, expected, rtol=1e-3)
 
 
-def test_a_released_cart_swings_at_its_own_frequency(fast_bench):
-    """With cart 1 held, a released cart 2 swings with the chain's frequency ω_2 and damping ζ_2."""
-    chain = PRESETS["throne-2dof"]
-    with host(fast_bench) as line:
-        line.write(encode(Hands(held=(1,), released=2)))
-        time.sleep(1.0)  # the hand needs 1.5 s of the bench's clock
-        readings = stream(fast_bench, line, Start(wave=Wave.DELTA, frequency=0.2, amplitude=0))
-        line.write(encode(Hands()))
-    counts = np.array([reading.counts for reading in readings], dtype=float).T
-    assert np.ptp(counts[0]) <= 1
-    record = Record(
-        id="decay",
-        kind="decay",
-        t=np.arange(len(readings), dtype=np.float64) * TRUE_PERIOD,
-        u=None,
-        y=counts,
-        carts=(1, 2),
-        free=(2,),
-        resolution=np.ones(2),
-    )
-    fit = fit_log_decrement(record, cart=2)
-    assert 0.3 <= fit.release <= 0.65
-    omega_n = np.sqrt((chain.k[1] + chain.k[2]) / chain.m[1])
-    # The fit's own standard errors are some 1e-5 and 1e-4. The fit starts while the hand's force
-    # fades, which adds some error.
-    assert fit.omega_n == pytest.approx(omega_n, rel=5e-4)
-    assert fit.zeta == pytest.approx(chain.c[1] / (2 * chain.m[1] * omega_n), rel=5e-3)
-
-
 def test_a_hand_releases_the_cart_even_if_the_run_starts_early():
     """If a run starts while a virtual hand still pulls, the hand still releases the cart."""
     carts = VirtualCarts(prepare_bench(preset="throne-1dof"), seed=1)
@@ -177,26 +145,6 @@ def damaged(readings: bytes) -> tuple[list[Reading], int]:
     """Return the lines that a host can read, and the number of those that it cannot."""
     parsed = [parse_reading(line) for line in readings.split(b"\n") if line]
     return [reading for reading in parsed if reading is not None], parsed.count(None)
-
-
-def test_a_host_finds_the_injected_faults():
-    """A host finds as many lost, garbled and merged lines as the emulator injected."""
-    faults = [f"--fault={kind}=0.01" for kind in ("drop", "garble", "merge", "delay", "reset")]
-    with emulator("--speed", "10", *faults) as bench, host(bench) as line:
-        start = encode(Start(wave=Wave.SINE, frequency=1.0, amplitude=200, cycles=20))
-        readings, spoiled = damaged(play(bench, line, start))
-        run = bench.event("run")
-    injected = run["injected"]
-    assert run["ended"] == "done"
-    assert all(120 < injected[kind] < 280 for kind in ("drop", "garble", "merge", "reset"))
-    assert spoiled == injected["garble"] + injected["merge"]
-    lost = injected["drop"] + injected["garble"] + 2 * injected["merge"]
-    assert len(readings) == run["lines"] - lost
-    ms = np.array([reading.ms for reading in readings])
-    # If a new clock follows another at once, the host may see only one of them.
-    assert np.sum(np.diff(ms) < 0) == pytest.approx(injected["reset"], abs=5)
-    # A lump holds the lines of 50 ms.
-    assert injected["late"] == pytest.approx(50 * injected["delay"], rel=0.05)
 
 
 def test_faults_come_at_the_requested_time():
@@ -312,29 +260,3 @@ def test_an_unknown_fault_is_reported(fault, message):
     """A fault that does not exist gives one clear message."""
     with pytest.raises(ConfigError, match=message):
         read_fault(fault)
-
-
-@pytest.mark.parametrize(
-    ("port", "message"),
-    [
-        ("COM3", "write socket://127.0.0.1:5555"),
-        ("socket://localhost", "write socket"),
-        ("socket://localhost:99999", "write socket"),
-        ("socket://0.0.0.0:0", "anyone who reaches this port"),
-    ],
-)
-def test_an_invalid_port_is_reported(port, message):
-    """A malformed port, or one that other computers could reach, gives one clear message."""
-    with pytest.raises(ConfigError, match=message):
-        open_link(port)
-
-
-def test_a_port_in_use_is_reported():
-    """Two benches cannot share one port, and a remote port must be requested explicitly."""
-    first = open_link("socket://127.0.0.1:0")
-    with pytest.raises(ConfigError, match=r"in use|normally permitted"):
-        open_link(first.address)
-    first.close()
-    anywhere = open_link("socket://0.0.0.0:0", remote=True)
-    assert anywhere.address.startswith("socket://0.0.0.0:")
-    anywhere.close()
