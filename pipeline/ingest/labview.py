@@ -13,7 +13,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from io import BytesIO
-from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,9 +23,9 @@ from pipeline.ingest.columns import is_time, join_unit
 from pipeline.ingest.table import (
     FileTable,
     Variable,
+    binary_table,
     checked_names,
     not_read,
-    refuse_unusable,
 )
 from pipeline.ingest.text import Block, Layout, decode, read_block
 from pipeline.words.numbers import first_few
@@ -222,11 +221,7 @@ def _headings(segment: _Segment, names: Sequence[str]) -> list[str]:
 # -------------------------------------------------------------------------------------------- .tdms
 
 _LEAD_IN = 28  # bytes
-_METADATA, _NEW_LIST, _BIG_ENDIAN = 0x2, 0x4, 0x40  # flags of a segment
-_MOST_METADATA = 10_000_000  # bytes
-_MOST_OBJECTS = 1_000
-_MOST_VISITS = 2_000_000  # limit; npTDMS visits each object in each segment
-_MOST_VALUES, _MOST_CHUNKS = 5_000_000, 200_000
+_BIG_ENDIAN = 0x40  # flag of a segment
 _SETTING = 0.1  # share of the longest channel; shorter channels are settings, as in a .mat file
 _MOST_NAMED = 8
 
@@ -243,7 +238,7 @@ def read_tdms(raw: bytes, *, source: str) -> list[FileTable]:
     ------
     SubmissionError : the file is broken or truncated, or holds no recording.
     """
-    _refuse_endless(raw, source=source)
+    _refuse_cut(raw, source=source)
     channels = _read_channels(raw, source=source)
     groups = _recordings(channels, source=source)
     used = [channel for read in groups.values() for channel in read]
@@ -275,17 +270,7 @@ def _table(group: str, read: Sequence["_Channel"], *, source: str) -> FileTable:
             names.insert(0, "time")
             columns.insert(0, even_times(read[0].samples, start=start, interval=interval))
     names = checked_names(names, place=f"{source} group {group!r}")
-    values = np.array(columns, dtype=np.float64)
-    refuse_unusable(values, names=names, place=lambda row: f"{source} sample {row + 1}")
-    return FileTable(
-        source=source,
-        form="tdms",
-        names=tuple(names),
-        values=values,
-        whole=tuple(bool((column == np.round(column)).all()) for column in values),
-        lines=None,
-        run=group,
-    )
+    return binary_table(columns, names=names, source=source, form="tdms", run=group)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -313,36 +298,24 @@ class _Channel:
         return join_unit(self.name, self.unit)
 
 
-def _refuse_endless(raw: bytes, *, source: str) -> None:
-    """Refuse a file that is truncated, or on which npTDMS would work longer than on any recording.
+def _refuse_cut(raw: bytes, *, source: str) -> None:
+    """Refuse a truncated file, of which npTDMS would read a part without a word.
 
     Raises
     ------
     SubmissionError : the file is refused.
     """
-    at = named = objects = visits = metadata = 0
+    at = 0
     while at < len(raw):
         if raw[at : at + 4] != b"TDSm" or at + _LEAD_IN > len(raw):
             raise SubmissionError(f"{source}: broken at byte {at:,}, where a segment should begin")
-        (flags,) = struct.unpack_from("<I", raw, at + 4)
-        order = ">" if flags & _BIG_ENDIAN else "<"
-        length, data = struct.unpack_from(f"{order}QQ", raw, at + 12)
+        order = ">" if raw[at + 4] & _BIG_ENDIAN else "<"
+        (length,) = struct.unpack_from(f"{order}Q", raw, at + 12)
         end = at + _LEAD_IN + length
         if end > len(raw):  # also true if LabVIEW never wrote the length
             raise SubmissionError(
                 f"{source}: the segment at byte {at:,} is not whole: the file was cut short, or "
                 "copied while LabVIEW was writing it"
-            )
-        if flags & _METADATA and end >= at + _LEAD_IN + 4:
-            (named,) = struct.unpack_from(f"{order}I", raw, at + _LEAD_IN)
-            objects = named + (0 if flags & _NEW_LIST else objects)
-            metadata += data
-            visits += named
-        visits += objects
-        if named > _MOST_OBJECTS or visits > _MOST_VISITS or metadata > _MOST_METADATA:
-            raise SubmissionError(
-                f"{source}: has too many pieces or channels; keep one recording and write it again "
-                "with TDMS Defragment in LabVIEW"
             )
         at = end
 
@@ -356,23 +329,14 @@ def _read_channels(raw: bytes, *, source: str) -> list[_Channel]:
     """
     from nptdms import TdmsFile
 
-    channels: list[_Channel] = []
     with _complaints() as messages:
         try:
-            with TdmsFile.open(BytesIO(raw)) as file:
-                values = sum(len(one) for group in file.groups() for one in group.channels())
-                chunks = islice(file.data_chunks(), _MOST_CHUNKS + 1) if values else ()
-                large = values > _MOST_VALUES or sum(1 for _ in chunks) > _MOST_CHUNKS
-            if not large:
-                file = TdmsFile.read(BytesIO(raw))
-                channels = [_channel(one) for group in file.groups() for one in group.channels()]
+            file = TdmsFile.read(BytesIO(raw))
+            channels = [_channel(one) for group in file.groups() for one in group.channels()]
+        except MemoryError:
+            raise
         except Exception:  # npTDMS raises many kinds of errors
             raise SubmissionError(f"{source}: the .tdms file is broken or cut short") from None
-    if large:
-        raise SubmissionError(
-            f"{source}: holds more than {_MOST_VALUES:,} numbers, or {_MOST_CHUNKS:,} pieces; "
-            "keep one recording"
-        )
     if messages:
         raise SubmissionError(f"{source}: the .tdms file is damaged ({messages[0][:100]})")
     return channels

@@ -18,9 +18,9 @@ from pipeline.ingest.table import (
     MOST_COLUMNS,
     FileTable,
     Variable,
+    binary_table,
     checked_names,
     not_read,
-    refuse_unusable,
 )
 from pipeline.words.numbers import first_few
 
@@ -121,26 +121,12 @@ def read_mat(raw: bytes, *, source: str) -> list[FileTable]:
         for v in variables
     )
     notes += not_read([variable for variable in made if not variable.read])
-    columns = []
-    for name, column in zip(names, arrays, strict=True):
-        wide = column.astype(np.float64)
-        refuse_unusable(wide[None, :], names=[name], place=lambda row: f"{source} sample {row + 1}")
-        unwrapped = _unwrap(wide, column.dtype)
-        if unwrapped is not wide:
+    columns = [_unwrap(column) for column in arrays]
+    for name, column, unwrapped in zip(names, arrays, columns, strict=True):
+        if unwrapped is not column:
             notes.append(f"{name}: a {column.dtype} counter that overflowed was made continuous")
-        columns.append(unwrapped)
-    values = np.array(columns)
     return [
-        FileTable(
-            source=source,
-            form=form,
-            names=tuple(names),
-            values=values,
-            whole=tuple(bool((column == np.round(column)).all()) for column in values),
-            lines=None,
-            notes=tuple(notes),
-            variables=made,
-        )
+        binary_table(columns, names=names, source=source, form=form, notes=notes, variables=made)
     ]
 
 
@@ -185,17 +171,9 @@ def _structure(name: str, fields: Mapping[str, MatVariable], *, source: str) -> 
     named = all(label for label, _ in columns)
     names = [label if named else str(i) for i, (label, _) in enumerate(columns, start=1)]
     names = checked_names(names, place=f"{source} {name}".strip())
-    values = np.array([column.astype(np.float64) for _, column in columns])
-    refuse_unusable(values, names=names, place=lambda row: f"{source} sample {row + 1}")
-    return FileTable(
-        source=source,
-        form="variables" if named else "matrix",
-        names=tuple(names),
-        values=values,
-        whole=tuple(bool((column == np.round(column)).all()) for column in values),
-        lines=None,
-        run=name,
-    )
+    form = "variables" if named else "matrix"
+    arrays = [column for _, column in columns]
+    return binary_table(arrays, names=names, source=source, form=form, run=name)
 
 
 def _label(element: Mapping[str, MatVariable]) -> str:
@@ -274,11 +252,12 @@ def _advice(variable: MatVariable, *, longest: int) -> str:
     return ""
 
 
-def _unwrap(values: np.ndarray, dtype: np.dtype) -> np.ndarray:
+def _unwrap(values: np.ndarray) -> np.ndarray:
     """Undo the overflow of a 16-bit encoder counter: a jump of more than half its range."""
-    if dtype.kind not in "iu" or dtype.itemsize != 2 or np.abs(np.diff(values)).max() <= 2**15:
+    if values.dtype.kind not in "iu" or values.dtype.itemsize != 2:
         return values
-    return np.unwrap(values, period=2**16)
+    wide = values.astype(np.float64)
+    return np.unwrap(wide, period=2**16) if np.abs(np.diff(wide)).max() > 2**15 else values
 
 
 # ------------------------------------------------------------------------------- variables

@@ -163,6 +163,37 @@ def checked_names(
     return clean
 
 
+def binary_table(
+    columns: Sequence[np.ndarray],
+    *,
+    names: Sequence[str],
+    source: str,
+    form: str,
+    run: str = "",
+    notes: Sequence[str] = (),
+    variables: Sequence[Variable] = (),
+) -> FileTable:
+    """Return the table of a binary file, which has samples instead of lines.
+
+    Raises
+    ------
+    SubmissionError : a number is not usable.
+    """
+    values = np.array(columns, dtype=np.float64)
+    refuse_unusable(values, names=names, place=lambda row: f"{source} sample {row + 1}")
+    return FileTable(
+        source=source,
+        form=form,
+        names=tuple(names),
+        values=values,
+        whole=tuple(bool((column == np.round(column)).all()) for column in values),
+        lines=None,
+        run=run,
+        notes=tuple(notes),
+        variables=tuple(variables),
+    )
+
+
 def not_read(variables: Sequence[Variable]) -> list[str]:
     """Return a note on each variable that is not read, the largest first."""
     large = [v for v in variables if v.advice]

@@ -3,7 +3,6 @@
 import datetime as dt
 import re
 import zipfile
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from io import BytesIO
@@ -15,14 +14,11 @@ from pipeline.ingest.text import Layout, find_blocks, is_bench_log, read_runs
 from pipeline.words.numbers import first_few
 
 _PARTS = (b"[Content_Types].xml", b"docProps/", b"xl/")  # one of these occurs early in the archive
-_MOST_BYTES = 200_000_000  # of all parts, unpacked
-_MOST_PARTS = 1_000
 _SETTING = 0.1  # share of the longest; shorter columns and tables are settings
 _MOST_NAMED = 8
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(e[-+]?\d+)?", re.IGNORECASE)
 _FORMULA = re.compile(rb"<(?:\w+:)?f[ >]")
 _FIRST_ROWS = 40  # rows that show how the numbers of a column are formatted
-_BOUND = 2**14  # columns of a sheet
 
 
 def is_workbook(raw: bytes) -> bool:
@@ -38,9 +34,8 @@ def read_workbook(raw: bytes, *, source: str) -> list[FileTable]:
     SubmissionError : the file is broken or has no headings, or too many cells are not numbers; the
         message names the row.
     """
-    has_formulas = _check_archive(raw, source=source)
     tables, sheets = [], []
-    for name, rows, notes in _sheets(raw, source=source, has_formulas=has_formulas):
+    for name, rows, notes in _sheets(raw, source=source):
         sheets.append(name)
         if lines := _lines(rows, notes, where=f"{source} sheet {name!r}"):
             found = _read_sheet(name, lines, source=source)
@@ -55,45 +50,42 @@ def read_workbook(raw: bytes, *, source: str) -> list[FileTable]:
     return [table for table in tables if table.values.shape[1] > _SETTING * longest]
 
 
-def _check_archive(raw: bytes, *, source: str) -> bool:
+def _has_formulas(raw: bytes, *, source: str) -> bool:
     """Return whether a workbook has formulas.
 
     Raises
     ------
-    SubmissionError : the archive is broken, locked, no workbook, or larger than any recording.
+    SubmissionError : the archive is locked, or no workbook.
     """
-    broken = SubmissionError(
-        f"{source}: the workbook is broken, cut short or larger than a recording; save it again"
-    )
-    try:
-        with zipfile.ZipFile(BytesIO(raw)) as archive:
-            parts = archive.infolist()
-            if any(part.flag_bits & 1 for part in parts):
-                raise SubmissionError(
-                    f"{source}: the workbook is locked by a password; save it without"
-                )
-            if len(parts) > _MOST_PARTS or sum(p.file_size for p in parts) > _MOST_BYTES:
-                raise broken
-            if parts and not any(part.filename.startswith("xl/") for part in parts):
-                raise SubmissionError(f"{source}: an Office document, but not an Excel workbook")
-            sheets = [p for p in parts if p.filename.startswith("xl/worksheets/")]
-            return any(_FORMULA.search(archive.read(sheet)) for sheet in sheets)
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError, zlib.error):
-        raise broken from None
+    with zipfile.ZipFile(BytesIO(raw)) as archive:
+        parts = archive.infolist()
+        if any(part.flag_bits & 1 for part in parts):
+            raise SubmissionError(
+                f"{source}: the workbook is locked by a password; save it without"
+            )
+        if parts and not any(part.filename.startswith("xl/") for part in parts):
+            raise SubmissionError(f"{source}: an Office document, but not an Excel workbook")
+        sheets = [p for p in parts if p.filename.startswith("xl/worksheets/")]
+        return any(_FORMULA.search(archive.read(sheet)) for sheet in sheets)
 
 
 def _sheets(
-    raw: bytes, *, source: str, has_formulas: bool
+    raw: bytes, *, source: str
 ) -> Iterator[tuple[str, list[tuple[object, ...]], list[str]]]:
-    """Yield the name, the rows and notes of each sheet."""
+    """Yield the name, the rows and notes of each sheet.
+
+    Raises
+    ------
+    SubmissionError : the workbook is broken, locked, or none.
+    """
     import openpyxl
 
     def load(*, data_only: bool) -> Any:
         return openpyxl.load_workbook(BytesIO(raw), read_only=True, data_only=data_only)
 
     try:
-        book = load(data_only=True)
-        for sheet in book.worksheets:
+        has_formulas = _has_formulas(raw, source=source)
+        for sheet in load(data_only=True).worksheets:
             sheet.reset_dimensions()  # the stated size need not be true
             rows = list(sheet.iter_rows(values_only=True))
             if has_formulas:
@@ -111,20 +103,16 @@ def _sheets(
                 for cell in row
                 if cell.value is not None and str(cell.number_format).endswith("%")
             }
-            yield (
-                sheet.title,
-                rows,
-                [
-                    f"column {letter} is shown in percent, but its stored value is used: "
-                    "0.5 for 50 %"
-                    for letter in sorted(percent)
-                ],
-            )
-    except SubmissionError:
+            notes = [
+                f"column {letter} is shown in percent, but its stored value is used: 0.5 for 50 %"
+                for letter in sorted(percent)
+            ]
+            yield sheet.title, rows, notes
+    except (SubmissionError, MemoryError):
         raise
-    except Exception:  # openpyxl raises many kinds of errors
+    except Exception:  # zipfile and openpyxl raise many kinds of errors
         raise SubmissionError(
-            f"{source}: the workbook is broken, cut short or larger than a recording; save it again"
+            f"{source}: the workbook is broken or cut short; save it again"
         ) from None
 
 
@@ -145,7 +133,7 @@ def _lines(
     """
     counts: dict[int, int] = {}
     for row in rows:
-        for i, value in enumerate(row[:_BOUND]):
+        for i, value in enumerate(row):
             if value is not None and _is_number(value):
                 counts[i] = counts.get(i, 0) + 1
     most = max(counts.values(), default=0)

@@ -2,7 +2,6 @@
 
 import datetime as dt
 import re
-import tracemalloc
 import zipfile
 from collections.abc import Callable
 from io import BytesIO
@@ -15,7 +14,6 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest import workbook
 from pipeline.ingest.files import parse_table, parse_tables
 from pipeline.ingest.table import FileTable
 from tests.helpers.recordings import package, saved, sheet_xml, xlsx
@@ -258,72 +256,38 @@ CLOSE = "</sheetData></worksheet>"
 FAR = '<row><c t="str"><v>x1</v></c></row><row r="2"><c r="A2"><v>1</v></c></row>'
 ENTITIES = "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 12))
 
-REFUSED = r"no sheet has|no rows of numbers|broken, cut short or larger"
-BOMBS = {
+HOSTILE = {
     "two cells far apart": (
-        package(OPEN + FAR + '<row r="1048576"><c r="XFD1048576"><v>2</v></c></row>' + CLOSE),
-        REFUSED,
-    ),
-    "a size that is not true": (
-        package(BOOK.replace("<sheetData>", '<dimension ref="A1:XFD1048576"/><sheetData>')),
-        "",
-    ),
-    "texts that are not there": (
-        package(OPEN + '<row><c t="s"><v>7</v></c></row>' + FAR + CLOSE, texts=(
-            f'<sst xmlns="{NAMESPACE}" uniqueCount="99999999999"><si><t>x1</t></si></sst>'
-        )),
-        REFUSED,
+        OPEN + FAR + '<row r="1048576"><c r="XFD1048576"><v>2</v></c></row>' + CLOSE
     ),
     "entities": (
-        package(f'<!DOCTYPE w [<!ENTITY a0 "aaaaaaaaaa">{ENTITIES}]>'
-                + OPEN + '<row><c t="str"><v>&a11;</v></c></row>' + CLOSE),
-        REFUSED,
+        f'<!DOCTYPE w [<!ENTITY a0 "aaaaaaaaaa">{ENTITIES}]>'
+        + OPEN + '<row><c t="str"><v>&a11;</v></c></row>' + CLOSE
     ),
     "a file elsewhere": (
-        package('<!DOCTYPE w [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
-                + OPEN + '<row><c t="str"><v>&a;</v></c></row>' + CLOSE),
-        REFUSED,
+        '<!DOCTYPE w [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
+        + OPEN + '<row><c t="str"><v>&a;</v></c></row>' + CLOSE
     ),
-    "a tag without end": (package(OPEN + f'<row x="{"y" * 5_000_000}"/>' + CLOSE), REFUSED),
-    "nested without end": (package(OPEN + "<a>" * 1_000), REFUSED),
-    "a cell beyond the last": (package(OPEN + '<c r="XFE1"><v>1</v></c>' + CLOSE), REFUSED),
-    "row 0": (package(OPEN + '<c r="A0"><v>1</v></c>' + CLOSE), REFUSED),
-    "many parts": (
-        package(BOOK, more={f"{i:0600}": b"" for i in range(2_000)}), REFUSED,
-    ),
-    "a sheet that is elsewhere": (
-        package(BOOK, more={"xl/_rels/workbook.xml.rels": (
-            b'<Relationships><Relationship Id="b" Type="x/worksheet" TargetMode="External" '
-            b'Target="http://example.org/one.xml"/></Relationships>'
-        )}),
-        REFUSED,
-    ),
-    "a sheet that is missing": (
-        package(BOOK, more={"xl/_rels/workbook.xml.rels": (
-            b'<Relationships><Relationship Id="b" Type="x/worksheet" Target="../../two.xml"/>'
-            b"</Relationships>"
-        )}),
-        REFUSED,
-    ),
-    "not a workbook": (document(), r"not an Excel workbook"),
-    "bits": (package(b"\xff\xfe\0\0"), REFUSED),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("raw", "said"), BOMBS.values(), ids=BOMBS.keys())
-def test_a_hostile_workbook_is_refused_in_little_memory(raw, said):
-    """Whatever sizes a workbook declares, it is refused in little memory."""
-    tracemalloc.start()
-    try:
-        if said:
-            with pytest.raises(SubmissionError, match=said):
-                table(raw)
-        else:
-            assert_array_equal(table(raw).values, [TIME, U, X1])
-        _, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert peak < 60_000_000
+@pytest.mark.parametrize("xml", HOSTILE.values(), ids=HOSTILE.keys())
+def test_a_hostile_workbook_is_refused(xml):
+    """A sheet that spans everything, grows by its entities or names another file is refused."""
+    with pytest.raises(SubmissionError, match=r"no sheet has|no rows of numbers|broken"):
+        table(package(xml))
+
+
+def test_the_stated_size_of_a_sheet_need_not_be_true():
+    """A sheet that states a size of sixteen billion cells is read like any other."""
+    raw = package(BOOK.replace("<sheetData>", '<dimension ref="A1:XFD1048576"/><sheetData>'))
+    assert_array_equal(table(raw).values, [TIME, U, X1])
+
+
+def test_a_document_is_no_workbook():
+    """Another Office document is refused with a message that says so."""
+    with pytest.raises(SubmissionError, match="not an Excel workbook"):
+        table(document())
 
 
 def test_a_locked_workbook_says_so():
@@ -342,25 +306,8 @@ def test_a_locked_workbook_says_so():
 def test_a_workbook_cut_short_is_refused(share):
     """A workbook cut anywhere is refused, since the table of contents at its end is missing."""
     raw = xlsx({"time": TIME, "x1": X1})
-    with pytest.raises(SubmissionError, match=r"broken, cut short|zip archive"):
+    with pytest.raises(SubmissionError, match=r"broken or cut short|zip archive"):
         table(raw[: max(int(share * len(raw)), 10)])
-
-
-def test_a_workbook_that_inflates_too_far_is_refused(monkeypatch):
-    """A workbook that inflates to more bytes than allowed is refused, whatever size it declares."""
-    monkeypatch.setattr(workbook, "_MOST_BYTES", 1_000_000)
-    with pytest.raises(SubmissionError, match="cut short or larger"):
-        table(package(OPEN + " " * 1_000_000 + CLOSE))
-
-
-def table_or_one_line(raw: bytes) -> FileTable | None:
-    """Return the table, or None after an error of one line."""
-    try:
-        return table(raw)
-    except SubmissionError as error:
-        message = str(error)
-    assert "\n" not in message
-    return None
 
 
 cells = st.one_of(
@@ -371,21 +318,13 @@ cells = st.one_of(
 @given(st.lists(st.lists(cells, max_size=5), max_size=12))
 def test_any_sheet_is_a_table_or_one_line(rows):
     """In a sheet of texts and numbers in any order, the numbers that are read are right."""
-    got = table_or_one_line(package(sheet_xml(rows)))
-    if got is None:
+    try:
+        got = table(package(sheet_xml(rows)))
+    except SubmissionError as error:
+        assert "\n" not in str(error)
         return
     written = {value for row in rows for value in row if isinstance(value, float)} | {0.5}
     assert set(got.values.ravel().tolist()) <= written
-
-
-@given(st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.binary(max_size=12)), max_size=4))
-def test_a_damaged_sheet_is_a_table_or_one_line(hits):
-    """A sheet with damaged XML gives a table or one line of error."""
-    part = bytearray(BOOK.encode())
-    for where, junk in hits:
-        at = int(where * len(part))
-        part[at : at + len(junk)] = junk
-    table_or_one_line(package(bytes(part)))
 
 
 def test_openpyxl_reads_the_same_numbers():
