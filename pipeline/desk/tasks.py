@@ -29,7 +29,7 @@ from pipeline.ingest.files import OF_STRANGERS, read_table
 from pipeline.ingest.fill import (
     Found,
     data_files,
-    examine_file,
+    examine_runs,
     hardly_moving,
     has_fractions,
     passed_over,
@@ -57,7 +57,7 @@ def describe_file(
     """
     if path_problem(Path(folder), file):
         raise SubmissionError(f"{file}: is outside the folder")
-    found = examine_file(Path(folder), file, columns=columns)
+    found = examine_runs(Path(folder), file, columns=columns)[0]
     return {**_describe(found), "lines": draw_thumbnail(Path(folder), found, columns=columns)}
 
 

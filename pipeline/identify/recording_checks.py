@@ -21,9 +21,8 @@ from pipeline.identify.recording_faults import (
     swings,
     why_other_frequency,
 )
-from pipeline.ingest.channels import saturation
+from pipeline.ingest.channels import line_frequency, saturation
 from pipeline.ingest.columns import conversion, input_units, is_count, is_known, position_units
-from pipeline.ingest.inspect import line_frequency
 from pipeline.ingest.read import Ingested
 from pipeline.ingest.sign import FEW_NAMES, Signs
 from pipeline.results import (

@@ -12,9 +12,8 @@ from pipeline.arrays import Array
 from pipeline.estimation.channel_delay import ChannelDelay, find_channel_delays
 from pipeline.estimation.record_fit import LENGTH_SCALES, TIME_UNITS, measured
 from pipeline.identify.findings import SAME, WITNESSES, RecordingFault, say
-from pipeline.ingest.channels import stuck_spans
+from pipeline.ingest.channels import is_stepped, line_frequency, stuck_spans
 from pipeline.ingest.columns import conversion
-from pipeline.ingest.inspect import is_stepped, line_frequency
 from pipeline.results import LateChannel, Record
 from pipeline.setup import Setup
 

@@ -132,6 +132,34 @@ def saturation(u: Array) -> float | None:
     return None
 
 
+def is_stepped(u: Array) -> bool:
+    """Return whether the input is constant between a few edges."""
+    # A change by 20 % of the input's range is an edge.
+    edges = np.flatnonzero(np.abs(np.diff(u)) > 0.2 * np.ptp(u)) + 1
+    # A sweep has more edges.
+    if edges.size > 20:
+        return False
+    pieces = np.split(u, edges)
+    spread = np.sqrt(sum(((piece - np.median(piece)) ** 2).sum() for piece in pieces) / u.size)
+    # Between edges the input may vary by 3 % of its range (rms). A constant input may have been
+    # switched on at the first sample.
+    return bool(spread <= 0.03 * np.ptp(u))
+
+
+def line_frequency(t: Array, u: Array) -> float | None:
+    """Return the frequency (Hz) of an input; None if it is not a single sine."""
+    even = np.linspace(t[0], t[-1], t.size)
+    signal = np.interp(even, t, u)
+    power = np.abs(np.fft.rfft((signal - signal.mean()) * np.hanning(t.size))) ** 2
+    peak = int(np.argmax(power))
+    line = slice(max(peak - 2, 0), peak + 3)
+    # A dwell has 90 % of the input's power in one spectral line.
+    if power[line].sum() < 0.9 * power.sum():
+        return None
+    centre = float(np.arange(power.size)[line] @ power[line] / power[line].sum())
+    return centre / float(t[-1] - t[0]) * (t.size - 1) / t.size
+
+
 def never_changes(name: str) -> str:
     """Return the sentence for a position that stays constant while another signal changes."""
     return f"{name!r} never changes: a held cart, or an encoder that is stuck"

@@ -120,18 +120,13 @@ def passed_over(folder: Path, *, named: Collection[str] = ()) -> list[Found]:
     ]
 
 
-def examine_file(folder: Path, file: str, *, columns: Mapping[str, str | int] = {}) -> Found:
-    """Return what a file of a submission contains; `state` is "broken" or, for now, "unknown".
+def examine_runs(folder: Path, file: str, *, columns: Mapping[str, str | int] = {}) -> list[Found]:
+    """Return what each recording in a file contains; `state` is "broken" or, for now, "unknown".
 
     Parameters
     ----------
     columns : the columns that `submission.toml` states, by role.
     """
-    return examine_runs(folder, file, columns=columns)[0]
-
-
-def examine_runs(folder: Path, file: str, *, columns: Mapping[str, str | int] = {}) -> list[Found]:
-    """Return what each recording in a file contains, as `examine_file` does for the first."""
     try:
         runs = inspect_runs(folder / file, columns=columns)
     except SubmissionError as error:

@@ -24,7 +24,6 @@ from pipeline.ingest.table import (
 )
 from pipeline.words.numbers import first_few
 
-_MAX_COLUMNS = 64
 _MOST_SETTINGS = 8  # numbers in a variable; a recording has more samples
 _MOST_NAMED = 8
 _BENCH = ({"enc1", "duty", "time"}, {"cart1pos", "duty_cycle", "t_received"})
@@ -195,7 +194,7 @@ def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariabl
         told = {v.name: advice for v in variables if (advice := _advice(v, longest=0))}
         first = next((f"; {name}: {advice}" for name, advice in told.items()), "")
         raise SubmissionError(f"{source}: holds no vector or matrix of numbers, but {found}{first}")
-    signals = [v for v in signals if min(v.size) <= _MAX_COLUMNS] or signals
+    signals = [v for v in signals if min(v.size) <= MOST_COLUMNS] or signals
     longest = max(v.samples for v in signals)
     # Shorter than a tenth of the longest, a variable holds gains or poles, not a truncated signal.
     signals = [v for v in signals if v.samples > 0.1 * longest]
@@ -208,17 +207,17 @@ def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariabl
     matrices = [v for v in signals if not v.is_vector]
     if not vectors and len(matrices) > 1:
         raise SubmissionError(f"{source}: holds several matrices ({sizes}); keep one")
-    if len(vectors) > _MAX_COLUMNS:
-        raise SubmissionError(f"{source}: holds more than {_MAX_COLUMNS} vectors")
+    if len(vectors) > MOST_COLUMNS:
+        raise SubmissionError(f"{source}: holds more than {MOST_COLUMNS} vectors")
     if not vectors:
-        if min(matrices[0].size) > _MAX_COLUMNS:
-            raise SubmissionError(f"{source}: {matrices[0]} has more than {_MAX_COLUMNS} columns")
+        if min(matrices[0].size) > MOST_COLUMNS:
+            raise SubmissionError(f"{source}: {matrices[0]} has more than {MOST_COLUMNS} columns")
         return matrices
     if any(bench <= {v.name for v in vectors} for bench in _BENCH):
         return vectors  # a bench log is complete; other variables were computed from it
     matrices = [matrix for matrix in matrices if matrix.samples == vectors[0].samples]
     columns = len(vectors) + sum(min(matrix.size) for matrix in matrices)
-    return [*vectors, *matrices] if columns <= _MAX_COLUMNS else vectors
+    return [*vectors, *matrices] if columns <= MOST_COLUMNS else vectors
 
 
 def _advice(variable: MatVariable, *, longest: int) -> str:
@@ -228,7 +227,7 @@ def _advice(variable: MatVariable, *, longest: int) -> str:
     """
     name = variable.name
     if variable.values is not None:
-        if variable.samples <= _MAX_COLUMNS:
+        if variable.samples <= MOST_COLUMNS:
             return ""
         return f"if it is a recording, save it in a separate file: save('new.mat', '{name}')"
     if variable.bytes < 8 * longest:  # too small to hold even the times

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.estimation.modulating import motion_period, window_weights
-from pipeline.ingest.channels import encoder_step, mirrors
+from pipeline.ingest.channels import encoder_step, is_stepped, mirrors
 from pipeline.ingest.clock import SLOW, read_clock
 from pipeline.ingest.table import FileTable
 from pipeline.submission.models import MOST_CARTS
@@ -155,7 +155,10 @@ def _find_input(table: FileTable, signals: Sequence[int]) -> tuple[int | None, i
         return None, None, ""
     values = table.values
     left = _left_unexplained(values, signals)
-    stepped = [i for i in signals if _is_stepped(values[i])]
+    stepped = [
+        i for i in signals
+        if (np.abs(np.diff(values[i])) > _JUMP * np.ptp(values[i])).any() and is_stepped(values[i])
+    ]  # fmt: skip
     found = _by_jumps(values, signals, stepped, left) if stepped else _by_law(values, signals, left)
     if found is not None:
         drive, reference = found
@@ -216,18 +219,6 @@ def _by_law(
 
 def _is_alike(values: Array, i: int, j: int) -> bool:
     return bool(abs(np.corrcoef(values[i], values[j])[0, 1]) > _ALIKE)
-
-
-def _is_stepped(column: Array) -> bool:
-    """Return whether a signal is flat between a few jumps."""
-    steps = np.abs(np.diff(column))
-    edges = np.flatnonzero(steps > _JUMP * np.ptp(column)) + 1
-    if not 0 < edges.size <= 20:
-        return False
-    pieces = np.split(column, edges)
-    spread = sum(((piece - np.median(piece)) ** 2).sum() for piece in pieces)
-    # Between jumps it may vary by 3 % of its range (rms).
-    return bool(np.sqrt(spread / column.size) < 0.03 * np.ptp(column))
 
 
 def _averages(values: Array, signals: Sequence[int]) -> tuple[Array, Array, Array] | None:

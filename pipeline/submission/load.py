@@ -38,7 +38,6 @@ from pipeline.submission.toml import (
     list_faults,
     list_keys,
     mend_number,
-    merge_equal,
     nearest,
     parse_toml,
     quote,
@@ -90,16 +89,12 @@ class InvalidSubmission(SubmissionError):
 
     Attributes
     ----------
-    problems : the first problems found, each with its place. The error's text has a line for each,
-        but only one for equal problems in several tables of a list.
-    more : the number of further problems.
+    problems : the first problems found, each with its place; the error's text has a line for each.
     """
 
-    def __init__(
-        self, where: str, problems: Sequence[tuple[Location, str]], *, more: int = 0
-    ) -> None:
-        self.problems, self.more = tuple(problems), more
-        super().__init__(list_faults(where, merge_equal(problems), more=more))
+    def __init__(self, where: str, problems: Sequence[tuple[Location, str]]) -> None:
+        self.problems = tuple(problems)[:MOST_LISTED]
+        super().__init__(list_faults(where, [what for _, what in self.problems]))
 
 
 def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submission:
@@ -112,7 +107,7 @@ def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submissio
     Raises
     ------
     SubmissionError : the text is not TOML.
-    InvalidSubmission : the content is invalid; the message lists every problem.
+    InvalidSubmission : the content is invalid; the message lists the first problems.
     """
     # Decimals are kept, so that no typed digit is lost.
     document = parse_toml(text, where=where, error=SubmissionError, as_typed=True)
@@ -246,16 +241,13 @@ def _validate(document: dict, *, where: str) -> Submission:
     except RecursionError:
         raise SubmissionError(f"{where}: lists or tables nest too deeply") from None
     if unusable:
-        listed = [(e.at, f"{dotted(e.at, document)}: {e}") for e in unusable[:MOST_LISTED]]
-        raise InvalidSubmission(where, listed, more=len(unusable) - len(listed))
+        raise InvalidSubmission(where, [(e.at, f"{dotted(e.at, document)}: {e}") for e in unusable])
     try:
         submission = Submission.model_validate(plain, strict=True)
     except ValidationError as error:
-        found = relevant_errors(error.errors())
-        first = found[:MOST_LISTED]
+        first = relevant_errors(error.errors())[:MOST_LISTED]
         worded = [(without_tag(e["loc"], plain), explain(e, plain)) for e in first]
-        more = len(found) - len(first)
-        raise InvalidSubmission(where, [*unknown, *worded], more=more) from None
+        raise InvalidSubmission(where, [*unknown, *worded]) from None
     if unknown:
         raise InvalidSubmission(where, unknown)
     return submission

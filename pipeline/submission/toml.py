@@ -216,26 +216,9 @@ def relevant_errors(errors: Sequence[ErrorDetails]) -> list[ErrorDetails]:
     return [*unknown, *(e for e in others if e["type"] != "missing" or not is_misspelt(e))]
 
 
-def merge_equal(problems: Sequence[tuple[Location, str]]) -> list[str]:
-    """Return the problems as text; equal ones in several tables of a list are counted.
-
-    After a search-and-replace, problems differ only in the numbers and ids of the tables.
-    """
-    found: dict[tuple, list[str]] = {}
-    for at, what in problems:
-        keys = tuple("" if isinstance(part, int) else part for part in at)
-        found.setdefault((keys, what.partition(": ")[2]), []).append(what)
-    return [
-        same[0] if len(same) == 1 else f"{same[0]} (and {len(same) - 1} more)"
-        for same in found.values()
-    ]
-
-
-def list_faults(where: str, problems: Sequence[str], *, more: int = 0) -> str:
-    """Return the faults of a file, one line each, and the number of further faults."""
-    beyond = max(len(problems) - MOST_LISTED, 0) + more
-    lines = [f"{where}: {what}" for what in problems[:MOST_LISTED]]
-    return "\n".join([*lines, *([f"{where}: and {beyond} more"] if beyond else [])])
+def list_faults(where: str, problems: Sequence[str]) -> str:
+    """Return the first faults of a file, one line each."""
+    return "\n".join(f"{where}: {what}" for what in problems[:MOST_LISTED])
 
 
 def without_tag(location: Location, document: object) -> list[int | str]:

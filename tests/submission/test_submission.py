@@ -286,23 +286,6 @@ gains = [1, 0, 1, 0]
         load_submission(tmp_path)
 
 
-def test_the_same_slip_in_several_tables_is_one_line(tmp_path):
-    """The same slip in three tables is one line with their number; another slip has its own."""
-    tables = "".join(
-        f'[[experiments]]\nid = "run-{i}"\nknid = "decay"\nfile = "{i}.csv"\n' for i in range(3)
-    )
-    text = f"version = 1\n[system]\ncarts = 1\n{tables}frequenzy = 2\n"
-    (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(InvalidSubmission) as told:
-        load_submission(tmp_path)
-    where = f"{tmp_path.name}/submission.toml: experiments"
-    assert str(told.value).split("\n") == [
-        f"{where}[1].knid (run-0): unknown key; did you mean 'kind'? (and 2 more)",
-        f"{where}[3].frequenzy (run-2): unknown key; did you mean 'frequency'?",
-    ]
-    assert len(told.value.problems) == 4  # the desk marks the field of each table
-
-
 def test_nearest_ignores_leading_zeros():
     """The nearest name to team-1 is team-01, although team-11 has more letters in common."""
     names = ["team-11", "team-01", "team-10"]
@@ -310,11 +293,11 @@ def test_nearest_ignores_leading_zeros():
     assert nearest("team-010", names) == "; did you mean 'team-10'?"
 
 
-def test_only_the_first_of_many_mistakes_are_written_out(tmp_path):
-    """Of thousands of mistakes, only the first ones are listed, and the others are counted."""
+def test_only_the_first_of_many_mistakes_are_listed(tmp_path):
+    """Of thousands of mistakes, only the first ones are listed."""
     keys = "".join(f"k{i} = 1\n" for i in range(60_000))
     text = f"version = 1\n[system]\ncarts = 1\n{keys}"
     (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(InvalidSubmission, match=r"unknown key[\s\S]*: and 59980 more$") as told:
+    with pytest.raises(InvalidSubmission, match="k0: unknown key") as told:
         load_submission(tmp_path)
-    assert len(told.value.problems) <= 100
+    assert len(str(told.value).split("\n")) == len(told.value.problems) <= 20
