@@ -8,11 +8,11 @@ of channels is a recording. Layouts: "Specification for the LabVIEW Measurement 
 import logging
 import re
 import struct
-import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from io import BytesIO
+from logging.handlers import BufferingHandler
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -249,7 +249,9 @@ def read_tdms(raw: bytes, *, source: str) -> list[FileTable]:
             size=(channel.samples, 1),
             kind=channel.kind,
             read=channel in used,
-            advice=_advice(channel, longest=longest),
+            advice="if it is a signal, write it as numbers"
+            if channel.values is None and channel.samples >= longest
+            else "",
         )
         for channel in channels
     )
@@ -338,7 +340,9 @@ def _read_channels(raw: bytes, *, source: str) -> list[_Channel]:
         except Exception:  # npTDMS raises many kinds of errors
             raise SubmissionError(f"{source}: the .tdms file is broken or cut short") from None
     if messages:
-        raise SubmissionError(f"{source}: the .tdms file is damaged ({messages[0][:100]})")
+        raise SubmissionError(
+            f"{source}: the .tdms file is damaged ({messages[0].getMessage()[:100]})"
+        )
     return channels
 
 
@@ -373,31 +377,19 @@ def _number(value: object) -> float:
 
 
 @contextmanager
-def _complaints() -> Iterator[list[str]]:
+def _complaints() -> Iterator[list[logging.LogRecord]]:
     """Collect the messages that npTDMS only logs, for example that data are missing."""
     from nptdms.log import log_manager
 
     log_manager.console_handler.setLevel(logging.CRITICAL)
-    listener = _Listener()
+    listener = BufferingHandler(1_000_000)
+    listener.setLevel(logging.WARNING)
     logger = logging.getLogger("nptdms")
     logger.addHandler(listener)
     try:
-        yield listener.messages
+        yield listener.buffer
     finally:
         logger.removeHandler(listener)
-
-
-class _Listener(logging.Handler):
-    """Collects the log messages of this thread, from warnings on."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self.messages: list[str] = []
-        self._thread = threading.get_ident()
-
-    def emit(self, record: logging.LogRecord) -> None:
-        if record.thread == self._thread:
-            self.messages.append(record.getMessage())
 
 
 def _recordings(channels: Sequence[_Channel], *, source: str) -> dict[str, list[_Channel]]:
@@ -423,13 +415,6 @@ def _recordings(channels: Sequence[_Channel], *, source: str) -> dict[str, list[
             sizes = first_few([f"{one.name} ({one.samples:,})" for one in read], _MOST_NAMED)
             raise SubmissionError(f"{source}: the channels differ in length: {sizes}")
     return groups
-
-
-def _advice(channel: _Channel, *, longest: int) -> str:
-    """Return advice for a channel that is not read but may belong to the recording."""
-    if channel.values is not None or channel.samples < longest:
-        return ""
-    return "if it is a signal, write it as numbers"
 
 
 def _clock(channels: Sequence[_Channel], *, source: str) -> tuple[float, float]:
