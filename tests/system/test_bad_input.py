@@ -375,7 +375,7 @@ BAD_DATA = {
     ),
     "workbook": (
         b"PK\x03\x04" + bytes(26) + b"[Content_Types].xml" + bytes(200),
-        r"the workbook is broken, cut short or larger",
+        r"the workbook is broken or cut short",
     ),
     "old workbook": (b"\xd0\xcf\x11\xe0" + bytes(99), r"an old Excel workbook, or a locked one"),
     "LabVIEW cut short": (b"LabVIEW Measurement\t\nSeparator\tTab\n", r"line 1: .* cut short"),
