@@ -3,29 +3,6 @@
 import subprocess
 import sys
 
-LOOKS = """
-import gc, sys
-looks = []
-gc.callbacks.append(lambda phase, info: looks.append(phase) if phase == "start" else None)
-sys.argv = ["cartlab", "effects", "--json"]
-from pipeline.cli import main
-try:
-    main()
-except SystemExit:
-    sys.stderr.write(f"{len(looks)}\\n")
-"""
-
-
-def test_a_command_rarely_collects_garbage():
-    """A command collects garbage fewer than 40 times.
-
-    With Python's defaults it would do so over 100 times.
-    """
-    command = [sys.executable, "-c", LOOKS]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert int(done.stderr.split()[-1]) < 40
-
-
 SERVES = """
 from pipeline.garbage import collect_for_hours, collect_seldom
 class Cycle:

@@ -7,7 +7,6 @@ import ast
 import json
 import subprocess
 import sys
-from dataclasses import replace
 
 import matplotlib as mpl
 import numpy as np
@@ -17,7 +16,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import linear_sum_assignment
 
 import pipeline
-from pipeline.errors import DataError
 from pipeline.json_files import json_text, plain
 from pipeline.notebook import Lab, analyse
 from pipeline.resources import EXAMPLES
@@ -117,15 +115,6 @@ def test_records_are_tables_by_time(lab):
     assert run.attrs["units"] == {
         "time": "s", "u": "V", "reference": "cm", "x1": "cm", "x2": "cm"
     }  # fmt: skip
-
-
-def test_a_missing_system_or_loop_is_explained(lab):
-    """Without a fit or a design there is no system or loop, and the error says what is missing."""
-    bare = replace(lab, results=replace(lab.results, fit=None, feedback=None))
-    with pytest.raises(DataError, match="the carts were not identified"):
-        _ = bare.system
-    with pytest.raises(DataError, match="no feedback was designed"):
-        _ = bare.closed_loop
 
 
 def test_an_analysis_shows_its_summary_and_its_table(lab):

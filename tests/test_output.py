@@ -17,7 +17,6 @@ from pipeline.output import (
     check_folder,
     csv_text,
     escape_formula,
-    named_folder,
     new_folder,
     own_folder,
     write_file,
@@ -85,16 +84,6 @@ def test_a_file_in_the_way_is_refused(tmp_path):
     (tmp_path / "out").write_text("")
     with pytest.raises(ConfigError, match="out: is a file"):
         check_folder(tmp_path / "out")
-
-
-@pytest.mark.parametrize("name", ["report.pdf", "gs.csv", "Grades.HTML"])
-def test_a_folder_named_like_a_file_is_refused(tmp_path, name):
-    """An output folder may not be named like a file, unless a folder of that name exists."""
-    with pytest.raises(ConfigError, match="give a folder with --out"):
-        named_folder(tmp_path / name)
-    (tmp_path / name).mkdir()
-    assert named_folder(tmp_path / name).is_dir()
-    assert named_folder(tmp_path / "lab 3.2") == tmp_path / "lab 3.2"
 
 
 def test_a_folder_with_files_is_refused(tmp_path):

@@ -295,15 +295,6 @@ def test_a_killed_host_leaves_a_readable_file_and_a_motor_that_is_off(tmp_path, 
     assert "data/dwell.partial.txt holds the data of an interrupted session" in notes.remarks
 
 
-def test_a_stuck_encoder_is_reported(tmp_path):
-    """An encoder that does not move while the motor drives is counted and mentioned in a note."""
-    work = write_work(tmp_path, [sine("dwell", seconds=6)])
-    with emulator("--fault", "stuck=2@0.2", "--speed", "10", "--period", "5.003") as bench:
-        *_, outcome = acquire(work, port=bench.address, observers=[Notes()], only=["dwell"])
-    assert outcome.anomalies.stuck == 1
-    assert "1 encoder stuck" in load_submission(work).experiments[0].note
-
-
 # ----------------------------------------------------------------- ports and scales
 
 

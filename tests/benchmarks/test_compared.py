@@ -8,14 +8,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from benchmarks.black_boxes import Model, Part, error
-from benchmarks.bode import judged, modes_named, multisine
+from benchmarks.bode import modes_named
 from benchmarks.bode_tools import (
     Dwells,
     curve_fitted,
     factors,
-    modes_of,
     rational,
-    responses_of,
     start_of,
 )
 from benchmarks.gap_tools import Bench, is_named
@@ -55,29 +53,6 @@ def test_curve_fit_finds_the_truth_in_dwells_without_noise():
     assert found.gains is not None
     assert truth.gains is not None
     assert_allclose(found.gains, truth.gains, rtol=1e-5)
-
-
-def test_the_responses_for_a_modal_analysis_are_those_of_the_chain():
-    """The responses given to the modal analysis equal those of the chain within 1 %."""
-    chain = PRESETS["throne-2dof"]
-    hertz, G = responses_of(multisine(chain, rng=np.random.default_rng(0), noise=1e-12))
-
-    band = (hertz > 0.3) & (hertz < 8.0)
-    true = chain.frequency_response(2 * np.pi * hertz[band])
-    assert np.all(np.abs(G[:, band] - true) < 0.01 * np.abs(true).max())
-
-
-def test_a_missing_answer_counts_as_infinitely_wrong():
-    """If a method gives no answer or too few resonances, its error counts as infinite."""
-    chain = PRESETS["throne-1dof"]
-    truth = modes_named(chain, list(chain.parameters().values()))
-
-    tried = judged(
-        lambda: modes_of(np.array([-1.0 + 0j]), n=1, gains=None), truth=truth, least=truth
-    )
-
-    assert tried.modes == np.inf
-    assert not tried.right
 
 
 def test_a_free_run_is_judged_after_its_start_and_divergence_is_infinite():

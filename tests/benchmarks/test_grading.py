@@ -4,8 +4,7 @@ from functools import partial
 
 import pytest
 
-from benchmarks import grading, grading_notebooks, lab_reference, report
-from benchmarks.grading_batch import Cost
+from benchmarks import grading_notebooks, lab_reference, report
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS
 from pipeline.submission import load_submission
@@ -58,18 +57,6 @@ def test_the_notebooks_reference_finds_the_true_values(teams, checks):
     truth = PRESETS[grading_notebooks.PRESET].parameters()
     found = lab_reference.final(tuple(sorted(_dwells(teams[0] / "team-000").items())))
     assert found == pytest.approx(truth, rel=0.01)
-
-
-def test_a_grader_is_judged_by_lost_points_and_named_mistakes():
-    slips = {"a": "", "b": "hz_for_rad_s", "c": "final_off", "d": grading_notebooks.COPIED}
-    done = grading_notebooks.Graded(
-        cost=Cost(clock=9.0, parent=1.0, workers=7.0),
-        lost=frozenset("bd"),
-        named={"b": frozenset({"hz_for_rad_s"}), "d": frozenset({"data_problem"})},
-    )
-    assert grading._judged(done, slips) == [
-        "2.00", "50 % (1 of 2)", "50 % (1 of 2)", "0 % (0 of 1)", "0 % (0 of 1)"
-    ]  # fmt: skip
 
 
 def test_records_of_many_sessions_are_all_different_and_can_be_read(tmp_path):

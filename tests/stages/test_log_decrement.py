@@ -402,31 +402,6 @@ def test_what_no_law_explains_is_unknown_and_widens_the_errors():
     assert np.isnan(got.law.size)
 
 
-def flags(seeds, *, d):
-    """Return, for each random decay with friction band d, whether dry friction is found."""
-    found = []
-    for seed in range(seeds):
-        rng = np.random.default_rng(seed)
-        run = released(
-            zeta=rng.uniform(0.01, 0.2),
-            d=d,
-            omega_n=rng.uniform(12, 35),
-            start=rng.choice([-1, 1]) * rng.uniform(0.7, 1.8),
-            fs=rng.choice([113.1, 250.0]),
-            duration=rng.uniform(2.0, 5.0),
-            noise=rng.choice([0.0, 0.2, 0.5]) * COUNT,
-            rng=rng,
-        )
-        found.append(fit_log_decrement(run, cart=1).law.is_friction)
-    return np.array(found)
-
-
-def test_friction_is_found_only_if_there_is_some():
-    """Dry friction is found in all of twenty decays with d = 0.01 cm, and in none without it."""
-    assert not flags(20, d=0.0).any()
-    assert flags(20, d=0.01).all()
-
-
 # ---------------------------------------------------------------- standard errors
 
 

@@ -235,17 +235,6 @@ def test_units_do_not_matter(position, force, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_step_down_mirrors_the_step_up(method):
-    """A negative reference gives the same gains as a positive one, and the negative response."""
-    up = design(PRESETS["throne-2dof"], cart=2, reference=0.5, method=method)
-    down = design(PRESETS["throne-2dof"], cart=2, reference=-0.5, method=method)
-
-    assert_allclose(down.gains, up.gains, rtol=0, atol=0)
-    assert_allclose(down.y, -up.y, rtol=0, atol=1e-15)
-    assert down.overshoot_percent == pytest.approx(up.overshoot_percent, abs=1e-9)
-
-
-@pytest.mark.parametrize("method", METHODS)
 def test_the_input_limit_is_kept(method):
     """If the input limit allows the goal, the design meets the goal within the limit."""
     chain = PRESETS["throne-3dof"]

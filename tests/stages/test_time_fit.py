@@ -217,20 +217,6 @@ def test_a_damping_at_its_bound_has_no_standard_error():
         assert fit.covariance[1, 1] > 0
 
 
-def test_a_missing_spring_is_held_at_zero():
-    """A declared spring that is missing is zero within its error, or held at zero with a note."""
-    rng = np.random.default_rng(1)
-    chain = Chain(m=np.array([3e-4, 2e-4]), c=np.array([6e-4, 4e-4]), k=np.array([0.1, 0.06, 0]))
-    fit = fit_records([step_record(chain, rng=rng)], bench=Setup(springs=(True,) * 3))
-    assert fit.converged
-    assert np.max(np.abs(errors(fit, chain))) < 4
-    spring = fit.chain.k[2]
-    assert ("k_3" in fit.message) == (spring == 0)
-    if "k_3" in fit.names:
-        variance = fit.covariance[fit.names.index("k_3"), fit.names.index("k_3")]
-        assert spring < 4 * np.sqrt(variance)
-
-
 # ------------------------------------------------------------- what cannot be done
 
 

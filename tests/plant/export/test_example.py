@@ -9,12 +9,9 @@ from pathlib import Path
 import pytest
 
 from docs.friction_compensation import main
-from pipeline.plant.effect import AugmentedChain
-from pipeline.report.model_files import save_model
 from pipeline.simulated.emulator.server import EmulatorOptions, Server
 from pipeline.simulated.hidden import prepare_bench
 from tests.helpers.commandline import cartlab_here
-from tests.helpers.examples import analysed
 from tests.helpers.exported import no_compiler
 from tests.helpers.places import ROOT
 
@@ -35,25 +32,6 @@ def running_bench() -> Iterator[str]:
         stop.set()
         serving.join()
         server.close()
-
-
-@pytest.mark.slow
-@pytest.mark.sample
-@no_compiler
-def test_friction_is_compensated_on_the_virtual_bench(tmp_path):
-    """With friction in the model the cart rests on the target; without it, far from the target.
-
-    The cart rests within one count of the target; the encoder's noise adds another count.
-    """
-    model = AugmentedChain(chain=HIDDEN.chain, terms=HIDDEN.effects)
-    save_model(model, analysed("one-cart"), tmp_path, free=(1,))
-    with running_bench() as address:
-        errors = main(tmp_path / "model.fmu", address)
-    assert abs(errors["with friction"]) <= 2
-    # As the page says.
-    told = re.search(r"linear: set point \d+ counts, error \+(\d+) counts", PAGE)
-    assert told is not None
-    assert abs(errors["linear"] - int(told[1])) <= 2
 
 
 @no_compiler
