@@ -129,10 +129,7 @@ def test_existing_recordings_are_skipped(tmp_path, fast):
 
 def test_a_stock_bench_is_driven_by_people(tmp_path):
     """On a stock bench a person holds the carts, and no watchdog guards the motor."""
-    work = write_work(tmp_path, [sine("dwell", seconds=1, settle=0.3)], scales="")
-    text = (work / "submission.toml").read_text(encoding="utf-8")
-    scaled = text.replace('unit = "cm"', 'unit = "cm", per_count = 0.00227')
-    (work / "submission.toml").write_text(scaled, encoding="utf-8")
+    work = write_work(tmp_path, [sine("dwell", seconds=1, settle=0.3)], per_count=0.00227)
     notes = Notes()
     with emulator("--stock", "--speed", "5", "--period", "5.003") as bench:
         *_, outcome = acquire(work, port=bench.address, observers=[notes], only=["dwell"])

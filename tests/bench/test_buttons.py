@@ -163,10 +163,8 @@ def test_a_run_that_broke_off_can_be_kept(tmp_path):
 def test_a_run_that_waits_for_a_person_can_be_ended(tmp_path, wish):
     """If a person is asked to free the carts, Stop or Skip ends the run before the motor moves."""
     scale = 'input = { unit = "V", per_count = 0.001220703125 }\n'
-    work = write_work(tmp_path, [sine("dwell", seconds=2, settle=0.3)], scales=scale)
-    text = (work / "submission.toml").read_text(encoding="utf-8")
-    scaled = text.replace('unit = "cm"', 'unit = "cm", per_count = 0.00227')
-    (work / "submission.toml").write_text(scaled, encoding="utf-8")
+    dwell = sine("dwell", seconds=2, settle=0.3)
+    work = write_work(tmp_path, [dwell], scales=scale, per_count=0.00227)
     state, ended = LiveState(work), []
     with emulator("--stock", "--speed", "5") as bench:
 

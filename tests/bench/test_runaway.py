@@ -288,10 +288,7 @@ def test_an_exploration_ends_if_the_bench_misbehaves(tmp_path, wrong):
 def test_a_stock_bench_that_misbehaves_is_stopped(tmp_path, wrong):
     """A stock bench, which answers no query, is watched as well."""
     scales = f'input = {{ unit = "V", per_count = {0.5 / FULL} }}\n'
-    work = write_work(tmp_path, plan(), scales=scales)
-    text = (work / "submission.toml").read_text(encoding="utf-8")
-    stated = f'{{ unit = "cm", per_count = {PER_COUNT} }}'
-    (work / "submission.toml").write_text(text.replace('{ unit = "cm" }', stated), encoding="utf-8")
+    work = write_work(tmp_path, plan(), scales=scales, per_count=PER_COUNT)
     with RunawayBench(wrong, duty=FULL, commands=frozenset()) as bench:
         partial, error = session(work, bench)
     assert_over(bench)

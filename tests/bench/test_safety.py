@@ -104,10 +104,8 @@ def test_an_impossible_recording_is_skipped_with_a_reason(tmp_path):
     )
     faint = sine("faint", seconds=1).model_copy(update={"amplitude": 1e-5})
     scales = 'input = { unit = "V", per_count = 0.0001220703125 }\n'
-    work = write_work(tmp_path, [chirp, faint, sine("dwell", seconds=1)], scales=scales)
-    text = (work / "submission.toml").read_text(encoding="utf-8")
-    text = text.replace('{ unit = "cm" }', '{ unit = "cm", per_count = 0.00227 }')
-    (work / "submission.toml").write_text(text, encoding="utf-8")
+    recordings = [chirp, faint, sine("dwell", seconds=1)]
+    work = write_work(tmp_path, recordings, scales=scales, per_count=0.00227)
     with emulator("--stock") as bench:
         with host(work, bench.address, "--yes") as process:
             _, said = process.communicate()

@@ -19,11 +19,11 @@ from pipeline.experiments.plan import PidLoop, PlanLimits, Recording, StateLoop
 from pipeline.plant.chain import Chain
 from pipeline.plant.sampled_loop import LoopSetup, Pid, StateFeedback, discretise, simulate_loop
 from pipeline.protocol import Description, Start, StateGains, Wave, encode
-from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, FeedbackDesign
 from pipeline.simulated.emulator.core import ReferenceCore
-from pipeline.submission import Submission, load_submission
+from pipeline.submission import Submission
 from pipeline.workflow import analyse
+from tests.helpers.examples import recorded
 
 COUNT = 0.00227  # cm
 DUTY = 0.5 / 4096  # V
@@ -43,9 +43,7 @@ SECONDS = 2.0
 @pytest.fixture(scope="module", params=["one-cart", "two-cart"])
 def identified(request) -> tuple[Submission, Analysis]:
     """Return a shipped example with the carts identified from decays, steps and sweep."""
-    submission = load_submission(EXAMPLES / request.param)
-    kept = tuple(e for e in submission.experiments if e.kind in ("decay", "step", "sweep"))
-    submission = submission.model_copy(update={"experiments": kept})
+    submission = recorded(request.param, "decay", "step", "sweep")
     return submission, analyse(submission)
 
 
@@ -199,9 +197,7 @@ def test_a_reversed_input_reverses_the_gains(identified):
 )
 def test_a_loop_that_would_do_harm_is_refused(loop, limits, amplitude, message):
     """A loop that is unstable, passes a limit or is not the designed one is refused."""
-    submission = load_submission(EXAMPLES / "one-cart")
-    kept = tuple(e for e in submission.experiments if e.kind in ("step", "sweep"))
-    submission = submission.model_copy(update={"experiments": kept})
+    submission = recorded("one-cart", "step", "sweep")
     with pytest.raises(DataError, match=message) as caught:
         gains_of((submission, analyse(submission)), loop, limits=limits, amplitude=amplitude)
     assert "control: " not in str(caught.value)  # the caller's message adds this name
@@ -224,9 +220,7 @@ def test_a_slow_bench_that_misses_the_goal_is_refused(identified):
 @pytest.mark.parametrize("example", ["one-cart", "two-cart", "three-cart"])
 def test_a_proposed_pid_brings_cart_1_to_the_level(example):
     """The PID proposed for a bench brings its cart 1 to within 2 % of 1 cm in 5 s."""
-    submission = load_submission(EXAMPLES / example)
-    kept = tuple(e for e in submission.experiments if e.kind in ("step", "sweep"))
-    submission = submission.model_copy(update={"experiments": kept})
+    submission = recorded(example, "step", "sweep")
     analysis = analyse(submission)
     bench = replace(BENCH, encoders=max(2, analysis.bench.n), carts=analysis.bench.n)
     recording = closing(None, carts=analysis.bench.n)

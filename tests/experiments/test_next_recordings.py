@@ -38,7 +38,7 @@ from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.commandline import cartlab_here
-from tests.helpers.examples import analysed
+from tests.helpers.examples import analysed, recorded
 from tests.helpers.virtual import VirtualBench, new_folder
 
 LIMITS = PlanLimits(input=0.5, travel=2.5)
@@ -48,9 +48,7 @@ COMMANDS = frozenset("cm")
 @pytest.fixture(scope="module")
 def analysis():
     """Return the analysis of the shipped two carts from steps and a sweep."""
-    submission = load_submission(EXAMPLES / "two-cart")
-    kept = tuple(e for e in submission.experiments if e.kind in ("decay", "step", "sweep"))
-    return analyse(submission.model_copy(update={"experiments": kept}))
+    return analyse(recorded("two-cart", "decay", "step", "sweep"))
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,6 @@ from pipeline.experiments.propose import AIM, extend_plan, make_plan, propose_pl
 from pipeline.plant.chain import PRESETS, quadratic_factors
 from pipeline.plant.simulate import SETTLED_DWELL, settling_wait, simulate_linear
 from pipeline.protocol import FULL_SCALE, Description, Start, Wave, target_at
-from pipeline.resources import EXAMPLES
 from pipeline.submission import (
     Design,
     InputScale,
@@ -28,6 +27,7 @@ from pipeline.submission import (
     new_submission,
 )
 from tests.helpers.desks import a_recorded_cart
+from tests.helpers.examples import recorded
 
 EXAMPLE_OF = {"throne-1dof": "one-cart", "throne-2dof": "two-cart", "throne-3dof": "three-cart"}
 STOCK = Description(name="stock", encoders=2, carts=2)
@@ -41,13 +41,6 @@ def bare(*, carts=2, springs=None, design=None, **system) -> Submission:
         carts=carts, springs=springs, **{"position": PositionScale(unit="cm"), **system}
     )
     return Submission(version=1, system=system, design=design)
-
-
-def recorded(example: str, *kinds: str) -> Submission:
-    """Return a shipped example with only some kinds of its recordings."""
-    submission = load_submission(EXAMPLES / example)
-    kept = tuple(e for e in submission.experiments if e.kind in kinds)
-    return submission.model_copy(update={"experiments": kept})
 
 
 def of_kind(plan: Plan, kind: str) -> list[Recording]:

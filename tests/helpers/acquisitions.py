@@ -32,11 +32,17 @@ def sine(name: str, *, seconds: float, frequency: float = 2.0, settle: float = 0
 
 
 def write_work(
-    folder: Path, recordings: Sequence[Recording], *, limits: PlanLimits = LIMITS, scales: str = ""
+    folder: Path,
+    recordings: Sequence[Recording],
+    *,
+    limits: PlanLimits = LIMITS,
+    scales: str = "",
+    per_count: float | None = None,
 ) -> Path:
     """Write a submission of two carts with this plan; scales not given come from the bench."""
     folder.mkdir(parents=True, exist_ok=True)
-    text = f'version = 1\n\n[system]  # ours\ncarts = 2\nposition = {{ unit = "cm" }}\n{scales}'
+    unit = '"cm"' if per_count is None else f'"cm", per_count = {per_count}'
+    text = f"version = 1\n\n[system]  # ours\ncarts = 2\nposition = {{ unit = {unit} }}\n{scales}"
     (folder / NAME).write_text(text, encoding="utf-8")
     save_plan(Plan(limits=limits, recordings=tuple(recordings)), load_submission(folder))
     return folder

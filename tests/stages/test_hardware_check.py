@@ -103,6 +103,13 @@ def bench(
     return encoder(run.x), run.u
 
 
+def run_design(chain: Chain, cart: int) -> tuple[FeedbackDesign, Array, Array]:
+    """Return a design for the cart, and readings and input of its loop."""
+    design = designed(chain, cart)
+    law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=chain)
+    return design, *bench(chain, law)
+
+
 @pytest.mark.parametrize(("name", "cart"), LAST_CART)
 def test_a_true_model_leaves_the_noise(name, cart):
     """With a true model, the errors of the open-loop and closed-loop simulations are only noise.
@@ -110,9 +117,7 @@ def test_a_true_model_leaves_the_noise(name, cart):
     Both simulations have the measured overshoot, settling time and level.
     """
     chain = PLANTS[name]
-    design = designed(chain, cart)
-    law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=chain)
-    y, u = bench(chain, law)
+    design, y, u = run_design(chain, cart)
 
     checks = check_hardware(
         record(y, u=u, reference=STEPS), chain, controller=stated(design), controlled_cart=cart
@@ -143,9 +148,7 @@ def test_a_true_model_leaves_the_noise(name, cart):
 def test_a_logged_input_of_another_sign_or_scale_is_corrected(name, cart, factor):
     """If the logged input has another sign or scale, its factor is found, reported and used."""
     chain = PLANTS[name]
-    design = designed(chain, cart)
-    law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=chain)
-    y, u = bench(chain, law)
+    design, y, u = run_design(chain, cart)
 
     checks = check_hardware(
         record(y, u=u / factor, reference=STEPS), chain, controller=stated(design, 1 / factor)
@@ -181,9 +184,7 @@ def test_a_stated_sign_that_the_log_contradicts_is_noted():
 
     A note says so.
     """
-    design = designed(TWO, 2)
-    law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
-    y, u = bench(TWO, law)
+    design, y, u = run_design(TWO, 2)
 
     checks = check_hardware(record(y, u=-u, reference=STEPS), TWO, controller=stated(design))
 
@@ -195,9 +196,7 @@ def test_a_stated_sign_that_the_log_contradicts_is_noted():
 @pytest.mark.parametrize("wrong", ["input", "reference", "gains", "controlled_cart", "counts"])
 def test_a_wrong_statement_about_a_run_fails_a_check(wrong):
     """If a column's unit, the gains or the controlled cart are wrong, a check fails."""
-    design = designed(TWO, 2)
-    law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
-    y, u = bench(TWO, law)
+    design, y, u = run_design(TWO, 2)
     gains = stated(design).gains
     swapped = submission.StateFeedbackController(
         type="state_feedback", gains=(gains[1], gains[0], *gains[2:]), prefilter=design.prefilter
@@ -314,9 +313,7 @@ def test_a_cut_closed_loop_is_checked_from_the_cut(start):
 
     The cut may be at rest, just after the step, or after settling.
     """
-    design = designed(TWO, 2)
-    law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
-    y, u = bench(TWO, law)
+    design, y, u = run_design(TWO, 2)
     y, whole = y[:, start:], noise_floor(y[1])
 
     run = record(y, u=u[start:], t=CLOCK[start:], reference=STEPS[start:])
