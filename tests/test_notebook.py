@@ -61,16 +61,6 @@ def test_the_system_is_the_identified_chain(lab):
         assert_array_equal(getattr(system, letter), own)
 
 
-def test_transfer_functions_are_those_of_the_system(lab):
-    """Each output has a transfer function with the frequency response of the state model."""
-    omega = np.geomspace(1.0, 100.0, 20)
-    assert list(lab.transfer_functions) == ["x1", "x2"]
-    for row, (name, found) in enumerate(lab.transfer_functions.items()):
-        assert found.output_labels == [name]
-        # Near a resonance of zeta 0.03, a polynomial of degree four loses two digits.
-        assert_allclose(found(1j * omega), lab.chain.frequency_response(omega)[row], rtol=1e-11)
-
-
 def test_the_closed_loop_is_the_designed_one(lab):
     """The loop has the design's sample time and poles, and a pole at zero for the delay."""
     loop, design = lab.closed_loop, lab.design

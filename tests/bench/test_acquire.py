@@ -247,15 +247,6 @@ def assert_stopped_at_once(raw: Path, offending: int) -> None:
     assert not seen or offending >= seen[-1].ms
 
 
-def test_an_amplitude_past_the_limits_is_never_sent(tmp_path, real):
-    """A plan with an amplitude beyond its own limits is refused before anything is sent."""
-    work = write_work(tmp_path, [sine("dwell", seconds=1)])
-    plan = (work / "plan.toml").read_text(encoding="utf-8")
-    (work / "plan.toml").write_text(plan.replace("input = 0.5", "input = 0.005"), encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"expected at most the limit of 0\.005 V, found 0\.01"):
-        acquire(work, port=real.address, observers=[Notes()])
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no SIGTERM to catch")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["ctrl-c", "sigterm"])
 def test_an_interrupted_host_stops_the_motor_and_saves(tmp_path, number, real):
@@ -359,14 +350,6 @@ def test_an_unknown_scale_is_asked_for(tmp_path, stock):
     wanted = r'position = \{ unit = "mm", per_count = … \} under \[system\]'
     with pytest.raises(ConfigError, match=wanted):
         prepare_submission(tmp_path, BENCH, stock=stock)
-
-
-@pytest.mark.parametrize("options", [[], ["--port", "x", "--import", "y"]])
-def test_a_port_and_a_folder_exclude_each_other(tmp_path, options):
-    """`acquire` with both a port and a folder to import, or with neither, is refused."""
-    result = CliRunner().invoke(app, ["acquire", str(tmp_path), *options])
-    assert isinstance(result.exception, ConfigError)
-    assert "either --port or --import" in str(result.exception)
 
 
 # ----------------------------------------------------------------- the terminal

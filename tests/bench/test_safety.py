@@ -64,16 +64,6 @@ def test_lines_that_cannot_be_read_end_a_run(tmp_path):
     assert sent["lines"] < 5000
 
 
-def test_a_run_that_passed_a_limit_is_not_tried_again(tmp_path, fast):
-    """A run that passed a limit is not repeated, even with `--yes`."""
-    near = PlanLimits(input=0.5, travel=0.1)  # cm: the dwell passes it within its first swing
-    work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=near)
-    notes = Notes()
-    outcomes = acquire(work, port=fast.address, observers=[notes], only=["dwell"])
-    assert [outcome.partial[:14] for outcome in outcomes] == ["stopped: cart "]
-    assert notes.confirmed == []
-
-
 def test_a_plan_for_a_stronger_bench_moves_nothing(tmp_path, real):
     """A plan for 5 V is refused on a bench of 0.5 V, and the message has both numbers."""
     strong = PlanLimits(input=5.0, travel=2.5)

@@ -74,20 +74,6 @@ def test_hands_are_found_at_low_rates(rate):
     assert more == []
 
 
-def test_a_recording_that_is_listed_twice_keeps_its_hands():
-    """If a recording is listed twice, a touch in it is still not taken for an effect."""
-    case = make_case(seed=71, n=1, rate=250.0, handled=True)
-    found = find_interventions(case.records)
-    driven = {r.id for r in case.records if r.u is not None and np.any(r.u)}
-    name = next(one.experiment for one in found if one.experiment in driven)
-    twin = replace(next(r for r in case.records if r.id == name), id="copy")
-
-    both = find_interventions([*case.records, twin])
-    times = [(one.start, one.end) for one in found if one.experiment == name]
-    assert [(one.start, one.end) for one in both if one.experiment == "copy"] == times
-    assert [one for one in both if one.experiment != "copy"] == list(found)
-
-
 @pytest.mark.parametrize(
     "effect",
     [

@@ -296,17 +296,6 @@ def test_a_constant_force_without_springs_is_found():
     assert sizes["force_offset"] == pytest.approx(0.0008, rel=0.03)
 
 
-def test_a_single_decay_is_cut_where_it_still_moves():
-    """From a single decay, the held-out part is one in which the cart still moves."""
-    case = make_case(seed=47, n=1, effects=["coulomb_friction"], rate=113.1)
-    (decay, *_) = (r for r in case.records if r.kind == "decay")
-
-    gap = explain_gap([decay], Setup(springs=case.springs))
-
-    assert 0.0 < gap.noise_floor < 0.5  # the noise is less than half of the motion
-    assert all(r.noise_floor < 0.5 for r in gap.by_record)
-
-
 def test_a_cart_without_recordings_does_not_change_the_verdict():
     """If only decays of cart 2 are recorded, a linear bench still gets the verdict `none`."""
     case = make_case(seed=48, n=2, effects=[], rate=113.1)

@@ -169,35 +169,6 @@ def test_diverging_model_is_reported_as_nan():
     assert np.all(np.isnan(derivatives))
 
 
-def test_a_hidden_mass_starts_at_the_given_position():
-    """A cart and its hidden mass, started apart, move as a chain of two carts."""
-    chain = Chain(m=np.array([1.7e-4]), c=np.array([4e-4]), k=np.array([0.034, 0.0]))
-    mass, stiffness = 2e-5, 0.004
-    term = make_term(
-        find_effect("extra_mode"),
-        place=1,
-        values={"mass": mass, "stiffness": stiffness, "damping": 0.0},
-        chain=chain,
-    )
-    pair = Chain(
-        m=np.array([1.7e-4, mass]), c=np.array([4e-4, 0.0]), k=np.array([0.034, stiffness, 0.0])
-    )
-    t = sample_times(800, 0.002)
-    cart, offset = (0.8, -3.0), (0.15, 2.0)  # position in cm and velocity in cm/s
-
-    got = simulate(
-        AugmentedChain(chain=chain, terms=(term,)).tables(),
-        t,
-        np.zeros(t.size),
-        x0=[cart[0], offset[0]],
-        v0=[cart[1], offset[1]],
-    )
-
-    start = np.array([cart[0], cart[1], cart[0] + offset[0], cart[1] + offset[1]])
-    true = simulate_linear(pair, t, np.zeros(t.size), x0=start)[0]
-    assert_allclose(got[0], true, atol=1e-6 * np.abs(true).max())
-
-
 _NOTHING_LEFT = """
 import numpy as np
 from pipeline.plant.simulator import contacts, kernel, laws, sensitivity, step

@@ -289,30 +289,6 @@ def test_a_stored_model_gives_the_same_records(tmp_path):
         assert path.read_bytes() == (tmp_path / "b" / "data" / path.name).read_bytes()
 
 
-def test_chain_and_effects_suffice_as_a_model(tmp_path):
-    """The chain and effects of `gap.json` suffice for a simulation, without other entries."""
-    document = {
-        "chain": {"m": [2e-4], "c": [5e-4], "k": [0.035, 0.0]},
-        "effects": [
-            {
-                "effect": "end_stop",
-                "where": {"cart": 1},
-                "parameters": {
-                    "position": {"value": 1.1, "std": 0.01, "unit": "cm"},
-                    "stiffness": {"value": 0.7, "std": 0.1, "unit": "V/cm"},
-                },
-            }
-        ],
-    }
-    file = tmp_path / "gap.json"
-    file.write_text(json.dumps(document), encoding="utf-8")
-
-    (term,) = prepare_bench(model=file).effects
-
-    assert term.values[:2] == (1.1, 0.7)
-    assert term.values[2] > 0
-
-
 def test_a_model_in_counts_moves_as_far(tmp_path):
     """A model stored in counts moves the carts as far as the same model in centimetres."""
     chain = PRESETS["throne-1dof"]

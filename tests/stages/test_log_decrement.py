@@ -330,22 +330,6 @@ def test_a_decay_of_few_swings_is_not_called_exponential(periods, outcome):
     assert ("too few swings" in check.message) == (outcome == "skip")
 
 
-@pytest.mark.parametrize("swing", [0.3, 0.7, 1.1])  # rad at the release
-def test_a_pendulum_has_the_frequency_of_small_swings(swing):
-    """If the frequency falls at large swings, as a pendulum's does, this is named and left out."""
-
-    def force(x, v):
-        angle = swing / 1.2
-        return -(OMEGA**2) * np.sin(x * angle) / angle - 2 * 0.01 * OMEGA * v
-
-    got = fit_log_decrement(swinging(force, seed=5), cart=1)
-    assert got.law.name == "frequency_shift"
-    # A first approximation: part of the shift can count as a change of phase.
-    assert_allclose(got.law.size, -(swing**2) / 16, rtol=0.25)
-    assert_allclose(got.omega_n, OMEGA, rtol=1e-3)
-    assert_allclose(got.zeta, 0.01, rtol=0.04)
-
-
 def stiffening(shift, *, noise, seed, duration):
     """Return a record of a cubic spring and its exact relative shift of frequency at the release.
 

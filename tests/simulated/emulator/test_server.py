@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -25,14 +24,13 @@ from pipeline.protocol import (
     parse_reading,
 )
 from pipeline.simulated.emulator.carts import TRUE_PERIOD, VirtualCarts
-from pipeline.simulated.emulator.server import Faults, read_fault
+from pipeline.simulated.emulator.server import read_fault
 from pipeline.simulated.hidden import prepare_bench
 from tests.helpers.benches import Emulator, emulator
 from tests.helpers.waiting import started
 
 QUIET = 0.3  # longest time in s that a read waits
 MOTOR_OFF = 1000  # ms after the last heartbeat: the watchdog's 100, and some for a busy machine
-pty_only = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 
 
 @contextmanager
@@ -70,38 +68,6 @@ def fast_bench() -> Iterator[Emulator]:
     """Yield the two-cart preset on a clock ten times as fast as wall time."""
     with emulator("--speed", "10", "--seed", "3", watchdog=WATCHDOG) as bench:
         yield bench
-
-
-@pytest.mark.slow
-@pytest.mark.sample
-@pty_only
-def test_hosts_talk_to_a_pseudo_terminal_one_after_the_other():
-    """At a pseudo-terminal a host gets a description, and a run in real time.
-
-    After a host has left, the next one can use the bench. A signal ends the bench with exit status
-    0.
-    """
-    with emulator("--port", "pty", "--hide", "coulomb_friction:force=0.004") as bench:
-        for _ in range(2):
-            with host(bench) as line:
-                line.write(encode(Signal.QUERY))
-                described = parse_description(line.readline())
-                assert (described.carts, described.commands) == (2, frozenset("cfhkms"))
-                began = time.monotonic()
-                readings = stream(
-                    bench, line, Start(wave=Wave.SQUARE, frequency=1.0, amplitude=300, cycles=2)
-                )
-                took = time.monotonic() - began - QUIET
-            # One more or less, depending on where in a ms the run began.
-            assert len(readings) == pytest.approx(2.0 / TRUE_PERIOD, abs=1)
-            steps = np.diff([reading.ms for reading in readings])
-            assert set(steps) == {1, 2}
-            assert np.sum(steps == 2) in (4, 5)  # at 1.0024 ms, one stamp in 417 is skipped
-            assert readings[-1].counts[0] > readings[-1].counts[1] > 100
-            assert took > 1.9
-            assert [bench.event("client")["connected"] for _ in "io"] == [True, False]
-        assert "hidden: coulomb_friction on cart 1: force 0.004 V" in bench.output
-    assert bench.event("exit")["status"] == 0
 
 
 def test_a_step_gives_the_static_gain(fast_bench):
@@ -165,19 +131,6 @@ def test_faults_come_at_the_requested_time():
             start = Start(wave=Wave.SINE, frequency=1.0, amplitude=200, cycles=1)
             again = stream(bench, line, start)
         assert len({reading.counts[1] for reading in again}) == 1
-
-
-def test_delayed_bytes_still_arrive():
-    """A lost line end is sent after the run, and delayed bytes arrive in order."""
-    faults = Faults([read_fault("merge@0.003"), read_fault("delay@0.004")], seed=0, period=1e-3)
-    sent = [faults.strike(b"1:2:3:4:%d\n" % ms, clock=1e-3 * ms)[0] for ms in range(3)]
-    assert sent == [b"1:2:3:4:0\n", b"1:2:3:4:1\n", b"1:2:3:4:2"]
-    assert faults.idle(clock=0.004) == b"\n"
-    sent = [faults.strike(b"1:2:3:4:%d\n" % ms, clock=0.005 + 1e-3 * ms)[0] for ms in range(3)]
-    assert sent == [b"", b"", b""]
-    assert faults.idle(clock=0.054) == b""
-    assert faults.idle(clock=0.056) == b"1:2:3:4:0\n1:2:3:4:1\n1:2:3:4:2\n"
-    assert faults.injected == {"merge": 1, "delay": 1, "late": 3}
 
 
 @pytest.mark.parametrize("way", ["falls silent", "goes away", "is killed"])
