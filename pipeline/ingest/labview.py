@@ -21,6 +21,8 @@ from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.columns import is_time, join_unit
 from pipeline.ingest.table import (
+    MOST_NAMED,
+    SETTING,
     FileTable,
     Variable,
     binary_table,
@@ -222,8 +224,6 @@ def _headings(segment: _Segment, names: Sequence[str]) -> list[str]:
 
 _LEAD_IN = 28  # bytes
 _BIG_ENDIAN = 0x40  # flag of a segment
-_SETTING = 0.1  # share of the longest channel; shorter channels are settings, as in a .mat file
-_MOST_NAMED = 8
 
 
 def is_tdms(raw: bytes) -> bool:
@@ -403,16 +403,16 @@ def _recordings(channels: Sequence[_Channel], *, source: str) -> dict[str, list[
     """
     signals = [one for one in channels if one.values is not None and one.samples > 1]
     if not signals:
-        found = first_few([f"{one.group}/{one.name}" for one in channels], _MOST_NAMED)
+        found = first_few([f"{one.group}/{one.name}" for one in channels], MOST_NAMED)
         raise SubmissionError(f"{source}: holds no channel of numbers, but {found or 'nothing'}")
     longest = max(one.samples for one in signals)
     groups: dict[str, list[_Channel]] = {}
     for one in signals:
-        if one.samples > _SETTING * longest:
+        if one.samples > SETTING * longest:
             groups.setdefault(one.group, []).append(one)
     for read in groups.values():
         if len({one.samples for one in read}) > 1:
-            sizes = first_few([f"{one.name} ({one.samples:,})" for one in read], _MOST_NAMED)
+            sizes = first_few([f"{one.name} ({one.samples:,})" for one in read], MOST_NAMED)
             raise SubmissionError(f"{source}: the channels differ in length: {sizes}")
     return groups
 
@@ -426,7 +426,7 @@ def _clock(channels: Sequence[_Channel], *, source: str) -> tuple[float, float]:
     """
     stated = {(one.interval, one.start) for one in channels if one.interval > 0}
     if len(stated) > 1:
-        shown = first_few([f"{interval:g} s" for interval, _ in sorted(stated)], _MOST_NAMED)
+        shown = first_few([f"{interval:g} s" for interval, _ in sorted(stated)], MOST_NAMED)
         raise SubmissionError(
             f"{source}: the channels were sampled at different times (wf_increment {shown}); "
             "keep those of one rate"

@@ -16,6 +16,8 @@ from pipeline.errors import SubmissionError
 from pipeline.ingest.columns import is_time
 from pipeline.ingest.table import (
     MOST_COLUMNS,
+    MOST_NAMED,
+    SETTING,
     FileTable,
     Variable,
     binary_table,
@@ -24,8 +26,7 @@ from pipeline.ingest.table import (
 )
 from pipeline.words.numbers import first_few
 
-_MOST_SETTINGS = 8  # numbers in a variable; a recording has more samples
-_MOST_NAMED = 8
+_MOSTSETTINGS = 8  # numbers in a variable; a recording has more samples
 _BENCH = ({"enc1", "duty", "time"}, {"cart1pos", "duty_cycle", "t_received"})
 _LONGEST_NAME, _DEEPEST = 64, 4  # characters; structs in structs
 _NUMBERS = frozenset(
@@ -138,7 +139,7 @@ def _structures(variables: Sequence[MatVariable], *, source: str) -> list[FileTa
     whole = {v.name: v for v in variables}
     if (one := _structure("", whole, source=source)) is not None:
         return [one]
-    if sum(v.values is not None and v.samples > _MOST_SETTINGS for v in variables) > 1:
+    if sum(v.values is not None and v.samples > _MOSTSETTINGS for v in variables) > 1:
         return []
     found = (
         _structure(v.name, element, source=source) for v in variables for element in v.elements
@@ -165,7 +166,7 @@ def _structure(name: str, fields: Mapping[str, MatVariable], *, source: str) -> 
         if values.shape[0] == longest and values.shape[1] <= MOST_COLUMNS:
             label = label if values.shape[1] == 1 else ""  # it does not name several signals
             columns += [(label, column) for column in values.T]
-    if len(columns) < 2 or longest <= _MOST_SETTINGS:
+    if len(columns) < 2 or longest <= _MOSTSETTINGS:
         return None
     named = all(label for label, _ in columns)
     names = [label if named else str(i) for i, (label, _) in enumerate(columns, start=1)]
@@ -190,15 +191,14 @@ def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariabl
     """
     signals = [v for v in variables if v.values is not None and v.samples > 1]
     if not signals:
-        found = first_few([str(v) for v in variables], _MOST_NAMED) or "nothing"
+        found = first_few([str(v) for v in variables], MOST_NAMED) or "nothing"
         told = {v.name: advice for v in variables if (advice := _advice(v, longest=0))}
         first = next((f"; {name}: {advice}" for name, advice in told.items()), "")
         raise SubmissionError(f"{source}: holds no vector or matrix of numbers, but {found}{first}")
     signals = [v for v in signals if min(v.size) <= MOST_COLUMNS] or signals
     longest = max(v.samples for v in signals)
-    # Shorter than a tenth of the longest, a variable holds gains or poles, not a truncated signal.
-    signals = [v for v in signals if v.samples > 0.1 * longest]
-    sizes = first_few([str(v) for v in signals], _MOST_NAMED)
+    signals = [v for v in signals if v.samples > SETTING * longest]
+    sizes = first_few([str(v) for v in signals], MOST_NAMED)
     vectors = [v for v in signals if v.is_vector]
     if all(v.samples < longest for v in vectors):  # the longest variable is a matrix
         vectors, signals = [], [v for v in signals if v.samples == longest]

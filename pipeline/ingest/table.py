@@ -14,7 +14,8 @@ from pipeline.words.numbers import first_few
 
 MOST_COLUMNS = 64
 _LONGEST_HEADING = 100  # characters
-_MOST_NAMED = 8
+MOST_NAMED = 8
+SETTING = 0.1  # share of the longest signal; a shorter one holds settings, such as gains
 # Range of values that a bench can measure, in any unit: times, positions, inputs, ratios. Powers
 # and products of several such values, as in the stages, neither overflow nor underflow.
 _SMALLEST_MEASURED, _LARGEST_MEASURED = 1e-12, 1e12
@@ -198,12 +199,12 @@ def not_read(variables: Sequence[Variable]) -> list[str]:
     """Return a note on each variable that is not read, the largest first."""
     large = [v for v in variables if v.advice]
     large.sort(key=lambda v: -math.prod(v.size))
-    notes = [f"not read: {v}; {v.advice}" for v in large[:_MOST_NAMED]]
+    notes = [f"not read: {v}; {v.advice}" for v in large[:MOST_NAMED]]
     alike: dict[str, list[str]] = {}
-    for v in (*large[_MOST_NAMED:], *(v for v in variables if not v.advice)):
+    for v in (*large[MOST_NAMED:], *(v for v in variables if not v.advice)):
         alike.setdefault(str(v).removeprefix(v.name), []).append(v.name)
-    rest = [first_few(names, _MOST_NAMED) + what for what, names in alike.items()]
-    return notes + ([f"not read: {first_few(rest, _MOST_NAMED)}"] if rest else [])
+    rest = [first_few(names, MOST_NAMED) + what for what, names in alike.items()]
+    return notes + ([f"not read: {first_few(rest, MOST_NAMED)}"] if rest else [])
 
 
 def refuse_unusable(values: Array, *, names: Sequence[str], place: Callable[[int], str]) -> None:

@@ -9,13 +9,11 @@ from io import BytesIO
 from typing import Any
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.table import FileTable
+from pipeline.ingest.table import MOST_NAMED, SETTING, FileTable
 from pipeline.ingest.text import Layout, find_blocks, is_bench_log, read_runs
 from pipeline.words.numbers import first_few
 
 _PARTS = (b"[Content_Types].xml", b"docProps/", b"xl/")  # one of these occurs early in the archive
-_SETTING = 0.1  # share of the longest; shorter columns and tables are settings
-_MOST_NAMED = 8
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(e[-+]?\d+)?", re.IGNORECASE)
 _FORMULA = re.compile(rb"<(?:\w+:)?f[ >]")
 _FIRST_ROWS = 40  # rows that show how the numbers of a column are formatted
@@ -41,13 +39,13 @@ def read_workbook(raw: bytes, *, source: str) -> list[FileTable]:
             found = _read_sheet(name, lines, source=source)
             tables += [replace(one, notes=(*one.notes, *notes)) for one in found]
     if not tables:
-        names = first_few([repr(name) for name in sheets], _MOST_NAMED) or "none"
+        names = first_few([repr(name) for name in sheets], MOST_NAMED) or "none"
         raise SubmissionError(
             f"{source}: no sheet has a row of headings (such as time, input, x1) above rows of "
             f"numbers; the sheets: {names}"
         )
     longest = max(table.values.shape[1] for table in tables)
-    return [table for table in tables if table.values.shape[1] > _SETTING * longest]
+    return [table for table in tables if table.values.shape[1] > SETTING * longest]
 
 
 def _has_formulas(raw: bytes, *, source: str) -> bool:
@@ -137,7 +135,7 @@ def _lines(
             if value is not None and _is_number(value):
                 counts[i] = counts.get(i, 0) + 1
     most = max(counts.values(), default=0)
-    used = [i for i, count in sorted(counts.items()) if count > _SETTING * most]
+    used = [i for i, count in sorted(counts.items()) if count > SETTING * most]
     lines = []
     for number, row in enumerate(rows, start=1):
         cells = [row[i] if i < len(row) else None for i in used]

@@ -20,6 +20,7 @@ from pipeline.processes import limited_memory
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission, toml
 from pipeline.submission.load import NAME
+from tests.helpers.recordings import package
 
 
 def in_matlab(fill) -> bytes:
@@ -131,6 +132,15 @@ def test_the_memory_to_read_one_file_is_limited(tmp_path, monkeypatch):
         read_table(tmp_path, "long.csv")
     monkeypatch.undo()
     assert read_table(tmp_path, "long.csv")[0].values.shape == (2, 1_000_000)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits address space")
+def test_a_workbook_that_inflates_is_refused_by_itself(tmp_path, monkeypatch):
+    """A workbook that unpacks to much more than its size needs too much memory, whoever sent it."""
+    (tmp_path / "a.xlsx").write_bytes(package("<worksheet>" + " " * 50_000_000 + "</worksheet>"))
+    monkeypatch.setattr(files, "MOST_MEMORY", 20_000_000)
+    with pytest.raises(SubmissionError, match=r"a\.xlsx: needs more than 0\.02 GB"):
+        read_table(tmp_path, "a.xlsx")
 
 
 # The patterns that are applied to text of any length, and how.
