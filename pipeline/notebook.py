@@ -13,8 +13,8 @@ from pipeline.grading.self_check.check import check_numbers
 from pipeline.grading.self_check.log import CheckAnswer
 from pipeline.grading.self_check.words import answer_lines
 from pipeline.plant.chain import Chain
-from pipeline.plant.export.motion import EquationsOfMotion
 from pipeline.plant.margins import closed_loop
+from pipeline.plant.motion import EquationsOfMotion
 from pipeline.report import gap_tables, tables
 from pipeline.report.document import Block, Document, Heading
 from pipeline.report.gap.load_gap import with_gap

@@ -11,8 +11,15 @@ from typing import Any
 import sympy
 from sympy.printing.pycode import PythonCodePrinter
 
-from pipeline.plant.effect import Effect, EffectParameter
-from pipeline.plant.law import ContactLaw, ForceLaw, FrictionLaw, HysteresisLaw, InputLaw
+from pipeline.plant.effect import (
+    ContactLaw,
+    Effect,
+    EffectParameter,
+    ForceLaw,
+    FrictionLaw,
+    HysteresisLaw,
+    InputLaw,
+)
 
 Expr = Any  # sympy's own annotations are partial
 

@@ -15,11 +15,9 @@ from pipeline.errors import DataError
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import AugmentedChain
 from pipeline.plant.simulator import kernel
-from pipeline.plant.simulator.contacts import contact_gap, toggle_contact
+from pipeline.plant.simulator.kernel import advance, contact_gap, smooth_forces, toggle_contact
 from pipeline.plant.simulator.laws import hysteresis, longest_step, shaped_input
-from pipeline.plant.simulator.sensitivity import make_sensitivities
-from pipeline.plant.simulator.state import Push
-from pipeline.plant.simulator.step import advance, smooth_forces
+from pipeline.plant.simulator.sensitivity import Push, make_sensitivities
 from pipeline.plant.simulator.tables import DRY, Cart, Drive, Spring, Tables
 
 _RUN_AWAY = "with these effects the carts diverge: a spring softens too much, or a force is huge"

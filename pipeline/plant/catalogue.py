@@ -10,10 +10,11 @@ from math import inf
 from operator import attrgetter
 
 from pipeline.errors import ConfigError
-from pipeline.plant.effect import Effect, EffectParameter
-from pipeline.plant.law import (
+from pipeline.plant.effect import (
     BuiltLaw,
     ContactLaw,
+    Effect,
+    EffectParameter,
     FitCoordinates,
     ForceLaw,
     FrictionLaw,

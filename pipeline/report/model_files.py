@@ -6,9 +6,7 @@ from pathlib import Path
 from pipeline.errors import DataError
 from pipeline.output import write_file
 from pipeline.plant.effect import AugmentedChain
-from pipeline.plant.export.description import describe
-from pipeline.plant.export.fmu import fmu
-from pipeline.plant.export.sources import c_sources, matlab_source
+from pipeline.plant.export import c_sources, describe, fmu, matlab_source
 from pipeline.results import Analysis
 
 FILES = ("model.fmu", "model.c", "model.h", "model.m")

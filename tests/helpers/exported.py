@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.arrays import Array
-from pipeline.plant.export.description import Description
-from pipeline.plant.export.sources import c_sources
+from pipeline.plant.export import Description, c_sources
 
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 OCTAVE = shutil.which("octave-cli") or shutil.which("octave")

@@ -8,8 +8,7 @@ from numpy.testing import assert_allclose
 
 from docs.codegen.__main__ import MADE, ROOM
 from pipeline.plant.catalogue import CATALOGUE, find_effect
-from pipeline.plant.effect import Effect
-from pipeline.plant.law import ContactLaw, ForceLaw, FrictionLaw, HysteresisLaw, evaluate
+from pipeline.plant.effect import ContactLaw, Effect, ForceLaw, FrictionLaw, HysteresisLaw, evaluate
 from pipeline.plant.simulator import laws, terms
 from pipeline.plant.simulator.tables import TABLES
 from pipeline.words.math import to_tex

@@ -10,7 +10,7 @@ from pipeline.plant.augmented import simulate_augmented
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain, Effect, chain_scales
-from pipeline.plant.export.motion import EquationsOfMotion
+from pipeline.plant.motion import EquationsOfMotion
 from tests.helpers.effects import make_term
 
 CHAIN = PRESETS["throne-2dof"]

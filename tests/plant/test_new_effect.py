@@ -12,8 +12,7 @@ from numpy.testing import assert_allclose
 import pipeline
 from docs.codegen.__main__ import MADE
 from pipeline.plant.catalogue import CATALOGUE
-from pipeline.plant.effect import Effect, EffectParameter
-from pipeline.plant.law import ForceLaw, FrictionLaw, HysteresisLaw
+from pipeline.plant.effect import Effect, EffectParameter, ForceLaw, FrictionLaw, HysteresisLaw
 
 ROOM = Path(pipeline.__file__).parent
 CUBIC_DRAG = Effect(
@@ -103,6 +102,5 @@ def test_only_its_own_file_names_an_effect(effect):
         for path in (ROOM / room).rglob("*.py")
         if re.search(rf"\b({effect.key}|{effect.key.upper()}\w*)\b", path.read_text("utf-8"))
     }
-    allowed = {f"plant/simulator/{name}" for name in MADE} | {"gap/pem/score.py"}
-    allowed |= {"gap/pem/choose.py"}  # keeps one of two dry frictions
+    allowed = {f"plant/simulator/{name}" for name in MADE} | {"gap/pem/fit.py"}
     assert files - {"plant/catalogue.py"} <= allowed

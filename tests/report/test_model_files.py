@@ -10,8 +10,7 @@ from fmpy.validation import validate_fmu
 from pipeline.plant.catalogue import find_effect
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain
-from pipeline.plant.export.description import describe
-from pipeline.plant.export.sources import c_sources
+from pipeline.plant.export import c_sources, describe
 from pipeline.report.model_files import FILES, clear_model, save_model
 from pipeline.results import Analysis
 from pipeline.setup import Units

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 from pipeline.plant.simulator.compiler import inlined, jit
-from pipeline.plant.simulator.state import add_spring
+from pipeline.plant.simulator.sensitivity import add_spring
 from pipeline.plant.simulator.terms import (
     FRICTION,
     HYSTERESIS,

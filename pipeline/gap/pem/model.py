@@ -13,7 +13,7 @@ from pipeline.gap.pem import kernel as forces
 from pipeline.gap.runs import GapRun
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import Chain
-from pipeline.plant.law import ForceLaw, FrictionLaw
+from pipeline.plant.effect import ForceLaw, FrictionLaw
 from pipeline.plant.simulator.tables import TABLES, Drive
 from pipeline.plant.simulator.terms import COEFFICIENTS, EffectKind
 

@@ -4,8 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from string import ascii_lowercase
 
-from pipeline.plant.effect import EffectTerm, input_steps
-from pipeline.plant.law import ForceLaw
+from pipeline.plant.effect import EffectTerm, ForceLaw, input_steps
 from pipeline.report.document import Formula
 from pipeline.report.equations.model import equations_of_motion, formula
 from pipeline.words.math import WIDE_SPACE, Math, Term, dot, row, sub, upright

@@ -19,14 +19,12 @@ from fmpy.validation import validate_fmu
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.arrays import Array
+from pipeline.plant import export as fmu_module
 from pipeline.plant.augmented import simulate_augmented
 from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain, Effect
-from pipeline.plant.export import fmu as fmu_module
-from pipeline.plant.export.description import describe
-from pipeline.plant.export.fmu import fmu
-from pipeline.plant.export.sources import matlab_source
+from pipeline.plant.export import describe, fmu, matlab_source
 from pipeline.setup import PAPER_UNITS
 from tests.helpers.effects import SIZES, make_term
 from tests.helpers.exported import OCTAVE, CompiledModel, no_compiler, no_octave

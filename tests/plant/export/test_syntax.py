@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.effect import Effect
-from pipeline.plant.export.syntax import in_c, in_matlab, substitute
+from pipeline.plant.export import in_c, in_matlab, substitute
 from tests.helpers.exported import COMPILER, OCTAVE, no_compiler, no_octave
 from tests.plant.test_new_effect import CUBIC_DRAG
 

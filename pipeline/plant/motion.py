@@ -21,11 +21,21 @@ from scipy.special import factorial
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.plant.effect import AugmentedChain, EffectTerm, input_steps
-from pipeline.plant.law import BuiltLaw, ContactLaw, ForceLaw, FrictionLaw, HysteresisLaw, InputLaw
+from pipeline.plant.effect import (
+    AugmentedChain,
+    BuiltLaw,
+    ContactLaw,
+    EffectTerm,
+    ForceLaw,
+    FrictionLaw,
+    HysteresisLaw,
+    InputLaw,
+    input_steps,
+)
 
 if TYPE_CHECKING:
     import control
+
 
 STOP_TIME = 1e-4  # in s; default of the parameter `stop`
 _PADE_ORDER = 4

@@ -1,31 +1,190 @@
-"""The content of an exported model, for all languages: its parameters, bodies and laws.
+"""Export a model to other programs: C, MATLAB and FMU."""
 
-Laws are expressions as described in `syntax`, with names such as `p.m1`, `x.cart_1`, `v.motor` and
-`z.z1`. `u` is the force of the drive on its body, and `on` is 1 while the drive is powered. In a
-spring's law, `d` is the stretch and `rate` its velocity.
-"""
-
-from collections.abc import Collection, Mapping, Sequence
+import ast
+import hashlib
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from pipeline import __version__
 from pipeline.errors import DataError
 from pipeline.plant.augmented import SteppedBench, rest_positions
 from pipeline.plant.chain import Chain
-from pipeline.plant.effect import AugmentedChain, EffectTerm, input_steps
-from pipeline.plant.export.syntax import substitute
-from pipeline.plant.law import (
+from pipeline.plant.effect import (
+    AugmentedChain,
     BuiltLaw,
     ContactLaw,
+    EffectTerm,
     ForceLaw,
     FrictionLaw,
     HysteresisLaw,
     InputLaw,
+    input_steps,
     names_in,
 )
 from pipeline.plant.simulator.laws import hysteresis
+from pipeline.resources import TEMPLATES
 from pipeline.setup import Units
+
+# --------------------------------------------- expressions, from Python's syntax to C and MATLAB
+#
+# The laws of the effects are such expressions (`plant.effect`). Here their symbols are names of the
+# model: `p.NAME` is a parameter, `x.BODY` a position, `v.BODY` a velocity and `z.NAME` a bristle of
+# dry friction. All other names are local variables.
+
+Symbols = Mapping[str, str]
+_FORMS = (
+    ast.Expression, ast.BinOp, ast.UnaryOp, ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow, ast.USub,
+)  # fmt: skip
+
+# Functions allowed in a law. `pow` stands for powers, which have no operator in C.
+_MATH = {name: name for name in ("abs", "min", "max", "exp", "sin", "cos", "sign", "pow")}
+
+_IN_C = {"π": "PI", "inf": "INFINITY"}
+_IN_MATLAB = {"π": "pi", "inf": "Inf"}
+
+
+def substitute(text: str, symbols: Symbols) -> str:
+    """Replace symbols of an expression by other names or expressions."""
+    return ast.unparse(_Substitution(symbols).visit(ast.parse(text, mode="eval")))
+
+
+def in_c(text: str) -> str:
+    """Return an expression in C; `sign` and `PI` must be defined in the file."""
+    return ast.unparse(_C().visit(ast.parse(text, mode="eval")))
+
+
+def in_matlab(text: str, *, bodies: Sequence[str], bristles: Sequence[str]) -> str:
+    """Return an expression in MATLAB; bodies and bristles are numbered in the given order."""
+    written = ast.unparse(_Matlab(bodies, bristles).visit(ast.parse(text, mode="eval")))
+    return written.replace(" ** ", "^")
+
+
+class _Substitution(ast.NodeTransformer):
+    def __init__(self, symbols: Symbols) -> None:
+        self._symbols = {name: ast.parse(text, mode="eval") for name, text in symbols.items()}
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        return self._symbols[node.id].body if node.id in self._symbols else node
+
+    def visit_Call(self, node: ast.Call) -> ast.expr:
+        return ast.Call(node.func, [self.visit(one) for one in node.args], [])
+
+    def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
+        """Simplify operations with 0 and 1, which the substitution may have introduced."""
+        left, right = self.visit(node.left), self.visit(node.right)
+        match node.op, _value(left), _value(right):
+            case (ast.Mult(), 0, _) | (ast.Mult(), _, 0):
+                return ast.Constant(0)
+            case (ast.Mult(), 1, _) | (ast.Add(), 0, _):
+                return right
+            case (ast.Mult() | ast.Div(), _, 1) | (ast.Add() | ast.Sub(), _, 0):
+                return left
+        return ast.BinOp(left, node.op, right)
+
+    def visit_UnaryOp(self, node: ast.UnaryOp) -> ast.expr:
+        operand = self.visit(node.operand)
+        return operand if _value(operand) == 0 else ast.UnaryOp(node.op, operand)
+
+
+def _value(node: ast.expr) -> object:
+    return node.value if isinstance(node, ast.Constant) else None
+
+
+def _not_known(node: ast.AST) -> ValueError:
+    return ValueError(f"no part of a law: {ast.unparse(node)}")
+
+
+class _Printer(ast.NodeTransformer):
+    """The rules for both languages. They refuse any syntax that laws do not use."""
+
+    def __init__(self, functions: Mapping[str, str], constants: Mapping[str, str]) -> None:
+        self._functions, self._constants = functions, constants
+
+    def generic_visit(self, node: ast.AST) -> ast.AST:
+        if not isinstance(node, _FORMS):
+            raise _not_known(node)
+        return super().generic_visit(node)
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        return ast.Name(self._constants.get(node.id, node.id))
+
+    def visit_Constant(self, node: ast.Constant) -> ast.expr:
+        if not isinstance(node.value, int | float):
+            raise _not_known(node)
+        return node
+
+    def visit_Call(self, node: ast.Call) -> ast.expr:
+        given = [self.visit(one) for one in node.args]
+        match node.func:
+            case ast.Name(id="clip"):
+                value, low, high = given
+                return self._call("min", self._call("max", value, low), high)
+            case ast.Name(id="min" | "max" as name):
+                first, *others = given
+                for other in others:
+                    first = self._call(name, first, other)
+                return first
+            case ast.Name(id=name) if name in self._functions:
+                return self._call(name, *given)
+        raise _not_known(node)
+
+    def _call(self, name: str, *given: ast.expr) -> ast.expr:
+        return ast.Call(ast.Name(self._functions[name]), list(given), [])
+
+
+class _C(_Printer):
+    def __init__(self) -> None:
+        super().__init__(_MATH | {"abs": "fabs", "min": "fmin", "max": "fmax"}, _IN_C)
+
+    def visit_Attribute(self, node: ast.Attribute) -> ast.expr:
+        of = ast.unparse(node.value)
+        return ast.Name(f"p->{node.attr}" if of == "p" else f"{of}[{node.attr.upper()}]")
+
+    def visit_Constant(self, node: ast.Constant) -> ast.expr:
+        super().visit_Constant(node)
+        return ast.Constant(float(node.value))  # pyright: ignore[reportArgumentType]
+
+    def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
+        if isinstance(node.op, ast.Pow):
+            return self._call("pow", self.visit(node.left), self.visit(node.right))
+        return self.generic_visit(node)
+
+
+class _Matlab(_Printer):
+    def __init__(self, bodies: Sequence[str], bristles: Sequence[str]) -> None:
+        super().__init__(_MATH | {"pow": "power"}, _IN_MATLAB)
+        self._order = {"x": bodies, "v": bodies, "z": bristles}
+
+    def visit_Attribute(self, node: ast.Attribute) -> ast.expr:
+        of = ast.unparse(node.value)
+        if of == "p":
+            return node
+        return ast.Name(f"{of}({self._order[of].index(node.attr) + 1})")
+
+    def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
+        # In MATLAB a^b^c means (a^b)^c, in Python a**b**c means a**(b**c).
+        nested = isinstance(node.right, ast.BinOp) and isinstance(node.right.op, ast.Pow)
+        if isinstance(node.op, ast.Pow) and nested:
+            return self._call("pow", self.visit(node.left), self.visit(node.right))
+        return self.generic_visit(node)
+
+
+# ----------------------------------------------------- the content of a model, for all languages
+#
+# Laws are expressions as described above, with names such as `p.m1`, `x.cart_1`, `v.motor`
+# and `z.z1`. `u` is the force of the drive on its body, and `on` is 1 while the drive is powered.
+# In a spring's law, `d` is the stretch and `rate` its velocity.
 
 _PHASE = 0.05  # rad of the fastest oscillation per step, for an error of 1e-4 in its period
 _LONGEST = 2e-4  # s
@@ -436,3 +595,164 @@ def _longest_step(model: AugmentedChain, free: Sequence[int]) -> float:
         if holds > 0.0:
             step = min(step, _PHASE / np.sqrt(holds * pace / mass))
     return float(min(step, _LONGEST))
+
+
+# ---------------------------------------------------------------------- source code
+
+TITLE = f"Carts on springs with the effects that cartlab {__version__} found"
+
+_LETTERS = str.maketrans({"µ": "u", "μ": "u", "°": "deg", "²": "^2", "³": "^3", "·": "*"})
+
+
+def c_sources(description: Description) -> dict[str, str]:
+    """Return the texts of `model.h` and `model.c`."""
+    return {name: render(name, description, code=in_c) for name in ("model.h", "model.c")}
+
+
+def matlab_source(description: Description) -> str:
+    """Return the text of `model.m`."""
+    bodies = [body.name for body in description.bodies]
+    bristles = [bristle.name for bristle in description.bristles]
+    code = partial(in_matlab, bodies=bodies, bristles=bristles)
+    return render("model.m", description, code=code)
+
+
+def render(
+    name: str, description: Description, *, code: Callable[[str], str] = in_c, **more: Any
+) -> str:
+    """Fill in a template of `templates/model`; `code` translates expressions."""
+    # Imported late, because this takes 50 ms.
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES / "model"),
+        undefined=jinja2.StrictUndefined,
+        autoescape=name.endswith(".xml"),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    bodies = [body.name for body in description.bodies]
+    number = {name: f"{place}" for place, name in enumerate(bodies, start=1)}
+    environment.filters |= {"code": code, "comment": comment, "number": number.__getitem__}
+    return environment.get_template(f"{name}.j2").render(
+        d=description, title=TITLE, units=description.units, **more
+    )
+
+
+def comment(text: str) -> str:
+    """Return a text that is safe in a comment: only ASCII, and nothing that ends the comment."""
+    plain = text.translate(_LETTERS).encode("ascii", "replace").decode().replace("\\", "/")
+    return plain.replace("/*", "/ *").replace("*/", "* /").replace("??", "? ?")
+
+
+# --------------------------------------------------------------------- FMI 2.0 for co-simulation
+#
+# It contains sources and, if there is a compiler, a binary.
+#
+# Reference: Functional Mock-up Interface for Model Exchange and Co-Simulation, version 2.0.4.
+
+_COMPILERS = ("cc", "gcc", "clang")
+_PATIENCE = 120.0  # s; compiling normally takes 0.3 s
+# earliest date in a zip file; a fixed date gives the same bytes each time
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+_LIBRARY = {"linux": "so", "darwin": "dylib", "win32": "dll"}
+_SYSTEM = {"linux": "linux", "darwin": "darwin", "win32": "win"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variable:
+    """A variable in modelDescription.xml; `member` is its name in the C structure."""
+
+    index: int
+    name: str
+    member: str
+    meaning: str
+    unit: str
+    causality: str
+    variability: str = "continuous"
+    start: str = ""
+
+
+def fmu(description: Description) -> tuple[bytes, bool]:
+    """Return `model.fmu`, and whether it has a binary for this computer."""
+    sources = c_sources(description)
+    variables = _variables(description)
+    settable = sum(v.causality in ("input", "parameter") for v in variables)
+    # The GUID in binary and description must be the same, because tools compare them.
+    known = "".join([*sources.values(), *map(repr, variables), __version__])
+    guid = f"{{{hashlib.sha256(known.encode()).hexdigest()[:32]}}}"
+    values = {"guid": guid, "variables": variables, "settable": settable, "version": __version__}
+    sources |= {name: render(name, description, **values) for name in ("fmi2.h", "fmi2.c")}
+    files: dict[str, str | bytes] = {
+        "modelDescription.xml": render("modelDescription.xml", description, **values),
+        **{f"sources/{name}": text for name, text in sources.items()},
+    }
+    binary = compile_library(sources)
+    if binary is not None:
+        bits = 64 if sys.maxsize > 2**32 else 32
+        system = _SYSTEM[sys.platform]
+        files[f"binaries/{system}{bits}/model.{_LIBRARY[sys.platform]}"] = binary
+    return _zip(files), binary is not None
+
+
+def _variables(description: Description) -> list[Variable]:
+    units, found = description.units, []
+
+    def add(name: str, member: str, meaning: str, unit: str, causality: str, **more: str) -> None:
+        index = len(found) + 1
+        found.append(
+            Variable(
+                index=index, name=name, member=member, meaning=meaning, unit=unit,
+                causality=causality, **more,
+            )
+        )  # fmt: skip
+
+    fixed = {"causality": "parameter", "variability": "fixed"}
+    tunable = {"causality": "parameter", "variability": "tunable"}
+    sign_note = "; the recordings count it the other way" if description.sign_reversed else ""
+    add("u", "u", f"input, constant during a step{sign_note}", units.input, "input", start="0")
+    for i, start in enumerate(description.rest, start=1):
+        meaning = f"start position of cart {i}"
+        add(f"x{i}_start", f"start[{i - 1}]", meaning, units.position, start=start, **fixed)
+    for p in description.parameters:
+        add(p.name, f"model.p.{p.name}", p.meaning, p.unit, start=p.text, **tunable)
+    for i in range(1, description.n + 1):
+        add(f"x{i}", f"model.y[{i - 1}]", f"reading of sensor {i}", units.position, "output")
+    speed = f"{units.position}/s"
+    for at, body in enumerate(description.bodies):
+        if at >= description.n:
+            meaning = f"position of {body.meaning}"
+            add(f"x{body.suffix}", f"model.x[{at}]", meaning, units.position, "local")
+        add(f"v{body.suffix}", f"model.v[{at}]", f"velocity of {body.meaning}", speed, "local")
+    for at, bristle in enumerate(description.bristles):
+        add(bristle.name, f"model.z[{at}]", f"bend, -1 to 1: {bristle.title}", "", "local")
+    if description.lag:
+        add("u_lag", "model.lagged", "input after the lag", units.input, "local")
+    return found
+
+
+def compile_library(sources: Mapping[str, str]) -> bytes | None:
+    """Return the sources compiled to a library for this computer; None if there is no compiler."""
+    compiler = next(filter(None, map(shutil.which, _COMPILERS)), None)
+    if compiler is None or sys.platform not in _LIBRARY:
+        return None
+    with tempfile.TemporaryDirectory() as name:
+        for file, text in sources.items():
+            (Path(name) / file).write_text(text, encoding="utf-8")
+        library = f"model.{_LIBRARY[sys.platform]}"
+        options = ["-std=c99", "-O2", "-shared", "-fPIC", "-fvisibility=hidden", "-o", library]
+        command = [compiler, *options, "model.c", "fmi2.c", "-lm"]
+        try:
+            done = subprocess.run(command, cwd=name, capture_output=True, timeout=_PATIENCE)
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return (Path(name) / library).read_bytes() if done.returncode == 0 else None
+
+
+def _zip(files: Mapping[str, str | bytes]) -> bytes:
+    stream = BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(zipfile.ZipInfo(name, _EPOCH), content, zipfile.ZIP_DEFLATED)
+    return stream.getvalue()
