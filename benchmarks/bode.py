@@ -23,11 +23,11 @@ from benchmarks.identification import (
 from benchmarks.page import Table, installed, missing, share, significant, spread
 from pipeline.arrays import Array
 from pipeline.errors import DataError
+from pipeline.estimation.time_fit import fit_records
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import ChainFit, FrequencyResponse, Record
 from pipeline.setup import Setup
-from pipeline.stages.time_fit import fit_records
 
 TITLE = "Resonances of one, two and three carts"
 WORDS = """

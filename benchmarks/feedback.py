@@ -3,11 +3,11 @@
 import numpy as np
 
 from benchmarks.page import Table, significant
+from pipeline.estimation.state_feedback import Method, design_feedback
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.sampled_loop import StateFeedback, loop_matrix, simulate_loop
 from pipeline.plant.simulate import overshoot_percent, settling_time
 from pipeline.results import FeedbackDesign
-from pipeline.stages.state_feedback import Method, design_feedback
 from pipeline.submission import Design
 
 TITLE = "State feedback"

@@ -26,7 +26,7 @@ from scipy.stats import beta
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.free_runs import start_at
-from pipeline.estimation.interventions import find_interventions
+from pipeline.estimation.force_balance import find_interventions
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit import fit_baseline
 from pipeline.gap.judge import Hypothesis, Study, fit_free_run, judge

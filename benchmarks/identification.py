@@ -18,11 +18,11 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
+from pipeline.estimation.bode_fit import fit_bode
 from pipeline.estimation.parametrisation import Parametrisation, named_estimates
 from pipeline.plant.chain import Chain
 from pipeline.results import ChainFit, FrequencyResponse
 from pipeline.setup import Setup
-from pipeline.stages.bode_fit import fit_bode
 
 RELATIVE_STD = 0.01
 ABSOLUTE_STD = 0.00115  # cm

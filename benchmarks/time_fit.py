@@ -5,9 +5,9 @@ import time
 import numpy as np
 
 from benchmarks.page import Table, share, spread
+from pipeline.estimation.time_fit import fit_records
 from pipeline.plant.chain import PRESETS
 from pipeline.setup import Setup
-from pipeline.stages.time_fit import fit_records
 from tests.helpers.time_records import random_chain, step_record
 
 TITLE = "The fit on time records"

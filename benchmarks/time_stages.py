@@ -4,12 +4,12 @@ import numpy as np
 
 from benchmarks.page import Table, share
 from pipeline.arrays import Array
+from pipeline.estimation.decay import fit_log_decrement
+from pipeline.estimation.sine import fit_sine
+from pipeline.estimation.step_gain import fit_step_gain
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import ExperimentKind, Record
-from pipeline.stages.log_decrement import fit_log_decrement
-from pipeline.stages.sine import fit_sine
-from pipeline.stages.step_gain import fit_step_gain
 
 TITLE = "Decays, dwells and steps"
 WORDS = """

@@ -8,7 +8,9 @@ from dataclasses import replace
 from functools import partial
 
 from pipeline.errors import DataError
-from pipeline.estimation.interventions import find_interventions
+from pipeline.estimation.force_balance import find_interventions
+from pipeline.estimation.hardware_check import check_hardware
+from pipeline.estimation.state_feedback import design_feedback
 from pipeline.identify.assumptions import list_assumptions
 from pipeline.identify.findings import Log, valid_records
 from pipeline.identify.fit import check_groups, find_groups
@@ -34,8 +36,6 @@ from pipeline.identify.springs import check_springs
 from pipeline.ingest.read import Ingested, read_data
 from pipeline.plant.chain import Chain
 from pipeline.results import Analysis, ChainFit, FeedbackDesign, HardwareCheck, Intervention, Stage
-from pipeline.stages.hardware_check import check_hardware
-from pipeline.stages.state_feedback import design_feedback
 from pipeline.submission import Design, Submission
 from pipeline.words.numbers import group_messages
 from pipeline.words.phrases import phrases

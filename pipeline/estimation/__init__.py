@@ -1,1 +1,1 @@
-"""Methods that several stages use: noise, peaks, levels, transforms and least squares."""
+"""From records to estimates: each stage is one file, and so is each method that several use."""

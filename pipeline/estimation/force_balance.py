@@ -1,22 +1,83 @@
-"""The law of motion of one cart, from all records at once, and the force that it does not explain.
+"""The law of motion of a cart over windows: its force balance, hands that disturb it, delays.
 
-The acceleration of the cart is regressed on positions, velocities and input, with dry friction and
-drag, over short windows. The problem is linear, so nothing is simulated or searched. The loss
-function ignores data that do not follow the law.
+The equation is multiplied by a bump, which is zero at both ends of a window, as are its first three
+derivatives. Then it is integrated by parts: the derivatives move from the data to the known bump.
+The result is linear in masses, dampings and springs.
 
-Reference: S. Geman and D. E. McClure, Bull. Int. Statistical Institute 52 (1987) 5-21 (the loss).
+References: M. Shinbrot, Trans. ASME 79 (1957), 579-588; H. A. Preisig & D. W. T. Rippin, Computers
+& Chemical Engineering 17 (1993).
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pipeline.arrays import Array
-from pipeline.estimation.modulating import bump_integral, is_even, window_weights
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA, resolution
-from pipeline.results import Record
+from pipeline.results import Intervention, Record
+
+# ---------------------------------------------------------------------- modulating functions
+
+
+def bump(s: Array, *, span: Array | float) -> tuple[Array, Array, Array]:
+    """Return (s (1 - s))⁴ for s from 0 to 1 over `span` seconds, and two time derivatives."""
+    b, slope = s * (1 - s), 1 - 2 * s
+    return b**4, 4 * b**3 * slope / span, (12 * b**2 * slope**2 - 8 * b**3) / span**2
+
+
+def motion_period(x: Array) -> float:
+    """Return the period, in samples, of a sine with the same size and speed as this motion."""
+    return float(2 * np.pi * np.std(x) / np.sqrt(np.mean(np.diff(x) ** 2)))
+
+
+def bump_integral(s: Array) -> Array:
+    """Return the integral of the bump from 0 to s; these are the weights for a held input."""
+    return s**5 * np.polyval([1 / 9, -1 / 2, 6 / 7, -2 / 3, 1 / 5], s)
+
+
+def is_even(t: Array) -> bool:
+    """Return whether the intervals between times (n,) differ only by rounding."""
+    dt = np.diff(t)
+    return bool(np.ptp(dt) <= 1e-9 * dt[0])
+
+
+def window_weights(t: Array) -> tuple[Array, Array, Array]:
+    """Return weights (windows, samples) for the mean, the negative mean slope, and the curvature.
+
+    With few samples the bump's derivatives are integrated badly. So the weights are corrected to be
+    exact for parabolas.
+
+    Parameters
+    ----------
+    t : times (windows, samples) of the samples in each window, s.
+    """
+    span = t[:, -1:] - t[:, :1]
+    w, w1, w2 = bump((t - t[:, :1]) / span, span=span)
+    dt = np.gradient(t, axis=1)
+    size = (w * dt).sum(1, keepdims=True)
+    w, w1, w2 = (weight * dt / size for weight in (w, w1, w2))
+    tau = t - (w * t).sum(1, keepdims=True)
+    spread = (w * tau**2).sum(1, keepdims=True)
+    w2 = w2 - w * w2.sum(1, keepdims=True) - w * tau * (w2 * tau).sum(1, keepdims=True) / spread
+    w2 = 2 * w2 / (w2 * tau**2).sum(1, keepdims=True)
+    w1 = w1 - w * w1.sum(1, keepdims=True)
+    w1 = -w1 / (w1 * tau).sum(1, keepdims=True)
+    return w, w1, w2
+
+
+# --------------------------------------------------------- the law of one cart, from all records
+#
+# The acceleration of the cart is regressed on positions, velocities and input, with dry friction
+# and drag, over short windows. The problem is linear, so nothing is simulated or searched. The loss
+# function ignores data that do not follow the law.
+#
+# Reference: S. Geman and D. E. McClure, Bull. Int. Statistical Institute 52 (1987) 5-21 (the loss).
 
 _WINDOW = 0.1  # s; the middle 0.04 s have most of the weight
 _LAGS = (0.0, 0.02, 0.05)  # trial delays of the input, s
@@ -295,3 +356,406 @@ def _fit(parts: Sequence[tuple[Array, Array]], *, least: float) -> tuple[list[Ar
             break
         weights = [1.0 / (1.0 + (one / bulk) ** 2) for one in left]
     return [law[place] for place in places], bulk
+
+
+# ----------------------------------------------------------------- interventions, such as a hand
+#
+# A hand causes a burst in the force that the law of motion does not explain. An effect that the law
+# lacks causes bursts too, but again and again: whenever position, stretch, speed and input are the
+# same. An impact of two bodies is over in an instant. So a burst counts as a hand if it lasts,
+# moves the cart, and occurs in a state in which the law holds at other times.
+
+T = TypeVar("T", bound=np.generic)
+
+
+def running_max(values: NDArray[T], width: int) -> NDArray[T]:
+    """Return, for each value, the largest of the `width` values centred on it; `width` is odd."""
+    padded = np.pad(values, width // 2, mode="edge")
+    return sliding_window_view(padded, width).max(axis=-1)
+
+
+# A burst must exceed the first multiple of `_BULK`. It begins and ends at the second multiple.
+_FAR, _BEGINS = 4.0, 1.5
+# Least share of a burst in the force on the cart, and least ratio of this share to its usual value.
+_SHARE, _TYPICAL = 0.3, 3.0
+# s before and after a window. A burst is compared with the largest force in this time.
+_AROUND = 0.15
+# s on either side of a window's middle; this part has most of the weight.
+_REACH = 0.02
+_GAP = 0.1  # s; closer bursts are merged
+_LASTS = 0.06  # s above half the peak of a burst; an impact has 0.04, the width of a window
+# s of a burst during which the cart must be in a state in which the law holds at other times.
+_KNOWN = 0.03
+_SWINGS = 3  # sign changes of a hand's force; an effect's force has many more
+_INSTANT = 0.03  # s; nobody pushes twice within this time of a recording
+# Number of bins for a variable of the state. At least this share and at least this number of
+# the windows in a bin must be quiet.
+_BINS, _MOST, _VISITS = 20, 0.5, 5
+
+
+def find_interventions(records: Sequence[Record]) -> tuple[Intervention, ...]:
+    """Return the interventions of hands on free carts, by record, cart and time.
+
+    Runs under feedback are skipped, because part of what drives their motor is often not logged.
+    """
+    return _found_in(tuple(records))
+
+
+@lru_cache(maxsize=1)  # a report and its gap analysis ask for the same records
+def _found_in(records: tuple[Record, ...]) -> tuple[Intervention, ...]:
+    open_loop = [record for record in records if record.kind not in ("closed_loop", "bode")]
+    first = {record.id: _first_copy(record, open_loop) for record in open_loop}
+    alone = [record for record in open_loop if first[record.id] == record.id]
+    carts = sorted({cart for r in alone for cart in r.free if cart in r.carts})
+    seen = [one for one in map(window_means, alone) if one is not None]
+    bursts = [one for cart in carts for one in _bursts(cart, seen)]
+    found = [
+        replace(one, experiment=name)
+        for name, twin in first.items()
+        for one in bursts
+        if one.experiment == twin
+    ]
+    order = [record.id for record in open_loop]
+    return tuple(sorted(found, key=lambda one: (order.index(one.experiment), one.cart, one.start)))
+
+
+def _first_copy(record: Record, records: Sequence[Record]) -> str:
+    """Return the id of the first record with the same readings; a file may be listed twice."""
+    return next(other.id for other in records if np.array_equal(other.y, record.y))
+
+
+def without_releases(
+    interventions: Sequence[Intervention], records: Sequence[Record]
+) -> list[Intervention]:
+    """Return the interventions without the holds that precede the release of a decay."""
+    released = {(record.id, float(record.t[0])) for record in records if record.kind == "decay"}
+    return [one for one in interventions if (one.experiment, one.start) not in released]
+
+
+def between(record: Record, interventions: Sequence[Intervention]) -> list[Record]:
+    """Return the parts of a record before, between and after the interventions."""
+    touched = np.zeros(record.t.size, dtype=np.bool_)
+    for one in interventions:
+        if one.experiment == record.id:
+            touched |= (record.t >= one.start) & (record.t <= one.end)
+    if not touched.any():
+        return [record]
+    pieces = []
+    for first, last in _runs(~touched):
+        if record.t[last] - record.t[first] < _GAP:
+            continue
+        part = slice(first, last + 1)
+        pieces.append(
+            replace(
+                record,
+                t=record.t[part],
+                u=None if record.u is None else record.u[part],
+                y=record.y[:, part],
+                reference=None if record.reference is None else record.reference[part],
+            )
+        )
+    return pieces
+
+
+def _bursts(cart: int, seen: Sequence[WindowMeans]) -> list[Intervention]:
+    forces, size = record_residual_forces(cart, seen)
+    if not forces:
+        return []
+    shares = [_share(force, size) for force in forces]
+    usual = np.concatenate([s[f.follows] for s, f in zip(shares, forces, strict=True)])
+    least = max(_SHARE, _TYPICAL * float(np.quantile(usual, 0.75)))
+    found = []
+    for force, share, known in zip(forces, shares, _known(forces, size), strict=True):
+        left = np.abs(force.residual)
+        bulk = size
+        if force.follows.any():  # a record that departs from the law throughout cannot show a hand
+            own = _BULK * MEDIAN_TO_SIGMA * float(np.median(left[force.follows]))
+            bulk = max(size, own)
+        strong = (left > _FAR * bulk) & (share > least) & ~force.jumps
+        above = left > _BEGINS * bulk
+        times = np.concatenate([force.record.t[:1], force.t[1:-1], force.record.t[-1:]])
+        for first, last in _stretches(above, force.t):
+            inside = slice(first, last + 1)
+            beyond = np.where(above[inside], force.residual[inside], 0.0)
+            if _is_hand(beyond, strong=strong[inside], known=known[inside], hop=force.hop):
+                found.append(
+                    Intervention(
+                        experiment=force.record.id,
+                        cart=cart,
+                        start=max(float(times[first]) - _REACH, float(times[0])),
+                        end=min(float(times[last]) + _REACH, float(times[-1])),
+                    )
+                )
+    driven = {
+        record.id: float(record.t[0])
+        for record in (one.record for one in seen)
+        if record.u is not None and np.any(record.u)
+    }
+    return [one for one in found if not _recurs(one, found, driven)]
+
+
+def _recurs(one: Intervention, found: Sequence[Intervention], driven: Mapping[str, float]) -> bool:
+    """Return whether a burst occurs at the same instant in another driven run.
+
+    Such a burst is not due to a hand. `driven` gives the time of each driven run's first sample.
+    """
+    if one.start == driven.get(one.experiment, one.start):
+        return False
+    return any(
+        abs(one.start - other.start) < _INSTANT
+        for other in found
+        if other.experiment != one.experiment and other.experiment in driven
+    )
+
+
+def _share(force: RecordResidualForce, size: float) -> Array:
+    """Return which share of the force on the cart is unexplained, near each sample."""
+    acting = running_max(force.acting, 2 * round(_AROUND / force.hop) + 1)
+    return np.abs(force.residual) / (acting + size)
+
+
+def _known(forces: Sequence[RecordResidualForce], size: float) -> list[NDArray[np.bool_]]:
+    """Return for each window whether the law holds at other times in the same state.
+
+    Position, stretches, velocity and input are checked one by one: most windows at about the same
+    value must be quiet. A cart that rests without an input is always in a known state, because
+    friction alone can hold it.
+    """
+    state = np.concatenate([force.state for force in forces], axis=1)
+    follows = np.concatenate([force.follows for force in forces])
+    quiet = np.concatenate([(np.abs(f.residual) < _BEGINS * size) & f.moves for f in forces])
+    known = np.ones(follows.size, dtype=np.bool_)
+    for values in state:
+        low, high = values[follows].min(), values[follows].max()
+        if high <= low:
+            continue
+        at = np.floor((values - low) / (high - low) * _BINS).astype(int)
+        inside = (at >= 0) & (at <= _BINS)
+        at = np.clip(at, 0, _BINS)
+        visits = np.bincount(at[follows], minlength=_BINS + 1)
+        calm = np.bincount(at[follows & quiet], minlength=_BINS + 1)
+        known &= inside & ((calm >= _MOST * visits) & (calm >= _VISITS))[at]
+    bounds = np.cumsum([0, *(force.t.size for force in forces)])
+    # A window also shows a little of its neighbours.
+    parts = [~running_max(~known[first:stop], 3) for first, stop in pairwise(bounds)]
+    return [part | force.idle for part, force in zip(parts, forces, strict=True)]
+
+
+def _stretches(above: NDArray[np.bool_], t: Array) -> list[tuple[int, int]]:
+    """Return first and last window of each stretch; stretches with a short gap are merged."""
+    found: list[tuple[int, int]] = []
+    for first, last in _runs(above):
+        if found and t[first] - t[found[-1][1]] < _GAP:
+            found[-1] = (found[-1][0], last)
+        else:
+            found.append((first, last))
+    return found
+
+
+def _runs(above: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the first and the last index of each run of true values."""
+    edges = np.flatnonzero(np.diff(np.pad(above.astype(int), 1))).tolist()
+    return [(first, behind - 1) for first, behind in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _is_hand(
+    left: Array, *, strong: NDArray[np.bool_], known: NDArray[np.bool_], hop: float
+) -> bool:
+    """Return whether a burst is due to a hand.
+
+    Where the unexplained force is below the level at which a burst begins, `residual` is zero. The
+    windows are `hop` s apart.
+    """
+    swings = np.count_nonzero(np.diff(np.sign(left[left != 0.0])))
+    lasts = understood = 0
+    for first, last in _runs(strong):
+        burst = np.abs(left[first : last + 1])
+        lasts += np.count_nonzero(burst > 0.5 * burst.max())
+        understood += np.count_nonzero(known[first : last + 1])
+    return bool(swings <= _SWINGS and lasts * hop >= _LASTS and understood * hop >= _KNOWN)
+
+
+# --------------------------------------------------------------- the delay of one cart's channel
+#
+# A cart without a motor is moved by its neighbours alone, whatever the input is and however late it
+# arrives. Its law of motion is
+#
+#     k_i x_{i-1} = m_i x_i'' + c_i x_i' + (k_i + k_{i+1}) x_i - k_{i+1} x_{i+1}.
+#
+# The best delay of a cart's channel, against the channel of the cart before it, is the one for
+# which this law fits best. No data are differentiated: both sides are averaged with a bump that
+# slides along the records. The coefficients may have any sign and size. So a cart in
+# another unit, or with a reversed sign, gives the same delay.
+
+_FEWEST_PLACES = 30
+_MOST_LATE = 15  # grid steps tried in each direction
+_PARTS = 8  # fewest records, or parts of records, for a standard error
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChannelDelay:
+    """The delay of one cart's channel against the channel of the cart before it.
+
+    Attributes
+    ----------
+    delay, std : delay in s, and its standard error by jackknife over records. The delay is positive
+        if the cart's channel is read later.
+    better : factor by which this delay lowers the residual of the cart's law. Friction, backlash
+        and end stops look like a small delay, but no delay removes their residual.
+    """
+
+    cart: int
+    delay: float
+    std: float
+    better: float
+    experiments: tuple[str, ...]
+
+
+def find_channel_delays(records: Sequence[Record], *, n: int) -> dict[int, ChannelDelay]:
+    """Return, by cart, the delay of its channel against the channel before it, if significant.
+
+    The search begins at the last cart, because the law of each cart uses the corrected times of the
+    cart after it.
+    """
+    found: dict[int, ChannelDelay] = {}
+    for cart in range(n, 1, -1):
+        after = found[cart + 1].delay if cart + 1 in found else 0.0
+        one = _channel_delay(records, cart, after=after)
+        if one is not None:
+            found[cart] = one
+    return found
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Normal:
+    """Normal equations of the law in a part of a record, for every trial delay.
+
+    Attributes
+    ----------
+    power : sum of squares (n_d,) of the left side.
+    cross : products (n_d, 4) of the left side with the columns of the right side.
+    square : products (4, 4) of the columns of the right side.
+    """
+
+    power: Array
+    cross: Array
+    square: Array
+
+    def without(self, other: "_Normal") -> "_Normal":
+        """Return these equations minus the equations of one part."""
+        return _Normal(
+            power=self.power - other.power,
+            cross=self.cross - other.cross,
+            square=self.square - other.square,
+        )
+
+    def left(self) -> Array:
+        """Return the power (n_d,) of the left side that the best law does not explain."""
+        used = np.diag(self.square) > 0
+        size = np.sqrt(np.diag(self.square)[used])
+        cross = self.cross[:, used] / size
+        square = self.square[np.ix_(used, used)] / size / size[:, None]
+        weights = np.linalg.lstsq(square, cross.T, rcond=None)[0]
+        return self.power - np.sum(cross * weights.T, axis=1)
+
+
+def _channel_delay(records: Sequence[Record], cart: int, *, after: float) -> ChannelDelay | None:
+    usable = [record for record in records if _shows_delay(record, cart)]
+    periods = [motion_period(one.position(cart)) * one.sample_time for one in usable]
+    if not usable:
+        return None
+    # The grid has 240 steps in a period of the motion, unless the samples are closer.
+    finest = float(np.median(periods)) / 240
+    step = max(float(np.median([record.sample_time for record in usable])), finest)
+    parts = -(-_PARTS // len(usable))
+    equations: list[_Normal] = []
+    experiments: list[str] = []
+    for record, period in zip(usable, periods, strict=True):
+        if found := _equations(record, cart, after=after, step=step, period=period, parts=parts):
+            equations += found
+            experiments.append(record.id)
+    if len(equations) < _PARTS:
+        return None
+    total = _Normal(
+        power=np.sum([one.power for one in equations], axis=0),
+        cross=np.sum([one.cross for one in equations], axis=0),
+        square=np.sum([one.square for one in equations], axis=0),
+    )
+    left = total.left()
+    best, least = _lowest(left)
+    if abs(best) >= _MOST_LATE:  # a still longer delay would fit better, so this is not a delay
+        return None
+    others = np.array([_lowest(total.without(one).left())[0] for one in equations])
+    spread = float(np.sum((others - others.mean()) ** 2))
+    return ChannelDelay(
+        cart=cart,
+        delay=best * step,
+        std=step * float(np.sqrt(spread * (others.size - 1) / others.size)),
+        better=float(left[_MOST_LATE]) / max(least, np.finfo(float).tiny),
+        experiments=tuple(experiments),
+    )
+
+
+def _shows_delay(record: Record, cart: int) -> bool:
+    """Return whether the record can show the delay.
+
+    All forces on the cart must have been measured, and both this cart and the cart before it must
+    move far.
+    """
+    if any(c not in record.carts or c not in record.free for c in (cart - 1, cart)):
+        return False
+    if cart + 1 in record.free and cart + 1 not in record.carts:
+        return False
+    # The motion must span at least this many encoder steps.
+    return all(np.ptp(record.position(c)) > 20.0 * record.encoder_step(c) for c in (cart - 1, cart))
+
+
+def _equations(
+    record: Record, cart: int, *, after: float, step: float, period: float, parts: int
+) -> list[_Normal]:
+    """Return the equations of each part of a record, or [] if the record is too short."""
+    t = np.arange(record.t[0], record.t[-1], step)
+    # A bump lasts a quarter of the motion's period, because wider bumps would suppress fast motion,
+    # which is the most informative. With fewer than 16 samples under a bump, only the encoder's
+    # steps would count.
+    width = max(round(0.25 * period / step), 16)
+    first, last = _MOST_LATE, t.size - width - _MOST_LATE
+    places = np.arange(first, last, max(width // 6, (last - first) // 400, 1))
+    if places.size < max(_FEWEST_PLACES, parts):
+        return []
+    weight, slope, bend = bump((np.arange(width) + 0.5) / width, span=width)
+
+    def at(cart: int, *, late: float = 0.0) -> Array:
+        return np.interp(t + late, record.t, record.position(cart))
+
+    own = sliding_window_view(at(cart), width)[places]
+    right = [own @ bend, -(own @ slope), own @ weight, np.zeros(places.size)]
+    if cart + 1 in record.free:
+        right[3] = sliding_window_view(at(cart + 1, late=after), width)[places] @ weight
+    before = np.correlate(at(cart - 1), weight)
+    shifts = np.arange(-_MOST_LATE, _MOST_LATE + 1)
+    left = before[places - shifts[:, None]]
+    # Encoder zeros cancel, and each record has the same weight.
+    left = left - left.mean(axis=1, keepdims=True)
+    size = float(np.linalg.norm(left[_MOST_LATE]))
+    if size == 0:
+        return []
+    a = left / size
+    b = (np.array(right) - np.mean(right, axis=1)[:, None]) / size
+    return [
+        _Normal(
+            power=np.sum(a[:, part] ** 2, axis=1),
+            cross=a[:, part] @ b[:, part].T,
+            square=b[:, part] @ b[:, part].T,
+        )
+        for part in np.array_split(np.arange(places.size), parts)
+    ]
+
+
+def _lowest(left: Array) -> tuple[float, float]:
+    """Return the delay (in grid steps, interpolated) with the least residual, and this residual."""
+    i = int(np.argmin(left))
+    between = 0.0
+    if 0 < i < left.size - 1 and (bend := left[i - 1] - 2 * left[i] + left[i + 1]) > 0:
+        between = 0.5 * float((left[i - 1] - left[i + 1]) / bend)
+    return i + between - _MOST_LATE, float(left[i])

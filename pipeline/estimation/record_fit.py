@@ -13,10 +13,8 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.estimation.modal_response import Modes, find_modes
-from pipeline.estimation.parametrisation import Parametrisation
-from pipeline.estimation.time_search import FOLLOWED
-from pipeline.estimation.time_window import FitWindow, compare, open_window
+from pipeline.estimation.parametrisation import Modes, Parametrisation, find_modes
+from pipeline.estimation.time_fit import FOLLOWED, FitWindow, compare, open_window
 from pipeline.plant.chain import Chain
 from pipeline.results import Record
 from pipeline.setup import Setup

@@ -14,11 +14,11 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
+from pipeline.estimation.state_feedback import stays_stable
 from pipeline.experiments.plan import PidLoop, PlanLimits, Recording, StateLoop
 from pipeline.identify.recording_checks import is_reversed
 from pipeline.plant import simulate
 from pipeline.plant.chain import Chain
-from pipeline.plant.feedback import stays_stable
 from pipeline.plant.sampled_loop import (
     Controller,
     LoopSetup,

@@ -21,15 +21,14 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.estimation.bode_points import Points, response_at, weighted_residuals
+from pipeline.estimation.bode_fit import Points, response_at, weighted_residuals
 from pipeline.estimation.noise import noise_beyond_rounding, score_covariance
 from pipeline.estimation.parametrisation import (
     Parametrisation,
     critical_damping,
     parameter_jacobian,
 )
-from pipeline.estimation.time_search import evaluate_chain
-from pipeline.estimation.time_window import FitWindow, open_window, weighed
+from pipeline.estimation.time_fit import FitWindow, evaluate_chain, open_window, weighed
 from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.experiments.propose import identified_chain
 from pipeline.plant.chain import Chain

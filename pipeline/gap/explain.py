@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pipeline.estimation.interventions import find_interventions
+from pipeline.estimation.force_balance import find_interventions
 from pipeline.gap.fit import Fitting, GapFit, Mapper, fit_baseline
 from pipeline.gap.judge import Study
 from pipeline.gap.pem.model import compile_follower

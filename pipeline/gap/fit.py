@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.arrays import Array
-from pipeline.estimation.modulating import bump
+from pipeline.estimation.force_balance import bump
 from pipeline.estimation.noise import high_frequency_noise, noise_beyond_rounding, score_covariance
 from pipeline.gap.parameters import (
     GapModel,

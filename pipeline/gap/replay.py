@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.estimation.measured_run import measured_run
+from pipeline.estimation.hardware_check import measured_run
 from pipeline.gap.runs import GapRun, prepare
 from pipeline.plant.effect import AugmentedChain
 from pipeline.results import HardwareCheck, Record

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from pipeline.arrays import Array
-from pipeline.estimation.modulating import bump_integral, window_weights
+from pipeline.estimation.force_balance import bump_integral, window_weights
 from pipeline.estimation.noise import high_frequency_noise
 from pipeline.gap.limits import BIC_DROP
 from pipeline.gap.parameters import GapModel, Nuisance, fresh_nuisance, simulate_run

@@ -10,9 +10,8 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.estimation.interventions import between
-from pipeline.estimation.noise import difference_noise
-from pipeline.estimation.peaks import extrema
+from pipeline.estimation.force_balance import between
+from pipeline.estimation.noise import difference_noise, extrema
 from pipeline.plant.simulate import interpolate_band_limited
 from pipeline.plant.simulator.kernel import Excitation, describe_run
 from pipeline.results import Intervention, LeftOut, Record

@@ -28,7 +28,7 @@ from pipeline.estimation.record_fit import (
     measured,
     most_are_consistent,
 )
-from pipeline.estimation.time_search import FOLLOWED
+from pipeline.estimation.time_fit import FOLLOWED
 from pipeline.identify.findings import SAME, SAME_SIZE, SIGMAS, WITNESSES, RecordingFault
 from pipeline.plant.chain import Chain
 from pipeline.plant.simulate import simulate_linear

@@ -12,6 +12,13 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
+from pipeline.estimation.bode_fit import fit_bode
+from pipeline.estimation.estimates import (
+    SIGMA_LIMIT,
+    motion_measured,
+    points_measured,
+    with_coverage,
+)
 from pipeline.estimation.parametrisation import Parametrisation
 from pipeline.estimation.record_fit import (
     RecordFit,
@@ -21,8 +28,8 @@ from pipeline.estimation.record_fit import (
     most_are_consistent,
     record_fits,
 )
-from pipeline.estimation.time_search import evaluate_chain
-from pipeline.estimation.time_window import open_window
+from pipeline.estimation.sine import FEW_COUNTS
+from pipeline.estimation.time_fit import evaluate_chain, fit_records, open_window
 from pipeline.identify.corrections import without_lone_factors
 from pipeline.identify.findings import Log, RecordingFault
 from pipeline.names import own_zeta, read_name
@@ -39,11 +46,6 @@ from pipeline.results import (
     Stage,
 )
 from pipeline.setup import Setup
-from pipeline.stages.bode_fit import fit_bode
-from pipeline.stages.compare import SIGMA_LIMIT
-from pipeline.stages.coverage import motion_measured, points_measured, with_coverage
-from pipeline.stages.sine import FEW_COUNTS
-from pipeline.stages.time_fit import fit_records
 from pipeline.words.numbers import join_names, listing, with_error
 from pipeline.words.phrases import phrases
 

@@ -11,8 +11,19 @@ from itertools import combinations, pairwise
 from typing import Any
 
 from pipeline.errors import DataError
-from pipeline.estimation.interventions import between
+from pipeline.estimation.bode_fit import fit_bode
+from pipeline.estimation.decay import fit_log_decrement
+from pipeline.estimation.estimates import compare, estimate_initially, undetermined_reason
+from pipeline.estimation.force_balance import between
+from pipeline.estimation.frequency_response import (
+    collect_dwells,
+    dwell_fault,
+    find_resonances,
+    response_from_records,
+)
 from pipeline.estimation.record_fit import RecordFit, most_are_consistent, record_fits
+from pipeline.estimation.sine import Dwell
+from pipeline.estimation.step_gain import fit_step_gain
 from pipeline.identify.corrections import (
     find_faults,
     find_impossible_gains,
@@ -40,18 +51,6 @@ from pipeline.results import (
     StepGain,
 )
 from pipeline.setup import Setup
-from pipeline.stages.bode_fit import fit_bode
-from pipeline.stages.compare import compare, undetermined_reason
-from pipeline.stages.frequency_response import (
-    collect_dwells,
-    dwell_fault,
-    find_resonances,
-    response_from_records,
-)
-from pipeline.stages.initial import estimate_initially
-from pipeline.stages.log_decrement import fit_log_decrement
-from pipeline.stages.sine import Dwell
-from pipeline.stages.step_gain import fit_step_gain
 from pipeline.words.numbers import group_messages, join_names
 from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress

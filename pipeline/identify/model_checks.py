@@ -13,6 +13,7 @@ from scipy.linalg import solve_discrete_are
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
+from pipeline.estimation.estimates import SIGMA_LIMIT, change_limit
 from pipeline.names import gain_name, own_zeta, read_name, toml_flags
 from pipeline.plant.chain import Chain
 from pipeline.plant.identities import brackets, recover_from_parameters
@@ -35,7 +36,6 @@ from pipeline.results import (
     passed,
 )
 from pipeline.setup import Setup
-from pipeline.stages.compare import SIGMA_LIMIT, change_limit
 from pipeline.words.numbers import join_names, listing, significant, with_error
 from pipeline.words.phrases import phrases
 

@@ -6,7 +6,7 @@ from math import ceil
 
 import numpy as np
 
-from pipeline.estimation.interventions import without_releases
+from pipeline.estimation.force_balance import without_releases
 from pipeline.identify.findings import RecordingFault, say, valid_records
 from pipeline.identify.recording_faults import (
     LEAST_SHARE,

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.estimation.channel_delay import ChannelDelay, find_channel_delays
+from pipeline.estimation.force_balance import ChannelDelay, find_channel_delays
 from pipeline.estimation.record_fit import LENGTH_SCALES, TIME_UNITS, measured
 from pipeline.identify.findings import SAME, WITNESSES, RecordingFault, say
 from pipeline.ingest.channels import is_stepped, line_frequency, stuck_spans

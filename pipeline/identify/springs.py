@@ -12,6 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import DataError, SubmissionError
+from pipeline.estimation.bode_fit import fit_bode
+from pipeline.estimation.estimates import SIGMA_LIMIT
+from pipeline.estimation.step_gain import fit_step_gain
 from pipeline.identify.model_checks import NEGLIGIBLE, check_vanishing
 from pipeline.ingest.fill import (
     Found,
@@ -26,9 +29,6 @@ from pipeline.ingest.read import read_data
 from pipeline.names import toml_flags
 from pipeline.results import EXPLAINED, ChainFit, Check, FrequencyResponse, Record, StepGain
 from pipeline.setup import Setup
-from pipeline.stages.bode_fit import fit_bode
-from pipeline.stages.compare import SIGMA_LIMIT
-from pipeline.stages.step_gain import fit_step_gain
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME, spring_names
 from pipeline.words.numbers import listing, significant

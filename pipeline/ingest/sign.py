@@ -7,7 +7,7 @@ the motor pushes. The equation of motion is
 
 It holds for every record of a bench with the same m, c, k and k', so all records together decide s.
 No data are differentiated: both sides are averaged with a bump that slides along the record
-(`modulating`). A late input (a delay or a lag) shifts the phase above the resonance so far that a
+(`force_balance`). A late input (a delay or a lag) shifts the phase above the resonance so far that a
 record, taken alone, can seem to have the other sign. With the inertia and stiffness from the other
 records, this does not happen.
 """
@@ -20,7 +20,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import nnls
 
 from pipeline.arrays import Array
-from pipeline.estimation.modulating import bump, motion_period
+from pipeline.estimation.force_balance import bump, motion_period
 from pipeline.results import Record
 from pipeline.submission import Submission
 from pipeline.words.numbers import join_names

@@ -11,7 +11,7 @@ from itertools import combinations
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.estimation.modulating import motion_period, window_weights
+from pipeline.estimation.force_balance import motion_period, window_weights
 from pipeline.ingest.channels import encoder_step, is_stepped, mirrors
 from pipeline.ingest.clock import SLOW, read_clock
 from pipeline.ingest.table import FileTable

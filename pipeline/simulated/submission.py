@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.arrays import Array
+from pipeline.estimation.state_feedback import design_feedback
 from pipeline.names import read_name
 from pipeline.plant.chain import Chain
 from pipeline.plant.sampled_loop import StateFeedback
@@ -15,7 +16,6 @@ from pipeline.results import FeedbackDesign
 from pipeline.simulated import runs
 from pipeline.simulated.bench import BenchRun, SimulatedBench, TrueMotion
 from pipeline.simulated.hidden import preset_bench
-from pipeline.stages.state_feedback import design_feedback
 from pipeline.submission import Design
 from pipeline.submission.toml import TypedNumber, Value, toml_section
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.estimation.interventions import between, find_interventions
+from pipeline.estimation.force_balance import between, find_interventions
 from pipeline.results import Intervention
 from tests.truth.bench import Hand
 from tests.truth.cases import EFFECTS, Case, make_case

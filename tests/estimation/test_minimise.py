@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.estimation.decay.separable import fit_separable
+from pipeline.estimation.least_squares import fit_separable
 
 
 class _Decay:

@@ -7,13 +7,13 @@ from itertools import product
 
 import numpy as np
 
+from pipeline.estimation.state_feedback import design_feedback
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.sampled_loop import StateFeedback
 from pipeline.results import Record
 from pipeline.simulated import runs, submission
 from pipeline.simulated.bench import COUNT, BenchRun, SimulatedBench, TrueMotion
 from pipeline.simulated.hidden import prepare_bench
-from pipeline.stages.state_feedback import design_feedback
 from pipeline.submission import Design
 
 USUAL_NOISE = 0.2  # counts, as in `cartlab simulate`

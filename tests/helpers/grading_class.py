@@ -15,6 +15,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
+from pipeline.estimation.state_feedback import design_feedback
 from pipeline.grading.judge.run import under_rubric
 from pipeline.grading.mistakes.state_model import own_chain
 from pipeline.grading.references.springs import with_all_springs
@@ -27,7 +28,6 @@ from pipeline.plant.effect import EffectTerm
 from pipeline.simulated.bench import SimulatedBench
 from pipeline.simulated.hidden import preset_bench
 from pipeline.simulated.submission import write_submission
-from pipeline.stages.state_feedback import design_feedback
 from pipeline.submission import (
     Design,
     Reported,

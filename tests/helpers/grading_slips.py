@@ -10,9 +10,9 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
+from pipeline.estimation.bode_fit import fit_bode
 from pipeline.results import FrequencyResponse
 from pipeline.setup import Setup
-from pipeline.stages.bode_fit import fit_bode
 from pipeline.submission import Reported, ReportedFeedback
 from tests.helpers.grading_class import Team, written
 

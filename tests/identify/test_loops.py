@@ -8,12 +8,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.errors import DataError
+from pipeline.estimation.state_feedback import Method, design_feedback
 from pipeline.identify.model_checks import design_margins, verify_design
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.margins import closed_loop, stability_margins
 from pipeline.plant.sampled_loop import StateFeedback, broken_loop
 from pipeline.results import FeedbackDesign
-from pipeline.stages.state_feedback import Method, design_feedback
 from pipeline.submission import Design
 
 RIGID = Chain(m=np.array([2e-4]), c=np.array([1e-4]), k=np.zeros(2))

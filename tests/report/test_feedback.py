@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from pipeline.estimation.state_feedback import Method, design_feedback
 from pipeline.identify.findings import Log
 from pipeline.identify.model_checks import design_margins
 from pipeline.json_files import json_text
@@ -21,7 +22,6 @@ from pipeline.report.sections.loops import feedback_blocks, margin_rows
 from pipeline.report.sections.page import Page
 from pipeline.results import Analysis, FeedbackDesign, Stage
 from pipeline.setup import Setup
-from pipeline.stages.state_feedback import Method, design_feedback
 from pipeline.submission import Design
 from pipeline.words.numbers import significant
 from pipeline.words.spans import plain

@@ -16,6 +16,7 @@ from numpy.testing import assert_allclose
 from sympy.parsing.sympy_parser import parse_expr
 
 from pipeline.errors import ConfigError
+from pipeline.estimation.state_feedback import design_feedback
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.report.document import Formula
@@ -35,7 +36,6 @@ from pipeline.report.solution.expected import (
 from pipeline.report.solution.write import build_solution, model_answer
 from pipeline.resources import RUBRICS
 from pipeline.setup import Setup
-from pipeline.stages.state_feedback import design_feedback
 from pipeline.submission import Design
 from pipeline.words.math import to_text
 from pipeline.words.spans import plain

@@ -10,10 +10,10 @@ from scipy.stats import binom
 from benchmarks.identification import PAPER_STARTS, measure, quality
 from pipeline.arrays import Array
 from pipeline.errors import DataError
+from pipeline.estimation.bode_fit import fit_bode
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.results import Estimate, FrequencyResponse
 from pipeline.setup import Setup
-from pipeline.stages.bode_fit import fit_bode
 
 BENCH_BAND = 2 * np.pi * np.geomspace(0.3, 7.0, 30)
 FOUR_CARTS = Chain(

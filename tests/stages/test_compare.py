@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.estimation.estimates import DAMPING_LIMIT, GAIN_AND_FREQUENCY_LIMIT, compare
 from pipeline.identify.model_checks import check_carts, check_rows
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.results import ChainFit, Estimate
 from pipeline.setup import Setup
-from pipeline.stages.compare import DAMPING_LIMIT, GAIN_AND_FREQUENCY_LIMIT, compare
 
 
 def _estimate(value, std=None, source="step"):

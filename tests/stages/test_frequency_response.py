@@ -8,14 +8,14 @@ from numpy.testing import assert_allclose
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.plant.chain import PRESETS, Chain
-from pipeline.plant.simulate import simulate_linear
-from pipeline.results import ExperimentKind, FrequencyResponse, Hold, Record, SinePoint
-from pipeline.stages.frequency_response import (
+from pipeline.estimation.frequency_response import (
     collect_dwells,
     find_resonances,
     response_from_records,
 )
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.simulate import simulate_linear
+from pipeline.results import ExperimentKind, FrequencyResponse, Hold, Record, SinePoint
 
 COUNT_NOISE = 0.00115  # cm, half an encoder count
 

@@ -12,13 +12,13 @@ from numpy.testing import assert_allclose
 from pipeline import submission
 from pipeline.arrays import Array
 from pipeline.errors import DataError
+from pipeline.estimation.hardware_check import check_hardware
+from pipeline.estimation.state_feedback import design_feedback
 from pipeline.identify.model_checks import check_loops
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.sampled_loop import Controller, LoopSetup, Pid, StateFeedback, simulate_loop
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import ExperimentKind, FeedbackDesign, HardwareCheck, Record
-from pipeline.stages.hardware_check import check_hardware
-from pipeline.stages.state_feedback import design_feedback
 from pipeline.submission import Design
 
 T = 0.00884  # s

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.stages.initial import combine_repeats
+from pipeline.estimation.estimates import combine_repeats
 
 
 def test_the_mean_of_repeats_has_the_error_of_their_spread():

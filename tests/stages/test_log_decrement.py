@@ -8,13 +8,13 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 from pipeline.errors import DataError
+from pipeline.estimation.decay import fit_log_decrement
 from pipeline.identify.model_checks import check_decays
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import ExperimentKind, Record
 from pipeline.setup import Setup
-from pipeline.stages.log_decrement import fit_log_decrement
 from pipeline.submission import load_submission
 from tests.helpers.ucsd import write_two_cart_submission
 

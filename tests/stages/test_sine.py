@@ -7,10 +7,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.errors import DataError
+from pipeline.estimation.sine import fit_sine
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Record
-from pipeline.stages.sine import fit_sine
 
 CHAIN = PRESETS["throne-1dof"]
 COUNT = 0.00227  # cm, encoder of the ECP 210

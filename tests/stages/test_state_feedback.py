@@ -12,8 +12,15 @@ from scipy.optimize import linear_sum_assignment
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
+from pipeline.estimation.state_feedback import (
+    Method,
+    design_feedback,
+    level_error_percent,
+    lqr_gains,
+    place_poles,
+    stays_stable,
+)
 from pipeline.plant.chain import PRESETS, Chain
-from pipeline.plant.feedback import level_error_percent, lqr_gains, place_poles, stays_stable
 from pipeline.plant.limits import MASS_SPRING_ERROR
 from pipeline.plant.sampled_loop import (
     LoopSetup,
@@ -24,7 +31,6 @@ from pipeline.plant.sampled_loop import (
 )
 from pipeline.plant.simulate import overshoot_percent, settling_time, simulate_linear
 from pipeline.results import FeedbackDesign
-from pipeline.stages.state_feedback import Method, design_feedback
 from pipeline.submission import Design
 
 T = 0.00884  # s

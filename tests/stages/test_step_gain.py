@@ -8,11 +8,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.errors import DataError
+from pipeline.estimation.step_gain import fit_step_gain
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Record
-from pipeline.stages.step_gain import fit_step_gain
 from pipeline.submission import load_submission
 from tests.helpers.ucsd import write_two_cart_submission
 

@@ -7,16 +7,14 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.errors import DataError
-from pipeline.estimation.modal_response import find_modes
 from pipeline.estimation.noise import long_run_variance, score_covariance
-from pipeline.estimation.parametrisation import Parametrisation
-from pipeline.estimation.time_window import compare, open_window
+from pipeline.estimation.parametrisation import Parametrisation, find_modes
+from pipeline.estimation.time_fit import compare, fit_records, open_window
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import ChainFit, Record
 from pipeline.setup import Setup
-from pipeline.stages.time_fit import fit_records
 from pipeline.submission import load_submission
 from tests.helpers.time_records import decay_record, measure, random_chain, step_record
 from tests.helpers.ucsd import write_two_cart_submission

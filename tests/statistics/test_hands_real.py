@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.estimation.interventions import find_interventions
+from pipeline.estimation.force_balance import find_interventions
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from pipeline.estimation.time_fit import fit_records
 from pipeline.plant.chain import PRESETS
 from pipeline.setup import Setup
-from pipeline.stages.time_fit import fit_records
 from tests.helpers.time_records import random_chain, step_record
 from tests.stages.test_time_fit import errors
 

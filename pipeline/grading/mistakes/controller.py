@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
+from pipeline.estimation.state_feedback import level_error_percent, static_levels
 from pipeline.grading import limits
 from pipeline.grading.grade import Flag
 from pipeline.grading.mistakes.loop_numbers import LoopNumbers, loop_numbers
@@ -21,7 +22,6 @@ from pipeline.grading.references.tolerance import as_typed, rounding
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.plant.chain import Chain
-from pipeline.plant.feedback import level_error_percent, static_levels
 from pipeline.plant.limits import MASS_SPRING_ERROR
 from pipeline.results import Analysis
 from pipeline.submission import Design, StateFeedbackController, Submission

@@ -7,12 +7,12 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
+from pipeline.estimation.bode_fit import fit_bode
 from pipeline.grading import limits
 from pipeline.grading.mistakes.catalogue import Mistake
 from pipeline.grading.references.reference import Reference
 from pipeline.names import read_name
 from pipeline.results import Analysis, FrequencyResponse, Record
-from pipeline.stages.bode_fit import fit_bode
 
 Reading = Callable[[Record, Array], float]
 

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pipeline.estimation.estimates import GAIN_AND_FREQUENCY_LIMIT
 from pipeline.estimation.record_fit import TIME_UNITS
-from pipeline.estimation.time_search import FOLLOWED
+from pipeline.estimation.time_fit import FOLLOWED
 from pipeline.grading import limits
 from pipeline.grading.references.readings import readings
 from pipeline.names import read_name
 from pipeline.plant.chain import Chain
 from pipeline.results import Analysis, Estimate, ParameterRow
-from pipeline.stages.compare import GAIN_AND_FREQUENCY_LIMIT
 
 OFF_SCALE = "the recordings are not in the stated units"
 _SLOWEST = 0.3  # s between samples; benches sample 20 times as often, or more

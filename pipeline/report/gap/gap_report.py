@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from pipeline import __version__
 from pipeline.arrays import Array
-from pipeline.estimation.interventions import without_releases
+from pipeline.estimation.force_balance import without_releases
 from pipeline.gap.residual import ResidualForce, residual_forces
 from pipeline.gap.types import FoundEffect, Gap, RecordGap, Trace
 from pipeline.plant.effect import AugmentedChain, effect_name, place_name

@@ -13,13 +13,12 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.estimation.measured_run import released_run
+from pipeline.estimation.hardware_check import check_hardware, released_run
 from pipeline.gap.replay import Replay, prepare_run, replay_driven, replay_fitted
 from pipeline.gap.runs import GapRun
 from pipeline.gap.types import Gap
 from pipeline.plant.chain import Chain
 from pipeline.results import Analysis, ExperimentKind, HardwareCheck, Record
-from pipeline.stages.hardware_check import check_hardware
 from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress
 

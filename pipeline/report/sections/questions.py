@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from pipeline.estimation.estimates import DAMPING_LIMIT
 from pipeline.names import read_name
 from pipeline.report.document import Block, Heading, Paragraph, Question, Section, paragraph
 from pipeline.report.sections.answers import named
@@ -18,7 +19,6 @@ from pipeline.report.sections.loops import CLOSE
 from pipeline.report.sections.notes import discussion_blocks, even_headings
 from pipeline.report.sections.parameters import source_text
 from pipeline.results import Analysis, HardwareCheck, ParameterRow
-from pipeline.stages.compare import DAMPING_LIMIT
 from pipeline.words.numbers import count, listing, percent, significant
 from pipeline.words.phrases import phrases
 from pipeline.words.spans import Span, plain

@@ -7,10 +7,10 @@ from decimal import Decimal
 import numpy as np
 import pytest
 
+from pipeline.estimation.bode_fit import fit_bode
 from pipeline.grading.mistakes.transient import early_readings
 from pipeline.results import FrequencyResponse
 from pipeline.setup import Setup
-from pipeline.stages.bode_fit import fit_bode
 from pipeline.submission import ReportedStateSpace
 from tests.helpers.grading_students import Student, student, typed
 

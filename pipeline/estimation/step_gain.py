@@ -8,9 +8,15 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.estimation.decay.ringing import find_poles, fit_ringing
-from pipeline.estimation.noise import noise_beyond_rounding, relative_psd, resolution, rounding_left
-from pipeline.estimation.peaks import extrema, plateaus
+from pipeline.estimation.least_squares import find_poles, fit_ringing
+from pipeline.estimation.noise import (
+    extrema,
+    noise_beyond_rounding,
+    plateaus,
+    relative_psd,
+    resolution,
+    rounding_left,
+)
 from pipeline.results import Record, StepEdge, StepGain
 
 _MOVED = 6.0  # grains (see `_FLAT`); a smaller motion does not count

@@ -1,1 +1,0 @@
-"""Find and fit damped sinusoids and dry friction in free motion."""

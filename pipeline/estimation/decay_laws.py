@@ -1,0 +1,832 @@
+"""Test whether a decay is exponential, and find the law that it follows if it is not.
+
+The residual of the exponential is compared with the noise of the recording itself. The noise is the
+residual of a flexible change of envelope, phase and rest point. If more is left than noise,
+the known reasons compete by their BIC, with the effective number of samples.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+from numpy.typing import NDArray
+from scipy.special import fdtri
+
+from pipeline.arrays import Array, ComplexArray
+from pipeline.estimation.least_squares import (
+    PRECISION,
+    Ringing,
+    SeparableModel,
+    Waves,
+    fit_separable,
+    inverse_normal,
+    squares_at,
+)
+from pipeline.results import DecayCause
+
+# ------------------------------------------------------------- the departure from an exponential
+#
+# The residual of the exponential is compared with the spectrum of the noise. The noise is the
+# residual of a flexible change of envelope, phase and rest point.
+
+_CHANCE = 1e-4  # share of exponential decays that fail the test
+_PER_PERIOD = 16  # samples per period that are enough to tell the laws apart
+_ORDERS = 3, 8  # least and most order of the flexible change; in between, one for each period
+_SAME = 1e-3  # share of a column outside the others, below which it adds nothing
+_LINE = 25.0  # power of a line above the noise that chance does not reach
+_BINS = 24  # frequencies near that of the decay that give the noise
+# What may be left as noise: a share of the motion, or a multiple of the noise between neighbouring
+# samples. The flexible change cannot follow a second mode over many periods.
+_NOISE_SHARE, _NOISE_RATIO = 0.01, 10.0
+SECOND = 0.3, 3.0  # frequencies where a second mode may be, relative to that of the first
+UNKNOWNS = 6  # of an exponential decay with a drift
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Departure:
+    """The residual of an exponential fit to a decay, relative to the noise.
+
+    Attributes
+    ----------
+    statistic : F-statistic of the flexible change, or that of dry friction, another mode or too
+        much noise if it says more.
+    limit : what the statistic exceeds by chance in one of 10,000 exponential decays.
+    columns : number of columns of the flexible change.
+    left : residual (n,) of the exponential fit.
+    noise : residual (n,) of the flexible change.
+    """
+
+    statistic: float
+    limit: float
+    columns: int
+    left: Array
+    noise: Array
+
+    @property
+    def present(self) -> bool:
+        """Whether more is left than noise."""
+        return self.statistic > self.limit
+
+
+def find_departure(
+    t: Array, y: Array, fit: Ringing, *, step: float, floor: float, friction: Array
+) -> Departure:
+    """Test whether the residual of an exponential exceeds the noise of the decay `y`.
+
+    Parameters
+    ----------
+    step : the encoder step.
+    floor : the noise between neighbouring samples (root mean square).
+    friction : what a little dry friction adds to the decay, shape (n,). This one column shows less
+        friction than the many of the flexible change.
+    """
+    tau, residual, pole = t - t[0], y - fit(t), complex(fit.poles[0])
+    n, angle = t.size, pole.imag * float(t[-1] - t[0]) / (t.size - 1)
+    orders = int(np.clip(angle * n / (2 * np.pi), *_ORDERS))
+    slow = legvander(2 * tau / tau[-1] - 1, orders).T
+    turning, decaying = np.exp(1j * pole.imag * tau), np.exp(pole.real * tau)
+    own = _columns(slow[:2], slow[:2] * decaying * turning)
+    flexible = _columns(
+        slow[2:4], slow * turning, slow[2:4] * decaying * turning, turning[None] ** 2,
+        turning[None] ** 3,
+    )  # fmt: skip
+    basis = np.linalg.qr(own)[0]
+    left = residual - basis @ (basis.T @ residual)
+    flexible /= np.linalg.norm(flexible, axis=0)
+    flexible -= basis @ (basis.T @ flexible)
+    added, sizes, _ = np.linalg.svd(flexible, full_matrices=False)
+    added = added[:, sizes > _SAME]
+    along = added.T @ left
+    noise = left - added @ along
+    density = noise_density(noise, angle=angle, step=step, unknowns=UNKNOWNS + along.size)
+    freedom = min(2.0 * _BINS, max(n - UNKNOWNS - along.size, 2.0))
+    limit = float(fdtri(along.size, freedom, 1 - _CHANCE))
+    friction = friction - basis @ (basis.T @ friction)
+    # Friction only ever brakes, so chance has twice its share on this side.
+    rubbed = max(float(friction @ left), 0.0) ** 2 / float(friction @ friction) / density
+    most = max(_NOISE_SHARE * float(np.ptp(y)), _NOISE_RATIO * floor)
+    return Departure(
+        statistic=max(
+            float(along @ along) / along.size / density,
+            limit / float(fdtri(1, freedom, 1 - 2 * _CHANCE)) * rubbed,
+            limit / _LINE * _highest_line(noise, angle=angle),
+            limit * (float(np.std(noise)) / most) ** 2 if most > 0 else 0.0,
+        ),
+        limit=limit,
+        columns=along.size,
+        left=left,
+        noise=noise,
+    )
+
+
+def _highest_line(residual: Array, *, angle: float) -> float:
+    """Return the highest power of another mode, relative to the usual power at its frequency."""
+    n = residual.size
+    window = np.hanning(n)
+    power = np.abs(np.fft.rfft(residual * window)) ** 2 / (window @ window)
+    first, last = (int(share * angle * n / (2 * np.pi)) for share in SECOND)
+    near = power[max(first, 2) : min(last, n // 2) + 1]
+    usual = float(np.median(near)) / np.log(2) if near.size >= _BINS else 0.0
+    return float(np.max(near)) / usual if usual > 0 else 0.0
+
+
+def _columns(*parts: Array | ComplexArray) -> Array:
+    """Return real columns (n, …) of real and complex rows."""
+    halves = [np.concatenate([p.real, p.imag]) if np.iscomplexobj(p) else p.real for p in parts]
+    return np.concatenate(halves).T
+
+
+def noise_density(residual: Array, *, angle: float, step: float, unknowns: int) -> float:
+    """Return the variance of the noise near a frequency of `angle` rad per sample.
+
+    It is the mean of the spectrum at the nearest frequencies, but for those that a fit to the decay
+    and its harmonics follows, and at least that of white noise or of the rounding.
+    """
+    n = residual.size
+    freedom = max(n - unknowns, 1)
+    white = max(float(residual @ residual) / freedom, step**2 / 12)
+    power = np.abs(np.fft.rfft(residual)) ** 2 / n
+    bins = np.arange(1, power.size - 1)
+    at = angle * n / (2 * np.pi)
+    apart = np.min(np.abs(bins - at * np.arange(4.0)[:, None]), axis=0)
+    usable = bins[apart > _ORDERS[1] / 2 + 1]
+    nearest = usable[np.argsort(np.abs(usable - at), kind="stable")[:_BINS]]
+    return max(white, float(np.mean(power[nearest]))) if nearest.size == _BINS else white
+
+
+def thinned(t: Array, y: Array, *, omega: float) -> tuple[Array, Array]:
+    """Return means of neighbouring samples, as many as a decay at `omega` rad/s allows.
+
+    A constant sine keeps its frequency and damping, and its amplitude changes by one factor.
+    Samples at uneven times are returned as they are.
+    """
+    intervals = np.diff(t)
+    usual = float(np.median(intervals))
+    size = int(2 * np.pi / omega / usual / _PER_PERIOD)
+    if size < 2 or np.max(np.abs(intervals - usual)) > 0.5 * usual:
+        return t, y
+    n = t.size // size * size
+    t_mean, y_mean = (values[:n].reshape(-1, size).mean(axis=1) for values in (t, y))
+    return t_mean, y_mean
+
+
+# ---------------------------------------------------- dry friction: the exact piecewise solution
+#
+# With viscous damping and dry friction F, a cart that moves one way swings about a point d = F/k to
+# one side of its rest. On the way back it swings about a point d to the other side. So successive
+# amplitudes follow A_{j+1} = rho A_j - (1 + rho) d.
+#
+# Reference: B. F. Feeny and J. W. Liang, J. Sound and Vibration 195 (1996) 149-154.
+
+_MOST_LOSS = 50.0  # bound of an exponent during the fit, against overflow
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Swings:
+    """A decay cut into half cycles at its turning points.
+
+    In each half cycle, y = rest + drift + (amplitude kept + friction pushed) swing - friction side.
+    Here friction means the friction band d.
+
+    Attributes
+    ----------
+    p : turning point in s, decay rate and damped frequency in rad/s.
+    since : time (n,) since the turning point, s.
+    tau : time (n,) since the half cycle began, s.
+    swing : cosine (n,) from 1 at the start of the half cycle to -1 at its end.
+    sine : quadrature (n,) of `swing`.
+    cycle : index (n,) of each sample's half cycle.
+    number : numbers (n_cycles,) of the half cycles; 0 for the one after the turning point.
+    kept, pushed, side : (n_cycles,), as in the equation above.
+    held : whether the cart has stopped (n,); it then stays where the half cycle ended.
+    """
+
+    p: Array
+    since: Array
+    tau: Array
+    swing: Array
+    sine: Array
+    cycle: NDArray[np.int64]
+    number: Array
+    kept: Array
+    pushed: Array
+    side: Array
+    held: NDArray[np.bool_]
+
+    @classmethod
+    def at(cls, t: Array, p: Array, *, direction: float, cycles: float = np.inf) -> "Swings":
+        """Cut the samples `t`.
+
+        After the turning point the cart moves in `direction` (1 or -1), for so many half `cycles`.
+        """
+        turning, decay, omega_d = p
+        since, half = t - turning, np.pi / omega_d
+        k = np.floor(since / half)
+        held = k >= cycles
+        k = np.minimum(k, cycles - 1)
+        tau = np.minimum(since - k * half, half)
+        number = np.arange(k.min(), k.max() + 1)
+        loss = np.clip(decay * half, -_MOST_LOSS, _MOST_LOSS)  # rho = exp(-loss)
+        lost = np.clip(-loss * number, -_MOST_LOSS, _MOST_LOSS)
+        # (1 - rho^k) / (1 - rho), which is k without viscous damping
+        geometric = np.expm1(lost) / np.expm1(-loss) if loss else number
+        sign = np.where(number % 2 == 0, 1.0, -1.0)
+        left = np.exp(np.clip(-decay * tau, -_MOST_LOSS, _MOST_LOSS))
+        sine = left * np.sin(omega_d * tau)
+        return cls(
+            p=p,
+            since=since,
+            tau=tau,
+            swing=left * np.cos(omega_d * tau) + decay / omega_d * sine,
+            sine=sine,
+            cycle=(k - number[0]).astype(np.int64),
+            number=number,
+            kept=sign * np.exp(lost),
+            pushed=direction * sign * (1 + (1 + np.exp(-loss)) * geometric),
+            side=direction * sign,
+            held=held,
+        )
+
+    @property
+    def columns(self) -> Array:
+        """The factors of rest point, drift, amplitude and friction band, (n, 4)."""
+        kept, pushed, side = (part[self.cycle] for part in (self.kept, self.pushed, self.side))
+        one = np.ones_like(self.tau)
+        return np.array([one, self.since, kept * self.swing, pushed * self.swing - side]).T
+
+    def derivatives(self, linear: Array) -> Array:
+        """Return dy/dp (n, 3); p is turning point, decay rate and frequency."""
+        _, drift, amplitude, band = linear
+        _, decay, omega_d = self.p
+        tau, swing, sine, ratio = self.tau, self.swing, self.sine, decay / omega_d
+        per_tau = -(decay**2 + omega_d**2) / omega_d * sine
+        per_decay = sine / omega_d - tau * swing
+        per_omega_d = ratio * (tau * swing - sine / omega_d) - (1 + ratio**2) * tau * sine
+        # The sizes of the half cycles depend on the logarithmic loss, pi decay / omega_d.
+        rho, number = np.exp(-np.clip(np.pi * ratio, -_MOST_LOSS, _MOST_LOSS)), self.number
+        geometric = (self.pushed / self.side - 1) / (1 + rho)
+        per_loss = (
+            (number * np.abs(self.kept) - rho * geometric) / (1 - rho)
+            if rho != 1
+            else -number * (number - 1) / 2
+        )
+        pushed_per_loss = self.side * ((1 + rho) * per_loss - rho * geometric)
+        size = (amplitude * self.kept + band * self.pushed)[self.cycle]
+        size_per_loss = (band * pushed_per_loss - amplitude * number * self.kept)[self.cycle]
+        # Derivative of tau by omega_d; a stopped cart is at the end of its half cycle.
+        longer = np.pi / omega_d**2 * np.where(self.held, -1.0, number[self.cycle])
+        return np.array(
+            [
+                -drift - np.where(self.held, 0.0, size * per_tau),
+                size * per_decay + np.pi / omega_d * size_per_loss * swing,
+                size * (per_omega_d + longer * per_tau)
+                - np.pi * ratio / omega_d * size_per_loss * swing,
+            ]
+        ).T
+
+
+# -------------------------------------------- damping or frequency that depends on the amplitude
+#
+# With quadratic drag beta |v| v, averaging gives A' = -gamma A - (4 beta omega / 3 pi) A². With a
+# spring that is not linear, the frequency changes in proportion to A². Both add a third harmonic.
+#
+# Reference: A. H. Nayfeh & D. T. Mook, Nonlinear Oscillations, 1979, chapters 2 and 3.
+
+_LEAST = 1e-3  # bound of a divisor during the fit
+_FLAT = 1e-3  # loss below which a series replaces a quotient of small numbers
+# Drag also slows the oscillation a little. The second coefficient is from simulations with beta A
+# from 0.02 to 0.4, which agree to 5 %.
+_SLOWS, _SLOWS_SQUARED = 0.5, 0.092
+_LEAD = 16  # points from the start to the first time, for the integrals
+SHIFTS_AGAIN = 5 / 12  # of a cubic spring
+DECAY, FREQUENCY, DRAG, SHIFT = range(4)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Modulated:
+    """A decay y = drift + Re(amplitude E e^{i phi}), with envelope E and phase phi.
+
+    The envelope is E = e^{-gamma tau} / (B sqrt(R)) with B = 1 + b (1 - e^{-gamma tau}) / gamma.
+    Because a stiffer spring stores more energy, R = 1 - (1 - e^{-2 gamma tau}) shift / omega.
+    Further, phi' = omega + shift E² - (5/12 shift² E⁴ + b gamma E / 2 + 0.092 b² E²) / omega.
+
+    Attributes
+    ----------
+    tau : time (n_lead + n,) since the start, s. The first times lead from the start to the samples.
+    p : gamma, omega, b and shift, 1/s.
+    free : which of p are unknown. The others are zero.
+    grown, below, bent : (1 - e^{-gamma tau}) / gamma, B and R (n_lead + n,).
+    envelope, phase : E and phi (n_lead + n,).
+    power : if positive, there is a third harmonic that follows E^power.
+    bends : highest power of time in the drift.
+    length : unit of time of these powers, s.
+    """
+
+    tau: Array
+    p: Array
+    free: Sequence[int]
+    grown: Array
+    below: Array
+    bent: Array
+    envelope: Array
+    phase: Array
+    power: int
+    bends: int
+    length: float
+
+    @classmethod
+    def at(
+        cls,
+        tau: Array,
+        p: Array,
+        *,
+        free: Sequence[int],
+        power: int = 0,
+        bends: int = 1,
+        length: float = 1.0,
+    ) -> "Modulated":
+        """Return the oscillation at the unknowns p (n_free,)."""
+        full = np.zeros(4)
+        full[list(free)] = p
+        gamma, omega, b, shift = full
+        tau = np.append(np.linspace(0.0, tau[0], _LEAD), tau)
+        left = np.exp(-np.clip(gamma * tau, -_MOST_LOSS, _MOST_LOSS))
+        flat = abs(gamma) * np.max(np.abs(tau)) <= _FLAT
+        grown = tau * (1 - gamma * tau / 2) if flat else (1 - left) / gamma
+        below = np.maximum(1 + b * grown, _LEAST)
+        bent = np.maximum(1 - (1 - left**2) * shift / omega, _LEAST)
+        envelope = left / below / np.sqrt(bent)
+        phase = omega * tau
+        if b or shift:
+            turning = shift * envelope**2 - _slowed(envelope, full) / omega
+            phase = phase + _integral(turning, tau)
+        return cls(
+            tau=tau,
+            p=full,
+            free=free,
+            grown=grown,
+            below=below,
+            bent=bent,
+            envelope=envelope,
+            phase=phase,
+            power=power,
+            bends=bends,
+            length=length,
+        )
+
+    @property
+    def columns(self) -> Array:
+        """The factors of drift, amplitude and harmonics, (n, n_linear)."""
+        tau, envelope, phase = self.tau[_LEAD:], self.envelope[_LEAD:], self.phase[_LEAD:]
+        drift = np.vander(tau / self.length, self.bends + 1, increasing=True).T
+        waves = [
+            part
+            for power, order in self._waves
+            for part in _parts(envelope**power * np.exp(1j * order * phase))
+        ]
+        return np.array([*drift, *waves]).T
+
+    @property
+    def _waves(self) -> list[tuple[int, int]]:
+        """Power of the envelope and order of the harmonic of each wave."""
+        return [(1, 1), (self.power, 3)] if self.power else [(1, 1)]
+
+    def derivatives(self, linear: Array) -> Array:
+        """Return dy/dp (n, n_free)."""
+        slopes, turns = self._changes
+        envelope, phase = self.envelope[_LEAD:], self.phase[_LEAD:]
+        by_size, by_phase = np.zeros((2, envelope.size))
+        for (power, order), (cosine, sine) in zip(
+            self._waves, linear[self.bends + 1 :].reshape(-1, 2), strict=True
+        ):
+            wave = (cosine - 1j * sine) * envelope**power * np.exp(1j * order * phase)
+            by_size += power * wave.real
+            by_phase -= order * wave.imag
+        return (by_size * slopes + by_phase * turns).T
+
+    @property
+    def _changes(self) -> tuple[Array, Array]:
+        """The derivatives (n_free, n) of ln E and of the phase by the unknowns."""
+        gamma, omega, b, shift = self.p
+        tau, E, grown = self.tau, self.envelope, self.grown
+        if not (b or shift or {DRAG, SHIFT} & set(self.free)):
+            zero = np.zeros_like(tau)
+            slopes, turns = np.array([-tau, zero]), np.array([zero, tau])
+            return slopes[:, _LEAD:], turns[:, _LEAD:]
+        left = np.exp(-np.clip(gamma * tau, -_MOST_LOSS, _MOST_LOSS))
+        flat = abs(gamma) * np.max(np.abs(tau)) <= _FLAT
+        per_gamma = -(tau**2) * (1 / 2 - gamma * tau / 3) if flat else (tau * left - grown) / gamma
+        by_shift = (1 - left**2) / (2 * self.bent * omega)
+        slopes = np.array(
+            [
+                shift / omega * tau * left**2 / self.bent - tau - b * per_gamma / self.below,
+                -shift / omega * by_shift,
+                -grown / self.below,
+                by_shift,
+            ]
+        )[list(self.free)]
+        slowing = _SLOWS * b * gamma * E, _SLOWS_SQUARED * (b * E) ** 2
+        again = SHIFTS_AGAIN * (shift * E**2) ** 2
+        per_size = 2 * shift * E**2 - (slowing[0] + 2 * slowing[1] + 4 * again) / omega
+        direct = np.array(
+            [
+                -_SLOWS * b * E / omega,
+                (slowing[0] + slowing[1] + again) / omega**2,
+                -(_SLOWS * gamma * E + 2 * _SLOWS_SQUARED * b * E**2) / omega,
+                E**2 - 2 * SHIFTS_AGAIN * shift * E**4 / omega,
+            ]
+        )[list(self.free)]
+        turns = _integral(direct + per_size * slopes, tau)
+        turns[self.free.index(FREQUENCY)] += tau
+        return slopes[:, _LEAD:], turns[:, _LEAD:]
+
+
+def _slowed(envelope: Array, p: Array) -> Array:
+    """Return what second order takes from the square of the frequency, at an envelope (n,)."""
+    gamma, _, b, shift = p
+    return (
+        _SLOWS * b * gamma * envelope
+        + _SLOWS_SQUARED * (b * envelope) ** 2
+        + SHIFTS_AGAIN * (shift * envelope**2) ** 2
+    )
+
+
+def _parts(wave: Array) -> tuple[Array, Array]:
+    return wave.real, wave.imag
+
+
+def _integral(values: Array, t: Array) -> Array:
+    """Return the integral of `values` (…, n) from the first time on, by the trapezoidal rule.
+
+    The envelope is slow, so this is exact enough between samples.
+    """
+    steps = np.diff(t) * (values[..., 1:] + values[..., :-1]) / 2
+    return np.concatenate([np.zeros_like(values[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)
+
+
+# ---------------------------------------------------------------------- the laws that compete
+
+_MARGIN = 6.0  # BIC by which the best law must be better than the next
+# Share of what the exponential leaves that a law may leave. On real carts, dry friction leaves 0.03
+# to 0.38; a wrong law may leave 0.23.
+_MOST_LEFT, _MOST_LEFT_BY_FRICTION = 0.2, 0.5
+# Unknowns that a law may have beyond the number of swings, unless it leaves only noise.
+_MORE_UNKNOWNS = 3
+_FEWEST_SWINGS = 4  # with fewer, most laws leave only noise
+_MAX_EVALUATIONS = 100
+_ROUGH = 1e-4  # relative tolerance of the squares in the competition
+_SIGMAS = 3.0  # a damping ratio further below zero is impossible
+_LEAST_ROUNDING = 0.1  # share of the rounding error that any fit leaves
+_LEAST_RATE = 0.1  # smaller decay rate of two modes, in the larger
+# Errors relative to the square of a shift, from simulated springs and pendulums.
+_NEGLECTED = np.array([1.0, 0.1, 1.0])  # of damping ratio, frequency and shift
+_MOST_SHIFT = 0.3  # relative shift of frequency up to which the series holds
+_APART = 0.5  # distance of two modes, in the larger decay rate
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LawFit:
+    """A law fitted to a decay.
+
+    Attributes
+    ----------
+    p : nonlinear unknowns, a start for another fit of the same law.
+    values : damping ratio, natural frequency and size of the cause.
+    unit : their standard errors for noise of unit density.
+    unknowns : number of unknowns, linear ones included.
+    """
+
+    name: DecayCause
+    p: Array
+    values: Array
+    unit: Array
+    unknowns: int
+    residual: Array
+    model: Callable[[Array], Array]
+
+    @property
+    def squares(self) -> float:
+        """The sum of squares of the residual."""
+        return float(self.residual @ self.residual)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Explained:
+    """A decay's test, and the law that it follows.
+
+    Attributes
+    ----------
+    name : "exponential", the law's name, or "unknown".
+    law : the law if it is neither exponential nor unknown.
+    density : density of the noise at the decay's frequency.
+    left : sum of squares that is not noise, left by the exponential and by the law.
+    """
+
+    name: DecayCause
+    departure: Departure
+    law: LawFit | None
+    density: float
+    left: tuple[float, float]
+
+    @property
+    def errors(self) -> Array:
+        """Standard errors of the law's damping ratio, natural frequency and size.
+
+        Unlike noise, what the law leaves beyond the noise does not average out, so it counts in
+        full. The averages behind a shift of frequency neglect its next power.
+        """
+        assert self.law is not None
+        zeta, omega_n, size = self.law.values
+        shift = abs(size) if self.law.name == "frequency_shift" else 0.0
+        neglected = _NEGLECTED * np.array([zeta, omega_n, 1.0]) * shift**2
+        return np.hypot(self.law.unit * np.sqrt(self.density + self.left[1]), neglected)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Candidate:
+    """A law to try.
+
+    Attributes
+    ----------
+    model : the model at times t and unknowns p.
+    pole : which of p are the decay rate and the damped frequency.
+    size : the size of the cause as weights of (p, linear), and whether the numbers make sense.
+    """
+
+    name: DecayCause
+    model: Callable[[Array, Array], SeparableModel]
+    starts: Sequence[Array]
+    scale: Array
+    pole: Callable[[Array, Array], tuple[int, int]]
+    size: Callable[[Array, Array, Array], tuple[Array, bool]]
+
+    def fit(self, t: Array, y: Array) -> LawFit | None:
+        """Return a rough fit from the best start, None if it makes no sense."""
+        start = min(self.starts, key=lambda p: squares_at(y, self.model(t, p)))
+        return self.fit_from(start, t, y, precision=_ROUGH)
+
+    def fit_from(self, start: Array, t: Array, y: Array, *, precision: float) -> LawFit | None:
+        """Return the fit from a start, None if it makes no sense."""
+        fit = fit_separable(
+            y,
+            partial(self.model, t),
+            start=start,
+            max_evaluations=_MAX_EVALUATIONS,
+            scale=self.scale,
+            precision=precision,
+        )
+        p, linear, at = fit.p, fit.linear, self.pole(fit.p, fit.linear)
+        decay, omega_d = p[list(at)]
+        weights, sound = self.size(t, p, linear)
+        if not (fit.converged and omega_d > 0 and sound):
+            return None
+        omega_n, n = float(np.hypot(decay, omega_d)), p.size + linear.size
+        gradient = np.zeros((3, n))
+        gradient[0, list(at)] = np.array([omega_d**2, -decay * omega_d]) / omega_n**3
+        gradient[1, list(at)] = decay / omega_n, omega_d / omega_n
+        gradient[2] = weights
+        covariance = inverse_normal(self.model(t, p), linear)
+        size = float(gradient[2] @ np.concatenate([p, linear]))
+        return LawFit(
+            name=self.name,
+            p=p,
+            values=np.array([decay / omega_n, omega_n, size]),
+            unit=np.sqrt(np.einsum("ij,jk,ik->i", gradient, covariance, gradient)),
+            unknowns=n,
+            residual=fit.residual,
+            model=lambda at: self.model(at, p).columns @ linear,
+        )
+
+
+# ------------------------------------------------------------- the competition
+
+
+def explain_decay(
+    t: Array,
+    y: Array,
+    fit: Ringing,
+    *,
+    step: float,
+    floor: float,
+    turning: Array,
+    falling: bool,
+    only: DecayCause | None = None,
+) -> Explained:
+    """Test whether a decay is exponential, and find the law that it follows if it is not.
+
+    Parameters
+    ----------
+    t, y : times and readings (n,) of one free decay.
+    fit : the exponential fit to the same samples.
+    step : the encoder step.
+    floor : the noise between neighbouring samples (root mean square).
+    turning : times of the turning points.
+    falling : whether y decreases after the first turning point.
+    only : the only law to try; by default all compete.
+    """
+    omega = float(fit.poles[0].imag)
+    coarse_t, coarse_y = thinned(t, y, omega=omega)
+    n, size = coarse_t.size, t.size // coarse_t.size
+    angle = omega * float(coarse_t[-1] - coarse_t[0]) / (n - 1)
+    density_of = partial(noise_density, angle=angle, step=step / np.sqrt(size))
+    swings_at = partial(Swings.at, direction=-1.0 if falling else 1.0)
+    around = np.array([turning[0], -fit.poles[0].real, omega])
+    departure = find_departure(
+        coarse_t,
+        coarse_y,
+        fit,
+        step=step / np.sqrt(size),
+        floor=floor,
+        friction=swings_at(coarse_t, around, cycles=np.inf).columns[:, 3],
+    )
+    noise, columns = departure.noise, departure.columns + UNKNOWNS
+    density = density_of(noise, unknowns=columns)
+    if not departure.present:
+        return Explained(
+            name="exponential",
+            departure=departure,
+            law=None,
+            density=size * density,
+            left=(0.0, 0.0),
+        )
+    tried = _candidates(coarse_t, coarse_y, fit, turning=turning, falling=falling, end=float(t[-1]))
+    fits = [
+        (law, one)
+        for one in tried
+        if only in (None, one.name) and (law := one.fit(coarse_t, coarse_y))
+    ]
+    for law, _ in fits:  # the residual of a law may be smaller than that of the flexible change
+        other = density_of(law.residual, unknowns=law.unknowns)
+        if other < density:
+            noise, columns, density = law.residual, law.unknowns, other
+    n_eff = max(float(noise @ noise) / density, 2.0)
+    # Rounding leaves this much even if the fit follows it.
+    least = n * (step**2 / size / 12) * _LEAST_ROUNDING
+
+    def bic(squares: float, unknowns: int) -> float:
+        return n_eff * float(np.log(max(squares, least) / n)) + unknowns * float(np.log(n_eff))
+
+    def excess(squares: float) -> float:
+        """Return what is left beyond the noise, zero if it is within chance."""
+        more = squares - float(noise @ noise)
+        return more if more > departure.limit * departure.columns * density else 0.0
+
+    def is_determined(law: LawFit) -> bool:
+        """Return whether the swings determine the law, or it leaves only noise.
+
+        Each swing gives one number: its amplitude, its time or its middle. Dry friction also shows
+        within a swing.
+        """
+        swings = n * angle / np.pi
+        few = law.unknowns <= swings + _MORE_UNKNOWNS
+        exact = swings >= _FEWEST_SWINGS and not excess(law.squares)
+        return few or exact or law.name == "dry_friction"
+
+    left = float(departure.left @ departure.left)
+    bics: dict[str, float] = {"exponential": bic(left, UNKNOWNS)}
+    best: tuple[LawFit, _Candidate] | None = None
+    for law, tried_one in fits:
+        if not is_determined(law):
+            continue
+        own = bic(law.squares, law.unknowns)
+        if own < bics.get(law.name, np.inf):
+            bics[law.name] = own
+            if own <= min(bics.values()):
+                best = law, tried_one
+    name: DecayCause = "unknown"
+    full, over = None, excess(left)
+    if best and _is_clear(best[0], bics, density=density):
+        law, tried_one = best
+        most = _MOST_LEFT_BY_FRICTION if law.name == "dry_friction" else _MOST_LEFT
+        if excess(law.squares) <= most * over:
+            full = tried_one.fit_from(law.p, t, y, precision=PRECISION)
+            name, over = (law.name, excess(law.squares)) if full else (name, over)
+    return Explained(
+        name=name,
+        departure=departure,
+        law=full,
+        density=size * density,
+        left=(size * excess(left), size * over),
+    )
+
+
+def _is_clear(law: LawFit, bics: Mapping[str, float], *, density: float) -> bool:
+    """Return whether the best law has a damping, and is clearly better than all others."""
+    others = [bic for name, bic in bics.items() if name != law.name]
+    undamped = law.values[0] < -_SIGMAS * law.unit[0] * np.sqrt(density)
+    return not undamped and bics[law.name] + _MARGIN < min(others)
+
+
+def _candidates(
+    t: Array, y: Array, fit: Ringing, *, turning: Array, falling: bool, end: float
+) -> Iterator[_Candidate]:
+    """Yield all laws that may explain why a decay is not exponential."""
+    pole = complex(fit.poles[0])
+    decay, omega, start = -pole.real, pole.imag, float(t[0])
+    length = float(t[-1] - t[0])
+
+    def modulated(
+        name: DecayCause,
+        free: Sequence[int],
+        p: Sequence[float],
+        size: Callable[[Array, Array, Array], tuple[Array, bool]],
+        *,
+        power: int = 0,
+        bends: int = 1,
+    ) -> _Candidate:
+        return _Candidate(
+            name=name,
+            model=lambda t, p: Modulated.at(
+                t - start, p, free=free, power=power, bends=bends, length=length
+            ),
+            starts=[np.array(p)],
+            scale=np.full(len(free), abs(pole)),
+            pole=lambda p, linear: (0, 1),
+            size=size,
+        )
+
+    # A cart that friction has stopped stays where it is: where it last turned, or one swing later.
+    stopped = end > turning[-1] + np.pi / omega
+    for cycles in [np.inf, *(turning.size - np.array([1.0, 0.0]) if stopped else [])]:
+        yield _Candidate(
+            name="dry_friction",
+            model=partial(Swings.at, direction=-1.0 if falling else 1.0, cycles=cycles),
+            starts=[np.array([turning[0], decay * share, omega]) for share in (1.0, 0.3)],
+            scale=np.array([1 / omega, abs(pole), abs(pole)]),
+            pole=lambda p, linear: (1, 2),
+            size=lambda t, p, linear: (np.eye(7)[6], linear[3] > 0),
+        )
+    drag = [0.5 * decay, omega, 0.5 * decay]
+    yield modulated("quadratic_drag", [DECAY, FREQUENCY, DRAG], drag, _drag_size)
+    yield modulated("quadratic_drag", [DECAY, FREQUENCY, DRAG], drag, _drag_size, power=2)
+    shift = [decay, omega, 0.0]
+    yield modulated("frequency_shift", [DECAY, FREQUENCY, SHIFT], shift, _shift_size)
+    yield modulated("frequency_shift", [DECAY, FREQUENCY, SHIFT], shift, _shift_size, power=3)
+    for bends in (3, 6):
+        if 2 * np.pi * bends <= omega * length:  # a drift is slower than the oscillation
+            yield modulated("drift", [DECAY, FREQUENCY], [decay, omega], _bend_size, bends=bends)
+    others = _other_frequencies(t, y - fit(t), pole)
+    yield _Candidate(
+        name="second_mode",
+        model=lambda t, p: Waves.at(t - start, p, level=np.array([np.ones_like(t), t - start])),
+        starts=[np.array([decay, decay, omega, other]) for other in others],
+        scale=np.full(4, abs(pole)),
+        pole=_main_mode,
+        size=_second_size,
+    )
+
+
+def _drag_size(t: Array, p: Array, linear: Array) -> tuple[Array, bool]:
+    """Return the weights of the drag coefficient beta."""
+    amplitude = float(np.hypot(*linear[2:4]))
+    return np.eye(p.size + linear.size)[2] * 3 * np.pi / (4 * p[1] * amplitude), p[2] > 0
+
+
+def _shift_size(t: Array, p: Array, linear: Array) -> tuple[Array, bool]:
+    """Return the weights of the relative change of frequency at the largest amplitude."""
+    weights, shift = np.zeros(p.size + linear.size), float(p[2] / p[1])
+    weights[2] = (1 - SHIFTS_AGAIN * shift) / p[1]
+    # The changes of the waveform are of second order in the shift.
+    amplitude, *others = np.hypot(*linear[2:].reshape(-1, 2).T)
+    small = max(others, default=0.0) < abs(shift) * amplitude / 2
+    return weights, abs(shift) < _MOST_SHIFT and small
+
+
+def _bend_size(t: Array, p: Array, linear: Array) -> tuple[Array, bool]:
+    """Return the weights of the rest point's largest distance from a line from start to end."""
+    share, bends = np.linspace(0, 1, 51)[:, None], np.arange(2, linear.size - 2)
+    shapes = share**bends - share
+    weights = np.zeros(p.size + linear.size)
+    distance = shapes @ linear[2 : linear.size - 2]
+    weights[p.size + bends] = shapes[int(np.argmax(np.abs(distance)))]
+    return weights, True
+
+
+def _main_mode(p: Array, linear: Array) -> tuple[int, int]:
+    """Return where decay rate and frequency of the mode with the larger amplitude are."""
+    return (0, 2) if np.hypot(*linear[[2, 4]]) >= np.hypot(*linear[[3, 5]]) else (1, 3)
+
+
+def _second_size(t: Array, p: Array, linear: Array) -> tuple[Array, bool]:
+    """Return the weights of the smaller mode's frequency; the modes must be apart."""
+    rates, frequencies = p.reshape(2, 2)
+    apart = abs(frequencies[1] - frequencies[0]) > _APART * np.max(np.abs(rates))
+    turns = float(np.min(frequencies)) * (t[-1] - t[0]) > 2 * np.pi
+    decays = float(np.min(rates)) > _LEAST_RATE * float(np.max(rates))
+    return np.eye(10)[3 if _main_mode(p, linear) == (0, 2) else 2], apart and turns and decays
+
+
+def _other_frequencies(t: Array, residual: Array, pole: complex) -> Iterator[float]:
+    """Yield frequencies to start from: the peak of the residual, and both sides of the first."""
+    length, padded = float(t[-1] - t[0]), 4 * t.size
+    omega = 2 * np.pi / length * (t.size - 1) / padded * np.arange(padded // 2 + 1)
+    power = np.abs(np.fft.rfft(residual * np.hanning(t.size), padded))
+    near = (omega > max(SECOND[0] * pole.imag, np.pi / length)) & (omega < SECOND[1] * pole.imag)
+    peak = float(omega[near][np.argmax(power[near])])
+    beside = np.pi / length
+    if abs(peak - pole.imag) > beside:
+        yield peak
+    yield pole.imag + beside
+    yield pole.imag - beside
