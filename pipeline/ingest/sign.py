@@ -6,8 +6,8 @@ the motor pushes. The equation of motion is
     s u = m x_1'' + c x_1' + k x_1 + k' (x_1 - x_2),   m, c, k, k' ≥ 0,   s = ±1.
 
 It holds for every record of a bench with the same m, c, k and k', so all records together decide s.
-No data are differentiated: both sides are averaged with a bump that slides along the record
-(`force_balance`). A late input (a delay or a lag) shifts the phase above the resonance so far that a
+No data are differentiated: both sides are averaged with a bump that slides along the record.
+A late input (a delay or a lag) shifts the phase above the resonance so far that a
 record, taken alone, can seem to have the other sign. With the inertia and stiffness from the other
 records, this does not happen.
 """
