@@ -139,6 +139,14 @@ readings = st.builds(
 )
 
 
+def test_a_stock_bench_knows_three_commands():
+    """A stock bench ignores the extensions' letters and fields, and knows no chirp."""
+    data = b"?;s;k;f;1;2;3;4;5;c;20;h;1;0;d;c;o;o;1;100;1;"
+    assert read(data, extensions=()) == []
+    known = [Start(wave=Wave.SINE, frequency=1.0, amplitude=5), PidGains(kp=1, ki=0, kd=0)]
+    assert read(b"".join(map(encode, known)), extensions=()) == known
+
+
 @given(readings)
 def test_lines_are_read_as_sent(reading):
     """A line is read as the reading that was written, with or without its line end."""

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline.bench.experiments import readings_of, save_record
+from pipeline.bench.experiments import log_text, readings_of, save_record
 from pipeline.bench.raw import RawHeader, RawWriter, read_raw
 from pipeline.errors import DataError
 from pipeline.experiments.plan import PlanLimits, Recording
@@ -107,3 +107,19 @@ file = "data/sine-µ.txt"
     assert record.u is not None
     assert record.u.tolist() == [0.001 * (i % 50) for i in range(40)]
     assert record.t[-1] == pytest.approx(39 * 1.0024e-3, abs=1e-3)
+
+
+def test_a_closed_loop_has_its_reference():
+    """Under feedback the target has its own column, which is read as the reference."""
+    heading, first, *_ = log_text(LINES, carts=1, reference=True).splitlines()
+    assert heading == "Sample\tTime\tEncoder 1 Pos\tTarget\tControl Effort"
+    assert first == "0\t0.000\t0\t0\t0"
+
+
+def test_a_raw_file_of_a_few_lines_makes_no_record(tmp_path):
+    """Seven lines are too few for a record, and the message says so."""
+    path = tmp_path / "short-1.raw"
+    with RawWriter(path, HEADER) as writer:
+        writer.write(b"".join(map(format_reading, LINES[:7])))
+    with pytest.raises(DataError, match=r"short-1.raw: holds 7 lines, too few"):
+        save_record(path, folder=tmp_path, carts=2)

@@ -138,6 +138,15 @@ def test_a_motor_with_another_duty_than_ordered_ends_the_session(tmp_path, wrong
     assert len(load_submission(work).experiments) == (wrong is resting_again)
 
 
+def test_a_cart_past_its_limit_at_rest_ends_the_session(tmp_path):
+    """Once the carts are zeroed, a cart beyond its travel limit ends the session, even at rest."""
+    work = write_work(tmp_path, plan())
+    with RunawayBench(resting_again, out=FAR) as bench:
+        (partial,), _ = session(work, bench)
+    assert_over(bench)
+    assert partial.startswith("while the carts came to rest, stopped: cart 1 was 11 cm from its ze")
+
+
 def test_before_the_carts_are_zeroed_they_may_be_anywhere(tmp_path):
     """Before the carts are zeroed, no position counts as too far, so nothing is stopped."""
     work = write_work(tmp_path, plan())
@@ -235,6 +244,15 @@ def test_a_motor_that_starts_while_a_person_holds_a_cart_is_stopped(tmp_path):
     assert_over(notes.bench)
     assert partial.startswith("stopped: the bench drives its motor")
     assert partial in notes.remarks  # before the Enter key was pressed
+
+
+def test_a_motor_that_starts_while_a_virtual_hand_pulls_is_stopped(tmp_path):
+    """If the motor starts while the virtual bench pulls a cart, the bench is stopped."""
+    work = write_work(tmp_path, [decay("decay")])
+    with RunawayBench(lambda bench: bench.is_pulled, duty=FULL) as bench:
+        (partial,), _ = session(work, bench, only=["decay"])
+    assert_over(bench)
+    assert partial.startswith("stopped: the bench drives its motor")
 
 
 def test_a_motor_that_starts_in_a_decay_by_hand_is_stopped(tmp_path):

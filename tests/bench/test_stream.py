@@ -153,6 +153,13 @@ def test_a_bench_that_restarts_ends_the_run():
     assert stream.anomalies().resets == 1
 
 
+def test_the_last_line_of_an_earlier_run_does_not_count():
+    """The last line of the previous run, whole or in part, is not taken for a line of this run."""
+    sent = lines(100)
+    got, _ = read(b"5:0:0\n" + format_reading(lines(9000)[-1]) + join(sent))
+    assert got == sent
+
+
 @pytest.mark.parametrize("closed", [True, False])
 def test_a_duty_in_only_one_line_is_accepted_in_closed_loop(closed):
     """A line whose duty differs from its neighbours' is accepted only in a closed loop.
@@ -183,6 +190,18 @@ def test_late_lines_are_counted_and_kept():
     )  # stamps 500 to 539; rounding decides on 540
 
 
+def test_a_busy_host_makes_no_line_late():
+    """Lines that waited because the host was busy do not count as late.
+
+    Lateness is measured from the last time that the host found the port empty.
+    """
+    sent = lines(1000, period=1.0)
+    stream = Stream(encoders=2)
+    for start in range(0, 1000, 100):  # the host reads every 100 ms
+        stream.feed(join(sent[start : start + 100]), since=1e-3 * start, now=1e-3 * (start + 100))
+    assert stream.anomalies().late == 0
+
+
 @pytest.mark.parametrize("since", [0, 2500])
 def test_an_encoder_that_stands_still_is_noticed(since):
     """An encoder that stops, or never moves, while the motor drives is reported as stuck."""
@@ -193,3 +212,13 @@ def test_an_encoder_that_stands_still_is_noticed(since):
     ]  # fmt: skip
     _, stream = read(join(sent))
     assert stream.anomalies().stuck == 1
+
+
+def test_a_cart_that_rests_after_a_step_is_not_stuck():
+    """A cart that comes to rest under a constant input does not count as a stuck encoder."""
+    sent = [
+        Reading(counts=(min(i, 300), 0), target=200, duty=200, ms=i) for i in range(4000)
+    ]  # fmt: skip
+    stream = Stream(encoders=2, free=(1,))
+    stream.feed(join(sent), since=0.0, now=4.0)
+    assert stream.anomalies().stuck == 0

@@ -78,6 +78,20 @@ def test_a_number_outside_the_limits_is_refused_by_name(work, kind, numbers, wor
     assert load_plan(submission) == plan
 
 
+@pytest.mark.parametrize(
+    ("seconds", "frequency", "cycles"), [(100.0, 0.07, 7), (101.0, 0.07, 8), (120.0, 0.07, 8)]
+)
+def test_whole_periods_last_as_long_as_typed(work, seconds, frequency, cycles):
+    """100 s at 0.07 Hz become exactly 7 periods, despite the rounding of floats."""
+    submission = load_submission(work)
+    made = make_recording(
+        WantedRecording(kind="sine", seconds=seconds, amplitude=0.1, frequency=frequency),
+        plan=load_plan(submission),
+        submission=submission,
+    )
+    assert made.cycles == cycles
+
+
 def test_recordings_that_others_added_meanwhile_are_kept(work):
     """Recordings that others added to the plan meanwhile are kept."""
     old = load_plan(load_submission(work))

@@ -182,6 +182,15 @@ def test_a_reversed_input_reverses_the_gains(identified):
         gains_of((submission, reversed_), PidLoop(kp=0.5, ki=10.0))
 
 
+def test_the_scale_of_the_submission_replaces_that_of_the_bench(identified):
+    """If the submission states `per_count`, the gains are scaled by it, not by the bench's."""
+    submission, analysis = identified
+    stated = submission.system.input.model_copy(update={"per_count": 2 * DUTY})
+    system = submission.system.model_copy(update={"input": stated})
+    other = submission.model_copy(update={"system": system})
+    assert bench_scales(other, bench=BENCH, analysis=analysis).input == 2 * DUTY
+
+
 @pytest.mark.parametrize(
     ("loop", "limits", "amplitude", "message"),
     [

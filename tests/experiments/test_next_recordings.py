@@ -2,13 +2,15 @@
 
 import itertools
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pipeline.errors import ConfigError
+from pipeline.errors import ConfigError, DataError
 from pipeline.experiments.candidates import (
     optimal_tones,
+    propose_candidates,
 )
 from pipeline.experiments.goal import Goal, choose, find_goal
 from pipeline.experiments.information import FisherInformation
@@ -235,6 +237,15 @@ def test_only_dwells_are_chosen_if_dwells_identified_the_carts():
     found = choose_next(analysis, Plan(limits=LIMITS), n=2, goal="zeta_2", commands=COMMANDS)
     assert {r.kind for r in found.recordings} == {"sine"}
     assert found.errors[2] < found.errors[1] < found.errors[0]
+
+
+def test_carts_that_hardly_settle_get_no_dwells():
+    """For carts that take too long to settle, no dwell is chosen, and a message says so."""
+    known = FisherInformation.of(analysed("two-cart"))
+    slow = replace(known, chain=replace(known.chain, c=0.2 * known.chain.c))
+    goal = find_goal("worst", slow, feedback=None)
+    with pytest.raises(DataError, match="too long to settle"):
+        propose_candidates(slow, limits=LIMITS, commands=COMMANDS, goal=goal)
 
 
 # --------------------------------------------------------------------------- multisines

@@ -62,6 +62,14 @@ def test_the_first_runs_suit_unknown_carts():
     assert max(abs(r.amplitude) for r in plan.recordings) <= 0.05 * plan.limits.input
 
 
+def test_carts_without_springs_get_no_release_and_no_step():
+    """A cart without springs is not released, and carts tied to no wall get no step."""
+    plan = propose_plan(bare(carts=1, springs=(False, False)))
+    assert [r.kind for r in plan.recordings] == ["sweep"]
+    plan = propose_plan(bare(carts=2, springs=(False, True, False)))
+    assert [r.kind for r in plan.recordings] == ["decay"] * 4 + ["sweep"]
+
+
 def test_a_stock_bench_gets_only_its_own_commands():
     """A stock bench gets only its own commands: a square wave as sweep, and its PID on cart 1."""
     (sweep,) = of_kind(propose_plan(bare(), bench=STOCK), "sweep")
@@ -190,6 +198,14 @@ def test_the_loop_comes_once_the_dwells_are_recorded():
     assert loop.controller == StateLoop(cart=2)
     assert loop.amplitude == 1.0
     assert extend_plan(extended, after) == extended
+
+
+def test_a_long_set_point_is_cut_to_the_travel():
+    """A set point beyond the travel limit is reduced."""
+    submission = recorded("two-cart", *FIRST, "sine")
+    plan = Plan(limits=PlanLimits(input=5.0, travel=0.5))
+    (loop,) = extend_plan(plan, submission).recordings
+    assert 0.2 < loop.amplitude < 0.4
 
 
 def test_data_that_identify_nothing_give_a_reason():

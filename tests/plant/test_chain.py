@@ -190,6 +190,12 @@ def test_a_held_cart_is_a_wall(chain, data):
     assert B[1, 0] == (1 / chain.m[0] if cart == 1 else 0.0)
 
 
+def test_the_order_of_free_carts_does_not_matter():
+    """The order in which free carts are named changes nothing: states start with cart 1."""
+    chain = PRESETS["throne-3dof"]
+    assert_allclose(chain.state_space(free=[3, 1])[0], chain.state_space(free=(1, 3))[0])
+
+
 def test_a_missing_cart_cannot_be_free():
     """If cart 3 of two carts is named as free, there is an error."""
     with pytest.raises(ValueError, match=r"free carts \[3\] are not among 1 to 2"):

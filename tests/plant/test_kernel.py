@@ -149,6 +149,20 @@ def test_every_effect_agrees_with_the_fine_step_simulator(key):
     assert np.sqrt(np.mean((linear - truth) ** 2)) > 2.0 * limit * COUNT
 
 
+def test_delay_shifts_the_response():
+    """A delay of n samples shifts the readings n samples later, or earlier if it is negative."""
+    chain = PRESETS["throne-2dof"]
+    t = sample_times(500, 0.005)
+    u = np.where(t > 0.1, 0.03, 0.0)
+    plain = simulate(linear_tables(chain), t, u)
+    for delay, shift in ((0.02, 4), (-0.02, -4)):
+        term = make_term(find_effect("input_delay"), place=0, values={"delay": delay}, chain=chain)
+
+        late = simulate(AugmentedChain(chain=chain, terms=(term,)).tables(), t, u)
+
+        assert_allclose(late[:, 100:400], plain[:, 100 - shift : 400 - shift], atol=1e-6)
+
+
 def test_diverging_model_is_reported_as_nan():
     """If a softening spring gives way, the readings become NaN, without a crash or endless run."""
     chain = PRESETS["throne-1dof"]
@@ -191,6 +205,35 @@ start = kernel.StartState(still, still, np.ones(2))
 kernel.simulate([(linear_tables(chain), start)], run, of=by_mass)
 assert [dict(one.cache_misses) for one in stats] == before
 """
+
+
+def test_a_hidden_mass_starts_at_the_given_position():
+    """A cart and its hidden mass, started apart, move as a chain of two carts."""
+    chain = Chain(m=np.array([1.7e-4]), c=np.array([4e-4]), k=np.array([0.034, 0.0]))
+    mass, stiffness = 2e-5, 0.004
+    term = make_term(
+        find_effect("extra_mode"),
+        place=1,
+        values={"mass": mass, "stiffness": stiffness, "damping": 0.0},
+        chain=chain,
+    )
+    pair = Chain(
+        m=np.array([1.7e-4, mass]), c=np.array([4e-4, 0.0]), k=np.array([0.034, stiffness, 0.0])
+    )
+    t = sample_times(800, 0.002)
+    cart, offset = (0.8, -3.0), (0.15, 2.0)  # position in cm and velocity in cm/s
+
+    got = simulate(
+        AugmentedChain(chain=chain, terms=(term,)).tables(),
+        t,
+        np.zeros(t.size),
+        x0=[cart[0], offset[0]],
+        v0=[cart[1], offset[1]],
+    )
+
+    start = np.array([cart[0], cart[1], cart[0] + offset[0], cart[1] + offset[1]])
+    true = simulate_linear(pair, t, np.zeros(t.size), x0=start)[0]
+    assert_allclose(got[0], true, atol=1e-6 * np.abs(true).max())
 
 
 def test_after_compile_simulator_nothing_is_compiled():

@@ -255,6 +255,13 @@ def test_carts_that_run_away_are_refused():
             bench(soft).move(run)
 
 
+def test_a_loop_cannot_look_ahead():
+    """A drive that leads its log by more than a sample is refused in a loop."""
+    assert np.all(np.isfinite(bench(usual("input_delay", delay=-SAMPLE_TIME)).move(control()).x))
+    with pytest.raises(DataError, match="lead its log by more than a sample"):
+        bench(usual("input_delay", delay=-0.02)).move(control())
+
+
 # --------------------------------------------------------------- a stored model
 
 

@@ -69,6 +69,17 @@ def test_exact_magnitudes_give_the_chain_without_a_start(chain):
         assert_allclose(got.parameters[name].value, value, rtol=1e-5)
 
 
+def test_a_rigid_body_has_mass_and_damping():
+    """If a single cart has no spring, the fit gives the cart's mass and damping."""
+    cart = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.zeros(2))
+
+    got = fit_bode(exact(cart), bench=Setup(springs=(False, False)))
+
+    assert_allclose(got.parameters["mass"].value, 3e-4, rtol=1e-5)
+    assert_allclose(got.parameters["damping"].value, 1e-3, rtol=1e-5)
+    assert got.staged == {}
+
+
 def test_the_staged_fit_is_reported_as_well():
     """From exact data, the stage-by-stage fit finds all parameters, even the recomputed ones."""
     chain = PRESETS["throne-3dof"]
@@ -105,6 +116,18 @@ def test_intervals_contain_the_true_values(preset, phases):
 # All points are beside the sharp peak, so they do not show its damping.
 SHARP = Chain(m=np.array([2e-3]), c=np.array([0.0]), k=np.array([0.6, 0.0]))
 BESIDE = np.sqrt(300.0) * np.array([0.4, 0.6, 0.8, 1.25, 1.5, 2.0])
+
+
+def test_a_missing_far_spring_and_damper_are_found_to_be_zero():
+    """If the far spring and the damper of cart 2 are missing, the fit finds both to be zero."""
+    chain = PRESETS["throne-2dof"]
+    loose = Chain(m=chain.m, c=np.array([6e-4, 0.0]), k=np.array([0.05, 0.127, 0.0]))
+
+    got = fit_bode(exact(loose), bench=Setup(springs=(True,) * 3))
+
+    assert_allclose(got.chain.k, loose.k, atol=1e-5)
+    assert_allclose(got.chain.c, loose.c, atol=1e-7)
+    assert_allclose(got.parameters["K_1"].value, got.parameters["K_2"].value, rtol=1e-4)
 
 
 def test_a_damping_at_its_bound_has_no_standard_error():

@@ -95,6 +95,12 @@ def test_dwells_are_sorted_by_frequency():
     assert got.source == "dwells"
 
 
+def test_dwells_without_an_input_are_refused():
+    """A dwell without an input amplitude is refused, since a gain needs one."""
+    with pytest.raises(DataError, match="dwells need a sinusoidal input"):
+        collect_dwells([replace(dwell(omega=5.0, gain=2.0), input_amplitude=0.0)])
+
+
 @pytest.mark.parametrize(("apart", "std"), [(0.0, 0.001 / np.sqrt(2)), (0.1, 0.05)])
 def test_repeats_become_one_point(apart, std):
     """Two dwells at one frequency have an error smaller by √2, or that of their scatter."""
@@ -239,6 +245,39 @@ def test_peaks_and_nulls_are_found(preset):
         # The grid's ratio is 1.08, and a peak is low by sqrt(1 - 2 zeta²), or 6 % at zeta 0.25.
         assert_allclose(got[name].value, truth[name], rtol=0.08)
     assert all(e.value == 0.1 for e in got.values() if e.source == "assumed")
+
+
+def test_a_mode_too_damped_to_peak_is_found_from_the_roll_off():
+    """If the first mode is too damped to have a peak, it is found from the roll-off."""
+    chain = PRESETS["throne-2dof"]
+    damped = Chain(m=chain.m, c=np.array([1, 1.7]) * 3e-3, k=chain.k * [1, 20, 1])
+    assert damped.parameters()["zeta_a"] > 0.72  # above 1/sqrt 2 there is no peak
+    omega = np.geomspace(1.0, 300.0, 60)
+
+    got = find_resonances(table(damped, omega), n=2)
+
+    # The value is only a start for a fit, since the formula ignores the damping.
+    assert_allclose(got["omega_a"].value, damped.parameters()["omega_a"], rtol=0.3)
+    assert_allclose(got["omega_b"].value, damped.parameters()["omega_b"], rtol=0.05)
+
+
+def test_noise_gives_no_resonance():
+    """A flat response with 5 % noise gives no resonance."""
+    omega = np.geomspace(1.0, 50.0, 40)
+    rng = np.random.default_rng(1)
+    flat = FrequencyResponse(
+        cart=1,
+        omega=omega,
+        magnitude=1 + 0.05 * rng.standard_normal(40),
+        magnitude_std=np.full(40, 0.05),
+        phase=None,
+        phase_std=None,
+        source="table",
+    )
+
+    got = find_resonances([flat], n=1)
+
+    assert set(got) == {"zeta"}
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -193,6 +193,24 @@ def test_a_stated_sign_that_the_log_contradicts_is_noted():
     assert checks[0].nrmse < 1.35 * noise_floor(y[0])
 
 
+def test_a_stated_scale_that_the_log_contradicts_is_noted():
+    """If the scale of the PID was left out, the factor found in the log is used."""
+    law = Pid(kp=2.0, kd=0.1, scale=0.009765625)
+    run = simulate_loop(TWO, law, t=CLOCK, reference=STEPS)
+    y = encoder(run.x)
+
+    checks = check_hardware(
+        record(y, u=run.u, reference=STEPS),
+        TWO,
+        controller=submission.PidController(type="pid", kp=2.0, kd=0.1),
+        controlled_cart=1,
+    )
+
+    # The scale is the median ratio of the input to a law that uses rounded readings.
+    assert re.match(r"the logged input is 0\.0097\d times what the stated", checks[0].note)
+    assert checks[0].nrmse < 1.35 * noise_floor(y[0])
+
+
 @pytest.mark.parametrize("wrong", ["input", "reference", "gains", "controlled_cart", "counts"])
 def test_a_wrong_statement_about_a_run_fails_a_check(wrong):
     """If a column's unit, the gains or the controlled cart are wrong, a check fails."""
@@ -219,6 +237,28 @@ def test_a_wrong_statement_about_a_run_fails_a_check(wrong):
         record(y, u=u, reference=STEPS), TWO, controller=stated(design), controlled_cart=2
     )
     assert check_loops(true) == []
+
+
+def test_noisy_velocities_do_not_change_the_scale():
+    """If velocities are mostly noise, as at 1 kHz, the controller's scale is still accepted."""
+    t = 0.001 * np.arange(4000, dtype=np.float64)
+    steps = np.where((t > 0.2) & (t < 2.5), 1.0, 0.0)
+    design = design_feedback(
+        TWO,
+        Design(cart=2, reference=1.0, overshoot_percent=10.0, settling_time=1.0, sample_time=0.001),
+    )
+    law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
+    run = simulate_loop(TWO, law, t=t, reference=steps, setup=LoopSetup(encoder_step=COUNT))
+    y = run.x + 0.01 * np.random.default_rng(5).standard_normal(run.x.shape)
+
+    checks = check_hardware(
+        record(y, u=run.u, t=t, reference=steps), TWO, controller=stated(design)
+    )
+
+    for check in checks:
+        assert check.note == ""
+        # This is the noise over the motion; 4000 samples give it to 1/sqrt(8000), or 1 %.
+        assert check.nrmse < 1.05 * 0.01 / np.sqrt(np.mean(y[check.cart - 1] ** 2))
 
 
 @pytest.mark.parametrize(

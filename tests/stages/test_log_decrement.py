@@ -185,6 +185,13 @@ def test_the_driven_part_of_a_decay_is_left_out():
     assert_allclose(got.zeta, chain.zeta_carts[0], rtol=2e-3)
 
 
+def test_noise_in_the_input_is_not_a_drive():
+    """Noise about zero in the input column is not taken for a drive."""
+    run = released(zeta=0.05)
+    noise = 1e-3 * np.random.default_rng(0).normal(size=run.t.size)
+    assert_allclose(fit_log_decrement(replace(run, u=noise), cart=1).zeta, 0.05, rtol=2e-3)
+
+
 # --------------------------------------------------------------- real conditions
 
 

@@ -281,6 +281,17 @@ def test_an_unreachable_settling_time_gives_the_best_design(method):
     assert got.peak_input <= 1.05 * holding + 1e-12
 
 
+def test_gains_that_cancel_a_soft_plant_give_a_warning():
+    """If requested poles are far from the poles of a soft plant, a warning gives the level's error.
+
+    The level is then sensitive to errors in the springs.
+    """
+    got = design(FOUR, cart=4, settling=0.5, method="poles")
+
+    assert level_error_percent(FOUR, got.gains, cart=4) > 5.0
+    assert "errors of 3 % in the springs move the level by up to" in got.message
+
+
 def test_a_fast_plant_is_sampled_faster():
     """If no sample time is stated, the design chooses one that suits the fastest mode."""
     chain = PRESETS["throne-2dof"]

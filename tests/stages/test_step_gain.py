@@ -154,6 +154,13 @@ def test_with_input_from_the_start_the_first_position_is_the_rest():
     assert got.edges[0].t == 0.0
 
 
+def test_one_sample_of_rest_before_the_edge_is_enough():
+    """One sample before the edge, as in the UCSD logs, is enough for the rest position."""
+    chain, t = PRESETS["throne-1dof"], seconds(6.0)
+    got = fit_step_gain(run_of(chain, t, staircase(t, (t[1], 0.03))), cart=1)
+    assert_allclose(got.gain, chain.static_gains()[0], atol=COUNT / 0.03)
+
+
 @pytest.mark.parametrize("noise", [0.5, 3.0])
 def test_noise_is_averaged(noise):
     """Noise on the position is averaged, and the gain is right to four standard errors."""
@@ -162,6 +169,17 @@ def test_noise_is_averaged(noise):
     got = fit_step_gain(run_of(chain, t, u, noise=noise * COUNT), cart=1)
     assert abs(got.gain - chain.static_gains()[0]) < 4 * got.gain_std
     assert got.gain_std < noise * COUNT / 0.03 / 1.5  # below the noise of a single sample
+
+
+def test_a_noisy_input_still_has_its_edges():
+    """Noise on the logged input is not taken for edges."""
+    chain, t = PRESETS["throne-1dof"], seconds(12.0)
+    run = run_of(chain, t, staircase(t, (0.5, 0.03), (6.0, 0.0)))
+    assert run.u is not None
+    noisy = run.u + 3e-4 * np.random.default_rng(0).normal(size=t.size)
+    got = fit_step_gain(replace(run, u=noisy), cart=1)
+    assert len(got.edges) == 2
+    assert_allclose(got.gain, chain.static_gains()[0], rtol=3e-3)
 
 
 def test_a_slow_edge_is_one_edge():

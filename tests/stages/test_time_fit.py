@@ -263,6 +263,14 @@ def test_records_that_no_chain_explains_give_no_fit():
     assert "no chain reproduces the recordings" in fit.message
 
 
+def test_a_decay_is_used_from_its_release_on():
+    """A decay is used from less than a quarter of a period after its release."""
+    record = decay_record(PRESETS["throne-1dof"], free=(1,), rng=np.random.default_rng(13))
+    start = record.t[usable_segment(record)][0]
+    # The release is at 1.5 s; a quarter of the period of 0.48 s later, half the swing is lost.
+    assert 1.5 < start < 1.5 + 0.12
+
+
 # ------------------------------------------------------------- standard errors
 
 
