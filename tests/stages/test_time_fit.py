@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from pipeline.errors import DataError
 from pipeline.estimation.noise import long_run_variance, score_covariance
 from pipeline.estimation.parametrisation import Parametrisation, find_modes
-from pipeline.estimation.time_fit import compare, fit_records, open_window
+from pipeline.estimation.time_fit import compare, fit_records, open_window, usable_segment
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.simulate import simulate_linear
