@@ -222,5 +222,5 @@ def test_a_damaged_submission_file_is_an_error_or_a_submission(hits, tmp_path_fa
     example = ROOT / "submissions" / "two-cart" / "submission.toml"
     folder = tmp_path_factory.mktemp("toml")
     (folder / "submission.toml").write_bytes(damaged(example.read_bytes()[:3000], hits))
-    with few_lines_at_most(MOST_LISTED + 1):
+    with few_lines_at_most(MOST_LISTED):
         load_submission(folder)
