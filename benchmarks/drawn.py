@@ -16,7 +16,7 @@ from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.effect import Effect, EffectTerm
 from pipeline.simulated.bench import SimulatedBench
-from pipeline.simulated.emulator.carts import TRUE_PERIOD
+from pipeline.simulated.emulator import TRUE_PERIOD
 from pipeline.simulated.hidden import default_values, prepare_bench
 from pipeline.submission import Submission
 

@@ -36,8 +36,7 @@ from sqlalchemy import create_engine, text
 from benchmarks.endurance_checks import Found, check_book, check_folders
 from benchmarks.endurance_people import Assistant, Files, Journal, Lab, Person, Student
 from benchmarks.page import machine
-from pipeline.experiments.plan import session_time
-from pipeline.experiments.plan_file import load_plan
+from pipeline.experiments.plan import load_plan, session_time
 from pipeline.grading.gradebook.request_gradebook import RequestGradebook
 from pipeline.grading.gradings import Batch
 from pipeline.grading.judge.recompute import findings_text

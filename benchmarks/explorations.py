@@ -24,7 +24,7 @@ from benchmarks.drawn import Drawn, acted, counted, draw, run_study, wilson
 from pipeline.bench.raw import known_commands
 from pipeline.errors import DataError, PipelineError
 from pipeline.experiments.exploration import Exploration
-from pipeline.experiments.goal import ErrorGoal
+from pipeline.experiments.information import ErrorGoal
 from pipeline.experiments.plan import session_time
 from pipeline.experiments.propose import extend_plan, propose_plan
 from pipeline.plant.catalogue import find_effect

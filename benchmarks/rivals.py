@@ -20,8 +20,7 @@ import json
 from benchmarks.drawn import acted, counted, draw, run_study, wilson
 from pipeline.errors import PipelineError
 from pipeline.experiments.discriminate import propose_for
-from pipeline.experiments.plan import Recording
-from pipeline.experiments.plan_file import load_plan
+from pipeline.experiments.plan import Recording, load_plan
 from pipeline.experiments.propose import renamed
 from pipeline.gap.explain import investigate
 from pipeline.gap.types import FoundEffect, Gap

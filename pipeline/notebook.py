@@ -27,8 +27,7 @@ from pipeline.results import Analysis, FeedbackDesign
 from pipeline.submission import load_submission
 from pipeline.submission.load import with_reported
 from pipeline.words.progress import silent
-from pipeline.words.spans import spans
-from pipeline.words.text import with_symbols
+from pipeline.words.text import spans, with_symbols
 from pipeline.workflow import analyse as run
 
 if TYPE_CHECKING:

@@ -23,8 +23,7 @@ from typing import IO, Any, Literal
 import psutil
 
 from pipeline.errors import PipelineError
-from pipeline.garbage import collect_seldom
-from pipeline.threads import with_one_thread
+from pipeline.startup import collect_seldom, with_one_thread
 from pipeline.words.progress import Progress, silent
 
 _GLANCE = 0.05  # s between checks of time, memory and stop requests

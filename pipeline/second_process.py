@@ -10,8 +10,7 @@ from importlib import import_module
 from types import TracebackType
 from typing import IO, Any, Literal
 
-from pipeline.garbage import collect_seldom
-from pipeline.threads import with_one_thread
+from pipeline.startup import collect_seldom, with_one_thread
 from pipeline.words.progress import Progress
 
 

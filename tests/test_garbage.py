@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 SERVES = """
-from pipeline.garbage import collect_for_hours, collect_seldom
+from pipeline.startup import collect_for_hours, collect_seldom
 class Cycle:
     def __init__(self):
         self.own = self

@@ -16,8 +16,8 @@ PIPELINE = ROOT / "pipeline"
 # package that contains it. A module imports only from its own level or from lower ones.
 LEVELS = (
     (
-        *("__init__", "arrays", "errors", "garbage", "json_files", "lock", "names", "output"),
-        *("processes", "protocol", "resources", "second_process", "setup", "threads", "web"),
+        *("__init__", "arrays", "errors", "json_files", "lock", "names", "output"),
+        *("processes", "protocol", "resources", "second_process", "setup", "startup", "web"),
         "words",
     ),
     ("plant",),

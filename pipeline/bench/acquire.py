@@ -30,8 +30,14 @@ from pipeline.bench.raw import free_raw_path
 from pipeline.bench.run import Session
 from pipeline.bench.serial_line import Runaway, SerialLine, open_line
 from pipeline.errors import ConfigError, DataError, HardwareError, PipelineError
-from pipeline.experiments.plan import Plan, Recording
-from pipeline.experiments.plan_file import add_recordings, load_plan, plan_path, save_plan
+from pipeline.experiments.plan import (
+    Plan,
+    Recording,
+    add_recordings,
+    load_plan,
+    plan_path,
+    save_plan,
+)
 from pipeline.experiments.propose import extend_plan, propose_plan
 from pipeline.lock import lock_or_refuse
 from pipeline.submission import Submission, load_submission

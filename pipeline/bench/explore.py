@@ -8,7 +8,7 @@ from pipeline.bench.events import Buttons, Observer, Observers, Stopped
 from pipeline.bench.raw import known_commands
 from pipeline.bench.serial_line import Runaway
 from pipeline.experiments.exploration import Exploration, Recorded
-from pipeline.experiments.goal import ErrorGoal
+from pipeline.experiments.information import ErrorGoal
 from pipeline.experiments.plan import Recording, session_time
 from pipeline.experiments.turn import Turn
 from pipeline.submission.load import NAME

@@ -10,8 +10,7 @@ from pathlib import Path
 from pipeline.bench.events import Observer
 from pipeline.bench.experiments import add_experiment
 from pipeline.errors import ConfigError, SubmissionError
-from pipeline.experiments.plan import Plan, Recording, hold_words
-from pipeline.experiments.plan_file import load_plan, plan_path
+from pipeline.experiments.plan import Plan, Recording, hold_words, load_plan, plan_path
 from pipeline.ingest.files import ENDINGS
 from pipeline.ingest.fill import experiment_entry, free_carts, free_id
 from pipeline.ingest.inspect import Inspection, inspect_file

@@ -25,8 +25,7 @@ from starlette.types import Scope
 from pipeline.bench.live_state import FRAME, LiveState, ShownSession
 from pipeline.errors import HardwareError
 from pipeline.resources import TEMPLATES
-from pipeline.web.origin_check import OriginCheck, find_site, list_own_names, refuse
-from pipeline.web.server import Served
+from pipeline.web import OriginCheck, Served, find_site, list_own_names, refuse
 
 _LARGEST_ANSWER = 200  # bytes; the largest request of a button
 _FILES = {

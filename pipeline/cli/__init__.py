@@ -25,8 +25,7 @@ def __getattr__(name: str) -> object:
 def main() -> None:
     """Run the command line."""
     try:
-        from pipeline.garbage import collect_seldom
-        from pipeline.threads import one_thread
+        from pipeline.startup import collect_seldom, one_thread
 
         collect_seldom()
         one_thread()

@@ -35,7 +35,7 @@ def desk(
     """Open the desk: all tasks of the other commands in a browser on this computer."""
     from pipeline.desk.app import DeskServer
     from pipeline.desk.crash_log import CrashLog
-    from pipeline.garbage import collect_for_hours
+    from pipeline.startup import collect_for_hours
 
     if (host is None) != (users is None):
         raise ConfigError("--host and --users need each other: others may only enter by name")

@@ -42,9 +42,9 @@ def emulate(
     ] = False,
 ) -> None:
     """Run a virtual bench that speaks the serial protocol; print its address on stderr."""
-    from pipeline.simulated.emulator.links import RunningBench, announced
-    from pipeline.simulated.emulator.server import EmulatorOptions, Server
+    from pipeline.simulated.emulator import EmulatorOptions, Server
     from pipeline.simulated.hidden import prepare_bench
+    from pipeline.simulated.links import RunningBench, announced
 
     bench = prepare_bench(preset=preset, model=model, hide=hide or ())
     options = EmulatorOptions(

@@ -36,7 +36,7 @@ def explore(
     """Record, identify, analyse the gap and choose the next recording, until the goal is met."""
     from pipeline.bench.explore import explore_bench
     from pipeline.bench.terminal import Terminal
-    from pipeline.experiments.goal import read_error_goal, read_time
+    from pipeline.experiments.information import read_error_goal, read_time
     from pipeline.report.exploration import NAME
     from pipeline.report.exploration.diary import write_diary
 

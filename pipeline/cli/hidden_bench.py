@@ -7,7 +7,7 @@ import threading
 from pathlib import Path
 
 from pipeline.cli.reports import explain
-from pipeline.garbage import collect_seldom
+from pipeline.startup import collect_seldom
 from pipeline.words.progress import Progress, silent
 
 

@@ -31,7 +31,7 @@ def plan(
 ) -> None:
     """Propose the experiments to record: write plan.toml, or add to it."""
     from pipeline.bench.raw import known_commands
-    from pipeline.experiments.goal import WORST
+    from pipeline.experiments.information import WORST
     from pipeline.experiments.next_recordings import plan_next
     from pipeline.experiments.plan import plan_data, plan_table
     from pipeline.experiments.propose import current_plan, make_plan

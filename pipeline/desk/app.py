@@ -31,8 +31,7 @@ from pipeline.desk.users import User, read_users
 from pipeline.desk.visibility import REFUSED
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.grading.intake.unpack import HAND_IN
-from pipeline.web.origin_check import Login, OriginCheck
-from pipeline.web.server import Served
+from pipeline.web import Login, OriginCheck, Served
 
 Handler = Callable[[PageRequest], Any]  # returns a Response or a coroutine of one
 

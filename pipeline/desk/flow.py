@@ -7,7 +7,7 @@ from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from pipeline.web.origin_check import refuse
+from pipeline.web import refuse
 
 AT_ONCE = 4  # requests of one person that are answered at the same time
 _WAITING = 24  # further requests of one person that wait for their turn

@@ -13,7 +13,7 @@ from pipeline.desk.navigation import list_feedback
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.users import Place, User, name_place
 from pipeline.errors import ConfigError, PipelineError
-from pipeline.experiments.plan_file import NAME as PLAN
+from pipeline.experiments.plan import NAME as PLAN
 from pipeline.grading.gradebook.schema import FILE
 from pipeline.submission.load import file_problem
 

@@ -13,8 +13,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from pipeline.desk.users import Proxy, User
-from pipeline.web.origin_check import HEADERS, find_site, list_own_names, refuse
-from pipeline.web.server import let_in
+from pipeline.web import HEADERS, find_site, let_in, list_own_names, refuse
 
 PAGE_HEADERS = {
     **HEADERS,

@@ -42,7 +42,7 @@ from pipeline.plant.effect import Effect, EffectTerm
 from pipeline.plant.simulator.compiler import is_compiled, kept_in
 from pipeline.results import Analysis, Record
 from pipeline.setup import Setup
-from pipeline.threads import with_one_thread
+from pipeline.startup import with_one_thread
 from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress, silent
 

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from pipeline import __version__
 from pipeline.words.math import Math
 from pipeline.words.numbers import at_decimal
-from pipeline.words.spans import Span, Spans, plain, spans
+from pipeline.words.text import Span, Spans, plain, spans
 
 _MUCH = 24  # a cell with more characters takes most of a phone's width
 _LONG = 16  # a tile whose value has more characters is wide

@@ -14,7 +14,7 @@ from pathlib import Path
 from pipeline.errors import ConfigError
 from pipeline.resources import TEMPLATES
 from pipeline.submission.toml import parse_toml, read_text
-from pipeline.words.spans import Span, Spans
+from pipeline.words.text import Span, Spans
 
 _MARK = re.compile(r"\*\*(?P<strong>.+?)\*\*|`(?P<code>.+?)`|\[(?P<link>.+?)\]\((?P<url>#.+?)\)")
 _VALUE = re.compile(r"\{(\w+)\}")

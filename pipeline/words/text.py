@@ -1,15 +1,56 @@
-"""Parameter names inside sentences, and text that any page can show."""
+"""Text that any page can show: marked words, and parameter names in sentences."""
 
 import re
 import unicodedata
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
 
 from markupsafe import Markup, escape
 
 from pipeline.names import read_name
-from pipeline.words.math import GREEK, symbol
+from pipeline.words.math import GREEK, Term, symbol
 from pipeline.words.numbers import listing, subscript, typeset
-from pipeline.words.spans import Span, Spans
+
+# ---------------------------------------------------- strong words, links and inline mathematics
+
+
+@dataclass(frozen=True)
+class Span:
+    """A piece of text in one style, a link, or inline mathematics.
+
+    Links from students are http, https or mailto. cartlab's own links may also lead to a place on
+    the page or to a file next to it.
+    """
+
+    text: str
+    style: Literal["plain", "strong", "em", "code"] = "plain"
+    url: str = ""
+    math: Term | None = None
+
+
+Spans = tuple[Span, ...]
+
+
+def spans(*parts: str | Span | Spans) -> Spans:
+    """Join strings, spans and tuples of spans."""
+    joined: list[Span] = []
+    for part in parts:
+        if isinstance(part, str):
+            joined.append(Span(part))
+        elif isinstance(part, Span):
+            joined.append(part)
+        else:
+            joined.extend(part)
+    return tuple(joined)
+
+
+def plain(text: Spans) -> str:
+    """Return only the text, for titles, alt texts and attributes."""
+    return "".join(span.text for span in text)
+
+
+# -------------------------------------------------------------- parameter names inside sentences
 
 _NAME = re.compile(r"\b(?:omega|zeta|K|X|m|c|k)_(?:\d|[a-h]|[nxy])\b|\b(?:omega|zeta)\b")
 # What a file contains or should contain: "write omega_a = 10.1", 'omega_1', reported.final.omega_1.

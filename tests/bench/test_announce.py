@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from pipeline.simulated.emulator.links import RunningBench, announced, running_benches
+from pipeline.simulated.links import RunningBench, announced, running_benches
 
 
 @pytest.fixture(autouse=True)

@@ -26,7 +26,7 @@ from pipeline.protocol import (
     format_reading,
     target_at,
 )
-from pipeline.simulated.emulator.core import CommandReader
+from pipeline.simulated.controller import CommandReader
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import Notes, sine, write_work
 

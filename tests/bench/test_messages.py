@@ -23,7 +23,7 @@ from pipeline.protocol import (
     parse_description,
     parse_reading,
 )
-from pipeline.simulated.emulator.core import CommandReader
+from pipeline.simulated.controller import CommandReader
 
 ENCODERS = 2
 # Nine significant digits are sent.

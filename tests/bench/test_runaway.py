@@ -12,7 +12,7 @@ from pipeline.bench.orders import make_order
 from pipeline.bench.run_watch import LineWatch
 from pipeline.errors import HardwareError
 from pipeline.experiments.gains import CountScales
-from pipeline.experiments.goal import ErrorGoal
+from pipeline.experiments.information import ErrorGoal
 from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.protocol import EXTENSIONS, Reading
 from pipeline.report.exploration.diary import write_diary

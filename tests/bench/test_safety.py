@@ -36,7 +36,7 @@ from pipeline.protocol import (
     encode,
     parse_description,
 )
-from pipeline.simulated.emulator.core import ReferenceCore
+from pipeline.simulated.controller import ReferenceCore
 from pipeline.submission import System, load_submission
 from tests.helpers.acquisitions import LIMITS, Notes, host, sine, until_bytes, write_work
 from tests.helpers.benches import Emulator, emulator

@@ -16,7 +16,7 @@ import pytest
 
 from pipeline.bench.raw import read_raw
 from pipeline.desk.app import DeskServer
-from pipeline.experiments.plan_file import load_plan
+from pipeline.experiments.plan import load_plan
 from pipeline.report.exploration.diary import NAME as DIARY
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import sine, write_work

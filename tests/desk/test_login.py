@@ -147,7 +147,7 @@ def test_idle_connections_are_few_and_short(visitor, monkeypatch):
         here = (c.laddr[1:] == (visitor.port,) and c.status == "ESTABLISHED" for c in mine)
         return sum(here)
 
-    monkeypatch.setattr("pipeline.web.server._STRANGER_STAYS", 0.5)
+    monkeypatch.setattr("pipeline.web._STRANGER_STAYS", 0.5)
     with ExitStack() as opened:
         for number in range(300):
             stranger = socket.create_connection(("127.0.0.1", visitor.port), timeout=PATIENCE)

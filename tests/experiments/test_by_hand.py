@@ -3,8 +3,8 @@
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.experiments.by_hand import WantedRecording, add_recording, make_recording
-from pipeline.experiments.plan_file import add_recordings, load_plan
+from pipeline.experiments.plan import add_recordings, load_plan
+from pipeline.experiments.propose import WantedRecording, add_recording, make_recording
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import sine, write_work
 

@@ -16,8 +16,7 @@ from pipeline.experiments.discriminate import (
     with_proposal,
 )
 from pipeline.experiments.next_recordings import plan_next
-from pipeline.experiments.plan import Plan, PlanLimits, Recording
-from pipeline.experiments.plan_file import load_plan, save_plan
+from pipeline.experiments.plan import Plan, PlanLimits, Recording, load_plan, save_plan
 from pipeline.gap.explain import investigate
 from pipeline.gap.types import AlternativeModel, Gap, Trace, read_gap
 from pipeline.ingest.read import read_data

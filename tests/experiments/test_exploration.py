@@ -10,16 +10,25 @@ import pytest
 from pipeline.bench.events import Stopped
 from pipeline.bench.raw import known_commands
 from pipeline.errors import ConfigError, DataError
-from pipeline.experiments.by_hand import add_recording
-from pipeline.experiments.candidates import propose_candidates
-from pipeline.experiments.choice import choose_recordings
 from pipeline.experiments.discriminate import propose_for
-from pipeline.experiments.exploration import Exploration, Recorded
-from pipeline.experiments.goal import ErrorGoal, find_goal, read_error_goal, read_time
-from pipeline.experiments.information import FisherInformation
-from pipeline.experiments.plan import PlanLimits, Recording, session_time, time_words
-from pipeline.experiments.plan_file import load_plan, save_plan
-from pipeline.experiments.propose import propose_plan
+from pipeline.experiments.exploration import Exploration, Recorded, choose_recordings
+from pipeline.experiments.information import (
+    ErrorGoal,
+    FisherInformation,
+    find_goal,
+    read_error_goal,
+    read_time,
+)
+from pipeline.experiments.next_recordings import propose_candidates
+from pipeline.experiments.plan import (
+    PlanLimits,
+    Recording,
+    load_plan,
+    save_plan,
+    session_time,
+    time_words,
+)
+from pipeline.experiments.propose import add_recording, propose_plan
 from pipeline.report.exploration.diary import NAME, write_diary
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission
@@ -338,7 +347,7 @@ def test_the_number_of_chosen_recordings_grows_with_the_data(tmp_path):
 @pytest.mark.parametrize("ends", ["not", "added", "vetoed"])
 def test_a_series_ends_when_a_person_intervenes(tmp_path, monkeypatch, ends):
     """Chosen recordings are made and then analysed together; a veto or an addition ends this."""
-    monkeypatch.setattr("pipeline.experiments.choice._SHARE", 1.0)
+    monkeypatch.setattr("pipeline.experiments.exploration._SHARE", 1.0)
     bench = VirtualBench(prepare_bench(preset="throne-1dof", model=None, hide=[]), seed=1)
     folder, asked = tmp_path / "work", []
     session = VirtualSession(folder, bench)

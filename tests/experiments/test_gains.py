@@ -20,7 +20,7 @@ from pipeline.plant.chain import Chain
 from pipeline.plant.sampled_loop import LoopSetup, Pid, StateFeedback, discretise, simulate_loop
 from pipeline.protocol import Description, Start, StateGains, Wave, encode
 from pipeline.results import Analysis, FeedbackDesign
-from pipeline.simulated.emulator.core import ReferenceCore
+from pipeline.simulated.controller import ReferenceCore
 from pipeline.submission import Submission
 from pipeline.workflow import analyse
 from tests.helpers.examples import recorded

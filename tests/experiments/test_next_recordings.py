@@ -8,19 +8,15 @@ import numpy as np
 import pytest
 
 from pipeline.errors import ConfigError, DataError
-from pipeline.experiments.candidates import (
-    optimal_tones,
-    propose_candidates,
-)
-from pipeline.experiments.goal import Goal, choose, find_goal
-from pipeline.experiments.information import FisherInformation
+from pipeline.experiments.information import FisherInformation, Goal, choose, find_goal
 from pipeline.experiments.next_recordings import (
     choose_next,
     compare_recordings,
+    optimal_tones,
+    propose_candidates,
     why_useless,
 )
-from pipeline.experiments.plan import Plan, PlanLimits, Recording
-from pipeline.experiments.plan_file import load_plan
+from pipeline.experiments.plan import Plan, PlanLimits, Recording, load_plan
 from pipeline.experiments.propose import extend_plan, propose_plan, renamed
 from pipeline.plant.sampled_loop import LoopSetup, simulate_loop
 from pipeline.plant.simulate import simulate_linear
@@ -35,7 +31,7 @@ from pipeline.protocol import (
     target_at,
 )
 from pipeline.resources import EXAMPLES
-from pipeline.simulated.emulator.core import ReferenceCore
+from pipeline.simulated.controller import ReferenceCore
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse

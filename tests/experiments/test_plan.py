@@ -10,10 +10,25 @@ from hypothesis import strategies as st
 
 from pipeline.cli import main
 from pipeline.errors import ConfigError, DataError
-from pipeline.experiments.by_hand import add_recording
-from pipeline.experiments.plan import PidLoop, Plan, PlanLimits, Recording, StateLoop
-from pipeline.experiments.plan_file import load_plan, plan_path, plan_text, save_plan
-from pipeline.experiments.propose import AIM, extend_plan, make_plan, propose_plan, release_by_hand
+from pipeline.experiments.plan import (
+    PidLoop,
+    Plan,
+    PlanLimits,
+    Recording,
+    StateLoop,
+    load_plan,
+    plan_path,
+    plan_text,
+    save_plan,
+)
+from pipeline.experiments.propose import (
+    AIM,
+    add_recording,
+    extend_plan,
+    make_plan,
+    propose_plan,
+    release_by_hand,
+)
 from pipeline.plant.chain import PRESETS, quadratic_factors
 from pipeline.plant.simulate import SETTLED_DWELL, settling_wait, simulate_linear
 from pipeline.protocol import FULL_SCALE, Description, Start, Wave, target_at

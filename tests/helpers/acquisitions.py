@@ -7,8 +7,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 
 from pipeline.bench.events import Anomalies, RunOutcome
-from pipeline.experiments.plan import Plan, PlanLimits, Recording
-from pipeline.experiments.plan_file import save_plan
+from pipeline.experiments.plan import Plan, PlanLimits, Recording, save_plan
 from pipeline.protocol import Reading
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME

@@ -11,7 +11,8 @@ from pipeline.estimation.state_feedback import design_feedback
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.sampled_loop import StateFeedback
 from pipeline.results import Record
-from pipeline.simulated import runs, submission
+from pipeline.simulated import submission
+from pipeline.simulated import submission as runs
 from pipeline.simulated.bench import COUNT, BenchRun, SimulatedBench, TrueMotion
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import Design

@@ -1,4 +1,4 @@
-"""The firmware's core, compiled here, controls like `pipeline.simulated.emulator.core`."""
+"""The firmware's core, compiled here, controls like `pipeline.simulated.controller`."""
 
 import ctypes
 import shutil

@@ -31,7 +31,7 @@ def order(**bench: Any) -> None:
 def be(*, words: list[str], watchdog: float, port: int) -> None:
     """Become the bench with these options; send the pid and then stderr to that port."""
     from pipeline.cli import main
-    from pipeline.simulated.emulator import core
+    from pipeline.simulated import controller as core
 
     core.WATCHDOG = watchdog
     with socket.create_connection(("127.0.0.1", port)) as line:
@@ -66,7 +66,7 @@ def fork_benches() -> None:
 
 def load_bench() -> None:
     """Import all that a bench needs, and compile its simulator unless that was done before."""
-    from pipeline.simulated.emulator.server import EmulatorOptions, Server
+    from pipeline.simulated.emulator import EmulatorOptions, Server
     from pipeline.simulated.hidden import prepare_bench
 
     Server(prepare_bench(preset="throne-1dof"), EmulatorOptions()).close()

@@ -25,7 +25,7 @@ from pipeline.protocol import (
     format_reading,
     parse_reading,
 )
-from pipeline.simulated.emulator.core import CommandReader, ReferenceCore
+from pipeline.simulated.controller import CommandReader, ReferenceCore
 
 PER_COUNT = 0.002  # cm
 BENCH = Description(

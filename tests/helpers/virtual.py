@@ -11,15 +11,28 @@ from pipeline.bench.experiments import add_experiment, data_file, log_text, reco
 from pipeline.bench.orders import make_order
 from pipeline.experiments.exploration import Recorded
 from pipeline.experiments.gains import CountScales
-from pipeline.experiments.plan import PlanLimits, Recording, session_time
-from pipeline.experiments.plan_file import load_plan, plan_path, save_plan
+from pipeline.experiments.plan import (
+    PlanLimits,
+    Recording,
+    load_plan,
+    plan_path,
+    save_plan,
+    session_time,
+)
 from pipeline.experiments.propose import propose_plan
 from pipeline.output import write_file
 from pipeline.plant.augmented import simulate_augmented
 from pipeline.protocol import EXTENSIONS, Description, Hands, Reading, Start, encode, parse_reading
 from pipeline.simulated.bench import SimulatedBench
-from pipeline.simulated.emulator.carts import _NOISE, TRUE_PERIOD, VirtualCarts, input_per_count
-from pipeline.simulated.emulator.core import ReferenceCore
+from pipeline.simulated.controller import ReferenceCore
+from pipeline.simulated.emulator import (
+    _ENCODER_NOISE as _NOISE,
+)
+from pipeline.simulated.emulator import (
+    TRUE_PERIOD,
+    VirtualCarts,
+    input_per_count,
+)
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME
 

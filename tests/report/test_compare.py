@@ -18,7 +18,7 @@ from pipeline.report.lab_report.changes import (
 from pipeline.report.sections.page import Page
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, Estimate
-from pipeline.words.spans import plain
+from pipeline.words.text import plain
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.examples import analysed

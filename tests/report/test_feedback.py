@@ -24,7 +24,7 @@ from pipeline.results import Analysis, FeedbackDesign, Stage
 from pipeline.setup import Setup
 from pipeline.submission import Design
 from pipeline.words.numbers import significant
-from pipeline.words.spans import plain
+from pipeline.words.text import plain
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.examples import analysed
 from tests.helpers.matlab import response, run_matlab

@@ -47,7 +47,7 @@ from pipeline.report.sections.page import Page
 from pipeline.results import FrequencyResponse
 from pipeline.setup import PAPER_UNITS, Units
 from pipeline.words.numbers import significant
-from pipeline.words.spans import plain
+from pipeline.words.text import plain
 from tests.helpers.analysis_factory import make_analysis
 
 COUNTS = Units(position="count", input="V")

@@ -20,7 +20,7 @@ from pipeline.report.document import (
 from pipeline.report.render.html import render_html
 from pipeline.report.render.pdf import render_pdf
 from pipeline.report.sections.notes import even_headings, note_blocks
-from pipeline.words.spans import Span, plain
+from pipeline.words.text import Span, plain
 
 
 def document_of(blocks: tuple[Block, ...]) -> Document:

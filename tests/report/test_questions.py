@@ -17,7 +17,7 @@ from pipeline.report.sections.questions import ask, open_line, placed, split_not
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, Estimate, StepGain
 from pipeline.submission import load_submission, new_submission
-from pipeline.words.spans import plain, spans
+from pipeline.words.text import plain, spans
 from pipeline.workflow import analyse
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.examples import analysed

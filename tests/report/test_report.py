@@ -40,7 +40,7 @@ from pipeline.report.sections.page import Page as Shown
 from pipeline.report.sections.summary import summary, terminal_summary
 from pipeline.results import Analysis, Check, Estimate, LeftOut, ParameterRow, Skipped, Stage
 from pipeline.setup import Setup, Units
-from pipeline.words.spans import plain, spans
+from pipeline.words.text import plain, spans
 from tests.helpers.analysis_factory import make_analysis
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}

@@ -38,7 +38,7 @@ from pipeline.resources import RUBRICS
 from pipeline.setup import Setup
 from pipeline.submission import Design
 from pipeline.words.math import to_text
-from pipeline.words.spans import plain
+from pipeline.words.text import plain
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.grading_students import student
 from tests.plant.test_chain import chains

@@ -15,7 +15,7 @@ from pipeline.report.sections.summary import terminal_summary
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, Check
 from pipeline.submission import load_submission
-from pipeline.words.spans import plain
+from pipeline.words.text import plain
 from pipeline.workflow import analyse
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.examples import analysed

@@ -7,7 +7,7 @@ from pipeline.report.sections.measurements import dwell_table
 from pipeline.report.sections.page import Page
 from pipeline.report.sections.parameters import parameter_table, reported_table
 from pipeline.report.sections.summary import terminal_summary
-from pipeline.words.spans import plain
+from pipeline.words.text import plain
 from tests.helpers.analysis_factory import make_analysis
 
 

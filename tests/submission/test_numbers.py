@@ -13,7 +13,7 @@ from pipeline.desk.student.folder_tasks import read_document
 from pipeline.desk.student.form import Field, fill_experiment, fill_form, write_fields
 from pipeline.desk.users import read_users
 from pipeline.errors import PipelineError, SubmissionError
-from pipeline.experiments.plan_file import load_plan, plan_path, save_plan
+from pipeline.experiments.plan import load_plan, plan_path, save_plan
 from pipeline.experiments.propose import propose_plan
 from pipeline.grading.rubric_file import parse_rubric
 from pipeline.ingest.fill import fill_submission

@@ -25,8 +25,8 @@ from pipeline.protocol import (
     parse_description,
     parse_reading,
 )
-from pipeline.simulated.emulator.core import ReferenceCore
-from pipeline.simulated.emulator.server import EmulatorOptions, Server
+from pipeline.simulated.controller import ReferenceCore
+from pipeline.simulated.emulator import EmulatorOptions, Server
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse

@@ -20,10 +20,10 @@ from pipeline.protocol import (
     parse_description,
     parse_reading,
 )
-from pipeline.simulated.emulator.carts import VirtualCarts
-from pipeline.simulated.emulator.core import ReferenceCore
-from pipeline.simulated.emulator.links import Link, open_link
+from pipeline.simulated.controller import ReferenceCore
+from pipeline.simulated.emulator import VirtualCarts
 from pipeline.simulated.hidden import prepare_bench
+from pipeline.simulated.links import Link, open_link
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.firmware_host import acquire, kept_going

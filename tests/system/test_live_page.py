@@ -335,7 +335,7 @@ def test_a_full_queue_does_not_keep_the_owner_out(page, monkeypatch):
 
 def test_only_connections_without_the_secret_time_out(folder, monkeypatch):
     """A connection without the secret is closed after a time; one with the secret stays."""
-    monkeypatch.setattr("pipeline.web.server._STRANGER_STAYS", 0.2)
+    monkeypatch.setattr("pipeline.web._STRANGER_STAYS", 0.2)
     with LivePage(folder) as page, ExitStack() as opened:
         stream = news(page, opened)
         assert stream.readline() == b"event: state\n"

@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.bench.importing import Importer
 from pipeline.errors import ConfigError
-from pipeline.experiments.plan_file import load_plan, plan_path, plan_text
+from pipeline.experiments.plan import load_plan, plan_path, plan_text
 from pipeline.experiments.propose import propose_plan
 from pipeline.gap.types import read_gap
 from pipeline.grading.intake.late_table import read_late_table

@@ -8,7 +8,7 @@ import pytest
 from pipeline.errors import ConfigError
 from pipeline.resources import TEMPLATES
 from pipeline.words.phrases import Phrases, phrases
-from pipeline.words.spans import Span
+from pipeline.words.text import Span
 from tests.helpers.places import ROOT
 
 PIPELINE = ROOT / "pipeline"

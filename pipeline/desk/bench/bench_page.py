@@ -18,7 +18,7 @@ from pipeline.desk.form_input import read_number, read_whole_number
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import serve_file
 from pipeline.errors import ConfigError, PipelineError
-from pipeline.experiments.goal import read_error_goal
+from pipeline.experiments.information import read_error_goal
 from pipeline.experiments.plan import Recording
 from pipeline.names import read_name
 from pipeline.report.exploration import NAME as DIARY
@@ -65,7 +65,7 @@ def explore(ask: PageRequest) -> Response:
 
 def add(ask: PageRequest) -> Response:
     """Add a recording to the plan; a running exploration records it next."""
-    from pipeline.experiments.by_hand import add_recording
+    from pipeline.experiments.propose import add_recording
 
     folder, typed = ask.folder(), {name: ask.text(name) for name in _TYPED}
     try:
@@ -79,7 +79,7 @@ def add(ask: PageRequest) -> Response:
 
 def show_comparison(ask: PageRequest) -> Response:
     """Show how much a typed recording would reduce the error, and how much the best one would."""
-    from pipeline.experiments.goal import WORST
+    from pipeline.experiments.information import WORST
 
     folder, typed = ask.folder(), {name: ask.text(name) for name in _TYPED}
     try:
@@ -163,8 +163,14 @@ def _note_plan(ask: PageRequest) -> None:
 
 def _read_recording(typed: Mapping[str, str], submission: Submission) -> Recording:
     """Return the custom recording of the form."""
-    from pipeline.experiments.by_hand import KINDS, NEEDED, TYPED, WantedRecording, make_recording
-    from pipeline.experiments.propose import current_plan
+    from pipeline.experiments.propose import (
+        KINDS,
+        NEEDED,
+        TYPED,
+        WantedRecording,
+        current_plan,
+        make_recording,
+    )
 
     if typed["kind"] not in KINDS:
         raise ConfigError(f"kind: expected {', '.join(KINDS)}, found {typed['kind']!r}")

@@ -6,8 +6,14 @@ from typing import Any
 
 from pipeline.desk.benches import BenchSession
 from pipeline.errors import PipelineError
-from pipeline.experiments.plan import Plan, session_time, time_words, what_words
-from pipeline.experiments.plan_file import load_plan, plan_path
+from pipeline.experiments.plan import (
+    Plan,
+    load_plan,
+    plan_path,
+    session_time,
+    time_words,
+    what_words,
+)
 from pipeline.names import parameter_names, read_name
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME, file_problem

@@ -11,7 +11,7 @@ from pipeline.desk.crash_log import find_log
 from pipeline.desk.page_request import PageRequest
 from pipeline.errors import ConfigError
 from pipeline.output import write_file
-from pipeline.simulated.emulator.links import running_benches
+from pipeline.simulated.links import running_benches
 
 _KEPT = 200  # folders whose port is remembered
 

@@ -34,8 +34,7 @@ from pipeline.report.render.builder import PageBuilder, Part
 from pipeline.report.render.html import render_html
 from pipeline.words.numbers import NOTHING, first_few, listing
 from pipeline.words.numbers import count as counted
-from pipeline.words.spans import Span, Spans, spans
-from pipeline.words.text import capital, clean
+from pipeline.words.text import Span, Spans, capital, clean, spans
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -34,8 +34,7 @@ from pipeline.report.render.html import render_html
 from pipeline.setup import Units
 from pipeline.words.numbers import NOTHING, percent, significant, typeset, unit_text
 from pipeline.words.numbers import count as counted
-from pipeline.words.spans import Span, spans
-from pipeline.words.text import capital, clean, name_span, rich
+from pipeline.words.text import Span, capital, clean, name_span, rich, spans
 
 _TITLE = re.compile(r"<title>(.*?)</title>", re.DOTALL)
 _NAME = re.compile(r"(omega|zeta|K)(_\w)?")

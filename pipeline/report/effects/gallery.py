@@ -15,7 +15,7 @@ from pipeline.simulated.hidden import usual_term
 from pipeline.words.numbers import significant
 from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress, silent
-from pipeline.words.spans import Span, spans
+from pipeline.words.text import Span, spans
 
 _WORDS = phrases("effects")
 BENCH = "throne-2dof"  # the smallest preset with a spring between two carts

@@ -22,8 +22,7 @@ from pipeline.report.sections.page import Page
 from pipeline.results import Analysis
 from pipeline.words.numbers import NOTHING, count, listing, unit_text, with_error
 from pipeline.words.phrases import phrases
-from pipeline.words.spans import spans
-from pipeline.words.text import capital, clean, name_span, rich, symbol_text
+from pipeline.words.text import capital, clean, name_span, rich, spans, symbol_text
 
 _WORDS = phrases("exploration")
 

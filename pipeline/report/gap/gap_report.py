@@ -52,8 +52,7 @@ from pipeline.report.sections.parameters import chain_table
 from pipeline.results import Analysis
 from pipeline.words.numbers import count, listing, percent
 from pipeline.words.progress import Progress, silent
-from pipeline.words.spans import Spans, plain
-from pipeline.words.text import capital, clean
+from pipeline.words.text import Spans, capital, clean, plain
 
 _MOST_ROWS = 28  # most runs in the overview; gap.json has all runs
 LEGEND = 46  # two names with more characters do not fit above a figure

@@ -11,8 +11,7 @@ from pipeline.plant.effect import Effect, effect_name, place_name
 from pipeline.report.document import Block, Tile, Tiles, Tone, bullet_list, paragraph, plain_lines
 from pipeline.words.numbers import count, listing, significant, unit_text, with_error
 from pipeline.words.phrases import phrases
-from pipeline.words.spans import Spans, spans
-from pipeline.words.text import capital, clean, rich
+from pipeline.words.text import Spans, capital, clean, rich, spans
 
 WORDS = phrases("gap")
 

@@ -36,7 +36,7 @@ from pipeline.results import Analysis
 from pipeline.words.numbers import count
 from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress, silent
-from pipeline.words.spans import spans
+from pipeline.words.text import spans
 
 if TYPE_CHECKING:
     from pipeline.gap.types import Gap

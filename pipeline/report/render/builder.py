@@ -13,8 +13,7 @@ from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import blank_svg, to_svg
 from pipeline.words.phrases import Phrases
 from pipeline.words.progress import Progress, silent
-from pipeline.words.spans import Spans
-from pipeline.words.text import clean, rich
+from pipeline.words.text import Spans, clean, rich
 
 # Anchor, title, and a function that returns the blocks of a page.
 Part = tuple[str, str, Callable[[Any], Sequence[Block]]]

@@ -20,8 +20,7 @@ from pipeline.report.figures.colours import GRID, MEASURED, MODEL, QUIET, SECOND
 from pipeline.resources import TEMPLATES
 from pipeline.words.math import Term, to_mathml
 from pipeline.words.numbers import unbroken
-from pipeline.words.spans import plain
-from pipeline.words.text import breakable
+from pipeline.words.text import breakable, plain
 
 # The style sheet defines each colour for light and dark pages.
 _ROLES = {

@@ -8,8 +8,7 @@ from pipeline.report.sections.parameters import reported_off
 from pipeline.results import Analysis, Check, Stage
 from pipeline.words.numbers import listing
 from pipeline.words.phrases import phrases
-from pipeline.words.spans import Span, Spans, spans
-from pipeline.words.text import clean, names_spans, rich
+from pipeline.words.text import Span, Spans, clean, names_spans, rich, spans
 
 _WORDS = phrases("summary")
 _MOST_TOLD = 3  # most messages shown for one group of checks

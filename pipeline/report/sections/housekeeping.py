@@ -8,8 +8,7 @@ from pipeline.report.sections.page import Page
 from pipeline.results import Assumption, Check
 from pipeline.words.numbers import count, listing
 from pipeline.words.phrases import phrases
-from pipeline.words.spans import Span, spans
-from pipeline.words.text import clean, rich
+from pipeline.words.text import Span, clean, rich, spans
 
 _WORDS = phrases("report")
 OUTCOMES: dict[str, tuple[str, Tone]] = {  # in the order of the table

@@ -12,8 +12,7 @@ from pipeline.report.sections.page import Page, left_out
 from pipeline.results import FrequencyResponse
 from pipeline.words.numbers import count, listing, percent, significant, with_error
 from pipeline.words.phrases import phrases
-from pipeline.words.spans import spans
-from pipeline.words.text import clean
+from pipeline.words.text import clean, spans
 
 _WORDS = phrases("measurements")
 _MANY = 900.0  # percent; above this, the caption states the ratio

@@ -12,8 +12,7 @@ from markdown_it import MarkdownIt
 from markdown_it.tree import SyntaxTreeNode
 
 from pipeline.report.document import Block, Cell, Code, Heading, Items, Paragraph, Quote, Table
-from pipeline.words.spans import Span, Spans, plain
-from pipeline.words.text import clean
+from pipeline.words.text import Span, Spans, clean, plain
 
 _DEEPEST_HEADING = 6
 _TOP_HEADING = 3  # larger headings belong to the report

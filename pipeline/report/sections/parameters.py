@@ -19,8 +19,7 @@ from pipeline.words.numbers import (
     with_errors,
 )
 from pipeline.words.phrases import phrases
-from pipeline.words.spans import Spans, spans
-from pipeline.words.text import clean, name_span, names_spans, rich
+from pipeline.words.text import Spans, clean, name_span, names_spans, rich, spans
 
 _WORDS = phrases("report")
 

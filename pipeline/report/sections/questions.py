@@ -21,8 +21,7 @@ from pipeline.report.sections.parameters import source_text
 from pipeline.results import Analysis, HardwareCheck, ParameterRow
 from pipeline.words.numbers import count, listing, percent, significant
 from pipeline.words.phrases import phrases
-from pipeline.words.spans import Span, plain
-from pipeline.words.text import clean, rich
+from pipeline.words.text import Span, clean, plain, rich
 
 _WORDS = phrases("questions")
 _MOST = 6  # most questions in a report; more would turn it into a questionnaire

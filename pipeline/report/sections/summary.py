@@ -22,8 +22,7 @@ from pipeline.words.numbers import (
     with_error,
 )
 from pipeline.words.phrases import phrases
-from pipeline.words.spans import Span, Spans, plain, spans
-from pipeline.words.text import clean, name_span, names_spans, rich
+from pipeline.words.text import Span, Spans, clean, name_span, names_spans, plain, rich, spans
 
 _WORDS = phrases("summary")
 _KINDS = {  # names for kinds of recordings

@@ -34,8 +34,7 @@ from pipeline.setup import Units
 from pipeline.submission import InputScale, System
 from pipeline.words.numbers import NOTHING, count, percent, significant, unit_text
 from pipeline.words.phrases import phrases
-from pipeline.words.spans import Span
-from pipeline.words.text import clean, name_span, rich
+from pipeline.words.text import Span, clean, name_span, rich
 
 _WORDS = phrases("solution")
 

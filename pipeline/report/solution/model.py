@@ -20,8 +20,7 @@ from pipeline.report.sections.parameters import chain_table
 from pipeline.words.math import Math, Term, lines, matrix, row, total
 from pipeline.words.numbers import count
 from pipeline.words.phrases import phrases
-from pipeline.words.spans import spans
-from pipeline.words.text import rich
+from pipeline.words.text import rich, spans
 
 _WORDS = phrases("solution")
 _MOST_ADDENDS = 3  # a longer sum is not written out with numbers for each product

@@ -25,8 +25,7 @@ from pipeline.submission import Submission
 from pipeline.words.numbers import count
 from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress, silent
-from pipeline.words.spans import Span
-from pipeline.words.text import rich
+from pipeline.words.text import Span, rich
 from pipeline.workflow import analyse
 
 _WORDS = phrases("solution")

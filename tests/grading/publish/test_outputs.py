@@ -28,7 +28,7 @@ from pipeline.grading.publish.gradescope import results_text
 from pipeline.grading.publish.outputs import grades_csv, write_outputs
 from pipeline.grading.words import WORDS
 from pipeline.setup import Units
-from pipeline.words.spans import plain
+from pipeline.words.text import plain
 from tests.helpers.grades import (
     failed_grade,
     hertz_flag,

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from docs.friction_compensation import main
-from pipeline.simulated.emulator.server import EmulatorOptions, Server
+from pipeline.simulated.emulator import EmulatorOptions, Server
 from pipeline.simulated.hidden import prepare_bench
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.exported import no_compiler

@@ -18,7 +18,7 @@ from pipeline.protocol import (
     parse_reading,
     target_at,
 )
-from pipeline.simulated.emulator.core import ReferenceCore
+from pipeline.simulated.controller import ReferenceCore
 
 PERIOD = 1e-3
 # Two carts in counts and duty counts: some 10 counts per duty count, 2 and 5 Hz.

@@ -23,8 +23,7 @@ from pipeline.protocol import (
     parse_description,
     parse_reading,
 )
-from pipeline.simulated.emulator.carts import TRUE_PERIOD, VirtualCarts
-from pipeline.simulated.emulator.server import read_fault
+from pipeline.simulated.emulator import TRUE_PERIOD, VirtualCarts, read_fault
 from pipeline.simulated.hidden import prepare_bench
 from tests.helpers.benches import Emulator, emulator
 from tests.helpers.waiting import started
