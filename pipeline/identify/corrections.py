@@ -29,7 +29,7 @@ from pipeline.estimation.record_fit import (
     most_are_consistent,
 )
 from pipeline.estimation.time_fit import FOLLOWED
-from pipeline.identify.findings import SAME, SAME_SIZE, SIGMAS, WITNESSES, RecordingFault
+from pipeline.identify.findings import SAME, SAME_SIZE, SIGMAS, WITNESSES, Finding
 from pipeline.plant.chain import Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Record, StepGain
@@ -56,7 +56,7 @@ class OtherReadings:
     """
 
     mistaken: dict[str, Correction] = field(default_factory=dict)
-    odd: dict[str, RecordingFault] = field(default_factory=dict)
+    odd: dict[str, Finding] = field(default_factory=dict)
 
 
 def find_other_readings(
@@ -159,9 +159,9 @@ def _is_sampled_so(record: Record, records: Sequence[Record], *, factor: float) 
     return abs(record.sample_time - usual) <= SAME * usual
 
 
-def _odd(name: str, *, scale: float) -> RecordingFault:
+def _odd(name: str, *, scale: float) -> Finding:
     code = "moves_too_little" if scale < 1 else "moves_too_far"
-    return RecordingFault(code=code, run=name, details={"scale": f"{scale:.3g}"}, is_wrong=False)
+    return Finding(code=code, run=name, details={"scale": f"{scale:.3g}"}, excludes="odd")
 
 
 def standing_still(records: Sequence[Record]) -> set[str]:
@@ -179,7 +179,7 @@ def standing_still(records: Sequence[Record]) -> set[str]:
 
 def find_faults(
     records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, RecordFit]
-) -> dict[str, RecordingFault]:
+) -> dict[str, Finding]:
     """Return the records that do not show what happened, by id, each with its fault.
 
     Parameters
@@ -210,7 +210,7 @@ def find_faults(
     # slowly.
     clocks = [record.sample_time for record in records]
     usual_clock = min((dt for dt in clocks if dt >= FASTEST), default=0.0)
-    found: dict[str, RecordingFault] = {}
+    found: dict[str, Finding] = {}
     for record in records:
         legal = record.id in misread and misread[record.id].legal
         for fault in (
@@ -229,7 +229,7 @@ def find_faults(
             ),
             *_dead_channels(record, chain=chain, friction=friction, steps=steps, moving=moving),
         ):
-            found.setdefault(record.id, replace(fault, is_wrong=not legal))
+            found.setdefault(record.id, replace(fault, excludes="odd" if legal else "wrong"))
     for name, one in readings.odd.items():
         found.setdefault(name, one)
     for stray in _strays(records, chain=chain, fits=fits):
@@ -237,13 +237,13 @@ def find_faults(
     return found
 
 
-def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, RecordingFault]:
+def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, Finding]:
     """Return the steps in which a cart moves further than the cart that pulls it, by id.
 
     The input acts on cart 1, and springs pull the other carts. So a cart's static gain is at most
     that of the cart before it.
     """
-    found: dict[str, RecordingFault] = {}
+    found: dict[str, Finding] = {}
     by_cart = {(gain.experiment, gain.cart): gain for gain in gains if gain.interval is None}
     for (run, cart), gain in by_cart.items():
         before = by_cart.get((run, cart - 1))
@@ -253,7 +253,7 @@ def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, RecordingFault
         # The difference must exceed the amount by which friction may hold the carts off.
         if least > 1.3 * (abs(before.gain) + SIGMAS * before.gain_std):
             details = {"times": f"{abs(gain.gain / before.gain):.3g}", "before": str(cart - 1)}
-            found[run] = RecordingFault(code="too_far", run=run, cart=cart, details=details)
+            found[run] = Finding(code="too_far", run=run, cart=cart, details=details)
     return found
 
 
@@ -293,7 +293,7 @@ def _dead_channels(
     friction: Mapping[int, float],
     steps: Mapping[int, float],
     moving: Set[int],
-) -> Iterator[RecordingFault]:
+) -> Iterator[Finding]:
     """Yield a fault for each free cart that must have moved, although its reading shows no motion.
 
     The reading is constant, or only noise. For each cart, `friction` is the largest friction that
@@ -305,13 +305,11 @@ def _dead_channels(
         never = is_driven(record) and cart not in moving
         noise = _is_noise(record, cart)
         if noise and (record.kind == "decay" or cart not in moving):
-            yield RecordingFault(code="only_noise", run=record.id, cart=cart)
+            yield Finding(code="only_noise", run=record.id, cart=cart)
         elif np.ptp(y) == 0 and (record.kind == "decay" or never):
             others = [free for free in record.free if free != cart]
             code = "never_changes_held" if others else "never_changes"
-            yield RecordingFault(
-                code=code, run=record.id, cart=cart, details={"others": str(others)}
-            )
+            yield Finding(code=code, run=record.id, cart=cart, details={"others": str(others)})
         if chain is None or record.u is None or not is_driven(record):
             continue
         force = force_on(record, chain, cart=cart)
@@ -322,10 +320,10 @@ def _dead_channels(
             if not _must_move(record, chain, still, cart=cart, step=steps[cart]):
                 continue
             if noise:
-                yield RecordingFault(code="only_noise", run=record.id, cart=cart)
+                yield Finding(code="only_noise", run=record.id, cart=cart)
                 continue
             code = "dead" if np.ptp(y) == 0 else "froze_at_input"
-            yield RecordingFault(code=code, run=record.id, cart=cart, details=_span(record, still))
+            yield Finding(code=code, run=record.id, cart=cart, details=_span(record, still))
 
 
 def _frozen(
@@ -335,7 +333,7 @@ def _frozen(
     *,
     friction: Mapping[int, float],
     steps: Mapping[int, float],
-) -> Iterator[RecordingFault]:
+) -> Iterator[Finding]:
     """Yield a fault for each reading that is constant for a while although the carts moved it far.
 
     The reading is constant for ten samples or more. Meanwhile the identified cart moves by at least
@@ -365,9 +363,7 @@ def _frozen(
             # motion.
             if follows and np.sqrt(elsewhere) < 0.25 * moved:
                 details = _span(record, part)
-                yield RecordingFault(
-                    code="froze_in_motion", run=record.id, cart=cart, details=details
-                )
+                yield Finding(code="froze_in_motion", run=record.id, cart=cart, details=details)
 
 
 def _span(record: Record, part: slice) -> dict[str, str]:
@@ -390,7 +386,7 @@ def _must_move(record: Record, chain: Chain, still: slice, *, cart: int, step: f
     return far >= max(_SEEN_COUNTS * step, 0.3 * float(np.ptp(y)))
 
 
-def _copies(records: Sequence[Record]) -> dict[str, RecordingFault]:
+def _copies(records: Sequence[Record]) -> dict[str, Finding]:
     """Return the records with exactly the samples of an earlier record of their kind."""
     first: dict[tuple[object, ...], str] = {}
     copies = {}
@@ -398,22 +394,20 @@ def _copies(records: Sequence[Record]) -> dict[str, RecordingFault]:
         what = (record.kind, record.free, record.t.tobytes(), record.y.tobytes())
         if first.setdefault(what, record.id) != record.id:
             details = {"original": first[what]}
-            copies[record.id] = RecordingFault(
-                code="copied_samples", run=record.id, details=details
-            )
+            copies[record.id] = Finding(code="copied_samples", run=record.id, details=details)
     return copies
 
 
-def _short_dwell(record: Record) -> Iterator[RecordingFault]:
+def _short_dwell(record: Record) -> Iterator[Finding]:
     if record.kind == "sine" and record.omega is not None:
         duration = float(record.t[-1] - record.t[0]) + record.sample_time
         cycles = record.omega * duration / (2 * np.pi)
         if cycles < _FEWEST_CYCLES:
             details = {"cycles": f"{_FEWEST_CYCLES:g}"}
-            yield RecordingFault(code="short_dwell", run=record.id, details=details)
+            yield Finding(code="short_dwell", run=record.id, details=details)
 
 
-def _wrong_clock(record: Record, *, usual: float) -> Iterator[RecordingFault]:
+def _wrong_clock(record: Record, *, usual: float) -> Iterator[Finding]:
     """Yield a fault if the time column of a record is in an unusual unit.
 
     That is so if its sample interval, converted from this unit, is the usual one.
@@ -423,21 +417,21 @@ def _wrong_clock(record: Record, *, usual: float) -> Iterator[RecordingFault]:
         is_unit = max(factor, 1 / factor) >= 100.0
         if is_unit and abs(record.sample_time - factor * usual) < SAME * factor * usual:
             details = {"apart": f"{record.sample_time:.3g}", "usual": f"{usual:.3g}", "look": words}
-            yield RecordingFault(code="other_clock", run=record.id, details=details)
+            yield Finding(code="other_clock", run=record.id, details=details)
 
 
 # ------------------------------------------------------- records that follow no carts
 
 
-def _correction_fault(record: Record, correction: Correction, everywhere: bool) -> RecordingFault:
+def _correction_fault(record: Record, correction: Correction, everywhere: bool) -> Finding:
     code = "misread_everywhere" if everywhere else "misread"
     details = {"look": correction.words, "remedy": correction.remedy}
-    return RecordingFault(code=code, run=record.id, details=details)
+    return Finding(code=code, run=record.id, details=details)
 
 
 def _strays(
     records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, RecordFit]
-) -> Iterator[RecordingFault]:
+) -> Iterator[Finding]:
     """Yield the records that follow neither the chain nor a slightly slower or faster one.
 
     It is enough if one cart follows, because another one may be near its null and hardly move. A
@@ -455,4 +449,4 @@ def _strays(
             min(near_by.unexplained_share.values()) > 0.5 for near_by in fit_detuned(record, chain)
         ):
             details = {"percent": f"{100 * min(fit.share, 1.0):.0f}"}
-            yield RecordingFault(code="stray", run=record.id, details=details, is_wrong=False)
+            yield Finding(code="stray", run=record.id, details=details, excludes="odd")

@@ -1,6 +1,6 @@
 """What is wrong with a recording, the set-up or the model, and which stages could not run.
 
-The sentences are in `templates/words/soundness.toml`.
+Each `Finding` has its sentence in `templates/words/findings.toml`.
 `tests/statistics/test_honest_records.py` shows that good records are not accused, even with
 sticking carts and coarse encoders. `tests/grading/mistakes/test_faults.py` shows that wrong records
 are found.
@@ -8,13 +8,13 @@ are found.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from pipeline.errors import DataError
 from pipeline.results import Check, CheckKind, LeftOut, Record, Skipped, Stage
 from pipeline.words.phrases import phrases
 
-_WORDS = phrases("soundness")
+_WORDS = phrases("findings")
 # Independent records, or kinds of record, that must agree. A single one may be wrong by chance.
 WITNESSES = 2
 SIGMAS = 4.0  # standard errors; by chance, one number in 16,000 is as far off
@@ -23,55 +23,64 @@ SIGMAS = 4.0  # standard errors; by chance, one number in 16,000 is as far off
 SAME = 0.02
 SAME_SIZE = 0.2  # relative difference up to which friction affects two step sizes equally
 T = TypeVar("T")
+Excludes = Literal["no", "odd", "wrong"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordingFault:
-    """A fault of a recording, or a contradiction between it and other recordings.
+class Finding:
+    """Something that is wrong with a recording, the set-up or the model.
 
     Attributes
     ----------
-    code : kind of the fault, which is also the key of its sentence.
-    run, cart : the recording and the cart. Without a cart, the fault concerns the whole recording.
-    details : values for the sentence, as text.
-    value, limit : the number that shows the fault, and its largest allowed value. None if there is
-        no such number.
-    is_wrong : whether the recording does not show what happened. Otherwise it only differs from
-        others.
+    code : what is wrong, which is also the key of its sentence.
+    kind : the consistency check that fails.
+    run, cart, parameter, part : what it is about, as in `Check`. Without a cart, it concerns the
+        whole recording; without a recording, the set-up or the model.
+    details : values for the sentence.
+    value, limit : the number that shows it, and its largest allowed value. None if there is no such
+        number.
+    excludes : whether the recording is used: "no" if it is, "odd" if it is left out because it
+        differs from others, "wrong" if it is left out because it does not show what happened.
     """
 
     code: str
-    run: str
+    kind: CheckKind = "record"
+    run: str = ""
     cart: int | None = None
-    details: Mapping[str, str] = field(default_factory=dict)
+    parameter: str = ""
+    part: str = ""
+    details: Mapping[str, object] = field(default_factory=dict)
     value: float | None = None
     limit: float | None = None
-    is_wrong: bool = True
+    excludes: Excludes = "wrong"
 
     @property
     def reason(self) -> str:
-        """The fault in words that follow the recording's name."""
-        return _WORDS.text(self.code, cart=self.cart, **self.details)
+        """What is wrong, in words that follow the recording's name, if it is about one."""
+        return say(self.code, **{"cart": self.cart, **self.details})
+
+    @property
+    def check(self) -> Check:
+        """The failed check."""
+        return Check(
+            kind=self.kind,
+            run=self.run,
+            cart=self.cart,
+            parameter=self.parameter,
+            part=self.part,
+            outcome="fail",
+            value=self.value,
+            limit=self.limit,
+            message=f"{self.run}: {self.reason}" if self.run else self.reason,
+        )
 
     @property
     def left_out(self) -> LeftOut:
         """The entry in the list of recordings that were not used."""
-        return LeftOut(experiment=self.run, reason=self.reason, is_wrong=self.is_wrong)
-
-    def check(self, kind: CheckKind) -> Check:
-        """Return the failed check that reports this fault."""
-        return Check(
-            kind=kind,
-            run=self.run,
-            cart=self.cart if kind == "held" else None,
-            outcome="fail",
-            value=self.value,
-            limit=self.limit,
-            message=f"{self.run}: {self.reason}",
-        )
+        return LeftOut(experiment=self.run, reason=self.reason, is_wrong=self.excludes == "wrong")
 
 
-def say(key: str, **values: str) -> str:
+def say(key: str, **values: object) -> str:
     """Return the sentence, or part of a sentence, with this key."""
     return _WORDS.text(key, **values)
 

@@ -31,7 +31,7 @@ from pipeline.estimation.record_fit import (
 from pipeline.estimation.sine import FEW_COUNTS
 from pipeline.estimation.time_fit import evaluate_chain, fit_records, open_window
 from pipeline.identify.corrections import without_lone_factors
-from pipeline.identify.findings import Log, RecordingFault
+from pipeline.identify.findings import Finding, Log
 from pipeline.names import own_zeta, read_name
 from pipeline.results import (
     EXPLAINED,
@@ -50,7 +50,6 @@ from pipeline.words.numbers import join_names, listing, with_error
 from pipeline.words.phrases import phrases
 
 _WORDS = phrases("skipped")
-_CHECKS = phrases("checks")
 # Relative difference of a mass or spring that matters, and of a frequency, its square root.
 _DIFFERENT, _DETUNED = 0.05, 0.025
 _MOST_SEEDS = 8  # recordings from which a group is started
@@ -76,7 +75,7 @@ class Fitted:
     fit: ChainFit | None = None
     fits: Mapping[str, RecordFit] = field(default_factory=dict)
     by_dwells: bool = False
-    conflict: Mapping[str, RecordingFault] = field(default_factory=dict)
+    conflict: Mapping[str, Finding] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -279,7 +278,7 @@ def _by_kind(records: Sequence[Record], fitted: Fitted) -> dict[str, list[str]]:
 
 def _conflict(
     records: Sequence[Record], fitted: Fitted, *, mine: Set[str], theirs: Set[str]
-) -> dict[str, RecordingFault]:
+) -> dict[str, Finding]:
     """Return, by record, why kinds of experiment that follow different chains may not be used.
 
     There is a conflict only if a known mistake would turn one chain into the other. Otherwise the
@@ -297,7 +296,7 @@ def _conflict(
     of_mine, of_theirs = (" and ".join(sorted(kinds)) for kinds in (mine - theirs, theirs - mine))
     details = {"mine": of_mine, "theirs": of_theirs, "example": example, "look": misread.words}
     return {
-        name: RecordingFault(code="contradicting_kinds", run=name, details=details)
+        name: Finding(code="contradicting_kinds", run=name, details=details)
         for kind in mine ^ theirs
         for name in ids[kind]
     }
@@ -366,8 +365,16 @@ def check_groups(groups: Sequence[RecordingGroup]) -> list[Check]:
         + listing([f"{k} = {with_error(v, group.std.get(k))}" for k, v in group.values.items()])
         for group in groups
     ]
-    message = _CHECKS.text("groups", groups="; ".join(told))
-    return [Check(kind="groups", outcome="fail", message=message, value=len(groups), limit=1)]
+    details = {"groups": "; ".join(told)}
+    finding = Finding(
+        code="groups",
+        kind="groups",
+        details=details,
+        value=len(groups),
+        limit=1,
+        excludes="no",
+    )
+    return [finding.check]
 
 
 def _against_decays(

@@ -360,8 +360,9 @@ def identify_with_rejection(
         sound = [record for record in driven if record.id not in faults]
         odd = find_outlier_repeats(sound, unit=bench.units.position)
         # A fault that says how a record is wrong has priority over a fault that only calls it odd.
-        doubted = {name: one for name, one in faults.items() if not one.is_wrong}
-        left_out = {**odd, **doubted, **shown, **{n: f for n, f in faults.items() if f.is_wrong}}
+        doubted = {name: one for name, one in faults.items() if one.excludes == "odd"}
+        sure = {name: one for name, one in faults.items() if one.excludes == "wrong"}
+        left_out = {**odd, **doubted, **shown, **sure}
         if left_out.keys() == without:
             break
         without = left_out.keys()

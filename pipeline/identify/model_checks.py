@@ -14,6 +14,7 @@ from scipy.linalg import solve_discrete_are
 from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.estimates import SIGMA_LIMIT, change_limit
+from pipeline.identify.findings import say
 from pipeline.names import gain_name, own_zeta, read_name, toml_flags
 from pipeline.plant.chain import Chain
 from pipeline.plant.identities import brackets, recover_from_parameters
@@ -45,7 +46,6 @@ _BELOW_ZERO = 2.0  # standard errors by which a mass, damping or spring may be b
 # or springs differ by a factor of 50. If a spring is missing, dry friction and loose screws look
 # like a spring of up to 1 % of its neighbour.
 NEGLIGIBLE = 0.02
-_WORDS = phrases("checks")
 _LAWS = phrases("decays")
 # Largest difference between the polynomials of two loops that count as the same. Rounding leaves
 # 1e-13 on realistic plants, and gains from another program up to 1e-8.
@@ -334,7 +334,7 @@ def check_coverage(rows: Sequence[ParameterRow]) -> list[Check]:
         found = sorted({w for w in (near.below, near.above) if w is not None})
         nearest = found[int(np.argmin(np.abs(np.array(found) - near.omega)))] if found else 0.0
         key = f"determined_by_{row.determined_by}"
-        message = _WORDS.text(
+        message = say(
             key if found else "extrapolated_from_nothing",
             name=row.name,
             zeta=read_name(row.name).damping,

@@ -1,13 +1,14 @@
 """Check that the recordings were read, match their description, and were used."""
 
 from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import groupby
 from math import ceil
 
 import numpy as np
 
 from pipeline.estimation.force_balance import without_releases
-from pipeline.identify.findings import RecordingFault, say, valid_records
+from pipeline.identify.findings import Finding, say, valid_records
 from pipeline.identify.recording_faults import (
     LEAST_SHARE,
     OTHER_DWELL,
@@ -17,7 +18,7 @@ from pipeline.identify.recording_faults import (
     find_other_units,
     find_wrong_setups,
     late_experiments,
-    late_fault,
+    late_finding,
     swings,
     why_other_frequency,
 )
@@ -39,15 +40,13 @@ from pipeline.results import (
 from pipeline.setup import Setup
 from pipeline.words.numbers import group_messages, join_names
 from pipeline.words.phrases import phrases
-from pipeline.words.text import capital
 
-_WORDS = phrases("checks")
 _SPELT_OUT = 3  # up to so many records are listed by name, even if they are a whole kind
 _PLURAL = {"sine": "dwells", "step": "steps", "decay": "decays", "sweep": "sweeps"}
 # Relative difference between a stated frequency and that of the input. A larger one means that the
 # file belongs to another run.
 _OTHER_RUN = 0.08
-_REMARKS = phrases("skipped")
+_WORDS = phrases("skipped")
 # m/s. The carts of a bench reach 0.4, and those of inverted pendulums 3. Centimetres read as metres
 # give 15 to 40.
 _FASTEST = 10.0
@@ -62,14 +61,15 @@ def check_recordings(
     bench: Setup,
 ) -> list[Check]:
     """Return all checks of the recordings, those whose failure affects most numbers first."""
+    sound = valid_records(data.records, left_out)
     return [
         *check_signs(data.signs, without={one.experiment for one in left_out if one.is_wrong}),
         *check_files(data.unreadable),
         *check_units(data.records, bench=bench),
-        *check_scales(valid_records(data.records, left_out), bench=bench),
+        *(one.check for one in find_other_scales(sound, bench=bench)),
         *check_left_out(left_out, records=data.records),
         *check_setup(data.records),
-        *check_held(data.records),
+        *(one.check for one in find_loose_holds(data.records)),
         *check_dwells(data.records, sines),
         *check_channels(late),
     ]
@@ -82,7 +82,7 @@ def check_files(unreadable: Mapping[str, str]) -> list[Check]:
             kind="data",
             run=name,
             outcome="fail",
-            message=_WORDS.text("unreadable", run=name, reason=reason),
+            message=say("unreadable", run=name, reason=reason),
         )
         for name, reason in unreadable.items()
     ]
@@ -104,54 +104,45 @@ def check_units(records: Sequence[Record], *, bench: Setup) -> list[Check]:
                 if other.role == role and not other.converts:
                     headed.setdefault(record.id, other)
         if not is_known(unit, known):
-            checks.append(_unit_check(kind, _unknown(unit, role=role, known=known)))
+            details = {"role": role, "unit": repr(unit), "hint": _hint(unit, known=known)}
+            finding = Finding(code="unknown_unit", kind=kind, details=details, excludes="no")
+            checks.append(finding.check)
         elif headed:
             other = next(iter(headed.values()))
-            message = _WORDS.text(
-                "other_heading",
-                runs=join_names(list(headed)),
-                heading=repr(other.heading),
-                unit=unit,
-                other=other.unit,
-                role=role,
-            )
-            checks.append(_unit_check(kind, message, n=len(headed)))
+            details = {"heading": repr(other.heading), "unit": unit}
+            details |= {"other": other.unit, "role": role}
+            checks.append(_unit_check("other_heading", kind, runs=list(headed), details=details))
         elif role == "position" and (other_step := find_other_steps(records, bench=bench)):
-            checks.append(_unit_check(kind, capital(other_step.reason), n=len(records)))
+            checks.append(other_step.check)
         elif role == "position" and fractions:
-            runs = join_names(fractions)
-            message = _WORDS.text("fractions", runs=runs, gain_unit=bench.units.gain)
-            checks.append(_unit_check(kind, message, n=len(fractions)))
+            details = {"gain_unit": bench.units.gain}
+            checks.append(_unit_check("fractions", kind, runs=fractions, details=details))
     return checks
 
 
-def _unit_check(kind: CheckKind, message: str, *, n: int | None = None) -> Check:
-    value, limit = (None, None) if n is None else (float(n), 0.0)
-    return Check(kind=kind, outcome="fail", value=value, limit=limit, message=message)
+def _unit_check(
+    code: str, kind: CheckKind, *, runs: Sequence[str], details: Mapping[str, str]
+) -> Check:
+    return Finding(
+        code=code,
+        kind=kind,
+        details={"runs": join_names(runs), **details},
+        value=float(len(runs)),
+        limit=0.0,
+        excludes="no",
+    ).check
 
 
-def _unknown(unit: str, *, role: str, known: Sequence[str]) -> str:
-    """Return the question to the student about an unknown unit."""
+def _hint(unit: str, *, known: Sequence[str]) -> str:
+    """Return which unit may be meant, or else all known units."""
     meant = next((one for one in known if one.casefold() == unit.casefold()), None)
-    hint = (
-        _WORDS.text("did_you_mean", unit=repr(meant))
-        if meant
-        else _WORDS.text("known_units", units=", ".join(known))
-    )
-    return _WORDS.text("unknown_unit", role=role, unit=repr(unit), hint=hint)
+    if meant:
+        return say("did_you_mean", unit=repr(meant))
+    return say("known_units", units=", ".join(known))
 
 
 def _has_fractions_of_a_count(record: Record) -> bool:
     return record.position_scale == 1.0 and not np.array_equal(record.y, np.round(record.y))
-
-
-def check_scales(records: Sequence[Record], *, bench: Setup) -> list[Check]:
-    """Return failed checks if positions or inputs are too large for any bench."""
-    kinds: Mapping[str, CheckKind] = {
-        "position_scale": "position_scale",
-        "input_scale": "input_scale",
-    }
-    return [fault.check(kinds[fault.code]) for fault in find_other_scales(records, bench=bench)]
 
 
 def check_signs(signs: Signs, *, without: Container[str]) -> list[Check]:
@@ -169,7 +160,7 @@ def check_signs(signs: Signs, *, without: Container[str]) -> list[Check]:
         ]
         contrary = [name for name in determined if signs.found[name] == -sign]
         if contrary and 2 * len(contrary) >= len(determined):
-            message = _WORDS.text(
+            message = say(
                 "sign",
                 stated=sign,
                 found=f"{-sign:+d}",
@@ -202,7 +193,7 @@ def check_left_out(left_out: Sequence[LeftOut], *, records: Sequence[Record]) ->
             outcome="fail",
             value=float(len(names)),
             limit=0.0,
-            message=_WORDS.text(
+            message=say(
                 "left_out",
                 are="is" if len(names) == 1 else "are",
                 runs=_named(names, records),
@@ -231,7 +222,7 @@ def check_setup(records: Sequence[Record]) -> list[Check]:
     for record in records:
         free, held = swings(record)
         if record.id in wrong:
-            checks.append(wrong[record.id].check("setup"))
+            checks.append(wrong[record.id].check)
         elif held:
             named = ", ".join(map(str, record.free))
             check = Check(
@@ -240,15 +231,10 @@ def check_setup(records: Sequence[Record]) -> list[Check]:
                 outcome="pass",
                 value=max(held.values()) / free if free > 0 else None,
                 limit=1 / LEAST_SHARE,
-                message=_WORDS.text("setup_right", run=record.id, free=named),
+                message=say("setup_right", run=record.id, free=named),
             )
             checks.append(check)
     return checks
-
-
-def check_held(records: Sequence[Record]) -> list[Check]:
-    """Return a failed check for each record in which a cart that should be held moves."""
-    return [fault.check("held") for fault in find_loose_holds(records)]
 
 
 def check_channels(late: Sequence[LateChannel]) -> list[Check]:
@@ -261,19 +247,13 @@ def check_channels(late: Sequence[LateChannel]) -> list[Check]:
         "closed_loop": "closed loop",
     }
     checks = []
-    for cart, of_cart in groupby(sorted(late, key=lambda one: one.cart), key=lambda one: one.cart):
+    for _, of_cart in groupby(sorted(late, key=lambda one: one.cart), key=lambda one: one.cart):
         alike = list(of_cart)
         surest = min(alike, key=lambda one: (one.than, one.limit))
         kinds_text = join_names([kinds[one.kind] for one in alike])
-        check = Check(
-            kind="late_channel",
-            cart=cart,
-            outcome="fail",
-            value=surest.delay,
-            limit=surest.limit,
-            message=_WORDS.text("late_channel", late=late_fault(surest).reason, kinds=kinds_text),
-        )
-        checks.append(check)
+        finding = late_finding(surest)
+        details = {**finding.details, "kinds": kinds_text}
+        checks.append(replace(finding, code="late_channel_in", details=details).check)
     return checks
 
 
@@ -291,23 +271,22 @@ def check_dwells(records: Sequence[Record], points: Sequence[SinePoint]) -> list
     ratio = float(np.median(list(off.values())))
     look = why_other_frequency(ratio)
     alike = all(abs(r / ratio - 1) < OTHER_DWELL for r in off.values())
-    message = _WORDS.text(
-        "dwells",
-        off=len(off),
-        all=len(ratios),
-        runs=", ".join(list(off)[:3]) + (" …" if len(off) > 3 else ""),
-        why=_WORDS.text("dwells_why", ratio=f"{ratio:.4g}", look=look) if look and alike else "",
+    details = {
+        "off": len(off),
+        "all": len(ratios),
+        "runs": ", ".join(list(off)[:3]) + (" …" if len(off) > 3 else ""),
+        "why": say("dwells_why", ratio=f"{ratio:.4g}", look=look) if look and alike else "",
+    }
+    finding = Finding(
+        code="dwells",
+        kind="dwells",
+        part="frequency",
+        details=details,
+        value=ratio,
+        limit=1.0,
+        excludes="no",
     )
-    return [
-        Check(
-            kind="dwells",
-            part="frequency",
-            outcome="fail",
-            value=ratio,
-            limit=1.0,
-            message=message,
-        )
-    ]
+    return [finding.check]
 
 
 def find_bad_recordings(analysis: Analysis) -> dict[str, str]:
@@ -336,26 +315,29 @@ def find_bad_recordings(analysis: Analysis) -> dict[str, str]:
     return found
 
 
-def _channels_at_fault(record: Record, *, sticky: bool) -> Iterator[RecordingFault]:
+def _channels_at_fault(record: Record, *, sticky: bool) -> Iterator[Finding]:
     """Yield a fault for each clipped channel, and for an input with a wrong frequency."""
     for cart in record.carts:
         if cart not in record.free or sticky or record.kind not in ("sine", "sweep"):
             continue
         if (limit := saturation(record.position(cart))) is not None:
             details = {"limit": f"{limit:.4g}"}
-            yield RecordingFault(code="clipped_position", run=record.id, cart=cart, details=details)
+            yield Finding(
+                code="clipped_position", run=record.id, cart=cart, details=details, excludes="no"
+            )
     u = record.u
     if u is None or record.kind == "closed_loop":
         return
     if (limit := saturation(u)) is not None:
-        yield RecordingFault(code="clipped_input", run=record.id, details={"limit": f"{limit:.4g}"})
+        details = {"limit": f"{limit:.4g}"}
+        yield Finding(code="clipped_input", run=record.id, details=details, excludes="no")
     if record.kind == "sine" and record.omega is not None and np.ptp(u) > 0:
         hertz, stated = line_frequency(record.t, u), record.omega / (2 * np.pi)
         resolution = 1.0 / float(record.t[-1] - record.t[0])
         if hertz is not None and abs(hertz - stated) > max(_OTHER_RUN * stated, resolution):
             look = why_other_frequency(stated / hertz) or say("frequency_of_another")
             details = {"found": f"{hertz:.3g}", "stated": f"{stated:.3g}", "look": look}
-            yield RecordingFault(code="other_frequency", run=record.id, details=details)
+            yield Finding(code="other_frequency", run=record.id, details=details, excludes="no")
 
 
 def reading_remarks(data: Ingested, *, unit: str) -> list[str]:
@@ -370,7 +352,7 @@ def reading_remarks(data: Ingested, *, unit: str) -> list[str]:
         *_too_fast(data.records, unit=unit),
         *group_messages((record.id, note) for record in data.records for note in record.notes),
         *group_messages(
-            (name, _REMARKS.text("decay_in_other_unit", reason=one.reason))
+            (name, _WORDS.text("decay_in_other_unit", reason=one.reason))
             for name, one in units.items()
         ),
     ]
@@ -381,7 +363,7 @@ def hand_remarks(interventions: Sequence[Intervention], *, records: Sequence[Rec
     return group_messages(
         (
             one.experiment,
-            _REMARKS.text(
+            _WORDS.text(
                 "hand",
                 cart=one.cart,
                 what=one.what,
@@ -406,7 +388,7 @@ def _too_fast(records: Sequence[Record], *, unit: str) -> list[str]:
     speed, run = sorted(fastest.values())[-2] if len(fastest) > 1 else (0.0, "")
     if not metres or speed * metres <= _FASTEST:
         return []
-    return [_REMARKS.text("too_fast", run=run, speed=f"{speed:.2g}", unit=unit)]
+    return [_WORDS.text("too_fast", run=run, speed=f"{speed:.2g}", unit=unit)]
 
 
 def _speed(record: Record) -> float:
@@ -430,4 +412,4 @@ def gain_sign_warning(records: Sequence[Record]) -> list[str]:
     """Return a warning if the bench's input has the opposite sign of the designed gains."""
     if not is_reversed(records):
         return []
-    return [_REMARKS.text("reversed")]
+    return [_WORDS.text("reversed")]

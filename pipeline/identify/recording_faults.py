@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.estimation.force_balance import ChannelDelay, find_channel_delays
 from pipeline.estimation.record_fit import LENGTH_SCALES, TIME_UNITS, measured
-from pipeline.identify.findings import SAME, WITNESSES, RecordingFault, say
+from pipeline.identify.findings import SAME, WITNESSES, Finding, say
 from pipeline.ingest.channels import is_stepped, line_frequency, stuck_spans
 from pipeline.ingest.columns import conversion
 from pipeline.results import LateChannel, Record
@@ -49,26 +49,27 @@ def swings(record: Record) -> tuple[float, dict[int, float]]:
     return (max(free), swing) if free else (0.0, {})
 
 
-def find_wrong_setups(records: Sequence[Record]) -> list[RecordingFault]:
+def find_wrong_setups(records: Sequence[Record]) -> list[Finding]:
     """Find the records in which a cart that should be held moves, but the free carts do not."""
     found = []
     for record in records:
         free, held = swings(record)
         mover = max(held, key=lambda cart: held[cart], default=0)
         if mover and free < LEAST_SHARE * held[mover]:
-            fault = RecordingFault(
+            fault = Finding(
                 code="wrong_setup",
+                kind="setup",
                 run=record.id,
-                cart=mover,
-                details={"free": ", ".join(map(str, record.free))},
+                details={"cart": mover, "free": ", ".join(map(str, record.free))},
                 value=held[mover] / free if free > 0 else None,
                 limit=1 / LEAST_SHARE,
+                excludes="no",
             )
             found.append(fault)
     return found
 
 
-def find_loose_holds(records: Sequence[Record]) -> list[RecordingFault]:
+def find_loose_holds(records: Sequence[Record]) -> list[Finding]:
     """Find carts that should be held but move much compared with the free ones."""
     found = []
     for record in records:
@@ -76,19 +77,21 @@ def find_loose_holds(records: Sequence[Record]) -> list[RecordingFault]:
         for cart, swing in held.items():
             if _HELD_FIRMLY * free < swing <= free:
                 share = swing / free
-                fault = RecordingFault(
+                fault = Finding(
                     code="moves_though_held",
+                    kind="held",
                     run=record.id,
                     cart=cart,
                     details={"percent": f"{100 * share:.0f}"},
                     value=share,
                     limit=_HELD_FIRMLY,
+                    excludes="no",
                 )
                 found.append(fault)
     return found
 
 
-def find_other_scales(records: Sequence[Record], *, bench: Setup) -> list[RecordingFault]:
+def find_other_scales(records: Sequence[Record], *, bench: Setup) -> list[Finding]:
     """Find positions or inputs of a size that no bench has, and so must be in another unit.
 
     Examples are counts in place of a length, and millivolts in place of volts. A fit to such
@@ -104,8 +107,14 @@ def find_other_scales(records: Sequence[Record], *, bench: Setup) -> list[Record
         why = say("position_scale_whole" if whole else "position_scale_long")
         details = {"reach": f"{travel:.4g}", "unit": unit, "quoted": repr(unit), "why": why}
         found.append(
-            RecordingFault(
-                code="position_scale", run=run, details=details, value=travel, limit=limit
+            Finding(
+                code="position_scale",
+                kind="position_scale",
+                run=run,
+                details=details,
+                value=travel,
+                limit=limit,
+                excludes="no",
             )
         )
     # Under feedback, a bench may log another signal as its input.
@@ -125,12 +134,20 @@ def find_other_scales(records: Sequence[Record], *, bench: Setup) -> list[Record
     if beyond > 1.0:
         details = {"reach": f"{largest:.4g}", "unit": unit, "why": say(why)}
         found.append(
-            RecordingFault(code="input_scale", run=run, details=details, value=beyond, limit=1.0)
+            Finding(
+                code="input_scale",
+                kind="input_scale",
+                run=run,
+                details=details,
+                value=beyond,
+                limit=1.0,
+                excludes="no",
+            )
         )
     return found
 
 
-def find_other_steps(records: Sequence[Record], *, bench: Setup) -> RecordingFault | None:
+def find_other_steps(records: Sequence[Record], *, bench: Setup) -> Finding | None:
     """Find positions whose encoder step is a power of ten times the known one of an ECP bench."""
     if any(one.role == "position" for record in records for one in record.heading_units):
         return None
@@ -144,8 +161,13 @@ def find_other_steps(records: Sequence[Record], *, bench: Setup) -> RecordingFau
         "unit": bench.units.position,
         "scale": f"{scale:g}",
     }
-    return RecordingFault(
-        code="other_step", run=records[0].id, details=details, value=scale, limit=1.0
+    return Finding(
+        code="other_step",
+        kind="position_unit",
+        details=details,
+        value=float(len(records)),
+        limit=0.0,
+        excludes="no",
     )
 
 
@@ -190,9 +212,7 @@ def why_other_frequency(ratio: float) -> str:
     return ""
 
 
-def find_other_units(
-    records: Sequence[Record], *, decays: bool = False
-) -> dict[str, RecordingFault]:
+def find_other_units(records: Sequence[Record], *, decays: bool = False) -> dict[str, Finding]:
     """Find, by id, the records whose encoder step is the usual one converted to another unit.
 
     The usual step is that of most kinds of experiment, not of most records. A dozen dwells may have
@@ -200,7 +220,7 @@ def find_other_units(
     number of decimals. The unit of a decay does not matter, so decays are searched only if
     `decays` is true, and then nothing else.
     """
-    found: dict[str, RecordingFault] = {}
+    found: dict[str, Finding] = {}
     for cart in sorted({cart for record in records for cart in record.carts}):
         steps = {r.id: r.encoder_step(cart) for r in records if cart in r.carts}
         by_kind = [
@@ -218,7 +238,7 @@ def find_other_units(
                 continue
             for scale in [s for s in scales if _alike(step, s * usual)]:
                 details = {"scale": f"{scale:.3g}"}
-                fault = RecordingFault(code="other_unit", run=record.id, cart=cart, details=details)
+                fault = Finding(code="other_unit", run=record.id, cart=cart, details=details)
                 found.setdefault(record.id, fault)
     return found
 
@@ -232,14 +252,14 @@ def _is_decimal(step: float) -> bool:
     return step > 0 and _alike(step, 10.0 ** round(np.log10(step)))
 
 
-def find_stuck(records: Sequence[Record]) -> dict[str, RecordingFault]:
+def find_stuck(records: Sequence[Record]) -> dict[str, Finding]:
     """Return the records in which the encoder of a free cart was stuck, by id.
 
     Static friction stops only a cart that is already slow, and the cart then starts from where it
     stopped. So the encoder was stuck if the reading stops while the cart is fast, or if it jumps
     when it changes again.
     """
-    found: dict[str, RecordingFault] = {}
+    found: dict[str, Finding] = {}
     for record in records:
         for cart in measured(record):
             y = record.position(cart)
@@ -249,48 +269,46 @@ def find_stuck(records: Sequence[Record]) -> dict[str, RecordingFault]:
                 away = last < moves.size and moves[last] >= 1.5 * fastest
                 if away or moves[first - 1] >= 0.6 * fastest:
                     details = {"first": f"{record.t[first]:.4g}", "last": f"{record.t[last]:.4g}"}
-                    fault = RecordingFault(code="stuck", run=record.id, cart=cart, details=details)
+                    fault = Finding(code="stuck", run=record.id, cart=cart, details=details)
                     found.setdefault(record.id, fault)
     return found
 
 
-def find_other_kinds(
-    records: Sequence[Record], *, files: Mapping[str, str]
-) -> dict[str, RecordingFault]:
+def find_other_kinds(records: Sequence[Record], *, files: Mapping[str, str]) -> dict[str, Finding]:
     """Return the records that are not a complete recording of their kind, by id.
 
     `files` has the digest of each data file.
     """
     largest = max((float(np.abs(r.u).max()) for r in records if r.u is not None), default=0.0)
     first: dict[str, str] = {}
-    found: dict[str, RecordingFault] = {}
+    found: dict[str, Finding] = {}
     for record in records:
         original = first.setdefault(files.get(record.source, record.source), record.source)
         if original != record.source:
             details = {"source": record.source, "original": original}
-            found[record.id] = RecordingFault(code="copied_file", run=record.id, details=details)
+            found[record.id] = Finding(code="copied_file", run=record.id, details=details)
         for fault in (*_another_input(record, largest=largest), *_cut(record, records)):
             found.setdefault(record.id, fault)
     return found
 
 
-def _another_input(record: Record, *, largest: float) -> Iterator[RecordingFault]:
+def _another_input(record: Record, *, largest: float) -> Iterator[Finding]:
     u = record.u
     if u is None:
         return
     if record.kind == "step" and not (np.any(u) and is_stepped(u)):
-        yield RecordingFault(code="no_step", run=record.id)
+        yield Finding(code="no_step", run=record.id)
     if record.kind == "sine" and not _is_sine(record.t, u):
-        yield RecordingFault(code="no_sine", run=record.id)
+        yield Finding(code="no_sine", run=record.id)
     if record.kind == "decay" and float(np.ptp(u[u.size // 2 :])) > 1e-3 * largest:
-        yield RecordingFault(code="driven_decay", run=record.id)
+        yield Finding(code="driven_decay", run=record.id)
 
 
 def _is_sine(t: Array, u: Array) -> bool:
     return bool(np.ptp(u) > 0) and line_frequency(t, u) is not None
 
 
-def _cut(record: Record, records: Sequence[Record]) -> Iterator[RecordingFault]:
+def _cut(record: Record, records: Sequence[Record]) -> Iterator[Finding]:
     """Yield a fault if most similar records have one length, and this one less than half of it.
 
     Recordings that a person stops by hand differ in duration, so they are not compared. A
@@ -312,7 +330,7 @@ def _cut(record: Record, records: Sequence[Record]) -> Iterator[RecordingFault]:
         return
     if length < 0.5 * usual and record.t.size < 0.5 * samples:
         details = {"length": f"{length:.3g}", "usual": f"{usual:.3g}"}
-        yield RecordingFault(code="cut", run=record.id, details=details)
+        yield Finding(code="cut", run=record.id, details=details)
 
 
 def find_late_channels(records: Sequence[Record], *, carts: int) -> tuple[LateChannel, ...]:
@@ -369,15 +387,21 @@ def _shows(link: ChannelDelay, *, sample: float) -> bool:
     return link.better >= _BETTER and abs(link.delay) > _limit(link, sample=sample)
 
 
-def late_fault(late: LateChannel) -> RecordingFault:
-    """Return the delay of a cart's channel as a fault of the first recording that shows it."""
+def late_finding(late: LateChannel) -> Finding:
+    """Return the delay of a cart's channel."""
     when = "later" if late.delay > 0 else "earlier"
-    details = {"delay": f"{1e3 * abs(late.delay):.3g}", "when": when, "than": str(late.than)}
-    return RecordingFault(
-        code="late_channel", run=late.experiments[0], cart=late.cart, details=details
+    details = {"delay": f"{1e3 * abs(late.delay):.3g}", "when": when, "than": late.than}
+    return Finding(
+        code="late_channel",
+        kind="late_channel",
+        cart=late.cart,
+        details=details,
+        value=late.delay,
+        limit=late.limit,
+        excludes="no",
     )
 
 
 def late_experiments(late: Sequence[LateChannel]) -> Mapping[str, str]:
     """Return the experiments in which a cart is late, each with its sentence."""
-    return {name: late_fault(one).reason for one in reversed(late) for name in one.experiments}
+    return {name: late_finding(one).reason for one in reversed(late) for name in one.experiments}

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 from pipeline.estimation.record_fit import TIME_FACTORS
-from pipeline.identify.findings import SAME_SIZE, SIGMAS, RecordingFault
+from pipeline.identify.findings import SAME_SIZE, SIGMAS, Finding
 from pipeline.names import gain_name, own_omega, own_zeta, read_name
 from pipeline.results import Check, Estimate, LogDecrement, Record, StepGain
 
@@ -31,7 +31,7 @@ _LIKE_THE_FIT = 0.15  # relative; the usual difference of initial and final esti
 _BY_THE_BENCH = {"K": 1.6, "omega": 1.3}
 
 
-def find_outlier_repeats(records: Sequence[Record], *, unit: str) -> dict[str, RecordingFault]:
+def find_outlier_repeats(records: Sequence[Record], *, unit: str) -> dict[str, Finding]:
     """Find the repeats that do not belong with the others, by id.
 
     Repeats have the same kind, free and measured carts, and nearly the same input (in closed loop,
@@ -39,7 +39,7 @@ def find_outlier_repeats(records: Sequence[Record], *, unit: str) -> dict[str, R
     the same place. Fewer than half of a group can be flagged, so none of two. `unit` is the
     unit of positions.
     """
-    outliers: dict[str, RecordingFault] = {}
+    outliers: dict[str, Finding] = {}
     for group in _groups(records):
         differences, expected = _differences(group)
         left = list(range(len(group)))
@@ -52,9 +52,7 @@ def find_outlier_repeats(records: Sequence[Record], *, unit: str) -> dict[str, R
             name, others = group[index].id, ", ".join(group[i].id for i in left)
             details = {"others": others, "unit": unit}
             details |= {"distance": f"{distance:.3g}", "spread": f"{spread:.3g}"}
-            outliers[name] = RecordingFault(
-                code="odd_repeat", run=name, details=details, is_wrong=False
-            )
+            outliers[name] = Finding(code="odd_repeat", run=name, details=details, excludes="odd")
     return outliers
 
 
@@ -151,7 +149,7 @@ class Repeats:
     """
 
     checks: tuple[Check, ...] = ()
-    odd: dict[str, RecordingFault] = field(default_factory=dict)
+    odd: dict[str, Finding] = field(default_factory=dict)
     undecided: tuple[str, ...] = ()
 
 
@@ -200,14 +198,15 @@ def compare_repeats(
     for name, all_ in readings.items():
         for reading in all_:
             of_run.setdefault(reading.run, {})[name] = reading.value
-    odd: dict[str, RecordingFault] = {}
+    odd: dict[str, Finding] = {}
     for name, value in usual.items():
         belong = {reading.run for reading in right[name]}
         for run in [r.run for r in readings[name] if r.run not in belong and r.run not in odd]:
             clock_error = _wrong_clock(of_run[run], usual)
             if clock_error or name not in by_size:
                 wrong = clock_error or (not right[name] and _differ_in_size(readings[name]))
-                odd[run] = RecordingFault(
+                is_wrong = bool(wrong) and not _is_reversed(of_run[run], usual)
+                odd[run] = Finding(
                     code="odd_number" if right[name] else "odd_beside_dwells",
                     run=run,
                     details={
@@ -216,7 +215,7 @@ def compare_repeats(
                         "usual": f"{value:.3g}",
                         "look": f": {clock_error}" if clock_error else "",
                     },
-                    is_wrong=bool(wrong) and not _is_reversed(of_run[run], usual),
+                    excludes="wrong" if is_wrong else "odd",
                 )
     undecided = tuple(name for name in readings if name not in usual and name not in by_size)
     return Repeats(
@@ -358,7 +357,7 @@ def _check(
     readings: Sequence[_Reading],
     *,
     right: Sequence[_Reading],
-    odd: Mapping[str, RecordingFault],
+    odd: Mapping[str, Finding],
     undecided: bool,
 ) -> Check:
     values = [reading.value for reading in readings]

@@ -5,7 +5,7 @@ stiffnesses: k_(n+1) / k_n = K_(n-1) / K_n - 1. Without a spring at the far wall
 equally, and only the spring wall-1 can hold them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from pipeline.errors import DataError, SubmissionError
 from pipeline.estimation.bode_fit import fit_bode
 from pipeline.estimation.estimates import SIGMA_LIMIT
 from pipeline.estimation.step_gain import fit_step_gain
+from pipeline.identify.findings import Finding
 from pipeline.identify.model_checks import NEGLIGIBLE, check_vanishing
 from pipeline.ingest.fill import (
     Found,
@@ -32,9 +33,7 @@ from pipeline.setup import Setup
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME, spring_names
 from pipeline.words.numbers import listing, significant
-from pipeline.words.phrases import phrases
 
-_WORDS = phrases("checks")
 # A missing spring leaves a χ² that is larger by this factor. Friction or a stiffening spring is not
 # explained by another linear spring.
 _MUCH_BETTER = 100.0
@@ -182,39 +181,49 @@ def check_springs(
     checks = []
     for j in wrong[:1] if n == 1 else wrong:  # of one cart, only the sum of the springs is known
         if better and better.springs[j] is not stated[j]:
-            alone = "_alone" if better.before is None else ""
-            key, value, limit = f"better_springs{alone}", better.before, better.limit
+            code = "better_springs" if better.before is not None else "better_springs_alone"
+            value, limit = better.before, better.limit
         else:
             assert last is not None
-            key, value, limit = "no_spring" if stated[j] else "spring", last, _NO_SPRING
-        message = _WORDS.text(
-            key,
-            spring=names[j],
-            named=_named(right, bench=bench),
-            before=f"K_{n - 1}",
-            last=f"K_{n}",
-            n=n,
-            value=significant(value or 0.0, digits=3),
-            percent=f"{100 * (value or 0.0):.0f}",
-            after=significant(better.after if better else 0.0, digits=3),
-            springs=toml_flags(right),
-        )
-        check = Check(
-            kind="springs",
-            parameter=f"k_{j + 1}",
-            outcome="fail",
-            value=value,
-            limit=limit,
-            message=message,
-        )
-        checks.append(check)
+            code, value, limit = "no_spring" if stated[j] else "spring", last, _NO_SPRING
+        details = {
+            "spring": names[j],
+            "named": _named(right, bench=bench),
+            "before": f"K_{n - 1}",
+            "last": f"K_{n}",
+            "n": n,
+            "value": significant(value or 0.0, digits=3),
+            "percent": f"{100 * (value or 0.0):.0f}",
+            "after": significant(better.after if better else 0.0, digits=3),
+            "springs": toml_flags(right),
+        }
+        checks.append(_spring_check(code, spring=j, details=details, value=value, limit=limit))
     if checks or bench.tied or (fit and fit.converged):
         return checks
     by_steps = decide_springs(records, n=n)
     if by_steps.is_certain and (by_steps.present[0] or by_steps.present[-1]):
-        message = _WORDS.text("tied", last=names[-1])
-        checks = [Check(kind="springs", parameter=f"k_{n + 1}", outcome="fail", message=message)]
+        checks = [_spring_check("tied", spring=n, details={"last": names[-1]})]
     return checks
+
+
+def _spring_check(
+    code: str,
+    *,
+    spring: int,
+    details: Mapping[str, object],
+    value: float | None = None,
+    limit: float | None = None,
+) -> Check:
+    """Return the failed check of a spring, which is counted from 0."""
+    return Finding(
+        code=code,
+        kind="springs",
+        parameter=f"k_{spring + 1}",
+        details=details,
+        value=value,
+        limit=limit,
+        excludes="no",
+    ).check
 
 
 def _named(right: Sequence[bool], *, bench: Setup) -> str:

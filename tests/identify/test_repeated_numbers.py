@@ -62,8 +62,8 @@ def test_the_fit_shows_which_of_two_numbers_is_wrong():
     """If the other records agree with 20 rad/s, a run that gives 0.02 rad/s is called odd."""
     found = compared([decay("a", 20.0), decay("b", 0.02)], omega_1=20.3)
     assert list(found.odd) == ["b"]
-    assert found.odd["b"].is_wrong
-    assert "milliseconds" in found.odd["b"].reason
+    assert found.odd["b"].excludes == "wrong"
+    assert found.odd["b"].code == "odd_number"
     assert found.undecided == ()
 
 
@@ -71,7 +71,7 @@ def test_without_a_fit_the_majority_of_repeats_decides():
     """If one of three gains is off by a quarter, its run is odd, though the reason is unknown."""
     found = compared(steps=[step("a", 2.0), step("b", 2.5), step("c", 2.01)])
     assert list(found.odd) == ["b"]
-    assert not found.odd["b"].is_wrong
+    assert found.odd["b"].excludes == "odd"
     assert [check.outcome for check in found.checks] == ["fail"]
 
 
@@ -81,7 +81,7 @@ def test_a_run_with_one_odd_number_is_named():
     steps += [step("d", 2.3, cart=1), step("d", 1.5, cart=2)]
     found = compared(steps=steps)
     assert list(found.odd) == ["d"]
-    assert not found.odd["d"].is_wrong
+    assert found.odd["d"].excludes == "odd"
     assert {check.id: check.outcome for check in found.checks} == {
         "repeats.K_1": "fail",
         "repeats.K_2": "pass",
@@ -102,7 +102,7 @@ def test_dampings_of_repeats_are_compared():
     """A decay with three times the damping of two others is odd; up to 1.5 times is accepted."""
     found = compared([damped("a", 0.03), damped("b", 0.031), damped("c", 0.09)])
     assert list(found.odd) == ["c"]
-    assert not found.odd["c"].is_wrong
+    assert found.odd["c"].excludes == "odd"
     assert compared([damped("a", 0.03), damped("b", 0.04)]).undecided == ()
     assert compared([damped("a", 0.03), damped("b", 0.09)]).undecided == ("zeta_1",)
     assert compared([damped("a", 0.03), damped("b", 0.09, std=0.02)]).undecided == ()
