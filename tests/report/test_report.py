@@ -647,18 +647,6 @@ def test_an_unreadable_file_asks_for_no_new_experiment():
     assert asked == [False, True]
 
 
-def test_skipped_stages_are_separated_by_semicolons():
-    """Skipped stages are separated by semicolons, since their names contain commas."""
-    skipped = tuple(
-        Skipped(stage=Stage.LOG_DECREMENT, run=f"decay-{i}", cart=1, reason="too short")
-        for i in range(5)
-    )
-    text = terminal_summary(replace(make_analysis(1, repeats=1), skipped=skipped))
-    (line,) = (line for line in text.splitlines() if "Skipped: " in line)
-    assert line.count("cart 1; ") == 3
-    assert "; 2 more; " in line
-
-
 def test_an_id_of_a_skipped_run_keeps_its_underscores(tmp_path):
     """An id with underscores is shown unchanged in the lists of skipped stages."""
     decay = Skipped(stage=Stage.LOG_DECREMENT, run="my_decay_1", cart=1, reason="too short")

@@ -179,12 +179,6 @@ def test_yaml_aliases_in_metadata_are_not_expanded(tmp_path):
     assert (found.id, found.handed_in) == ("submission_77", "")
 
 
-def test_folders_named_like_canvas_files_are_separate_submissions(tmp_path):
-    """Folders whose names look like one Canvas student's files are separate submissions."""
-    tree(tmp_path / "c", {f"team_1_{n}_lab/submission.toml": TOML for n in range(3)})
-    assert len(hand_ins(tmp_path, tmp_path / "c")) == 3
-
-
 def test_a_folder_keeps_its_name_whatever_platform_it_looks_like(tmp_path):
     """A team's folder keeps its name, even if it looks like the name of a file from Canvas."""
     names = ("throne_2026_03_alpha", "throne_2026_03_beta", "sec_01_02_x", "ME405_03_07_team")

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import SubmissionError
-from pipeline.grading.intake.unpack import HAND_IN, UnpackLimits, is_debris, member_names, unpack
+from pipeline.grading.intake.unpack import HAND_IN, UnpackLimits, member_names, unpack
 from tests.helpers.hostile import overlapping
 
 SMALL = UnpackLimits(members=20, total=100_000, ratio=200.0, directory=10_000)
@@ -38,11 +38,14 @@ def test_files_are_unpacked_without_debris(tmp_path):
         "team/submission.toml": "x",
         "team/data/step.csv": "1,2",
         "__MACOSX/team/._submission.toml": "junk",
+        "team/data/._step.csv": "junk",
+        "team/data/_step.csv": "3,4",
         "team/.DS_Store": "junk",
         "team/Thumbs.db": "junk",
     }
     assert unpack(zipped(tmp_path / "a.zip", members), tmp_path / "out", limits=HAND_IN) == {}
-    assert files_below(tmp_path / "out") == ["team/data/step.csv", "team/submission.toml"]
+    kept = ["team/data/_step.csv", "team/data/step.csv", "team/submission.toml"]
+    assert files_below(tmp_path / "out") == kept
 
 
 @pytest.mark.parametrize(
@@ -79,19 +82,20 @@ def test_links_pipes_and_devices_are_refused(tmp_path, mode, reason):
 
 
 @pytest.mark.parametrize(
-    ("members", "reason"),
+    ("members", "limits", "reason"),
     [
-        ({"zeros": "0" * 90_000_000}, "unpacks to more than"),
-        ({"zeros": "0" * 2_000_000}, "unpacks to more than"),
-        ({str(i): "" for i in range(21)}, "more than 20 files"),
+        ({"zeros": "0" * 2_000_000}, SMALL, "unpacks to more than"),
+        ({"zeros": "0" * 20_000_000}, HAND_IN, "200 times its size"),
+        ({str(i): "" for i in range(21)}, SMALL, "more than 20 files"),
     ],
 )
-def test_zip_bombs_are_stopped(tmp_path, members, reason):
+def test_zip_bombs_are_stopped(tmp_path, members, limits, reason):
     """While a zip bomb is unpacked, limits on size, ratio and number of files stop it."""
     archive = zipped(tmp_path / "bomb.zip", members)
     with pytest.raises(SubmissionError, match=reason):
-        unpack(archive, tmp_path / "out", limits=SMALL)
-    assert sum(p.stat().st_size for p in tmp_path.rglob("*") if p.suffix != ".zip") <= 100_000
+        unpack(archive, tmp_path / "out", limits=limits)
+    written = sum(p.stat().st_size for p in tmp_path.rglob("*") if p.is_file() and p != archive)
+    assert written <= min(limits.total, 10_000_000)
 
 
 def test_the_64_bit_length_of_the_contents_is_limited_too(tmp_path):
@@ -111,13 +115,6 @@ def test_the_64_bit_length_of_the_contents_is_limited_too(tmp_path):
     with pytest.raises(SubmissionError, match="table of contents"):
         unpack(archive, tmp_path / "out", limits=BRIEF)
     assert member_names(archive, limits=BRIEF) == []
-
-
-def test_a_high_ratio_is_refused_even_below_the_size_limit(tmp_path):
-    """A file that unpacks to over 200 times its size is refused, even below the size limit."""
-    archive = zipped(tmp_path / "bomb.zip", {"zeros": "0" * 20_000_000})
-    with pytest.raises(SubmissionError, match="200 times its size"):
-        unpack(archive, tmp_path / "out", limits=HAND_IN)
 
 
 def test_a_zip_bomb_with_a_false_size_is_refused(tmp_path):
@@ -169,13 +166,6 @@ def test_any_bytes_are_unpacked_or_refused(tmp_path_factory, junk, at, patch):
         member_names(path)
         with suppress(SubmissionError):
             unpack(path, folder / str(number), limits=SMALL)
-
-
-def test_debris_is_distinguished_from_work():
-    """Hidden files that macOS adds are ignored; a student's file with an odd name is kept."""
-    assert is_debris(PurePosixPath("a/._step.csv"))
-    assert is_debris(PurePosixPath("__MACOSX/a"))
-    assert not is_debris(PurePosixPath("a/_step.csv"))
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
