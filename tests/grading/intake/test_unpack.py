@@ -37,7 +37,7 @@ def test_files_are_unpacked_without_debris(tmp_path):
     members = {
         "team/submission.toml": "x",
         "team/data/step.csv": "1,2",
-        "__MACOSX/team/._submission.toml": "junk",
+        "__MACOSX/team/submission.toml": "junk",
         "team/data/._step.csv": "junk",
         "team/data/_step.csv": "3,4",
         "team/.DS_Store": "junk",
