@@ -14,7 +14,11 @@ from pipeline.errors import ConfigError
 from pipeline.experiments.plan import load_plan, plan_path, plan_text
 from pipeline.experiments.propose import propose_plan
 from pipeline.gap.types import read_gap
-from pipeline.grading.intake.lms_names import gradescope_metadata
+from pipeline.grading.intake.late_table import read_late_table
+from pipeline.grading.intake.lms_names import Platform, gradescope_metadata
+from pipeline.grading.publish.roster import Roster
+from pipeline.grading.publish.students import Student
+from pipeline.grading.publish.survey import read_survey, survey_dict, survey_text
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.json_files import json_text
 from pipeline.report.gap.verdict import terminal_verdict
@@ -23,13 +27,22 @@ from pipeline.resources import RUBRICS
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission
 from pipeline.submission.toml import MOST_LISTED
+from tests.grading.publish.test_survey import write_paper
 from tests.helpers.acquisitions import Notes, write_work
-from tests.helpers.poison import damaged, poisoned_json, poisoned_toml
+from tests.helpers.grades import make_grade
+from tests.helpers.poison import damaged, poisoned_json, poisoned_table, poisoned_toml
 from tests.ingest.test_spoilt_files import FILES, few_lines_at_most
 from tests.report.test_gap import make_gap, two_cart_analysis
 
-NAMES = ("submission_metadata.yml", "rubric.toml", "plan.toml", "results.json", "gap.json",
+ROSTERS: dict[Platform, str] = {
+    "canvas": "Student,ID,SIS User ID,Section,Lab 3 (77)\nJane Doe,7,s1,A,\nBob,8,s2,A,4\n",
+    "moodle": "Identifier,Full name,Email address,Grade\nParticipant 7,Jane Doe,s1,\n",
+    "gradescope": "Name,SID,Email,Total Score\nJane Doe,s1,j@x,\nBob,s2,b@x,3\n",
+}
+NAMES = ("survey.csv", *(f"{name}.csv" for name in ROSTERS), "late.csv",
+         "submission_metadata.yml", "rubric.toml", "plan.toml", "results.json", "gap.json",
          "model.json", "import")  # fmt: skip
+LATE = "submission,days_late\nteam-1,0.5\nteam-2,2\nteam-3,0\n"
 SENT = """submission_77001:
   :submitters:
   - :name: Jane Doe
@@ -43,9 +56,13 @@ def sound() -> dict[str, bytes]:
     with tempfile.TemporaryDirectory() as folder:
         submission = load_submission(write_work(Path(folder), []))
         plan = plan_text(propose_plan(submission), submission.system).encode()
+        survey = write_paper(Path(folder) / "survey.csv").read_bytes()
     analysis = two_cart_analysis()
     gap = json_text(make_gap(keys=("coulomb_friction", "input_delay"))).encode()
     return {
+        "survey.csv": survey,
+        **{f"{name}.csv": text.encode() for name, text in ROSTERS.items()},
+        "late.csv": LATE.encode(),
         "submission_metadata.yml": SENT.encode(),
         "rubric.toml": (RUBRICS / "throne-2dof.toml").read_bytes(),
         "plan.toml": plan,
@@ -64,12 +81,29 @@ def spoilt(name: str, rng: Random) -> bytes:
         return json.dumps(poisoned_json(json.loads(raw), rng)).encode()
     if name.endswith(".toml"):
         return poisoned_toml(raw.decode(), rng).encode("utf-8", "replace")
+    if name.endswith(".csv"):
+        try:
+            return poisoned_table(raw.decode(), rng).encode("utf-8", "replace")
+        except ValueError:  # some tables contain words
+            return damaged(raw, rng)
     return damaged(raw, rng)
 
 
 def use(name: str, path: Path) -> None:
     """Read a file with the function for its name, and use the result."""
-    if name == "submission_metadata.yml":
+    student = Student(
+        id="s1", name="Jane Doe", number="7", grade=make_grade("a"), by_hand=frozenset()
+    )
+    if name == "survey.csv":
+        survey = read_survey(path)
+        json.dumps(survey_dict(survey), allow_nan=False)
+        survey_text(survey)
+    elif path.stem in ROSTERS:
+        roster = Roster.read(path, platform=path.stem)  # type: ignore[arg-type]
+        roster.fill([student], {"Lab 3": lambda student: "1"})
+    elif name == "late.csv":
+        read_late_table(path)
+    elif name == "submission_metadata.yml":
         gradescope_metadata(path.parent)
     elif name == "rubric.toml":
         load_rubric(path)
