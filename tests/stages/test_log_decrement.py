@@ -396,6 +396,31 @@ def test_what_no_law_explains_is_unknown_and_widens_the_errors():
 # ---------------------------------------------------------------- standard errors
 
 
+def flags(seeds, *, d):
+    """Return, for each random decay with friction band d, whether dry friction is found."""
+    found = []
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        run = released(
+            zeta=rng.uniform(0.01, 0.2),
+            d=d,
+            omega_n=rng.uniform(12, 35),
+            start=rng.choice([-1, 1]) * rng.uniform(0.7, 1.8),
+            fs=rng.choice([113.1, 250.0]),
+            duration=rng.uniform(2.0, 5.0),
+            noise=rng.choice([0.0, 0.2, 0.5]) * COUNT,
+            rng=rng,
+        )
+        found.append(fit_log_decrement(run, cart=1).law.is_friction)
+    return np.array(found)
+
+
+def test_friction_is_found_only_if_there_is_some():
+    """Dry friction is found in all of twenty decays with d = 0.01 cm, and in none without it."""
+    assert not flags(20, d=0.0).any()
+    assert flags(20, d=0.01).all()
+
+
 def standardised(seeds):
     """Return the errors of (ζ, ω_n, ζ by peaks), divided by their standard errors.
 
@@ -429,7 +454,8 @@ def test_the_standard_errors_are_about_right():
 def test_the_standard_errors_of_a_law_are_about_right(name):
     """Over 40 noisy decays, the errors of a law's numbers are as large as their standard errors.
 
-    The root mean square is 1 ± 4/sqrt(80). What a law neglects is stated too, but is small here.
+    The root mean square is 1 ± 4/sqrt(80). The error of neglected terms is stated too; here it is
+    small.
     """
     errors = []
     for seed in range(40):
