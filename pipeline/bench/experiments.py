@@ -7,6 +7,7 @@ from pipeline.bench.raw import FOLDER, RawRun, read_raw
 from pipeline.bench.stream import Stream
 from pipeline.errors import ConfigError, DataError
 from pipeline.experiments.plan import Plan, PlanLimits, Recording
+from pipeline.ingest.columns import is_count
 from pipeline.ingest.read import DUTY_COUNT
 from pipeline.output import new_folder, own_folder, write_file
 from pipeline.protocol import FULL_SCALE, Description, Reading
@@ -176,7 +177,7 @@ def prepare_submission(folder: Path, bench: Description, *, stock: bool) -> Subm
         )
     missing: dict[str, float] = {}
     if system.position.per_count is None:
-        counts = stock or _is_count(system.position.unit)
+        counts = stock or is_count(system.position.unit)
         stated = ("count", 1.0) if counts else (bench.position_unit, bench.position_per_count)
         missing["position"] = _scale(folder, "position", system.position.unit, stated)
     if system.input.per_count is None:
@@ -239,13 +240,9 @@ def limit_words(limits: PlanLimits, submission: Submission, bench: Description) 
     )
 
 
-def _is_count(unit: str) -> bool:
-    return unit.rstrip("s") == "count"
-
-
 def _scale(folder: Path, name: str, unit: str, stated: tuple[str, float]) -> float:
     stated_unit, per_count = stated
-    if unit != stated_unit and not (_is_count(unit) and _is_count(stated_unit)):
+    if unit != stated_unit and not (is_count(unit) and is_count(stated_unit)):
         raise ConfigError(
             f"{folder.resolve().name}/{NAME}: state how many {unit} one count is (the bench states "
             f'{stated_unit}): {name} = {{ unit = "{unit}", per_count = … }} under [system]'

@@ -11,7 +11,7 @@ from pipeline.bench.events import Observer
 from pipeline.bench.experiments import add_experiment
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.experiments.plan import Plan, Recording, hold_words, load_plan, plan_path
-from pipeline.ingest.files import ENDINGS
+from pipeline.ingest.files import ENDINGS, OF_STRANGERS
 from pipeline.ingest.fill import experiment_entry, free_carts, free_id
 from pipeline.ingest.inspect import Inspection, inspect_file
 from pipeline.output import own_folder
@@ -52,6 +52,7 @@ class Importer:
     def __init__(self, folder: Path, source: Path, *, observer: Observer) -> None:
         if not source.is_dir():
             raise ConfigError(f"{source}: not a folder")
+        OF_STRANGERS.set(True)
         self._folder = folder
         self._source = source
         self._observer = observer
@@ -182,9 +183,10 @@ class Importer:
         if inspection.cut_short:
             if not final and self._unchanged[path] < 20:  # its last line may still be written
                 self._over.discard(path)
-            else:
+                return None
+            if inspection.unusable:
                 self._observer.remark(f"{path.name}: not imported: {inspection.problems[0]}")
-            return None
+                return None
         planned = self._match(inspection)
         kind = planned.kind if planned else inspection.kind
         if kind is None:

@@ -301,7 +301,7 @@ def _weighted_mean(values: Array, std: Array) -> tuple[float, float]:
 def response_from_records(records: Sequence[Record]) -> tuple[FrequencyResponse, ...]:
     """Return the frequency response of each cart from step and sweep records with all carts free.
 
-    Each record gives a ratio of transforms (`record_transforms`). These ratios are averaged with
+    Each record gives a ratio of transforms (`transfer_ratio`). These ratios are averaged with
     weights, and their scatter is included in the standard error. Only frequencies at which the
     input moves the cart are returned.
 

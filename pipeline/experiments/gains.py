@@ -142,9 +142,9 @@ def propose_pid(
         # This gives a damping ratio of 0.5, with all carts as one mass.
         damping = 2 * 0.5 * float(np.sqrt((stiffness + kp) * chain.m.sum()))
         loop = PidLoop(
-            kp=_typed(counts * kp),
-            ki=_typed(counts * kp * slowest * 0.25),  # slower than any pole
-            kd=_typed(counts * damping) if damped else 0.0,
+            kp=rounded(counts * kp),
+            ki=rounded(counts * kp * slowest * 0.25),  # slower than any pole
+            kd=rounded(counts * damping) if damped else 0.0,
         )
         try:
             trial.refuse_pid(loop)
@@ -177,7 +177,8 @@ def _six_digits(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-def _typed(value: float) -> float:
+def rounded(value: float) -> float:
+    """Return the number with two significant digits."""
     return float(f"{value:.2g}")
 
 

@@ -14,7 +14,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from pipeline.errors import ConfigError, DataError
-from pipeline.experiments.gains import propose_pid
+from pipeline.experiments.gains import propose_pid, rounded
 from pipeline.experiments.plan import (
     Plan,
     PlanLimits,
@@ -373,11 +373,6 @@ def _loop(
         recording, submission=submission, analysis=analysis, bench=bench, limits=limits
     )
     return recording.model_copy(update={"controller": pid})
-
-
-def rounded(value: float) -> float:
-    """Return the number with two significant digits."""
-    return float(f"{value:.2g}")
 
 
 def rounded_down(value: float) -> float:

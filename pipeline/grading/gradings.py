@@ -69,7 +69,7 @@ class Grading(Member):
     ----------
     settled : False if the next run must grade the submission again, for example after a crash.
     grade : text of `grade.json`, without the flag for shared data and without overrides.
-    findings : results of the checks, as `judge.reweigh` stores them; "" if grading failed.
+    findings : results of the checks, as `judge.recompute_points` stores them; "" if grading failed.
     figures : file name and SVG text of each figure in the feedback.
     detail : for developers: the traceback of an error in the grader, or "".
     is_disk_full : whether the disk was full; the gradebook does not store this.
@@ -120,7 +120,7 @@ class Batch:
     failed : name and reason for each submission that could not be graded.
     unsettled : failed submissions that the next run grades again.
     disk_full : submissions that failed because the disk was full.
-    kept, moved, taken_over : changes to the class list; see `so_far.SoFar`.
+    kept, moved, taken_over : changes to the class list; see `class_changes.ClassChanges`.
     """
 
     keys: tuple[str, ...]

@@ -253,7 +253,9 @@ def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, Finding]:
         # The difference must exceed the amount by which friction may hold the carts off.
         if least > 1.3 * (abs(before.gain) + SIGMAS * before.gain_std):
             details = {"times": f"{abs(gain.gain / before.gain):.3g}", "before": str(cart - 1)}
-            found[run] = Finding(code="too_far", run=run, cart=cart, details=details)
+            found[run] = Finding(
+                code="too_far", run=run, cart=cart, details=details, excludes="wrong"
+            )
     return found
 
 
@@ -305,11 +307,17 @@ def _dead_channels(
         never = is_driven(record) and cart not in moving
         noise = _is_noise(record, cart)
         if noise and (record.kind == "decay" or cart not in moving):
-            yield Finding(code="only_noise", run=record.id, cart=cart)
+            yield Finding(code="only_noise", run=record.id, cart=cart, excludes="wrong")
         elif np.ptp(y) == 0 and (record.kind == "decay" or never):
             others = [free for free in record.free if free != cart]
             code = "never_changes_held" if others else "never_changes"
-            yield Finding(code=code, run=record.id, cart=cart, details={"others": str(others)})
+            yield Finding(
+                code=code,
+                run=record.id,
+                cart=cart,
+                details={"others": str(others)},
+                excludes="wrong",
+            )
         if chain is None or record.u is None or not is_driven(record):
             continue
         force = force_on(record, chain, cart=cart)
@@ -320,10 +328,12 @@ def _dead_channels(
             if not _must_move(record, chain, still, cart=cart, step=steps[cart]):
                 continue
             if noise:
-                yield Finding(code="only_noise", run=record.id, cart=cart)
+                yield Finding(code="only_noise", run=record.id, cart=cart, excludes="wrong")
                 continue
             code = "dead" if np.ptp(y) == 0 else "froze_at_input"
-            yield Finding(code=code, run=record.id, cart=cart, details=_span(record, still))
+            yield Finding(
+                code=code, run=record.id, cart=cart, details=_span(record, still), excludes="wrong"
+            )
 
 
 def _frozen(
@@ -363,7 +373,13 @@ def _frozen(
             # motion.
             if follows and np.sqrt(elsewhere) < 0.25 * moved:
                 details = _span(record, part)
-                yield Finding(code="froze_in_motion", run=record.id, cart=cart, details=details)
+                yield Finding(
+                    code="froze_in_motion",
+                    run=record.id,
+                    cart=cart,
+                    details=details,
+                    excludes="wrong",
+                )
 
 
 def _span(record: Record, part: slice) -> dict[str, str]:
@@ -394,7 +410,9 @@ def _copies(records: Sequence[Record]) -> dict[str, Finding]:
         what = (record.kind, record.free, record.t.tobytes(), record.y.tobytes())
         if first.setdefault(what, record.id) != record.id:
             details = {"original": first[what]}
-            copies[record.id] = Finding(code="copied_samples", run=record.id, details=details)
+            copies[record.id] = Finding(
+                code="copied_samples", run=record.id, details=details, excludes="wrong"
+            )
     return copies
 
 
@@ -404,7 +422,7 @@ def _short_dwell(record: Record) -> Iterator[Finding]:
         cycles = record.omega * duration / (2 * np.pi)
         if cycles < _FEWEST_CYCLES:
             details = {"cycles": f"{_FEWEST_CYCLES:g}"}
-            yield Finding(code="short_dwell", run=record.id, details=details)
+            yield Finding(code="short_dwell", run=record.id, details=details, excludes="wrong")
 
 
 def _wrong_clock(record: Record, *, usual: float) -> Iterator[Finding]:
@@ -417,7 +435,7 @@ def _wrong_clock(record: Record, *, usual: float) -> Iterator[Finding]:
         is_unit = max(factor, 1 / factor) >= 100.0
         if is_unit and abs(record.sample_time - factor * usual) < SAME * factor * usual:
             details = {"apart": f"{record.sample_time:.3g}", "usual": f"{usual:.3g}", "look": words}
-            yield Finding(code="other_clock", run=record.id, details=details)
+            yield Finding(code="other_clock", run=record.id, details=details, excludes="wrong")
 
 
 # ------------------------------------------------------- records that follow no carts
@@ -426,7 +444,7 @@ def _wrong_clock(record: Record, *, usual: float) -> Iterator[Finding]:
 def _correction_fault(record: Record, correction: Correction, everywhere: bool) -> Finding:
     code = "misread_everywhere" if everywhere else "misread"
     details = {"look": correction.words, "remedy": correction.remedy}
-    return Finding(code=code, run=record.id, details=details)
+    return Finding(code=code, run=record.id, details=details, excludes="wrong")
 
 
 def _strays(

@@ -52,7 +52,7 @@ class Finding:
     details: Mapping[str, object] = field(default_factory=dict)
     value: float | None = None
     limit: float | None = None
-    excludes: Excludes = "wrong"
+    excludes: Excludes
 
     @property
     def reason(self) -> str:

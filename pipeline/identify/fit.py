@@ -296,7 +296,7 @@ def _conflict(
     of_mine, of_theirs = (" and ".join(sorted(kinds)) for kinds in (mine - theirs, theirs - mine))
     details = {"mine": of_mine, "theirs": of_theirs, "example": example, "look": misread.words}
     return {
-        name: Finding(code="contradicting_kinds", run=name, details=details)
+        name: Finding(code="contradicting_kinds", run=name, details=details, excludes="wrong")
         for kind in mine ^ theirs
         for name in ids[kind]
     }

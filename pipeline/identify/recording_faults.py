@@ -238,7 +238,9 @@ def find_other_units(records: Sequence[Record], *, decays: bool = False) -> dict
                 continue
             for scale in [s for s in scales if _alike(step, s * usual)]:
                 details = {"scale": f"{scale:.3g}"}
-                fault = Finding(code="other_unit", run=record.id, cart=cart, details=details)
+                fault = Finding(
+                    code="other_unit", run=record.id, cart=cart, details=details, excludes="wrong"
+                )
                 found.setdefault(record.id, fault)
     return found
 
@@ -269,7 +271,9 @@ def find_stuck(records: Sequence[Record]) -> dict[str, Finding]:
                 away = last < moves.size and moves[last] >= 1.5 * fastest
                 if away or moves[first - 1] >= 0.6 * fastest:
                     details = {"first": f"{record.t[first]:.4g}", "last": f"{record.t[last]:.4g}"}
-                    fault = Finding(code="stuck", run=record.id, cart=cart, details=details)
+                    fault = Finding(
+                        code="stuck", run=record.id, cart=cart, details=details, excludes="wrong"
+                    )
                     found.setdefault(record.id, fault)
     return found
 
@@ -286,7 +290,9 @@ def find_other_kinds(records: Sequence[Record], *, files: Mapping[str, str]) -> 
         original = first.setdefault(files.get(record.source, record.source), record.source)
         if original != record.source:
             details = {"source": record.source, "original": original}
-            found[record.id] = Finding(code="copied_file", run=record.id, details=details)
+            found[record.id] = Finding(
+                code="copied_file", run=record.id, details=details, excludes="wrong"
+            )
         for fault in (*_another_input(record, largest=largest), *_cut(record, records)):
             found.setdefault(record.id, fault)
     return found
@@ -297,11 +303,11 @@ def _another_input(record: Record, *, largest: float) -> Iterator[Finding]:
     if u is None:
         return
     if record.kind == "step" and not (np.any(u) and is_stepped(u)):
-        yield Finding(code="no_step", run=record.id)
+        yield Finding(code="no_step", run=record.id, excludes="wrong")
     if record.kind == "sine" and not _is_sine(record.t, u):
-        yield Finding(code="no_sine", run=record.id)
+        yield Finding(code="no_sine", run=record.id, excludes="wrong")
     if record.kind == "decay" and float(np.ptp(u[u.size // 2 :])) > 1e-3 * largest:
-        yield Finding(code="driven_decay", run=record.id)
+        yield Finding(code="driven_decay", run=record.id, excludes="wrong")
 
 
 def _is_sine(t: Array, u: Array) -> bool:
@@ -330,7 +336,7 @@ def _cut(record: Record, records: Sequence[Record]) -> Iterator[Finding]:
         return
     if length < 0.5 * usual and record.t.size < 0.5 * samples:
         details = {"length": f"{length:.3g}", "usual": f"{usual:.3g}"}
-        yield Finding(code="cut", run=record.id, details=details)
+        yield Finding(code="cut", run=record.id, details=details, excludes="wrong")
 
 
 def find_late_channels(records: Sequence[Record], *, carts: int) -> tuple[LateChannel, ...]:

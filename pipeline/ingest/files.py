@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, replace
 from functools import cache
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,8 @@ _READERS: tuple[tuple[Callable[[bytes], bool], Callable[..., list[FileTable]]], 
 MOST_MEMORY = 900_000_000  # bytes to read one file; the largest recording takes 850,000,000
 MOST_SECONDS = 30.0  # of processor time to read one file; the largest recording takes ten
 _WAIT = 600.0  # s; longer than the processor time takes on a busy computer
-# Whether the files are those of strangers, as in a process that grades.
+_OUT_OF_TIME = "signal 24"  # SIGXCPU, on Linux and macOS
+# Whether a file that crashes its reader may not end this process, as when it grades or imports.
 OF_STRANGERS: ContextVar[bool] = ContextVar("OF_STRANGERS", default=False)
 
 # A `.mat` file of version 4 begins with a type, two sizes, a flag, and the length of a name.
@@ -166,14 +168,22 @@ def _limited(source: str) -> Iterator[None]:
             signal.setitimer(signal.ITIMER_VIRTUAL, 0)
             signal.signal(signal.SIGVTALRM, before)
     except _TooLong:
-        why = f"takes more than {MOST_SECONDS:g} s of processor time to read"
+        fault = _too_costly(source)
     except MemoryError:
         if not own:  # the whole submission needs more than it may
             raise
-        why = f"needs more than {MOST_MEMORY / 1e9:g} GB of memory to read"
+        fault = _too_costly(source, memory=True)
     else:
         return
-    raise SubmissionError(f"{source}: {why}; save the recording as CSV")
+    raise fault
+
+
+def _too_costly(source: str, *, memory: bool = False) -> SubmissionError:
+    """Return the error for a file whose reading takes too much time or memory."""
+    why = f"takes more than {MOST_SECONDS:g} s of processor time to read"
+    if memory:
+        why = f"needs more than {MOST_MEMORY / 1e9:g} GB of memory to read"
+    return SubmissionError(f"{source}: {why}; save the recording as CSV")
 
 
 @cache
@@ -191,23 +201,43 @@ def _parse_apart(raw: bytes, *, source: str) -> list[FileTable]:
     """
     task = {"raw": b64encode(raw).decode("ascii"), "source": source}
     try:
-        return [_unpacked(table) for table in _reader().do(task, limit=_WAIT)]
+        answer = _reader().do(task, limit=_WAIT)
     except Ended as error:
-        if error.how == "start":
+        if error.how in ("start", "stopped"):
             raise OSError(str(error)) from error
+        if error.how == "memory":
+            raise _too_costly(source, memory=True) from None
+        if error.how == "time" or error.status == _OUT_OF_TIME:
+            raise _too_costly(source) from None
         raise SubmissionError(f"{source}: the .mat file is damaged or truncated") from None
-    except Failed as error:
-        raise SubmissionError(str(error)) from None
+    except Failed as error:  # a fault of this program, not of the file
+        raise RuntimeError(str(error)) from error
+    if "refused" in answer:
+        raise SubmissionError(answer["refused"])
+    return [_unpacked(table) for table in answer["tables"]]
 
 
-def _parse_here(task: dict[str, str], _: object) -> list[dict[str, Any]]:
-    """Return the recordings of a file as plain data; this runs in the process of `_reader`."""
-    with _limited(task["source"]):
-        tables = parse_tables(b64decode(task["raw"]), source=task["source"])
-    return [
+def _parse_here(task: dict[str, str], _: object) -> dict[str, Any]:
+    """Return the recordings of a file as plain data; this runs in the process of `_reader`.
+
+    If a library never returns to Python, `_limited` cannot stop it; then the process is ended.
+    """
+    if sys.platform != "win32":
+        import resource
+
+        used = sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
+        _, hard = resource.getrlimit(resource.RLIMIT_CPU)
+        resource.setrlimit(resource.RLIMIT_CPU, (ceil(used + MOST_SECONDS) + 5, hard))
+    try:
+        with _limited(task["source"]):
+            tables = parse_tables(b64decode(task["raw"]), source=task["source"])
+    except SubmissionError as error:
+        return {"refused": str(error)}
+    plain = [
         asdict(table) | {"values": b64encode(table.values.tobytes()).decode("ascii")}
         for table in tables
     ]
+    return {"tables": plain}
 
 
 def _unpacked(plain: dict[str, Any]) -> FileTable:
@@ -289,10 +319,6 @@ def _continues(before: FileTable, after: FileTable) -> bool:
         return False
     times = [i for i, name in enumerate(before.names) if is_time(name)]
     return bool(times and after.values[times[0], 0] > before.values[times[0], -1])
-
-
-if __name__ == "__main__":
-    serve(lambda: _parse_here)
 
 
 # ------------------------------------------------------------------------------------------ folders
@@ -429,3 +455,7 @@ def _is_hidden(name: str) -> bool:
 def _natural(path: Path) -> list[tuple[str, int]]:
     parts = re.findall(r"(\D*)(\d{0,9})", path.as_posix().casefold())
     return [(text, int(n or -1)) for text, n in parts]
+
+
+if __name__ == "__main__":
+    serve(lambda: _parse_here)

@@ -220,7 +220,7 @@ def _inspect(table: FileTable, path: Path, *, columns: Mapping[str, str | int]) 
         variables=table.variables,
         guessed=guessed,
         doubts=roles.doubts,
-        cut_short=bool(table.cut_short),
+        cut_short=bool(table.cut_short) or table.ends_broken,
     )
 
 

@@ -26,7 +26,7 @@ from pipeline.ingest.table import (
 )
 from pipeline.words.numbers import first_few
 
-_MOSTSETTINGS = 8  # numbers in a variable; a recording has more samples
+_MOST_SETTINGS = 8  # numbers in a variable; a recording has more samples
 _BENCH = ({"enc1", "duty", "time"}, {"cart1pos", "duty_cycle", "t_received"})
 _LONGEST_NAME, _DEEPEST = 64, 4  # characters; structs in structs
 _NUMBERS = frozenset(
@@ -139,7 +139,7 @@ def _structures(variables: Sequence[MatVariable], *, source: str) -> list[FileTa
     whole = {v.name: v for v in variables}
     if (one := _structure("", whole, source=source)) is not None:
         return [one]
-    if sum(v.values is not None and v.samples > _MOSTSETTINGS for v in variables) > 1:
+    if sum(v.values is not None and v.samples > _MOST_SETTINGS for v in variables) > 1:
         return []
     found = (
         _structure(v.name, element, source=source) for v in variables for element in v.elements
@@ -166,7 +166,7 @@ def _structure(name: str, fields: Mapping[str, MatVariable], *, source: str) -> 
         if values.shape[0] == longest and values.shape[1] <= MOST_COLUMNS:
             label = label if values.shape[1] == 1 else ""  # it does not name several signals
             columns += [(label, column) for column in values.T]
-    if len(columns) < 2 or longest <= _MOSTSETTINGS:
+    if len(columns) < 2 or longest <= _MOST_SETTINGS:
         return None
     named = all(label for label, _ in columns)
     names = [label if named else str(i) for i, (label, _) in enumerate(columns, start=1)]

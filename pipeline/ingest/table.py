@@ -59,6 +59,7 @@ class FileTable:
     lines : (n,) line of the file in which each row is written; None for a binary file.
     lines_are : what `lines` counts: "line", or "row" for a sheet.
     cut : the broken last line of a truncated file; None if the file is complete.
+    ends_broken : whether the last line is broken, as in a file that is still being written.
     notes : repairs and omissions made while reading.
     variables : the variables of a binary file, in the order of the file.
     partial : columns left out because cells are empty or not numbers: heading to a description.
@@ -72,6 +73,7 @@ class FileTable:
     whole: tuple[bool, ...]
     lines: NDArray[np.int64] | None
     cut: str | None = None
+    ends_broken: bool = False
     notes: tuple[str, ...] = ()
     lines_are: str = "line"
     variables: tuple[Variable, ...] = ()

@@ -470,6 +470,7 @@ def read_block(
         lines=np.array(lines),
         lines_are=block.line,
         cut=cut,
+        ends_broken=lines[-1] != block.rows[-1][0],
         notes=(*block.notes, *notes),
         partial=partial,
     )

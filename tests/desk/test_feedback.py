@@ -207,6 +207,8 @@ def test_a_request_goes_from_the_student_to_the_ta_and_back(released, book):
     assert "No request waits" in ta.get(QUEUE).text
     team = ta.get(ROOM + "team?of=team-04&criterion=laws").text
     assert "Another look: answered" in team
+    (link,) = re.findall(r'href="([^"]*requests\?[^"]*)"', team)
+    assert ta.get(unescape(link)).status == 200
     for step in ("asked     laws: by s4: see page 3", "answered  laws: 0.5 by hand, by Ada"):
         assert step in team
     assert ask(student).status == 422

@@ -122,7 +122,7 @@ def test_a_last_line_that_is_cut_is_skipped(tmp_path):
     (tmp_path / "a.csv").write_text(text + "\n10.0")
     got = inspect_file(tmp_path / "a.csv")
     assert got.samples == 2000
-    assert not got.unusable
+    assert (got.unusable, got.cut_short) == ((), True)
     (problem,) = got.problems
     assert "line 2002" in problem
 

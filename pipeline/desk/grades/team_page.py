@@ -212,7 +212,7 @@ def _show_page(
             (paper, f"{ask.here}paper?{urlencode({'of': name, 'file': paper})}")
             for paper in (list_papers(folder) if folder else ())
         ],
-        requests_at=f"{ask.here}again?{urlencode({'of': name})}",
+        requests_at=f"{ask.here}requests?{urlencode({'of': name})}",
         **_show_chosen(ask, shown, grade, now, chosen=chosen, wrong=wrong),
     )
 

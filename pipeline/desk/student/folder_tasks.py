@@ -87,7 +87,7 @@ def students_see(folder: str, *, progress: Progress) -> str:
 
 
 def read_folder(folder: str, check: bool, *, progress: Progress) -> dict[str, Any]:
-    """Return the state of a folder, as `Room` shows it.
+    """Return the state of a folder, as `SubmissionView` shows it.
 
     The keys are the `text` of `submission.toml`, the `document` in it, and its `fault` (None for a
     valid file). `doubts` are marked in it; `keeps` says why the folder cannot be handed in.

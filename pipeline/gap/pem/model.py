@@ -9,7 +9,6 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.gap.pem import kernel
-from pipeline.gap.pem import kernel as forces
 from pipeline.gap.runs import GapRun
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import Chain
@@ -50,7 +49,7 @@ DRIVE_COLUMNS = (
     Drive.INPUT_DELAY_DELAY,
     Drive.ACTUATOR_LAG_TIME_CONSTANT,
 )
-DEAD_ZONE, LIMIT, DELAY, LAG = range(forces.DRIVE)
+DEAD_ZONE, LIMIT, DELAY, LAG = range(kernel.DRIVE)
 
 
 def column_set(columns: Iterable[IntEnum]) -> frozenset[Column]:
@@ -143,7 +142,7 @@ class LawSet:
     @cached_property
     def base(self) -> int:
         """The number of parameters of chain and drive."""
-        return 3 * self.bench.n + 1 + forces.DRIVE
+        return 3 * self.bench.n + 1 + kernel.DRIVE
 
     @cached_property
     def first(self) -> np.ndarray:
@@ -485,17 +484,17 @@ def errors_of(
     DX, DV = np.zeros((n, lanes)), np.zeros((n, lanes))
     for i in np.flatnonzero(track.free) if derive else ():
         DX[i, p.size + i], DX[i, p.size + n + i], DV[i, p.size + 2 * n + i] = -1.0, 1.0, 1.0
-    aux, DA = np.zeros((count, forces.ROOM)), np.zeros((2 * count, lanes))
+    aux, DA = np.zeros((count, kernel.ROOM)), np.zeros((2 * count, lanes))
     for law, (kind, place) in enumerate(laws.keys):
         if kind in (EffectKind.EXTRA_MODE, EffectKind.BACKLASH):
-            aux[law, : forces.OWN] = x[place], own.v0[place]
+            aux[law, : kernel.OWN] = x[place], own.v0[place]
             DA[2 * law], DA[2 * law + 1] = DX[place], DV[place]
     play = max(np.flatnonzero(laws.kinds == EffectKind.BACKLASH), default=-1)
     # With a large gain, step errors do not add up.
     longest = track.longest * (1.0 if gain > 0.05 else _FREELY)
     if play >= 0:
         longest = min(longest, _KNOCK * track.longest)
-    run = forces.PemRunArrays(
+    run = kernel.PemRunArrays(
         t=track.t,
         y=track.y,
         seen=track.seen,
@@ -509,10 +508,10 @@ def errors_of(
         gain=float(gain),
         longest=longest,
     )
-    state = forces.PemState(x, own.v0.copy(), aux, DX, DV, DA)
+    state = kernel.PemState(x, own.v0.copy(), aux, DX, DV, DA)
     room = (np.zeros(shape) for shape in (n, n, n, (n, n), (n, n), 4, 4, (n, lanes), (n, lanes)))
-    acting = forces.ActingLaws(p, laws.kinds, laws.places, laws.first, int(play))
-    fine = kernel.predict_run(acting, run, state, forces.WorkArrays(*room), E, J)
+    acting = kernel.ActingLaws(p, laws.kinds, laws.places, laws.first, int(play))
+    fine = kernel.predict_run(acting, run, state, kernel.WorkArrays(*room), E, J)
     return (E, J) if fine and np.all(np.isfinite(E)) else None
 
 
@@ -547,5 +546,5 @@ def compile_follower() -> None:
     )  # fmt: skip
     chain = Chain(m=one, c=one, k=np.array([1.0, 0.0]))
     bench = PemSetup(chain=chain, springs=(True, False), largest=1.0, free=((True,),))
-    laws = LawSet(bench=bench, keys=(), drive=(True,) * forces.DRIVE)
+    laws = LawSet(bench=bench, keys=(), drive=(True,) * kernel.DRIVE)
     errors_of(laws, laws.start(chain), track, track.fresh(), gain=0.0, derive=True)

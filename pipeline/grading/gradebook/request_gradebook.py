@@ -54,7 +54,7 @@ class OwnFeedback:
 
 @dataclass(frozen=True, kw_only=True)
 class Queued:
-    """A request as teaching assistants see it; an answer must name its `current`."""
+    """A request as teaching assistants see it; an answer must name its `version`."""
 
     entry: Entry
     request: Request
@@ -200,7 +200,7 @@ class RequestGradebook(SharedGradebook):
         ----------
         points : new points; None or the current points change nothing.
         text : answer for the students; also stored as the reason for new points.
-        version : version of the request that the person saw, from `Queued.current`.
+        version : version of the request that the person saw, from `Queued.version`.
 
         Raises
         ------
@@ -268,7 +268,7 @@ class RequestGradebook(SharedGradebook):
         Raises
         ------
         ConfigError : nobody asked about this criterion.
-        Conflict : the request or the points have changed since the version `current`.
+        Conflict : the request or the points have changed since this `version`.
         """
         last, row = self._find(connection, submission)
         request = read_requests(connection, row.submission_id, row.authors).get(criterion)

@@ -133,7 +133,10 @@ def next_answer(
         disagree=found.disagree,
         agree=found.agree,
         not_checked=found.not_checked,
-        unread=tuple(part.message for part in found.context.submission.unread),
+        unread=(
+            *(part.message for part in found.context.submission.unread),
+            *(f"{name}: {why}" for name, why in found.context.analysis.unreadable.items()),
+        ),
         doubtful=tuple(found.context.bad),
         hints=tuple(find_hint(number, found.context, found.flags) for number in hinted),
     )

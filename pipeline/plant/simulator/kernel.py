@@ -300,7 +300,7 @@ def first_switch(tables, bodies, step, none):
 def advance(tables, bodies, push, lanes):
     """Advance x, v and the presliding state z by a step, from event to event.
 
-    Derivatives are advanced too; see `make_lanes`.
+    Derivatives are advanced too; see `make_sensitivities`.
     """
     s, K, C, n, N = bodies.s, bodies.K, bodies.C, bodies.n, bodies.N
     switches, active = bodies.switches, bodies.active

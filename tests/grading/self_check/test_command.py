@@ -53,6 +53,14 @@ def test_correct_numbers_end_with_status_0(honest):
     assert len(read_answers(honest)) == 1
 
 
+def test_an_unreadable_recording_is_named_with_its_reason(honest):
+    """The answer quotes a mistyped file name and suggests the right one."""
+    change(honest, "data/step-1.csv", "data/stp-1.csv")
+    done = check(honest, "--rubric", RUBRIC)
+    assert "data/stp-1.csv" in done.stdout
+    assert "did you mean 'data/step-1.csv'" in done.stdout
+
+
 def test_the_second_answer_says_where_to_look(in_hertz):
     """The first answer names the wrong number, the second says where to look.
 
