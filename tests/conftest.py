@@ -43,7 +43,7 @@ settings.load_profile("cartlab")
 _BENCHES = "benches"  # group of the files that mostly wait for virtual benches
 _WITH_BENCHES = {
     "bench/test_acquire", "bench/test_mistakes", "bench/test_safety",
-    "simulated/emulator/test_server", "system/test_live_page",
+    "simulated/test_emulator", "system/test_live_page",
 }  # fmt: skip
 _PAGES = "pages"  # group of the files that share a browser
 _WITH_BROWSER = {
@@ -52,11 +52,11 @@ _WITH_BROWSER = {
     "system/test_report_pages",
 }  # fmt: skip
 _LONGEST = {  # each takes ten seconds or more, so it must not start late
-    "desk/test_bench", "desk/test_doors", "desk/test_grades", "desk/test_student",
+    "desk/test_bench", "desk/test_login", "desk/test_grades", "desk/test_student",
     "experiments/test_exploration", "gap/test_explain",
     "grading/autograder/test_gradescope", "grading/batch/test_faults_of_the_computer",
     "grading/mistakes/test_faults", "grading/similarity/test_shared_data",
-    "grading/test_class_so_far", "report/test_gap", "report/test_report", "report/test_solution",
+    "grading/test_class_changes", "report/test_gap", "report/test_report", "report/test_solution",
     "simulated/test_hidden", "statistics/test_gap",
 }  # fmt: skip
 _FEW = 2  # up to this many files, starting other processes takes more time than it saves

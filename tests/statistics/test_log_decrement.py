@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.stages.test_log_decrement import flags, standardised
+from tests.estimation.test_log_decrement import flags, standardised
 
 
 @pytest.mark.slow

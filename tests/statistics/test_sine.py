@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.stages.test_sine import coverage
+from tests.estimation.test_sine import coverage
 
 
 @pytest.mark.slow

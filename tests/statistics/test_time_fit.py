@@ -6,8 +6,8 @@ import pytest
 from pipeline.estimation.time_fit import fit_records
 from pipeline.plant.chain import PRESETS
 from pipeline.setup import Setup
+from tests.estimation.test_time_fit import errors
 from tests.helpers.time_records import random_chain, step_record
-from tests.stages.test_time_fit import errors
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.gap.judge import SURE, fit_free_run, judge, make_candidate, prune, significance
 from pipeline.plant.catalogue import find_effect
-from tests.gap.search.begun import COULOMB, DAHL, DELAY, begun
+from tests.gap.begun import COULOMB, DAHL, DELAY, begun
 from tests.truth.bench import Hidden
 
 

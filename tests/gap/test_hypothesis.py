@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.gap.judge import Hypothesis, Study, worth_it
 from pipeline.plant.catalogue import find_effect
-from tests.gap.search.begun import CUBIC, DELAY
+from tests.gap.begun import CUBIC, DELAY
 
 
 def judged(

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from pipeline.gap.search import Deadline, Search
-from tests.gap.search.begun import COULOMB, DELAY, begun
+from tests.gap.begun import COULOMB, DELAY, begun
 from tests.truth.bench import Hidden
 
 FRICTION = Hidden(effect="coulomb_friction", place=1, parameters={"force": 0.0006})

@@ -3,7 +3,7 @@
 from pipeline.gap.judge import judge
 from pipeline.gap.limits import BIC_DROP
 from pipeline.gap.search import find_hypotheses
-from tests.gap.search.begun import COULOMB, DELAY, begun
+from tests.gap.begun import COULOMB, DELAY, begun
 from tests.truth.bench import Hidden
 
 
