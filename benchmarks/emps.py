@@ -9,7 +9,7 @@ from benchmarks.free_runs import LINEAR_CART, OURS, left_out, start_at, words_of
 from benchmarks.page import Table, significant
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.parameters import fresh_nuisance, simulate_run
-from pipeline.gap.pem.model import compile_follower
+from pipeline.gap.pem.model import compile_predictor
 from pipeline.gap.runs import prepare
 from pipeline.plant.augmented import compile_simulator
 from pipeline.plant.effect import AugmentedChain
@@ -74,7 +74,7 @@ def tables(*, quick: bool) -> list[Table]:
         return [Table(title=title, head=head, rows=[row], note=_NOTE)]
     train, test = emps_record("train"), emps_record("test")
     compile_simulator()
-    compile_follower()
+    compile_predictor()
     began = time.process_time()
     gap = explain_gap([train], Setup(springs=SPRINGS, units=Units(position="m", input="V")))
     seconds = f"{time.process_time() - began:.0f}"

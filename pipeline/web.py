@@ -150,15 +150,15 @@ class Login(Protocol):
 
 
 class OriginCheck:
-    """Passes on requests that the door admits, and refuses those made by other pages.
+    """Passes on requests that the login admits, and refuses those made by other pages.
 
     Parameters
     ----------
     headers : security headers added to every answer, unless the page itself sets them.
     """
 
-    def __init__(self, app: ASGIApp, door: Login, *, headers: Mapping[str, str] = HEADERS) -> None:
-        self._app, self._door, self._headers = app, door, headers
+    def __init__(self, app: ASGIApp, login: Login, *, headers: Mapping[str, str] = HEADERS) -> None:
+        self._app, self._login, self._headers = app, login, headers
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, or refuse it."""
@@ -171,8 +171,8 @@ class OriginCheck:
             await send(message)
 
         headers = Headers(scope=scope)
-        why = _find_refusal(headers, scope["method"], self._door)
-        found = refuse(why) if why else self._door.enter(scope, headers)
+        why = _find_refusal(headers, scope["method"], self._login)
+        found = refuse(why) if why else self._login.enter(scope, headers)
         if isinstance(found, Response):
             await found(scope, receive, answer)
             return
@@ -196,14 +196,14 @@ def find_site(sites: Collection[str], headers: Headers) -> str:
     return next((site for site in sites if site.partition("://")[2] == host), "")
 
 
-def _find_refusal(headers: Headers, method: str, door: Login) -> str:
+def _find_refusal(headers: Headers, method: str, login: Login) -> str:
     """Return why a request must be refused, or "" if a person or our own page sent it.
 
     A request that reached this computer under a foreign name has a different Host. A request by
     another page has a different Origin. Browsers state in Sec-Fetch-Site which page caused a
     request.
     """
-    origin, site = headers.get("origin"), door.site(headers)
+    origin, site = headers.get("origin"), login.site(headers)
     if not site:
         return "use the address that cartlab printed"
     if origin != site and (origin is not None or method != "GET"):
@@ -211,6 +211,6 @@ def _find_refusal(headers: Headers, method: str, door: Login) -> str:
     if headers.get("sec-fetch-site", "none") in ("same-origin", "none"):
         return ""
     asked = headers.get("sec-fetch-mode"), headers.get("sec-fetch-dest")
-    if door.allows_arrivals and method == "GET" and asked == ("navigate", "document"):
+    if login.allows_arrivals and method == "GET" and asked == ("navigate", "document"):
         return ""
     return "another page's request"

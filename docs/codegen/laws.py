@@ -376,7 +376,7 @@ def _steps(catalogue: Iterable[Effect]) -> Iterator[str]:
     yield "    return longest, smooth\n"
 
 
-# ------------------------------------------------------------------- the functions of followers
+# ------------------------------------------------------- the functions of the prediction-error fit
 
 
 def followed(effect: Effect, catalogue: Iterable[Effect]) -> tuple[Expr, list[sympy.Symbol]]:

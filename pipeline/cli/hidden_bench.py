@@ -13,13 +13,13 @@ from pipeline.words.progress import Progress, silent
 
 def find_hidden(out: Path, *, progress: Progress) -> list[str]:
     """Write a bench with hidden friction and its gap analysis; return the messages to print."""
-    from pipeline.gap.explain import follower_compiled
+    from pipeline.gap.explain import predictor_compiled
     from pipeline.simulated.hidden import prepare_bench
     from pipeline.simulated.submission import write_submission
 
     hidden, folder = prepare_bench(preset="throne-2dof", hide=["coulomb_friction"]), out / "bench"
     if not (folder / "submission.toml").exists():
-        with follower_compiled():
+        with predictor_compiled():
             write_submission(folder, hidden, seed=0)
     _, told = explain(folder, out=out / "gap", progress=progress)
     return [*(f"hidden: {sentence}" for sentence in hidden.effect_sentences), *told]

@@ -83,7 +83,7 @@ class Points:
         ]
         spread = np.concatenate(phase_std)
         distinct, at = np.unique(omega, return_inverse=True)
-        # A phase with a standard error above this (rad) is not used.
+        # A phase with a standard error above 0.5 rad is not used.
         return cls(
             omega=distinct,
             at=at,

@@ -465,8 +465,7 @@ def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
     count = np.arange(n) - (n - 1) / 2
     late = peak_t - peak_t.mean() - interval * count
     interval_std = float(np.linalg.norm(per_time * late)) * np.sqrt(n / (n - 2))
-    # Because samples meet the motion at any phase, the decrement can still differ by this relative
-    # amount.
+    # Because samples meet the motion at any phase, the decrement can still differ by 1e-4 of it.
     return _Peaks(
         t=peak_t,
         y=peak_y,

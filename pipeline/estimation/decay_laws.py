@@ -16,6 +16,7 @@ from scipy.special import fdtri
 
 from pipeline.arrays import Array, ComplexArray
 from pipeline.estimation.least_squares import (
+    MOST_GROWTH,
     PRECISION,
     Ringing,
     SeparableModel,
@@ -27,9 +28,6 @@ from pipeline.estimation.least_squares import (
 from pipeline.results import DecayCause
 
 # ------------------------------------------------------------- the departure from an exponential
-#
-# The residual of the exponential is compared with the spectrum of the noise. The noise is the
-# residual of a flexible change of envelope, phase and rest point.
 
 _CHANCE = 1e-4  # share of exponential decays that fail the test
 _PER_PERIOD = 16  # samples per period that are enough to tell the laws apart
@@ -180,8 +178,6 @@ def thinned(t: Array, y: Array, *, omega: float) -> tuple[Array, Array]:
 #
 # Reference: B. F. Feeny and J. W. Liang, J. Sound and Vibration 195 (1996) 149-154.
 
-_MOST_LOSS = 50.0  # bound of an exponent during the fit, against overflow
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Swings:
@@ -228,12 +224,12 @@ class Swings:
         k = np.minimum(k, cycles - 1)
         tau = np.minimum(since - k * half, half)
         number = np.arange(k.min(), k.max() + 1)
-        loss = np.clip(decay * half, -_MOST_LOSS, _MOST_LOSS)  # rho = exp(-loss)
-        lost = np.clip(-loss * number, -_MOST_LOSS, _MOST_LOSS)
+        loss = np.clip(decay * half, -MOST_GROWTH, MOST_GROWTH)  # rho = exp(-loss)
+        lost = np.clip(-loss * number, -MOST_GROWTH, MOST_GROWTH)
         # (1 - rho^k) / (1 - rho), which is k without viscous damping
         geometric = np.expm1(lost) / np.expm1(-loss) if loss else number
         sign = np.where(number % 2 == 0, 1.0, -1.0)
-        left = np.exp(np.clip(-decay * tau, -_MOST_LOSS, _MOST_LOSS))
+        left = np.exp(np.clip(-decay * tau, -MOST_GROWTH, MOST_GROWTH))
         sine = left * np.sin(omega_d * tau)
         return cls(
             p=p,
@@ -265,7 +261,7 @@ class Swings:
         per_decay = sine / omega_d - tau * swing
         per_omega_d = ratio * (tau * swing - sine / omega_d) - (1 + ratio**2) * tau * sine
         # The sizes of the half cycles depend on the logarithmic loss, pi decay / omega_d.
-        rho, number = np.exp(-np.clip(np.pi * ratio, -_MOST_LOSS, _MOST_LOSS)), self.number
+        rho, number = np.exp(-np.clip(np.pi * ratio, -MOST_GROWTH, MOST_GROWTH)), self.number
         geometric = (self.pushed / self.side - 1) / (1 + rho)
         per_loss = (
             (number * np.abs(self.kept) - rho * geometric) / (1 - rho)
@@ -352,7 +348,7 @@ class Modulated:
         full[list(free)] = p
         gamma, omega, b, shift = full
         tau = np.append(np.linspace(0.0, tau[0], _LEAD), tau)
-        left = np.exp(-np.clip(gamma * tau, -_MOST_LOSS, _MOST_LOSS))
+        left = np.exp(-np.clip(gamma * tau, -MOST_GROWTH, MOST_GROWTH))
         flat = abs(gamma) * np.max(np.abs(tau)) <= _FLAT
         grown = tau * (1 - gamma * tau / 2) if flat else (1 - left) / gamma
         below = np.maximum(1 + b * grown, _LEAST)
@@ -415,7 +411,7 @@ class Modulated:
             zero = np.zeros_like(tau)
             slopes, turns = np.array([-tau, zero]), np.array([zero, tau])
             return slopes[:, _LEAD:], turns[:, _LEAD:]
-        left = np.exp(-np.clip(gamma * tau, -_MOST_LOSS, _MOST_LOSS))
+        left = np.exp(-np.clip(gamma * tau, -MOST_GROWTH, MOST_GROWTH))
         flat = abs(gamma) * np.max(np.abs(tau)) <= _FLAT
         per_gamma = -(tau**2) * (1 / 2 - gamma * tau / 3) if flat else (tau * left - grown) / gamma
         by_shift = (1 - left**2) / (2 * self.bent * omega)

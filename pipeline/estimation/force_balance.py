@@ -31,11 +31,6 @@ def bump(s: Array, *, span: Array | float) -> tuple[Array, Array, Array]:
     return b**4, 4 * b**3 * slope / span, (12 * b**2 * slope**2 - 8 * b**3) / span**2
 
 
-def motion_period(x: Array) -> float:
-    """Return the period, in samples, of a sine with the same size and speed as this motion."""
-    return float(2 * np.pi * np.std(x) / np.sqrt(np.mean(np.diff(x) ** 2)))
-
-
 def bump_integral(s: Array) -> Array:
     """Return the integral of the bump from 0 to s; these are the weights for a held input."""
     return s**5 * np.polyval([1 / 9, -1 / 2, 6 / 7, -2 / 3, 1 / 5], s)
@@ -45,6 +40,11 @@ def is_even(t: Array) -> bool:
     """Return whether the intervals between times (n,) differ only by rounding."""
     dt = np.diff(t)
     return bool(np.ptp(dt) <= 1e-9 * dt[0])
+
+
+def motion_period(x: Array) -> float:
+    """Return the period, in samples, of a sine with the same size and speed as this motion."""
+    return float(2 * np.pi * np.std(x) / np.sqrt(np.mean(np.diff(x) ** 2)))
 
 
 def window_weights(t: Array) -> tuple[Array, Array, Array]:
@@ -563,7 +563,7 @@ def _is_hand(
 ) -> bool:
     """Return whether a burst is due to a hand.
 
-    Where the unexplained force is below the level at which a burst begins, `residual` is zero. The
+    Where the unexplained force is below the level at which a burst begins, `left` is zero. The
     windows are `hop` s apart.
     """
     swings = np.count_nonzero(np.diff(np.sign(left[left != 0.0])))

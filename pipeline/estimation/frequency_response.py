@@ -193,24 +193,13 @@ def _local_polynomials(
     return TransferRatio(G=found[:, :, 0], std=np.sqrt(variance * gain))
 
 
-# ---------------------------------------------------------------------- the stage
+# ---------------------------------------------------------------------- dwells
 
-# Largest relative standard error of a record's response; other frequencies are dropped.
-_LARGEST_RELATIVE_STD = 0.2
 # Two dwells are repeats if their frequencies differ by less than this. A fitted frequency is
 # accurate to some 1e-4. Within this limit, no response changes by more than its standard error.
 _SAME_FREQUENCY = 1e-3
 # No bench measures more accurately, and exact data would get infinite weight.
 _SMALLEST_RELATIVE_STD = 1e-6
-
-
-# A mode has been passed where the response has fallen by this factor from low frequencies.
-_CLEAR_FALL = 3.0
-# Share of the first resonance. At a lower frequency, the magnitude gives the static gain.
-_LOW_SHARE = 0.7
-
-
-# ---------------------------------------------------------------------- dwells
 
 
 def dwell_fault(point: SinePoint) -> str:
@@ -297,6 +286,9 @@ def _weighted_mean(values: Array, std: Array) -> tuple[float, float]:
 
 # --------------------------------------------------------------------- records
 
+# Largest relative standard error of a record's response; other frequencies are dropped.
+_LARGEST_RELATIVE_STD = 0.2
+
 
 def response_from_records(records: Sequence[Record]) -> tuple[FrequencyResponse, ...]:
     """Return the frequency response of each cart from step and sweep records with all carts free.
@@ -371,6 +363,11 @@ def _combined(
 
 
 # ------------------------------------------------------------- peaks and nulls
+
+# A mode has been passed where the response has fallen by this factor from low frequencies.
+_CLEAR_FALL = 3.0
+# Share of the first resonance. At a lower frequency, the magnitude gives the static gain.
+_LOW_SHARE = 0.7
 
 
 class _Extremum(NamedTuple):

@@ -172,7 +172,7 @@ def _solved(y: Array, model: SeparableModel) -> _Point:
 # ---------------------------------------------------------------- damped sinusoids about a level
 
 _MAX_EVALUATIONS = 100
-_MOST_GROWTH = 50.0  # bound of an exponent, against overflow
+MOST_GROWTH = 50.0  # bound of an exponent, against overflow
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -208,7 +208,7 @@ class Ringing:
 
     def growth(self, t: Array) -> Array:
         """Return the size of each mode relative to its size at `t0`, (n_modes, n); at most e^50."""
-        return np.exp(np.minimum(self.poles.real[:, None] * (t - self.t0), _MOST_GROWTH))
+        return np.exp(np.minimum(self.poles.real[:, None] * (t - self.t0), MOST_GROWTH))
 
 
 def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ringing:
@@ -226,7 +226,7 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
     tau = scale * (t - t[0])
     level = np.array([np.ones_like(t), t - t[0]] if drift else [np.ones_like(t)])
     k = len(level)
-    # The decay rate at the start is at least this share of the frequency.
+    # At the start, the decay rate is at least 1e-6 of the frequency.
     fit = fit_separable(
         y,
         lambda p: Waves.at(tau, p, level=level),
@@ -273,7 +273,7 @@ class Waves:
     def at(cls, tau: Array, p: Array, *, level: Array) -> "Waves":
         """Return the waves with decay rates and frequencies p (2 n_modes,)."""
         decay, frequency = p.reshape(2, -1, 1)
-        growth = np.minimum(-decay * tau, _MOST_GROWTH)
+        growth = np.minimum(-decay * tau, MOST_GROWTH)
         return cls(tau=tau, level=level, waves=np.exp(growth + 1j * frequency * tau))
 
     @property

@@ -1,4 +1,4 @@
-"""The noise of a measured signal, its turning points, and standard errors under correlation."""
+"""The noise of a signal, its turning points and plateaus, and errors under correlation."""
 
 from functools import cache, lru_cache
 from math import comb

@@ -19,13 +19,13 @@ from pipeline.estimation.noise import (
 )
 from pipeline.results import Record, StepEdge, StepGain
 
-_MOVED = 6.0  # grains (see `_FLAT`); a smaller motion does not count
+# Motion is counted in grains. A grain is the encoder step, or the step whose rounding error equals
+# the noise if that is larger.
+_MOVED = 6.0  # grains; a smaller motion does not count
 # Largest residual and standard error of an extrapolated level, as shares of the motion.
 _EXTRAPOLATES = 0.02
 _STICKS_SIGMAS = 4.0  # standard errors; by chance, one edge in 16,000 is as far off
 _MIN_SAMPLES = 12
-# Motion is counted in grains. A grain is the encoder step, or the step whose rounding error equals
-# the noise if that is larger.
 _FLAT = 3.0  # grains; a window with a smaller range is level
 _PROMINENCE = 6.0
 _ARITHMETIC = 1e-3  # scatter, in grains, of a level without noise or rounding

@@ -43,7 +43,7 @@ from pipeline.words.numbers import count, first_few
 from pipeline.words.progress import Progress
 from pipeline.workflow import analyse
 
-# ----------------------------------------------- candidates, as large as the travel limit allows
+# ---------------------------------------------------------------------- multisines with a low peak
 
 Tones = tuple[tuple[int, float, float], ...]
 Lines = NDArray[np.int64]  # numbers of harmonics
@@ -120,6 +120,8 @@ def _synthesise(lines: Lines, amplitude: ComplexArray) -> Array:
 def _peak(lines: Lines, amplitude: ComplexArray) -> float:
     return float(np.max(np.abs(_synthesise(lines, amplitude))))
 
+
+# ----------------------------------------------- candidates, as large as the travel limit allows
 
 _PERIODS = 2  # periods of a multisine in a record
 _BAND = (0.4, 1.6)  # lowest and highest frequency, as multiples of the first and the last resonance

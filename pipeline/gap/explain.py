@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from pipeline.estimation.force_balance import find_interventions
 from pipeline.gap.fit import Fitting, GapFit, Mapper, fit_baseline
 from pipeline.gap.judge import Study
-from pipeline.gap.pem.model import compile_follower
+from pipeline.gap.pem.model import compile_predictor
 from pipeline.gap.residual import map_residual, windowed_residual_forces
 from pipeline.gap.runs import drop_left_out, prepare, split_holdout
 from pipeline.gap.search import Deadline, Search
@@ -156,18 +156,18 @@ def _first_open(maps: Iterable[_Map]) -> _Map | None:
 
 # ----------------------------------------------------------------- compiling in a second process
 
-_ROOM = Path(__file__).parent / "pem"
-_SCRIPT = "from pipeline.gap.pem.model import compile_follower; compile_follower()"
+_FOLDER = Path(__file__).parent / "pem"
+_SCRIPT = "from pipeline.gap.pem.model import compile_predictor; compile_predictor()"
 
 
 @contextmanager
-def follower_compiled() -> Iterator[None]:
-    """Compile the follower during this block, unless compiled code is stored or cannot be.
+def predictor_compiled() -> Iterator[None]:
+    """Compile the prediction-error fit meanwhile, unless compiled code is stored or cannot be.
 
     So the first search on a computer with two cores begins eight seconds earlier. If the second
-    process fails, the follower is compiled when it is needed.
+    process fails, it is compiled when it is needed.
     """
-    stored = kept_in(_ROOM) is None or is_compiled(_ROOM, function="predict_run")
+    stored = kept_in(_FOLDER) is None or is_compiled(_FOLDER, function="predict_run")
     if stored or (os.cpu_count() or 1) == 1:
         yield
         return
@@ -201,9 +201,9 @@ def investigate(analysis: Analysis, *, progress: Progress, budget: float | None 
     records, notes = drop_left_out(analysis.records, left_out=analysis.left_out)
     start = analysis.fit and analysis.fit.chain  # even a failed fit is near enough to start from
     progress("preparing the simulator")
-    with follower_compiled():
+    with predictor_compiled():
         compile_simulator()
-    compile_follower()
+    compile_predictor()
     explain = partial(explain_gap, records, analysis.bench, chain=start, progress=progress)
     if analysis.lacks_springs:
         gap = explain(catalogue=(), budget=budget)

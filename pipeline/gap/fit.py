@@ -14,6 +14,7 @@ from pipeline.arrays import Array
 from pipeline.estimation.force_balance import bump
 from pipeline.estimation.noise import high_frequency_noise, noise_beyond_rounding, score_covariance
 from pipeline.gap.parameters import (
+    FRICTION_SPREAD,
     GapModel,
     Linear,
     Nuisance,
@@ -201,12 +202,11 @@ def fit_model(start: GapModel, runs: Sequence[GapRun], how: Fitting) -> GapFit:
     low, high = structure.bounds()
     bounds = low, high, structure.largest_step()
     goes_on = start if isinstance(start, GapFit) else None
-    # At first, friction is assumed to differ by 5 % between runs.
     best = evaluate(
         GapModel(structure=structure, theta=np.clip(start.theta, low, high)),
         runs,
         goes_on.nuisance if goes_on else [fresh_nuisance(run) for run in runs],
-        spread=goes_on.spread if goes_on else np.full(structure.n, 0.05),
+        spread=goes_on.spread if goes_on else np.full(structure.n, FRICTION_SPREAD),
         mapper=how.mapper,
     )
     damp = _DAMP

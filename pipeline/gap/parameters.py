@@ -300,8 +300,9 @@ def bench_scales(
 _START_STEP = 1e-3  # step for numerical derivatives, relative to swing or friction
 _HOME = 0.1  # weight of the priors on starts that the data do not determine
 _HELD = 1e6  # weight of a velocity that is known to be zero
-_FACTOR_STEP = 0.3  # largest step of a friction factor
-_FACTORS = (0.3, 3.0)  # limits of a friction factor
+FACTOR_STEP = 0.3  # largest step of a friction factor
+FACTORS = (0.3, 3.0)  # limits of a friction factor
+FRICTION_SPREAD = 0.05  # by how much friction is at first assumed to differ between runs, relative
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -642,9 +643,9 @@ def move_nuisance(
             change[0] = 0.0
         v0[:, list(layout.v0)] += change
     factors = wide[: len(layout.scatter)]
-    scatter[list(layout.scatter)] += scale * np.clip(factors, -_FACTOR_STEP, _FACTOR_STEP)
+    scatter[list(layout.scatter)] += scale * np.clip(factors, -FACTOR_STEP, FACTOR_STEP)
     zero[list(layout.zero)] += scale * wide[len(layout.scatter) :]
-    return Nuisance(x0=x0, v0=v0, zero=zero, scatter=np.clip(scatter, *_FACTORS))
+    return Nuisance(x0=x0, v0=v0, zero=zero, scatter=np.clip(scatter, *FACTORS))
 
 
 def run_cost(

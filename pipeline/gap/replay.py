@@ -8,7 +8,16 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.hardware_check import measured_run
+from pipeline.gap.fit import evaluate, fit_nuisance
+from pipeline.gap.parameters import (
+    FRICTION_SPREAD,
+    Candidate,
+    Structure,
+    fresh_nuisance,
+    simulate_run,
+)
 from pipeline.gap.runs import GapRun, prepare
+from pipeline.plant.augmented import rest_positions, simulate_augmented
 from pipeline.plant.effect import AugmentedChain
 from pipeline.results import HardwareCheck, Record
 
@@ -35,9 +44,6 @@ def replay_driven(
     ----------
     checks : the linear model's result under the same input, one for each cart.
     """
-    # imported here, because the linear report never needs this compiled code
-    from pipeline.plant.augmented import rest_positions, simulate_augmented
-
     if record.u is None:
         return []
     run = measured_run(record, model.chain)
@@ -86,9 +92,6 @@ def replay_fitted(run: GapRun, model: AugmentedChain, *, springs: tuple[bool, ..
     ------
     DataError : the simulation diverges.
     """
-    from pipeline.gap.fit import evaluate, fit_nuisance
-    from pipeline.gap.parameters import Candidate, Structure, fresh_nuisance, simulate_run
-
     structure = Structure(
         springs=springs,
         effects=tuple(
@@ -102,7 +105,7 @@ def replay_fitted(run: GapRun, model: AugmentedChain, *, springs: tuple[bool, ..
         ),
     )
     start = structure.start(model.chain, [term.values for term in model.terms])
-    spread = np.full(structure.n, 0.05)
+    spread = np.full(structure.n, FRICTION_SPREAD)
     known = evaluate(start, [run], [fresh_nuisance(run)], spread=spread)
     fit = fit_nuisance(known, [run])
     readings = simulate_run(fit, run, fit.nuisance[0])

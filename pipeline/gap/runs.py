@@ -1,4 +1,4 @@
-"""Prepare records for fitting: cut them to free motion, and hold some of the runs out."""
+"""Prepare records for fitting: cut to free motion, hold some out, count independent readings."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence

@@ -33,7 +33,7 @@ from pipeline.gap.judge import (
 )
 from pipeline.gap.parameters import Candidate, GapModel, Nuisance
 from pipeline.gap.pem.fit import PemFit, Records, choose_laws, rivals_of
-from pipeline.gap.pem.model import make_track
+from pipeline.gap.pem.model import make_pem_run
 from pipeline.gap.runs import GapRun
 from pipeline.gap.types import Verdict
 from pipeline.plant.chain import Chain
@@ -157,7 +157,7 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
     found = [baseline]
     with suppress(OutOfTime):
         records = Records(
-            runs=tuple(make_track(run) for run in study.training),
+            runs=tuple(make_pem_run(run) for run in study.training),
             mapper=study.mapper,
             columns=frozenset().union(*(filled(effect) for effect in study.catalogue)),
         )

@@ -1,7 +1,7 @@
 """Simulate the chain with effects: whole runs at once, or sample by sample under a controller.
 
 The results are sensor readings, so scale errors of sensors are included. Importing this module
-compiles code that the linear chain never needs.
+loads numba, which the linear chain never needs.
 """
 
 from collections import deque

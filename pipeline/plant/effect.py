@@ -1,4 +1,4 @@
-"""An effect is a hypothesis about the bench, with a law, an equation, a fingerprint and a test."""
+"""The laws of effects, the effects as hypotheses about a bench, and a chain with effects."""
 
 import ast
 from collections.abc import Callable, Mapping, Sequence

@@ -148,7 +148,7 @@ def input_per_count(bench: SimulatedBench) -> float:
     return 5.0 * 10.0 ** round(math.log10(REACH * hold / 5.0)) / FULL_SCALE
 
 
-# ---------------------------------------------------------------------- the bench
+# ---------------------------------------------------------------------- faults of the line
 
 HOLD = 0.05  # s of the bench's clock for which a late chunk is held back
 
@@ -313,6 +313,8 @@ class Faults:
                 counts[encoder - 1] = shown
         return b":".join([*counts, target, duty, b"%d" % (ms - self._clock_began)]) + b"\n"
 
+
+# ---------------------------------------------------------------------- the bench
 
 _MOST_UNSENT = 262_144  # bytes. A bench that is faster than its host waits for it
 

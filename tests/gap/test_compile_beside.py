@@ -1,4 +1,4 @@
-"""The follower is compiled in a second process, once."""
+"""The prediction-error fit is compiled in a second process, once."""
 
 import os
 import subprocess
@@ -12,10 +12,10 @@ SCRIPT = """
 from pipeline.gap import explain as beside
 from pipeline.plant.simulator.compiler import is_compiled
 
-print(is_compiled(beside._ROOM, function="predict_run"))
-with beside.follower_compiled():
+print(is_compiled(beside._FOLDER, function="predict_run"))
+with beside.predictor_compiled():
     pass
-print(is_compiled(beside._ROOM, function="predict_run"))
+print(is_compiled(beside._FOLDER, function="predict_run"))
 """
 
 

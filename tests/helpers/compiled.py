@@ -38,11 +38,11 @@ def compile_all() -> None:
     """Compile the workflow's simulators and the tests' independent one."""
     import numpy as np
 
-    from pipeline.gap.explain import follower_compiled
+    from pipeline.gap.explain import predictor_compiled
     from pipeline.plant.augmented import compile_simulator
     from tests.truth.bench import simulate_truth
 
-    with follower_compiled():
+    with predictor_compiled():
         compile_simulator()
         t = 1e-3 * np.arange(2)
         simulate_truth(m=[1.0], c=[0.0], k=[1.0, 0.0], t=t, u=np.zeros(2), free=(1,))

@@ -76,14 +76,14 @@ class PemFit:
         return min(alone, self.points / 4.0)
 
     @property
-    def inflate(self) -> float:
+    def inflation(self) -> float:
         """Factor on the noise, at least 1, that makes it as large as the misfit."""
         return max(1.0, float(np.sqrt(self.chi))) if np.isfinite(self.chi) else 1.0
 
     @property
     def total(self) -> float:
         """The cost including the priors."""
-        return self.cost + self.inflate**2 * self.prior
+        return self.cost + self.inflation**2 * self.prior
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -143,7 +143,7 @@ class Records:
 
     def slope(self, fit: PemFit, *, factors: bool = True) -> Slope:
         """Return the normal equations; without `factors`, dry friction is the same in all runs."""
-        laws, size, inflate = fit.laws, fit.p.size, fit.inflate
+        laws, size, inflate = fit.laws, fit.p.size, fit.inflation
         dry = laws.dry & factors
 
         def one(pair: tuple[PemRun, RunParameters]) -> tuple[Array, Array, Array]:
@@ -193,12 +193,12 @@ class Records:
                     for track, one, taken in zip(self.runs, best.own, slope.back, strict=True)
                 )
                 trial = self.evaluate(replace(best, p=best.p + delta, own=own))
-                if trial.cost + best.inflate**2 * trial.prior < best.total:
+                if trial.cost + best.inflation**2 * trial.prior < best.total:
                     break
                 damp = max(damp * _CHANGE, _DAMP)
             else:
                 break
-            fall = 1.0 - (trial.cost + best.inflate**2 * trial.prior) / best.total
+            fall = 1.0 - (trial.cost + best.inflation**2 * trial.prior) / best.total
             best, damp = trial, max(damp / _CHANGE, _LEAST_DAMP)
             # The fit has converged.
             if fall < 1e-3:

@@ -8,6 +8,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from pipeline.arrays import Array
+from pipeline.gap.parameters import FACTOR_STEP, FACTORS, FRICTION_SPREAD
 from pipeline.gap.pem import kernel
 from pipeline.gap.runs import GapRun
 from pipeline.plant.catalogue import CATALOGUE
@@ -358,7 +359,6 @@ _LONGEST = 2.5e-3  # s; longest step for a bench of carts
 _FREELY = 0.4  # factor on the longest step for a small gain, where step errors add up
 _KNOCK = 0.25  # factor on the longest step if bodies may meet
 _SURE = 1e6  # weight of known quantities
-_FACTORS, _FACTOR_STEP = (0.3, 3.0), 0.3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -418,7 +418,7 @@ class PemRun:
         start = np.full(n, _SURE if self.at_rest else 1.0 / max(0.3 * self.swing, 1e-12))
         speed = np.where(self.free & (not self.at_rest), 1.0 / self.start_std[1], _SURE)
         start = np.where(np.isfinite(self.start_std[0]), 1.0 / self.start_std[0], start)
-        factor = np.where(dry, 1.0 / 0.05, _SURE)  # friction differs by 5 % between runs
+        factor = np.where(dry, 1.0 / FRICTION_SPREAD, _SURE)
         weight = np.concatenate([1.0 / self.zero_std, start, speed, factor])
         off = [self.zero - own.zero, -own.shift, self.slope - own.v0, 1.0 - own.factor]
         # An unknown velocity needs a weak prior, because following the record closely does not
@@ -429,16 +429,16 @@ class PemRun:
     def moved(self, own: RunParameters, by: Array) -> RunParameters:
         """Return the run's own parameters after a step (4 n,)."""
         zero, shift, v0, factor = by.reshape(4, -1)
-        step = np.clip(factor, -_FACTOR_STEP, _FACTOR_STEP)
+        step = np.clip(factor, -FACTOR_STEP, FACTOR_STEP)
         return RunParameters(
             zero=own.zero + zero,
             shift=own.shift + shift,
             v0=own.v0 + v0,
-            factor=np.clip(own.factor + step, *_FACTORS),
+            factor=np.clip(own.factor + step, *FACTORS),
         )
 
 
-def make_track(run: GapRun) -> PemRun:
+def make_pem_run(run: GapRun) -> PemRun:
     """Thin a run to the sample rate that is needed to describe a swing."""
     n = run.zero.size
     sampled = 1.0 / float(np.median(np.diff(run.t)))
@@ -532,7 +532,7 @@ def _shaped(track: PemRun, dead: float, limit: float) -> Array:
     return out
 
 
-def compile_follower() -> None:
+def compile_predictor() -> None:
     """Compile the simulation by running it on a record of two readings.
 
     This takes seconds, unless compiled code is stored.

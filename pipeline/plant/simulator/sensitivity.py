@@ -66,7 +66,7 @@ class Bodies(NamedTuple):
     parent : row of the cart that carries a hidden mass; -1 for other bodies.
     s : the state table.
     K, C : the stiffness and damping matrices. Closed contacts are included.
-    switches : numbers of the existing contacts and slack springs, as in `guard`.
+    switches : numbers of the existing contacts and slack springs, as in `contact_gap`.
     active : whether each of the switches is closed.
     """
 
@@ -91,7 +91,7 @@ class Push(NamedTuple):
     on : 1 if the drive is powered, otherwise 0.
     scatter : factor (n,) on all dry friction of each cart.
     dry : whether there is dry friction.
-    smooth : flags for the places of smooth forces, from `reach_of`.
+    smooth : flags for the places of smooth forces, from `longest_step`.
     contact_step : longest step inside a contact.
     """
 

@@ -11,7 +11,7 @@ from pipeline.gap.pem.model import (
     RunParameters,
     TrialLaw,
     errors_of,
-    make_track,
+    make_pem_run,
 )
 from pipeline.gap.runs import make_run
 from pipeline.plant.chain import Chain
@@ -47,7 +47,7 @@ def test_derivatives_agree_with_differences_of_the_errors(kind, gain):
     """Derivatives with respect to parameters and a run's start agree with finite differences."""
     case = make_case(seed=44, n=2, rate=113.1)
     chain = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
-    track = make_track(make_run(case.records[0], n=2))
+    track = make_pem_run(make_run(case.records[0], n=2))
     largest, top = float(np.abs(track.command).max()), float(np.abs(track.y).max())
     bench = PemSetup(chain=chain, springs=case.springs, largest=largest, free=((True, True),))
     values = SIZES[kind](largest, top, float(chain.m[0]), float(chain.k[1]))
