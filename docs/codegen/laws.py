@@ -1,7 +1,7 @@
 """Write source code that simulates the effects' laws, with all derivatives.
 
 Every law is differentiated symbolically, and printed for the compiler twice: in the parameters that
-the simulator's tables hold, and in the coordinates of a model that follows (`FitCoordinates`).
+the simulator's tables hold, and in those of the prediction-error fit (`FitCoordinates`).
 """
 
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,1 +1,1 @@
-"""Identify the carts from records, after leaving out records that do not show what happened."""
+"""Identify the carts from the records that show what happened; check records and results."""

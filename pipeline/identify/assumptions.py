@@ -96,8 +96,10 @@ def _units(
         support: Support = "open"
         if doubt := doubts.get(f"{role}_unit") or doubts.get(f"{role}_scale"):
             support, reason = "contradicted", doubt
-        elif headed:
+        elif 2 * len(headed) >= sum(role == "position" or r.u is not None for r in records) > 0:
             support, reason = "supported", f"the headings of {join_names(headed)} state a unit"
+        elif headed:
+            reason = f"only the headings of {join_names(headed)} state a unit"
         elif role == "position" and is_count(side.unit) and records:
             support, reason = "supported", "the positions are whole numbers, as counts are"
         else:

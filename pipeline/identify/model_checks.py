@@ -525,6 +525,18 @@ def _numbers(decay: LogDecrement, *, unit: str) -> dict[str, str]:
     }
 
 
+def check_loops(hardware: Sequence[HardwareCheck]) -> list[Check]:
+    """Return a failed check for each run whose log or stated controller is wrong."""
+    notes: dict[str, list[str]] = {}
+    for check in hardware:
+        if check.contradicted:
+            notes.setdefault(check.experiment, []).extend([check.note] if check.note else [])
+    return [
+        Check(kind="hardware", run=run, outcome="fail", message=f"{run}: {'; '.join(texts)}.")
+        for run, texts in notes.items()
+    ]
+
+
 def design_margins(chain: Chain, design: FeedbackDesign, *, on_bench: bool = False) -> Margins:
     """Return the margins of the designed loop, including its observer and delay.
 
@@ -565,18 +577,6 @@ def verify_design(chain: Chain, design: FeedbackDesign) -> Check:
     if value > _SAME_LOOP:
         return _check("fail", value, f"the gains do not give {asked}: do not run them")
     return _check("pass", value, f"the gains give {asked}")
-
-
-def check_loops(hardware: Sequence[HardwareCheck]) -> list[Check]:
-    """Return a failed check for each run whose log or stated controller is wrong."""
-    notes: dict[str, list[str]] = {}
-    for check in hardware:
-        if check.contradicted:
-            notes.setdefault(check.experiment, []).extend([check.note] if check.note else [])
-    return [
-        Check(kind="hardware", run=run, outcome="fail", message=f"{run}: {'; '.join(texts)}.")
-        for run, texts in notes.items()
-    ]
 
 
 def _check(outcome: CheckOutcome, value: float | None, message: str) -> Check:

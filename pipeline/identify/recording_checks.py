@@ -1,4 +1,4 @@
-"""Check that the recordings were read, match their description, and were used."""
+"""Check that the recordings were read, match their description, and were used; remark on them."""
 
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -338,6 +338,9 @@ def _channels_at_fault(record: Record, *, sticky: bool) -> Iterator[Finding]:
             look = why_other_frequency(stated / hertz) or say("frequency_of_another")
             details = {"found": f"{hertz:.3g}", "stated": f"{stated:.3g}", "look": look}
             yield Finding(code="other_frequency", run=record.id, details=details, excludes="no")
+
+
+# ---------------------------------------------------------------------- remarks
 
 
 def reading_remarks(data: Ingested, *, unit: str) -> list[str]:

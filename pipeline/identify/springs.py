@@ -21,6 +21,7 @@ from pipeline.ingest.fill import (
     Found,
     fill_submission,
     has_fractions,
+    heading_doubts,
     mark_system,
     system_doubts,
     unit_doubt,
@@ -95,13 +96,13 @@ def fill(folder: Path) -> Filled:
     submission = load_submission(folder)
     fractions = [found.file for found in files if has_fractions(found)]
     doubt = unit_doubt(submission.system.position.unit, fractions=fractions)
+    own = {"position": doubt} if doubt else {}
     if new:
         _state_springs(submission)
-        if doubt:
-            mark_system(folder, "position", doubt=unsure(doubt))
-    doubts = system_doubts(folder)
-    if doubt:
-        doubts.setdefault("position", doubt)
+        own = heading_doubts(files) | own
+        for key, why in own.items():
+            mark_system(folder, key, doubt=unsure(why))
+    doubts = own | system_doubts(folder)
     return Filled(files=files, doubts=tuple(f"{key}: {one}" for key, one in doubts.items()))
 
 

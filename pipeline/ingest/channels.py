@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 from pipeline.ingest.columns import unit_symbol
+from pipeline.ingest.table import FEW_NAMED
 from pipeline.words.numbers import first_few
 
 _MOST_LEVELS = 20_000  # an encoder on a lab cart has a few thousand counts over its travel
@@ -196,7 +197,6 @@ _MOST_BAD = 12  # readings in a row that a spike lasts
 _MOST_SHARE = 0.05  # share of readings that may be wrong
 _BITS = (8, 10, 12, 14, 16, 20, 24, 32)
 _FEWEST_CHANGES = 20
-_MOST_NAMED = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,7 +244,7 @@ def repair_positions(
         for repair in _repairs(x, u, unit=unit, scale=scales[name], wanted=wanted):
             x = repair.x
             keep &= repair.keep
-            where = first_few([f"{t[i]:.4g} s" for i in repair.at], _MOST_NAMED)
+            where = first_few([f"{t[i]:.4g} s" for i in repair.at], FEW_NAMED)
             notes.append(
                 f"{name!r}: {repair.message} ({where}); to undo: "
                 f"repair = {{ {repair.key} = false }}"

@@ -109,11 +109,6 @@ class Heading:
     unit: str | None
     run: str
 
-    @property
-    def has_known_unit(self) -> bool:
-        """Whether the unit is known, or not stated."""
-        return self.unit is None or is_known_unit(self.unit)
-
 
 def unit_symbol(text: str) -> str | None:
     """Return the symbol of a unit that is written as a symbol or as a word; None if unknown."""
@@ -327,8 +322,7 @@ def assign_columns(
         columns[role] = _column(table, table.index(wanted), role)
     taken = {column.index for column in columns.values()}
     plain = [plain_name(name) for name in table.names]
-    is_time = [bool(re.fullmatch(TIME, name)) for name in plain]
-    has_time = "time" in columns or any(is_time)
+    has_time = "time" in columns or any(re.fullmatch(TIME, name) for name in plain)
     found: dict[str, list[tuple[int, int]]] = {}  # for each role, (rank, column)
     unused: list[str] = []
     for index, name in enumerate(plain):
@@ -358,17 +352,23 @@ def assign_columns(
 
 
 def refuse_unknown_unit(table: FileTable, column: Column, *, stated: str = "") -> None:
-    """Refuse a column whose heading states a unit that is not known.
+    """Refuse a column whose heading states a unit that is not known, or not one of a position.
 
     Raises
     ------
-    SubmissionError : the unit is not known, and it is not the one that the submission states.
+    SubmissionError : the unit is not known, or a position has the unit of another quantity. A unit
+        that the submission states is accepted.
     """
     unit = column.unit
-    if unit is not None and unit != stated and not is_known_unit(unit):
+    if unit is None or unit == stated:
+        return
+    why = "which is not known" if not is_known_unit(unit) else ""
+    if column.role[:1] == "x" and not why and not is_known(unit, position_units()):
+        why = "which is no unit of a position"
+    if why:
         raise SubmissionError(
-            f"{table.source}: {column.name!r} states the unit {unit!r}, which is not known: which "
-            "unit is it? Write it in the heading, as in 'x1 [mm]'"
+            f"{table.source}: {column.name!r} states the unit {unit!r}, {why}: which unit is it? "
+            "Write it in the heading, as in 'x1 [mm]'"
         )
 
 

@@ -61,7 +61,7 @@ OF_STRANGERS: ContextVar[bool] = ContextVar("OF_STRANGERS", default=False)
 # A `.mat` file of version 4 begins with a type, two sizes, a flag, and the length of a name.
 _VERSION_4 = re.compile(rb"[\0-\x34]\0{3}.{8}[\0\1]\0{3}[\2-\x40]\0{3}[A-Za-z]", re.DOTALL)
 # First bytes of files that are submitted by mistake, and the advice to give.
-_STRANGERS = (
+_BY_MISTAKE = (
     (b"PK\x03\x04", "a zip archive, or a document of LibreOffice: save the sheet as .xlsx or CSV"),
     (b"\xd0\xcf\x11\xe0", "an old Excel workbook, or a locked one; save it as .xlsx, unlocked"),
     (b"\x89HDF", "an HDF5 file that MATLAB did not write; save the recording as CSV"),
@@ -268,7 +268,7 @@ def parse_tables(raw: bytes, *, source: str) -> list[FileTable]:
         raise SubmissionError(f"{source}: the file is empty")
     read = next((read for is_theirs, read in _READERS if is_theirs(raw)), None)
     if read is None:
-        for start, what in _STRANGERS:
+        for start, what in _BY_MISTAKE:
             if raw.startswith(start):
                 raise SubmissionError(f"{source}: {what}")
         if _VERSION_4.match(raw):
@@ -301,6 +301,7 @@ def _joined(tables: Sequence[FileTable]) -> list[FileTable]:
                 whole=tuple(map(all, zip(before.whole, table.whole, strict=True))),
                 lines=np.concatenate([before.lines, table.lines]),
                 cut=table.cut,
+                ends_broken=table.ends_broken,
                 notes=tuple(dict.fromkeys((*before.notes, *table.notes))),
             )
             counts[-1] += 1
@@ -356,7 +357,7 @@ class NotRead:
 
 def data_files_in(folder: Path) -> list[Path]:
     """Return the files that may hold data, in a folder and its subfolders; "2" precedes "10"."""
-    return [path for path in _entries(folder) if _is_recording(path)]
+    return [path for path in _entries(folder) if _has_data_ending(path)]
 
 
 def files_not_read(folder: Path, *, root: Path) -> list[NotRead]:
@@ -365,7 +366,7 @@ def files_not_read(folder: Path, *, root: Path) -> list[NotRead]:
     Names are relative to `root`; links that lead out of `root` are not followed. Hidden files are
     skipped.
     """
-    names = [p.relative_to(root).as_posix() for p in _entries(folder) if not _is_recording(p)]
+    names = [p.relative_to(root).as_posix() for p in _entries(folder) if not _has_data_ending(p)]
     return [refused(root, name) or _not_read(root, name) for name in names]
 
 
@@ -386,7 +387,7 @@ def recordings_beside(folder: Path, *, named: Iterable[str]) -> list[NotRead]:
     found = []
     for path in sorted(folder.iterdir(), key=_natural) if folder.is_dir() else ():
         name = path.name
-        if _is_hidden(name) or name in known or not _is_recording(path):
+        if _is_hidden(name) or name in known or not _has_data_ending(path):
             continue
         if file_problem(folder, name) is None and _is_table(folder, name):
             reason = "it is outside data/, and only files in data/ are read"
@@ -431,7 +432,7 @@ def _is_table(root: Path, name: str) -> bool:
     return True
 
 
-def _is_recording(path: Path) -> bool:
+def _has_data_ending(path: Path) -> bool:
     return path.suffix.casefold() in ENDINGS and path.is_file()
 
 

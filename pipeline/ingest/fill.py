@@ -7,6 +7,7 @@ file. Existing entries are never changed. Doubts become comments.
 import filecmp
 import json
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -29,6 +30,7 @@ from pipeline.ingest.files import (
     refused,
 )
 from pipeline.ingest.inspect import NO_CLOCK, Inspection, inspect_runs
+from pipeline.ingest.table import FEW_NAMED
 from pipeline.results import ExperimentKind
 from pipeline.submission.edit import (
     append_experiment,
@@ -492,15 +494,48 @@ def _carts_seen(looked: Sequence[Found]) -> int:
     return max((cart for cart in carts if cart <= MOST_CARTS), default=1)
 
 
-def _state_units(document: tomlkit.TOMLDocument, looked: Sequence[Found]) -> None:
-    """Write the units stated by headings into a new document, except counts."""
-    system: Any = document["system"]
+def _headed_units(looked: Sequence[Found]) -> dict[str, Counter[str]]:
+    """Return for "position" and "input" how many recordings state which unit; "" for none.
+
+    Counts are a matter of each file, so they are not listed.
+    """
+    stated: dict[str, Counter[str]] = {"position": Counter(), "input": Counter()}
     for inspection in (one.inspection for one in looked if one.inspection):
-        for column in inspection.columns:
-            role = column.role or ""
-            key = "input" if role == "input" else "position" if role[:1] == "x" else ""
-            if key and column.unit and not column.unit.startswith("count"):
-                system[key]["unit"] = column.unit
+        units = {
+            (key, column.unit or "")
+            for column in inspection.columns
+            for key, begins in (("position", "x"), ("input", "input"))
+            if (column.role or "").startswith(begins)
+        }
+        for key, unit in units:
+            if not unit.startswith("count"):
+                stated[key][unit] += 1
+    return stated
+
+
+def _state_units(document: tomlkit.TOMLDocument, looked: Sequence[Found]) -> None:
+    """Write the units stated by most headings into a new document, except counts."""
+    system: Any = document["system"]
+    for key, stated in _headed_units(looked).items():
+        units = [unit for unit, _ in stated.most_common() if unit]
+        if units:
+            system[key]["unit"] = units[0]
+
+
+def heading_doubts(found: Sequence[Found]) -> dict[str, str]:
+    """Return why units from headings are doubtful, by key of `[system]`."""
+    doubts: dict[str, str] = {}
+    for key, stated in _headed_units(found).items():
+        units = [unit for unit, _ in stated.most_common() if unit]
+        if len(units) > 1:
+            said = first_few([f"{unit} ({stated[unit]})" for unit in units], FEW_NAMED)
+            doubts[key] = f"headings state different units, {said}: is {units[0]} right?"
+        elif units and stated[""] > stated[units[0]]:
+            doubts[key] = (
+                f"only {stated[units[0]]} of {stated.total()} recordings state the unit "
+                f"{units[0]}, the others none: is it right?"
+            )
+    return doubts
 
 
 def format_found(found: Sequence[Found]) -> str:

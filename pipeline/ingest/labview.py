@@ -44,7 +44,7 @@ def is_lvm(raw: bytes) -> bool:
     return _START.match(raw) is not None
 
 
-def even_times(n: int, *, start: float, interval: float) -> Array:
+def _even_times(n: int, *, start: float, interval: float) -> Array:
     """Return n times in s, from the first time and the interval."""
     return start + interval * np.arange(n, dtype=np.float64)
 
@@ -198,7 +198,7 @@ def _read(segment: _Segment, layout: Layout, *, across: str, source: str) -> Fil
     if not interval:
         return table
     start = segment.stated("X0", layout, source=source) or 0.0
-    times = even_times(table.values.shape[1], start=start, interval=interval)
+    times = _even_times(table.values.shape[1], start=start, interval=interval)
     return replace(
         table,
         names=("time", *table.names),
@@ -270,7 +270,7 @@ def _table(group: str, read: Sequence["_Channel"], *, source: str) -> FileTable:
         interval, start = _clock(read, source=source)
         if interval:
             names.insert(0, "time")
-            columns.insert(0, even_times(read[0].samples, start=start, interval=interval))
+            columns.insert(0, _even_times(read[0].samples, start=start, interval=interval))
     names = checked_names(names, place=f"{source} group {group!r}")
     return binary_table(columns, names=names, source=source, form="tdms", run=group)
 

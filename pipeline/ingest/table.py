@@ -15,6 +15,7 @@ from pipeline.words.numbers import first_few
 MOST_COLUMNS = 64
 _LONGEST_HEADING = 100  # characters
 MOST_NAMED = 8
+FEW_NAMED = 4  # places named in a note
 SETTING = 0.1  # share of the longest signal; a shorter one holds settings, such as gains
 # Range of values that a bench can measure, in any unit: times, positions, inputs, ratios. Powers
 # and products of several such values, as in the stages, neither overflow nor underflow.
@@ -58,8 +59,9 @@ class FileTable:
     whole : (n_columns,) whether all numbers of a column were written as whole numbers.
     lines : (n,) line of the file in which each row is written; None for a binary file.
     lines_are : what `lines` counts: "line", or "row" for a sheet.
-    cut : the broken last line of a truncated file; None if the file is complete.
-    ends_broken : whether the last line is broken, as in a file that is still being written.
+    cut : what is missing at the end of a truncated file; None if nothing is known to be missing.
+    ends_broken : whether the last line is no row of the table, as in a file that is still being
+        written.
     notes : repairs and omissions made while reading.
     variables : the variables of a binary file, in the order of the file.
     partial : columns left out because cells are empty or not numbers: heading to a description.
@@ -85,7 +87,7 @@ class FileTable:
         """The message about a truncated file, with advice; "" for a complete file."""
         if self.cut is None:
             return ""
-        return f"{self.cut}; the file is truncated: export it again, or delete its last line"
+        return f"{self.cut}; the file is truncated: export it again"
 
     def place(self, row: int) -> str:
         """Return "line 12" (or "row 12", or "sample 12") for a row counted from 0."""

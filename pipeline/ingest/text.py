@@ -17,7 +17,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.columns import are_units, is_time, join_unit, parse_heading
-from pipeline.ingest.table import FileTable, checked_names, refuse_unusable
+from pipeline.ingest.table import FEW_NAMED, FileTable, checked_names, refuse_unusable
 from pipeline.words.numbers import first_few
 
 _FEW_LINES, _SNIFFED_LINES = 40, 400
@@ -25,7 +25,6 @@ _LONG = 8  # similar rows that begin a table; a shorter table must be alone in i
 _BEST = 1.5 * _LONG  # score of a layout in which every field is a plain number
 _WORST = 0.01  # largest share of rows that may be skipped
 _SPARSE = 0.1  # share of missing values from which a column is left out
-_MOST_NAMED = 4
 _DATED = 1e6  # s; a time of day is less, the time since 1900 is more
 # The names in an ECP heading consist of words with single spaces between them.
 _HEADING_WORDS = re.compile(
@@ -355,7 +354,7 @@ def _without_rows(
         end -= 1
     if end == len(head) or not end or not _is_name(head[end - 1][1]):
         return head, ()
-    where = first_few([str(number) for number, _ in head[end:]], _MOST_NAMED)
+    where = first_few([str(number) for number, _ in head[end:]], FEW_NAMED)
     what = head[end][1].strip()[:30]
     rows_are = "1 row was" if end == len(head) - 1 else f"{len(head) - end} rows were"
     return head[:end], (f"{rows_are} skipped, {line} {where}: expected numbers, found {what!r}",)
@@ -527,7 +526,7 @@ def _mend(
     kept = np.array([i for i in range(len(rows)) if i not in faults and i not in comments])
     notes = []
     if comments:
-        where = first_few([str(lines[i]) for i in sorted(comments)], _MOST_NAMED)
+        where = first_few([str(lines[i]) for i in sorted(comments)], FEW_NAMED)
         notes.append(f"not read: text in {block.line} {where}")
     if not kept.size:
         raise SubmissionError(f"{block.source}: holds no rows of numbers")
@@ -541,7 +540,7 @@ def _mend(
                 said = f"{name!r} has {good.sum():,} of {kept.size:,} values"
                 if not good[:last].all():
                     bad = [str(lines[i]) for i in kept[~good]]
-                    said += f", missing in {block.line} {first_few(bad, _MOST_NAMED)}"
+                    said += f", missing in {block.line} {first_few(bad, FEW_NAMED)}"
                     partial[name] = said
                 notes.append(f"not read: {said}")
             elif names[j].strip():
@@ -583,10 +582,11 @@ def _mend(
         if cut is None:
             notes.append(f"the last row, {block.line} {lines[last]}, is cut off: {what}")
     if faults:
-        where = first_few([str(lines[i]) for i in sorted(faults)], _MOST_NAMED)
+        bad_lines = [str(lines[i]) for i in sorted(faults)]
+        where, others = (first_few(some, FEW_NAMED) for some in (bad_lines, bad_lines[1:]))
         first = min(faults)
         if len(faults) > _WORST * len(rows) or not fits:
-            more = f" (and {len(faults) - 1} more rows: {where})" if len(faults) > 1 else ""
+            more = f" (and {len(faults) - 1} more: {others})" if len(faults) > 1 else ""
             raise SubmissionError(f"{block.place(lines[first])}: {faults[first]}{more}")
         rows_are = "1 row was" if len(faults) == 1 else f"{len(faults)} rows were"
         notes.append(f"{rows_are} skipped, {block.line} {where}: {faults[first]}")

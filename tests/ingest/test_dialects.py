@@ -1,5 +1,7 @@
 """One step in the dialects of many programs gives the same time, input and position."""
 
+import re
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -141,7 +143,7 @@ def test_a_broken_row_at_either_end_is_skipped_and_shown(broken, last):
     assert got.values.shape == (3, N)
     assert got.cut is None
     assert len(got.notes) == 1
-    assert f"line {N + 2 if last else 2}" in got.notes[0]
+    assert re.search(rf"line {N + 2 if last else 2}\b", got.notes[0])
 
 
 def test_a_column_with_many_bad_cells_is_refused_if_it_is_asked_for():
@@ -159,6 +161,17 @@ def test_a_unit_that_is_not_known_is_asked_about(name):
     got = parse_table(f"time,input,{name}\n{PLAIN}".encode(), source="f")
     columns, _ = assign_columns(got, explicit={"x1": 3}, free=(1,))
     with pytest.raises(SubmissionError, match="furlong"):
+        refuse_unknown_unit(got, columns["x1"])
+
+
+@pytest.mark.parametrize("unit", ["kg", "N", "Hz", "s", "Nm"])
+def test_a_position_in_the_unit_of_another_quantity_is_asked_about(unit):
+    """A position in kg stops the reading, unless the submission states this unit."""
+    got = parse_table(f"time,input [N],x1 [{unit}]\n{PLAIN}".encode(), source="f")
+    columns, _ = assign_columns(got, explicit={"x1": 3, "input": 2}, free=(1,))
+    refuse_unknown_unit(got, columns["input"])
+    refuse_unknown_unit(got, columns["x1"], stated=unit)
+    with pytest.raises(SubmissionError, match="no unit of a position"):
         refuse_unknown_unit(got, columns["x1"])
 
 

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.errors import ConfigError, SubmissionError
+from pipeline.identify.springs import fill
 from pipeline.ingest.files import files_not_read, not_read_notes
 from pipeline.ingest.fill import data_files, fill_submission
 from pipeline.ingest.read import read_data
@@ -67,6 +68,25 @@ def test_a_folder_of_files_becomes_a_submission(tmp_path):
     assert "# unsure: which controller ran? controller" in text
     assert "#[design]" in text  # a comment of the file that `cartlab new` writes
     assert len(read_data(submission).records) == 4
+
+
+@pytest.mark.parametrize(
+    ("heads", "unit", "doubtful"),
+    [
+        (["x1__cm", "x1__cm", "x1__cm"], "cm", False),
+        (["x1__cm", "x1__cm", "x1"], "cm", False),
+        (["x1", "x1__mm", "x1"], "mm", True),  # one heading does not speak for all recordings
+        (["x1__cm", "x1__mm", "x1__cm"], "cm", True),
+        (["x1__mm", "x1__cm", "x1__cm"], "cm", True),
+    ],
+)
+def test_a_unit_that_few_headings_state_is_marked(heads, unit, doubtful, tmp_path):
+    """`fill` writes the unit of most headings; it is unsure if few state one, or if they differ."""
+    for i, head in enumerate(heads):
+        put(tmp_path, f"run-{i}.csv", **{"time": T, "input": (1 + i) * STEP, head: RING / 300})
+    doubts = fill(tmp_path).doubts
+    assert load_submission(tmp_path).system.position.unit == unit
+    assert any(one.startswith("position: ") for one in doubts) == doubtful
 
 
 def test_a_second_run_prints_as_much_as_the_first(tmp_path):

@@ -24,7 +24,7 @@ def ask_setup_questions(
     Parameters
     ----------
     fractions : files whose positions are not whole numbers.
-    doubts : what `submission.toml` marks as unsure; see `tasks.list_doubts`.
+    doubts : what `submission.toml` marks as unsure; see `folder_tasks.folder_state`.
     findings : assumptions and contradictions of the current report.
     """
     return tuple(

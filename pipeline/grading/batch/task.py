@@ -39,7 +39,7 @@ class Task:
 
     Attributes
     ----------
-    id, owner, days_late : as in `intake.hand_ins.HandIn`.
+    id, owner, days_late : as in `intake.find.HandIn`.
     key : hash of everything that affects the outcome; see `gradings.Member`.
     digest : expected hash of the submitted files; "" to skip this check.
     repairs : see `intake.repairs.read_repairs`.

@@ -401,7 +401,7 @@ class Gradebook:
         criterion, points = asked.criterion, asked.points
         why, by = asked.why.strip(), by.strip()
         if not why or not by:
-            raise ConfigError("an override needs a reason (--why) and a name (--by)")
+            raise ConfigError("a change of points needs a reason (--why) and a name (--by)")
         out_of = {c.id: c.points for c in rubric.criteria}
         if criterion == TOTAL:
             if points is None or not math.isfinite(points) or points == 0:
