@@ -22,6 +22,7 @@ from pipeline.ingest.read import read_data
 from pipeline.submission import load_submission
 from tests.helpers.places import REAL_DATA, ROOT
 from tests.helpers.ucsd import write_one_cart_submission, write_two_cart_submission
+from tests.references.class_life import life
 from tests.references.facts import Facts, read_facts, tree
 from tests.references.hook import sitecustomize as hook
 from tests.references.inputs import (
@@ -293,6 +294,8 @@ def everything(inputs: Path) -> Iterator[Case]:
     yield class_case(inputs, carts=2, teams=MISTAKES, seed=100)
     yield class_case(inputs, carts=1, teams=FEW_TEAMS, seed=200)
     yield class_case(inputs, carts=3, teams=FEW_TEAMS, seed=300)
+    for name in ("named", "anonymous"):
+        yield Case(name=f"life/{name}", facts=partial(life, anonymous=name == "anonymous"))
     yield from real_cases(inputs)
 
 
