@@ -9,9 +9,9 @@ sections of this file:
 
 - Recordings: `Record`, `Intervention`, `SinePoint`, `DecayLaw`, `LogDecrement`, `StepGain`.
 - Carts: `FrequencyResponse`, `Estimate` with its `Coverage`, `ChainFit`.
-- Comparisons: `ParameterRow` (initial against final), `Check`.
+- Comparisons: `ParameterRow` (initial against final), `Check`, `Finding`.
 - Control: `FeedbackDesign`, `HardwareCheck`.
-- Remarks: `Skipped`, `LeftOut`, `RecordingGroup`, `Assumption`, `LateChannel`.
+- Remarks: `Skipped`, `RecordingGroup`, `Assumption`, `LateChannel`.
 - Tables that only `results.json` has: `Submitted`, `Provenance`, `ChainWithUnits`, ….
 - All together: `Analysis`.
 
@@ -52,6 +52,7 @@ from pipeline.plant.chain import Chain
 from pipeline.plant.margins import Margins
 from pipeline.plant.sampled_loop import StateFeedback
 from pipeline.setup import Setup, Units
+from pipeline.words.phrases import phrases
 
 ExperimentKind = Literal["decay", "step", "sine", "sweep", "closed_loop", "bode"]
 Hold = Literal["zero_order", "band_limited"]
@@ -68,6 +69,7 @@ def passed(good: bool) -> CheckOutcome:
 EXPLAINED = 2.0
 
 
+_SENTENCES = phrases("findings")
 SIGNAL = 3.0  # standard errors; a smaller magnitude may be noise alone
 
 
@@ -667,6 +669,73 @@ class Check:
         return ".".join(filter(None, (self.run, cart, self.parameter, self.part)))
 
 
+@result()
+class Finding:
+    """Something that is wrong with a recording, the set-up or the model.
+
+    Attributes
+    ----------
+    code : what is wrong, which is also the key of its sentence in
+        `templates/words/findings.toml`.
+    kind : the consistency check that fails.
+    run, cart, parameter, part : what it is about, as in `Check`. Without a cart, it concerns the
+        whole recording; without a recording, the set-up or the model.
+    details : values for the sentence. A sentence with `runs` names its recordings itself.
+    value, limit : the number that shows it, and its largest allowed value. None if there is no such
+        number.
+    excludes : whether the recording is used: "no" if it is, "odd" if it is left out because it
+        differs from others, "wrong" if it is left out because it does not show what happened.
+    """
+
+    code: str
+    kind: CheckKind = "record"
+    run: str = ""
+    cart: int | None = None
+    parameter: str = ""
+    part: str = ""
+    details: Mapping[str, object] = field(default_factory=dict)
+    value: float | None = None
+    limit: float | None = None
+    excludes: Literal["no", "odd", "wrong"] = "no"
+
+    @classmethod
+    def from_written(cls, *, experiment: str, reason: str, is_wrong: bool) -> "Finding":
+        """Return the finding of a file, which has its sentence instead of its code."""
+        excludes = "wrong" if is_wrong else "odd"
+        return cls(code="quoted", run=experiment, details={"reason": reason}, excludes=excludes)
+
+    @computed()
+    def experiment(self) -> str:
+        """The recording that was not used."""
+        return self.run
+
+    @computed()
+    def reason(self) -> str:
+        """What is wrong, in words that follow the recording's name, if it is about one."""
+        return _SENTENCES.text(self.code, **{"cart": self.cart, **self.details})
+
+    @computed(default=False)
+    def is_wrong(self) -> bool:
+        """True: the recording is wrong; false: it only differs from its repeats."""
+        return self.excludes == "wrong"
+
+    @property
+    def check(self) -> Check:
+        """The failed check."""
+        named = self.run and "runs" not in self.details
+        return Check(
+            kind=self.kind,
+            run=self.run,
+            cart=self.cart,
+            parameter=self.parameter,
+            part=self.part,
+            outcome="fail",
+            value=self.value,
+            limit=self.limit,
+            message=f"{self.run}: {self.reason}" if named else self.reason,
+        )
+
+
 # ------------------------------------------------------------------------------------------ control
 
 
@@ -809,18 +878,6 @@ class Skipped:
     parameter: str = ""
     reason: str = written()
     missing: str = ""
-
-
-@result()
-class LeftOut:
-    """A recording that was not used, and why."""
-
-    experiment: str = written()
-    reason: str = written("in words that follow the recording's name")
-    is_wrong: bool = written(
-        "true: the recording is wrong; false: it only differs from its repeats",
-        default=False,
-    )
 
 
 @result()
@@ -1008,7 +1065,7 @@ class Analysis:
     unread: tuple[str, ...] = ()
     unexplained: dict[str, float] = field(default_factory=dict)
     discussion: str | None
-    left_out: tuple[LeftOut, ...] = ()
+    left_out: tuple[Finding, ...] = ()
     late_channels: tuple[LateChannel, ...] = ()
     groups: tuple[RecordingGroup, ...] = ()
     reported: Mapping[str, Mapping[str, Decimal]] = field(default_factory=dict)

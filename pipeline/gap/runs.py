@@ -14,7 +14,7 @@ from pipeline.estimation.force_balance import between
 from pipeline.estimation.noise import difference_noise, extrema
 from pipeline.plant.simulate import interpolate_band_limited
 from pipeline.plant.simulator.kernel import Excitation, describe_run
-from pipeline.results import Intervention, LeftOut, Record
+from pipeline.results import Finding, Intervention, Record
 from pipeline.words.numbers import group_messages
 from pipeline.words.phrases import phrases
 
@@ -394,7 +394,7 @@ _FEWEST, _SHORTEST = 50, 0.5  # samples, s
 
 
 def drop_left_out(
-    records: Sequence[Record], *, left_out: Sequence[LeftOut]
+    records: Sequence[Record], *, left_out: Sequence[Finding]
 ) -> tuple[list[Record], list[str]]:
     """Return the records that the identification used, and notes on those that it left out.
 

@@ -11,7 +11,7 @@ from pipeline.errors import ConfigError
 from pipeline.json_files import Number, computed, read_json, result, written
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import AugmentedChain, Effect
-from pipeline.results import ChainWithUnits, Intervention, LeftOut, Provenance, RecordingGroup
+from pipeline.results import ChainWithUnits, Finding, Intervention, Provenance, RecordingGroup
 from pipeline.setup import Setup, Units
 from pipeline.submission.toml import first_refusal, quote
 
@@ -341,7 +341,7 @@ class Gap:
 
     training: tuple[str, ...] = written("ids of the runs")
     held_out: tuple[str, ...] = written("ids of the runs")
-    left_out: tuple[LeftOut, ...] = written(
+    left_out: tuple[Finding, ...] = written(
         "recordings that the identification did not use; no figure here includes them",
         default=(),
     )

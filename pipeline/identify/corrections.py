@@ -29,10 +29,10 @@ from pipeline.estimation.record_fit import (
     most_are_consistent,
 )
 from pipeline.estimation.time_fit import FOLLOWED
-from pipeline.identify.findings import SAME, SAME_SIZE, SIGMAS, WITNESSES, Finding
+from pipeline.identify.findings import SAME, SAME_SIZE, SIGMAS, WITNESSES
 from pipeline.plant.chain import Chain
 from pipeline.plant.simulate import simulate_linear
-from pipeline.results import Record, StepGain
+from pipeline.results import Finding, Record, StepGain
 
 # A reading is suspicious if it is constant while the input changes by half its range, and for this
 # share of the record afterwards. It is a fault if the identified carts meanwhile move by this many

@@ -31,13 +31,14 @@ from pipeline.estimation.record_fit import (
 from pipeline.estimation.sine import FEW_COUNTS
 from pipeline.estimation.time_fit import evaluate_chain, fit_records, open_window
 from pipeline.identify.corrections import without_lone_factors
-from pipeline.identify.findings import Finding, Log
+from pipeline.identify.findings import Log
 from pipeline.names import own_zeta, read_name
 from pipeline.results import (
     EXPLAINED,
     ChainFit,
     Check,
     Estimate,
+    Finding,
     FrequencyResponse,
     LogDecrement,
     ParameterRow,
@@ -366,14 +367,7 @@ def check_groups(groups: Sequence[RecordingGroup]) -> list[Check]:
         for group in groups
     ]
     details = {"groups": "; ".join(told)}
-    finding = Finding(
-        code="groups",
-        kind="groups",
-        details=details,
-        value=len(groups),
-        limit=1,
-        excludes="no",
-    )
+    finding = Finding(code="groups", kind="groups", details=details, value=len(groups), limit=1)
     return [finding.check]
 
 

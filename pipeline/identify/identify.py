@@ -39,9 +39,9 @@ from pipeline.plant.chain import Chain
 from pipeline.results import (
     ChainFit,
     Estimate,
+    Finding,
     FrequencyResponse,
     Intervention,
-    LeftOut,
     LogDecrement,
     ParameterRow,
     Record,
@@ -321,7 +321,7 @@ def identify_with_rejection(
     interventions: Sequence[Intervention],
     bench: Setup,
     progress: Progress,
-) -> tuple[Identified, list[LeftOut]]:
+) -> tuple[Identified, list[Finding]]:
     """Identify the carts; leave out records that contradict these carts or their own repeats.
 
     A record with a constant reading is used only if carts identified from the other records would
@@ -376,7 +376,7 @@ def identify_with_rejection(
     repeats = replace(found.repeats, checks=tuple(checks.values()))
     return (
         replace(found, repeats=repeats),
-        [left_out[record.id].left_out for record in data.records if record.id in left_out],
+        [left_out[record.id] for record in data.records if record.id in left_out],
     )
 
 

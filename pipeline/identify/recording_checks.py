@@ -8,7 +8,7 @@ from math import ceil
 import numpy as np
 
 from pipeline.estimation.force_balance import without_releases
-from pipeline.identify.findings import Finding, say, valid_records
+from pipeline.identify.findings import say, valid_records
 from pipeline.identify.recording_faults import (
     LEAST_SHARE,
     OTHER_DWELL,
@@ -30,10 +30,10 @@ from pipeline.results import (
     Analysis,
     Check,
     CheckKind,
+    Finding,
     HeadingUnit,
     Intervention,
     LateChannel,
-    LeftOut,
     Record,
     SinePoint,
 )
@@ -55,7 +55,7 @@ _FASTEST = 10.0
 def check_recordings(
     data: Ingested,
     *,
-    left_out: Sequence[LeftOut],
+    left_out: Sequence[Finding],
     sines: Sequence[SinePoint],
     late: Sequence[LateChannel],
     bench: Setup,
@@ -78,12 +78,9 @@ def check_recordings(
 def check_files(unreadable: Mapping[str, str]) -> list[Check]:
     """Return a failed check for each experiment whose file could not be read."""
     return [
-        Check(
-            kind="data",
-            run=name,
-            outcome="fail",
-            message=say("unreadable", run=name, reason=reason),
-        )
+        Finding(
+            code="not_read", kind="data", run=name, details={"runs": name, "reason": reason}
+        ).check
         for name, reason in unreadable.items()
     ]
 
@@ -105,7 +102,7 @@ def check_units(records: Sequence[Record], *, bench: Setup) -> list[Check]:
                     headed.setdefault(record.id, other)
         if not is_known(unit, known):
             details = {"role": role, "unit": repr(unit), "hint": _hint(unit, known=known)}
-            finding = Finding(code="unknown_unit", kind=kind, details=details, excludes="no")
+            finding = Finding(code="unknown_unit", kind=kind, details=details)
             checks.append(finding.check)
         elif headed:
             other = next(iter(headed.values()))
@@ -129,7 +126,6 @@ def _unit_check(
         details={"runs": join_names(runs), **details},
         value=float(len(runs)),
         limit=0.0,
-        excludes="no",
     ).check
 
 
@@ -181,7 +177,7 @@ def check_signs(signs: Signs, *, without: Container[str]) -> list[Check]:
     ]
 
 
-def check_left_out(left_out: Sequence[LeftOut], *, records: Sequence[Record]) -> list[Check]:
+def check_left_out(left_out: Sequence[Finding], *, records: Sequence[Record]) -> list[Check]:
     """Return a failed check for each reason for which records were left out."""
     runs: dict[str, list[str]] = {}
     for one in left_out:
@@ -278,40 +274,33 @@ def check_dwells(records: Sequence[Record], points: Sequence[SinePoint]) -> list
         "why": say("dwells_why", ratio=f"{ratio:.4g}", look=look) if look and alike else "",
     }
     finding = Finding(
-        code="dwells",
-        kind="dwells",
-        part="frequency",
-        details=details,
-        value=ratio,
-        limit=1.0,
-        excludes="no",
+        code="dwells", kind="dwells", part="frequency", details=details, value=ratio, limit=1.0
     )
     return [finding.check]
 
 
-def find_bad_recordings(analysis: Analysis) -> dict[str, str]:
-    """Return the recordings with a fault, each with the fault in words."""
-    found = dict(analysis.unreadable)
-    found |= {one.experiment: one.reason for one in analysis.left_out if one.is_wrong}
-    sound = valid_records(analysis.records, analysis.left_out)
-    setups = {
-        fault.run: fault.reason
-        for fault in (
-            *find_other_scales(sound, bench=analysis.bench),
-            *find_wrong_setups(analysis.records),
-        )
+def find_bad_recordings(analysis: Analysis) -> dict[str, Finding]:
+    """Return the recordings with a fault, each with its first one."""
+    found = {
+        name: Finding(code="unreadable", run=name, details={"reason": why}, excludes="wrong")
+        for name, why in analysis.unreadable.items()
     }
+    found |= {one.run: one for one in analysis.left_out if one.is_wrong}
+    sound = valid_records(analysis.records, analysis.left_out)
+    scales = find_other_scales(sound, bench=analysis.bench)
+    setups = {one.run: one for one in (*scales, *find_wrong_setups(analysis.records))}
     late = late_experiments(analysis.late_channels)
     # A cart that sticks rests at its turning points, which looks like a clipped reading.
     sticky = analysis.fit is not None and not analysis.fit.explains_data
     for record in analysis.records:
-        if record.id in setups:
-            found[record.id] = setups[record.id]
+        name = record.id
+        if name in setups:
+            found[name] = setups[name]
             continue
-        here = [late[record.id]] if record.id in late else []
-        reasons = (fault.reason for fault in _channels_at_fault(record, sticky=sticky))
-        for problem in (*reasons, *here):
-            found.setdefault(record.id, problem)
+        faults = [*_channels_at_fault(record, sticky=sticky), late.get(name)]
+        first = next(filter(None, faults), None)
+        if first:
+            found.setdefault(name, first)
     return found
 
 
@@ -322,22 +311,20 @@ def _channels_at_fault(record: Record, *, sticky: bool) -> Iterator[Finding]:
             continue
         if (limit := saturation(record.position(cart))) is not None:
             details = {"limit": f"{limit:.4g}"}
-            yield Finding(
-                code="clipped_position", run=record.id, cart=cart, details=details, excludes="no"
-            )
+            yield Finding(code="clipped_position", run=record.id, cart=cart, details=details)
     u = record.u
     if u is None or record.kind == "closed_loop":
         return
     if (limit := saturation(u)) is not None:
         details = {"limit": f"{limit:.4g}"}
-        yield Finding(code="clipped_input", run=record.id, details=details, excludes="no")
+        yield Finding(code="clipped_input", run=record.id, details=details)
     if record.kind == "sine" and record.omega is not None and np.ptp(u) > 0:
         hertz, stated = line_frequency(record.t, u), record.omega / (2 * np.pi)
         resolution = 1.0 / float(record.t[-1] - record.t[0])
         if hertz is not None and abs(hertz - stated) > max(_OTHER_RUN * stated, resolution):
             look = why_other_frequency(stated / hertz) or say("frequency_of_another")
             details = {"found": f"{hertz:.3g}", "stated": f"{stated:.3g}", "look": look}
-            yield Finding(code="other_frequency", run=record.id, details=details, excludes="no")
+            yield Finding(code="other_frequency", run=record.id, details=details)
 
 
 # ---------------------------------------------------------------------- remarks

@@ -5,16 +5,17 @@ another unit; their input or length is that of another experiment; or one channe
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.estimation.force_balance import ChannelDelay, find_channel_delays
 from pipeline.estimation.record_fit import LENGTH_SCALES, TIME_UNITS, measured
-from pipeline.identify.findings import SAME, WITNESSES, Finding, say
+from pipeline.identify.findings import SAME, WITNESSES, say
 from pipeline.ingest.channels import is_stepped, line_frequency, stuck_spans
 from pipeline.ingest.columns import conversion
-from pipeline.results import LateChannel, Record
+from pipeline.results import Finding, LateChannel, Record
 from pipeline.setup import Setup
 
 OTHER_DWELL = 0.1  # relative; a dwell this far from its stated frequency is another dwell
@@ -63,7 +64,6 @@ def find_wrong_setups(records: Sequence[Record]) -> list[Finding]:
                 details={"cart": mover, "free": ", ".join(map(str, record.free))},
                 value=held[mover] / free if free > 0 else None,
                 limit=1 / LEAST_SHARE,
-                excludes="no",
             )
             found.append(fault)
     return found
@@ -85,7 +85,6 @@ def find_loose_holds(records: Sequence[Record]) -> list[Finding]:
                     details={"percent": f"{100 * share:.0f}"},
                     value=share,
                     limit=_HELD_FIRMLY,
-                    excludes="no",
                 )
                 found.append(fault)
     return found
@@ -114,7 +113,6 @@ def find_other_scales(records: Sequence[Record], *, bench: Setup) -> list[Findin
                 details=details,
                 value=travel,
                 limit=limit,
-                excludes="no",
             )
         )
     # Under feedback, a bench may log another signal as its input.
@@ -141,7 +139,6 @@ def find_other_scales(records: Sequence[Record], *, bench: Setup) -> list[Findin
                 details=details,
                 value=beyond,
                 limit=1.0,
-                excludes="no",
             )
         )
     return found
@@ -167,7 +164,6 @@ def find_other_steps(records: Sequence[Record], *, bench: Setup) -> Finding | No
         details=details,
         value=float(len(records)),
         limit=0.0,
-        excludes="no",
     )
 
 
@@ -404,10 +400,13 @@ def late_finding(late: LateChannel) -> Finding:
         details=details,
         value=late.delay,
         limit=late.limit,
-        excludes="no",
     )
 
 
-def late_experiments(late: Sequence[LateChannel]) -> Mapping[str, str]:
-    """Return the experiments in which a cart is late, each with its sentence."""
-    return {name: late_finding(one).reason for one in reversed(late) for name in one.experiments}
+def late_experiments(late: Sequence[LateChannel]) -> Mapping[str, Finding]:
+    """Return the experiments in which a cart is late, each with its finding."""
+    return {
+        name: replace(late_finding(one), run=name)
+        for one in reversed(late)
+        for name in one.experiments
+    }

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 from pipeline.estimation.record_fit import TIME_FACTORS
-from pipeline.identify.findings import SAME_SIZE, SIGMAS, Finding
+from pipeline.identify.findings import SAME_SIZE, SIGMAS
 from pipeline.names import gain_name, own_omega, own_zeta, read_name
-from pipeline.results import Check, Estimate, LogDecrement, Record, StepGain
+from pipeline.results import Check, Estimate, Finding, LogDecrement, Record, StepGain
 
 _MATERIAL = 0.05  # share of the response; a smaller difference does not matter
 # A repeat is odd if it differs from the others by this many times their spread; the keys are

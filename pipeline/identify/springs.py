@@ -15,7 +15,6 @@ from pipeline.errors import DataError, SubmissionError
 from pipeline.estimation.bode_fit import fit_bode
 from pipeline.estimation.estimates import SIGMA_LIMIT
 from pipeline.estimation.step_gain import fit_step_gain
-from pipeline.identify.findings import Finding
 from pipeline.identify.model_checks import NEGLIGIBLE, check_vanishing
 from pipeline.ingest.fill import (
     Found,
@@ -29,7 +28,15 @@ from pipeline.ingest.fill import (
 )
 from pipeline.ingest.read import read_data
 from pipeline.names import toml_flags
-from pipeline.results import EXPLAINED, ChainFit, Check, FrequencyResponse, Record, StepGain
+from pipeline.results import (
+    EXPLAINED,
+    ChainFit,
+    Check,
+    Finding,
+    FrequencyResponse,
+    Record,
+    StepGain,
+)
 from pipeline.setup import Setup
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME, spring_names
@@ -223,7 +230,6 @@ def _spring_check(
         details=details,
         value=value,
         limit=limit,
-        excludes="no",
     ).check
 
 

@@ -5,7 +5,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from pipeline.identify.findings import Finding
+from pipeline.json_files import json_text, plain, read_json
+from pipeline.results import Finding
 from pipeline.words.phrases import phrases
 from tests.helpers.places import ROOT
 
@@ -39,16 +40,17 @@ def test_every_code_has_a_sentence():
 def test_a_finding_is_seen_the_same_everywhere(excludes):
     """A finding about a cart of a recording gives a failed check and an entry with its reason."""
     finding = Finding(code="never_changes", run="step-1", cart=2, value=3.0, excludes=excludes)
-    check, entry = finding.check, finding.left_out
+    check = finding.check
     assert (check.id, check.outcome, check.value) == ("record.step-1.cart_2", "fail", 3.0)
-    assert check.message == f"step-1: {entry.reason}"
-    assert (entry.experiment, entry.is_wrong) == ("step-1", excludes == "wrong")
+    assert check.message == f"step-1: {finding.reason}"
+    entry = {"experiment": "step-1", "reason": finding.reason, "is_wrong": excludes == "wrong"}
+    assert plain(finding) == entry
+    again = read_json(Finding, json_text(finding))
+    assert (plain(again), again.excludes) == (entry, excludes)
 
 
 def test_a_finding_about_the_set_up_names_no_recording():
     """Without a recording, the message is the sentence alone."""
-    finding = Finding(
-        code="tied", kind="springs", parameter="k_3", details={"last": "2-wall"}, excludes="no"
-    )
+    finding = Finding(code="tied", kind="springs", parameter="k_3", details={"last": "2-wall"})
     assert finding.check.id == "springs.k_3"
     assert finding.check.message == finding.reason

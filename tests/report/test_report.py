@@ -38,7 +38,7 @@ from pipeline.report.sections.housekeeping import file_table, provenance_blocks
 from pipeline.report.sections.measurements import decay_blocks
 from pipeline.report.sections.page import Page as Shown
 from pipeline.report.sections.summary import summary, terminal_summary
-from pipeline.results import Analysis, Check, Estimate, LeftOut, ParameterRow, Skipped, Stage
+from pipeline.results import Analysis, Check, Estimate, Finding, ParameterRow, Skipped, Stage
 from pipeline.setup import Setup, Units
 from pipeline.words.text import plain, spans
 from tests.helpers.analysis_factory import make_analysis
@@ -613,7 +613,7 @@ def test_a_recording_that_was_left_out_is_not_listed_as_a_source():
     """
     analysis = make_analysis(2)
     dwells = [record.id for record in analysis.records if record.kind == "sine"]
-    left_out = LeftOut(experiment=dwells[0], reason="froze", is_wrong=True)
+    left_out = Finding(code="stray", run=dwells[0], details={"percent": 30}, excludes="wrong")
     whole = terminal_summary(analysis)
     assert analysis.fit is not None
     unreadable = {"step-9": "there is no file"}
@@ -631,7 +631,7 @@ def test_a_recording_that_was_left_out_is_not_listed_as_a_source():
     assert f"{len(dwells) - 1} sine dwells" in text
     assert "Give a file that can be read, or correct its name. step-9 could not be read" in text
     assert "Fix the recordings that were left out, record them again, or remove them." in text
-    assert f"{dwells[0]} is left out: froze" in text
+    assert f"{dwells[0]} is left out: {left_out.reason}" in text
 
 
 def test_an_unreadable_file_asks_for_no_new_experiment():

@@ -82,16 +82,16 @@ def _required(criterion: asked.RequiredPieces, context: GradingContext) -> Verdi
 
 
 def _data(_: asked.DataQuality, context: GradingContext) -> Verdict:
-    bad, runs = context.bad, len(context.submission.experiments)
+    problems, runs = context.problems, len(context.submission.experiments)
     share = share_sound(context)
-    said = group_messages((run, why.rstrip(".")) for run, why in bad.items())[:_NAMED]
+    said = group_messages((run, why.rstrip(".")) for run, why in problems.items())[:_NAMED]
     faults = " ".join(text if text.endswith("?") else f"{text}." for text in said)
     if not runs:
         faults = "There are no recordings."
-    elif share == 1 and bad:
+    elif share == 1 and problems:
         faults = f"{faults} The other recordings are as many as the lab asks for."
     return Verdict(
-        share=share, message=faults or "The recordings are sound.", found={"problems": dict(bad)}
+        share=share, message=faults or "The recordings are sound.", found={"problems": problems}
     )
 
 

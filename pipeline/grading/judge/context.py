@@ -17,7 +17,7 @@ from pipeline.grading.references.readings import readings
 from pipeline.grading.references.reference import References
 from pipeline.grading.rubric import RequiredPieces, RequiredRuns, Rubric, matching
 from pipeline.names import read_name
-from pipeline.results import Analysis, ExperimentKind
+from pipeline.results import Analysis, ExperimentKind, Finding
 from pipeline.submission import (
     Experiment,
     Reported,
@@ -71,7 +71,7 @@ class GradingContext:
     references : the parameters from the recordings, with bounds.
     controller : the reported controller, with the models to simulate it on.
     state_models : acceptable values of [A B].
-    bad : recordings with a problem, and the problem of each.
+    bad : recordings with a problem, and the first problem of each.
     named : for each table, the parameters whose errors a known mistake explains.
     slipped : for each table, what mistakes did to its numbers.
     meant : the gains that were meant, if a known mistake explains the reported ones, shape (2n,).
@@ -86,7 +86,7 @@ class GradingContext:
     references: References
     controller: Controller | None
     state_models: Sequence[StateMatrices]
-    bad: Mapping[str, str]
+    bad: Mapping[str, Finding]
     named: Mapping[Label, frozenset[str]]
     slipped: Mapping[Label, Sequence[Slipped]]
     order: Order
@@ -117,6 +117,11 @@ class GradingContext:
     def pieces(self) -> list[Piece]:
         """The required items; an unreadable file counts as missing."""
         return find_pieces(self.submission, self.rubric, unreadable=self.analysis.unreadable)
+
+    @property
+    def problems(self) -> dict[str, str]:
+        """The recordings with a problem, each with its problem in words."""
+        return {run: finding.reason for run, finding in self.bad.items()}
 
     @property
     def missing(self) -> list[Piece]:
@@ -300,17 +305,17 @@ def missing_flag(pieces: Sequence[Piece], rubric: Rubric) -> Flag:
     )
 
 
-def data_flag(bad: Mapping[str, str]) -> Flag:
+def data_flag(problems: Mapping[str, str]) -> Flag:
     """Return the flag for recordings with a problem."""
-    first, problem = next(iter(bad.items()))
-    others = len(bad) - 1
+    first, problem = next(iter(problems.items()))
+    others = len(problems) - 1
     have = "run has" if others == 1 else "runs have"
     more = f" ({others} more {have} a problem)" if others else ""
     return Flag(
         code="data_problem",
-        parameters=tuple(bad),
+        parameters=tuple(problems),
         message=f"{first}: {problem.rstrip('.')}{more}.",
-        evidence={"problems": dict(bad)},
+        evidence={"problems": dict(problems)},
     )
 
 

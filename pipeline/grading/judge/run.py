@@ -317,6 +317,6 @@ def _flags(context: GradingContext) -> tuple[list[Flag], Array | None]:
     flags += diagnose_reduced(context.analysis)
     if context.missing:
         flags.append(missing_flag(context.missing, context.rubric))
-    if context.bad:
-        flags.append(data_flag(context.bad))
+    if problems := context.problems:
+        flags.append(data_flag(problems))
     return flags, meant
