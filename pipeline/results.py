@@ -69,7 +69,7 @@ def passed(good: bool) -> CheckOutcome:
 EXPLAINED = 2.0
 
 
-_SENTENCES = phrases("findings")
+_SENTENCES = phrases("findings", "findings")
 SIGNAL = 3.0  # standard errors; a smaller magnitude may be noise alone
 
 

@@ -12,9 +12,10 @@ from pipeline.estimation.force_balance import find_interventions
 from pipeline.estimation.hardware_check import check_hardware
 from pipeline.estimation.state_feedback import design_feedback
 from pipeline.identify.assumptions import list_assumptions
-from pipeline.identify.findings import Log, valid_records
+from pipeline.identify.findings import valid_records
 from pipeline.identify.fit import check_groups, find_groups
 from pipeline.identify.identify import compare_estimates, identify_with_rejection
+from pipeline.identify.log import Log
 from pipeline.identify.model_checks import (
     check_carts,
     check_coverage,

@@ -31,7 +31,7 @@ from pipeline.estimation.record_fit import (
 from pipeline.estimation.sine import FEW_COUNTS
 from pipeline.estimation.time_fit import evaluate_chain, fit_records, open_window
 from pipeline.identify.corrections import without_lone_factors
-from pipeline.identify.findings import Log
+from pipeline.identify.log import Log
 from pipeline.names import own_zeta, read_name
 from pipeline.results import (
     EXPLAINED,

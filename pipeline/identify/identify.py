@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, pairwise
-from typing import Any
 
 from pipeline.errors import DataError
 from pipeline.estimation.bode_fit import fit_bode
@@ -29,8 +28,8 @@ from pipeline.identify.corrections import (
     find_impossible_gains,
     standing_still,
 )
-from pipeline.identify.findings import Log
 from pipeline.identify.fit import Fitted, Runs, fit_carts
+from pipeline.identify.log import Log, Measured
 from pipeline.identify.recording_faults import find_other_kinds, find_other_units, find_stuck
 from pipeline.identify.repeats import Repeats, compare_repeats, find_outlier_repeats
 from pipeline.ingest.read import Ingested
@@ -85,7 +84,7 @@ def identify(
     without: Set[str],
     bench: Setup,
     progress: Progress,
-    measured: dict[str, Any],
+    measured: Measured,
 ) -> Identified:
     """Run all stages up to the fit on the records, except those in `without`.
 
@@ -206,7 +205,9 @@ def _log_decrements(
             )
         for run in swinging:
             find = partial(_decays_between, between(run, interventions), cart=cart)
-            decays += log.attempt_once(Stage.LOG_DECREMENT, find, of=run.id, cart=cart) or ()
+            known = log.measured.decays
+            seen = log.attempt_once(Stage.LOG_DECREMENT, find, known, of=run.id, cart=cart)
+            decays += seen or ()
     return decays
 
 
@@ -258,7 +259,7 @@ def _step_gains(runs: Runs, *, bench: Setup, log: Log) -> list[StepGain]:
     for run in steps:
         for cart in run.carts:
             fit = partial(fit_step_gain, run, cart=cart)
-            gain = log.attempt_once(Stage.STEP_GAIN, fit, of=run.id, cart=cart)
+            gain = log.attempt_once(Stage.STEP_GAIN, fit, log.measured.gains, of=run.id, cart=cart)
             if gain:
                 gains.append(gain)
     return gains
@@ -270,7 +271,7 @@ def _sine_points(records: Sequence[Record], *, log: Log) -> list[SinePoint]:
         dwell = Dwell(run)
         for cart in run.carts if run.kind == "sine" else ():
             fit = partial(dwell.fit, cart=cart)
-            point = log.attempt_once(Stage.SINE, fit, of=run.id, cart=cart)
+            point = log.attempt_once(Stage.SINE, fit, log.measured.points, of=run.id, cart=cart)
             if point and (fault := dwell_fault(point)):
                 log.skip(Stage.SINE, fault, run=run.id, cart=cart)
             elif point:
@@ -346,7 +347,7 @@ def identify_with_rejection(
         interventions=interventions,
         bench=bench,
         progress=progress,
-        measured={},
+        measured=Measured(),
     )
     found = again(without=without)
     for _ in range(_ROUNDS):

@@ -5,6 +5,7 @@ and loops must be those that were requested or logged.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -29,6 +30,7 @@ from pipeline.results import (
     Coverage,
     DecayLaw,
     FeedbackDesign,
+    Finding,
     HardwareCheck,
     LogDecrement,
     ParameterRow,
@@ -58,8 +60,7 @@ def check_carts(
 ) -> list[Check]:
     """Check the fit, and whether the chain has the signs, redundancies and orders of real carts."""
     if fit is None:
-        message = "No model was identified. The list of what was skipped has the reasons."
-        return [Check(kind="fit", part="identified", outcome="fail", message=message)]
+        return [Finding(code="no_model", kind="fit", part="identified").check]
     if not fit.converged:
         return _fit_checks(fit)
     chain = fit.chain
@@ -152,25 +153,30 @@ def check_vanishing(
         beside = _larger_neighbour(name, values)
         share = value / values[beside] if beside else 1.0
         if value == 0 or (sigmas is not None and abs(sigmas) <= SIGMA_LIMIT):
-            found = f"{name} ends at zero"
-            if sigmas:
-                found = f"{name} = {value:.2g} ± {std[name]:.1g} is zero within its error"
+            seen = "zero_within_error" if sigmas else "ends_at_zero"
             measured, limit = sigmas, SIGMA_LIMIT
         elif 0 < share < NEGLIGIBLE:
-            found = f"{name} = {value:.2g} is {100 * share:.2g} % of {beside}, almost nothing"
-            measured, limit = share, NEGLIGIBLE
+            seen, measured, limit = "almost_nothing", share, NEGLIGIBLE
         else:
             continue
-        checks.append(
-            Check(
-                kind="vanishing",
-                parameter=name,
-                outcome="fail",
-                value=measured or 0.0,
-                limit=limit,
-                message=f"{found}. {_ask_if_there(name, decays=decays, bench=bench)}",
-            )
+        found = say(
+            seen,
+            name=name,
+            value=f"{value:.2g}",
+            std=f"{std.get(name) or 0.0:.1g}",
+            percent=f"{100 * share:.2g}",
+            beside=beside,
         )
+        code, details = _ask_if_there(name, decays=decays, bench=bench)
+        finding = Finding(
+            code=code,
+            kind="vanishing",
+            parameter=name,
+            details={"found": found, **details},
+            value=measured or 0.0,
+            limit=limit,
+        )
+        checks.append(finding.check)
     return checks
 
 
@@ -185,44 +191,29 @@ def _larger_neighbour(name: str, values: Mapping[str, float]) -> str:
     return max((o for o in beside if values.get(o, 0.0) > 0), key=lambda o: values[o], default="")
 
 
-def _ask_if_there(name: str, *, decays: Sequence[LogDecrement], bench: Setup) -> str:
-    """Return a question to the student about a vanishing parameter, with the line to change."""
+def _ask_if_there(
+    name: str, *, decays: Sequence[LogDecrement], bench: Setup
+) -> tuple[str, dict[str, object]]:
+    """Return the code of the question to the student about a vanishing parameter, with its values.
+
+    Its sentence has the line of submission.toml to change.
+    """
     read, n = read_name(name), bench.n
     assert read.cart is not None
     i = read.cart
     if read.symbol == "c" and (alike := [one for one in decays if one.cart == i]):
         runs = join_names(list(dict.fromkeys(one.experiment for one in alike)))
-        return (
-            f"The fit does not determine this damping. Use that of {runs}: "
-            f"{own_zeta(i, n=n)} = {alike[0].zeta:.2g}."
-        )
+        zeta = f"{alike[0].zeta:.2g}"
+        return "damping_of_decay", {"runs": runs, "zeta": own_zeta(i, n=n), "value": zeta}
     if read.symbol == "c":
-        alone = f", carts = [{i}]" if n > 1 else ""
-        return (
-            f"Do the recordings show the damping of cart {i}? A decay of that cart would show "
-            f'it: add one to submission.toml, [[experiments]] with kind = "decay"{alone}.'
-        )
+        return "no_damping", {"n": i, "alone": f", carts = [{i}]" if n > 1 else ""}
     if read.symbol == "m":
-        fewer = f"carts = {n - 1}, or " if n > 1 else ""
-        return (
-            f"Is there a cart {i}, and does its column hold its position? If not, write "
-            f"{fewer}columns = {{ x{i} = … }} in submission.toml."
-        )
-    if n == 1:
-        return (
-            "Is there a spring at all? If not, write "
-            f"springs = {toml_flags([False, False])} in submission.toml."
-        )
+        return "no_cart", {"n": i, "fewer": f"carts = {n - 1}, or " if n > 1 else ""}
     if 1 < i <= n:
-        return (
-            f"Does a spring tie cart {i} to cart {i - 1}? If not, the motor does not move cart "
-            f"{i}: write carts = {i - 1} in submission.toml."
-        )
-    ends = f"wall-{i}" if i == 1 else f"{n}-wall"
-    fewer = [flag and j != i for j, flag in enumerate(bench.springs, start=1)]
-    return (
-        f"Is there a spring {ends}? If not, write springs = {toml_flags(fewer)} in submission.toml."
-    )
+        return "no_link", {"n": i, "before": i - 1}
+    fewer = [flag and n > 1 and j != i for j, flag in enumerate(bench.springs, start=1)]
+    end = "at all" if n == 1 else f"wall-{i}" if i == 1 else f"{n}-wall"
+    return "no_end_spring", {"end": end, "springs": toml_flags(fewer)}
 
 
 def _redundancy_checks(values: Mapping[str, float]) -> list[Check]:
@@ -448,48 +439,26 @@ def check_steps(
 
 
 def _step_check(step: StepGain, *, shown: Sequence[str], bench: Setup) -> Check:
-    outcome: CheckOutcome
-    edges, width = len(step.edges), None
+    """Return the check of one step, whose cart shows dry friction in the runs `shown`."""
+    run, cart, edges = step.experiment, step.cart, len(step.edges)
     if step.interval:
         low, high = step.interval
-        width = high - low
-        outcome, found = (
-            "fail",
-            (  # the shift of the rest points gives the least friction that can hold the cart
-                f"sticks: its rest positions give static gains from {low:.4g} to {high:.4g} "
-                f"{bench.units.gain}, but the true gain may be outside this range."
-            ),
-        )
-    elif shown:
-        runs = join_names(list(dict.fromkeys(shown)))
-        outcome, found = (
-            "skip",
-            (
-                f"has the same gain at every edge, but shows dry friction in {runs}. Friction may "
-                "stop it short of its level here too, by the same distance at every edge."
-            ),
-        )
+        # The shift of the rest points gives the least friction that can hold the cart.
+        details = {"low": f"{low:.4g}", "high": f"{high:.4g}", "unit": bench.units.gain}
+        return Finding(
+            code="sticks", kind="step", run=run, cart=cart, details=details, value=high - low
+        ).check
+    outcome: CheckOutcome = "skip"
+    if shown:
+        found = say("step_with_friction", runs=join_names(list(dict.fromkeys(shown))))
     elif edges < 2:
-        outcome, found = (
-            "skip",
-            (
-                "settles after one edge of the input only, so it is unknown whether friction holds "
-                "it off its level. A step on and off again would show it."
-            ),
-        )
+        found = say("step_with_one_edge")
     else:
-        back = "" if step.rest_shift is None else " and returns to its initial rest position"
         all_edges = "both edges" if edges == 2 else f"all {edges} edges"
-        outcome, found = "pass", f"has the same gain at {all_edges} of the input{back}."
-    return Check(
-        kind="step",
-        run=step.experiment,
-        cart=step.cart,
-        outcome=outcome,
-        value=width,
-        limit=None,
-        message=f"{step.experiment}: cart {step.cart} {found}",
-    )
+        back = "" if step.rest_shift is None else say("step_returns")
+        outcome, found = "pass", say("step_agrees", all_edges=all_edges, back=back)
+    message = f"{run}: cart {cart} {found}"
+    return Check(kind="step", run=run, cart=cart, outcome=outcome, message=message)
 
 
 def say_law(decay: LogDecrement, *, unit: str) -> str:
@@ -532,7 +501,7 @@ def check_loops(hardware: Sequence[HardwareCheck]) -> list[Check]:
         if check.contradicted:
             notes.setdefault(check.experiment, []).extend([check.note] if check.note else [])
     return [
-        Check(kind="hardware", run=run, outcome="fail", message=f"{run}: {'; '.join(texts)}.")
+        Finding(code="loop", kind="hardware", run=run, details={"notes": "; ".join(texts)}).check
         for run, texts in notes.items()
     ]
 
@@ -567,27 +536,27 @@ def verify_design(chain: Chain, design: FeedbackDesign) -> Check:
     Riccati solver gives.
     """
     asked = "the requested poles" if design.Q is None else "the same loop as scipy's Riccati solver"
+    message = f"the gains give {asked}"
+    verified = Check(
+        kind="feedback", part="gains", outcome="pass", limit=_SAME_LOOP, message=message
+    )
     try:
         ours, wanted, level = _loops(chain, design)
     except (np.linalg.LinAlgError, ValueError, ZeroDivisionError):
-        return _check("skip", None, "not verified: the plant's numbers differ too much in size")
+        message = "not verified: the plant's numbers differ too much in size"
+        return replace(verified, outcome="skip", message=message)
     value = float(np.max(np.append(np.abs(ours - wanted), abs(level - 1))).round(_LAST_DIGIT))
-    if not np.isfinite(value):
-        return _check("fail", None, "the designed loop has no finite polynomial: do not run it")
-    if value > _SAME_LOOP:
-        return _check("fail", value, f"the gains do not give {asked}: do not run them")
-    return _check("pass", value, f"the gains give {asked}")
-
-
-def _check(outcome: CheckOutcome, value: float | None, message: str) -> Check:
-    return Check(
-        kind="feedback",
-        part="gains",
-        outcome=outcome,
-        value=value,
-        limit=_SAME_LOOP,
-        message=message,
-    )
+    if not value <= _SAME_LOOP:
+        finite = bool(np.isfinite(value))
+        return Finding(
+            code="other_loop" if finite else "no_polynomial",
+            kind="feedback",
+            part="gains",
+            details={"asked": asked},
+            value=value if finite else None,
+            limit=_SAME_LOOP,
+        ).check
+    return replace(verified, value=value)
 
 
 def _loops(chain: Chain, design: FeedbackDesign) -> tuple[Array, Array, float]:

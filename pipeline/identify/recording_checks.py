@@ -156,25 +156,24 @@ def check_signs(signs: Signs, *, without: Container[str]) -> list[Check]:
         ]
         contrary = [name for name in determined if signs.found[name] == -sign]
         if contrary and 2 * len(contrary) >= len(determined):
-            message = say(
-                "sign",
+            those = f"{len(contrary)} of the {len(determined)}"
+            shown = say(
+                "sign_shown",
                 stated=sign,
                 found=f"{-sign:+d}",
                 found_plain=-sign,
                 runs=join_names(contrary, most=FEW_NAMES),
-                those="all"
-                if contrary == determined
-                else f"{len(contrary)} of the {len(determined)}",
+                those="all" if contrary == determined else those,
             )
-            says.append(message)
+            says.append(shown)
             wrong += len(contrary)
     if not says:
         return []
-    message = " ".join(says)
-    value = float(wrong)
-    return [
-        Check(kind="input", part="sign", outcome="fail", value=value, limit=0.0, message=message)
-    ]
+    details = {"shown": " ".join(says)}
+    finding = Finding(
+        code="sign", kind="input", part="sign", details=details, value=float(wrong), limit=0.0
+    )
+    return [finding.check]
 
 
 def check_left_out(left_out: Sequence[Finding], *, records: Sequence[Record]) -> list[Check]:
@@ -183,19 +182,17 @@ def check_left_out(left_out: Sequence[Finding], *, records: Sequence[Record]) ->
     for one in left_out:
         runs.setdefault(one.reason, []).append(one.experiment)
     return [
-        Check(
-            kind="record",
+        Finding(
+            code="left_out",
             run=names[0],
-            outcome="fail",
+            details={
+                "are": "is" if len(names) == 1 else "are",
+                "runs": _named(names, records),
+                "reason": reason,
+            },
             value=float(len(names)),
             limit=0.0,
-            message=say(
-                "left_out",
-                are="is" if len(names) == 1 else "are",
-                runs=_named(names, records),
-                reason=reason,
-            ),
-        )
+        ).check
         for reason, names in sorted(runs.items(), key=lambda item: -len(item[1]))
     ]
 

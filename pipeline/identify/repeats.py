@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 from pipeline.estimation.record_fit import TIME_FACTORS
-from pipeline.identify.findings import SAME_SIZE, SIGMAS
+from pipeline.identify.findings import SAME_SIZE, SIGMAS, say
 from pipeline.names import gain_name, own_omega, own_zeta, read_name
 from pipeline.results import Check, Estimate, Finding, LogDecrement, Record, StepGain
 
@@ -365,28 +365,31 @@ def _check(
     spread = 100 * (max(values) - min(values)) / largest if largest > 0 else 0.0
     # A run that is odd in another number may agree in this one.
     off = [reading for reading in readings if reading.run in odd and reading not in right]
-    apart = f"from {min(values):.4g} to {max(values):.4g}"
-    count = f"{len(readings)} runs"
+    details = {
+        "name": name,
+        "count": len(readings),
+        "apart": f"from {min(values):.4g} to {max(values):.4g}",
+        "runs": ", ".join(f"{reading.run} ({reading.value:.4g})" for reading in off),
+        "are": "is" if len(off) == 1 else "are",
+        "spread": f"{spread:.2g}",
+    }
+    limit, code = readings[0].tolerance, ""
     if undecided:
-        outcome, text = (
-            "fail",
-            f"contradict each other ({apart}), and nothing shows which is right: no run is used",
-        )
+        code = "undecided_repeats"
     elif off:
-        runs = ", ".join(f"{reading.run} ({reading.value:.4g})" for reading in off)
-        are = "is" if len(off) == 1 else "are"
-        outcome, text = "fail", f"contradict each other ({apart}). {runs} {are} left out"
+        code = "odd_repeats"
     elif np.any(_contradictions(readings)):
-        outcome, text = "fail", f"give values {apart} that depend on the step, as if a cart stuck"
-    elif spread > readings[0].tolerance:
-        outcome, text = "skip", f"give values {apart}; their standard errors allow this difference"
-    else:
-        outcome, text = "pass", f"agree within {spread:.2g} %"
+        code = "sticking_repeats"
+    if code:
+        return Finding(
+            code=code, kind="repeats", parameter=name, details=details, value=spread, limit=limit
+        ).check
+    agree = spread <= limit
     return Check(
         kind="repeats",
         parameter=name,
-        outcome=outcome,
+        outcome="pass" if agree else "skip",
         value=spread,
-        limit=readings[0].tolerance,
-        message=f"{name}: {count} {text}.",
+        limit=limit,
+        message=say("repeats_agree" if agree else "repeats_differ", **details),
     )

@@ -23,16 +23,20 @@ _LARGEST = 1_000_000  # largest file in bytes
 
 @dataclass(frozen=True)
 class Phrases:
-    """The sentences of one file; a `ConfigError` reports a mistake in the file."""
+    """The sentences of one file, or of one of its tables; a `ConfigError` reports a mistake."""
 
     path: Path
+    table: str = ""
 
     @cached_property
     def by_key(self) -> Mapping[str, str]:
-        """The sentences of the file, by key."""
+        """The sentences of the file or the table, by key."""
         where = self._where()
         text = read_text(self.path, where=where, limit=_LARGEST, error=ConfigError)
         found = parse_toml(text, where=where, error=ConfigError)
+        found = found.get(self.table) if self.table else found
+        if not isinstance(found, dict):
+            raise ConfigError(f"{where}: needs a table [{self.table}]; add it")
         for key, sentence in found.items():
             if not isinstance(sentence, str):
                 raise ConfigError(f"{where}: {key} needs a sentence in quotes, found {sentence!r}")
@@ -66,9 +70,9 @@ class Phrases:
         return f"templates/words/{self.path.name}"
 
 
-def phrases(subject: str) -> Phrases:
-    """Return the sentences of a subject."""
-    return Phrases(TEMPLATES / "words" / f"{subject}.toml")
+def phrases(subject: str, table: str = "") -> Phrases:
+    """Return the sentences of a subject, or of one table of its file."""
+    return Phrases(TEMPLATES / "words" / f"{subject}.toml", table)
 
 
 def _filled_in(template: str, values: Mapping[str, object]) -> str:

@@ -2,6 +2,7 @@
 
 import ast
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -10,30 +11,46 @@ from pipeline.results import Finding
 from pipeline.words.phrases import phrases
 from tests.helpers.places import ROOT
 
-
-def codes() -> Iterator[tuple[str, str]]:
-    """Yield each code of a finding in the source, with the module and line."""
-    for path in (ROOT / "pipeline" / "identify").glob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            values: list[ast.expr] = []
-            if isinstance(node, ast.Call):
-                values = [word.value for word in node.keywords if word.arg == "code"]
-                if getattr(node.func, "id", "") == "say":
-                    values += node.args
-            elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "code":
-                values = [node.value]
-            for value in values:
-                ends = [value.body, value.orelse] if isinstance(value, ast.IfExp) else [value]
-                for end in ends:
-                    if isinstance(end, ast.Constant):
-                        yield str(end.value), f"{path.name}:{end.lineno}"
+RESULTS = ROOT / "pipeline" / "results.py"
+IDENTIFY = sorted((ROOT / "pipeline" / "identify").glob("*.py"))
 
 
-def test_every_code_has_a_sentence():
-    """Every code is a key of the catalogue; `test_every_sentence_is_used` tests the reverse."""
-    sentences, found = phrases("findings").by_key, dict(codes())
-    assert {code: where for code, where in found.items() if code not in sentences} == {}
-    assert len(found) > 40  # so that this test cannot pass by finding no codes
+def keys_in(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield the keys of sentences in a module, each with its table: codes, and parts for `say`.
+
+    A string that is not an argument of `say` may be a code.
+    """
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    said: set[ast.AST] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            is_say = getattr(node.func, "id", "") == "say"
+            values = [("findings", word.value) for word in node.keywords if word.arg == "code"]
+            values += [("parts", value) for value in node.args if is_say]
+            said |= {one for _, value in values if is_say for one in ast.walk(value)}
+        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "code":
+            values = [("findings", node.value)]
+        else:
+            continue
+        for table, value in values:
+            ends = [value.body, value.orelse] if isinstance(value, ast.IfExp) else [value]
+            yield from ((table, str(e.value)) for e in ends if isinstance(e, ast.Constant))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in said:
+            yield "perhaps", node.value
+
+
+def test_every_code_has_a_sentence_and_every_sentence_a_code():
+    """Codes and parts are keys of their tables; no sentence of a finding is without its code."""
+    found = {key for path in (*IDENTIFY, RESULTS) for key in keys_in(path)}
+    for table, fewest in (("findings", 40), ("parts", 15)):
+        sentences = phrases("findings", table).by_key
+        keys = {key for of, key in found if of == table and key}
+        assert keys <= sentences.keys()
+        assert len(keys) > fewest  # so that this test cannot pass by finding no keys
+    assert phrases("findings", "findings").by_key.keys() <= {
+        k for of, k in found if of == "perhaps"
+    }
 
 
 @pytest.mark.parametrize("excludes", ["odd", "wrong"])

@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.estimation.state_feedback import Method, design_feedback
-from pipeline.identify.findings import Log
+from pipeline.identify.log import Log
 from pipeline.identify.model_checks import design_margins
 from pipeline.json_files import json_text
 from pipeline.plant.chain import PRESETS, Chain

@@ -1,18 +1,27 @@
 """The sentences that an instructor may edit: found by key, with values and markup."""
 
 import ast
+import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from pipeline.errors import ConfigError
 from pipeline.resources import TEMPLATES
-from pipeline.words.phrases import Phrases, phrases
+from pipeline.words.phrases import Phrases
 from pipeline.words.text import Span
 from tests.helpers.places import ROOT
 
 PIPELINE = ROOT / "pipeline"
-SUBJECTS = sorted(path.stem for path in (TEMPLATES / "words").glob("*.toml"))
+
+
+def catalogues() -> Iterator[Phrases]:
+    """Yield the sentences of every file, or of each table if it has tables."""
+    for path in sorted((TEMPLATES / "words").glob("*.toml")):
+        found = tomllib.loads(path.read_text(encoding="utf-8"))
+        tables = [key for key, value in found.items() if isinstance(value, dict)]
+        yield from (Phrases(path, table) for table in tables or [""])
 
 
 def written(folder: Path, text: str) -> Phrases:
@@ -33,10 +42,10 @@ def modules() -> list[tuple[str, set[str]]]:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("subject", SUBJECTS)
-def test_every_sentence_is_used(subject, modules):
+@pytest.mark.parametrize("words", catalogues(), ids=lambda words: words.path.stem + words.table)
+def test_every_sentence_is_used(words, modules):
     """Every sentence of a catalogue is used by some module."""
-    asking = (f'"{subject}"', "WORDS", "say(", "words: Phrases", "advice_keys=(")
+    asking = (f'"{words.path.stem}"', "WORDS", "say(", "words: Phrases", "advice_keys=(")
     strings: set[str] = set()
     parts: set[str] = set()  # keys that are put together, as in f"title_{verdict}"
     for text, found in modules:
@@ -44,7 +53,7 @@ def test_every_sentence_is_used(subject, modules):
         parts |= found if any(word in text for word in asking) else set()
     built = tuple(s for s in parts if s.endswith("_"))
     built_ends = tuple(s for s in parts if s.startswith("_"))
-    for key in phrases(subject).by_key:
+    for key in words.by_key:
         is_used = key in strings or key.startswith(built) or key.endswith(built_ends)
         assert is_used or key in ("bode_fit", "time_fit"), key  # names of fit methods
 
