@@ -29,7 +29,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from enum import StrEnum
-from typing import Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -647,6 +647,12 @@ class Check:
     value: float | None = written(default=None)
     limit: float | None = written(default=None)
     message: str = written()
+
+    @classmethod
+    def from_written(cls, *, id: str, **said: Any) -> "Check":
+        """Return the check of a file, whose id has the kind and what the check is about."""
+        kind, _, about = id.partition(".")
+        return cls(kind=cast(CheckKind, kind), parameter=about, **said)
 
     @property
     def is_cause(self) -> bool:

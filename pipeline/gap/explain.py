@@ -34,7 +34,7 @@ from pipeline.gap.summary import (
     make_traces,
     repeatability,
 )
-from pipeline.gap.types import Cause, FoundEffect, Gap
+from pipeline.gap.types import FoundEffect, Gap
 from pipeline.plant.augmented import compile_simulator
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import Chain
@@ -217,11 +217,7 @@ def investigate(analysis: Analysis, *, progress: Progress, budget: float | None 
         provenance=analysis.provenance,
         left_out=analysis.left_out,
         groups=analysis.groups,
-        causes=tuple(
-            Cause(id=c.id, value=c.value, limit=c.limit, message=c.message)
-            for c in analysis.causes
-            if not c.run or c.run in used
-        ),
+        causes=tuple(c for c in analysis.causes if not c.run or c.run in used),
         notes=(*notes, *gap.notes),
     )
 

@@ -11,7 +11,14 @@ from pipeline.errors import ConfigError
 from pipeline.json_files import Number, computed, read_json, result, written
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import AugmentedChain, Effect
-from pipeline.results import ChainWithUnits, Finding, Intervention, Provenance, RecordingGroup
+from pipeline.results import (
+    ChainWithUnits,
+    Check,
+    Finding,
+    Intervention,
+    Provenance,
+    RecordingGroup,
+)
 from pipeline.setup import Setup, Units
 from pipeline.submission.toml import first_refusal, quote
 
@@ -213,17 +220,6 @@ class Prediction:
     positions: Array
 
 
-@result()
-class Cause:
-    """A failed check of the set-up, such as its springs or units, that comes before any effect."""
-
-    id: str = written()
-    outcome: Literal["fail"] = written(default="fail")
-    value: float | None = written(default=None)
-    limit: float | None = written(default=None)
-    message: str = written()
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Proposal:
     """The recording that best distinguishes the contenders.
@@ -281,7 +277,7 @@ class Gap:
         "another search may find more",
         default=True,
     )
-    causes: tuple[Cause, ...] = written(
+    causes: tuple[Check, ...] = written(
         "failed checks of the set-up, which may cause the gap, the most serious first; effects "
         "count only once the set-up is right",
         default=(),

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.json_files import json_text, plain, read_json
-from pipeline.results import Finding
+from pipeline.results import Check, Finding
 from pipeline.words.phrases import phrases
 from tests.helpers.places import ROOT
 
@@ -71,3 +71,11 @@ def test_a_finding_about_the_set_up_names_no_recording():
     finding = Finding(code="tied", kind="springs", parameter="k_3", details={"last": "2-wall"})
     assert finding.check.id == "springs.k_3"
     assert finding.check.message == finding.reason
+
+
+def test_a_check_of_a_file_is_the_same_check():
+    """A check keeps its id, numbers and message when its file is read and written again."""
+    finding = Finding(code="tied", kind="springs", parameter="k_3", details={"last": "2-wall"})
+    again = read_json(Check, text := json_text(finding.check))
+    assert json_text(again) == text
+    assert (again.kind, again.is_cause) == ("springs", True)

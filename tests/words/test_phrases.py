@@ -42,7 +42,9 @@ def modules() -> list[tuple[str, set[str]]]:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("words", catalogues(), ids=lambda words: words.path.stem + words.table)
+@pytest.mark.parametrize(
+    "words", list(catalogues()), ids=lambda words: words.path.stem + words.table
+)
 def test_every_sentence_is_used(words, modules):
     """Every sentence of a catalogue is used by some module."""
     asking = (f'"{words.path.stem}"', "WORDS", "say(", "words: Phrases", "advice_keys=(")
