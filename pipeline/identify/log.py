@@ -8,7 +8,7 @@ from pipeline.errors import DataError
 from pipeline.results import LogDecrement, SinePoint, Skipped, Stage, StepGain
 
 T = TypeVar("T")
-# The result of a stage, or the reason why there is none, by record and cart.
+# The result of a stage, or its error, by record and cart.
 Known: TypeAlias = dict[tuple[str, int], T | DataError]
 
 
