@@ -389,7 +389,9 @@ def _input(opened: _Opened) -> tuple[Array | None, float]:
         or (per_count is not None and (table.form in ("matrix", "variables") or column.is_counted))
     )
     if per_count is not None and column.unit is None:
-        in_counts = in_counts or _beyond_volts(values)
+        # Large whole numbers, such as "512.0", are counts, not volts.
+        is_whole = bool(np.all(values == np.round(values)))
+        in_counts = in_counts or (is_whole and np.abs(values).max() > _FEW_COUNTS)
     if override is not None and override.per_count is not None:
         scale = override.per_count
     elif in_counts:
@@ -399,11 +401,6 @@ def _input(opened: _Opened) -> tuple[Array | None, float]:
     else:
         scale = _unit_scale(opened, column, stated.unit, "input")
     return values * scale, scale
-
-
-def _beyond_volts(values: Array) -> bool:
-    """Return whether values are counts, not volts: large whole numbers, such as "512.0"."""
-    return bool(np.all(values == np.round(values)) and np.abs(values).max() > _FEW_COUNTS)
 
 
 def _reference(opened: _Opened, keep: NDArray[np.intp]) -> Array | None:
