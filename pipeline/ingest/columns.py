@@ -242,7 +242,6 @@ _ONE_POSITION = (
 )
 # known headings of columns that have no role
 _NO_ROLE = re.compile(r"|sample|samples|index|n|no|nr|i|row|#")
-_IN_UNITS = ("csv", "workbook", "lvm", "tdms")  # formats whose values are in the submission's units
 _COUNTED = re.compile(r"\benc|counts?\b|commanded pos", re.IGNORECASE)
 # Names of a time that are its unit, too.
 _NAMED_UNITS = {
@@ -279,7 +278,7 @@ class Column:
 
 def holds_counts(table: FileTable, column: Column) -> bool:
     """Return whether a column holds whole numbers that the format or the heading calls counts."""
-    return table.whole[column.index] and (table.form not in _IN_UNITS or column.is_counted)
+    return table.whole[column.index] and (table.format.positions != "heading" or column.is_counted)
 
 
 def is_count(unit: str) -> bool:

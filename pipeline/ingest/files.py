@@ -21,7 +21,7 @@ from pipeline.errors import SubmissionError, is_file_fault
 from pipeline.ingest.columns import is_time
 from pipeline.ingest.labview import is_lvm, is_tdms, read_lvm, read_tdms
 from pipeline.ingest.matlab import is_mat, read_mat
-from pipeline.ingest.table import FileTable, Variable
+from pipeline.ingest.table import FileTable, Format, Variable
 from pipeline.ingest.text import read_text
 from pipeline.ingest.workbook import is_workbook, read_workbook
 from pipeline.processes import Ended, Failed, Supervisor, limited_memory, serve
@@ -32,17 +32,6 @@ from pipeline.words.numbers import first_few
 ENDINGS = (
     ".txt", ".csv", ".xlsx", ".mat", ".m", ".tdms", ".lvm", ".log", ".dat", ".tsv", ".asc",
 )  # fmt: skip
-FORM_TITLES = {
-    "ecp": 'ECP "Export Raw Data" text',
-    "bench_log": "bench log",
-    "bench_mat": "bench log, .mat",
-    "matrix": "bare matrix, .mat",
-    "variables": "vectors, .mat",
-    "csv": "table of text (CSV)",
-    "workbook": "Excel workbook",
-    "tdms": "National Instruments .tdms",
-    "lvm": "LabVIEW measurement file (.lvm)",
-}
 # For each format, a function that recognises it and one that reads it; all other files are text.
 _READERS: tuple[tuple[Callable[[bytes], bool], Callable[..., list[FileTable]]], ...] = (
     (is_mat, read_mat),
@@ -248,7 +237,7 @@ def _unpacked(plain: dict[str, Any]) -> FileTable:
     made["variables"] = tuple(
         Variable(**(one | {"size": tuple(one["size"])})) for one in plain["variables"]
     )
-    made["values"] = values
+    made |= {"format": Format(**plain["format"]), "values": values}
     return FileTable(**made)
 
 

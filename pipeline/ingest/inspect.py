@@ -27,7 +27,7 @@ from pipeline.ingest.columns import (
     plain_name,
     refuse_unknown_unit,
 )
-from pipeline.ingest.files import FORM_TITLES, choose_run, read_tables
+from pipeline.ingest.files import choose_run, read_tables
 from pipeline.ingest.table import FileTable, Variable
 from pipeline.ingest.unnamed import Roles, find_roles
 from pipeline.results import ExperimentKind
@@ -205,7 +205,7 @@ def _inspect(table: FileTable, path: Path, *, columns: Mapping[str, str | int]) 
         needs.append("sample_rate")
     return Inspection(
         file=str(path),
-        format=FORM_TITLES[table.form],
+        format=table.format.title,
         columns=_inspect_columns(table, assigned),
         samples=table.values.shape[1],
         duration=float(clock.t[-1] - clock.t[0]) if clock else None,
@@ -326,7 +326,12 @@ def _guess(
     if u is not None and u[0] != 0.0 and np.ptp(u) == 0.0 and _starts_at_rest(positions):
         return "step", None  # the log begins at the step
     if u is None or np.ptp(u) == 0.0:
-        if table.form != "bench_mat" or reference is None or np.ptp(reference) == 0.0:
+        if (
+            table.format.inputs != "count"
+            or table.lines is not None
+            or reference is None
+            or np.ptp(reference) == 0.0
+        ):
             return "decay", None
         problems.append(
             f"the input never changes, yet {columns['reference'].name!r} does: was it saved as "

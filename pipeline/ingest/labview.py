@@ -24,6 +24,7 @@ from pipeline.ingest.table import (
     MOST_NAMED,
     SETTING,
     FileTable,
+    Format,
     Variable,
     binary_table,
     checked_names,
@@ -35,6 +36,8 @@ from pipeline.words.numbers import first_few
 if TYPE_CHECKING:
     from nptdms import TdmsChannel
 
+_LVM = Format(title="LabVIEW measurement file (.lvm)")
+_TDMS = Format(title="National Instruments .tdms")
 _START = re.compile(rb"(\xef\xbb\xbf)?LabVIEW Measurement[\t,\r\n]")
 _END, _SPECIAL, _END_OF_SPECIAL = "***End_of_Header***", "***Start_Special***", "***End_Special***"
 
@@ -185,7 +188,7 @@ def _read(segment: _Segment, layout: Layout, *, across: str, source: str) -> Fil
     block = Block(head=[(segment.line, "")], rows=rows, source=source)
     headings = _headings(segment, [names[i] for i in used])
     apart = Layout("\x01", comma=layout.comma)
-    table = read_block(block, apart, form="lvm", names=headings)
+    table = read_block(block, apart, format=_LVM, names=headings)
     most = max((int(n) for n in segment.tags.get("Samples", []) if n.isdecimal()), default=0)
     complete = len(rows) - (rows[-1][1].count("\x01") != len(used) - 1)
     if complete < most:
@@ -272,7 +275,7 @@ def _table(group: str, read: Sequence["_Channel"], *, source: str) -> FileTable:
             names.insert(0, "time")
             columns.insert(0, _even_times(read[0].samples, start=start, interval=interval))
     names = checked_names(names, place=f"{source} group {group!r}")
-    return binary_table(columns, names=names, source=source, form="tdms", run=group)
+    return binary_table(columns, names=names, source=source, format=_TDMS, run=group)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

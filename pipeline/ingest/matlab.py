@@ -19,6 +19,7 @@ from pipeline.ingest.table import (
     MOST_NAMED,
     SETTING,
     FileTable,
+    Format,
     Variable,
     binary_table,
     checked_names,
@@ -26,6 +27,9 @@ from pipeline.ingest.table import (
 )
 from pipeline.words.numbers import first_few
 
+_VECTORS = Format(title="vectors, .mat", positions="unknown", inputs="unknown")
+_MATRIX = Format(title="bare matrix, .mat", positions="unknown", inputs="unknown")
+_BENCH_LOG = Format(title="bench log, .mat", positions="unknown", inputs="count")
 _MOST_SETTINGS = 8  # numbers in a variable; a recording has more samples
 _BENCH = ({"enc1", "duty", "time"}, {"cart1pos", "duty_cycle", "t_received"})
 _LONGEST_NAME, _DEEPEST = 64, 4  # characters; structs in structs
@@ -111,9 +115,9 @@ def read_mat(raw: bytes, *, source: str) -> list[FileTable]:
         names += [f"{variable.name} column {i}" if joined else str(i) for i in numbers]
     used = {variable.name for variable in record}
     longest = max(variable.samples for variable in record)
-    form = "variables" if joined or record[0].is_vector else "matrix"
+    format = _VECTORS if joined or record[0].is_vector else _MATRIX
     if any(bench <= used for bench in _BENCH):
-        form = "bench_mat"
+        format = _BENCH_LOG
     made = tuple(
         v.entry(read=True)
         if v in record
@@ -126,7 +130,9 @@ def read_mat(raw: bytes, *, source: str) -> list[FileTable]:
         if unwrapped is not column:
             notes.append(f"{name}: a {column.dtype} counter that overflowed was made continuous")
     return [
-        binary_table(columns, names=names, source=source, form=form, notes=notes, variables=made)
+        binary_table(
+            columns, names=names, source=source, format=format, notes=notes, variables=made
+        )
     ]
 
 
@@ -171,9 +177,9 @@ def _structure(name: str, fields: Mapping[str, MatVariable], *, source: str) -> 
     named = all(label for label, _ in columns)
     names = [label if named else str(i) for i, (label, _) in enumerate(columns, start=1)]
     names = checked_names(names, place=f"{source} {name}".strip())
-    form = "variables" if named else "matrix"
+    format = _VECTORS if named else _MATRIX
     arrays = [column for _, column in columns]
-    return binary_table(arrays, names=names, source=source, form=form, run=name)
+    return binary_table(arrays, names=names, source=source, format=format, run=name)
 
 
 def _label(element: Mapping[str, MatVariable]) -> str:

@@ -342,7 +342,7 @@ def _position_scale(opened: _Opened, column: Column) -> float:
     if holds_counts(table, column):
         if per_count is not None:
             return per_count
-        if is_count(unit) or not (table.form == "ecp" or column.is_counted):
+        if is_count(unit) or not (table.format.positions == "count" or column.is_counted):
             return 1.0
         raise SubmissionError(
             f"{table.source}: {column.name!r} holds encoder counts; state how many {unit} one "
@@ -384,9 +384,9 @@ def _input(opened: _Opened) -> tuple[Array | None, float]:
     override = experiment.input
     values, per_count = table.values[column.index], stated.per_count
     in_counts = table.whole[column.index] and (
-        table.form in ("bench_log", "bench_mat")
+        table.format.inputs == "count"
         or column.is_duty
-        or (per_count is not None and (table.form in ("matrix", "variables") or column.is_counted))
+        or (per_count is not None and (table.format.inputs == "unknown" or column.is_counted))
     )
     if per_count is not None and column.unit is None:
         # Large whole numbers, such as "512.0", are counts, not volts.

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,29 @@ SETTING = 0.1  # share of the longest signal; a shorter one holds settings, such
 # Range of values that a bench can measure, in any unit: times, positions, inputs, ratios. Powers
 # and products of several such values, as in the stages, neither overflow nor underflow.
 _SMALLEST_MEASURED, _LARGEST_MEASURED = 1e-12, 1e12
+
+
+# Where the unit of a column stands: in its heading or the submission; it is a count; or unknown.
+UnitFrom = Literal["heading", "count", "unknown"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Format:
+    """What the format of a file says about its numbers.
+
+    Attributes
+    ----------
+    title : name of the format.
+    positions, inputs : where the units of positions and of inputs stand. If a unit is unknown,
+        whole numbers may be counts.
+    """
+
+    title: str
+    positions: UnitFrom = "heading"
+    inputs: UnitFrom = "heading"
+
+
+BENCH_LOG = Format(title="bench log", positions="unknown", inputs="count")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +77,7 @@ class FileTable:
     Attributes
     ----------
     source : the file's name, for messages.
-    form : the format of the file, a key of `FORM_TITLES`.
+    format : the format of the file.
     names : (n_columns,) headings as written. Without headings, the numbers "1", "2", ….
     values : (n_columns, n), all finite.
     whole : (n_columns,) whether all numbers of a column were written as whole numbers.
@@ -69,7 +93,7 @@ class FileTable:
     """
 
     source: str
-    form: str
+    format: Format
     names: tuple[str, ...]
     values: Array
     whole: tuple[bool, ...]
@@ -173,7 +197,7 @@ def binary_table(
     *,
     names: Sequence[str],
     source: str,
-    form: str,
+    format: Format,
     run: str = "",
     notes: Sequence[str] = (),
     variables: Sequence[Variable] = (),
@@ -188,7 +212,7 @@ def binary_table(
     refuse_unusable(values, names=names, place=lambda row: f"{source} sample {row + 1}")
     return FileTable(
         source=source,
-        form=form,
+        format=format,
         names=tuple(names),
         values=values,
         whole=tuple(bool((column == np.round(column)).all()) for column in values),

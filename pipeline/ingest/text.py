@@ -17,9 +17,18 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.columns import are_units, is_time, join_unit, parse_heading
-from pipeline.ingest.table import FEW_NAMED, FileTable, checked_names, refuse_unusable
+from pipeline.ingest.table import (
+    BENCH_LOG,
+    FEW_NAMED,
+    FileTable,
+    Format,
+    checked_names,
+    refuse_unusable,
+)
 from pipeline.words.numbers import first_few
 
+CSV = Format(title="table of text (CSV)")
+ECP = Format(title='ECP "Export Raw Data" text', positions="count")
 _FEW_LINES, _SNIFFED_LINES = 40, 400
 _LONG = 8  # similar rows that begin a table; a shorter table must be alone in its file
 _BEST = 1.5 * _LONG  # score of a layout in which every field is a plain number
@@ -64,7 +73,7 @@ def read_text(raw: bytes, *, source: str) -> list[FileTable]:
         layout = Layout(None, comma=False)
         block = Block(head=head, rows=rows, source=source)
         names = _names_above(block, layout)
-        table = read_block(block, layout, form="ecp", names=names, cut=cut)
+        table = read_block(block, layout, format=ECP, names=names, cut=cut)
         return [replace(table, notes=(*table.notes, *notes))]
     lines = [(i, line) for i, line in enumerate(text.split("\n"), 1) if line.strip(' \t;,"')]
     sample = [line for _, line in lines[:_SNIFFED_LINES]]
@@ -72,7 +81,7 @@ def read_text(raw: bytes, *, source: str) -> list[FileTable]:
     if layout is None:
         raise SubmissionError(_no_table(lines, source))
     blocks = find_blocks(lines, layout, source=source)
-    return [table for block in blocks for table in read_runs(block, layout, form="csv")]
+    return [table for block in blocks for table in read_runs(block, layout, format=CSV)]
 
 
 def decode(raw: bytes, *, source: str) -> str:
@@ -369,7 +378,7 @@ def _begins(signatures: Sequence[str], i: int) -> bool:
     return named and _start(signatures[i : i + _LONG]) == (0, _LONG)
 
 
-def read_runs(block: Block, layout: Layout, *, form: str) -> list[FileTable]:
+def read_runs(block: Block, layout: Layout, *, format: Format) -> list[FileTable]:
     """Return the table of each run in a block: runs may stand side by side.
 
     Raises
@@ -380,7 +389,7 @@ def read_runs(block: Block, layout: Layout, *, form: str) -> list[FileTable]:
     of_run = [parse_heading(name).run for name in names]
     runs = [run for run in dict.fromkeys(of_run) if run]
     if len(runs) < 2:
-        table = read_block(block, layout, form=form, names=names)
+        table = read_block(block, layout, format=format, names=names)
         return [replace(table, run=runs[0] if runs else "")]
     tables = []
     rows = [(number, layout.split(row)) for number, row in block.rows]
@@ -398,7 +407,7 @@ def read_runs(block: Block, layout: Layout, *, form: str) -> list[FileTable]:
             lines = [(number, "\x01".join(fields)) for number, fields in parts]
             own_names = [names[i] for i in columns]
             part = replace(block, rows=lines, values=None)
-            table = read_block(part, apart, form=form, names=own_names)
+            table = read_block(part, apart, format=format, names=own_names)
             tables.append(replace(table, run=run))
     return tables
 
@@ -423,7 +432,7 @@ def read_block(
     block: Block,
     layout: Layout,
     *,
-    form: str,
+    format: Format,
     names: Sequence[str],
     cut: str | None = None,
 ) -> FileTable:
@@ -462,7 +471,7 @@ def read_block(
     )
     return FileTable(
         source=block.source,
-        form="bench_log" if form == "csv" and is_bench_log(names) else form,
+        format=BENCH_LOG if format.positions == "heading" and is_bench_log(names) else format,
         names=tuple(names),
         values=values,
         whole=whole,

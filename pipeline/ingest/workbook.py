@@ -9,10 +9,11 @@ from io import BytesIO
 from typing import Any
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.table import MOST_NAMED, SETTING, FileTable
-from pipeline.ingest.text import Layout, find_blocks, is_bench_log, read_runs
+from pipeline.ingest.table import MOST_NAMED, SETTING, FileTable, Format
+from pipeline.ingest.text import Layout, find_blocks, read_runs
 from pipeline.words.numbers import first_few
 
+_FORMAT = Format(title="Excel workbook")
 _PARTS = (b"[Content_Types].xml", b"docProps/", b"xl/")  # one of these occurs early in the archive
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(e[-+]?\d+)?", re.IGNORECASE)
 _FORMULA = re.compile(rb"<(?:\w+:)?f[ >]")
@@ -187,9 +188,8 @@ def _read_sheet(name: str, lines: Sequence[tuple[int, str]], *, source: str) -> 
     where = f"{source} sheet {name!r}"
     tables = []
     for block in find_blocks(lines, layout, source=where, line="row"):
-        for table in read_runs(block, layout, form="workbook"):
+        for table in read_runs(block, layout, format=_FORMAT):
             if any(not heading.isdigit() for heading in table.names):
-                form = "bench_log" if is_bench_log(table.names) else "workbook"
                 run = f"{name} {table.run}".strip() if table.run else name
-                tables.append(replace(table, form=form, source=source, run=run))
+                tables.append(replace(table, source=source, run=run))
     return tables

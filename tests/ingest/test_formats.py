@@ -57,7 +57,7 @@ def test_an_ecp_export_is_read_in_every_dialect(content):
     """Brackets, semicolons, line ends and a script's frame around them change no number."""
     got = table(content)
 
-    assert got.form == "ecp"
+    assert got.format.positions == "count"
     assert got.names[2:] == ("Commanded Pos", "Encoder 1 Pos", "Encoder 2 Pos", "Control Effort")
     assert_array_equal(column(got, "Time"), TIME)
     assert_array_equal(column(got, "Encoder 1 Pos"), X1)
@@ -126,7 +126,7 @@ def test_delimiter_and_decimal_mark_are_found(content):
     """Whatever delimiter and decimal mark a text table has, it gives the same numbers."""
     got = table(content)
 
-    assert got.form == "csv"
+    assert (got.format.positions, got.format.inputs) == ("heading", "heading")
     assert got.names == ("time", "input", "x1", "x2")
     for row, expected in zip(got.values, (TIME, U, X1, X2), strict=True):
         assert_array_equal(row, expected)
@@ -172,7 +172,7 @@ def test_a_bench_log_is_distinguished_from_an_ecp_export():
         for i, (t, a, b) in enumerate(zip(TIME, X1, X2, strict=True))
     ]
     got = table("\n".join(lines) + "\n")
-    assert got.form == "bench_log"
+    assert got.format.inputs == "count"
     assert_array_equal(column(got, "encoder 2 pos"), X2)
     assert got.whole == (True, False, True, True, True)
 
@@ -194,7 +194,7 @@ def test_mat_vectors_of_every_number_type_are_read(dtype, compress):
     got = table(raw)
 
     oracle = scipy.io.loadmat(BytesIO(raw), squeeze_me=True)
-    assert got.form == "bench_mat"
+    assert got.format.inputs == "count"
     for name in ("time", "enc1", "duty"):
         assert_array_equal(column(got, name), oracle[name])
 
@@ -221,7 +221,7 @@ def test_a_bare_matrix_has_numbered_columns():
     """The columns of a matrix are numbered; one saved in rows is transposed, with a note."""
     matrix = np.column_stack([np.arange(N), TIME, X1, U])
     upright, lying = table(mat(data=matrix)), table(mat(data=matrix.T))
-    assert upright.form == "matrix"
+    assert upright.format.inputs == "unknown"
     assert upright.names == ("1", "2", "3", "4")
     assert_array_equal(upright.values, matrix.T)
     assert_array_equal(lying.values, matrix.T)
@@ -277,7 +277,7 @@ def test_the_matrix_of_a_mat_file_is_the_recording():
     settings = {f"p{i}": float(i) for i in range(12)}
     scipy.io.savemat(stream, {**settings, "gains": [1.0, 2.0, 3.0], "log": matrix})
     got = table(stream.getvalue())
-    assert (got.form, got.names) == ("matrix", ("1", "2", "3"))
+    assert (got.format.inputs, got.names) == ("unknown", ("1", "2", "3"))
     assert_array_equal(got.values, matrix.T)
     read = [variable for variable in got.variables if variable.read]
     assert [(one.name, one.size) for one in read] == [("log", matrix.shape)]
@@ -373,7 +373,7 @@ def test_a_matlab_7_3_log_is_read_like_any_other():
         "duty": np.zeros(N, "i2"),
     }
     old, new = table(mat(**log)), table(mat73(**log))
-    assert (new.form, sorted(new.names)) == (old.form, sorted(old.names))
+    assert (new.format, sorted(new.names)) == (old.format, sorted(old.names))
     for name in log:
         assert_array_equal(column(new, name), column(old, name))
     matrix = np.column_stack([TIME, X1, U])

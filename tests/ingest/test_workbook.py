@@ -122,7 +122,7 @@ def test_every_sheet_gives_the_same_numbers(fill):
     got = table(sheet(fill))
     assert [re.sub(r" \[.*", "", name) for name in got.names] == HEADINGS
     assert_array_equal(got.values, [TIME, U, X1])
-    assert got.form == "workbook"
+    assert got.format.title == "Excel workbook"
     assert got.cut is None
 
 
@@ -153,7 +153,7 @@ def test_every_sheet_with_headings_is_a_run():
 def test_a_bench_log_in_a_workbook_is_a_bench_log():
     """A bench log that Excel opened and saved still has its duty counts."""
     columns = {"Sample": np.arange(N), "Time": TIME, "Encoder 1 Pos": X1, "Control Effort": U}
-    assert table(xlsx(columns)).form == "bench_log"
+    assert table(xlsx(columns)).format.inputs == "count"
 
 
 def test_dates_and_times_of_day_become_seconds():
