@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterator, Sequence
 from itertools import groupby
 from math import isclose
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, ValidationError
@@ -380,7 +380,7 @@ def _recording_text(recording: Recording) -> str:
 
 
 def _parse(text: str, *, where: str, system: System) -> Plan:
-    document = _tuples(parse_toml(text, where=where, error=ConfigError, root=Plan))
+    document = parse_toml(text, where=where, error=ConfigError, root=Plan)
     try:
         plan = Plan.model_validate(document, strict=True)
     except ValidationError as error:
@@ -391,12 +391,6 @@ def _parse(text: str, *, where: str, system: System) -> Plan:
         if not problems:
             return plan
     raise ConfigError(list_faults(where, problems))
-
-
-def _tuples(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _tuples(item) for key, item in value.items()}
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
 
 
 # ------------------------------------------------- consistency of several keys

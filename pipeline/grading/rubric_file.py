@@ -115,7 +115,7 @@ def parse_rubric(text: str, *, where: str) -> Rubric:
     InvalidRubric : the rubric has mistakes. If it is not TOML, the first is listed; else all are.
     """
     try:
-        document = _tuples(read_toml(text, root=Rubric))
+        document = read_toml(text, root=Rubric)
     except TomlSlip as slip:
         raise InvalidRubric(where, [(slip.line, str(slip))]) from None
     found = _validate(document)
@@ -218,12 +218,6 @@ def _without(document: dict, wrong: Sequence[ErrorDetails]) -> dict:
         elif isinstance(here, dict):
             here.pop(key, None)
     return left
-
-
-def _tuples(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _tuples(item) for key, item in value.items()}
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
 
 
 # ------------------------------------------------- contradictions between the tables

@@ -32,7 +32,6 @@ from pipeline.submission.toml import (
     UnusableNumber,
     at_line,
     backslash_words,
-    check_number,
     dotted,
     explain,
     list_faults,
@@ -40,6 +39,7 @@ from pipeline.submission.toml import (
     mend_number,
     nearest,
     parse_toml,
+    plain_values,
     quote,
     read_apart,
     read_text,
@@ -237,7 +237,7 @@ def _validate(document: dict, *, where: str) -> Submission:
     document = {key: value for key, value in document.items() if key in keys}
     unusable: list[UnusableNumber] = []
     try:
-        plain = {key: _plain(value, (key,), unusable) for key, value in document.items()}
+        plain = plain_values(document, refused=unusable, exact="reported")
     except RecursionError:
         raise SubmissionError(f"{where}: lists or tables nest too deeply") from None
     if unusable:
@@ -251,27 +251,6 @@ def _validate(document: dict, *, where: str) -> Submission:
     if unknown:
         raise InvalidSubmission(where, unknown)
     return submission
-
-
-def _plain(value: object, at: tuple[int | str, ...], unusable: list[UnusableNumber]) -> object:
-    """Return lists as tuples; decimals become floats, except under `reported`.
-
-    Numbers that cannot be used are added to `unusable`.
-    """
-    if isinstance(value, dict):
-        return {key: _plain(item, (*at, key), unusable) for key, item in value.items()}
-    if isinstance(value, list):
-        return tuple(_plain(item, (*at, i), unusable) for i, item in enumerate(value))
-    if isinstance(value, bool) or not isinstance(value, int | Decimal):
-        return value
-    try:
-        check_number(value, at)
-    except UnusableNumber as error:
-        unusable.append(error)
-        return None
-    if at[0] == "reported":
-        return Decimal(value)
-    return float(value) if isinstance(value, Decimal) else value
 
 
 def load_notes(folder: Path) -> str | None:

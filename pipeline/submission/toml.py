@@ -350,8 +350,8 @@ def parse_toml(
     ----------
     where : name of the file in messages. A line's number is added.
     error : class of error to raise for a mistake.
-    as_typed : whether to keep numbers with a point or an exponent as decimals instead of floats.
-        Decimals can have any size; see `check_number`.
+    as_typed : whether to keep lists, and numbers with a point or an exponent as decimals; else
+        they become tuples and floats. Decimals can have any size; see `check_number`.
     root : the model of the format.
 
     Raises
@@ -380,7 +380,13 @@ def read_toml(
     TomlSlip : the first mistake.
     """
     document = _parse(text, root=root)
-    return document if as_typed else _with_floats(document, ())
+    if as_typed:
+        return document
+    refused: list[UnusableNumber] = []
+    plain = plain_values(document, refused=refused)
+    for unusable in refused:
+        raise TomlSlip(0, f"{dotted(unusable.at, {})}: {unusable}")
+    return plain
 
 
 def _parse(text: str, *, root: type[BaseModel], numbers: bool = False) -> dict[str, Any]:
@@ -628,18 +634,40 @@ def _decimal(text: str) -> Decimal:
         return Decimal((0, (1,), 10 * _LARGEST))
 
 
-def _with_floats(value: Any, at: tuple[int | str, ...]) -> Any:
-    """Return a document with floats in place of decimals."""
+def plain_values(
+    value: Any,
+    at: tuple[int | str, ...] = (),
+    *,
+    refused: list[UnusableNumber],
+    exact: str = "",
+) -> Any:
+    """Return lists as tuples, and decimals as floats.
+
+    Parameters
+    ----------
+    at : the place of the value in the file.
+    refused : gets the numbers that cannot be used; they become None.
+    exact : name of a table whose numbers all become decimals.
+    """
     if isinstance(value, dict):
-        return {key: _with_floats(item, (*at, key)) for key, item in value.items()}
+        return {
+            key: plain_values(item, (*at, key), refused=refused, exact=exact)
+            for key, item in value.items()
+        }
     if isinstance(value, list):
-        return [_with_floats(item, (*at, i)) for i, item in enumerate(value)]
+        return tuple(
+            plain_values(item, (*at, i), refused=refused, exact=exact)
+            for i, item in enumerate(value)
+        )
     if isinstance(value, bool) or not isinstance(value, int | Decimal):
         return value
     try:
         check_number(value, at)
     except UnusableNumber as unusable:
-        raise TomlSlip(0, f"{dotted(unusable.at, {})}: {unusable}") from None
+        refused.append(unusable)
+        return None
+    if at[0] == exact:
+        return Decimal(value)
     return float(value) if isinstance(value, Decimal) else value
 
 

@@ -185,8 +185,9 @@ def test_a_column_typed_with_thousands_of_digits_is_refused(tmp_path):
 
 
 def test_valid_numbers_are_read_as_python_reads_them():
-    """Numbers are read as tomllib reads them, or with their exact digits if asked."""
+    """Numbers are read as tomllib reads them, lists as tuples; or with exact digits if asked."""
     text = "a = 0.1\nb = -1.5e-7\nc = [1, 2.50]\nd = { e = 1_000.0 }\n"
-    assert parse_toml(text, where="f", error=PipelineError) == tomllib.loads(text)
+    read = parse_toml(text, where="f", error=PipelineError)
+    assert read == tomllib.loads(text) | {"c": (1, 2.5)}
     exact = parse_toml(text, where="f", error=PipelineError, as_typed=True)
     assert str(exact["c"][1]) == "2.50"
