@@ -410,7 +410,7 @@ def posix(name: str) -> str:
 def list_experiments(document: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the `[[experiments]]` tables of a document, which need not be valid."""
     tables = document.get("experiments")
-    return [t for t in tables if isinstance(t, dict)] if isinstance(tables, list) else []
+    return [t for t in tables if isinstance(t, dict)] if isinstance(tables, list | tuple) else []
 
 
 def stated_columns(document: Mapping[str, Any], file: str) -> dict[str, str | int]:
