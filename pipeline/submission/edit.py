@@ -23,7 +23,7 @@ from pipeline.submission.load import (
     spring_names,
 )
 from pipeline.submission.models import MOST_CARTS, Submission
-from pipeline.submission.toml import Value, read_text
+from pipeline.submission.toml import Value, read_text, toml_value
 
 
 class Outdated(SubmissionError):
@@ -129,17 +129,7 @@ def comment_text(remark: str) -> str:
 
 def toml_item(value: Value) -> Any:
     """Return a plain value as an item of a document, with tables inline."""
-    if isinstance(value, Mapping):
-        table = tomlkit.inline_table()
-        for key, item in value.items():
-            table.append(key, toml_item(item))
-        return table
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        array = tomlkit.array()
-        for item in value:
-            array.append(toml_item(item))
-        return array
-    return tomlkit.item(value)
+    return tomlkit.value(toml_value(value))
 
 
 # --------------------------------------------------------------------------------- a new submission

@@ -4,7 +4,7 @@ import errno
 import re
 import stat
 import unicodedata
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from decimal import Decimal, InvalidOperation
 from itertools import islice
@@ -27,15 +27,13 @@ from pipeline.submission.toml import (
     MOST_LISTED,
     MOST_SPOILT,
     Location,
-    ReadApart,
+    Statement,
     TomlSlip,
-    UnusableNumber,
     at_line,
     backslash_words,
     dotted,
     explain,
     list_faults,
-    list_keys,
     mend_number,
     nearest,
     parse_toml,
@@ -110,7 +108,7 @@ def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submissio
     InvalidSubmission : the content is invalid; the message lists the first problems.
     """
     # Decimals are kept, so that no typed digit is lost.
-    document = parse_toml(text, where=where, error=SubmissionError, as_typed=True)
+    document = parse_toml(text, where=where, error=SubmissionError, as_typed=True, root=Submission)
     return _check(document, folder=folder, where=where)
 
 
@@ -122,22 +120,27 @@ def _without_unread(text: str, *, folder: Path, where: str) -> Submission:
     SubmissionError : something else cannot be read.
     """
     try:
-        read = read_apart(text, "reported")
+        document, statements = read_apart(text, "reported", root=Submission)
     except TomlSlip as slip:
         raise SubmissionError(at_line(where, slip.line, str(slip))) from None
-    document, unread = read.document, dict[Location, Unread]()
+    typed = {one.at: one for one in reversed(statements)}  # the first of each key
+    unread: dict[Location, Unread] = {}
 
     def leave_out(at: Location, line: int, what: str) -> None:
         """Leave out a number or table of `[reported]`."""
-        nonlocal document
         part = tuple(map(str, at[: 3 if len(at) > 2 else 2]))
-        document = _without(document, part)
         unread.setdefault(part, Unread(at=part, message=at_line(NAME, line, what)))
         if len(unread) > MOST_SPOILT:
             raise SubmissionError(f"{where}: [reported] has more than {MOST_SPOILT} mistakes")
+        table: Any = document
+        for key in part[:-1]:
+            table = table.get(key) if isinstance(table, dict) else None
+        if isinstance(table, dict) and len(part) > 1:  # nothing was read below a spoilt heading
+            table.pop(part[-1], None)
 
-    for spoilt in read.spoilt:
-        leave_out(*spoilt)
+    for one in statements:
+        if one.fault:
+            leave_out(one.at, *one.fault)
     while True:  # a round finds the first problems of one kind, and leaves at least one part out
         try:
             submission = _check(document, folder=folder, where=where)
@@ -147,33 +150,22 @@ def _without_unread(text: str, *, folder: Path, where: str) -> Submission:
             if any(tuple(at[:1]) != ("reported",) for at, _ in wrong.problems):
                 raise
             for at, what in wrong.problems:
-                leave_out(at, read.line(at), what + _write(read, at))
+                above = (typed.get((*at[:n],)) for n in range(min(len(at), 3), 0, -1))
+                line = next((one.line for one in above if one), 0)
+                leave_out(at, line, what + _write(typed.get((*at,))))
             if len(unread) == before:
                 raise
 
 
-def _write(read: ReadApart, at: Location) -> str:
+def _write(typed: Statement | None) -> str:
     """Return "; write …" for a number that was typed as text; "" for anything else."""
-    typed = read.statements.get(tuple(at))
     mended = mend_number(typed.text) if typed and re.search("[\"']", typed.text) else ""
     return f"; write {mended}" if mended else ""
 
 
-def _without(document: dict[str, Any], at: Sequence[str]) -> dict[str, Any]:
-    """Return a document without a key, which need not exist."""
-    key, *below = at
-    if not below:
-        return {name: value for name, value in document.items() if name != key}
-    if not isinstance(document.get(key), dict):
-        return document
-    return document | {key: _without(document[key], below)}
-
-
 def _check(document: dict[str, Any], *, folder: Path, where: str) -> Submission:
     submission = _validate(document, where=where)
-    if found := list(_problems(submission, folder)):
-        worded = [(at, f"{dotted(at, document)}: {what}") for at, what in found]
-        raise InvalidSubmission(where, worded)
+    _refuse(_problems(submission, folder), document, where=where)
     everyone = tuple(range(1, submission.system.carts + 1))
     experiments = tuple(
         experiment.model_copy(
@@ -187,6 +179,12 @@ def _check(document: dict[str, Any], *, folder: Path, where: str) -> Submission:
     return submission.model_copy(
         update={"experiments": experiments, "folder": folder, "discussion": load_notes(folder)}
     )
+
+
+def _refuse(problems: Iterable[tuple[Location, str]], document: dict, *, where: str) -> None:
+    """Raise the problems of a document, if there are any, with their places."""
+    if worded := [(at, f"{dotted(at, document)}: {what}") for at, what in problems]:
+        raise InvalidSubmission(where, worded)
 
 
 def with_reported(submission: Submission, reported: Mapping[str, Any]) -> Submission:
@@ -205,9 +203,7 @@ def with_reported(submission: Submission, reported: Mapping[str, Any]) -> Submis
     changed = submission.model_copy(
         update={"reported": _validate(document, where="numbers").reported}
     )
-    if found := list(_reported_problems(changed)):
-        worded = [(at, f"{dotted(at, document)}: {what}") for at, what in found]
-        raise InvalidSubmission("numbers", worded)
+    _refuse(_reported_problems(changed), document, where="numbers")
     return changed
 
 
@@ -229,28 +225,18 @@ def _as_typed(value: object) -> object:
 
 
 def _validate(document: dict, *, where: str) -> Submission:
-    keys = list_keys(Submission)
-    unknown: list[tuple[Location, str]] = [
-        ((key,), f"{dotted([key], document)}: unknown key{nearest(key, keys)}")
-        for key in islice((key for key in document if key not in keys), MOST_LISTED)
-    ]
-    document = {key: value for key, value in document.items() if key in keys}
-    unusable: list[UnusableNumber] = []
+    refused: list[tuple[Location, str]] = []
     try:
-        plain = plain_values(document, refused=unusable, exact="reported")
+        plain = plain_values(document, refused=refused, exact="reported")
     except RecursionError:
         raise SubmissionError(f"{where}: lists or tables nest too deeply") from None
-    if unusable:
-        raise InvalidSubmission(where, [(e.at, f"{dotted(e.at, document)}: {e}") for e in unusable])
+    _refuse(refused, document, where=where)
     try:
-        submission = Submission.model_validate(plain, strict=True)
+        return Submission.model_validate(plain, strict=True)
     except ValidationError as error:
         first = relevant_errors(error.errors())[:MOST_LISTED]
-        worded = [(without_tag(e["loc"], plain), explain(e, plain)) for e in first]
-        raise InvalidSubmission(where, [*unknown, *worded]) from None
-    if unknown:
-        raise InvalidSubmission(where, unknown)
-    return submission
+        worded = [(without_tag(e["loc"], plain), explain(e, plain, root=Submission)) for e in first]
+        raise InvalidSubmission(where, worded) from None
 
 
 def load_notes(folder: Path) -> str | None:

@@ -10,7 +10,7 @@ from decimal import Decimal, InvalidOperation
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias, get_args, get_origin
+from typing import Any, Literal, TypeAlias, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
@@ -85,41 +85,25 @@ def _plain_name(name: str) -> str:
     return re.sub(r"(?<!\d)0+(?=\d)", "", name.casefold())
 
 
-@cache
-def list_tables(root: type[BaseModel]) -> Mapping[str, type[BaseModel]]:
-    """Return the tables of a format by dotted path; each variant of a table has a path."""
-    found: dict[str, type[BaseModel]] = {}
-    for name, field in root.model_fields.items():
-        kinds = [kind for kind in _kinds(field.annotation) if isinstance(kind, type)]
-        models = [kind for kind in kinds if issubclass(kind, BaseModel)]
-        for model in models:
-            tags = (
-                get_args(one.annotation)
-                for key, one in model.model_fields.items()
-                if get_origin(one.annotation) is Literal
-                and all(key in other.model_fields for other in models)
-            )
-            for tag in next(tags) if len(models) > 1 else ("",):
-                path = f"{name}.{tag}".rstrip(".")
-                found[path] = model
-                found |= {f"{path}.{key}": below for key, below in list_tables(model).items()}
-    return found
-
-
-def list_keys(model: type[BaseModel]) -> tuple[str, ...]:
-    """Return the keys allowed in a table."""
-    return tuple(name for name, field in model.model_fields.items() if not field.exclude)
+def list_keys(root: type[BaseModel], table: Location = ()) -> tuple[str, ...]:
+    """Return the keys allowed in a table of a format, with pydantic's path of the table."""
+    models = [root]
+    for part in table:
+        fields = [model.model_fields.get(str(part)) for model in models]
+        below = [kind for field in fields if field for kind in _models(field.annotation)]
+        models = below or [one for one in models if part in _tags(one)] or models
+    fields = {name: one for model in models for name, one in model.model_fields.items()}
+    return tuple(name for name, field in fields.items() if not field.exclude)
 
 
 def takes_numbers(key: str, root: type[BaseModel]) -> bool:
     """Return whether a key holds numbers and never text, in any table of a format."""
-    kinds = [
-        kind
-        for model in list_tables(root).values()
-        if key in model.model_fields
-        for kind in _kinds(model.model_fields[key].annotation)
-    ]
-    return any(kind in (int, float, Decimal) for kind in kinds) and str not in kinds
+    kinds, models = set[object](), [root]
+    for model in models:  # the list grows
+        for name, field in model.model_fields.items():
+            models += _models(field.annotation)
+            kinds |= set(_kinds(field.annotation)) if name == key else set()
+    return bool(kinds & {int, float, Decimal}) and str not in kinds
 
 
 def _kinds(annotation: object) -> Iterator[object]:
@@ -129,6 +113,20 @@ def _kinds(annotation: object) -> Iterator[object]:
         yield annotation
     for one in inner:
         yield from [type(one)] if get_origin(annotation) is Literal else _kinds(one)
+
+
+def _models(annotation: object) -> list[type[BaseModel]]:
+    """Return the tables that an annotation allows."""
+    return [
+        kind
+        for kind in _kinds(annotation)
+        if isinstance(kind, type) and issubclass(kind, BaseModel)
+    ]
+
+
+def _tags(model: type[BaseModel]) -> list[object]:
+    """Return the values that select this variant of a table."""
+    return [tag for field in model.model_fields.values() for tag in get_args(field.annotation)]
 
 
 def dotted(location: Location, document: object) -> str:
@@ -144,10 +142,7 @@ def dotted(location: Location, document: object) -> str:
             path += ("." if path else "") + (
                 part if re.fullmatch(r"[A-Za-z0-9_-]{1,40}", part) else quote(part)
             )
-        try:
-            here = here[part]  # type: ignore[index]
-        except (KeyError, IndexError, TypeError):
-            here = None
+        here = _below(here, part)
         if isinstance(here, dict) and isinstance(part, int) and isinstance(here.get("id"), str):
             name = f" ({quote(here['id'])[1:-1]})"
     return path + name
@@ -159,14 +154,12 @@ def explain(error: ErrorDetails, document: dict, *, root: type[BaseModel] = Subm
     `root` is the model of the format.
     """
     location = [part for part in error["loc"] if not isinstance(part, str) or part != "str"]
-    table = ".".join(part for part in location[:-1] if isinstance(part, str))
     location = without_tag(location, document)
     where, found, kind = dotted(location, document), error["input"], error["type"]
     if kind == "missing":
         return f"{where}: is required and missing"
     if kind == "extra_forbidden":
-        keys = list_keys(list_tables(root).get(table, root))
-        return f"{where}: unknown key{nearest(location[-1], keys)}"
+        return f"{where}: unknown key{nearest(location[-1], list_keys(root, error['loc'][:-1]))}"
     text = f"{where}: {refusal(error)}"
     if kind == "tuple_type" and isinstance(found, dict):
         text += f"; start each with [[{where}]], in double brackets"
@@ -233,11 +226,16 @@ def without_tag(location: Location, document: object) -> list[int | str]:
         if selected and i < len(location) - 1:
             continue
         kept.append(part)
-        try:
-            here = here[part]  # type: ignore[index]
-        except (KeyError, IndexError, TypeError):
-            here = None
+        here = _below(here, part)
     return kept
+
+
+def _below(value: Any, part: int | str) -> Any:
+    """Return what a table or list holds at a key or index; None if it holds nothing there."""
+    try:
+        return value[part]
+    except (KeyError, IndexError, TypeError):
+        return None
 
 
 # ------------------------------------------------------------------------------------------ reading
@@ -247,14 +245,13 @@ _LONGEST_LINE, _SHOWN = 300, 60  # characters of a line that are checked, and th
 # exponent; larger than that of any physical number, yet numbers can still be multiplied
 _LARGEST = 30
 _AT = re.compile(r" \(at line (\d+), column (\d+)\)$")
-_HEADER = re.compile(r"\s*(\[\[?)\s*([^\[\],\s](?:[^\[\],]*[^\[\],\s])?)\s*\]\]?\s*(?:#.*)?$")
-_KEY = re.compile(r"\s*([A-Za-z0-9_.\"'-]+)\s*=")
 _QUOTED = re.compile(r"\"(?:\\.|[^\"\\\n])*\"|'[^'\n]*'")
 _KEYS = re.compile(rf"(?:[\w-]+|{_QUOTED.pattern})(?:[ \t]*\.[ \t]*(?:[\w-]+|{_QUOTED.pattern}))*")
 # A heading, even if a bracket of it is missing; not a row of numbers in a longer list.
 _HEADING = re.compile(
-    r"\s*(?:\[+\s*|(?=[^=]*\]\s*(?:#.*)?$)|\W+(?=(?:reported|system|design|experiments)\b))([A-Za-z_\"'][^,=\[\]()]*)[^,=]*$"
+    r"\s*(?:\[+\s*|(?=[^=]*\]\s*$)|\W+(?=(?:reported|system|design|experiments)\b))([A-Za-z_\"'][^,=\[\]()]*)[^,=]*$"
 )
+_PART = re.compile(rf"{_QUOTED.pattern}|[\w-]+")
 # The name at the beginning of a line, and = if it is there.
 _NAME = re.compile(r"\s*[\"']?([^\W\d][\w.-]*)[\"']?(?:[^\W\d]|[ \t])*([=:]?)")
 _QUOTES = "\"'“”„‟«»‘’‚"
@@ -267,7 +264,6 @@ _ONE_NUMBER = re.compile(
     rf"[{_QUOTES}]* ?(?:(?!m?Hz|°|deg)[A-Za-zµ][^#]*|(?:±|\+/-)[^#]*)?(?:#.*)?"
 )
 MOST_SPOILT = 200  # statements and tables; a file with more mistakes is refused
-_NOT_VALID = "not valid TOML"
 _DASHES = str.maketrans("−–—", "---")
 
 
@@ -276,8 +272,8 @@ class _Slip:
     """A typing mistake in TOML; see templates/toml_slips.toml."""
 
     words: str
-    parser: str = ""
-    line: str = ""
+    parser: str = "(?!)"  # matches nothing
+    line: str = "(?!)"
     code: str = ""
     mends: Sequence[Sequence[str]] = ()
 
@@ -351,7 +347,7 @@ def parse_toml(
     where : name of the file in messages. A line's number is added.
     error : class of error to raise for a mistake.
     as_typed : whether to keep lists, and numbers with a point or an exponent as decimals; else
-        they become tuples and floats. Decimals can have any size; see `check_number`.
+        they become tuples and floats. Decimals can have any size; see `refuse_number`.
     root : the model of the format.
 
     Raises
@@ -382,10 +378,10 @@ def read_toml(
     document = _parse(text, root=root)
     if as_typed:
         return document
-    refused: list[UnusableNumber] = []
+    refused: list[tuple[Location, str]] = []
     plain = plain_values(document, refused=refused)
-    for unusable in refused:
-        raise TomlSlip(0, f"{dotted(unusable.at, {})}: {unusable}")
+    for at, why in refused:
+        raise TomlSlip(0, f"{dotted(at, {})}: {why}")
     return plain
 
 
@@ -410,8 +406,7 @@ def _parse(text: str, *, root: type[BaseModel], numbers: bool = False) -> dict[s
         lines = text.split("\n")
         line = int(at[1]) if at else 1 if numbers else len(lines)
         shown = lines[line - 1].strip()
-        slip = _find_slip(shown, _AT.sub("", message))
-        words = _explain_slip(slip, shown, root, numbers=numbers)
+        words = _explain_slip(shown, _AT.sub("", message), root, numbers=numbers)
         shown = shown if shown.isprintable() and len(shown) <= _SHOWN else quote(shown)
         raise TomlSlip(line, f"{words}; found {shown or 'the end'}") from None
     except RecursionError:
@@ -420,20 +415,24 @@ def _parse(text: str, *, root: type[BaseModel], numbers: bool = False) -> dict[s
         raise TomlSlip(_long_number(text), "a number has too many digits") from None
 
 
-@dataclass(kw_only=True)
+@dataclass
 class Statement:
-    """A key with its value, as typed in one or more lines of a file.
+    """A heading, or a key with its value, as typed in one or more lines of a file.
 
     Attributes
     ----------
     line : number of the first line.
-    table, at : keys of the table above, and of the statement itself.
+    table, at : keys of the table above, and of the statement itself. A table in double brackets has
+        its number as the last key.
+    fault : the line and the text of a mistake, if the statement cannot be read.
     """
 
     line: int
     table: Location
     at: Location
+    is_heading: bool
     lines: list[str]
+    fault: tuple[int, str] | None = None
 
     @property
     def text(self) -> str:
@@ -441,112 +440,84 @@ class Statement:
         return "\n".join(self.lines)
 
 
-class Spoilt(NamedTuple):
-    """A statement or a table that cannot be read, with its line and what is wrong."""
+def split_statements(text: str) -> Iterator[Statement]:
+    """Yield the headings and keys of a text, which need not be TOML.
 
-    at: Location
-    line: int
-    what: str
+    A line with a name begins a statement unless a list is open; a heading, or a line with "name =",
+    always does. Lines without a name below a heading are a statement without a key.
+    """
+    one, depth = Statement(1, (), (), is_heading=False, lines=[]), 0  # of open lists
+    counts: dict[Location, int] = {}
+    for number, line in enumerate(text.split("\n"), start=1):
+        code, name = line.partition("#")[0], _NAME.match(line[:_LONGEST_LINE])
+        heading: Location = ()
+        if (depth <= 0 or code.lstrip()[:1] == "[") and len(code) <= _LONGEST_LINE:
+            typed = _HEADING.match(code)
+            heading = _keys(typed[1]) if typed else ()
+            if heading and "[[" in code:
+                counts[heading] = counts.get(heading, -1) + 1
+                heading = (*heading, counts[heading])
+        if heading or (name and (name[2] or depth <= 0)) or (one.is_heading and depth <= 0):
+            yield one
+            table = heading or one.table
+            at = (*table, *_keys(name[1])) if name and not heading else table
+            one, depth = Statement(number, table, at, is_heading=bool(heading), lines=[]), 0
+        one.lines.append(line)
+        depth += code.count("[") - code.count("]")
+    yield one
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReadApart:
-    """The result of `read_apart`; `statements` are those of the table, by their keys."""
-
-    document: dict[str, Any]
-    statements: Mapping[Location, Statement]
-    spoilt: Sequence[Spoilt]
-
-    def line(self, at: Location) -> int:
-        """Return the line of a key or of its table; 0 if it is not in the table."""
-        found = (self.statements.get((*at[:n],)) for n in range(min(len(at), 3), 0, -1))
-        return next((one.line for one in found if one), 0)
+def _keys(dotted: str) -> tuple[str, ...]:
+    """Return the parts of a key or heading."""
+    return tuple(part.strip("\"'") for part in _PART.findall(dotted))
 
 
-def read_apart(text: str, table: str, *, root: type[BaseModel] = Submission) -> ReadApart:
+def read_apart(
+    text: str, table: str, *, root: type[BaseModel] = Submission
+) -> tuple[dict[str, Any], Sequence[Statement]]:
     """Read typed TOML; a mistake in a statement of one table costs only this statement.
 
-    All values of the table must be numbers or lists of numbers.
+    All values of the table must be numbers or lists of numbers. A heading that cannot be read costs
+    the statements below it.
+
+    Returns
+    -------
+    the document, and the statements of the table; those with a `fault` are not in the document.
 
     Raises
     ------
-    TomlSlip : the first mistake outside the table.
+    TomlSlip : the first mistake outside the table, or a table with very many mistakes.
     """
-    others, statements, spoilt = _take_out(text.replace("\r\n", "\n"), table)
-    document, first = _parse("\n".join(others), root=root), dict[Location, Statement]()
-    for one in statements:
-        if len(spoilt) > MOST_SPOILT:
-            raise TomlSlip(0, f"[{table}] has more than {MOST_SPOILT} mistakes")
+    statements = list(split_statements(text.replace("\r\n", "\n")))
+    others = [line if one.at[:1] != (table,) else "" for one in statements for line in one.lines]
+    document = _parse("\n".join(others), root=root)
+    own = [one for one in statements if one.at[:1] == (table,)]
+    first, is_lost, mistakes = dict[Location, Statement](), False, 0
+    for one in own:
         earlier = first.setdefault(one.at, one)
+        is_lost &= not one.is_heading
+        if is_lost:
+            continue
         try:
-            if not one.lines:  # a heading
-                continue
             value = _parse(one.text, root=root, numbers=True)
-            if not _merge(document, one.table, value):
+            if one.is_heading:
+                is_lost = isinstance(one.at[-1], int)
+            elif value and not _merge(document, one.table, value):
                 key = ".".join(map(str, one.at[len(one.table) :]))
                 raise TomlSlip(1, f"{key} already has a value in line {earlier.line}; keep one")
         except TomlSlip as slip:
-            spoilt.append(Spoilt(one.at, one.line + max(slip.line, 1) - 1, str(slip)))
-    return ReadApart(document=document, statements=first, spoilt=spoilt)
-
-
-def _take_out(text: str, table: str) -> tuple[list[str], list[Statement], list[Spoilt]]:
-    """Return the lines without a table, the statements of the table, and its bad headings.
-
-    The statements below a bad heading are left out.
-    """
-    lines = text.split("\n")
-    others, found, spoilt = list(lines), list[Statement](), list[Spoilt]()
-    above: Location = ()
-    is_lost, one, depth = False, None, 0  # depth of the lists that are open
-    for number, line in enumerate(lines, start=1):
-        if _heading(line):
-            above, is_lost = _table_of(line)
-            one = None
-            if above[:1] == (table,):
-                others[number - 1] = ""
-                found.append(Statement(line=number, table=above, at=above, lines=[]))
-                if is_lost:
-                    what = "a table starts with [name] on a line of its own"
-                    spoilt.append(Spoilt(above, number, f"{what}; found {line.strip()}"))
-            continue
-        name = _NAME.match(line[:_LONGEST_LINE])
-        if name and (name[2] or one is None or depth <= 0):
-            at = (*above, *name[1].split("."))
-            one, depth = Statement(line=number, table=above, at=at, lines=[]), 0
-            if at[0] != table:
-                one = None
-            elif not is_lost:
-                found.append(one)
-        if one is not None or above[:1] == (table,):
-            others[number - 1] = ""
-        if one is not None:
-            one.lines.append(line)
-            depth += line.count("[") - line.count("]")
-        elif others[number - 1] != line and line.strip() and not line.lstrip().startswith("#"):
-            spoilt.append(Spoilt(above, number, f"expected name = number; found {quote(line)}"))
-    return others, found, spoilt
-
-
-def _heading(line: str) -> re.Match[str] | None:
-    """Return the heading in a line, even a spoilt one; a very long line is not one."""
-    return _HEADING.match(line) if len(line) <= _LONGEST_LINE else None
-
-
-def _table_of(heading: str) -> tuple[Location, bool]:
-    """Return the keys in a heading, and whether it is spoilt."""
-    found: list[str] = []
-    try:
-        here: Any = tomllib.loads(heading)
-        while isinstance(here, dict) and here:
-            key, here = next(iter(here.items()))
-            found.append(key)
-        if here == {}:
-            return tuple(found), False
-    except (tomllib.TOMLDecodeError, RecursionError):
-        pass
-    typed = _HEADING.match(heading) or _HEADER.match(heading)
-    return tuple(re.split(r"[\s.]+", typed[1].strip(" \"'\r"))) if typed else (), True
+            is_lost = one.is_heading
+            line, what = max(slip.line, 1) - 1, str(slip)
+            if one.at == one.table:
+                what = f"expected name = number; found {quote(one.lines[line])}"
+            one.fault = (one.line + line, what)
+        if is_lost:
+            what = "a table starts with [name] on a line of its own"
+            one.fault = (one.line, f"{what}; found {one.lines[0].strip()}")
+        mistakes += one.fault is not None
+        if mistakes > MOST_SPOILT:
+            raise TomlSlip(0, f"[{table}] has more than {MOST_SPOILT} mistakes")
+    return document, own
 
 
 def _merge(into: dict[str, Any], table: Location, new: Mapping[str, Any]) -> bool:
@@ -578,41 +549,21 @@ def mend_number(line: str) -> str:
     return f"{key} = {number}" if re.fullmatch(r"[\w-]+", key, re.ASCII) else ""
 
 
-class UnusableNumber(Exception):
-    """A number that cannot be computed with; its text says why.
-
-    Attributes
-    ----------
-    at : the place of the number in the file.
-    """
-
-    def __init__(self, at: Location, why: str) -> None:
-        super().__init__(why)
-        self.at = at
-
-
-def check_number(value: float | Decimal, at: Location) -> None:
-    """Refuse a number of an impossible size, or with more digits than any instrument gives.
-
-    Raises
-    ------
-    UnusableNumber : the number is refused.
-    """
+def refuse_number(value: float | Decimal) -> str:
+    """Return why a number has an impossible size, or more digits than any instrument; or ""."""
     number = value if isinstance(value, int) else Decimal(value)
-    if isinstance(number, Decimal) and not number.is_finite():
-        raise UnusableNumber(at, f"expected a finite number, found {number}")
-    # Check the exponent before any computation, since computing with a huge one never ends.
-    sound = (
-        number.bit_length() <= 100 and abs(number) < 10**_LARGEST
-        if isinstance(number, int)
-        else -_LARGEST <= number.adjusted() < _LARGEST
+    if isinstance(number, int):
+        sound = number.bit_length() <= 100 and abs(number) < 10**_LARGEST
+    elif number.is_finite():
+        # Check the exponent before any computation, since computing with a huge one never ends.
+        sound = -_LARGEST <= number.adjusted() < _LARGEST
+        if sound and len(number.as_tuple().digits) > 1_000:
+            return "expected a number of at most 1000 digits"
+    else:
+        return f"expected a finite number, found {number}"
+    return (
+        "" if sound else f"expected a number between 1e-{_LARGEST} and 1e+{_LARGEST} in size, or 0"
     )
-    if not sound:
-        raise UnusableNumber(
-            at, f"expected a number between 1e-{_LARGEST} and 1e+{_LARGEST} in size, or 0"
-        )
-    if isinstance(number, Decimal) and len(number.as_tuple().digits) > 1_000:
-        raise UnusableNumber(at, "expected a number of at most 1000 digits")
 
 
 def find_deep_key(text: str) -> int:
@@ -627,7 +578,7 @@ def find_deep_key(text: str) -> int:
 
 
 def _decimal(text: str) -> Decimal:
-    """Return a number as typed; if its exponent is too large, one that `check_number` refuses."""
+    """Return a number as typed; if its exponent is too large, one that `refuse_number` refuses."""
     try:
         return Decimal(text)
     except InvalidOperation:
@@ -635,36 +586,26 @@ def _decimal(text: str) -> Decimal:
 
 
 def plain_values(
-    value: Any,
-    at: tuple[int | str, ...] = (),
-    *,
-    refused: list[UnusableNumber],
-    exact: str = "",
+    value: Any, at: Location = (), *, refused: list[tuple[Location, str]], exact: str = ""
 ) -> Any:
     """Return lists as tuples, and decimals as floats.
 
     Parameters
     ----------
     at : the place of the value in the file.
-    refused : gets the numbers that cannot be used; they become None.
+    refused : gets the numbers that cannot be used, with the reason; they become None.
     exact : name of a table whose numbers all become decimals.
     """
-    if isinstance(value, dict):
-        return {
-            key: plain_values(item, (*at, key), refused=refused, exact=exact)
-            for key, item in value.items()
+    if isinstance(value, dict | list):
+        pairs = value.items() if isinstance(value, dict) else enumerate(value)
+        below = {
+            key: plain_values(item, (*at, key), refused=refused, exact=exact) for key, item in pairs
         }
-    if isinstance(value, list):
-        return tuple(
-            plain_values(item, (*at, i), refused=refused, exact=exact)
-            for i, item in enumerate(value)
-        )
+        return below if isinstance(value, dict) else tuple(below.values())
     if isinstance(value, bool) or not isinstance(value, int | Decimal):
         return value
-    try:
-        check_number(value, at)
-    except UnusableNumber as unusable:
-        refused.append(unusable)
+    if why := refuse_number(value):
+        refused.append((at, why))
         return None
     if at[0] == exact:
         return Decimal(value)
@@ -677,45 +618,29 @@ def _long_number(text: str) -> int:
     return text.count("\n", 0, found.start()) + 1 if found else 0
 
 
-def key_lines(text: str) -> Iterator[tuple[int, tuple[int | str, ...]]]:
-    """Yield line and path of every table heading, and of every key at the beginning of a line."""
-    table: tuple[int | str, ...] = ()
-    counts: dict[str, int] = {}
-    for number, line in enumerate(text.splitlines(), start=1):
-        if header := _HEADER.match(line):
-            keys = tuple(part.strip(" \"'") for part in header[2].split("."))
-            table = keys
-            if header[1] == "[[":
-                counts[header[2]] = counts.get(header[2], -1) + 1
-                table = (*keys, counts[header[2]])
-            yield number, table
-        elif key := _KEY.match(line):
-            yield number, (*table, *(part.strip("\"'") for part in key[1].split(".")))
+def key_lines(text: str) -> Iterator[tuple[int, Location]]:
+    """Yield line and path of every heading, and of every key at the beginning of a line."""
+    for one in split_statements(text):
+        if one.is_heading or (one.at != one.table and "=" in one.lines[0]):
+            yield one.line, one.at
 
 
-def _find_slip(line: str, message: str) -> _Slip:
-    """Return the mistake in a line, found from its form or from the parser's message."""
-    for slip in _slips():
-        if slip.parser and re.fullmatch(slip.parser, message):
-            return slip
-        if slip.line and re.search(slip.line, line[:_LONGEST_LINE]):
-            return slip
-    return _Slip(words=f"{_NOT_VALID}: {message}")
-
-
-def _explain_slip(slip: _Slip, line: str, root: type[BaseModel], *, numbers: bool) -> str:
+def _explain_slip(line: str, message: str, root: type[BaseModel], *, numbers: bool) -> str:
     """Return what is wrong, with ": write …" and the corrected line if it is known.
 
     Parameters
     ----------
+    line, message : the line with the mistake, and what the parser says of it.
     numbers : whether the table of the line takes only numbers.
     """
     line = line[:_LONGEST_LINE]
     key = line.partition("=")[0].strip()
+    slips = (s for s in _slips() if re.fullmatch(s.parser, message) or re.search(s.line, line))
+    slip = next(slips, _Slip(words=f"not valid TOML: {message}", code="unknown"))
     if slip.code == "unquoted_text" and (numbers or takes_numbers(key, root)):
         return f"{key} takes a number, written in digits"
     words = slip.words
-    if numbers and not slip.code and not slip.mends and slip.words.startswith(_NOT_VALID):
+    if numbers and slip.code == "unknown":
         words = f"{key} takes a number, such as 10.1, or a list of numbers"
     new = line
     for pattern, put in slip.mends:
@@ -723,13 +648,12 @@ def _explain_slip(slip: _Slip, line: str, root: type[BaseModel], *, numbers: boo
     if numbers and "[" not in line:
         new = mend_number(line)
     try:
-        if numbers and any(isinstance(value, str) for value in tomllib.loads(new).values()):
-            return words
-        tomllib.loads(new)
+        read = tomllib.loads(new)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError):
         return words
+    is_text = numbers and any(isinstance(value, str) for value in read.values())
     mended = new not in ("", line) and new.isprintable() and len(new) <= _SHOWN
-    return f"{words}: write {new}" if mended else words
+    return f"{words}: write {new}" if mended and not is_text else words
 
 
 @cache
@@ -752,18 +676,25 @@ class TypedNumber(str):
 
 def toml_section(heading: str, entries: Mapping[str, Value]) -> str:
     """Return one table as TOML or, without a heading, the keys for the top of the file."""
-    lines = [f"{key} = {_toml(value)}" for key, value in entries.items()]
+    lines = [f"{key} = {toml_value(value)}" for key, value in entries.items()]
     return "\n".join([heading, *lines] if heading else lines) + "\n"
 
 
-def _toml(value: Value) -> str:
-    if isinstance(value, TypedNumber):
-        return value
-    if isinstance(value, str | bool):
-        # JSON's text is valid in TOML too, except that TOML escapes the delete character.
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
-    if isinstance(value, Sequence):
-        return "[" + ", ".join(map(_toml, value)) + "]"
+def toml_value(value: Value) -> str:
+    """Return a value as TOML in one line."""
+    match value:
+        case TypedNumber():
+            return value
+        case str() | bool():
+            # JSON's text is valid in TOML too, except that TOML escapes the delete character.
+            return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+        case Mapping():
+            pairs = (f"{_toml_key(key)} = {toml_value(item)}" for key, item in value.items())
+            return f"{{ {', '.join(pairs)} }}"
+        case Sequence():
+            return f"[{', '.join(map(toml_value, value))}]"
     return repr(value)
+
+
+def _toml_key(key: str) -> str:
+    return key if re.fullmatch(r"[\w-]+", key, re.ASCII) else toml_value(key)

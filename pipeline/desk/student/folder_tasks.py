@@ -58,7 +58,7 @@ def read_document(text: str, *, folder: str = "", progress: Progress = silent) -
     except (tomllib.TOMLDecodeError, RecursionError, ValueError):
         pass
     try:
-        return _plain(read_apart(text, "reported").document)
+        return _plain(read_apart(text, "reported")[0])
     except (TomlSlip, RecursionError):
         return {}
 
@@ -79,7 +79,7 @@ def _plain(value: Any, depth: int = 0) -> Any:
 def students_see(folder: str, *, progress: Progress) -> str:
     """Return what `[students] see` of `submission.toml` states; "" if it states nothing."""
     try:
-        document = read_apart(submission_text(Path(folder)), "reported").document
+        document, _ = read_apart(submission_text(Path(folder)), "reported")
     except (SubmissionError, TomlSlip, OSError):  # the page says what is wrong
         return ""
     students = document.get("students")
