@@ -166,13 +166,13 @@ def test_fill_and_desk_refuse_an_impossible_number(tmp_path, number):
     (tmp_path / NAME).write_text(
         f"version = 1\n[system]\ncarts = 2\n[reported.initial]\nK_1 = {number}\n", encoding="utf-8"
     )
-    said = r"reported\.initial\.K_1: expected a number|line 5: a number has too many digits"
+    said = r"reported\.initial\.K_1: |line 5\b"
     with pytest.raises(SubmissionError, match=said):
         fill_submission(tmp_path)
     (part,) = load_submission(tmp_path).unread
     assert part.at == ("reported", "initial", "K_1")
     assert re.search(said, part.message)
-    with pytest.raises(SubmissionError, match=rf"{said}|at line 5"):
+    with pytest.raises(SubmissionError, match=said):
         edit_submission(tmp_path, lambda document: document.update({"title": "t"}))
 
 
@@ -180,7 +180,7 @@ def test_a_column_typed_with_thousands_of_digits_is_refused(tmp_path):
     """A column with thousands of digits, typed into the desk's form, is refused."""
     (tmp_path / NAME).write_text("version = 1\n[system]\ncarts = 2\n", encoding="utf-8")
     columns = Field(path="system.columns", label="", kind="columns", value=f"time = {'9' * 5000}")
-    with pytest.raises(SubmissionError, match="a number has too many digits"):
+    with pytest.raises(SubmissionError, match=r"too many digits$"):
         edit_submission(tmp_path, lambda document: write_fields(document, [columns]))
 
 

@@ -153,7 +153,8 @@ def test_a_cart_without_springs_reports_mass_and_damping(tmp_path):
     assert set(reported.final) == {"mass", "damping"}
     (tmp_path / "submission.toml").write_text(head + "K = 2.0\n")
     (part,) = load_submission(tmp_path).unread
-    assert "reported.final.K: unknown parameter; known: mass, damping" in part.message
+    assert part.at == ("reported", "final", "K")
+    assert all(name in part.message for name in ("mass", "damping"))
 
 
 @pytest.mark.parametrize(
@@ -190,11 +191,7 @@ def test_every_problem_is_listed(folder):
     with pytest.raises(SubmissionError) as told:
         load_submission(folder)
     where = f"{folder.name}/submission.toml: "
-    wanted = (
-        "design.cart: there is no cart 9",
-        "reported.initial.K_7: unknown parameter",
-        "reported.initial.zeta_q: unknown parameter",
-    )
+    wanted = ("design.cart: ", "reported.initial.K_7: ", "reported.initial.zeta_q: ")
     for line, start in zip(str(told.value).split("\n"), wanted, strict=True):
         assert line.startswith(where + start)
 
@@ -206,16 +203,15 @@ def test_an_unknown_table_does_not_hide_other_mistakes(folder):
     (folder / "submission.toml").write_text(text, encoding="utf-8")
     with pytest.raises(InvalidSubmission) as told:
         load_submission(folder)
-    said = str(told.value)
-    for words in ("desing: unknown key; did you mean 'design'", "colour: unknown", "system.carts:"):
-        assert words in said
+    for words in ("desing: ", "'design'", "colour: ", "system.carts: "):
+        assert words in str(told.value)
 
 
 def test_the_first_wrong_line_is_reported(folder):
     """Of the lines that are not TOML, the first is reported, with its number."""
     text = "version = 1\ntitle = “a”\n[system\ncarts = 2\n[design]\ncart = 1,5\nx = [1, two,\n 3]\n"
     (folder / "submission.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(SubmissionError, match=r" line 2: these are curly quotes") as told:
+    with pytest.raises(SubmissionError, match=r" line 2: ") as told:
         load_submission(folder)
     assert len(str(told.value).split("\n")) == 1
 
@@ -229,7 +225,7 @@ def test_a_new_submission_asks_for_experiments(carts, tmp_path):
     assert submission.system.carts == carts
     assert submission.discussion is None
     assert (tmp_path / "team" / "data").is_dir()
-    with pytest.raises(SubmissionError, match=r"no \[\[experiments\]\] table yet"):
+    with pytest.raises(SubmissionError, match=r"\[\[experiments\]\]"):
         read_data(submission)
 
 
@@ -262,7 +258,7 @@ def test_a_new_submission_overwrites_nothing(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
     with pytest.raises(ConfigError, match="not empty"):
         new_submission(tmp_path / "mine.txt", carts=2)
-    with pytest.raises(ConfigError, match="expected 1 to 4, found 5"):
+    with pytest.raises(ConfigError, match=r"^carts: .*\b5$"):
         new_submission(tmp_path / "new", carts=5)
     assert not (tmp_path / "new").exists()
 
@@ -282,15 +278,15 @@ controller = { type = "state_feedback", gains = [1, 0, 1, 0] }
 gains = [1, 0, 1, 0]
 """
     (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(SubmissionError, match=r"system\.carts: carts = 3, but .* are for 2"):
+    with pytest.raises(SubmissionError, match=r"system\.carts: .*\b2\n"):
         load_submission(tmp_path)
 
 
 def test_nearest_ignores_leading_zeros():
     """The nearest name to team-1 is team-01, although team-11 has more letters in common."""
     names = ["team-11", "team-01", "team-10"]
-    assert nearest("team-1", names) == "; did you mean 'team-01'?"
-    assert nearest("team-010", names) == "; did you mean 'team-10'?"
+    assert "'team-01'" in nearest("team-1", names)
+    assert "'team-10'" in nearest("team-010", names)
 
 
 def test_only_the_first_of_many_mistakes_are_listed(tmp_path):
@@ -298,6 +294,6 @@ def test_only_the_first_of_many_mistakes_are_listed(tmp_path):
     keys = "".join(f"k{i} = 1\n" for i in range(60_000))
     text = f"version = 1\n[system]\ncarts = 1\n{keys}"
     (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(InvalidSubmission, match="k0: unknown key") as told:
+    with pytest.raises(InvalidSubmission, match="k0: ") as told:
         load_submission(tmp_path)
     assert len(str(told.value).split("\n")) == len(told.value.problems) == 20

@@ -46,12 +46,24 @@ TEXT = "\n".join(
         "",
     )
 )
+LINE_9 = "omega_a = 10.1"
 ROWS = TEXT.replace("[[0, 1", "[\n  [0, 1").replace("], [", "],\n  [").replace("-6]]", "-6]\n]")
 
 
 def read(folder: Path, text: str) -> Submission:
     (folder / "submission.toml").write_text(text, encoding="utf-8")
     return load_submission(folder)
+
+
+def line_of(message: str) -> int:
+    """Return the line of `submission.toml` that a message names; 0 if it names none."""
+    named = re.search(r"submission\.toml line (\d+): ", message)
+    return int(named[1]) if named else 0
+
+
+def advice(message: str) -> list[str]:
+    """Return the line that a message says to write, if it says any."""
+    return re.findall(r"write (\S+ = [^;\s]+)", message)
 
 
 def numbers(reported: Reported | None) -> set[str]:
@@ -65,71 +77,90 @@ def numbers(reported: Reported | None) -> set[str]:
 
 
 @pytest.mark.parametrize(
-    ("typed", "said"),
+    ("typed", "says", "write"),
     [
-        ("omega_a = 10,1", "line 9: a decimal comma; write a point: write omega_a = 10.1"),
-        ('omega_a = "n/a"', "line 9: reported.final.omega_a: expected a number, found 'n/a'"),
-        ("omega_a = n/a", "line 9: omega_a takes a number, written in digits; found omega_a = n/a"),
-        ("omega_a = nan", "line 9: reported.final.omega_a: expected a finite number, found NaN"),
-        ("omega_a = -inf", "expected a finite number, found -Infinity"),
-        ("omega_a = 10.1 rad/s", "without a unit or a formula: write omega_a = 10.1"),
-        ("omega_a = 10.1 ± 0.2", "only a number is allowed"),
-        ("omega_a =", "the value after = is missing"),
-        ("omega_a = [10.1]", "expected a number, found [10.1]"),
-        ("omega_a: 10.1", "there must be = between a name and its value: write omega_a = 10.1"),
-        ("omega_a = −10.1", "type the minus of the keyboard"),
-        ('omega_a = "10.1', "the quote is not closed"),
-        (
-            "omega_a = 10.1\nomega_a = 10.2",
-            "line 10: omega_a already has a value in line 9; keep one",
-        ),
-        (f"omega_a = {'1' * 5000}", "line 9: a number has too many digits"),
-        ("omega_a = 1e999999999999", "expected a number between 1e-30 and 1e+30"),
-        ("omega_A = 10.1", "unknown parameter; did you mean 'omega_a'?"),
-        (
-            "ω_a = 10.1",
-            "line 9: a name has only the letters a to z, digits, - and _: write omega_a",
-        ),
-        ("omega a = 10.1", "line 9: there must be ="),
+        ("omega_a = 10,1", "comma", "omega_a = 10.1"),
+        ("omega_a = 1,234.5", "comma", ""),
+        ('omega_a = "n/a"', "'n/a'", ""),
+        ("omega_a = n/a", "digits", ""),
+        ("omega_a = ten", "digits", ""),
+        ("omega_a = nan", "NaN", ""),
+        ("omega_a = -inf", "-Infinity", ""),
+        ("omega_a = 1e999999999999", "1e+30", ""),
+        (f"omega_a = {'1' * 5000}", "digits", ""),
+        ("omega_a = 10.1 rad/s", "unit", "omega_a = 10.1"),
+        ("omega_a = 1.6 Hz", "unit", ""),  # the number alone would be in Hz
+        ("omega_a = 2*pi*1.6", "formula", ""),
+        ("omega_a = 10.1 ± 0.2", "only", "omega_a = 10.1"),
+        ("omega_a = 10.1 // from the fit", "only", ""),
+        ("omega_a = 10 1", "number", ""),
+        ("omega_a = 10.1.2", "number", ""),
+        ("omega_a = 10.1.", "number", "omega_a = 10.1"),
+        ("omega_a = .5", "point", "omega_a = 0.5"),
+        ("omega_a = 1,01·10^1", "comma", "omega_a = 1.01e1"),
+        ("omega_a =", "missing", ""),
+        ("omega_a = [10.1]", "[10.1]", ""),
+        ("omega_a: 10.1", "=", "omega_a = 10.1"),
+        ("omega_a 10.1", "=", "omega_a = 10.1"),
+        ("omega a = 10.1", "=", "omega_a = 10.1"),
+        ("omega_a = −10.1", "minus", "omega_a = -10.1"),
+        ("omega_a = −10,1 rad/s # ours", "minus", "omega_a = -10.1"),
+        ('omega_a = "10.1', "quote", "omega_a = 10.1"),
+        ('omega_a = "24,3"', "'24,3'", "omega_a = 24.3"),
+        ("omega_a = “10.1”", "curly", "omega_a = 10.1"),
+        ("omega_A = 10.1", "'omega_a'", ""),
+        ("ω_a = 10.1", "letters", "omega_a = 10.1"),
+        ("ωₐ = 10,1", "", "omega_a = 10.1"),
+        ("ω₁: 10.1", "", "omega_1 = 10.1"),
     ],
 )
-def test_a_number_that_cannot_be_read_costs_this_number(tmp_path, typed, said):
-    """One mistyped number is left out, and its message has the line and what to write."""
+def test_a_number_that_cannot_be_read_costs_this_number(tmp_path, typed, says, write):
+    """One mistyped number is left out; its message has the line, and what to write if certain."""
     whole = numbers(read(tmp_path, TEXT).reported)
-    found = read(tmp_path, TEXT.replace("omega_a = 10.1", typed))
+    found = read(tmp_path, TEXT.replace(LINE_9, typed))
     assert whole - numbers(found.reported) == {"final.omega_a"}
     (part,) = found.unread
     assert part.at[:2] == ("reported", "final")
-    assert part.message.startswith("submission.toml line ")
-    assert said in part.message
+    assert line_of(part.message) == 9
+    assert says in part.message
+    assert advice(part.message) == [write] * bool(write)
+    assert not re.search("write ;|TOML", part.message)
+    if write:
+        assert not read(tmp_path, TEXT.replace(LINE_9, write)).unread
 
 
 @pytest.mark.parametrize(
-    ("text", "lost"),
+    ("text", "lost", "says"),
     [
-        (TEXT.replace("-6]]", "-6]"), "state_space.A"),
-        (TEXT.replace("3, 0],", "3, 0,"), "state_space.A"),
-        (TEXT.replace("-2, 3, 0]", "-2,5 3, 0]"), "state_space.A"),
-        (TEXT.replace("[-1, -2, 3, 0]", "[-1 -2 3 0]"), "state_space.A"),
-        (TEXT.replace("[0, 0, 0, 1], ", ""), "state_space.A"),
-        (TEXT.replace("-2, 3, 0]", "-2, nan, 0]"), "state_space.A"),
-        (ROWS.replace("[-1, -2", "[-1, n/a"), "state_space.A"),
-        (ROWS.replace("[4, 0", "[n/a, 0"), "state_space.A"),
-        (ROWS.replace("-6]\n]", "-6]\n"), "state_space.A"),
-        (ROWS.replace("3, 0],", "3, 0]"), "state_space.A"),
-        (TEXT.replace("3196.70, 0, 0]", "3196.70, 0, 0"), "state_space.B"),
-        (TEXT.replace("gains = [1, 2, 3, 4]", "gains = [1, 2, 3, 4"), "feedback.gains"),
-        (TEXT.replace("gains = [1, 2, 3, 4]", "gains = 1, 2, 3, 4]"), "feedback.gains"),
-        (TEXT.replace("gains = [1, 2, 3, 4]", "gains = [1, 2, 3]"), "feedback.gains"),
-        (TEXT.replace("prefilter", "perfilter"), "feedback.prefilter"),
+        (TEXT.replace("-6]]", "-6]"), "state_space.A", ""),
+        (TEXT.replace("3, 0],", "3, 0,"), "state_space.A", ""),
+        (TEXT.replace("-2, 3, 0]", "-2,5 3, 0]"), "state_space.A", ""),
+        (TEXT.replace("[-1, -2, 3, 0]", "[-1 -2 3 0]"), "state_space.A", ""),
+        (TEXT.replace("[0, 0, 0, 1], ", ""), "state_space.A", ""),
+        (TEXT.replace("-2, 3, 0]", "-2, nan, 0]"), "state_space.A", ""),
+        (ROWS.replace("[-1, -2", "[-1, n/a"), "state_space.A", ""),
+        (ROWS.replace("[4, 0", "[n/a, 0"), "state_space.A", ""),
+        (ROWS.replace("-6]\n]", "-6]\n"), "state_space.A", ""),
+        (ROWS.replace("3, 0],", "3, 0]"), "state_space.A", ""),
+        (TEXT.replace("3196.70, 0, 0]", "3196.70, 0, 0"), "state_space.B", ""),
+        (TEXT.replace("gains = [1, 2, 3, 4]", "gains = [1, 2, 3, 4"), "feedback.gains", ""),
+        (TEXT.replace("gains = [1, 2, 3, 4]", "gains = 1, 2, 3, 4]"), "feedback.gains", ""),
+        (TEXT.replace("[1, 2, 3, 4]", "[1, 2, 3]"), "feedback.gains", "3"),
+        (TEXT.replace("[1, 2, 3, 4]", "[1,1, 2,2, 3,3, 4,4]"), "feedback.gains", "1.5"),
+        (TEXT.replace("[1, 2, 3, 4]", "[1,1; 2,2; 3,3; 4,4]"), "feedback.gains", "commas"),
+        (TEXT.replace("[1, 2, 3, 4]", "[1 2 3 4]"), "feedback.gains", "comma"),
+        (TEXT.replace("[1, 2, 3, 4]", '["1", "2", "3", "4"]'), "feedback.gains", "'1'"),
+        (TEXT.replace("[0, 3196.70, 0, 0]", "[0; 3196.70; 0; 0]"), "state_space.B", "commas"),
+        (TEXT.replace("prefilter", "perfilter"), "feedback.prefilter", "'prefilter'"),
     ],
 )
-def test_a_list_that_cannot_be_read_costs_this_list(tmp_path, text, lost):
+def test_a_list_that_cannot_be_read_costs_this_list(tmp_path, text, lost, says):
     """A matrix or list with a wrong bracket, comma or entry is left out; the rest is read."""
     whole = numbers(read(tmp_path, TEXT).reported)
     found = read(tmp_path, text)
     assert whole - numbers(found.reported) == {lost}
-    assert len(found.unread) == 1
+    (part,) = found.unread
+    assert says in part.message
 
 
 @pytest.mark.parametrize(
@@ -147,10 +178,8 @@ def test_a_table_that_cannot_be_read_costs_this_table(tmp_path, heading):
     whole = numbers(read(tmp_path, TEXT).reported)
     found = read(tmp_path, TEXT.replace("[reported.final]", heading))
     assert whole - numbers(found.reported) == {"final.K_1", "final.omega_a", "final.zeta_a"}
-    assert found.reported is not None
-    assert str(found.reported.initial["K_1"]) == "25.6"
     (part,) = found.unread
-    assert part.message.startswith("submission.toml line 7: ")
+    assert line_of(part.message) == 7
 
 
 def test_all_numbers_may_be_unreadable(tmp_path):
@@ -167,10 +196,10 @@ def test_all_numbers_may_be_unreadable(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("carts = 2", "carts = 2,0", "line 3: a decimal comma"),
-        ("carts = 2", 'carts = "two"', "system.carts: expected a whole number"),
-        ("[system]", "[system", "line 2: "),
-        ("version = 1", "versoin = 1", "versoin: unknown key"),
+        ("carts = 2", "carts = 2,0", "carts = 2.0"),
+        ("carts = 2", 'carts = "two"', "system.carts"),
+        ("[system]", "[system", "[system"),
+        ("version = 1", "versoin = 1", "versoin"),
     ],
 )
 def test_a_mistake_elsewhere_is_the_only_one_told(tmp_path, old, new, said):
@@ -179,10 +208,8 @@ def test_a_mistake_elsewhere_is_the_only_one_told(tmp_path, old, new, said):
     for one in (text, text.replace("25.6", "25,6").replace("10.1", "n/a"), reordered(text)):
         with pytest.raises(SubmissionError) as told:
             read(tmp_path, one.replace("10.1", "10,1"))
-        assert said.replace("line 3", "line").replace("line 2", "line") in re.sub(
-            r"line \d+", "line", str(told.value)
-        )
-        assert "decimal comma" not in str(told.value) or "carts" in str(told.value)
+        assert said in str(told.value)
+        assert not re.search("reported|omega_a", str(told.value))
 
 
 def reordered(text: str) -> str:
@@ -191,65 +218,13 @@ def reordered(text: str) -> str:
     return head + reported + system
 
 
-@pytest.mark.parametrize(
-    ("typed", "write"),
-    [
-        ('omega_a = "24.3', "omega_a = 24.3"),
-        ('omega_a = "24,3"', "omega_a = 24.3"),
-        ("omega_a = 10.1.", "omega_a = 10.1"),
-        ("omega_a = −10,1 rad/s # ours", "omega_a = -10.1"),
-        ("omega_a = 10.1 ± 0.2", "omega_a = 10.1"),
-        ("omega_a = 1,01·10^1", "omega_a = 1.01e1"),
-        ("omega_a = .5", "omega_a = 0.5"),
-        ("ω_a = 10.1", "omega_a = 10.1"),
-        ("ωₐ = 10,1", "omega_a = 10.1"),
-        ("ω₁: 10.1", "omega_1 = 10.1"),
-        ("omega a = 10.1", "omega_a = 10.1"),
-        ("omega_a 10.1", "omega_a = 10.1"),
-        ("omega_a = “10.1”", "omega_a = 10.1"),
-        ("omega_a = 1.6 Hz", ""),  # the number alone would be in Hz
-        ("omega_a = 1,234.5", ""),
-        ("omega_a = 10.1.2", ""),
-        ("omega_a = 2*pi*1.6", ""),
-        ("omega_a = 10 1", ""),
-        ("omega_a = ten", ""),
-        ("omega_a =", ""),
-        ("omega_a = 10.1 // from the fit", ""),
-    ],
-)
-def test_the_advice_is_a_line_that_can_be_read(tmp_path, typed, write):
-    """The message has the line to write if it is certain, and never one that is wrong too."""
-    (part,) = read(tmp_path, TEXT.replace("omega_a = 10.1", typed)).unread
-    assert re.findall(r"write (\S+ = [^;\s]+)", part.message) == [write] * bool(write)
-    assert "write ;" not in part.message
-    assert "not valid TOML" not in part.message
-    if write:
-        assert not read(tmp_path, TEXT.replace("omega_a = 10.1", write)).unread
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("[1, 2, 3, 4]", "[1,1, 2,2, 3,3, 4,4]", "found 8; write decimals with a point"),
-        ("[1, 2, 3, 4]", "[1,1; 2,2; 3,3; 4,4]", "a list has commas between its numbers"),
-        ("[0, 3196.70, 0, 0]", "[0; 3196.70; 0; 0]", "a list has commas between its numbers"),
-        ("[1, 2, 3, 4]", "[1 2 3 4]", "not closed, or lacks a comma"),
-        ("[1, 2, 3, 4]", '["1", "2", "3", "4"]', "expected a number, found '1'"),
-    ],
-)
-def test_the_advice_about_a_list(tmp_path, old, new, said):
-    """Decimal commas and semicolons in a list are named."""
-    (part,) = read(tmp_path, TEXT.replace(old, new)).unread
-    assert said in part.message
-
-
 def test_a_value_typed_twice_names_both_lines(tmp_path):
     """A name with two values costs this number only, wherever the second value is."""
     for second in ("omega_a = 10.2\n", "[reported.final]\nomega_a = 10.2\n"):
         found = read(tmp_path, TEXT.replace("zeta_a = 0.1\n", f"zeta_a = 0.1\n{second}"))
         (part,) = found.unread
         assert part.at == ("reported", "final", "omega_a")
-        assert "omega_a already has a value in line 9; keep one" in part.message
+        assert re.findall(r"line (\d+)", part.message) == [str(11 + second.count("[")), "9"]
         assert found.reported
         assert set(found.reported.final) == {"K_1", "zeta_a"}
 
@@ -284,7 +259,7 @@ def test_a_long_mistake_takes_little_time(tmp_path, many):
 def test_very_many_mistakes_are_refused(tmp_path):
     """A table of thousands of mistakes is refused at once."""
     many = "".join(f"a{i} = x\n" for i in range(50_000))
-    with pytest.raises(SubmissionError, match=r"\[reported\] has more than 200 mistakes"):
+    with pytest.raises(SubmissionError, match=r"\[reported\].*\b200\b"):
         read(tmp_path, TEXT.replace("zeta_a = 0.1\n", many))
 
 
@@ -298,7 +273,7 @@ def test_a_number_that_cannot_be_read_does_not_show_the_report(tmp_path):
 def test_an_edit_still_needs_a_valid_file(tmp_path):
     """A program does not edit a file with a number that cannot be read."""
     read(tmp_path, TEXT.replace("10.1", '"n/a"'))
-    with pytest.raises(SubmissionError, match="expected a number, found 'n/a'"):
+    with pytest.raises(SubmissionError, match=r"omega_a.*'n/a'"):
         edit_submission(tmp_path, lambda document: document.update({"title": "t"}))
 
 
@@ -344,17 +319,16 @@ def test_a_mistyped_number_costs_only_itself(judged, old, new, losing):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("^omega_1", "omega1", "final.omega1: unknown parameter; did you mean 'omega_1'?"),
-        (r"^\[reported.final\]", "[reported.finale]", "did you mean 'final'?"),
-        (r"^\[reported.feedback\]", "", "state_space.prefilter: unknown key"),
-        (r"^\[reported.state_space\]", "[reported.statespace]", "did you mean 'state_space'?"),
+        ("^omega_1", "omega1", "'omega_1'"),
+        (r"^\[reported.final\]", "[reported.finale]", "'final'"),
+        (r"^\[reported.feedback\]", "", "state_space.prefilter"),
+        (r"^\[reported.state_space\]", "[reported.statespace]", "'state_space'"),
     ],
 )
 def test_a_wrong_name_is_said_where_its_number_is_missing(judged, old, new, said):
     """The feedback quotes the mistyped name of a number or table."""
     (missing,) = (c for c in judged(old, new).criteria if c.id == "pieces")
-    assert "Missing: " in missing.message
-    assert "Cannot be read: submission.toml line " in missing.message
+    assert line_of(missing.message)
     assert said in missing.message
 
 
@@ -375,16 +349,12 @@ def test_one_typo_costs_one_number_in_grading(tmp_path):
     lost = {c.id: c for c in grade.criteria if c.points < c.out_of}
     assert set(lost) == {"pieces", "final-frequencies"}
     found = lost["final-frequencies"].message
-    assert f"a decimal comma; write a point: write {line}" in found
-    assert found.startswith("Cannot be read: omega_n: submission.toml line ")
+    assert advice(found) == [line]
     assert [flag.code for flag in grade.flags] == ["missing"]
     analysis = analyse(submission)
-    assert any("a decimal comma" in said for said in analysis.warnings)
-    told = plain_lines([next_steps(analysis)])
-    assert f"write {line}" in told
-    assert "Nothing to fix" not in told
+    assert [line] in map(advice, analysis.warnings)
+    assert advice(plain_lines([next_steps(analysis)])) == [line]
     done = cartlab_here("check", folder)
-    assert "a decimal comma" not in done.stderr
-    _, said = done.stdout.split("Not checked, because they cannot be read:\n")
-    assert said.startswith("  submission.toml line ")
-    assert f"a decimal comma; write a point: write {line}" in said
+    assert line not in done.stderr
+    assert line_of(done.stdout) == text.split("\n").index(line.replace(".", ",")) + 1
+    assert advice(done.stdout) == [line]
