@@ -20,8 +20,8 @@ from pipeline.json_files import json_text, plain
 from pipeline.notebook import Lab, analyse
 from pipeline.resources import EXAMPLES
 from tests.helpers.examples import analysed
+from tests.helpers.pages import Page
 from tests.helpers.places import ROOT
-from tests.report.test_report import Page
 
 NOTEBOOK = ROOT / "docs" / "example.ipynb"
 

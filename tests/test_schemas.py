@@ -14,9 +14,9 @@ from pipeline.schemas import MODELS, schema_text
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.examples import analysed
+from tests.helpers.gaps import make_gap
 from tests.helpers.grades import write_class
 from tests.helpers.places import ROOT
-from tests.report.test_gap import make_gap
 
 DOCS = ROOT / "docs"
 

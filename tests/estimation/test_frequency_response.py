@@ -16,25 +16,24 @@ from pipeline.estimation.frequency_response import (
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import ExperimentKind, FrequencyResponse, Hold, Record, SinePoint
+from tests.helpers.time_records import record_of
 
 COUNT_NOISE = 0.00115  # cm, half an encoder count
 
 
-def dwell(
-    *, omega: float, gain: float, std: float = 0.001, phase: float = -1.0, settled: bool = True
-) -> SinePoint:
+def dwell(*, omega: float, gain: float, phase: float = -1.0) -> SinePoint:
     return SinePoint(
         experiment=f"sine-{omega:g}",
         cart=1,
         omega=omega,
         amplitude=0.1 * gain,
-        amplitude_std=0.1 * std,
+        amplitude_std=0.1 * 0.001,
         phase=phase,
         phase_std=0.01,
         input_amplitude=0.1,
         input_amplitude_std=0.0,
         steady_from=1.0,
-        settled=settled,
+        settled=True,
         n_points=100,
     )
 
@@ -46,23 +45,12 @@ def record(
     *,
     kind: ExperimentKind = "step",
     noise: float = 0.0,
-    seed: int = 0,
     hold: Hold = "zero_order",
 ) -> Record:
     """Simulate all carts of a chain with noise."""
     y = simulate_linear(chain, t, u, hold=hold)
-    carts = tuple(range(1, chain.n + 1))
-    return Record(
-        id=f"{kind}-{seed}",
-        kind=kind,
-        t=t,
-        u=u,
-        y=y + noise * np.random.default_rng(seed).standard_normal(y.shape),
-        carts=carts,
-        free=carts,
-        resolution=np.zeros(chain.n),
-        hold=hold,
-    )
+    y = y + noise * np.random.default_rng(0).standard_normal(y.shape)
+    return record_of(t, u, y, kind=kind, count=0.0, hold=hold)
 
 
 def pulse(t: Array) -> Array:
@@ -85,13 +73,31 @@ def errors(chain: Chain, response: FrequencyResponse) -> Array:
 # ---------------------------------------------------------------------- dwells
 
 
-def test_dwells_are_sorted_by_frequency():
-    """Each dwell becomes one point with its gain and error, in ascending order of frequency."""
-    (got,) = collect_dwells([dwell(omega=20.0, gain=3.0), dwell(omega=5.0, gain=2.0)])
+HALF_TURN = np.deg2rad(179.0)
 
-    assert_allclose(got.omega, [5.0, 20.0])
-    assert_allclose(got.magnitude, [2.0, 3.0], rtol=1e-12)
-    assert_allclose(got.magnitude_std, 0.001, rtol=1e-9)
+
+@pytest.mark.parametrize(
+    ("dwells", "omega", "magnitude", "std", "phase"),
+    [
+        # in the order of frequency
+        ([(20.0, 3.0, -1.0), (5.0, 2.0, -1.0)], [5, 20], [2, 3], [0.001] * 2, [1, 1]),
+        # the error of two repeats is smaller by √2, or that of their scatter
+        ([(5.0, 2.0, -1.0), (5.002, 2.0, -1.0)], [5], [2], [0.001 / np.sqrt(2)], [1]),
+        ([(5.0, 1.95, -1.0), (5.002, 2.05, -1.0)], [5], [2], [0.05], [1]),
+        # the mean of 179° and −179° is half a turn
+        ([(5.0, 2.0, HALF_TURN), (5.0, 2.0, -HALF_TURN)], [5], [2], None, [np.pi]),
+    ],
+)
+def test_dwells_become_points(dwells, omega, magnitude, std, phase):
+    """Each frequency becomes one point with its gain, phase and error; repeats are combined."""
+    (got,) = collect_dwells([dwell(omega=w, gain=g, phase=p) for w, g, p in dwells])
+
+    assert_allclose(got.omega, omega, rtol=1e-3)
+    assert_allclose(got.magnitude, magnitude, rtol=1e-12)
+    if std is not None:
+        assert_allclose(got.magnitude_std, std, rtol=1e-9)
+    assert got.phase is not None
+    assert_allclose(np.abs(got.phase), phase, rtol=1e-9)
     assert got.source == "dwells"
 
 
@@ -99,28 +105,6 @@ def test_dwells_without_an_input_are_refused():
     """A dwell without an input amplitude is refused, since a gain needs one."""
     with pytest.raises(DataError, match="dwells need a sinusoidal input"):
         collect_dwells([replace(dwell(omega=5.0, gain=2.0), input_amplitude=0.0)])
-
-
-@pytest.mark.parametrize(("apart", "std"), [(0.0, 0.001 / np.sqrt(2)), (0.1, 0.05)])
-def test_repeats_become_one_point(apart, std):
-    """Two dwells at one frequency have an error smaller by √2, or that of their scatter."""
-    (got,) = collect_dwells(
-        [dwell(omega=5.0, gain=2 - apart / 2), dwell(omega=5.002, gain=2 + apart / 2)]
-    )
-
-    assert_allclose(got.magnitude, [2.0], rtol=1e-12)
-    assert_allclose(got.magnitude_std, std, rtol=1e-9)
-
-
-def test_repeats_around_half_a_turn_do_not_cancel():
-    """The mean of the phases 179° and −179° is 180°, not zero."""
-    phase = np.deg2rad(179.0)
-    (got,) = collect_dwells(
-        [dwell(omega=5.0, gain=2.0, phase=phase), dwell(omega=5.0, gain=2.0, phase=-phase)]
-    )
-
-    assert got.phase is not None
-    assert_allclose(np.abs(got.phase), np.pi, rtol=1e-9)
 
 
 # --------------------------------------------------------------------- records
@@ -263,19 +247,9 @@ def test_a_mode_too_damped_to_peak_is_found_from_the_roll_off():
 
 def test_noise_gives_no_resonance():
     """A flat response with 5 % noise gives no resonance."""
-    omega = np.geomspace(1.0, 50.0, 40)
-    rng = np.random.default_rng(1)
-    flat = FrequencyResponse(
-        cart=1,
-        omega=omega,
-        magnitude=1 + 0.05 * rng.standard_normal(40),
-        magnitude_std=np.full(40, 0.05),
-        phase=None,
-        phase_std=None,
-        source="table",
-    )
+    flat = Chain(m=np.array([1e-9]), c=np.array([1e-9]), k=np.array([1.0, 0.0]))
 
-    got = find_resonances([flat], n=1)
+    got = find_resonances(table(flat, np.geomspace(1.0, 50.0, 40), noise=0.05), n=1)
 
     assert set(got) == {"zeta"}
 

@@ -1,6 +1,7 @@
 """The check of model against bench is tested on simulated benches and on a real one."""
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +21,9 @@ from pipeline.plant.sampled_loop import Controller, LoopSetup, Pid, StateFeedbac
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import ExperimentKind, FeedbackDesign, HardwareCheck, Record
 from pipeline.submission import Design
+from tests.helpers.time_records import COUNT, record_of
 
 T = 0.00884  # s
-COUNT = 0.00227  # cm
 NOISE = 0.001  # cm
 CLOCK = T * np.arange(700, dtype=np.float64)
 STEPS = np.where((CLOCK > 0.5) & (CLOCK < 3.5), 1.0, 0.0)  # cm
@@ -52,18 +53,16 @@ def record(
     kind: ExperimentKind = "closed_loop",
     free: tuple[int, ...] | None = None,
 ) -> Record:
-    carts = tuple(range(1, len(y) + 1))
-    return Record(
-        id="control",
-        kind=kind,
-        t=t,
-        u=u,
-        y=y,
-        carts=carts,
-        free=carts if free is None else free,
-        reference=reference,
-        resolution=np.full(len(y), COUNT),
-    )
+    return record_of(t, u, y, kind=kind, free=free, reference=reference, id="control")
+
+
+def pushed(y: Array, u: Array = 0.06 * STEPS, t: Array = CLOCK) -> tuple[HardwareCheck, ...]:
+    """Return the checks of a run of two carts without a controller."""
+    return check_hardware(record(y, u=u, t=t, kind="step"), TWO)
+
+
+PidController = partial(submission.PidController, type="pid")
+StateController = partial(submission.StateFeedbackController, type="state_feedback")
 
 
 def designed(chain: Chain, cart: int) -> FeedbackDesign:
@@ -73,11 +72,7 @@ def designed(chain: Chain, cart: int) -> FeedbackDesign:
 
 
 def stated(design: FeedbackDesign, factor: float = 1.0) -> submission.StateFeedbackController:
-    return submission.StateFeedbackController(
-        type="state_feedback",
-        gains=tuple(factor * design.gains),
-        prefilter=factor * design.prefilter,
-    )
+    return StateController(gains=tuple(factor * design.gains), prefilter=factor * design.prefilter)
 
 
 def of(checks: tuple[HardwareCheck, ...], loop: str) -> dict[int, HardwareCheck]:
@@ -143,8 +138,10 @@ def test_a_true_model_leaves_the_noise(name, cart):
     assert_allclose(known(steered.settling_measured), known(steered.settling_model), atol=0.05)
 
 
-@pytest.mark.parametrize(("name", "cart"), LAST_CART)
-@pytest.mark.parametrize("factor", [-0.5, -1.0, 3.0])
+@pytest.mark.parametrize(
+    ("name", "cart", "factor"),
+    [(name, cart, factor) for name, cart in LAST_CART for factor in (-0.5, 3.0)],
+)
 def test_a_logged_input_of_another_sign_or_scale_is_corrected(name, cart, factor):
     """If the logged input has another sign or scale, its factor is found, reported and used."""
     chain = PLANTS[name]
@@ -157,19 +154,12 @@ def test_a_logged_input_of_another_sign_or_scale_is_corrected(name, cart, factor
     for check in checks:
         assert_allclose(known(check.input_scale), factor, rtol=1e-3)
         assert check.nrmse < 1.35 * noise_floor(y[check.cart - 1])
-    assert (
-        f"only if multiplied by {known(of(checks, 'open')[1].input_scale):.3g}"
-        in checks[chain.n].note
-    )
+    assert f"multiplied by {known(of(checks, 'open')[1].input_scale):.3g}" in checks[chain.n].note
 
 
 def test_a_gain_of_the_bench_20_percent_off_is_not_corrected():
     """If the bench's gain is 20 % above the model's gain, this is reported but not corrected."""
-    y = encoder(1.2 * simulate_linear(TWO, CLOCK, 0.06 * STEPS))
-
-    checks = check_hardware(record(y, u=0.06 * STEPS, kind="step"), TWO)
-
-    for check in checks:
+    for check in pushed(encoder(1.2 * simulate_linear(TWO, CLOCK, 0.06 * STEPS))):
         assert check.note == ""
         assert_allclose(known(check.input_scale), 1.2, atol=1e-3)
         # The model's level is low by 0.2 of 1.2.
@@ -202,12 +192,12 @@ def test_a_stated_scale_that_the_log_contradicts_is_noted():
     checks = check_hardware(
         record(y, u=run.u, reference=STEPS),
         TWO,
-        controller=submission.PidController(type="pid", kp=2.0, kd=0.1),
+        controller=PidController(kp=2.0, kd=0.1),
         controlled_cart=1,
     )
 
     # The scale is the median ratio of the input to a law that uses rounded readings.
-    assert re.match(r"the logged input is 0\.0097\d times what the stated", checks[0].note)
+    assert re.search(r"input is 0\.0097\d times", checks[0].note)
     assert checks[0].nrmse < 1.35 * noise_floor(y[0])
 
 
@@ -216,9 +206,7 @@ def test_a_wrong_statement_about_a_run_fails_a_check(wrong):
     """If a column's unit, the gains or the controlled cart are wrong, a check fails."""
     design, y, u = run_design(TWO, 2)
     gains = stated(design).gains
-    swapped = submission.StateFeedbackController(
-        type="state_feedback", gains=(gains[1], gains[0], *gains[2:]), prefilter=design.prefilter
-    )
+    swapped = StateController(gains=(gains[1], gains[0], *gains[2:]), prefilter=design.prefilter)
     run = record(
         y / COUNT if wrong == "counts" else y,
         u=10 * u if wrong == "input" else u,
@@ -262,47 +250,29 @@ def test_noisy_velocities_do_not_change_the_scale():
 
 
 @pytest.mark.parametrize(
-    ("law", "sample_time"),
+    ("law", "sample_time", "limit"),
     [
-        (Pid(kp=0.02, ki=0.03, kd=0.001, cart=1), None),
-        (Pid(kp=0.02, kd=0.001, cart=1), 0.000884),
-        (StateFeedback(gains=np.array([0.03, 0.006, -0.03, 0.0]), prefilter=0.06), None),
+        (Pid(kp=0.02, ki=0.03, kd=0.001, cart=1), None, None),
+        (Pid(kp=0.02, kd=0.001, cart=1), 0.000884, None),
+        (Pid(kp=0.2, kd=0.01, cart=1), None, 0.06),  # the limit is a plateau in the log
+        (StateFeedback(gains=np.array([0.03, 0.006, -0.03, 0.0]), prefilter=0.06), None, None),
     ],
 )
-def test_fast_and_slow_controllers_are_simulated_to_the_noise(law, sample_time):
-    """For slow and fast controllers, with or without a model, simulation errors are only noise."""
-    y, u = bench(TWO, law, sample_time=sample_time)
-    controller: submission.Controller
-    if isinstance(law, Pid):
-        controller = submission.PidController(
-            type="pid", kp=law.kp, ki=law.ki, kd=law.kd, cart=law.cart
-        )
-    else:
-        controller = submission.StateFeedbackController(
-            type="state_feedback", gains=tuple(law.gains), prefilter=law.prefilter
-        )
+def test_fast_slow_and_limited_controllers_are_simulated_to_the_noise(law, sample_time, limit):
+    """For slow, fast and limited controllers, simulation errors are only noise."""
+    y, u = bench(TWO, law, sample_time=sample_time, limit=limit)
+    controller = (
+        PidController(kp=law.kp, ki=law.ki, kd=law.kd, cart=law.cart)
+        if isinstance(law, Pid)
+        else StateController(gains=tuple(law.gains), prefilter=law.prefilter)
+    )
 
     checks = check_hardware(record(y, u=u, reference=STEPS), TWO, controller=controller)
 
+    assert limit is None or np.sum(np.abs(u) >= limit) > 5
     for check in of(checks, "closed").values():
         # Differences of rounded readings make the controller restless, which doubles the noise.
         assert check.nrmse < 2 * noise_floor(y[check.cart - 1])
-
-
-def test_an_unstated_input_limit_is_found_in_the_log():
-    """If the input limit is not stated, it is found as a plateau in the log and simulated."""
-    law = Pid(kp=0.2, kd=0.01)
-    y, u = bench(TWO, law, limit=0.06)
-    assert np.sum(np.abs(u) >= 0.06) > 5
-
-    checks = check_hardware(
-        record(y, u=u, reference=STEPS),
-        TWO,
-        controller=submission.PidController(type="pid", kp=0.2, kd=0.01),
-        controlled_cart=1,
-    )
-
-    assert of(checks, "closed")[1].nrmse < 2 * noise_floor(y[0])
 
 
 def test_a_pid_reads_the_controlled_cart_unless_it_names_one():
@@ -310,8 +280,8 @@ def test_a_pid_reads_the_controlled_cart_unless_it_names_one():
     law = Pid(kp=0.008, kd=0.0008, cart=2)
     y, u = bench(TWO, law)
     run = record(y, u=u, reference=STEPS)
-    unnamed = submission.PidController(type="pid", kp=0.008, kd=0.0008)
-    named = submission.PidController(type="pid", kp=0.008, kd=0.0008, cart=2)
+    unnamed = PidController(kp=0.008, kd=0.0008)
+    named = PidController(kp=0.008, kd=0.0008, cart=2)
 
     for controller, cart in ((unnamed, 2), (named, 1), (named, None)):
         checks = check_hardware(run, TWO, controller=controller, controlled_cart=cart)
@@ -322,9 +292,7 @@ def test_a_displaced_rest_does_not_change_the_error():
     """If encoders were not zeroed at rest, the open-loop simulation's error is still only noise."""
     y = encoder(simulate_linear(TWO, CLOCK, 0.06 * STEPS) + np.array([[3.0], [-2.0]]))
 
-    checks = check_hardware(record(y, u=0.06 * STEPS, kind="step"), TWO)
-
-    for check, rest in zip(checks, (3.0, -2.0), strict=True):
+    for check, rest in zip(pushed(y), (3.0, -2.0), strict=True):
         assert check.nrmse < 1.1 * noise_floor(y[check.cart - 1] - rest)
         assert_allclose(
             known(check.steady_state_measured), known(check.steady_state_model), atol=COUNT
@@ -371,9 +339,8 @@ def test_uneven_and_rounded_time_does_no_harm():
     t = np.round(CLOCK[kept], 3)
     y = encoder(simulate_linear(TWO, t, 0.06 * STEPS[kept]))
 
-    checks = check_hardware(record(y, u=0.06 * STEPS[kept], t=t, kind="step"), TWO)
-
-    assert all(check.nrmse < 1.1 * noise_floor(y[check.cart - 1]) for check in checks)
+    for check in pushed(y, 0.06 * STEPS[kept], t):
+        assert check.nrmse < 1.1 * noise_floor(y[check.cart - 1])
 
 
 def test_held_and_unmeasured_carts_have_no_check():
@@ -393,14 +360,8 @@ def test_held_and_unmeasured_carts_have_no_check():
     ("controller", "note"),
     [
         (None, ""),
-        (
-            submission.StateFeedbackController(type="state_feedback", gains=(), prefilter=1.0),
-            "the controller has no gains: state them",
-        ),
-        (
-            submission.PidController(type="pid"),
-            "the controller has no gains: state kp, ki or kd",
-        ),
+        (StateController(gains=(), prefilter=1.0), "no gains"),
+        (PidController(), "kp, ki or kd"),
     ],
 )
 def test_without_gains_the_measured_input_alone_is_checked(controller, note):
@@ -414,16 +375,17 @@ def test_without_gains_the_measured_input_alone_is_checked(controller, note):
     checks = check_hardware(record(y, u=u, reference=STEPS), TWO, controller=controller)
 
     assert [check.loop for check in checks] == ["open", "open"]
-    assert checks[0].note == note
+    assert note in checks[0].note
+    assert bool(note) == bool(checks[0].note)
     assert all(check.overshoot_measured is not None for check in checks)
 
 
 @pytest.mark.parametrize(
     ("run", "message"),
     [
-        (record(np.ones((2, 700)) * STEPS, u=None), "found neither a logged input nor"),
-        (record(np.ones((2, 700)) * STEPS, u=np.zeros(700)), "found neither a logged input nor"),
-        (record(np.ones((2, 700)), u=STEPS), "a cart that moves, found none"),
+        (record(np.ones((2, 700)) * STEPS, u=None), "a logged input"),
+        (record(np.ones((2, 700)) * STEPS, u=np.zeros(700)), "a logged input"),
+        (record(np.ones((2, 700)), u=STEPS), "cart that moves"),
         (record(np.ones((2, 700)) * STEPS, u=STEPS, free=(2,)), "cart 1, .*, found free \\[2\\]"),
     ],
 )
@@ -441,17 +403,8 @@ def ucsd(folder: Path, name: str, *, sign: float) -> Record:
     rows = [re.findall(r"-?\d+\.?\d*", line) for line in (folder / name).read_text().splitlines()]
     _, stamp, reference, y1, y2, u = np.array([row for row in rows if len(row) == 6], float).T
     index = np.arange(stamp.size)
-    return Record(
-        id=name,
-        kind="closed_loop",
-        t=index * np.polyfit(index, stamp, 1)[0],
-        u=sign * u,
-        y=np.array([y1, y2]),
-        carts=(1, 2),
-        free=(1, 2),
-        reference=reference,
-        resolution=np.ones(2),
-    )
+    t, y = index * np.polyfit(index, stamp, 1)[0], np.array([y1, y2])
+    return record_of(t, sign * u, y, kind="closed_loop", count=1.0, reference=reference, id=name)
 
 
 UCSD_MASS, UCSD_SPRING = np.array([5.5e-6, 3.7e-6]), np.array([1.79e-3, 1.03e-3, 0.0])
@@ -476,14 +429,14 @@ def test_the_ucsd_logs_differ_in_sign_and_scale(real_data, name, gains, closed_l
     checks = check_hardware(
         run,
         UCSD,
-        controller=submission.PidController(type="pid", scale=5 / 512, **gains),
+        controller=PidController(scale=5 / 512, **gains),
         controlled_cart=1,
         input_limit=4.884,
     )
 
     closed, opened = of(checks, "closed")[1], of(checks, "open")[1]
     assert 2.0 < sign * known(closed.input_scale) < 4.0
-    assert "the logged input explains the motion only if multiplied by" in opened.note
+    assert "multiplied by" in opened.note
     assert ("opposite sign" in closed.note) == (sign < 0)
     assert closed.nrmse < closed_limit
     if name == "closed_loop_pid.csv":  # because of integral action
@@ -504,14 +457,10 @@ def test_the_ucsd_logs_differ_in_sign_and_scale(real_data, name, gains, closed_l
     controller=st.sampled_from(
         [
             None,
-            submission.PidController(type="pid", kp=1.0, ki=3.0, kd=-0.2),
-            submission.PidController(type="pid", kp=1.0, cart=3),
-            submission.StateFeedbackController(
-                type="state_feedback", gains=(1.0, 1.0), prefilter=-2.0
-            ),
-            submission.StateFeedbackController(
-                type="state_feedback", gains=(9.0,) * 4, prefilter=1e9
-            ),
+            PidController(kp=1.0, ki=3.0, kd=-0.2),
+            PidController(kp=1.0, cart=3),
+            StateController(gains=(1.0, 1.0), prefilter=-2.0),
+            StateController(gains=(9.0,) * 4, prefilter=1e9),
         ]
     ),
     seed=st.integers(0, 2**32 - 1),
@@ -544,14 +493,5 @@ def test_any_record_gives_finite_numbers_or_a_clear_error(
         return
     assert checks
     for check in checks:
-        figures = [
-            check.nrmse,
-            check.overshoot_model,
-            check.overshoot_measured,
-            check.settling_model,
-            check.settling_measured,
-            check.steady_state_model,
-            check.steady_state_measured,
-            check.input_scale,
-        ]
-        assert all(np.isfinite(figure) for figure in figures if figure is not None)
+        numbers = [value for value in vars(check).values() if isinstance(value, float)]
+        assert np.isfinite(numbers).all()

@@ -37,6 +37,7 @@ T = 0.00884  # s
 RIGID = Chain(m=np.array([2e-4]), c=np.array([1e-4]), k=np.zeros(2))
 FREE_PAIR = Chain(m=np.full(2, 3e-4), c=np.full(2, 4e-4), k=np.array([0.0, 0.12, 0.0]))
 FOUR = Chain(m=np.full(4, 3e-4), c=np.full(4, 4e-4), k=np.array([0.1, 0.12, 0.1, 0.09, 0.05]))
+BROKEN = Chain(m=np.ones(3), c=np.ones(3), k=np.array([1.0, 1.0, 0.0, 1.0]))
 PLANTS = {**PRESETS, "rigid": RIGID, "free pair": FREE_PAIR, "four": FOUR}
 EVERY_CART = [(name, cart) for name, plant in PLANTS.items() for cart in range(1, plant.n + 1)]
 METHODS: tuple[Method, ...] = ("lqr", "poles")
@@ -47,24 +48,21 @@ def design(
     *,
     cart: int = 1,
     reference: float = 1.0,
-    overshoot: float = 10.0,
     settling: float = 1.0,
     limit: float | None = None,
     sample_time: float | None = None,
     method: Method = "lqr",
 ) -> FeedbackDesign:
-    return design_feedback(
-        chain,
-        Design(
-            cart=cart,
-            reference=reference,
-            overshoot_percent=overshoot,
-            settling_time=settling,
-            input_limit=limit,
-            sample_time=sample_time,
-            method=method,
-        ),
+    task = Design(
+        cart=cart,
+        reference=reference,
+        overshoot_percent=10.0,
+        settling_time=settling,
+        input_limit=limit,
+        sample_time=sample_time,
+        method=method,
     )
+    return design_feedback(chain, task)
 
 
 def off_by(chain: Chain, rng: np.random.Generator) -> Chain:
@@ -240,45 +238,27 @@ def test_units_do_not_matter(position, force, method):
     assert same.settling_time == base.settling_time
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_the_input_limit_is_kept(method):
-    """If the input limit allows the goal, the design meets the goal within the limit."""
-    chain = PRESETS["throne-3dof"]
-    roomy = design(chain, cart=3, method=method)
-    got = design(chain, cart=3, limit=0.075, method=method)
-
-    assert got.reachable
-    assert got.peak_input <= 0.075
-    assert roomy.peak_input >= got.peak_input or roomy.peak_input <= 0.075
+HOLDING = 1 / PRESETS["throne-2dof"].static_gains()[1]
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_level_beyond_the_input_limit_is_out_of_reach(method):
-    """If the input limit is too small to hold the step, the message gives the level it can hold."""
-    chain = PRESETS["throne-2dof"]
-    got = design(chain, cart=2, limit=0.05, method=method)
+@pytest.mark.parametrize(
+    ("limit", "settling", "reachable", "said"),
+    [
+        (1.2 * HOLDING, 1.0, True, ""),
+        # too little to hold the step, or to reach it in time
+        (0.8 * HOLDING, 1.0, False, f"at most {0.8:.3g}"),
+        (1.05 * HOLDING, 0.15, False, "0.15 s within ±0.0639"),
+    ],
+)
+def test_the_input_limit_is_kept(method, limit, settling, reachable, said):
+    """The best design within the input limit is given; a message says what is out of reach."""
+    got = design(PRESETS["throne-2dof"], cart=2, settling=settling, limit=limit, method=method)
 
-    assert not got.reachable
-    held = 0.05 * chain.static_gains()[1]
-    assert f"cannot hold cart 2 at 1; it reaches at most {held:.3g}" in got.message
-    assert np.abs(got.u).max() <= 0.05
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_an_unreachable_settling_time_gives_the_best_design(method):
-    """If the input limit is too small for the settling time, the best possible design is given.
-
-    The message names its overshoot and settling time.
-    """
-    chain = PRESETS["throne-2dof"]
-    holding = 1 / chain.static_gains()[1]
-    got = design(chain, cart=2, settling=0.15, limit=1.05 * holding, method=method)
-
-    assert not got.reachable
-    assert (
-        "settling in 0.15 s within ±0.0639 of input cannot be met: the best design" in got.message
-    )
-    assert got.peak_input <= 1.05 * holding + 1e-12
+    assert got.reachable == reachable
+    assert got.peak_input <= limit + 1e-12
+    assert np.abs(got.u).max() <= limit + 1e-12
+    assert said in got.message
 
 
 def test_gains_that_cancel_a_soft_plant_give_a_warning():
@@ -289,7 +269,7 @@ def test_gains_that_cancel_a_soft_plant_give_a_warning():
     got = design(FOUR, cart=4, settling=0.5, method="poles")
 
     assert level_error_percent(FOUR, got.gains, cart=4) > 5.0
-    assert "errors of 3 % in the springs move the level by up to" in got.message
+    assert "the springs" in got.message
 
 
 def test_a_fast_plant_is_sampled_faster():
@@ -307,14 +287,9 @@ def test_a_fast_plant_is_sampled_faster():
 @pytest.mark.parametrize(
     ("chain", "cart", "reference", "message"),
     [
-        (PRESETS["throne-2dof"], 3, 1.0, "a cart from 1 to 2, found 3"),
-        (PRESETS["throne-2dof"], 1, 0.0, "a reference other than 0"),
-        (
-            Chain(m=np.ones(3), c=np.ones(3), k=np.array([1.0, 1.0, 0.0, 1.0])),
-            1,
-            1.0,
-            "no spring between carts 2 and 3",
-        ),
+        (PRESETS["throne-2dof"], 3, 1.0, "found 3"),
+        (PRESETS["throne-2dof"], 1, 0.0, "reference"),
+        (BROKEN, 1, 1.0, "carts 2 and 3"),
     ],
 )
 def test_impossible_tasks_are_refused(chain, cart, reference, message):
@@ -344,28 +319,20 @@ def test_the_step_is_right_between_the_ticks_of_a_slow_clock(name, sample_time, 
     assert_allclose(found.overshoot_percent, overshoot, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("name", "sample_time", "method"),
-    [("throne-1dof", 0.5, "poles"), ("throne-2dof", 0.5, "poles")],
-)
-def test_a_design_worse_than_no_feedback_is_refused(name, sample_time, method):
+@pytest.mark.parametrize("name", ["throne-1dof", "throne-2dof"])
+def test_a_design_worse_than_no_feedback_is_refused(name):
     """A clock so slow that feedback adds overshoot is refused, with a sample time that works."""
     chain = PRESETS[name]
-    with pytest.raises(DataError, match="overshoot less than") as refused:
-        design(chain, cart=chain.n, sample_time=sample_time, method=method)
+    with pytest.raises(DataError) as refused:
+        design(chain, cart=chain.n, sample_time=0.5, method="poles")
 
-    said = re.search(
-        r"less than the ([\d.]+) % .* found ([\d.]+) % at best, .* set sample_time to ([\d.]+) s, "
-        r"where the design overshoots by ([\d.]+) %",
-        str(refused.value),
-    )
-    assert said
-    alone, found, proposed, overshoot = map(float, said.groups())
+    numbers = re.findall(r"([\d.]+) (?:%|s,)", str(refused.value))
+    alone, found, proposed, overshoot = map(float, numbers)
     t = np.linspace(0, 3, 3000)
     step = simulate_linear(chain, t=t, u=np.ones_like(t))[chain.n - 1]
     peak = overshoot_percent(step, before=0.0, level=chain.static_gains()[chain.n - 1])
     assert_allclose(alone, peak, rtol=0.01)  # three digits, and 512 points
     assert found > alone
-    better = design(chain, cart=chain.n, sample_time=proposed, method=method)
+    better = design(chain, cart=chain.n, sample_time=proposed, method="poles")
     assert better.reachable
     assert_allclose(better.overshoot_percent, overshoot, atol=0.06)

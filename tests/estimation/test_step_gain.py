@@ -14,9 +14,9 @@ from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Record
 from pipeline.submission import load_submission
+from tests.helpers.time_records import COUNT
 from tests.helpers.ucsd import write_two_cart_submission
 
-COUNT = 0.00227  # cm, encoder of the ECP 210
 FS = 113.1  # Hz, the usual sampling rate of the ECP 210
 FOUR = Chain(
     m=np.array([3e-4, 2.5e-4, 2e-4, 2e-4]),
@@ -92,13 +92,8 @@ def test_each_step_in_a_record_gives_a_gain():
     chain, t = PRESETS["throne-1dof"], seconds(24.0)
     u = staircase(t, (0.5, 0.02), (5.0, 0.04), (10.0, -0.03), (15.0, 0.0), (20.0, -0.01))
     got = fit_step_gain(run_of(chain, t, u), cart=1)
-    assert [round(edge.u_after - edge.u_before, 9) for edge in got.edges] == [
-        0.02,
-        0.02,
-        -0.07,
-        0.03,
-        -0.01,
-    ]
+    sizes = [edge.u_after - edge.u_before for edge in got.edges]
+    assert_allclose(sizes, [0.02, 0.02, -0.07, 0.03, -0.01], atol=1e-12)
     assert_allclose(got.gain, chain.static_gains()[0], rtol=2e-3)
     assert all(abs(edge.gain - got.gain) < 4 * edge.gain_std for edge in got.edges)
 
@@ -134,31 +129,33 @@ def test_if_a_record_ends_early_a_fit_gives_the_level(name, wait):
         assert "still oscillates" in got.note
 
 
-def test_an_edge_before_the_carts_settle_is_used():
-    """If the input ends before the carts settle, both edges are still used."""
-    chain, t = PRESETS["throne-2dof"], seconds(8.0)
-    got = fit_step_gain(run_of(chain, t, staircase(t, (0.5, 0.03), (1.7, 0.0))), cart=1)
-    assert len(got.edges) == 2
-    assert_allclose(got.gain, chain.static_gains()[0], rtol=2e-3)
-
-
 # --------------------------------------------------------------- real conditions
 
 
-def test_with_input_from_the_start_the_first_position_is_the_rest():
-    """If the input is on from the first sample, the first position counts as the rest position."""
-    chain, t = PRESETS["throne-1dof"], seconds(6.0)
-    got = fit_step_gain(run_of(chain, t, np.full_like(t, 0.03), offset=-0.2), cart=1)
-    assert_allclose(got.gain, chain.static_gains()[0], atol=COUNT / 0.03)
-    assert "on from the first sample" in got.note
-    assert got.edges[0].t == 0.0
+SHORT, LONG = seconds(7.0), seconds(16.0)
+UNUSUAL = {
+    # name: times, input, its noise, rest position, number of edges, words in the note
+    "begun before it settles": (LONG, staircase(LONG, (0.5, 0.03), (1.7, 0.0)), 0, 0, 2, ""),
+    "on from the start": (SHORT, np.full_like(SHORT, 0.03), 0, -0.2, 1, "first sample"),
+    "one sample of rest": (SHORT, staircase(SHORT, (SHORT[1], 0.03)), 0, 0, 1, ""),
+    "noisy": (LONG, staircase(LONG, (0.5, 0.03), (8.0, 0.0)), 3e-4, 0, 2, ""),
+    "a slow edge": (SHORT, 0.03 * np.clip((SHORT - 0.5) / 0.09, 0, 1), 0, 0, 1, ""),
+    "a drift": (LONG, staircase(LONG, (3.0, 0.03), (9.0, 0.0)), 0, 0.01 * LONG, 2, "drift"),
+}
 
 
-def test_one_sample_of_rest_before_the_edge_is_enough():
-    """One sample before the edge, as in the UCSD logs, is enough for the rest position."""
-    chain, t = PRESETS["throne-1dof"], seconds(6.0)
-    got = fit_step_gain(run_of(chain, t, staircase(t, (t[1], 0.03))), cart=1)
-    assert_allclose(got.gain, chain.static_gains()[0], atol=COUNT / 0.03)
+@pytest.mark.parametrize("name", UNUSUAL)
+def test_an_unusual_step_gives_the_gain(name):
+    """Edges and gain are right for an early, slow or noisy edge, little rest, and a drift."""
+    t, u, noise, rest, edges, note = UNUSUAL[name]
+    chain = PRESETS["throne-1dof"]
+    noisy = u + noise * np.random.default_rng(0).normal(size=t.size)
+    got = fit_step_gain(replace(run_of(chain, t, u, offset=rest), u=noisy), cart=1)
+    assert len(got.edges) == edges
+    # Half a count at each level; a drift and an input's noise move the level by about as much.
+    assert_allclose(got.gain, chain.static_gains()[0], atol=1.1 * COUNT / 0.03)
+    assert note in got.note
+    assert got.interval is None
 
 
 @pytest.mark.parametrize("noise", [0.5, 3.0])
@@ -169,37 +166,6 @@ def test_noise_is_averaged(noise):
     got = fit_step_gain(run_of(chain, t, u, noise=noise * COUNT), cart=1)
     assert abs(got.gain - chain.static_gains()[0]) < 4 * got.gain_std
     assert got.gain_std < noise * COUNT / 0.03 / 1.5  # below the noise of a single sample
-
-
-def test_a_noisy_input_still_has_its_edges():
-    """Noise on the logged input is not taken for edges."""
-    chain, t = PRESETS["throne-1dof"], seconds(12.0)
-    run = run_of(chain, t, staircase(t, (0.5, 0.03), (6.0, 0.0)))
-    assert run.u is not None
-    noisy = run.u + 3e-4 * np.random.default_rng(0).normal(size=t.size)
-    got = fit_step_gain(replace(run, u=noisy), cart=1)
-    assert len(got.edges) == 2
-    assert_allclose(got.gain, chain.static_gains()[0], rtol=3e-3)
-
-
-def test_a_slow_edge_is_one_edge():
-    """If the input takes ten samples to reach its level, this counts as one edge."""
-    chain, t = PRESETS["throne-1dof"], seconds(7.0)
-    u = 0.03 * np.clip((t - 0.5) / 0.09, 0, 1)
-    got = fit_step_gain(run_of(chain, t, u), cart=1)
-    assert len(got.edges) == 1
-    assert_allclose(got.gain, chain.static_gains()[0], atol=COUNT / 0.03)
-
-
-def test_a_drift_does_not_change_the_gain():
-    """If the rest position drifts steadily, the drift does not change the gain."""
-    chain, t = PRESETS["throne-1dof"], seconds(16.0)
-    u = staircase(t, (3.0, 0.03), (9.0, 0.0))
-    y = simulate_linear(chain, t, u) + 0.01 * t
-    got = fit_step_gain(record(t, u, y), cart=1)
-    assert "a drift of" in got.note
-    assert_allclose(got.gain, chain.static_gains()[0], rtol=3e-3)
-    assert got.interval is None
 
 
 # ----------------------------------------------------------------------- friction

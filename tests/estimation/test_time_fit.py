@@ -16,7 +16,7 @@ from pipeline.plant.simulate import simulate_linear
 from pipeline.results import ChainFit, Record
 from pipeline.setup import Setup
 from pipeline.submission import load_submission
-from tests.helpers.time_records import decay_record, measure, random_chain, step_record
+from tests.helpers.time_records import decay_record, random_chain, record_of, step_record
 from tests.helpers.ucsd import write_two_cart_submission
 
 
@@ -81,13 +81,10 @@ def test_a_band_limited_input_is_used_as_such():
 
     If the input were treated as held between samples, the error would be above 1e-2.
     """
-    chain, rng = PRESETS["throne-2dof"], np.random.default_rng(2)
-    t = np.arange(600) / 113.0
+    chain, t = PRESETS["throne-2dof"], np.arange(600) / 113.0
     u = 0.05 * np.sin(15 * t) * np.sin(np.pi * t / t[-1]) ** 2
     y = simulate_linear(chain, t, u, hold="band_limited")
-    record = measure(
-        y, t, u, kind="sweep", carts=(1, 2), rng=rng, noise=0.0, count=0.0, hold="band_limited"
-    )
+    record = record_of(t, u, y, kind="sweep", count=0.0, hold="band_limited")
     parametrisation = Parametrisation(bench=Setup(springs=(True, True, True)))
 
     def off(record):
@@ -189,7 +186,7 @@ def test_a_body_on_no_spring_has_mass_and_damping():
     u = 0.01 * np.sign(np.sin(4 * t))
     y = simulate_linear(truth, t, u)
     rng = np.random.default_rng(6)
-    record = measure(y, t, u, kind="step", carts=(1,), rng=rng, noise=0.0005)
+    record = record_of(t, u, y + 0.0005 * rng.standard_normal(y.shape), kind="step")
     for springs in ((False, False), (True, True)):
         fit = fit_records([record], bench=Setup(springs=springs))
         assert np.max(np.abs(errors(fit, truth))) < 4
@@ -218,28 +215,24 @@ def test_a_damping_at_its_bound_has_no_standard_error():
 # ------------------------------------------------------------- what cannot be done
 
 
-def test_decays_alone_are_refused():
-    """Decays alone cannot give a mass in units of the input, and the error says what is needed."""
-    record = decay_record(PRESETS["throne-2dof"], free=(1, 2), rng=np.random.default_rng(8))
-    with pytest.raises(DataError, match="needs a record that drives cart 1, found none"):
-        fit_records([record], bench=Setup(springs=(True,) * 3))
+TWO_CARTS = PRESETS["throne-2dof"]
 
 
-def test_an_undetermined_parameter_is_named():
-    """If the records do not determine a parameter, the error names it.
-
-    In the test, cart 2 was held, so its mass is unknown.
-    """
-    record = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(9), free=(1,))
-    with pytest.raises(DataError, match=r"the records do not determine \w_\d"):
-        fit_records([record], bench=Setup(springs=(True,) * 3))
-
-
-def test_a_broken_chain_is_refused():
-    """If no spring joins two carts, the fit is refused, since the motor moves only the first."""
-    record = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(9))
-    with pytest.raises(DataError, match="spring between carts 1 and 2"):
-        fit_records([record], bench=Setup(springs=(True, False, True)))
+@pytest.mark.parametrize(
+    ("record", "springs", "missing"),
+    [
+        # decays give no mass in units of the input
+        (decay_record(TWO_CARTS, free=(1, 2), rng=np.random.default_rng(8)), 3, "drives cart 1"),
+        # cart 2 was held, so its mass is unknown
+        (step_record(TWO_CARTS, rng=np.random.default_rng(9), free=(1,)), 3, r"\w_\d"),
+        # the motor moves only the first cart
+        (step_record(TWO_CARTS, rng=np.random.default_rng(9)), 0, "spring between carts 1 and 2"),
+    ],
+)
+def test_what_the_records_do_not_determine_is_named(record, springs, missing):
+    """Decays alone, a held cart and a broken chain are refused, with what is missing."""
+    with pytest.raises(DataError, match=missing):
+        fit_records([record], bench=Setup(springs=(True, bool(springs), True)))
 
 
 def test_a_record_without_motion_is_left_out_with_a_message():

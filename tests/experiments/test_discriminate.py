@@ -36,8 +36,8 @@ from pipeline.words.progress import silent
 from pipeline.workflow import analyse
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.effects import make_term
+from tests.helpers.gaps import make_gap, two_cart_analysis
 from tests.helpers.virtual import VirtualBench, VirtualSession
-from tests.report.test_gap import make_gap, two_cart_analysis
 
 BENCH = Setup(springs=(True, True, True))
 LIMITS = PlanLimits(input=0.5, travel=2.5)

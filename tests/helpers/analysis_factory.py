@@ -3,11 +3,13 @@
 The numbers are what the stages would plausibly find: the true values plus a small, seeded error.
 """
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
 from pipeline.arrays import Array
+from pipeline.estimation.frequency_response import collect_dwells
 from pipeline.names import read_name
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.simulate import simulate_linear
@@ -18,7 +20,6 @@ from pipeline.results import (
     DecayLaw,
     Estimate,
     FeedbackDesign,
-    FrequencyResponse,
     HardwareCheck,
     LogDecrement,
     ParameterRow,
@@ -30,10 +31,10 @@ from pipeline.results import (
     StepGain,
 )
 from pipeline.setup import PAPER_UNITS, Setup
+from tests.helpers.time_records import COUNT, record_of
 
 NOTES = "## What we saw\n\nThe *dampings* differ, as `zeta_a` shows:\n\n- friction\n- play\n"
 _SAMPLE_TIME = 0.00884  # s, the controller of the ECP bench
-_COUNT = 0.00227  # cm, one encoder step
 _AMPLITUDE = 0.1  # V
 _PRESET = {1: "throne-1dof", 2: "throne-2dof", 3: "throne-3dof"}
 
@@ -59,7 +60,7 @@ def make_analysis(carts: int = 2, *, seed: int = 1, repeats: int = 2) -> Analysi
         log_decrements=tuple(decay for _, decay in decays),
         step_gains=gains,
         sine_points=points,
-        frequency_responses=_responses(points),
+        frequency_responses=collect_dwells(points),
         fit=fit,
         rows=_rows(fit, rng),
         checks=_checks(carts),
@@ -74,25 +75,11 @@ def make_analysis(carts: int = 2, *, seed: int = 1, repeats: int = 2) -> Analysi
     )
 
 
-def _measure(y: Array, rng: np.random.Generator) -> Array:
+def _record(kind, id_, t, y, rng, *, u=None, carts=None, reference=None, omega=None) -> Record:
     """Return positions as an encoder with a little noise reads them."""
-    return np.round((y + rng.normal(0.0, 0.3 * _COUNT, y.shape)) / _COUNT) * _COUNT
-
-
-def _record(kind, id_, t, y, *, u=None, carts, free=None, reference=None, omega=None) -> Record:
-    return Record(
-        id=id_,
-        kind=kind,
-        t=t,
-        u=u,
-        y=y,
-        carts=tuple(carts),
-        free=tuple(free or carts),
-        reference=reference,
-        omega=omega,
-        resolution=np.full(len(carts), _COUNT),
-        source=f"data/{id_}.csv",
-    )
+    y = y + rng.normal(0.0, 0.3 * COUNT, y.shape)
+    record = record_of(t, u, y, kind=kind, id=id_, carts=carts, reference=reference, omega=omega)
+    return replace(record, source=f"data/{id_}.csv")
 
 
 def _decay(chain: Chain, cart: int, repeat: int, rng: np.random.Generator):
@@ -106,10 +93,9 @@ def _decay(chain: Chain, cart: int, repeat: int, rng: np.random.Generator):
         swing = np.cos(omega_d * s) + zeta / np.sqrt(1 - zeta**2) * np.sin(omega_d * s)
         return 2.5 * np.exp(-zeta * omega * s) * swing
 
-    record = _record(
-        "decay", f"decay-{cart}-{repeat + 1}", t, _measure(wave(tau), rng)[None], carts=[cart]
-    )
-    n_peaks = int(np.clip(np.log(2.5 / (4 * _COUNT)) / (np.pi * zeta), 3, 14))
+    name = f"decay-{cart}-{repeat + 1}"
+    record = _record("decay", name, t, wave(tau)[None], rng, carts=(cart,))
+    n_peaks = int(np.clip(np.log(2.5 / (4 * COUNT)) / (np.pi * zeta), 3, 14))
     peak_t = release + np.pi / omega_d * np.arange(n_peaks)
     fit_t = t[t >= release]
     envelope = 2.5 * np.exp(-zeta * omega * (fit_t - release)) / np.sqrt(1 - zeta**2)
@@ -156,10 +142,7 @@ def _decay(chain: Chain, cart: int, repeat: int, rng: np.random.Generator):
 def _step(chain: Chain, rng: np.random.Generator):
     t = np.arange(0.0, 9.0, _SAMPLE_TIME)
     u = np.where((t > 0.5) & (t < 5.0), 0.05, 0.0)
-    record = _record(
-        "step", "step-a", t, _measure(simulate_linear(chain, t, u), rng), u=u,
-        carts=range(1, chain.n + 1),
-    )  # fmt: skip
+    record = _record("step", "step-a", t, simulate_linear(chain, t, u), rng, u=u)
     gains = []
     for cart, K in enumerate(chain.static_gains(), start=1):
         K = float(K * (1 + rng.normal(0, 0.01)))
@@ -199,10 +182,8 @@ def _dwells(chain: Chain, rng: np.random.Generator):
         t = np.arange(0.0, 8.0, _SAMPLE_TIME)
         u = _AMPLITUDE * np.sin(omega * t)
         id_ = f"sine-{i + 1:02d}"
-        y = _measure(simulate_linear(chain, t, u), rng)
-        records.append(
-            _record("sine", id_, t, y, u=u, carts=range(1, chain.n + 1), omega=float(omega))
-        )
+        y = simulate_linear(chain, t, u)
+        records.append(_record("sine", id_, t, y, rng, u=u, omega=float(omega)))
         for cart, value in enumerate(response, start=1):
             amplitude = _AMPLITUDE * abs(value)
             std = 0.01 * amplitude + 0.001
@@ -225,30 +206,9 @@ def _dwells(chain: Chain, rng: np.random.Generator):
     return records, tuple(points)
 
 
-def _responses(points: tuple[SinePoint, ...]) -> tuple[FrequencyResponse, ...]:
-    responses = []
-    for cart in sorted({point.cart for point in points}):
-        mine = sorted((p for p in points if p.cart == cart), key=lambda p: p.omega)
-        responses.append(
-            FrequencyResponse(
-                cart=cart,
-                omega=np.array([p.omega for p in mine]),
-                magnitude=np.array([p.gain for p in mine]),
-                magnitude_std=np.array([p.gain_std for p in mine]),
-                phase=np.array([p.phase for p in mine]),
-                phase_std=np.array([p.phase_std for p in mine]),
-                source="dwells",
-            )
-        )
-    return tuple(responses)
-
-
 def _fit(chain: Chain, *, n_points: int, dwells: list[str]) -> ChainFit:
-    names = tuple(
-        [f"m_{i}" for i in range(1, chain.n + 1)]
-        + [f"c_{i}" for i in range(1, chain.n + 1)]
-        + [f"k_{i}" for i in range(1, chain.n + 2)]
-    )
+    sizes = (("m", chain.n), ("c", chain.n), ("k", chain.n + 1))
+    names = tuple(f"{letter}_{i}" for letter, n in sizes for i in range(1, n + 1))
     values = np.concatenate([chain.m, chain.c, chain.k])
     parameters = {
         name: Estimate(value=value, std=0.003 * value, source="bode_fit")
@@ -333,11 +293,10 @@ def _closed_loop(chain: Chain, rng: np.random.Generator):
     t = np.arange(0.0, 4.0, _SAMPLE_TIME)
     reference = np.where(t > 0.2, 1.0, 0.0)
     model = simulate_linear(loop, t, prefilter * reference)
-    measured = _measure(1.05 * model, rng)
+    record = _record("closed_loop", "control", t, 1.05 * model, rng, reference=reference)
+    measured = record.y
     u = prefilter * reference - gains[0] * measured[0]
-    record = _record(
-        "closed_loop", "control", t, measured, u=u, carts=range(1, n + 1), reference=reference
-    )
+    record = replace(record, u=u)
     hardware = tuple(
         HardwareCheck(
             experiment="control",

@@ -11,31 +11,32 @@ COUNT = 0.00227  # cm, an ECP 210 encoder count
 RATE = 113.0  # Hz, the usual rate of the ECP 210
 
 
-def measure(
-    y: Array,
+def record_of(
     t: Array,
     u: Array | None,
+    y: Array,
     *,
     kind: ExperimentKind,
-    carts: tuple[int, ...],
-    rng: np.random.Generator,
-    noise: float,
     count: float = COUNT,
-    hold: Hold = "zero_order",
     id: str = "run",
+    free: tuple[int, ...] | None = None,
+    carts: tuple[int, ...] | None = None,
+    omega: float | None = None,
+    reference: Array | None = None,
+    hold: Hold = "zero_order",
 ) -> Record:
-    """Return positions read by an encoder, with white noise added before the rounding."""
-    read = y + noise * rng.standard_normal(y.shape)
-    if count:
-        read = np.round(read / count) * count
+    """Return positions (carts, samples) read by an encoder of this step; with 0 they are exact."""
+    carts = carts or tuple(range(1, len(y) + 1))
     return Record(
         id=id,
         kind=kind,
         t=t,
         u=u,
-        y=read,
+        y=np.round(y / count) * count if count else y,
         carts=carts,
-        free=carts,
+        free=carts if free is None else free,
+        omega=omega,
+        reference=reference,
         resolution=np.full(len(carts), count),
         hold=hold,
     )
@@ -61,7 +62,8 @@ def step_record(
     t = t + jitter / rate * rng.uniform(-0.5, 0.5, t.size)
     u = np.where((t > 0.1) & (t < duration / 2), swing / chain.static_gains()[0], 0.0)
     y = simulate_linear(chain, t, u, free=carts, x0=x0)
-    return measure(y, t, u, kind="step", carts=carts, rng=rng, noise=noise, count=count, id=id)
+    y = y + noise * rng.standard_normal(y.shape)
+    return record_of(t, u, y, kind="step", carts=carts, count=count, id=id)
 
 
 def decay_record(
@@ -84,7 +86,8 @@ def decay_record(
         ],
         axis=1,
     )
-    return measure(y + 0.3, t, None, kind="decay", carts=free, rng=rng, noise=0.0005, id=id)
+    y = y + 0.3 + 0.0005 * rng.standard_normal(y.shape)
+    return record_of(t, None, y, kind="decay", carts=free, id=id)
 
 
 def random_chain(n: int, rng: np.random.Generator) -> tuple[Chain, tuple[bool, ...]]:

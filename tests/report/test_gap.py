@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from functools import cache
 from itertools import permutations
 from types import SimpleNamespace
 
@@ -19,18 +20,9 @@ from pipeline.gap.residual import residual_forces
 from pipeline.gap.types import (
     Alternative,
     AlternativeModel,
-    ForceAgainst,
-    ForceFormula,
-    FormulaTerm,
-    FoundEffect,
-    FreeRun,
     Gap,
-    GapWindow,
-    NamedValue,
     Prediction,
     Proposal,
-    RecordGap,
-    Residual,
     Trace,
     Verdict,
     read_gap,
@@ -38,371 +30,166 @@ from pipeline.gap.types import (
 from pipeline.json_files import json_text
 from pipeline.plant.augmented import simulate_augmented
 from pipeline.plant.catalogue import CATALOGUE, find_effect
-from pipeline.plant.chain import PRESETS
-from pipeline.plant.effect import AugmentedChain, EffectTerm, chain_scales, input_steps
+from pipeline.plant.effect import AugmentedChain, effect_name, input_steps
 from pipeline.plant.simulator.laws import shaped_input
-from pipeline.report.document import Formula
+from pipeline.report.document import Document, Formula, paragraph, plain_lines
 from pipeline.report.equations.effects import augmented_equations, in_order, law
 from pipeline.report.figures.gap import predicted_figure
 from pipeline.report.gap.gap_report import LEGEND, build_gap_document, make_gap_files
 from pipeline.report.gap.load_gap import with_gap
-from pipeline.report.gap.verdict import WORDS, kept_together, terminal_verdict
+from pipeline.report.gap.verdict import WORDS, added_name, kept_together, share, terminal_verdict
 from pipeline.report.lab_report.content import build_document
 from pipeline.report.render.folder import write_files
 from pipeline.report.render.html import render_html
-from pipeline.results import Provenance
-from pipeline.setup import Setup
 from pipeline.submission import load_submission
 from pipeline.words.math import to_text
+from pipeline.words.text import plain
 from pipeline.workflow import analyse
-from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.effects import make_term
-from tests.report.test_report import HOSTILE, Page
+from tests.helpers.gaps import CHAIN, RESIDUAL, T, U, make_gap, two_cart_analysis, usual_terms
+from tests.helpers.pages import HOSTILE, Page, pictures, rows, sections, tiles
 from tests.truth.cases import make_case
 
-CHAIN = PRESETS["throne-2dof"]
-T = np.arange(0.0, 4.0, 0.00884)
-U = np.where((T > 0.1) & (T < 2.0), 0.05, 0.0)
+SUSPECT = Alternative(effect=find_effect("backlash"), where={}, nrmse_after=0.12, confidence=0.9)
+NAMES = {
+    key: effect_name(find_effect(key), {"cart": 2})
+    for key in ("coulomb_friction", "quadratic_drag")
+}
 
 
-# -------------------------------------------------------------- constructed gaps
-
-
-def usual_values(effect, place):
-    """Return parameter values of usual size."""
-    scales = chain_scales(CHAIN, place=effect.place, at=place, input=0.05)
-    return {p.name: p.size(scales) * p.typical for p in effect.parameters}
-
-
-RESIDUAL = Residual(
-    cart=2,
-    unit="V",
-    against=(
-        ForceAgainst(
-            quantity="velocity", unit="cm/s", at=(-1.0, 2.0), force=(0.1, -0.4),
-            spread=(0.02, None), formula=(0.1, -0.4),
-        ),
-    ),
-    formula=ForceFormula(
-        terms=(
-            FormulaTerm(term="v|v|", coefficient=-0.1, std=0.01, unit="V s^2/cm^2"),
-            FormulaTerm(term="|u| sign v", coefficient=0.02, std=0.001, unit="1"),
-        ),
-        explains=0.9,
-    ),
-)  # fmt: skip
-
-
-def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
-    """Return a plausible gap of the two-cart bench, with traces of the first cart's runs."""
-    terms: list[EffectTerm] = []
-    for key in keys:
-        effect = find_effect(key)
-        place = effect.places((True, True, True))[-1]
-        terms.append(
-            make_term(effect, place=place, values=usual_values(effect, place), chain=CHAIN)
-        )
-    linear, model = AugmentedChain(chain=CHAIN), AugmentedChain(chain=CHAIN, terms=tuple(terms))
-    rng = np.random.default_rng(7)
-    before, after = (simulate_augmented(m, T, U) for m in (linear, model))
-    traces = [
-        Trace(
-            experiment=run, cart=cart, held_out=held, t=T, u=U, baseline=before[cart - 1],
-            measured=after[cart - 1] + rng.normal(0.0, 0.001, T.size), final=after[cart - 1],
-        )
-        for run, held in (("step-a", True), ("step-b", False))
-        for cart in (1, 2)
-    ]  # fmt: skip
-    errors = np.linspace(0.153, 0.041, len(terms) + 1)
-    rivals = (
-        Alternative(
-            effect=find_effect("quadratic_drag"), where={"cart": 2}, nrmse_after=0.042,
-            confidence=0.4,
-        ),
-        Alternative(
-            effect=find_effect("stiction"), where={"cart": 2}, nrmse_after=0.3, confidence=0.001
-        ),
-    )  # fmt: skip
-    effects = tuple(
-        FoundEffect(
-            effect=term.effect,
-            where=term.where,
-            parameters={
-                p.name: NamedValue(
-                    value=value, std=0.02 * abs(value),
-                    unit=p.unit_text(position="cm", input="V"),
-                )
-                for p, value in zip(term.effect.parameters, term.values, strict=True)
-                if p.reported
-            },
-            details={},
-            confidence=0.6,
-            nrmse_before=float(errors[i]),
-            nrmse_after=float(errors[i + 1]),
-            rivals=rivals if i + 1 == len(terms) else (),
-        )
-        for i, term in enumerate(terms)
-    )  # fmt: skip
-    return Gap(
-        title="Two carts",
-        bench=Setup(springs=(True, True, True)),
-        provenance=Provenance(files={"data/step-a.csv": "0" * 64}),
-        verdict=verdict,
-        effects=effects,
-        baseline=0.153,
-        final=float(errors[-1]),
-        noise_floor=0.03,
-        repeatability=None,
-        free_run=tuple(
-            FreeRun(experiment=run, error=error)
-            for run, error in (("step-a", 0.1), ("step-b", None))
-        ),
-        residual=(RESIDUAL,) if verdict in ("partial", "unexplained") else (),
-        by_record=tuple(
-            RecordGap(
-                experiment=t.experiment, cart=t.cart, held_out=t.held_out, baseline=0.153,
-                final=0.041, noise_floor=0.03,
-            )
-            for t in traces
-        ),
-        where=(
-            GapWindow(
-                experiment="step-b", cart=2, start=2.0, end=2.6, what="velocity near zero",
-                share=0.62,
-            ),
-        ),
-        left=()
-        if verdict in ("none", "named")
-        else (
-            GapWindow(
-                experiment="step-b", cart=2, start=2.0, end=2.6, what="velocity near zero",
-                share=0.31,
-            ),
-        ),
-        next_experiment="" if verdict == "none" else "Steps of three sizes.",
-        linear=linear,
-        model=model,
-        training=("step-b",),
-        held_out=("step-a",),
-        traces=tuple(traces),
-        chain_std={f"{letter}_{i}": 1e-7 for letter in "mck" for i in (1, 2)},
-        spread={2: 0.05} if "coulomb_friction" in keys else {},
-        notes=("no run could be spared for testing, so the last 40 % of the longest is held out",),
-    )  # fmt: skip
-
-
-def two_cart_analysis():
-    """Return an analysis whose recordings belong to the constructed gaps."""
-    analysis = make_analysis(2)
-    step = next(record for record in analysis.records if record.id == "step-a")
-    return replace(analysis, records=(step, replace(step, id="step-b")))
+@cache
+def document_of(verdict: Verdict, *keys: str) -> Document:
+    """Return the gap report of a constructed gap."""
+    return build_gap_document(make_gap(verdict, keys), two_cart_analysis())
 
 
 def page_of(gap: Gap) -> Page:
-    """Return the parsed page of a gap report."""
+    """Return the parsed page of a gap report, with the text of its figures."""
     return Page(render_html(build_gap_document(gap, two_cart_analysis())))
 
 
-def test_the_first_paragraph_names_the_effect_with_its_numbers():
-    """The first paragraph names the effect, its place, its size, the errors and the noise."""
-    text = page_of(make_gap()).text
+@pytest.mark.parametrize(
+    ("verdict", "keys", "more", "tones"),
+    [
+        ("named", ("coulomb_friction",), "effect-1 model", ["", "good", ""]),
+        ("ambiguous", ("coulomb_friction",), "effect-1 apart model", ["", "", ""]),
+        ("partial", ("coulomb_friction",), "effect-1 force-left model", ["", "bad", ""]),
+        ("unexplained", ("coulomb_friction",), "effect-1 force-left model", ["", "bad", ""]),
+        ("unexplained", (), "force-left", ["bad", ""]),
+    ],
+)
+def test_each_verdict_has_its_sections_and_errors(verdict, keys, more, tones):
+    """Title, sections, errors and their colours follow from the verdict."""
+    found = sections(document_of(verdict, *keys))
+    assert found["summary"].title == WORDS.text(f"title_{verdict}")
+    always = {"summary", "where", "method", "provenance"}
+    assert found.keys() - {"runs", "warnings"} == always | {*more.split()}
+    board = tiles(found["summary"].blocks)
+    errors = [0.153, 0.041, 0.03] if keys else [0.153, 0.03]
+    assert [plain(tile.value) for tile in board] == [share(error) for error in errors]
+    assert [tile.tone for tile in board] == tones
+    # The figures call the model as the verdict does, and draw no model with effects without one.
+    name = added_name(make_gap(verdict, keys))
+    drawn = Page(render_html(document_of(verdict, *keys))).text
+    other = {WORDS.text("with_effects"), WORDS.text("with_suspects")} - {name}
+    assert (name in drawn) == bool(keys)
+    assert not any(one in drawn for one in other)
 
-    assert "Dry (Coulomb) friction on cart 2 explains what the linear model leaves out" in text
-    assert "falls from 15.3 % of the motion to 4.1 %; noise alone accounts for 3.0 %" in text
-    assert text.index("explains what") < text.rindex("Where the linear model fails")
+
+def test_the_summary_names_effects_sizes_and_errors():
+    """The terminal's summary has each name with its errors; a suspect is not an explanation."""
+    said = {verdict: terminal_verdict(make_gap(verdict)) for verdict in ("named", "ambiguous")}
+    for text in said.values():
+        assert NAMES["coulomb_friction"][1:] in text
+        assert all(share(error) in text for error in (0.153, 0.041, 0.03))
+    assert NAMES["quadratic_drag"] in said["ambiguous"]
+    assert NAMES["quadratic_drag"] not in said["named"]
+    gap = replace(make_gap("unexplained", ()), final=0.153, suspects=(SUSPECT,))
+    assert f"{effect_name(SUSPECT.effect, {})} (leaves an error of 12.0 %)" in terminal_verdict(gap)
+    assert read_gap(json_text(gap)).suspects == gap.suspects
+    repeated = replace(make_gap(), repeatability=0.035)
+    assert WORDS.text("repeats_differ", share=share(0.035)) in terminal_verdict(repeated)
 
 
 def test_each_force_is_given_with_its_cart():
-    """If both carts have dry friction, each force is given with its cart.
-
-    The sentence on dry friction appears only once.
-    """
+    """If both carts have dry friction, each force is given with its cart, and the law once."""
     gap = make_gap()
     (one,) = gap.effects
     said = terminal_verdict(replace(gap, effects=(replace(one, where={"cart": 1}), one)))
 
-    assert re.search(r"force [^;]+ V on cart 1; force [^;]+ V on cart 2\. ", said)
+    carts = re.findall(r"force [^;]+ V on cart (\d)", said)
+    assert carts == ["1", "2"]
     assert said.count(one.effect.sentence) == 1
-    assert " V on cart" not in terminal_verdict(gap)  # the effect's name includes the cart
+    assert not re.findall(r"force [^;]+ V on cart", terminal_verdict(gap))  # named before
 
 
-def test_an_evenly_spread_error_is_described():
-    """If the error is spread evenly over a part of the run, the sentence and the table say so."""
+def test_where_the_error_is_left_is_said():
+    """A partial verdict says how much error is left and where, also if it is spread evenly."""
     gap = replace(make_gap("partial"), noise_floor=0.01)
     (window,) = gap.left
-    text = page_of(replace(gap, left=(replace(window, what="throughout"),))).text
-
-    assert "(evenly over the whole stretch)" in text
-    assert "throughout" not in text
-
-
-def test_scattering_repeats_are_compared_with_the_models_error():
-    """If repeats differ by more than the noise, the model's error is compared with the repeats."""
-    gap = replace(make_gap(), repeatability=0.035)
-    text = page_of(gap).text
-
-    assert "to 4.1 %; repeats of one run differ by 3.5 %" in text
+    for what in (window.what, "throughout"):
+        said = terminal_verdict(replace(gap, left=(replace(window, what=what),)))
+        assert re.search(r"4\.1 times .*step-b, cart 2, from 2\.00 to 2\.60 s", said)
+        assert (what in said) == (what != "throughout")
 
 
-def test_suspects_are_listed_with_their_errors():
-    """If the verdict is unexplained, each suspect is listed with the error that would remain."""
-    suspect = Alternative(
-        effect=find_effect("backlash"), where={}, nrmse_after=0.12, confidence=0.9
-    )
-    gap = replace(make_gap("unexplained", ()), final=0.153, suspects=(suspect,))
-    text = page_of(gap).text
-
-    assert "Suspected, though not proven: backlash between motor and cart 1" in text
-    assert "cart 1 (leaves an error of 12.0 %)" in text
-    assert read_gap(json_text(gap)).suspects == gap.suspects
-
-
-def test_the_page_of_the_verdict_none_mentions_no_effects():
-    """If the verdict is "none", the page mentions no effects and draws only one model."""
+def test_the_verdict_none_says_what_it_covers():
+    """If no effect is needed, the page says how far the carts moved and what could be hidden."""
     gap = replace(make_gap("none", ()), final=0.031, baseline=0.031, where=())
-    page = page_of(gap)
+    found = sections(build_gap_document(gap, two_cart_analysis()))
 
-    for wrong in (
-        "With 0 effects",
-        "Where the linear model fails",
-        "the residual of each model",
-        "before (ring)",
-        "An observer then followed",
-    ):
-        assert wrong not in page.text
-    assert "No effect is needed" in page.text
-    assert "with the effects" not in html_of(gap)  # nor do the legends of the figures
-    assert tones(gap) == ["good", ""]
-    assert "Error and noise of every run" in page.text
-    assert "cart 1 up to" in page.text
-    assert "the input up to 0.0500 V" in page.text
+    assert not found.keys() & {"effect-1", "model", "apart", "force-left"}
+    assert [tile.tone for tile in tiles(found["summary"].blocks)] == ["good", ""]
+    assert [name for name in pictures(found["summary"].blocks)] == ["before-after-1"]
+    said = plain_lines(found["summary"].blocks)
+    reach = [max(np.ptp(t.measured) for t in gap.traces if t.cart == cart) for cart in (1, 2)]
+    numbers = [float(n) for n in re.findall(r"cart \d up to ([\d.]+)", said)]
+    assert_allclose(numbers, reach, rtol=0.1)  # ptp includes the swing to the other side
+    assert re.search(r"input up to 0\.0500", said)
     # A search begins at a chi-square of 1.15 per point. With noise of 3 %: 3 % √(1.15 - 1) = 1.2 %.
-    assert "by more than about 1.2 % of their motion" in page.text
-    assert page.text.index("What to do next") < page.text.rindex("Error and noise of every run")
-    assert "What to do next." in terminal_verdict(gap)
+    assert re.search(r"1\.2 %", said)
 
 
-def test_an_unexplained_gap_is_drawn_without_effects():
-    """If the verdict is unexplained, no figure shows a model with effects.
-
-    If there are suspects, figures show the model with the suspects, marked as such.
-    """
-    alone = make_gap("unexplained", ())
-    assert "with the effects" not in html_of(alone)
-    assert "With 0 suspects" not in page_of(alone).text
-    suspected = make_gap("unexplained")
-    assert "With 1 suspect" in page_of(suspected).text
-    assert "The model with the suspects" in page_of(suspected).text
-    assert "with the effects" not in html_of(suspected)
-    assert "with the suspects" in html_of(suspected)
-
-
-def test_an_ambiguous_error_is_neither_good_nor_bad():
-    """If the verdict is ambiguous, the remaining error is marked neither good nor bad."""
-    assert tones(make_gap("ambiguous")) == ["", "", ""]
-    assert (
-        "One explanation: dry (Coulomb) friction on cart 2" in page_of(make_gap("ambiguous")).text
-    )
-    assert tones(make_gap("named")) == ["", "good", ""]
-    assert tones(make_gap("partial")) == ["", "bad", ""]
-
-
-def html_of(gap: Gap) -> str:
-    """Return the page of a gap report, including the text in its figures."""
-    return render_html(build_gap_document(gap, two_cart_analysis()))
-
-
-def tones(gap: Gap) -> list[str]:
-    """Return the marks of the tiles at the top, such as "good" or "bad"."""
-    return re.findall(r'<div class="tile (\w*)"', html_of(gap))
-
-
-def test_both_explanations_are_described():
-    """If the verdict is ambiguous, both explanations and the deciding experiment are described."""
-    text = page_of(make_gap("ambiguous")).text
-
-    assert "Dry (Coulomb) friction on cart 2, or quadratic drag on cart 2" in text
-    assert "these data cannot tell which" in text
-    assert "The experiment that would tell them apart. Steps of three sizes." in text
-    assert find_effect("quadratic_drag").deciding_run in text
-    assert "explains what" not in text
-
-
-@pytest.mark.parametrize("keys", [(), ("coulomb_friction",)])
-def test_an_unexplained_gap_names_only_suspects(keys):
-    """If the verdict is unexplained, suspects are named, but not as an explanation."""
-    text = page_of(make_gap("unexplained", keys)).text
-
-    assert "nothing in the catalogue explains" in text
-    assert ("best suspect is dry (Coulomb) friction" in text) == bool(keys)
-    assert "explains what" not in text
-
-
-def test_a_partial_verdict_says_how_much_error_is_left():
-    """If the verdict is partial, the page says how much error remains, and where."""
-    gap = replace(make_gap("partial"), noise_floor=0.01)
-    text = page_of(gap).text
-
-    assert "explains part of what the linear model leaves out" in text
-    assert "The error is still 4.1 times that" in text
-    assert "step-b, cart 2, from 2.00 to 2.60 s (velocity near zero)" in text
-    assert "Where the model with its effects fails most" in text
-    assert "its largest part is in" not in terminal_verdict(make_gap())
-
-
-@pytest.mark.parametrize("verdict", ["partial", "unexplained"])
-def test_the_unexplained_force_has_a_figure_and_a_formula(verdict):
+def test_the_unexplained_force_has_a_figure_and_a_formula():
     """The unexplained force is drawn for each cart, with a formula that is not in the catalogue."""
-    page = page_of(make_gap(verdict))
-
-    assert "The unexplained force" in page.text
-    assert "Not in the catalogue" in page.text
-    assert "f = -0.1 v|v| + 0.02 |u| sign v" in page.text
-    alts = [
-        alt for alt in page.values("aria-label") if alt.startswith("Unexplained force on cart 2")
-    ]
-    assert len(alts) == 1
-
-    assert "The unexplained force" not in page_of(make_gap()).text
+    assert RESIDUAL.formula is not None
+    for keys in ((), ("coulomb_friction",)):
+        blocks = sections(document_of("unexplained", *keys))["force-left"].blocks
+        assert list(pictures(blocks)) == ["force-left-2"]
+        assert RESIDUAL.formula.text in plain_lines(blocks)
 
 
 def test_an_answer_at_the_time_limit_is_called_the_best_so_far():
     """If the time budget ended the search, the page calls its result the best answer so far."""
-    text = page_of(replace(make_gap("unexplained", ()), complete=False)).text
-
-    assert "best answer so far" in text
-    assert "The same input gives the same report." not in text
-    assert "best answer so far" not in page_of(make_gap()).text
+    so_far = paragraph(WORDS.spans("so_far"))
+    for complete in (True, False):
+        gap = replace(make_gap("unexplained", ()), complete=complete)
+        found = sections(build_gap_document(gap, two_cart_analysis()))
+        assert (so_far in found["summary"].blocks) != complete
+        method = paragraph(WORDS.spans("method" if complete else "method_so_far"))
+        assert method in found["method"].blocks
 
 
 def test_effects_that_help_only_together_are_one_step():
-    """If an effect helps only together with the next one, the page treats both as one step.
-
-    The table has one row for both. Each effect's section gives the error before and after both
-    effects.
-    """
+    """If an effect helps only together with the next one, both share a row and their errors."""
     gap = make_gap("partial", ("coulomb_friction", "saturation", "dead_zone"))
     errors = (0.135, 0.0925, 0.0968, 0.0723)
-    gap = replace(
-        gap,
-        effects=tuple(
-            replace(found, nrmse_before=before, nrmse_after=after)
-            for found, before, after in zip(gap.effects, errors, errors[1:], strict=False)
-        ),
+    effects = tuple(
+        replace(found, nrmse_before=before, nrmse_after=after)
+        for found, before, after in zip(gap.effects, errors, errors[1:], strict=False)
     )
-    text = page_of(gap).text
+    friction, saturation, dead_zone = effects
+    assert kept_together(effects) == [(friction,), (saturation, dead_zone)]
+    found = sections(build_gap_document(replace(gap, effects=effects), two_cart_analysis()))
 
-    said = (
-        "from 9.2 % of the motion to 7.2 %. With saturation of the input alone it would be 9.7 %."
-    )
-    assert text.count(said) == 2
-    assert "with saturation of the input and dead zone of the input7.2 %" in text
-    assert "with dry (Coulomb) friction on cart 29.2 %" in text
-    assert "from 13.5 % of the motion to 9.2 %." in text
-    assert "9.7 % of the motion" not in text
-    friction, saturation, dead_zone = gap.effects
-    assert kept_together(gap.effects) == [(friction,), (saturation, dead_zone)]
+    shown = [errors for name, errors in rows(found["summary"].blocks).items() if "with" in name]
+    assert [share(error) in row for error, row in zip((0.0925, 0.0723), shown, strict=True)] == [
+        True, True,
+    ]  # fmt: skip
+    steps = [re.findall(r"[\d.]+ %", plain_lines(found[f"effect-{i}"].blocks)) for i in (1, 2, 3)]
+    assert steps[0][:2] == ["13.5 %", "9.2 %"]
+    assert steps[1][:3] == steps[2][:3] == ["9.2 %", "7.2 %", "9.7 %"]
 
 
 @pytest.mark.parametrize("seen", [True, False])
@@ -414,69 +201,49 @@ def test_the_band_of_the_noise_is_mentioned_if_it_can_be_seen(seen):
     gap = make_gap()
     if seen:
         gap = replace(gap, traces=tuple(replace(one, baseline=one.final) for one in gap.traces))
+    found = sections(build_gap_document(gap, two_cart_analysis()))
+    caption = plain(pictures(found["summary"].blocks)["before-after-1"].caption)
+    assert (WORDS.text("band") in caption) == seen
 
-    assert ("the band is twice the noise" in page_of(gap).text) == seen
 
+# ------------------------------------------------------------------ two explanations
 
 LINE = np.linspace(0.0, 1.0, 50)
 PREDICTION = Prediction(
     pair=(0, 1), cart=2, t=LINE, u=LINE, positions=np.array([np.sin(LINE), np.cos(LINE)])
 )
-
-
-def predicted(first, second) -> Gap:
-    """Return a gap that proposes a recording to decide between two models with these effects."""
-    contenders = tuple(
-        AlternativeModel(chain=CHAIN, terms=make_gap("named", keys).model.terms, weight=0.5)
-        for keys in (first, second)
-    )
-    proposal = Proposal(
-        recording={"wave": "triangle", "amplitude": 0.6, "frequency": 0.12},
-        limits={},
-        separation=42.0,
-        prediction=PREDICTION,
-    )
-    return replace(make_gap("partial"), contenders=contenders, proposal=proposal)
-
-
 MANY = ("cogging", "drive_damping", "input_delay", "slack_spring", "coulomb_friction")
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "names", "legend"),
+    ("first", "second", "only", "legend"),
     [
-        (
-            ("coulomb_friction",),
-            ("cogging", "coulomb_friction"),
-            "the model with cogging of the motor and the one without it",
-            ["with cogging of the motor", "without it"],
-        ),
+        (("coulomb_friction",), ("cogging", "coulomb_friction"), ("cogging",), "without it"),
         (
             ("end_stop", "coulomb_friction"),
             ("end_stop", "cubic_spring"),
-            "the model with dry (Coulomb) friction on cart 2 and the one with ",
-            ["the first model", "the second model"],
+            ("coulomb_friction", "cubic_spring"),
+            "the second model",
         ),
-        (
-            ("saturation",),
-            ("saturation", *MANY),
-            "and dry (Coulomb) friction on cart 2 and the one without them",
-            ["with these effects", "without them"],
-        ),
+        (("saturation",), ("saturation", *MANY), MANY, "without them"),
     ],
 )
-def test_two_models_are_named_by_their_differences(first, second, names, legend):
+def test_two_models_are_named_by_their_differences(first, second, only, legend):
     """The text names the effects that only one model has, and the legend shows short names."""
-    gap = predicted(first, second)
-    page = page_of(gap)
+    contenders = tuple(
+        AlternativeModel(chain=CHAIN, terms=usual_terms(*keys), weight=0.5)
+        for keys in (first, second)
+    )
+    recording = {"wave": "triangle", "amplitude": 0.6, "frequency": 0.12}
+    proposal = Proposal(recording=recording, limits={}, separation=42.0, prediction=PREDICTION)
+    gap = replace(make_gap("partial"), contenders=contenders, proposal=proposal)
+    blocks = sections(build_gap_document(gap, two_cart_analysis()))["apart"].blocks
 
-    assert names in page.text
-    shared = set(first) & set(second)
-    deciding = page.text[page.text.index("Of all recordings") :].split("times the noise")[0]
-    for key in shared:
-        assert find_effect(key).title[1:] not in deciding
-    for label in legend:
-        assert f">{label}</text>" in html_of(gap)
+    said = plain_lines(blocks)
+    for term in (*contenders[0].terms, *contenders[1].terms):
+        name = effect_name(term.effect, term.where)
+        assert (name in said) == (term.effect.key in only)
+    assert f">{legend}</text>" in pictures(blocks)["predicted"].svg
 
 
 def test_the_longest_names_in_a_legend_fit_in_the_figure():
@@ -494,16 +261,29 @@ def test_the_longest_names_in_a_legend_fit_in_the_figure():
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
 def test_the_page_of_every_effect_is_complete(effect):
     """The page of every effect has its figure, its fingerprint and its reference."""
-    page = page_of(make_gap("named", (effect.key,)))
+    document = document_of("named", effect.key)
+    text = Page(render_html(document)).text
 
-    assert effect.fingerprint in page.text
-    assert effect.reference in page.text
-    assert f"The evidence for {effect.title[:1].lower()}" in page.text
-    assert "\\" not in page.text
-    assert not re.search(r"\b(None|nan|inf)\b", page.text)
-    alts = [alt for alt in page.values("aria-label") if alt.startswith("Evidence for")]
-    alts = [alt for alt in alts if effect.fingerprint in alt]
-    assert alts
+    assert effect.fingerprint in text
+    assert effect.reference in text
+    assert "\\" not in text
+    assert not re.search(r"\b(None|nan|inf)\b", text)
+    evidence = pictures(sections(document)["effect-1"].blocks)["effect-1"]
+    assert effect.fingerprint in evidence.alt
+    formulas = [b for s in document.sections for b in s.blocks if isinstance(b, Formula)]
+    assert formulas
+    assert all(formula.alt for formula in formulas)
+
+
+# ------------------------------------------------------------------ equations
+
+
+def laws_of(*keys: str) -> tuple[list[str], list[str]]:
+    """Return the equations of motion and the law of each effect, as text without spaces."""
+    terms = usual_terms(*keys)
+    motion = to_text(augmented_equations((True, True, True), terms).math).split("; ")
+    laws = [to_text(law(terms, index).math) for index in in_order(terms)]
+    return motion, [text.replace(" ", "") for text in laws]
 
 
 @pytest.mark.parametrize(
@@ -514,18 +294,15 @@ def test_changes_of_the_input_are_applied_as_in_the_simulator(keys):
 
     The input after the last change pushes cart 1 and enters the load-dependent friction.
     """
-    terms = make_gap("named", (*keys, "load_friction")).model.terms
-    laws = [to_text(law(terms, index).math) for index in in_order(terms)]
+    (first, second), laws = laws_of(*keys, "load_friction")
 
-    assert [text.replace(" ", "") for text in laws] == [
+    assert laws[:-1] == [
         "u_a=\u2009sign\u2009u·\u2009max(|u|−w,0)",
         "u_b=\u2009clip(u_a,−L,L)",
         "u_c(t)=u_b(t−T)",
         "τu′_d+u_d=u_c",
-        laws[-1].replace(" ", ""),
     ]
-    assert laws[-1].startswith("f_e = −μ|u_d|")
-    first, second = to_text(augmented_equations((True, True, True), terms).math).split("; ")
+    assert laws[-1].startswith("f_e=−μ|u_d|")
     assert first.endswith("= u_d")
     assert second.endswith("= f_e")
 
@@ -546,18 +323,22 @@ def test_the_dead_zone_comes_before_the_saturation_in_the_simulator():
     assert [term.effect.key for term in input_steps(terms)] == ["dead_zone", "saturation"]
 
 
-def test_with_backlash_the_input_pushes_the_motor():
-    """With backlash, cart 1 feels the contact; the motor feels input, contact and cogging.
+def test_forces_between_bodies_act_on_both():
+    """Spring 2 pulls both of its carts; with backlash, the contact pushes cart 1 and the motor.
 
     The motor's mass is part of m_1, so it is subtracted on the right-hand side.
     """
-    terms = make_gap("named", ("backlash", "cogging", "input_delay", "drive_damping")).model.terms
-    laws = [to_text(law(terms, index).math) for index in in_order(terms)]
-
-    motion = to_text(augmented_equations((True, True, True), terms).math)
-    assert motion.split("; ")[0].endswith("= f_a + m_mx″_1 + f_d")
-    assert laws[0].endswith("m_mx″_m = u_c−f_a + f_b")
+    motion, laws = laws_of("backlash", "cogging", "input_delay", "drive_damping")
+    assert motion[0].endswith("= f_a + m_mx″_1 + f_d")
+    assert laws[0].endswith("m_mx″_m=u_c−f_a+f_b")
     assert "x_m/λ" in laws[1]
+    spring = make_term(
+        find_effect("cubic_spring"), place=2, values={"coefficient": 1.0}, chain=CHAIN
+    )
+    first, second = to_text(augmented_equations((True, True, True), (spring,)).math).split("; ")
+    assert first.endswith("= u + f_a")
+    assert second.endswith("= −f_a")
+    assert to_text(law((spring,), 0).math) == "f_a = ad^3"
 
 
 def test_a_model_of_many_effects_has_its_equations():
@@ -565,10 +346,7 @@ def test_a_model_of_many_effects_has_its_equations():
     keys = ("saturation", "dead_zone", "input_delay", "actuator_lag", "cogging", "drive_damping",
             "coulomb_friction", "quadratic_drag", "cubic_spring", "slack_spring", "end_stop",
             "coupling_damper")  # fmt: skip
-    terms = make_gap("named", keys).model.terms
-    laws = [to_text(law(terms, index).math) for index in in_order(terms)]
-
-    named = [re.search("[uf]′?_(.)", text) for text in laws]
+    named = [re.search("[uf]′?_(.)", text) for text in laws_of(*keys)[1]]
     assert [found and found[1] for found in named] == list("abcdefghijkl")
 
 
@@ -584,18 +362,6 @@ def test_every_command_on_the_page_can_be_copied(tmp_path):
         group.commands[name].make_context(name, args)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_a_spring_pulls_both_of_its_carts():
-    """The extra force of spring 2 acts on cart 2 and, reversed, on cart 1."""
-    terms = (
-        make_term(find_effect("cubic_spring"), place=2, values={"coefficient": 1.0}, chain=CHAIN),
-    )
-    motion = to_text(augmented_equations((True, True, True), terms).math)
-    first, second = motion.split("; ")
-    assert first.endswith("= u + f_a")
-    assert second.endswith("= −f_a")
-    assert to_text(law(terms, 0).math) == "f_a = ad^3"
-
-
 def test_pdf_and_files_are_the_same_each_time(tmp_path):
     """PDF and other files are the same each time; the PDF's first page has the verdict."""
     for name in ("one", "two"):
@@ -606,8 +372,7 @@ def test_pdf_and_files_are_the_same_each_time(tmp_path):
     for file in files:
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
     first = pypdf.PdfReader(tmp_path / "one" / "gap.pdf").pages[0].extract_text()
-    assert "explains what the linear model leaves out" in first
-    assert "The experiment that would confirm it" in first
+    assert NAMES["coulomb_friction"][1:] in first
 
 
 # ------------------------------------------------------------------ residual force
@@ -650,15 +415,13 @@ def test_a_cart_beside_one_that_was_not_measured_has_no_residual_force():
 @pytest.mark.parametrize("verdict", ["named", "partial", "none", "ambiguous", "unexplained"])
 def test_the_file_is_read_back_as_it_was(verdict):
     """A `gap.json` that is read and written again is the same, with the same verdict."""
-    keys = () if verdict == "none" else ("end_stop", "input_delay")
-    gap = make_gap(verdict, keys)
+    gap = make_gap(verdict, () if verdict == "none" else ("end_stop", "input_delay"))
     text = json_text(gap)
 
     again = read_gap(text)
 
     assert json_text(again) == text
-    assert again.provenance == gap.provenance
-    assert again.bench == gap.bench
+    assert (again.provenance, again.bench) == (gap.provenance, gap.bench)
     assert terminal_verdict(again) == terminal_verdict(gap)
 
 
@@ -731,8 +494,7 @@ def test_command_writes_everything_and_names_the_friction(bench):
     assert set(document["provenance"]["files"]) == {
         f"data/{path.name}" for path in (bench.folder / "data").iterdir()
     }
-    assert "Dry (Coulomb) friction on cart 1 explains" in bench.done.stderr
-    assert "model.fmu, model.c, model.h and model.m" in bench.done.stderr
+
     force = effect["parameters"]["force"]["value"]
     for name in ("model.c", "model.m"):
         assert f"coulomb_friction_1_force = {force}" in (out / name).read_text(encoding="ascii")
@@ -746,18 +508,17 @@ def test_report_shows_the_verdict_and_the_better_simulation(bench):
     assert gap is not None
     assert analysis.warnings == analyse(load_submission(bench.folder)).warnings
 
-    page = Page(render_html(build_document(analysis, gap=gap)))
+    document = build_document(analysis, gap=gap)
+    page = Page(render_html(document))
 
-    assert "What the linear model leaves out" in page.text
-    assert "Dry (Coulomb) friction on cart 1 explains" in page.text
+    assert effect_name(find_effect("coulomb_friction"), {"cart": 1})[1:] in page.text
     linear, augmented = map(
         float, re.findall(r"step-d1(\d+(?:\.\d+)?) %(\d+(?:\.\d+)?) %", page.text)[-1]
     )
     # The fit did not use this run, so the error is only the encoder's rounding.
     assert augmented < 0.2 * linear
-    assert {href[1:] for href in page.values("href") if href.startswith("#")} <= set(
-        page.values("id")
-    )
+    links = {href[1:] for href in page.values("href") if href.startswith("#")}
+    assert links <= set(page.values("id"))
 
 
 def test_gap_analysis_of_other_data_is_only_a_warning(bench, tmp_path):
@@ -768,11 +529,11 @@ def test_gap_analysis_of_other_data_is_only_a_warning(bench, tmp_path):
     warned, gap = with_gap(changed, bench.folder)
 
     assert gap is None
-    assert warned.warnings[-1].startswith("gap/gap.json belongs to other data than this report")
+    assert "gap.json" in warned.warnings[-1]
     assert with_gap(analysis, tmp_path) == (analysis, None)
     for text in ("{", "[" * 200_000, " " * 20_000_000):
         (tmp_path / "gap.json").write_text(text, encoding="utf-8")
-        assert "gap.json cannot be used" in with_gap(analysis, tmp_path)[0].warnings[-1]
+        assert "gap.json" in with_gap(analysis, tmp_path)[0].warnings[-1]
 
 
 def test_hostile_text_in_a_gap_file_stays_text(bench):
@@ -784,8 +545,7 @@ def test_hostile_text_in_a_gap_file_stays_text(bench):
 
     page = Page(render_html(build_document(analysis, gap=gap)))
 
-    assert not {tag for tag, _ in page.tags} & {"img", "iframe"}
-    assert sum(tag == "script" for tag, _ in page.tags) == 1
+    assert (page.count("img"), page.count("iframe"), page.count("script")) == (0, 0, 1)
     assert "<script>alert(1)</script>" in page.text
 
 
@@ -795,12 +555,3 @@ def test_a_folder_without_a_submission_gives_one_line(tmp_path):
 
     assert done.returncode == 2
     assert len(done.stderr.strip().splitlines()) == 1
-
-
-def test_every_formula_has_a_text_alternative():
-    """Every formula has a text alternative for readers who cannot see it."""
-    document = build_gap_document(make_gap("named", ("extra_mode",)), two_cart_analysis())
-    formulas = [b for s in document.sections for b in s.blocks if isinstance(b, Formula)]
-
-    assert formulas
-    assert all(formula.alt for formula in formulas)

@@ -77,11 +77,11 @@ def test_nothing_is_asked_if_all_results_agree():
 @pytest.mark.parametrize(
     ("name", "percent", "source", "section", "words"),
     [
-        ("zeta_b", 65.0, "log_decrement", "parameters", "zeta_b that differ by 65.0 %. Which"),
-        ("K_1", 40.0, "log_decrement", "parameters", "short of its spring equilibrium"),
-        ("omega_1", 40.0, "log_decrement", "parameters", "Which masses and which springs"),
-        ("zeta_b", -67.0, "assumed", "frequency-response", "is sharper than assumed"),
-        ("zeta_a", 148.0, "assumed", "frequency-response", "is flatter than assumed"),
+        ("zeta_b", 65.0, "log_decrement", "parameters", "65.0 %"),
+        ("K_1", 40.0, "log_decrement", "parameters", "equilibrium"),
+        ("omega_1", 40.0, "log_decrement", "parameters", "masses"),
+        ("zeta_b", -67.0, "assumed", "frequency-response", "sharper"),
+        ("zeta_a", 148.0, "assumed", "frequency-response", "flatter"),
         ("zeta_a", 20.0, "assumed", "", ""),
     ],
 )
@@ -131,7 +131,7 @@ def test_a_cart_that_sticks_is_asked_about_with_its_interval():
     assert isinstance(stuck, StepGain)
     (question,) = ask(replace(analysis, step_gains=(stuck,)))
     assert question.id == "sticking-1"
-    assert "from 23.1 to 26.4" in question.text
+    assert re.search(r"23\.1 \w+ 26\.4", question.text)
 
 
 def test_a_poor_fit_asks_about_its_worst_point():
@@ -144,7 +144,8 @@ def test_a_poor_fit_asks_about_its_worst_point():
     fit = replace(analysis.fit, chi_square_per_dof=5.0, standardised=residual)
     (question,) = ask(replace(analysis, fit=fit))
     assert question.id == "misfit"
-    assert f"at cart {response.cart} at {response.omega[3]:.3g} rad/s, by 8.1" in question.text
+    for number in (f"cart {response.cart}", f"{response.omega[3]:.3g} rad/s", "8.1"):
+        assert number in question.text
 
 
 # ------------------------------------------------------------------------- answers
@@ -199,20 +200,14 @@ def test_an_answer_is_shown_beside_its_question():
     "heading", ["zeta_b", "Question zeta_b", "Q: zeta_b: amplitudes", "`zeta_b`", "ζ_b", "ZETA_B."]
 )
 def test_an_answer_is_found_under_any_spelling_of_its_id(heading):
-    """An answer is found under any spelling of its question's id."""
+    """An answer is found under any spelling of its question's id; without a question it stays."""
+    notes = discussion_blocks(NOTES.format(heading=heading))
     analysis = replace(off("zeta_b", 65.0), discussion=NOTES.format(heading=heading))
-    answers, rest = split_notes(discussion_blocks(analysis.discussion or ""), ask(analysis))
+    answers, rest = split_notes(notes, ask(analysis))
     assert {name: len(blocks) for name, blocks in answers.items()} == {"zeta_b": 4}
-    words = " ".join(plain(b.text) for b in rest if isinstance(b, Paragraph))
-    assert words == "The bench squeaks. Oil it."
+    assert len(rest) == len(notes) - 5  # the answer and its heading
     assert open_line(analysis) == ""
-
-
-def test_an_answer_without_a_question_stays_in_the_discussion():
-    """An answer to a question that the data no longer raise stays in the discussion."""
-    analysis = replace(well(), discussion=NOTES.format(heading="zeta_b"))
-    _, rest = split_notes(discussion_blocks(analysis.discussion or ""), ask(analysis))
-    assert len(rest) == len(discussion_blocks(analysis.discussion or ""))
+    assert len(split_notes(notes, ask(well()))[1]) == len(notes)
 
 
 def test_an_empty_heading_is_no_answer():
@@ -220,7 +215,7 @@ def test_an_empty_heading_is_no_answer():
     analysis = replace(off("zeta_b", 65.0), discussion="## zeta_b\n\n## Rest\n\nText.\n")
     ((_, question),) = questions_of(analysis)
     assert question.answer == ()
-    assert open_line(analysis) == "1 question to answer in notes.md, under “## zeta_b”"
+    assert "zeta_b" in open_line(analysis)
 
 
 def test_page_and_print_mark_the_place_and_show_the_answer():
@@ -239,11 +234,11 @@ def test_page_and_print_mark_the_place_and_show_the_answer():
         pages[name] = render_html(document)
         printed = pypdf.PdfReader(BytesIO(render_pdf(document))).pages
         prints[name] = " ".join(" ".join(page.extract_text().split()) for page in printed)
-    assert "under the heading <code>## zeta_b</code>" in pages["open"]
-    assert 'under the heading "## zeta_b"' in prints["open"].replace("“", '"').replace("”", '"')
-    assert "&lt;b&gt;Ours&lt;/b&gt; &amp; <em>more</em>" in pages["done"]
-    assert "<b>Ours</b> & more" in prints["done"]
-    assert "To be answered" not in pages["done"] + prints["done"]
+    answer = {"page": "&lt;b&gt;Ours&lt;/b&gt; &amp;", "print": "<b>Ours</b> &"}
+    for name, shown in (("page", pages), ("print", prints)):
+        assert "## zeta_b" in shown["open"]
+        assert [answer[name] in shown[state] for state in ("open", "done")] == [False, True]
+        assert "To be" not in shown["done"]
     for page in pages.values():  # the list in the discussion links to every question
         assert page.count('href="#question-zeta_b"') == page.count('id="question-zeta_b"') == 1
 
@@ -298,16 +293,10 @@ def test_real_carts_raise_friction_and_damping(tmp_path, real_data):
     assert len(ids) <= 6
 
 
-@pytest.mark.parametrize(
-    ("heading", "hint"),
-    [
-        ("zeta-b", "; “## zeta-b” answers none of them, did you mean “## zeta_b”?"),
-        ("Why zeta?", ""),
-        ("Rest", ""),
-    ],
-)
-def test_a_misspelt_id_is_named(heading, hint):
+@pytest.mark.parametrize(("heading", "named"), [("zeta-b", 2), ("Why zeta?", 1), ("Rest", 1)])
+def test_a_misspelt_id_is_named(heading, named):
     """Only a heading that is almost the id of an unanswered question is named."""
     analysis = replace(off("zeta_b", 65.0), discussion=f"## {heading}\n\nText.\n")
-    asked = "1 question to answer in notes.md, under “## zeta_b”"
-    assert open_line(analysis) == asked + hint
+    line = open_line(analysis)
+    assert line.count("## zeta_b") == named
+    assert (heading in line) == (named == 2)

@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 
+import pytest
+
 from pipeline.report.render.page_filling import Choices, End, Pages, fill_pages
 
 TOP, BOTTOM = 50.0, 750.0
@@ -31,21 +33,17 @@ def test_a_figure_that_nearly_fits_is_drawn_smaller():
     assert (BOTTOM - TOP) * 0.9 < shares[1] * 750.0 <= BOTTOM - TOP
 
 
-def test_no_figure_becomes_too_small_to_read():
-    """If a figure would become too small to read, the page keeps its white space."""
-    assert fill_pages(figures(400.0, 600.0, 100.0)) == Choices()
-
-
-def test_full_pages_are_left_as_they_are():
-    """If all pages are full at first, no other layout is tried."""
-    told = []
-
-    def lay_out(choices: Choices) -> Pages:
-        told.append(choices)
-        return figures(600.0, 600.0)(choices)
-
-    assert fill_pages(lay_out) == Choices()
-    assert told == [Choices()]
+@pytest.mark.parametrize(
+    "heights",
+    [
+        (400.0, 600.0, 100.0),  # too small to read if it should fit
+        (600.0, 600.0),  # full pages
+        (),
+    ],
+)
+def test_other_pages_are_left_as_they_are(heights):
+    """Full pages, and figures that would become too small to read, stay as they are."""
+    assert fill_pages(figures(*heights)) == Choices()
 
 
 def test_a_table_stays_whole_if_this_saves_white_space():
@@ -62,8 +60,3 @@ def test_a_table_stays_whole_if_this_saves_white_space():
         return Pages(ends=ends, top=TOP, bottom=BOTTOM)
 
     assert fill_pages(lay_out) == Choices(whole=(7,))
-
-
-def test_a_document_without_blocks_has_no_pages_to_fill():
-    """A document without blocks needs no choices."""
-    assert fill_pages(lambda choices: Pages(ends=[], top=TOP, bottom=BOTTOM)) == Choices()

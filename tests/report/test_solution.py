@@ -41,6 +41,7 @@ from pipeline.words.math import to_text
 from pipeline.words.text import plain
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.grading_students import student
+from tests.helpers.pages import sections
 from tests.plant.test_chain import chains
 
 s = sympy.Symbol("s")
@@ -126,30 +127,30 @@ def truth(request):
     return request.param, Truth(request.param)
 
 
-def test_the_way_to_the_transfer_functions_is_true(truth):
-    """Each printed step from Newton's laws to the transfer functions is an identity."""
-    springs, chain = truth
+def way_there(springs) -> list[Any]:
+    """Return every printed step from Newton's laws to the transfer functions."""
     n = len(springs) - 1
-    equations = [*derivation.newton(springs), *derivation.laplace(springs)]
+    steps = [*derivation.newton(springs), *derivation.laplace(springs)]
     if n > 1:
-        equations += [
+        steps += [
             *derivation.single_carts(springs), *derivation.per_mass(n),
             *derivation.elimination(n), *derivation.transfer(n), *derivation.static_gains(n),
         ]  # fmt: skip
-    names = chain.names()
-    for equation in equations:
-        assert is_zero(f"({equation.left})-({equation.right})", names), equation
+    return steps
 
 
-def test_the_way_back_to_masses_and_springs_is_true(truth):
-    """Each printed step from coefficients back to masses and springs is an identity."""
-    springs, chain = truth
+def way_back(springs) -> list[Any]:
+    """Return every printed step from coefficients back to masses and springs."""
     n = len(springs) - 1
-    names = chain.names()
     steps = [*derivation.couplings(n), *derivation.physical(springs)]
-    if n > 1:
-        steps += [*derivation.carts_alone(n), *derivation.redundancies(n)]
-    for step in steps:
+    return [*steps, *derivation.carts_alone(n), *derivation.redundancies(n)] if n > 1 else steps
+
+
+def test_each_printed_step_is_true(truth):
+    """Each printed step from Newton's laws to the transfer functions and back is an identity."""
+    springs, chain = truth
+    names = chain.names()
+    for step in [*way_there(springs), *way_back(springs)]:
         assert is_zero(f"({step.left})-({step.right})", names), step
 
 
@@ -234,14 +235,8 @@ def side_by_side(parts):
 def test_a_displayed_formula_equals_the_tested_one(springs):
     """Every displayed formula, read with its brackets, equals the tested expression."""
     n = len(springs) - 1
-    equations = [*derivation.newton(springs), *derivation.laplace(springs)]
-    equations += [*derivation.couplings(n), *derivation.physical(springs)]
-    if n > 1:
-        equations += [
-            *derivation.single_carts(springs), *derivation.per_mass(n),
-            *derivation.elimination(n), *derivation.transfer(n), *derivation.static_gains(n),
-            *derivation.coefficients(n), *derivation.carts_alone(n), *derivation.redundancies(n),
-        ]  # fmt: skip
+    equations = [*way_there(springs), *way_back(springs)]
+    equations += derivation.coefficients(n) if n > 1 else []
     spelt: dict[str, Any] = {f"w_{i}": sympy.Symbol(f"omega_{i}") ** 2 for i in range(1, n + 1)}
     for i in range(1, n + 1):
         spelt |= {
@@ -311,20 +306,15 @@ def test_ackermann_is_exact_in_symbols():
 
 
 def test_expected_values_pass_and_mistakes_fail():
-    """Every expected value is within its own tolerance.
-
-    A frequency in Hz or a doubled gain is far outside the tolerance.
-    """
+    """Every expected value is within its own tolerance; Hz or a doubled gain is far outside."""
     analysis = make_analysis(3)
     for p in expected_parameters(analysis, default_rubric(analysis)):
         assert p.tolerance is not None
         assert p.low is not None
         assert p.high is not None
         assert p.low < p.value < p.high
-        if p.name.startswith("omega"):
-            assert abs(p.value / (2 * np.pi) - p.value) > p.tolerance
-        if p.name.startswith("K"):
-            assert abs(2 * p.value - p.value) > p.tolerance
+        wrong = {"o": p.value / (2 * np.pi), "K": 2 * p.value}.get(p.name[0])
+        assert wrong is None or abs(wrong - p.value) > p.tolerance
 
 
 @pytest.mark.parametrize(
@@ -369,9 +359,9 @@ def test_another_rubric_has_other_bounds(tmp_path):
     assert (accepted["zeta_a"], accepted["K_1"], accepted["zeta_b"]) == (7, 5, None)
     assert found["rubric"] == rubric.title
     page = render_html(build_solution(analysis, rubric=rubric))
-    assert "Strict: identification" in page
+    assert rubric.title in page
     assert "not judged" in page
-    with pytest.raises(ConfigError, match="the rubric is for 2 carts, the submission for 1"):
+    with pytest.raises(ConfigError, match="2 carts"):
         check_carts(rubric, carts=1)
 
 
@@ -403,15 +393,12 @@ def test_tolerances_of_entries_cover_tolerated_tables(chain, seed):
 def test_the_document_works_everything_out(carts):
     """The document has every worked section with the model's numbers."""
     analysis = make_analysis(carts)
-    document = build_solution(analysis)
-    ids = [section.id for section in document.sections]
-    assert ids[:6] == [
+    found = sections(build_solution(analysis))
+    assert [*found][:6] == [
         "summary", "motion", "transfer-functions", "state-model", "worked-design", "expected",
     ]  # fmt: skip
-    alts = " ".join(
-        block.alt for section in document.sections for block in section.blocks
-        if isinstance(block, Formula)
-    )  # fmt: skip
+    blocks = [block for section in found.values() for block in section.blocks]
+    alts = " ".join(block.alt for block in blocks if isinstance(block, Formula))
     assert analysis.chain is not None
     A, B, _, _ = analysis.chain.state_space()
     for value in (*A[(A != 0) & (A != 1)], *B[B != 0]):
@@ -444,23 +431,18 @@ def test_every_kind_of_question_has_a_model_answer(kind):
 
 def test_without_a_fit_the_solution_is_only_the_derivation():
     """Without a fit, the solution is only the derivation; a fitted rigid cart has a state model."""
-    bare = replace(make_analysis(2), fit=None, rows=(), feedback=None)
-    ids = [section.id for section in build_solution(bare).sections]
-    assert ids[1:3] == ["motion", "transfer-functions"]
-    assert not {"state-model", "worked-design", "expected"} & set(ids)
-    rigid = analyse_rigid()
-    document = build_solution(rigid)
-    assert {"motion", "transfer-functions", "state-model"} <= {s.id for s in document.sections}
-
-
-def analyse_rigid():
+    found = sections(build_solution(replace(make_analysis(2), fit=None, rows=(), feedback=None)))
+    assert [*found][1:3] == ["motion", "transfer-functions"]
+    assert not {"state-model", "worked-design", "expected"} & found.keys()
     analysis = make_analysis(1)
     assert analysis.fit is not None
     chain = Chain(m=np.array([2e-4]), c=np.array([5e-4]), k=np.zeros(2))
     fit = replace(
         analysis.fit, chain=chain, names=("m_1", "c_1"), covariance=1e-12 * np.eye(2), parameters={}
     )
-    return replace(analysis, bench=Setup(springs=(False, False)), fit=fit, rows=(), feedback=None)
+    bench = Setup(springs=(False, False))
+    rigid = build_solution(replace(analysis, bench=bench, fit=fit, rows=(), feedback=None))
+    assert {"motion", "transfer-functions", "state-model"} <= sections(rigid).keys()
 
 
 def test_solution_json_is_the_reference_for_programs():
@@ -481,9 +463,10 @@ def test_a_reference_that_failed_a_check_has_a_warning():
     (failed,) = doubtful.failed_checks
     sound = replace(doubtful, checks=tuple(c for c in doubtful.checks if c != failed))
     pages = [build_solution(analysis) for analysis in (doubtful, sound)]
-    told, silent = (next(s.blocks for s in page.sections if s.id == "expected") for page in pages)
+    told, silent = (sections(page)["expected"].blocks for page in pages)
     (doubt,) = json.loads(solution_text(doubtful))["doubts"]
     assert doubt == {"id": failed.id, "message": failed.message}
     assert told[2:] == silent
-    assert pages[0].subtitle.startswith(pages[1].subtitle + " · doubtful")
+    assert pages[0].subtitle.startswith(pages[1].subtitle)
+    assert pages[0].subtitle != pages[1].subtitle
     assert json.loads(solution_text(sound))["doubts"] == []

@@ -30,10 +30,10 @@ from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.accessibility import violations
 from tests.helpers.examples import analysed
+from tests.helpers.gaps import make_gap, two_cart_analysis
 from tests.helpers.grades import write_class
 from tests.helpers.ucsd import write_one_cart_submission, write_two_cart_submission
 from tests.helpers.waiting import PATIENCE
-from tests.report.test_gap import make_gap, two_cart_analysis
 
 LONG = [pytest.mark.slow, pytest.mark.sample]
 CASES = (
