@@ -224,7 +224,7 @@ def test_residuals_without_a_far_point_are_all_shown(carts, cart):
     assert chain is not None
     model = np.abs(chain.frequency_response(response.omega)[cart - 1])
     assert_allclose(points, 100 * (response.magnitude / model - 1), atol=1e-9)
-    assert_allclose(data(gain.lines[1], "y"), 20 * np.log10(response.magnitude), atol=1e-9)
+    assert_allclose(data(marked(gain, "D")[0], "y"), 20 * np.log10(response.magnitude), atol=1e-9)
 
 
 def test_a_dwell_shades_the_transient():
