@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 from pipeline.errors import ConfigError, HardwareError
 from pipeline.experiments.gains import (
     CountScales,
+    LoopTrial,
     Table,
-    bench_gains,
-    bench_scales,
     controller_table,
 )
 from pipeline.experiments.plan import Plan, PlanLimits, Recording
@@ -121,10 +120,14 @@ def order_on(
     table: Table | None = None
     if recording.controller is not None:
         analysis = analyse(submission)
-        scales = bench_scales(submission, bench=bench, analysis=analysis)
-        gains = bench_gains(
-            recording, submission=submission, analysis=analysis, bench=bench, limits=plan.limits
+        trial = LoopTrial(
+            recording=recording,
+            submission=submission,
+            analysis=analysis,
+            bench=bench,
+            limits=plan.limits,
         )
+        scales, gains = trial.scales, trial.gains()
         cart = recording.controller.cart
         table = dict(controller_table(gains, cart=cart, scales=scales, carts=system.carts))
     order = make_order(

@@ -214,16 +214,6 @@ _ZETA_RANGE = (0.01, 1.0)  # damping ratios allowed at the start; others do not 
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LogMagnitude:
-    """ln|X_cart/U| at omega (n_w,), and the weight of each point (one over its error)."""
-
-    cart: int
-    omega: Array
-    level: Array
-    weight: Array
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class StagedFit:
     """Static gains (n,), polynomials T_1 … T_n as in `Chain.tails`, and the named parameters."""
 
@@ -233,13 +223,13 @@ class StagedFit:
 
 
 def fit_stage_by_stage(
-    measured: Mapping[int, LogMagnitude], *, n: int, initial: Mapping[str, float], like: Chain
+    data: Points, *, n: int, initial: Mapping[str, float], like: Chain
 ) -> StagedFit:
     """Fit the transfer functions cart by cart, cart n first.
 
     Parameters
     ----------
-    measured : magnitudes by cart. A missing cart keeps its start values.
+    data : the measured points. A missing cart keeps its start values.
     initial : the named parameters to start from, as far as they are known.
     like : a chain that gives start values for all other parameters.
     """
@@ -247,15 +237,10 @@ def fit_stage_by_stage(
     gains = np.array([known[gain_name(i, n=n)] for i in range(1, n + 1)])
     factors = [_start(known, i, n=n, like=like) for i in range(n)]
     for cart in range(n, 0, -1):
-        if cart not in measured:
-            continue
-        points = measured[cart]
-        if cart == n:
-            gains[-1], factors[0] = _fit(points, gains[-1], factors[0], power=-1, known=None)
-        else:
-            gains[cart - 1], factors[cart] = _fit(
-                points, gains[cart - 1], factors[cart], power=1, known=factors[0]
-            )
+        i = cart % n  # T_1, the denominator, comes with the last cart
+        gains[cart - 1], factors[i] = _fit(
+            data, gains[cart - 1], factors[i], cart=cart, denominator=factors[0] if i else None
+        )
     tails = [_polynomial(factor) for factor in factors]
     return StagedFit(gains=gains, tails=tails, parameters=_named(gains, factors, tails))
 
@@ -283,27 +268,27 @@ def _suffixes(i: int, *, n: int) -> list[str]:
 
 
 def _fit(
-    points: LogMagnitude, gain: float, factors: Array, *, power: int, known: Array | None
+    data: Points, gain: float, factors: Array, *, cart: int, denominator: Array | None
 ) -> tuple[float, Array]:
-    """Fit ln|G| = ln K + power Σ ln|Q_j| (less the known denominator); Q = 1 - r² + 2jζr."""
-    target = points.level + (0.0 if known is None else _log_factors(points.omega, known)[0])
+    """Fit ln|G| = ln K ± Σ ln|Q_j| (less the known denominator) of a cart; Q = 1 - r² + 2jζr."""
+    of = data.of_cart(cart)
+    omega, target, weight = data.omega[data.at[of]], data.level[of], data.level_weight[of]
+    power = -1 if denominator is None else 1
+    if denominator is not None:
+        target = target + _log_factors(omega, denominator)[0]
     shape = factors.shape
 
     def evaluate(theta: Array) -> tuple[Array, Array]:
-        level, jacobian = _log_factors(points.omega, theta[1:].reshape(shape))
-        columns = np.hstack([np.ones((points.omega.size, 1)), power * jacobian])
+        level, jacobian = _log_factors(omega, theta[1:].reshape(shape))
+        columns = np.hstack([np.ones((omega.size, 1)), power * jacobian])
         residual = theta[0] + power * level - target
-        return points.weight * residual, points.weight[:, None] * columns
+        return weight * residual, weight[:, None] * columns
 
     start = np.concatenate([[np.log(gain)], factors.ravel()])
-    if points.omega.size < start.size:
+    if omega.size < start.size:
         return gain, factors  # too few points for this stage; the joint fit sees all carts
     # A fit that succeeds takes about ten evaluations.
-    found = minimise(
-        evaluate,
-        start,
-        max_evaluations=100,
-    ).x
+    found = minimise(evaluate, start, max_evaluations=_EVALUATIONS).x
     # If a logarithm changes by 7, a factor of 1000, the fit has gone astray.
     if np.max(np.abs(found - start)) > 7.0:
         return gain, factors
@@ -450,17 +435,7 @@ def _staged_start(
     """Fit stage by stage; return this fit and its chain, corrected to be physically possible."""
     if not any(bench.springs):
         return None, like
-    measured = {}
-    for cart in range(1, bench.n + 1):
-        of = data.of_cart(cart)
-        if of.any():
-            measured[cart] = LogMagnitude(
-                cart=cart,
-                omega=data.omega[data.at[of]],
-                level=data.level[of],
-                weight=data.level_weight[of],
-            )
-    staged = fit_stage_by_stage(measured, n=bench.n, initial=known, like=like)
+    staged = fit_stage_by_stage(data, n=bench.n, initial=known, like=like)
     implied = recover_chain(staged.gains, staged.tails).chain()
     return staged, physical_start(implied, bench=bench)
 

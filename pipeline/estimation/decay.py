@@ -1,7 +1,8 @@
 """Free decay of one cart: logarithmic decrement, exponential fit, and why it may not be one."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -315,7 +316,6 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
             f"{_motion(fitted.zeta)} with {100 * unexplained:.0f} % of it unexplained"
         )
     peaks = _peaks(t, y, decay, floor=floor)
-    (zeta_peaks, zeta_peaks_std), (omega_n_peaks, omega_n_peaks_std) = peaks.zeta, peaks.omega_n
     end = t[decay.stop - 1]
     n_figure = int(60 * pole.imag * (end - fit.t0) / (2 * np.pi)) + 2  # 60 points per period
     fit_t = np.linspace(fit.t0, end, min(n_figure, 3000))
@@ -330,10 +330,10 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
         amplitude=peaks.amplitude,
         delta=peaks.delta,
         delta_std=peaks.delta_std,
-        zeta_peaks=zeta_peaks,
-        zeta_peaks_std=zeta_peaks_std,
-        omega_n_peaks=omega_n_peaks,
-        omega_n_peaks_std=omega_n_peaks_std,
+        zeta_peaks=peaks.zeta[0],
+        zeta_peaks_std=peaks.zeta[1],
+        omega_n_peaks=peaks.omega_n[0],
+        omega_n_peaks_std=peaks.omega_n[1],
         zeta=fitted.zeta,
         zeta_std=fitted.zeta_std,
         omega_n=fitted.omega_n,
@@ -348,8 +348,7 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Fitted:
+class _Fitted(NamedTuple):
     """Damping ratio and natural frequency (rad/s) with their standard errors."""
 
     zeta: float
@@ -379,12 +378,7 @@ def _of_exponential(decay: FreeDecay) -> _Fitted:
     per_zeta = np.array([pole.imag**2, pole.real * pole.imag]) / abs(pole) ** 3
     per_omega = np.array([-pole.real, pole.imag]) / abs(pole)
     zeta_std, omega_n_std = (np.sqrt(per @ covariance @ per) for per in (per_zeta, per_omega))
-    return _Fitted(
-        zeta=-pole.real / abs(pole),
-        zeta_std=float(zeta_std),
-        omega_n=abs(pole),
-        omega_n_std=float(omega_n_std),
-    )
+    return _Fitted(-pole.real / abs(pole), float(zeta_std), abs(pole), float(omega_n_std))
 
 
 def _of_law(decay: FreeDecay) -> _Fitted:
@@ -394,27 +388,22 @@ def _of_law(decay: FreeDecay) -> _Fitted:
         return _of_exponential(decay)
     zeta, omega_n, _ = explained.law.values
     zeta_std, omega_n_std, _ = explained.errors
-    return _Fitted(
-        zeta=max(float(zeta), 0.0),
-        zeta_std=float(zeta_std),
-        omega_n=float(omega_n),
-        omega_n_std=float(omega_n_std),
-    )
+    return _Fitted(max(float(zeta), 0.0), float(zeta_std), float(omega_n), float(omega_n_std))
 
 
 def _law(decay: FreeDecay) -> DecayLaw:
     """Return the result of the test, and what the law implies."""
     explained, implied = decay.explained, _of_law(decay)
     assert explained is not None, "a decay that swings is tested"
-    size = (float("nan"),) * 2
+    size = size_std = float("nan")
     if explained.law:
-        size = float(explained.law.values[2]), float(explained.errors[2])
+        size, size_std = float(explained.law.values[2]), float(explained.errors[2])
     return DecayLaw(
         name=explained.name,
         statistic=explained.departure.statistic,
         limit=explained.departure.limit,
-        size=size[0],
-        size_std=size[1],
+        size=size,
+        size_std=size_std,
         zeta=implied.zeta,
         zeta_std=implied.zeta_std,
         omega_n=implied.omega_n,
@@ -443,17 +432,18 @@ def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
     swing = _half_swing(n)
     signed = swing @ peak_y
     amplitude = np.abs(signed)
+    decay_std, omega_d_std = np.sqrt(np.diag(decay.fit.covariance)[2:])
+    peaks = _Peaks(
+        t=peak_t,
+        y=peak_y,
+        amplitude=amplitude,
+        delta=-2 * np.pi * pole.real / pole.imag,
+        delta_std=float(2 * np.pi * decay_std / pole.imag),
+        omega_d=pole.imag,
+        omega_d_std=float(omega_d_std),
+    )
     if n < _PEAKS_FOR_REGRESSION:
-        decay_std, omega_d_std = np.sqrt(np.diag(decay.fit.covariance)[2:])
-        return _Peaks(
-            t=peak_t,
-            y=peak_y,
-            amplitude=amplitude,
-            delta=-2 * np.pi * pole.real / pole.imag,
-            delta_std=float(2 * np.pi * decay_std / pole.imag),
-            omega_d=pole.imag,
-            omega_d_std=float(omega_d_std),
-        )
+        return peaks
     # The noise of the amplitude A is constant, so ln A has the weight A². The standard errors
     # follow from the errors of the turning points, because neighbouring amplitudes share them.
     per_log = _slope(amplitude)
@@ -466,10 +456,8 @@ def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
     late = peak_t - peak_t.mean() - interval * count
     interval_std = float(np.linalg.norm(per_time * late)) * np.sqrt(n / (n - 2))
     # Because samples meet the motion at any phase, the decrement can still differ by 1e-4 of it.
-    return _Peaks(
-        t=peak_t,
-        y=peak_y,
-        amplitude=amplitude,
+    return replace(
+        peaks,
         delta=2 * loss,
         delta_std=2 * float(np.hypot(noise, 1e-4 * loss)),
         omega_d=np.pi / interval,

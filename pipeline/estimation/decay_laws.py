@@ -23,7 +23,7 @@ from pipeline.estimation.least_squares import (
     Waves,
     fit_separable,
     inverse_normal,
-    squares_at,
+    solve_linear,
 )
 from pipeline.results import DecayCause
 
@@ -380,7 +380,8 @@ class Modulated:
         waves = [
             part
             for power, order in self._waves
-            for part in _parts(envelope**power * np.exp(1j * order * phase))
+            for wave in [envelope**power * np.exp(1j * order * phase)]
+            for part in (wave.real, wave.imag)
         ]
         return np.array([*drift, *waves]).T
 
@@ -447,10 +448,6 @@ def _slowed(envelope: Array, p: Array) -> Array:
         + _SLOWS_SQUARED * (b * envelope) ** 2
         + SHIFTS_AGAIN * (shift * envelope**2) ** 2
     )
-
-
-def _parts(wave: Array) -> tuple[Array, Array]:
-    return wave.real, wave.imag
 
 
 def _integral(values: Array, t: Array) -> Array:
@@ -560,8 +557,9 @@ class _Candidate:
 
     def fit(self, t: Array, y: Array) -> LawFit | None:
         """Return a rough fit from the best start, None if it makes no sense."""
-        start = min(self.starts, key=lambda p: squares_at(y, self.model(t, p)))
-        return self.fit_from(start, t, y, precision=_ROUGH)
+        residuals = [solve_linear(y, partial(self.model, t), p).residual for p in self.starts]
+        best = int(np.argmin([residual @ residual for residual in residuals]))
+        return self.fit_from(self.starts[best], t, y, precision=_ROUGH)
 
     def fit_from(self, start: Array, t: Array, y: Array, *, precision: float) -> LawFit | None:
         """Return the fit from a start, None if it makes no sense."""
@@ -583,7 +581,7 @@ class _Candidate:
         gradient[0, list(at)] = np.array([omega_d**2, -decay * omega_d]) / omega_n**3
         gradient[1, list(at)] = decay / omega_n, omega_d / omega_n
         gradient[2] = weights
-        covariance = inverse_normal(self.model(t, p), linear)
+        covariance = inverse_normal(fit.model, linear)
         size = float(gradient[2] @ np.concatenate([p, linear]))
         return LawFit(
             name=self.name,

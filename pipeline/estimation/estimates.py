@@ -5,20 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline import results
 from pipeline.arrays import Array
 from pipeline.estimation.noise import local_noise
 from pipeline.names import gain_name, own_omega, own_zeta, read_name
-from pipeline.results import (
-    ChainFit,
-    Coverage,
-    DeterminedBy,
-    Estimate,
-    FrequencyResponse,
-    LogDecrement,
-    ParameterRow,
-    Record,
-    StepGain,
-)
 from pipeline.setup import Setup
 
 # ------------------------------------------------------- initial estimates, as in Throne's paper
@@ -26,7 +16,7 @@ from pipeline.setup import Setup
 
 def combine_repeats(
     values: Sequence[float], *, std: Sequence[float], source: str, experiments: Sequence[str] = ()
-) -> Estimate:
+) -> results.Estimate:
     """Combine repeats of one number into their mean.
 
     Its standard error follows from their spread or from their errors, whichever makes it larger.
@@ -34,7 +24,7 @@ def combine_repeats(
     v = np.array(values, dtype=float)
     within = float(np.sqrt(np.sum(np.square(std))) / v.size)
     spread = float(np.std(v, ddof=1) / np.sqrt(v.size)) if v.size > 1 else 0.0
-    return Estimate(
+    return results.Estimate(
         value=float(np.mean(v)),
         std=max(within, spread),
         source=source,
@@ -43,8 +33,11 @@ def combine_repeats(
 
 
 def estimate_initially(
-    *, carts: int, log_decrements: Sequence[LogDecrement], step_gains: Sequence[StepGain]
-) -> dict[str, Estimate]:
+    *,
+    carts: int,
+    log_decrements: Sequence[results.LogDecrement],
+    step_gains: Sequence[results.StepGain],
+) -> dict[str, results.Estimate]:
     """Estimate gains from steps, and each cart's own frequency and damping from decays."""
     measured: dict[str, list[tuple[float, float, str, str]]] = {}
     for decay in log_decrements:
@@ -86,13 +79,13 @@ _ONE_SOURCE = "the fit's own points do not determine it, so the final value uses
 
 
 def compare(
-    initial: Mapping[str, Estimate],
+    initial: Mapping[str, results.Estimate],
     *,
-    final: Mapping[str, Estimate],
+    final: Mapping[str, results.Estimate],
     names: Sequence[str],
     bench: Setup,
     fitted_to: Collection[str] = (),
-) -> tuple[ParameterRow, ...]:
+) -> tuple[results.ParameterRow, ...]:
     """Combine the initial and the final estimate of every parameter in `names`.
 
     Parameters
@@ -120,7 +113,7 @@ def compare(
                 if not consistent and sigmas is not None and sigmas <= SIGMA_LIMIT:
                     consistent, note = None, _UNDECIDED
         rows.append(
-            ParameterRow(
+            results.ParameterRow(
                 name=name,
                 unit=read_name(name).unit(bench.units),
                 initial=before,
@@ -137,8 +130,8 @@ def compare(
 
 
 def _determined_by(
-    name: str, before: Estimate | None, after: Estimate | None, *, agree: bool
-) -> DeterminedBy | None:
+    name: str, before: results.Estimate | None, after: results.Estimate | None, *, agree: bool
+) -> results.DeterminedBy | None:
     """Return what determines a final frequency or damping ratio; None for other parameters.
 
     A decay that agrees with an extrapolated number measures it.
@@ -157,7 +150,7 @@ def _determined_by(
     return "points" if after.source == "bode_fit" else "motion"
 
 
-def undetermined_reason(name: str, final: Estimate) -> str:
+def undetermined_reason(name: str, final: results.Estimate) -> str:
     """Return why a fitted value cannot be relied on, or ""."""
     if final.at_bound:
         return AT_BOUND
@@ -171,7 +164,7 @@ def change_limit(name: str) -> float:
     return DAMPING_LIMIT if read_name(name).is_damping else GAIN_AND_FREQUENCY_LIMIT
 
 
-def _combined_sigmas(before: Estimate, after: Estimate) -> float | None:
+def _combined_sigmas(before: results.Estimate, after: results.Estimate) -> float | None:
     if before.std is None or after.std is None:
         return None
     combined = float(np.hypot(before.std, after.std))
@@ -194,7 +187,7 @@ _LARGEST_RELATIVE_STD = 0.2
 _VISIBLE = 5.0
 
 
-def points_measured(responses: Iterable[FrequencyResponse]) -> Array:
+def points_measured(responses: Iterable[results.FrequencyResponse]) -> Array:
     """Return the frequencies, rad/s, at which a frequency response has a point above its error."""
     seen = [np.zeros(0)]
     for r in responses:
@@ -204,12 +197,12 @@ def points_measured(responses: Iterable[FrequencyResponse]) -> Array:
     return np.unique(np.concatenate(seen))
 
 
-def motion_measured(records: Iterable[Record]) -> Array:
+def motion_measured(records: Iterable[results.Record]) -> Array:
     """Return the frequencies, rad/s, at which the motion in some record exceeds its noise."""
     return np.unique(np.concatenate([np.zeros(0), *map(_visible, records)]))
 
 
-def _visible(record: Record) -> Array:
+def _visible(record: results.Record) -> Array:
     n, dt = record.t.size, record.sample_time
     even = np.linspace(record.t[0], record.t[-1], n)
     window = np.hanning(n)
@@ -225,7 +218,7 @@ def _visible(record: Record) -> Array:
     return omega[seen & (omega > 4 * np.pi / (n * dt))]
 
 
-def with_coverage(fit: ChainFit, measured: Array) -> ChainFit:
+def with_coverage(fit: results.ChainFit, measured: Array) -> results.ChainFit:
     """Return the fit; each frequency and damping ratio has its `Coverage`.
 
     Frequencies of carts held alone that are no null follow from all resonances and nulls, so they
@@ -237,7 +230,7 @@ def with_coverage(fit: ChainFit, measured: Array) -> ChainFit:
     """
     found = fit.parameters
     omegas = [name for name in found if read_name(name).is_frequency]
-    seen: dict[str, Coverage] = {}
+    seen: dict[str, results.Coverage] = {}
     for name in omegas:
         zeta = found.get(read_name(name).damping)
         if _is_root(name, n=fit.chain.n) and found[name].value > 0:
@@ -263,13 +256,13 @@ def _is_root(omega: str, *, n: int) -> bool:
     return read.is_by_eye or omega == own_omega(n, n=n)
 
 
-def _coverage(name: str, *, omega: float, zeta: float, measured: Array) -> Coverage:
+def _coverage(name: str, *, omega: float, zeta: float, measured: Array) -> results.Coverage:
     half_width = max(zeta, 0.0) * omega
 
     def nearest(there: Array) -> float | None:
         return float(there[np.argmin(np.abs(there - omega))]) if there.size else None
 
-    return Coverage(
+    return results.Coverage(
         of=name,
         omega=omega,
         half_width=half_width,

@@ -152,19 +152,15 @@ class WindowMeans:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Windows:
-    """Means over windows (n,) of one record; `x` and `v` (3, n) of a cart and its neighbours."""
+class _CartWindows:
+    """Means over windows (n,) for one cart's law; `x` and `v` (3, n) include its neighbours."""
 
-    record: Record
-    t: Array
+    means: WindowMeans
     x: Array
     v: Array
     acceleration: Array
-    u: Array
-    on: Array
     noise: float
     moves: NDArray[np.bool_]
-    jumps: NDArray[np.bool_]
 
     def columns(self, *, driven: bool) -> Array:
         """Return the columns (n, unknowns) of the law: those of `_SPRINGS`, `_DAMPERS` and `_DRY`.
@@ -172,13 +168,13 @@ class _Windows:
         Each record gets a separate rest and input gain, because a drive's gain may depend on the
         level of the input.
         """
-        v, u = self.v[1], driven * self.u
+        v, u = self.v[1], driven * self.means.u
         # In a window in which the cart reverses, this is its main direction.
         turning = np.maximum(np.abs(self.acceleration) * _WINDOW / 4.0, 1e-12 * np.abs(v).max())
         side = np.clip(v / np.maximum(turning, 1e-300), -1.0, 1.0)
         rest = np.ones(v.size)
-        dampers = [*self.v, np.abs(v) * v, v * self.on]
-        dry = [side, side * np.abs(self.u[0])]
+        dampers = [*self.v, np.abs(v) * v, v * self.means.on]
+        dry = [side, side * np.abs(self.means.u[0])]
         return np.array([rest, u[0], *self.x, *u, *dampers, *dry]).T
 
 
@@ -195,7 +191,7 @@ def record_residual_forces(
     if not windows:
         return [], 0.0
     columns = [one.columns(driven=cart == 1) for one in windows]
-    usable = [one.moves & ~one.jumps for one in windows]
+    usable = [one.moves & ~one.means.jumps for one in windows]
     parts = [(c[use], w.acceleration[use])
              for c, w, use in zip(columns, windows, usable, strict=True)]  # fmt: skip
     unknowns = columns[0].shape[1] + _OWN * (len(windows) - 1)
@@ -209,20 +205,21 @@ def record_residual_forces(
         free = one.acceleration - asked - column[:, _DAMPERS] @ law[_DAMPERS]
         rubs, by_load = np.abs(law[_DRY])
         # The largest static friction is assumed to be three times the friction in motion.
-        holds = 3.0 * (rubs + by_load * np.abs(one.u[0]))
+        u = one.means.u
+        holds = 3.0 * (rubs + by_load * np.abs(u[0]))
         at_rest = np.sign(free) * np.maximum(np.abs(free) - holds, 0.0)
         offset, stiffness = law[0], -law[_POSITION]
         rest = offset / stiffness if stiffness * np.ptp(one.x[1]) > size else 0.0
         found.append(
             RecordResidualForce(
-                record=one.record,
-                t=one.t,
+                record=one.means.record,
+                t=one.means.t,
                 residual=np.where(one.moves, free - column[:, _DRY] @ law[_DRY], at_rest),
                 acting=np.maximum(np.abs(one.acceleration), np.abs(asked)),
-                state=np.array([one.x[1] - rest, *np.diff(one.x, axis=0), one.v[1], one.u[0]]),
+                state=np.array([one.x[1] - rest, *np.diff(one.x, axis=0), one.v[1], u[0]]),
                 moves=one.moves,
-                jumps=one.jumps,
-                idle=~one.moves & ~np.any(one.u, axis=0),
+                jumps=one.means.jumps,
+                idle=~one.moves & ~np.any(u, axis=0),
             )
         )
     return found, size
@@ -261,7 +258,7 @@ def window_means(record: Record) -> WindowMeans | None:
     )
 
 
-def _between_neighbours(means: WindowMeans, cart: int) -> _Windows | None:
+def _between_neighbours(means: WindowMeans, cart: int) -> _CartWindows | None:
     """Return the data to which one cart's law is fitted; None if a free neighbour is unmeasured."""
     record, neighbours = means.record, (cart - 1, cart, cart + 1)
     if any(c in record.free and c not in record.carts for c in neighbours):
@@ -271,17 +268,13 @@ def _between_neighbours(means: WindowMeans, cart: int) -> _Windows | None:
     row = record.carts.index(cart)
     step = resolution(record.t, record.position(cart), step=record.encoder_step(cart))
     # A cart rests if its readings change by at most three steps in a window.
-    return _Windows(
-        record=record,
-        t=means.t,
+    return _CartWindows(
+        means=means,
         x=np.array([still if i is None else means.x[i] for i in rows]),
         v=np.array([still if i is None else means.v[i] for i in rows]),
         acceleration=means.acceleration[row],
-        u=means.u,
-        on=means.on,
         noise=means.gain * step / np.sqrt(12.0),
         moves=means.span[row] > 3.0 * step,
-        jumps=means.jumps,
     )
 
 
@@ -626,37 +619,18 @@ def find_channel_delays(records: Sequence[Record], *, n: int) -> dict[int, Chann
     return found
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Normal:
-    """Normal equations of the law in a part of a record, for every trial delay.
+def _unexplained(products: Array) -> Array:
+    """Return the power (n_d,) of the left side that the best law does not explain.
 
-    Attributes
-    ----------
-    power : sum of squares (n_d,) of the left side.
-    cross : products (n_d, 4) of the left side with the columns of the right side.
-    square : products (4, 4) of the columns of the right side.
+    `products` (n_d, 5, 5) are those of left side and right columns, for every trial delay.
     """
-
-    power: Array
-    cross: Array
-    square: Array
-
-    def without(self, other: "_Normal") -> "_Normal":
-        """Return these equations minus the equations of one part."""
-        return _Normal(
-            power=self.power - other.power,
-            cross=self.cross - other.cross,
-            square=self.square - other.square,
-        )
-
-    def left(self) -> Array:
-        """Return the power (n_d,) of the left side that the best law does not explain."""
-        used = np.diag(self.square) > 0
-        size = np.sqrt(np.diag(self.square)[used])
-        cross = self.cross[:, used] / size
-        square = self.square[np.ix_(used, used)] / size / size[:, None]
-        weights = np.linalg.lstsq(square, cross.T, rcond=None)[0]
-        return self.power - np.sum(cross * weights.T, axis=1)
+    power, cross, square = products[:, 0, 0], products[:, 0, 1:], products[0, 1:, 1:]
+    used = np.diag(square) > 0
+    size = np.sqrt(np.diag(square)[used])
+    cross = cross[:, used] / size
+    square = square[np.ix_(used, used)] / size / size[:, None]
+    weights = np.linalg.lstsq(square, cross.T, rcond=None)[0]
+    return power - np.sum(cross * weights.T, axis=1)
 
 
 def _channel_delay(records: Sequence[Record], cart: int, *, after: float) -> ChannelDelay | None:
@@ -668,24 +642,20 @@ def _channel_delay(records: Sequence[Record], cart: int, *, after: float) -> Cha
     finest = float(np.median(periods)) / 240
     step = max(float(np.median([record.sample_time for record in usable])), finest)
     parts = -(-_PARTS // len(usable))
-    equations: list[_Normal] = []
+    products: list[Array] = []
     experiments: list[str] = []
     for record, period in zip(usable, periods, strict=True):
-        if found := _equations(record, cart, after=after, step=step, period=period, parts=parts):
-            equations += found
+        if found := _products(record, cart, after=after, step=step, period=period, parts=parts):
+            products += found
             experiments.append(record.id)
-    if len(equations) < _PARTS:
+    if len(products) < _PARTS:
         return None
-    total = _Normal(
-        power=np.sum([one.power for one in equations], axis=0),
-        cross=np.sum([one.cross for one in equations], axis=0),
-        square=np.sum([one.square for one in equations], axis=0),
-    )
-    left = total.left()
+    total = np.sum(products, axis=0)
+    left = _unexplained(total)
     best, least = _lowest(left)
     if abs(best) >= _MOST_LATE:  # a still longer delay would fit better, so this is not a delay
         return None
-    others = np.array([_lowest(total.without(one).left())[0] for one in equations])
+    others = np.array([_lowest(_unexplained(total - one))[0] for one in products])
     spread = float(np.sum((others - others.mean()) ** 2))
     return ChannelDelay(
         cart=cart,
@@ -710,10 +680,13 @@ def _shows_delay(record: Record, cart: int) -> bool:
     return all(np.ptp(record.position(c)) > 20.0 * record.encoder_step(c) for c in (cart - 1, cart))
 
 
-def _equations(
+def _products(
     record: Record, cart: int, *, after: float, step: float, period: float, parts: int
-) -> list[_Normal]:
-    """Return the equations of each part of a record, or [] if the record is too short."""
+) -> list[Array]:
+    """Return products (n_d, 5, 5) of the law's left side and right columns, by trial delay.
+
+    There is one array for each part of the record, and none if the record is too short.
+    """
     t = np.arange(record.t[0], record.t[-1], step)
     # A bump lasts a quarter of the motion's period, because wider bumps would suppress fast motion,
     # which is the most informative. With fewer than 16 samples under a bump, only the encoder's
@@ -742,14 +715,14 @@ def _equations(
         return []
     a = left / size
     b = (np.array(right) - np.mean(right, axis=1)[:, None]) / size
-    return [
-        _Normal(
-            power=np.sum(a[:, part] ** 2, axis=1),
-            cross=a[:, part] @ b[:, part].T,
-            square=b[:, part] @ b[:, part].T,
-        )
-        for part in np.array_split(np.arange(places.size), parts)
-    ]
+    found = []
+    for part in np.array_split(np.arange(places.size), parts):
+        products = np.zeros((shifts.size, 5, 5))
+        products[:, 0, 0] = np.sum(a[:, part] ** 2, axis=1)
+        products[:, 0, 1:] = a[:, part] @ b[:, part].T
+        products[:, 1:, 1:] = b[:, part] @ b[:, part].T
+        found.append(products)
+    return found
 
 
 def _lowest(left: Array) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -255,6 +255,18 @@ def _collect_cart(points: Sequence[SinePoint], *, cart: int) -> FrequencyRespons
         omega = float(np.mean([p.omega for p in group]))
         phase = float(_wrapped(np.array(around + turn)))
         rows.append((omega, magnitude, magnitude_std, phase, phase_std))
+    measured = tuple(p.experiment for p in ordered)
+    return _response(rows, cart=cart, source="dwells", experiments=measured)
+
+
+def _response(
+    rows: Sequence[tuple[float, ...]],
+    *,
+    cart: int,
+    source: Literal["dwells", "records"],
+    experiments: tuple[str, ...],
+) -> FrequencyResponse:
+    """Return the response from rows of omega, magnitude, phase and their errors."""
     omega, magnitude, magnitude_std, phase, phase_std = np.array(rows).T
     return FrequencyResponse(
         cart=cart,
@@ -263,8 +275,8 @@ def _collect_cart(points: Sequence[SinePoint], *, cart: int) -> FrequencyRespons
         magnitude_std=magnitude_std,
         phase=phase,
         phase_std=phase_std,
-        source="dwells",
-        experiments=tuple(p.experiment for p in ordered),
+        source=source,
+        experiments=experiments,
     )
 
 
@@ -313,10 +325,9 @@ def response_from_records(records: Sequence[Record]) -> tuple[FrequencyResponse,
             for run, ratio in zip(runs, ratios, strict=True)
             if cart in run.carts
         ]
-        response = _combined(omega, rows, cart=cart)
-        if response.omega.size:
+        if points := _combined(omega, rows):
             measured = tuple(run.id for run in runs if cart in run.carts)
-            responses.append(replace(response, experiments=measured))
+            responses.append(_response(points, cart=cart, source="records", experiments=measured))
     if not responses:
         raise DataError(
             f"frequency response: the motion in {', '.join(run.id for run in runs)} is not above "
@@ -334,9 +345,7 @@ def _grid(runs: Sequence[Record]) -> Array:
     return base * np.unique(np.rint(np.geomspace(1, top, count)))
 
 
-def _combined(
-    omega: Array, rows: Sequence[tuple[ComplexArray, Array]], *, cart: int
-) -> FrequencyResponse:
+def _combined(omega: Array, rows: Sequence[tuple[ComplexArray, Array]]) -> list[tuple[float, ...]]:
     points = []
     for w in range(omega.size):
         G = np.array([row[0][w] for row in rows])
@@ -350,16 +359,7 @@ def _combined(
         if spread <= _LARGEST_RELATIVE_STD * magnitude:
             phase = np.arctan2(imag, real)
             points.append((omega[w], magnitude, spread, phase, spread / magnitude))
-    columns = np.array(points).reshape(-1, 5).T
-    return FrequencyResponse(
-        cart=cart,
-        omega=columns[0],
-        magnitude=columns[1],
-        magnitude_std=columns[2],
-        phase=columns[3],
-        phase_std=columns[4],
-        source="records",
-    )
+    return points
 
 
 # ------------------------------------------------------------- peaks and nulls

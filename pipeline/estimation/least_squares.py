@@ -1,7 +1,7 @@
 """Nonlinear least squares, with variable projection, and the fit of damped sinusoids by it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
@@ -82,15 +82,18 @@ class SeparableModel(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SeparableFit:
-    """The nonlinear unknowns p (n_p,), and the linear unknowns with the least residual.
+    """The model at nonlinear unknowns p (n_p,), and the linear unknowns with the least residual.
 
-    `residual` (n,) is model - y; `converged` is False if the fit ran out of steps.
+    `basis` (n, n_linear) spans the model's columns, and `residual` (n,) is model - y; `converged`
+    is False if the fit ran out of steps.
     """
 
     p: Array
+    model: SeparableModel
+    basis: Array
     linear: Array
     residual: Array
-    converged: bool
+    converged: bool = False
 
 
 def fit_separable(
@@ -108,11 +111,11 @@ def fit_separable(
     and of the slope.
     """
 
-    def jacobian(point: _Point) -> Array:
+    def jacobian(point: SeparableFit) -> Array:
         J = point.model.derivatives(point.linear)
         return J - point.basis @ (point.basis.T @ J)
 
-    at = evaluated_once(lambda p: _solved(y, model(p)))
+    at = evaluated_once(lambda p: solve_linear(y, model, p))
     # `least_squares` runs the same MINPACK routine, but preparing each call takes as long as the
     # fit.
     with np.errstate(over="ignore"):  # in the covariance of p, which is not used
@@ -127,14 +130,7 @@ def fit_separable(
             maxfev=max_evaluations,
             diag=np.broadcast_to(1 / np.asarray(scale, dtype=np.float64), start.shape),
         )
-    best = at(p)
-    return SeparableFit(p=p, linear=best.linear, residual=best.residual, converged=status in _FOUND)
-
-
-def squares_at(y: Array, model: SeparableModel) -> float:
-    """Return the least sum of squares that a model leaves of y (n,)."""
-    residual = _solved(y, model).residual
-    return float(residual @ residual)
+    return replace(at(p), p=p, converged=status in _FOUND)
 
 
 def inverse_normal(model: SeparableModel, linear: Array) -> Array:
@@ -145,19 +141,10 @@ def inverse_normal(model: SeparableModel, linear: Array) -> Array:
     return inverse @ inverse.T
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Point:
-    """The model at some p (n_p,) with its best linear unknowns; `basis` spans the columns."""
-
-    model: SeparableModel
-    basis: Array
-    linear: Array
-    residual: Array
-
-
-def _solved(y: Array, model: SeparableModel) -> _Point:
-    """Return the model with the linear unknowns that give the least residual."""
-    X = model.columns
+def solve_linear(y: Array, model: Callable[[Array], SeparableModel], p: Array) -> SeparableFit:
+    """Return the model at p (n_p,), with the linear unknowns that give the least residual."""
+    at = model(p)
+    X = at.columns
     basis, upper = np.linalg.qr(X)
     sizes = np.abs(np.diag(upper))
     least = np.finfo(np.float64).eps * len(X) * np.max(sizes)
@@ -166,7 +153,7 @@ def _solved(y: Array, model: SeparableModel) -> _Point:
     else:  # far from the solution, columns may be nearly equal; they then share their contribution
         basis, sizes, turn = np.linalg.svd(X, full_matrices=False)
         linear = (y @ basis / np.maximum(sizes, least)) @ turn
-    return _Point(model=model, basis=basis, linear=linear, residual=X @ linear - y)
+    return SeparableFit(p=p, model=at, basis=basis, linear=linear, residual=X @ linear - y)
 
 
 # ---------------------------------------------------------------- damped sinusoids about a level

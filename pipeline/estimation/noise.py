@@ -85,12 +85,14 @@ def resolution(t: Array, y: Array, *, step: float) -> float:
     return max(step, float(np.sqrt(12) * local_noise(t, y)), arithmetic)
 
 
-def rounding_left(sigma: float, *, step: float) -> float:
+def rounding_left(rms: float, *, step: float) -> float:
     """Return the share (0 to 1) of the rounding error that remains after averaging.
 
-    Noise `sigma` before the rounding acts as dither: the first harmonic of the rounding error
-    shrinks by exp(-2 pi² sigma²/step²) (Widrow & Kollár, Quantization Noise, 2008, chapter 4).
+    Noise sigma before the rounding, which follows from the residual's `rms`, acts as dither: the
+    first harmonic of the rounding error shrinks by exp(-2 pi² sigma²/step²) (Widrow & Kollár,
+    Quantization Noise, 2008, chapter 4).
     """
+    sigma = noise_beyond_rounding(rms, step=step)
     return float(np.exp(-2 * (np.pi * sigma / step) ** 2)) if step > 0 else 0.0
 
 

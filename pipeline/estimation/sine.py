@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.estimation.noise import noise_beyond_rounding, relative_psd, resolution, rounding_left
+from pipeline.estimation.noise import relative_psd, resolution, rounding_left
 from pipeline.results import Record, SinePoint
 
 # ---------------------------------------------------------------------- independent columns
@@ -109,8 +109,8 @@ class _Steady:
     left: float
 
 
-def fit_sine(record: Record, *, cart: int) -> SinePoint:
-    """Fit the sinusoidal steady state of one cart to a dwell.
+class Dwell:
+    """The sinusoidal steady state of a dwell: its frequency, and the columns shared by all fits.
 
     The last windows show whether there is a steady part. It extends back as far as the sine fitted
     to it explains the record. The input is fitted over the same part. If the input is held between
@@ -122,25 +122,20 @@ def fit_sine(record: Record, *, cart: int) -> SinePoint:
     Parameters
     ----------
     record : the dwell. Without `omega`, the frequency is fitted to the input.
-    cart : the cart whose position is fitted. For several carts, use `Dwell`.
-
-    Raises
-    ------
-    DataError : there is no input column, the input does not oscillate, or it has less than a full
-        cycle.
     """
-    return Dwell(record).fit(cart=cart)
-
-
-class Dwell:
-    """The driven part of a dwell: its frequency, and the columns shared by all fits."""
 
     def __init__(self, record: Record) -> None:
         self._record = record
         self._parts: dict[tuple[int, int], _Part] = {}
 
     def fit(self, *, cart: int) -> SinePoint:
-        """Fit the steady state of one cart; see `fit_sine`."""
+        """Fit the steady state of one cart.
+
+        Raises
+        ------
+        DataError : there is no input column, the input does not oscillate, or it has less than a
+            full cycle.
+        """
         record, driven = self._record, self._driven
         y, step = record.position(cart)[driven], record.encoder_step(cart)
         if np.ptp(y) == 0:
@@ -169,8 +164,13 @@ class Dwell:
         notes = [
             frequency_note,
             "" if steady.settled else "no steady state is seen before the record ends",
-            _note_small(amplitude, step=step),
-            _note_off_sine(position, floor=floor),
+            f"the amplitude is only {amplitude / step:.1f} encoder counts"
+            if step and amplitude < FEW_COUNTS * step
+            else "",
+            # A residual below 1 % of the amplitude is good.
+            f"{100 * position.rms / amplitude:.1f} % of the motion is not at the drive frequency"
+            if position.rms > max(2 * floor, 0.01 * amplitude)
+            else "",
         ]
         return SinePoint(
             experiment=record.id,
@@ -190,7 +190,27 @@ class Dwell:
 
     @cached_property
     def _driven(self) -> slice:
-        return _driven(self._record)
+        """The samples in which the input oscillates."""
+        record, u = self._record, self._record.u
+        if u is None:
+            raise DataError(
+                f"{record.id}: a sine dwell needs the input as well as the positions, found no "
+                "input column: export it too, or name it under `columns`"
+            )
+        if np.ptp(u) == 0:
+            raise DataError(
+                f"{record.id}: a sine dwell needs an input that oscillates, found {u[0]:g} "
+                "throughout"
+            )
+        offset = (np.max(u) + np.min(u)) / 2
+        # The dwell runs from the first to the last sample beyond half of the input's amplitude.
+        first, last = np.flatnonzero(np.abs(u - offset) > 0.5 * np.ptp(u) / 2)[[0, -1]]
+        if last + 1 - first < _MIN_SAMPLES:
+            raise DataError(
+                f"{record.id}: a sine fit needs {_MIN_SAMPLES} samples of driven motion, found "
+                f"{last + 1 - first}"
+            )
+        return slice(int(first), int(last) + 1)
 
     @cached_property
     def _t(self) -> Array:
@@ -326,9 +346,9 @@ def _rounding_std(fit: _Sine, *, step: float) -> float:
     """
     if step == 0:
         return 0.0
-    left = rounding_left(noise_beyond_rounding(fit.rms, step=step), step=step)
     # in encoder steps, times sqrt(step / amplitude): see the docstring
-    return 0.111 * step * float(np.sqrt(step / max(abs(fit.z), step))) * left
+    scale = 0.111 * step * float(np.sqrt(step / max(abs(fit.z), step)))
+    return scale * rounding_left(fit.rms, step=step)
 
 
 def _held(t: Array, *, omega: float) -> complex:
@@ -340,30 +360,6 @@ def _held(t: Array, *, omega: float) -> complex:
 
 
 # -------------------------------------------------------- what the record holds
-
-
-def _driven(record: Record) -> slice:
-    """Return the samples in which the input oscillates."""
-    u = record.u
-    if u is None:
-        raise DataError(
-            f"{record.id}: a sine dwell needs the input as well as the positions, found no input "
-            "column: export it too, or name it under `columns`"
-        )
-    if np.ptp(u) == 0:
-        raise DataError(
-            f"{record.id}: a sine dwell needs an input that oscillates, found {u[0]:g} throughout"
-        )
-    offset = (np.max(u) + np.min(u)) / 2
-    # The dwell runs from the first to the last sample beyond half of the input's amplitude.
-    first, last = np.flatnonzero(np.abs(u - offset) > 0.5 * np.ptp(u) / 2)[[0, -1]]
-    driven = slice(int(first), int(last) + 1)
-    if last + 1 - first < _MIN_SAMPLES:
-        raise DataError(
-            f"{record.id}: a sine fit needs {_MIN_SAMPLES} samples of driven motion, found "
-            f"{last + 1 - first}"
-        )
-    return driven
 
 
 def _frequency(t: Array, u: Array, *, stated: float | None) -> tuple[float, str]:
@@ -405,19 +401,3 @@ def _windows(t: Array, *, omega: float) -> list[tuple[int, int]]:
         for a, b in zip(first[::-1], stop[::-1], strict=True)
         if b - a >= _MIN_SAMPLES
     ] or whole
-
-
-# ------------------------------------------------------------------------ notes
-
-
-def _note_small(amplitude: float, *, step: float) -> str:
-    if step == 0 or amplitude >= FEW_COUNTS * step:
-        return ""
-    return f"the amplitude is only {amplitude / step:.1f} encoder counts"
-
-
-def _note_off_sine(fit: _Sine, *, floor: float) -> str:
-    # A residual below 1 % of the amplitude is good.
-    if fit.rms <= max(2 * floor, 0.01 * abs(fit.z)):
-        return ""
-    return f"{100 * fit.rms / abs(fit.z):.1f} % of the motion is not at the drive frequency"

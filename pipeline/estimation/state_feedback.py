@@ -14,7 +14,6 @@ consider those with the smallest inputs, and choose the fastest.
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Literal
 
 import numpy as np
 from scipy.linalg import hadamard, hessenberg
@@ -22,19 +21,9 @@ from scipy.optimize import linear_sum_assignment
 
 from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
-from pipeline.plant import limits, simulate
+from pipeline.plant import limits, sampled_loop, simulate
 from pipeline.plant.chain import Chain, quadratic_factors
 from pipeline.plant.limits import DAMPING_ERROR, MASS_SPRING_ERROR
-from pipeline.plant.sampled_loop import (
-    RADIANS_PER_STEP,
-    LoopSetup,
-    StateFeedback,
-    check_ticks,
-    discretise,
-    loop_matrix,
-    parts_per_sample,
-    simulate_loop,
-)
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import FeedbackDesign
 from pipeline.submission import Design
@@ -86,7 +75,9 @@ def place_poles(phi: Array, gamma: Array, poles: ComplexArray) -> Array:
     return row.real / reach @ basis.T @ rotation.T
 
 
-def stays_stable(chain: Chain, controller: StateFeedback, *, sample_time: float) -> bool:
+def stays_stable(
+    chain: Chain, controller: sampled_loop.StateFeedback, *, sample_time: float
+) -> bool:
     """Return whether the loop is stable on all plants within the errors of identification.
 
     A two-level screening design, together with its mirror image, gives 32 plants. They cover every
@@ -104,7 +95,7 @@ def stays_stable(chain: Chain, controller: StateFeedback, *, sample_time: float)
             c=chain.c * (1 + limits.DAMPING_ERROR * damped),
             k=chain.k * (1 + limits.MASS_SPRING_ERROR * stiff),
         )
-        matrices.append(loop_matrix(plant, controller, sample_time=sample_time))
+        matrices.append(sampled_loop.loop_matrix(plant, controller, sample_time=sample_time))
     return bool(np.abs(np.linalg.eigvals(np.array(matrices))).max() < 1.0)
 
 
@@ -156,10 +147,10 @@ class SampledPlant:
         if sample_time is None:
             # The laboratory controller's sample time, or less if modes are fast, or if the loop
             # would settle in less than 25 samples.
-            sample_time = min(0.00884, RADIANS_PER_STEP / speeds.max(), settling / 25)
+            sample_time = min(0.00884, sampled_loop.RADIANS_PER_STEP / speeds.max(), settling / 25)
         tied = chain.k[0] > 0 or chain.k[-1] > 0
         stiffness = 1 / chain.static_gains()[0] if tied else chain.m.sum() * rate**2
-        phi, gamma = discretise(chain, sample_time)
+        phi, gamma = sampled_loop.discretise(chain, sample_time)
         if not (np.all(np.isfinite(phi)) and np.all(np.isfinite(gamma * stiffness))):
             raise np.linalg.LinAlgError("the sampled plant is not finite")
         unit = np.tile([1.0, rate], chain.n)
@@ -189,13 +180,13 @@ class SampledPlant:
 
     def after(self, share: float) -> tuple[Array, Array]:
         """Return phi and gamma, in scaled units, for a share of the sample time."""
-        phi, gamma = discretise(self.chain, share * self.sample_time)
+        phi, gamma = sampled_loop.discretise(self.chain, share * self.sample_time)
         unit = np.tile([1.0, self.rate], self.chain.n)
         return phi * unit / unit[:, None], gamma * self.stiffness / unit
 
     def stays_stable(self, gains: Array) -> bool:
         """Whether the loop with these unscaled gains tolerates the usual errors of the chain."""
-        controller = StateFeedback(gains=gains, prefilter=1.0, model=self.chain)
+        controller = sampled_loop.StateFeedback(gains=gains, prefilter=1.0, model=self.chain)
         return stays_stable(self.chain, controller, sample_time=self.sample_time)
 
 
@@ -217,8 +208,6 @@ def energy_weights(plant: SampledPlant, weights: Array) -> Array:
 
 
 # ---------------------------------------------------------------------- the stage
-
-Method = Literal["poles", "lqr"]
 
 _POINTS = 512  # points of a candidate's step; a power of two, because doubling computes them
 
@@ -258,21 +247,15 @@ def design_feedback(chain: Chain, task: Design) -> FeedbackDesign:
             f"state feedback needs every cart within the motor's reach, found no spring between "
             f"carts {missing} and {missing + 1}"
         )
-    goal = _Goal(
-        overshoot=task.overshoot_percent,
-        settling=task.settling_time,
-        limit=np.inf if task.input_limit is None else task.input_limit,
-        reference=task.reference,
-    )
     try:
         # A candidate may be unstable and diverge, which its final numbers show.
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             plant = SampledPlant.of(
                 chain, cart=task.cart, settling=task.settling_time, sample_time=task.sample_time
             )
-            design = _design(plant, goal, method=task.method)
+            design = _design(plant, task)
             if chain.is_tied:
-                _refuse_more_overshoot(plant, goal, design)
+                _refuse_more_overshoot(plant, task, design)
             return design
     except np.linalg.LinAlgError:
         raise DataError(
@@ -282,7 +265,7 @@ def design_feedback(chain: Chain, task: Design) -> FeedbackDesign:
         ) from None
 
 
-def _refuse_more_overshoot(plant: SampledPlant, goal: "_Goal", design: FeedbackDesign) -> None:
+def _refuse_more_overshoot(plant: SampledPlant, task: Design, design: FeedbackDesign) -> None:
     """Raise DataError if the design overshoots more than a step of the input without feedback."""
     slowest = float(np.abs(plant.chain.poles).min())
     t = np.linspace(0.0, max(float(design.t[-1]), 2 * np.pi / slowest), _POINTS)
@@ -294,9 +277,9 @@ def _refuse_more_overshoot(plant: SampledPlant, goal: "_Goal", design: FeedbackD
     for halvings in range(1, _HALVINGS + 1):
         sample_time = plant.sample_time / 2**halvings
         faster = SampledPlant.of(
-            plant.chain, cart=plant.cart, settling=goal.settling, sample_time=sample_time
+            plant.chain, cart=plant.cart, settling=task.settling_time, sample_time=sample_time
         )
-        better = _design(faster, goal, method=design.method)
+        better = _design(faster, task)
         if better.reachable:
             advice = (
                 f"set sample_time to {sample_time:.3g} s, where the design overshoots by "
@@ -316,62 +299,49 @@ def _range(values: Array) -> str:
     return f"{values.min():.1e} to {values.max():.1e}"
 
 
-def _design(plant: SampledPlant, goal: "_Goal", *, method: Method) -> FeedbackDesign:
-    """Choose among the candidates of a method, and simulate the chosen one."""
-    if method == "lqr":
+def _design(plant: SampledPlant, task: Design) -> FeedbackDesign:
+    """Choose among the candidates of the task's method, and simulate the chosen one."""
+    if task.method == "lqr":
         requested, costs = None, energy_weights(plant, _WEIGHTS)
-        candidates = _try_step(plant, lqr_gains(plant.phi, plant.gamma, costs), goal)
-        best, met = _choose(plant, candidates, goal)
+        candidates = _try_step(plant, lqr_gains(plant.phi, plant.gamma, costs), task)
+        best, met = _choose(plant, candidates, task)
         if not met:  # the goal may be much faster than the plant
             heavy = energy_weights(plant, _HEAVY_WEIGHTS)
             # At slow sampling, the heaviest weights have no solution in double precision.
             with suppress(np.linalg.LinAlgError):
-                candidates = _try_step(plant, lqr_gains(plant.phi, plant.gamma, heavy), goal)
-                best, met = _choose(plant, candidates, goal)
+                candidates = _try_step(plant, lqr_gains(plant.phi, plant.gamma, heavy), task)
+                best, met = _choose(plant, candidates, task)
                 costs = heavy
     else:
-        requested, costs = _pole_candidates(plant, goal), None
+        requested, costs = _pole_candidates(plant, task), None
         z = np.exp(requested * plant.sample_time)
-        candidates = _try_step(plant, place_poles(plant.phi, plant.gamma, z), goal)
-        best, met = _choose(plant, candidates, goal)
+        candidates = _try_step(plant, place_poles(plant.phi, plant.gamma, z), task)
+        best, met = _choose(plant, candidates, task)
     design = _finish(
         plant,
-        goal,
+        task,
         gains=plant.to_units(candidates.gains[best]),
         requested=None if requested is None else requested[best],
         settling=float(candidates.settling[best]),
-        method=method,
     )
     if costs is None:
         return design
     return replace(design, Q=plant.cost_to_units(costs[best]), R=1 / plant.stiffness)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Goal:
-    overshoot: float  # percent
-    settling: float  # s
-    limit: float  # input units; infinite without a limit
-    reference: float  # position units
-
-    def __str__(self) -> str:
-        within = f" within ±{self.limit:.3g} of input" if np.isfinite(self.limit) else ""
-        return f"overshoot {self.overshoot:.3g} % and settling in {self.settling:.3g} s{within}"
-
-
 # -------------------------------------------------------------- candidate gains
 
 
-def _pole_candidates(plant: SampledPlant, goal: _Goal) -> ComplexArray:
+def _pole_candidates(plant: SampledPlant, task: Design) -> ComplexArray:
     """Return continuous pole sets (n_candidates, 2n), rad/s."""
     omega, zeta = quadratic_factors(plant.chain.poles)
     shares = np.array([overshoot for _, overshoot in _AIMS])
-    log = np.log(np.maximum(shares * goal.overshoot, _UNSEEN) / 100)
+    log = np.log(np.maximum(shares * task.overshoot_percent, _UNSEEN) / 100)
     dominant_zeta = -log / np.hypot(np.pi, log)
     z, settling, further_zeta, further_speed = (
         axis.ravel()
         for axis in np.meshgrid(
-            dominant_zeta, goal.settling * _DOMINANT_SETTLING, _FURTHER_ZETA, _FURTHER_SPEED
+            dominant_zeta, task.settling_time * _DOMINANT_SETTLING, _FURTHER_ZETA, _FURTHER_SPEED
         )
     )
     # exp(-4) is about the 2 % that define the settling time. No pair is made slower than the
@@ -406,19 +376,19 @@ class _Candidates:
     level_error: Array  # percent of the step, due to errors in the model
 
 
-def _try_step(plant: SampledPlant, gains: Array, goal: _Goal) -> _Candidates:
+def _try_step(plant: SampledPlant, gains: Array, task: Design) -> _Candidates:
     """Simulate the step of every candidate at once, exactly at the simulated points.
 
     The points are close enough to show every peak, also between the ticks of a slow clock. If the
     simulation therefore ends before the goal's settling time, the settling time is estimated.
     """
     loop = plant.phi - plant.gamma[:, None] * gains[:, None, :]
-    fastest = np.abs(plant.chain.poles).max() + 4 / goal.settling
+    fastest = np.abs(plant.chain.poles).max() + 4 / task.settling_time
     # The step is simulated for three times the goal's settling time, if there are enough points for
     # this.
-    apart = min(3.0 * goal.settling / _POINTS, RADIANS_PER_STEP / fastest)
+    apart = min(3.0 * task.settling_time / _POINTS, sampled_loop.RADIANS_PER_STEP / fastest)
     stride = max(1, round(apart / plant.sample_time))
-    parts = parts_per_sample(plant.chain, plant.sample_time)
+    parts = sampled_loop.parts_per_sample(plant.chain, plant.sample_time)
     level = np.linalg.solve(np.eye(plant.gamma.size) - loop, plant.gamma[:, None])
     prefilter = 1 / level[:, plant.row]
     level = level * prefilter[:, None]
@@ -446,24 +416,24 @@ def _try_step(plant: SampledPlant, gains: Array, goal: _Goal) -> _Candidates:
         gains=gains,
         overshoot=simulate.overshoot_percent(y, before=0.0, level=one),
         settling=np.where(np.isnan(settling), np.where(radius < 1, slowest, np.inf), settling),
-        peak=np.abs(u).max(-1) * plant.stiffness * abs(goal.reference),
+        peak=np.abs(u).max(-1) * plant.stiffness * abs(task.reference),
         level_error=level_error_percent(plant.chain, plant.to_units(gains), cart=plant.cart),
     )
 
 
-def _choose(plant: SampledPlant, candidates: _Candidates, goal: _Goal) -> tuple[int, bool]:
+def _choose(plant: SampledPlant, candidates: _Candidates, task: Design) -> tuple[int, bool]:
     """Return the index of the best candidate, and whether it meets the goal.
 
     If no candidate meets the goal, the index is that of the nearest one.
     """
-    within = candidates.peak <= goal.limit
+    within = candidates.peak <= (np.inf if task.input_limit is None else task.input_limit)
     if not within.any():  # a step of this size is out of reach, so design for a smaller one
         within = np.full_like(within, True)
     # Errors in the springs should move the steady position by at most 10 % of the step.
     for level_error, (settling, overshoot) in product((10.0, np.inf), _AIMS):
         good = within & (candidates.level_error <= level_error)
-        good &= candidates.settling <= settling * goal.settling
-        good &= candidates.overshoot <= max(overshoot * goal.overshoot, _UNSEEN)
+        good &= candidates.settling <= settling * task.settling_time
+        good &= candidates.overshoot <= max(overshoot * task.overshoot_percent, _UNSEEN)
         if not good.any():
             continue
         # A faster candidate may need up to 1.25 times the least peak input of all good candidates.
@@ -475,8 +445,8 @@ def _choose(plant: SampledPlant, candidates: _Candidates, goal: _Goal) -> tuple[
             if plant.stays_stable(plant.to_units(candidates.gains[index])):
                 return int(index), True
     excess = np.maximum(
-        candidates.settling / goal.settling,
-        np.maximum(candidates.overshoot, 1.0) / max(goal.overshoot, 1.0),
+        candidates.settling / task.settling_time,
+        np.maximum(candidates.overshoot, 1.0) / max(task.overshoot_percent, 1.0),
     )
     return int(np.argmin(np.where(within & ~np.isnan(excess), excess, np.inf))), False
 
@@ -486,16 +456,15 @@ def _choose(plant: SampledPlant, candidates: _Candidates, goal: _Goal) -> tuple[
 
 def _finish(
     plant: SampledPlant,
-    goal: _Goal,
+    task: Design,
     *,
     gains: Array,
     requested: ComplexArray | None,
     settling: float,
-    method: Method,
 ) -> FeedbackDesign:
     """Simulate the chosen design with delay and input limit, and describe the result."""
     chain, T = plant.chain, plant.sample_time
-    phi, gamma = discretise(chain, T)
+    phi, gamma = sampled_loop.discretise(chain, T)
     loop = phi - np.outer(gamma, gains)
     prefilter = 1 / float(np.linalg.solve(np.eye(2 * chain.n) - loop, gamma)[plant.row])
     z = np.linalg.eigvals(loop).astype(np.complex128)
@@ -505,26 +474,26 @@ def _finish(
         requested = requested[linear_sum_assignment(away)[1]]
     # The result shows twice the goal's or the design's settling time, whichever is longer. If the
     # design misses the goal, the result shows at most 20 times the goal's settling time.
-    shown = 2.0 * min(max(goal.settling, settling), 10.0 * goal.settling)
-    check_ticks(shown, T)
-    parts = parts_per_sample(chain, T)
+    shown = 2.0 * min(max(task.settling_time, settling), 10.0 * task.settling_time)
+    sampled_loop.check_ticks(shown, T)
+    parts = sampled_loop.parts_per_sample(chain, T)
     t = T / parts * np.arange(parts * np.ceil(shown / T) + 1, dtype=np.float64)
-    run = simulate_loop(
+    run = sampled_loop.simulate_loop(
         chain,
-        StateFeedback(gains=gains, prefilter=prefilter, model=chain),
+        sampled_loop.StateFeedback(gains=gains, prefilter=prefilter, model=chain),
         t=t,
-        reference=goal.reference,
-        setup=LoopSetup(sample_time=T, input_limit=goal.limit),
+        reference=task.reference,
+        setup=sampled_loop.LoopSetup(sample_time=T, input_limit=task.input_limit),
     )
     y = run.x[plant.cart - 1]
-    judged = {"before": 0.0, "level": np.float64(goal.reference)}
+    judged = {"before": 0.0, "level": np.float64(task.reference)}
     overshoot = float(simulate.overshoot_percent(y, **judged))
     settling = float(simulate.settling_time(t, y, **judged))
-    met = overshoot <= goal.overshoot + _UNSEEN and settling <= goal.settling + T / 2
+    met = overshoot <= task.overshoot_percent + _UNSEEN and settling <= task.settling_time + T / 2
     design = FeedbackDesign(
         cart=plant.cart,
-        method=method,
-        reference=goal.reference,
+        method=task.method,
+        reference=task.reference,
         gains=gains,
         prefilter=prefilter,
         poles=poles,
@@ -539,25 +508,31 @@ def _finish(
         reachable=bool(met),
         message="",
     )
-    return replace(design, message=_message(plant, goal, design))
+    return replace(design, message=_message(plant, task, design))
 
 
-def _message(plant: SampledPlant, goal: _Goal, design: FeedbackDesign) -> str:
+def _message(plant: SampledPlant, task: Design, design: FeedbackDesign) -> str:
     """Return a warning if the goal cannot be met or model errors matter; otherwise ""."""
     parts = []
     tied = plant.chain.k[0] > 0 or plant.chain.k[-1] > 0
-    held = abs(plant.chain.static_gains()[plant.cart - 1]) * goal.limit if tied else np.inf
-    if not design.reachable and abs(goal.reference) > held:
+    limit = task.input_limit
+    held = np.inf
+    if tied and limit is not None:
+        held = abs(plant.chain.static_gains()[plant.cart - 1]) * limit
+    if not design.reachable and abs(task.reference) > held:
         parts.append(
-            f"an input of ±{goal.limit:.3g} cannot hold cart {plant.cart} at "
-            f"{goal.reference:.3g}; it reaches at most {held:.3g}"
+            f"an input of ±{limit:.3g} cannot hold cart {plant.cart} at "
+            f"{task.reference:.3g}; it reaches at most {held:.3g}"
         )
     elif not design.reachable:
         settling = design.settling_time
         settles = "does not settle" if settling is None else f"settles in {settling:.3g} s"
+        within = "" if limit is None else f" within ±{limit:.3g} of input"
         parts.append(
-            f"{goal} cannot be met: the best design overshoots by {design.overshoot_percent:.2g} % "
-            f"and {settles}, with an input of {design.peak_input:.3g}"
+            f"overshoot {task.overshoot_percent:.3g} % and settling in {task.settling_time:.3g} s"
+            f"{within} cannot be met: the best design overshoots by "
+            f"{design.overshoot_percent:.2g} % and {settles}, with an input of "
+            f"{design.peak_input:.3g}"
         )
     if not plant.stays_stable(design.gains):
         parts.append(

@@ -8,15 +8,8 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
+from pipeline.estimation import noise
 from pipeline.estimation.least_squares import find_poles, fit_ringing
-from pipeline.estimation.noise import (
-    extrema,
-    noise_beyond_rounding,
-    plateaus,
-    relative_psd,
-    resolution,
-    rounding_left,
-)
 from pipeline.results import Record, StepEdge, StepGain
 
 # Motion is counted in grains. A grain is the encoder step, or the step whose rounding error equals
@@ -76,7 +69,7 @@ def fit_step_gain(record: Record, *, cart: int) -> StepGain:
         raise DataError(f"{record.id}: step gain needs a cart that is free, cart {cart} is held")
     if np.ptp(y) == 0:
         raise DataError(f"{record.id}: step gain needs motion, cart {cart} does not move")
-    size = resolution(t, y, step=step)
+    size = noise.resolution(t, y, step=step)
     found = [_settle(record, y, part, size=size, step=step) for part in parts]
     for _ in range(_DRIFT_PASSES):  # without the drift, more samples count as settled
         more = _drift(t, y, [p.level for p in found if p.level], size=size)
@@ -133,7 +126,7 @@ def _constant_parts(record: Record) -> list[tuple[int, int, float]]:
     creep = 0.005 * float(np.ptp(u))
     long = [
         (a, b)
-        for a, b in plateaus(u)
+        for a, b in noise.plateaus(u)
         if a == 0 or (b - a >= _MIN_SAMPLES and abs(_halves_differ(u[a:b])) <= creep)
     ]
     share = sum(b - a for a, b in long) / u.size
@@ -183,7 +176,7 @@ def _level(t: Array, y: Array, *, n_modes: int, size: float, step: float) -> _Le
 
 def _pace(t: Array, y: Array, *, size: float) -> float:
     """Return how long (s) a window must be to prove rest: two periods, or two rise times."""
-    turning = extrema(y, prominence=_PROMINENCE * size)
+    turning = noise.extrema(y, prominence=_PROMINENCE * size)
     if len(turning) > 3:  # the ends are not turning points
         return 2 * float(np.max(np.diff(t[turning[1:-1]])))
     risen = np.abs(y - y[0]) >= (1 - np.exp(-1)) * abs(y[-1] - y[0])
@@ -205,8 +198,8 @@ def _mean_level(y: Array, first: int, *, step: float, arithmetic: float) -> _Lev
     window = y[first:]
     residual = window - window.mean()
     rms = float(np.sqrt(np.mean(residual**2)))
-    scatter = max(rms, arithmetic) * np.sqrt(relative_psd(residual, angle=0.0) / window.size)
-    rounding = step / np.sqrt(12) * rounding_left(noise_beyond_rounding(rms, step=step), step=step)
+    scatter = max(rms, arithmetic) * np.sqrt(noise.relative_psd(residual, angle=0.0) / window.size)
+    rounding = step / np.sqrt(12) * noise.rounding_left(rms, step=step)
     return _Level(
         first=first,
         stop=y.size,
@@ -273,7 +266,7 @@ def _drift(t: Array, y: Array, levels: Sequence[_Level], *, size: float) -> floa
         residual = window - window.mean() - slope * tau
         rms = max(float(np.sqrt(np.mean(residual**2))), size / np.sqrt(12))
         slopes.append(slope)
-        errors.append(rms * np.sqrt(relative_psd(residual, angle=0.0) / (tau @ tau)))
+        errors.append(rms * np.sqrt(noise.relative_psd(residual, angle=0.0) / (tau @ tau)))
     if len(slopes) < 2:
         return 0.0
     weight = 1 / np.square(errors)

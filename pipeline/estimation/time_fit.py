@@ -23,7 +23,6 @@ from pipeline.estimation.least_squares import minimise
 from pipeline.estimation.noise import (
     local_noise,
     long_run_variance,
-    noise_beyond_rounding,
     rounding_left,
     score_covariance,
 )
@@ -112,7 +111,7 @@ class FitWindow:
         sigma = np.maximum(self.stated_sigma, np.sqrt(np.mean(residual**2, axis=1)))
         moving = self.rms_in_motion(residual)
         left = [
-            rounding_left(noise_beyond_rounding(rms, step=step), step=step)
+            rounding_left(rms, step=step)
             for rms, step in zip(moving.tolist(), self.step.tolist(), strict=True)
         ]
         shared = (np.array(left) * self.step / sigma) ** 2 / 12 if at_rest else 0.0
@@ -568,34 +567,20 @@ def stacked_triangle(misfits: Sequence[Misfit]) -> Array:
     return np.asarray(np.linalg.qr(triangles, mode="r"))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SearchOutcome:
-    """The result of a search.
-
-    Attributes
-    ----------
-    best : the attempt with the lowest cost on the whole windows.
-    cut_short : whether some starts were not tried although no chain explained the records.
-    """
-
-    best: Attempt
-    n_starts: int
-    cut_short: bool
-
-
 def search(
     windows: Sequence[FitWindow],
     parametrisation: Parametrisation,
     *,
     given: Chain | None,
-    most_comparisons: int = _MOST_COMPARISONS,
-) -> SearchOutcome:
+) -> tuple[Attempt, int, bool]:
     """Return the best chain from several starts; stop early if one explains the records.
+
+    Also return the number of starts, and whether some starts were not tried although no chain
+    explained the records.
 
     Parameters
     ----------
     given : a chain to start from, or None.
-    most_comparisons : limit on the number of comparisons of a chain with a record.
 
     Raises
     ------
@@ -612,7 +597,7 @@ def search(
     tried = comparisons = 0
     cut_short = False
     for theta in (*near, *even):
-        if cut_short := comparisons >= most_comparisons:
+        if cut_short := comparisons >= _MOST_COMPARISONS:
             break
         found = minimise_from(windows, parametrisation, theta)
         tried, comparisons = tried + 1, comparisons + found.n_evaluations * len(windows)
@@ -626,9 +611,7 @@ def search(
             "time fit: needs records that a chain with these springs can follow, found none: "
             "are the springs stated right?"
         )
-    return SearchOutcome(
-        best=evaluate_chain(full, parametrisation, best.theta), n_starts=tried, cut_short=cut_short
-    )
+    return evaluate_chain(full, parametrisation, best.theta), tried, cut_short
 
 
 # ---------------------------------------------------------------------- the stage
@@ -659,8 +642,8 @@ def fit_records(records: Sequence[Record], *, bench: Setup, start: Chain | None 
     """
     parametrisation = Parametrisation(bench=bench)
     windows, remarks = _open(records)
-    found = search(windows, parametrisation, given=start)
-    attempt, explained = found.best, found.best.follows
+    attempt, n_starts, cut_short = search(windows, parametrisation, given=start)
+    explained = attempt.follows
     windows = [_informed(attempt, index) for index in range(len(windows))]
     attempt = minimise_from(windows, parametrisation, attempt.theta, tolerance=_TOLERANCE)
     covariance = _covariance(attempt)
@@ -671,13 +654,11 @@ def fit_records(records: Sequence[Record], *, bench: Setup, start: Chain | None 
         covariance = _covariance(attempt)
     if not explained:
         remarks.insert(0, "no chain reproduces the recordings")
-    elif found.cut_short:
-        remarks.insert(
-            0, f"the search ended after {found.n_starts} starts; more might find a better fit"
-        )
+    elif cut_short:
+        remarks.insert(0, f"the search ended after {n_starts} starts; more might find a better fit")
     elif not attempt.converged:
         remarks.insert(0, "the search did not converge")
-    return _result(attempt, explained=explained, n_starts=found.n_starts, remarks=remarks)
+    return _result(attempt, explained=explained, n_starts=n_starts, remarks=remarks)
 
 
 def _open(records: Sequence[Record]) -> tuple[list[FitWindow], list[str]]:

@@ -19,15 +19,9 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError, PipelineError
+from pipeline.experiments import propose
 from pipeline.experiments.information import sampled_input
 from pipeline.experiments.plan import PlanLimits, Recording
-from pipeline.experiments.propose import (
-    FURTHEST,
-    current_plan,
-    release_by_hand,
-    rounded,
-    rounded_down,
-)
 from pipeline.gap.limits import CLOSE_BIC, THINNING
 from pipeline.gap.types import Gap, Prediction, Proposal
 from pipeline.plant.augmented import rest_positions, simulate_augmented
@@ -76,7 +70,7 @@ def propose_for(gap: Gap, submission: Submission, *, without: Sequence[Recording
     because plan.toml is broken, a note says why.
     """
     try:
-        return with_proposal(gap, limits=current_plan(submission).limits, without=without)
+        return with_proposal(gap, limits=propose.current_plan(submission).limits, without=without)
     except PipelineError as error:
         return replace(gap, notes=(*gap.notes, f"no recording is proposed: {error}"))
 
@@ -185,10 +179,10 @@ def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, f
     zero if no cart is released.
     """
     resonances = np.sort(np.abs(chain.poles)) / (2 * np.pi)
-    settle = rounded(settling_wait(chain, time_constants=SETTLED))
+    settle = propose.rounded(settling_wait(chain, time_constants=SETTLED))
     everyone = tuple(range(1, chain.n + 1))
     slow, low, high, fastest = (
-        rounded(float(f))
+        propose.rounded(float(f))
         for f in (
             1.5 / _TIME,
             0.5 * resonances[0],
@@ -198,14 +192,14 @@ def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, f
     )
     waves: tuple[tuple[Shape, TrialKind, float, float | None], ...] = (
         ("square", "step", slow, None),
-        ("square", "sweep", rounded(float(resonances[0])), None),
+        ("square", "sweep", propose.rounded(float(resonances[0])), None),
         ("triangle", "sweep", slow, None),
-        ("triangle", "sweep", rounded(float(resonances[0])), None),
+        ("triangle", "sweep", propose.rounded(float(resonances[0])), None),
         ("chirp", "sweep", low, high),
         # At high frequencies the carts move little, even with the motor's full input. This shows
         # delays, and laws that matter only for small motions.
         ("chirp", "sweep", high, fastest),
-        ("chirp", "sweep", rounded(float(np.sqrt(high * fastest))), fastest),
+        ("chirp", "sweep", propose.rounded(float(np.sqrt(high * fastest))), fastest),
     )
     for wave, kind, f, end in waves:
         whole = Recording(
@@ -222,18 +216,18 @@ def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, f
         )
         t, u = sampled_input(whole, period=_PERIOD)
         reach = float(np.max(np.abs(simulate_linear(chain, t, u))))
-        largest = min(FURTHEST * limits.travel / reach, limits.input)
+        largest = min(propose.FURTHEST * limits.travel / reach, limits.input)
         # Several sizes, because laws differ in how they grow with the motion.
         for size in (1.0, 0.5, 0.2):
             for sign in (1, -1) if wave == "square" else (1,):
-                amplitude = sign * rounded_down(size * largest)
+                amplitude = sign * propose.rounded_down(size * largest)
                 yield whole.model_copy(update={"amplitude": amplitude}), 0.0
     for cart in everyone:
         if chain.k[cart - 1] + chain.k[cart] <= 0:
             continue
         for share in (0.6, 0.2):  # shares of the travel limit, for a release by hand
-            height = rounded(share * limits.travel)
-            release = release_by_hand(cart, name=f"apart-decay-{cart}", seconds=_TIME)
+            height = propose.rounded(share * limits.travel)
+            release = propose.release_by_hand(cart, name=f"apart-decay-{cart}", seconds=_TIME)
             note = f"let go at {share:.0%} of the travel limit, {height:g} from the zero"
             yield release.model_copy(update={"note": note, "aim": "gap"}), height
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.errors import ConfigError, DataError
 from pipeline.estimation.parametrisation import named_estimates
+from pipeline.experiments import propose
 from pipeline.experiments.discriminate import far_sweep, propose_for
 from pipeline.experiments.information import GAP, ErrorGoal
 from pipeline.experiments.next_recordings import NextPlan, choose_next
@@ -22,14 +23,6 @@ from pipeline.experiments.plan import (
     save_plan,
     session_time,
     time_words,
-)
-from pipeline.experiments.propose import (
-    FIRST_SWEEP_TIME,
-    FURTHEST,
-    add_recording,
-    identified_chain,
-    large_steps,
-    propose_plan,
 )
 from pipeline.experiments.turn import (
     WORDS,
@@ -147,7 +140,7 @@ def _reach_far_out(analysis: Analysis, limits: PlanLimits) -> Iterator[tuple[Rec
     The first is a step to the furthest intended rest position; the second is a sweep with large
     swings to both sides. The reason is empty if earlier records already go about as far.
     """
-    chain = identified_chain(analysis)
+    chain = propose.identified_chain(analysis)
     driven = [record for record in analysis.records if record.kind in ("step", "sweep")]
     inputs = [float(np.abs(record.u).max()) for record in driven if record.u is not None]
     hardest = max(inputs, default=0.0)
@@ -155,13 +148,13 @@ def _reach_far_out(analysis: Analysis, limits: PlanLimits) -> Iterator[tuple[Rec
         max((float((side * y).max()) for record in driven for y in record.y), default=0.0)
         for side in (1, -1)
     )
-    step, swing = large_steps(chain, limits)[0], far_sweep(chain, limits)
+    step, swing = propose.large_steps(chain, limits)[0], far_sweep(chain, limits)
     unit = analysis.bench.units.input
     words = WORDS.text("far_step", most=f"{hardest:.2g}", unit=unit)
     yield step, words if hardest < _HARD * abs(step.amplitude) else ""
     unit = analysis.bench.units.position
     words = WORDS.text("far_swing", most=f"{furthest:.2g}", unit=unit)
-    yield swing, words if furthest < _HARD * FURTHEST * limits.travel else ""
+    yield swing, words if furthest < _HARD * propose.FURTHEST * limits.travel else ""
 
 
 # ---------------------------------------------------------------------- the exploration
@@ -262,7 +255,7 @@ class Exploration:
         self._check_goal(submission and submission.system)
         known = submission is not None and bool(submission.experiments)
         planned = submission is not None and plan_path(submission).exists()
-        first = FIRST_SWEEP_TIME
+        first = propose.FIRST_SWEEP_TIME
         if submission and planned:
             plan = load_plan(submission)
             self.ours.update(one.id for one in plan.recordings)
@@ -275,7 +268,7 @@ class Exploration:
                 )
             self._record([_FIRST])
         submission = load_submission(self.folder)
-        usual = propose_plan(submission)
+        usual = propose.propose_plan(submission)
         if not plan_path(submission).exists():
             save_plan(usual, submission)
         if not planned:
@@ -394,7 +387,7 @@ class Exploration:
         still, planned = self._unrecorded(), []
         for recording in recordings:
             same = (o for o in still if o.aim == recording.aim and _shape(o) == _shape(recording))
-            planned.append(next(same, None) or add_recording(self.folder, recording))
+            planned.append(next(same, None) or propose.add_recording(self.folder, recording))
             still = [one for one in still if one.id != planned[-1].id]
         key = "therefore" if len(planned) == 1 else "therefore_these"
         names = listing([one.id for one in planned])

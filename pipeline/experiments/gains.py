@@ -7,8 +7,9 @@ the loop is simulated as the bench will run it, before any gain is sent.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
-from typing import Any, Self, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -17,16 +18,8 @@ from pipeline.errors import DataError
 from pipeline.estimation.state_feedback import stays_stable
 from pipeline.experiments.plan import PidLoop, PlanLimits, Recording, StateLoop
 from pipeline.identify.recording_checks import is_reversed
-from pipeline.plant import simulate
+from pipeline.plant import sampled_loop, simulate
 from pipeline.plant.chain import Chain
-from pipeline.plant.sampled_loop import (
-    Controller,
-    LoopSetup,
-    Pid,
-    StateFeedback,
-    discretise,
-    simulate_loop,
-)
 from pipeline.protocol import FULL_SCALE, Description, PidGains, StateGains
 from pipeline.results import Analysis, FeedbackDesign
 from pipeline.submission import Design, Submission
@@ -79,82 +72,6 @@ def bench_scales(submission: Submission, *, bench: Description, analysis: Analys
     )
 
 
-def bench_gains(
-    recording: Recording,
-    *,
-    submission: Submission,
-    analysis: Analysis,
-    bench: Description,
-    limits: PlanLimits,
-) -> StateGains | PidGains:
-    """Return the gains to send to the bench before a closed-loop recording.
-
-    Errors do not name the recording; the caller adds its name.
-
-    Raises
-    ------
-    DataError : the carts are not identified, or the loop on the bench would be unstable, pass a
-        limit, or miss its design goal.
-    """
-    trial = _Trial.of(
-        recording, submission=submission, analysis=analysis, bench=bench, limits=limits
-    )
-    loop, per_count = recording.controller, trial.scales.position / trial.scales.input
-    if isinstance(loop, PidLoop):
-        trial.refuse_pid(loop)
-        return PidGains(kp=loop.kp, ki=loop.ki, kd=loop.kd)
-    if loop is None:
-        raise DataError("it has no controller")
-    law = _law(loop, analysis.feedback)
-    goal = None if loop.gains else submission.design or Design(cart=loop.cart)
-    trial.refuse_state(law, cart=loop.cart, goal=goal, design=analysis.feedback)
-    spare = [0.0] * (2 * (bench.encoders - trial.chain.n))  # zero gains for encoders without a cart
-    return StateGains(
-        gains=(*(per_count * law.gains).tolist(), *spare), prefilter=per_count * law.prefilter
-    )
-
-
-def propose_pid(
-    recording: Recording,
-    *,
-    submission: Submission,
-    analysis: Analysis,
-    bench: Description,
-    limits: PlanLimits,
-) -> PidLoop:
-    """Return PID gains on cart 1 for a bench without state feedback.
-
-    The gains add stiffness and damping, and bring the cart to the reference. On a cart without the
-    motor, a PID soon becomes unstable; on the driven cart it hardly ever does.
-
-    Raises
-    ------
-    DataError : the carts are not identified, or all gains tried are unstable or pass a limit.
-    """
-    trial = _Trial.of(
-        recording, submission=submission, analysis=analysis, bench=bench, limits=limits
-    )
-    chain, counts = trial.chain, trial.scales.position / trial.scales.input
-    stiffness, slowest = 1 / chain.static_gains()[0], float(np.min(np.abs(chain.poles)))
-    refused = ""
-    for damped, share in product((True, False), _PID_SHARES):
-        kp = share * stiffness
-        # This gives a damping ratio of 0.5, with all carts as one mass.
-        damping = 2 * 0.5 * float(np.sqrt((stiffness + kp) * chain.m.sum()))
-        loop = PidLoop(
-            kp=rounded(counts * kp),
-            ki=rounded(counts * kp * slowest * 0.25),  # slower than any pole
-            kd=rounded(counts * damping) if damped else 0.0,
-        )
-        try:
-            trial.refuse_pid(loop)
-        except DataError as error:
-            refused = str(error)
-        else:
-            return loop
-    raise DataError(f"no PID is proposed: {refused}")
-
-
 def controller_table(
     gains: StateGains | PidGains, *, cart: int, scales: CountScales, carts: int
 ) -> Table:
@@ -182,10 +99,10 @@ def rounded(value: float) -> float:
     return float(f"{value:.2g}")
 
 
-def _law(loop: StateLoop, design: FeedbackDesign | None) -> StateFeedback:
+def _law(loop: StateLoop, design: FeedbackDesign | None) -> sampled_loop.StateFeedback:
     """Return the gains for the bench: those in the plan or, if none are stated, the design's."""
     if loop.gains and loop.prefilter is not None:
-        return StateFeedback(gains=np.array(loop.gains), prefilter=loop.prefilter)
+        return sampled_loop.StateFeedback(gains=np.array(loop.gains), prefilter=loop.prefilter)
     if design is None:
         raise DataError("there is no controller to run; `cartlab report` says why")
     if design.cart != loop.cart:
@@ -193,49 +110,101 @@ def _law(loop: StateLoop, design: FeedbackDesign | None) -> StateFeedback:
             f"the controller is designed for cart {design.cart}, but the plan has cart "
             f"{loop.cart}: change one, or state the gains"
         )
-    return StateFeedback(gains=design.gains, prefilter=design.prefilter)
+    return sampled_loop.StateFeedback(gains=design.gains, prefilter=design.prefilter)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Trial:
+class LoopTrial:
     """The step of a recording, simulated on the identified carts as the bench will run it."""
 
     recording: Recording
-    chain: Chain
-    period: float
-    scales: CountScales
+    submission: Submission
+    analysis: Analysis
+    bench: Description
     limits: PlanLimits
 
-    @classmethod
-    def of(
-        cls,
-        recording: Recording,
-        *,
-        submission: Submission,
-        analysis: Analysis,
-        bench: Description,
-        limits: PlanLimits,
-    ) -> Self:
-        fit = analysis.fit
+    @cached_property
+    def chain(self) -> Chain:
+        """The identified carts."""
+        fit = self.analysis.fit
         if fit is None or not fit.converged:
             raise DataError("a closed loop needs identified carts")
-        return cls(
-            recording=recording,
-            chain=fit.chain,
-            period=bench.period,
-            scales=bench_scales(submission, bench=bench, analysis=analysis),
-            limits=limits,
+        return fit.chain
+
+    @cached_property
+    def scales(self) -> CountScales:
+        """What a count is worth."""
+        return bench_scales(self.submission, bench=self.bench, analysis=self.analysis)
+
+    def gains(self) -> StateGains | PidGains:
+        """Return the gains to send to the bench before a closed-loop recording.
+
+        Errors do not name the recording; the caller adds its name.
+
+        Raises
+        ------
+        DataError : the carts are not identified, or the loop on the bench would be unstable, pass a
+            limit, or miss its design goal.
+        """
+        n, loop, design = self.chain.n, self.recording.controller, self.analysis.feedback
+        per_count = self.scales.position / self.scales.input
+        if isinstance(loop, PidLoop):
+            self._refuse_pid(loop)
+            return PidGains(kp=loop.kp, ki=loop.ki, kd=loop.kd)
+        if loop is None:
+            raise DataError("it has no controller")
+        law = _law(loop, design)
+        goal = None if loop.gains else self.submission.design or Design(cart=loop.cart)
+        self._refuse_state(law, cart=loop.cart, goal=goal, design=design)
+        spare = [0.0] * (2 * (self.bench.encoders - n))  # zero gains for encoders without a cart
+        return StateGains(
+            gains=(*(per_count * law.gains).tolist(), *spare), prefilter=per_count * law.prefilter
         )
 
-    def refuse_state(
-        self, law: StateFeedback, *, cart: int, goal: Design | None, design: FeedbackDesign | None
+    def propose_pid(self) -> PidLoop:
+        """Return PID gains on cart 1 for a bench without state feedback.
+
+        The gains add stiffness and damping, and bring the cart to the reference. On a cart without
+        the motor, a PID soon becomes unstable; on the driven cart it hardly ever does.
+
+        Raises
+        ------
+        DataError : the carts are not identified, or all gains tried are unstable or pass a limit.
+        """
+        chain, counts = self.chain, self.scales.position / self.scales.input
+        stiffness, slowest = 1 / chain.static_gains()[0], float(np.min(np.abs(chain.poles)))
+        refused = ""
+        for damped, share in product((True, False), _PID_SHARES):
+            kp = share * stiffness
+            # This gives a damping ratio of 0.5, with all carts as one mass.
+            damping = 2 * 0.5 * float(np.sqrt((stiffness + kp) * chain.m.sum()))
+            loop = PidLoop(
+                kp=rounded(counts * kp),
+                ki=rounded(counts * kp * slowest * 0.25),  # slower than any pole
+                kd=rounded(counts * damping) if damped else 0.0,
+            )
+            try:
+                self._refuse_pid(loop)
+            except DataError as error:
+                refused = str(error)
+            else:
+                return loop
+        raise DataError(f"no PID is proposed: {refused}")
+
+    def _refuse_state(
+        self,
+        law: sampled_loop.StateFeedback,
+        *,
+        cart: int,
+        goal: Design | None,
+        design: FeedbackDesign | None,
     ) -> None:
         """Raise DataError if the loop is unstable, passes a limit or misses its goal."""
         reference = self.recording.amplitude
-        if not stays_stable(self.chain, law, sample_time=self.period):
+        if not stays_stable(self.chain, law, sample_time=self.bench.period):
             raise DataError(
                 f"with these gains the loop may be unstable at the bench's period of "
-                f"{1e3 * self.period:g} ms{self._advice(goal)}"
+                f"{1e3 * self.bench.period:g} ms{self._advice(goal)}"
             )
         t, x = self._step(law, delay=1)
         if goal is None or design is None:
@@ -255,18 +224,20 @@ class _Trial:
                 f"{self._advice(goal)}"
             )
 
-    def refuse_pid(self, loop: PidLoop) -> None:
+    def _refuse_pid(self, loop: PidLoop) -> None:
         """Raise DataError if the loop is unstable or passes a limit."""
         if loop.cart > self.chain.n:
             raise DataError(f"there is no cart {loop.cart} to control")
-        law = Pid(
+        law = sampled_loop.Pid(
             kp=loop.kp,
             ki=loop.ki,
             kd=loop.kd,
             scale=self.scales.input / self.scales.position,
             cart=loop.cart,
         )
-        radius = np.abs(np.linalg.eigvals(_pid_matrix(self.chain, law, period=self.period))).max()
+        radius = np.abs(
+            np.linalg.eigvals(_pid_matrix(self.chain, law, period=self.bench.period))
+        ).max()
         if radius >= 1.0:
             raise DataError(
                 f"with kp = {loop.kp:g}, ki = {loop.ki:g}, kd = {loop.kd:g} "
@@ -277,22 +248,22 @@ class _Trial:
     def _advice(self, goal: Design | None) -> str:
         if goal is None:
             return ""
-        return f": set design.sample_time = {self.period:g} in submission.toml"
+        return f": set design.sample_time = {self.bench.period:g} in submission.toml"
 
-    def _step(self, law: Controller, *, delay: int) -> tuple[Array, Array]:
+    def _step(self, law: sampled_loop.Controller, *, delay: int) -> tuple[Array, Array]:
         """Return t (n,) and positions (n_carts, n) of the step.
 
         A step that passes a limit is refused.
         """
         run = self.recording
         seconds = min(run.duration, 10.0)  # s of the step to simulate
-        motion = simulate_loop(
+        motion = sampled_loop.simulate_loop(
             self.chain,
             law,
-            t=np.arange(0.0, seconds, self.period),
+            t=np.arange(0.0, seconds, self.bench.period),
             reference=run.amplitude,
-            setup=LoopSetup(
-                sample_time=self.period,
+            setup=sampled_loop.LoopSetup(
+                sample_time=self.bench.period,
                 delay=delay,
                 input_limit=FULL_SCALE * abs(self.scales.input),
                 encoder_step=self.scales.position,
@@ -312,12 +283,12 @@ class _Trial:
         return motion.t, motion.x
 
 
-def _pid_matrix(chain: Chain, pid: Pid, *, period: float) -> Array:
+def _pid_matrix(chain: Chain, pid: sampled_loop.Pid, *, period: float) -> Array:
     """Return the matrix that takes (state, ∫e, last e) to the next sample, without reference.
 
     If ki is zero, the integral is left out: it has no effect, but would add an eigenvalue of 1.
     """
-    phi, gamma = discretise(chain, period)
+    phi, gamma = sampled_loop.discretise(chain, period)
     row = np.zeros(gamma.size)
     row[2 * (pid.cart - 1)] = 1.0
     on_error = pid.kp + pid.ki * period + pid.kd / period

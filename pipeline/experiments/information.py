@@ -3,10 +3,11 @@
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal, Self
+from typing import Literal, Self, TypeAlias
 
 import numpy as np
 
+from pipeline import results
 from pipeline.arrays import Array
 from pipeline.errors import ConfigError, DataError
 from pipeline.estimation.bode_fit import Points, response_at, weighted_residuals
@@ -24,14 +25,6 @@ from pipeline.plant.chain import Chain
 from pipeline.plant.sampled_loop import LoopSetup, simulate_loop
 from pipeline.plant.simulate import SETTLED_DWELL, settling_wait, simulate_linear
 from pipeline.protocol import Start, Tone, Wave, shape_at
-from pipeline.results import (
-    Analysis,
-    ChainFit,
-    FeedbackDesign,
-    FrequencyResponse,
-    Record,
-    SinePoint,
-)
 from pipeline.submission.toml import nearest
 
 # ------------------------------------------------------------------- the information of a record
@@ -75,11 +68,11 @@ class FisherInformation:
     noise: Array
     sample_time: float
     beyond: float = 1.0
-    dwells: tuple[SinePoint, ...] = ()
+    dwells: tuple[results.SinePoint, ...] = ()
     misfit: float = 0.0
 
     @classmethod
-    def of(cls, analysis: Analysis) -> Self:
+    def of(cls, analysis: results.Analysis) -> Self:
         """Return the information in the records of a submission.
 
         Raises
@@ -153,7 +146,7 @@ class FisherInformation:
         """Return H and S (2, n_p, n_p) of a recording with all carts free, starting from rest."""
         if recording.kind == "sine":
             return self._of_dwell(recording)
-        t, u = self.input(recording)
+        t, u = sampled_input(recording, period=self.sample_time)
         sigma = np.hypot(self.step / np.sqrt(12), self.noise)
         window = FitWindow(
             id=recording.id,
@@ -232,10 +225,10 @@ class FisherInformation:
         H = samples * np.einsum("cwp,cwq->wpq", np.conj(dG), dG).real
         return np.stack([H, self.beyond * H], axis=1)
 
-    def _response(self, omega: Array, carts: Iterable[int]) -> list[FrequencyResponse]:
+    def _response(self, omega: Array, carts: Iterable[int]) -> list[results.FrequencyResponse]:
         G = self.chain.frequency_response(omega)
         return [
-            FrequencyResponse(
+            results.FrequencyResponse(
                 cart=cart,
                 omega=omega,
                 magnitude=np.abs(G[cart - 1]),
@@ -247,13 +240,9 @@ class FisherInformation:
             for cart in carts
         ]
 
-    def input(self, recording: Recording) -> tuple[Array, Array]:
-        """Return the bench's sample times (n,) in s, and the input (n,) at unit amplitude."""
-        return sampled_input(recording, period=self.sample_time)
-
     def at_its_limits(self, recording: Recording, *, limits: PlanLimits, share: float) -> float:
         """Return the largest amplitude within the input limit and this `share` of the travel."""
-        t, u = self.input(recording)
+        t, u = sampled_input(recording, period=self.sample_time)
         x = simulate_linear(self.chain, t, u, free=recording.carts)
         return min(share * limits.travel / float(np.max(np.abs(x))), limits.input)
 
@@ -281,7 +270,7 @@ def _sampled(
     return t, u
 
 
-def _fitted_records(analysis: Analysis, fit: ChainFit) -> list[Record]:
+def _fitted_records(analysis: results.Analysis, fit: results.ChainFit) -> list[results.Record]:
     """Return the records used in the fit.
 
     Raises
@@ -304,7 +293,7 @@ def _fitted_records(analysis: Analysis, fit: ChainFit) -> list[Record]:
 
 
 def _median_by_cart(
-    runs: Sequence[Record] | Sequence[FitWindow], values: Sequence[Array], *, n: int
+    runs: Sequence[results.Record] | Sequence[FitWindow], values: Sequence[Array], *, n: int
 ) -> Array:
     """Return each cart's median (n,) of a value over the runs in which it was measured."""
     found = [
@@ -322,6 +311,13 @@ def _median_by_cart(
 
 GAP = "gap"  # the goal of distinguishing the explanations of a gap
 DESIGN, WORST, MEAN, VOLUME = "design", "worst", "mean", "volume"
+Mean: TypeAlias = Literal["largest", "root mean square", "volume"]
+# The goals that concern all parameters: words, and how their errors become one number.
+_OVER_ALL: dict[str, tuple[str, Mean]] = {
+    WORST: ("the error of the least known parameter", "largest"),
+    MEAN: ("the mean error of all parameters", "root mean square"),
+    VOLUME: ("the mean error of masses, damping coefficients and stiffnesses", "volume"),
+}
 _STEP = 1e-4  # relative change of a parameter for a numerical derivative
 
 
@@ -343,7 +339,7 @@ class Goal:
     name: str
     words: str
     rows: Array
-    mean: Literal["largest", "root mean square", "volume"] = "largest"
+    mean: Mean = "largest"
 
     def of(self, information: Array) -> Array:
         """Return the error (…,) for the matrices H and S (…, 2, n_p, n_p); inf if unbounded."""
@@ -380,7 +376,9 @@ def check_goal(name: str, *, names: Sequence[str]) -> None:
         raise ConfigError(f"--for {name}: there is no such parameter or goal{nearest(name, goals)}")
 
 
-def find_goal(name: str, known: FisherInformation, *, feedback: FeedbackDesign | None) -> Goal:
+def find_goal(
+    name: str, known: FisherInformation, *, feedback: results.FeedbackDesign | None
+) -> Goal:
     """Return the goal with this name: a parameter, "design", "worst", "mean" or "volume".
 
     Raises
@@ -390,19 +388,9 @@ def find_goal(name: str, known: FisherInformation, *, feedback: FeedbackDesign |
     """
     values, rows = known.chain.parameters(), known.by_parameters()
     check_goal(name, names=[*values])
-    if name == WORST:
-        return Goal(name=name, words="the error of the least known parameter", rows=rows)
-    if name == MEAN:
-        return Goal(
-            name=name, words="the mean error of all parameters", rows=rows, mean="root mean square"
-        )
-    if name == VOLUME:
-        return Goal(
-            name=name,
-            words="the mean error of masses, damping coefficients and stiffnesses",
-            rows=rows,
-            mean="volume",
-        )
+    if name in _OVER_ALL:
+        words, mean = _OVER_ALL[name]
+        return Goal(name=name, words=words, rows=rows, mean=mean)
     if name == DESIGN:
         if feedback is None:
             raise DataError("--for design: no controller is designed: add a [design] table first")
@@ -412,7 +400,7 @@ def find_goal(name: str, known: FisherInformation, *, feedback: FeedbackDesign |
     return Goal(name=name, words=f"the error of {name}", rows=rows[at : at + 1])
 
 
-def _by_overshoot(known: FisherInformation, feedback: FeedbackDesign) -> Array:
+def _by_overshoot(known: FisherInformation, feedback: results.FeedbackDesign) -> Array:
     """Return the derivatives (1, n_p) of the loop's peak with respect to the parameters.
 
     The parameters change by shares of their values, and the peak is a share of the step. The

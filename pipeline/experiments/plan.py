@@ -14,19 +14,8 @@ from pipeline.errors import ConfigError
 from pipeline.lock import lock_when_free
 from pipeline.output import write_file
 from pipeline.protocol import FREQUENCIES, MOST_TONES, Tone
-from pipeline.submission import Submission, System, load_submission
+from pipeline.submission import Submission, System, load_submission, toml
 from pipeline.submission.models import TomlTable
-from pipeline.submission.toml import (
-    Location,
-    dotted,
-    explain,
-    list_faults,
-    parse_toml,
-    quote,
-    read_text,
-    relevant_errors,
-    toml_section,
-)
 from pipeline.words.numbers import count
 
 # ----------------------------------------------------------- recordings, limits, and their words
@@ -286,7 +275,7 @@ def load_plan(submission: Submission) -> Plan:
     where = f"{submission.folder.resolve().name}/{NAME}"
     if path.is_symlink():
         raise ConfigError(f"{where}: is a link; put the file itself there")
-    text = read_text(path, where=where, limit=1_000_000, error=ConfigError)
+    text = toml.read_text(path, where=where, limit=1_000_000, error=ConfigError)
     return _parse(text, where=where, system=submission.system)
 
 
@@ -362,8 +351,8 @@ def plan_text(plan: Plan, system: System) -> str:
     return "\n".join(
         [
             _HEAD.format(**units),
-            toml_section("", {"version": plan.version, "baud": plan.baud}),
-            _CHECK.format(**units) + toml_section("[limits]", plan.limits.model_dump()),
+            toml.toml_section("", {"version": plan.version, "baud": plan.baud}),
+            _CHECK.format(**units) + toml.toml_section("[limits]", plan.limits.model_dump()),
             *(_recording_text(recording) for recording in plan.recordings),
         ]
     )
@@ -373,30 +362,32 @@ def _recording_text(recording: Recording) -> str:
     entries = recording.model_dump(mode="json", exclude_defaults=True)
     if recording.controller is not None:
         entries["controller"]["type"] = recording.controller.type
-    return toml_section("[[recordings]]", entries)
+    return toml.toml_section("[[recordings]]", entries)
 
 
 # ----------------------------------------------------------------------- reading
 
 
 def _parse(text: str, *, where: str, system: System) -> Plan:
-    document = parse_toml(text, where=where, error=ConfigError, root=Plan)
+    document = toml.parse_toml(text, where=where, error=ConfigError, root=Plan)
     try:
         plan = Plan.model_validate(document, strict=True)
     except ValidationError as error:
-        problems = [explain(e, document, root=Plan) for e in relevant_errors(error.errors())]
+        problems = [
+            toml.explain(e, document, root=Plan) for e in toml.relevant_errors(error.errors())
+        ]
     else:
         found = list(_problems(plan, system))
-        problems = [f"{dotted(at, document)}: {what}" for at, what in found]
+        problems = [f"{toml.dotted(at, document)}: {what}" for at, what in found]
         if not problems:
             return plan
-    raise ConfigError(list_faults(where, problems))
+    raise ConfigError(toml.list_faults(where, problems))
 
 
 # ------------------------------------------------- consistency of several keys
 
 
-def _problems(plan: Plan, system: System) -> Iterator[tuple[Location, str]]:
+def _problems(plan: Plan, system: System) -> Iterator[tuple[toml.Location, str]]:
     """Yield (location, problem) for problems that involve several values."""
     first: dict[str, int] = {}
     for i, recording in enumerate(plan.recordings):
@@ -415,7 +406,7 @@ def recording_problems(
     n, carts, wave = system.carts, recording.carts, recording.wave
     if not _ID.fullmatch(recording.id):
         wanted = "letters, digits, dots, dashes; its data files are named after it"
-        yield "id", f"expected {wanted}, found {quote(recording.id)}"
+        yield "id", f"expected {wanted}, found {toml.quote(recording.id)}"
     if not carts or len(set(carts)) < len(carts) or not all(1 <= cart <= n for cart in carts):
         yield "carts", f"expected some of the carts 1 to {n}, each once, found {list(carts)}"
     if recording.release is not None and recording.release not in carts:

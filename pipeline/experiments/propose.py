@@ -14,7 +14,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from pipeline.errors import ConfigError, DataError
-from pipeline.experiments.gains import propose_pid, rounded
+from pipeline.experiments.gains import LoopTrial, rounded
 from pipeline.experiments.plan import (
     Plan,
     PlanLimits,
@@ -27,15 +27,8 @@ from pipeline.experiments.plan import (
     renamed,
 )
 from pipeline.ingest.read import DUTY_COUNT
+from pipeline.plant import simulate
 from pipeline.plant.chain import Chain
-from pipeline.plant.simulate import (
-    SETTLED,
-    SETTLED_DWELL,
-    dwell_frequencies,
-    largest_motion,
-    settling_wait,
-    steady_time,
-)
 from pipeline.protocol import CHIRP_SPAN, FREQUENCIES, FULL_SCALE, Description
 from pipeline.results import Analysis, Stage
 from pipeline.submission import Design, Submission, System, load_submission
@@ -126,7 +119,12 @@ def propose_plan(submission: Submission, *, bench: Description | None = None) ->
         if not any(e.kind == "decay" and e.carts == (cart,) for e in recorded):
             proposed += _decays(cart, system)
     if system.bench.tied and not kinds & {"step", "sine", "bode"}:
-        proposed += _first_steps(system, limits)
+        proposed += _steps(
+            [sign * _FIRST_STEP * limits.input for sign in (1, -1)],
+            carts=system.carts,
+            edge=5.0,  # s between edges of the first steps
+            settle=_FIRST_SETTLE,
+        )
     if not kinds & {"sweep", "sine", "bode"}:
         proposed.append(_sweep(system, limits, chirps=bench is None or "c" in bench.commands))
     recordings = renamed(proposed, taken=[e.id for e in recorded])
@@ -229,15 +227,6 @@ def release_by_hand(cart: int, *, name: str, seconds: float) -> Recording:
     )
 
 
-def _first_steps(system: System, limits: PlanLimits) -> list[Recording]:
-    return _steps(
-        [sign * _FIRST_STEP * limits.input for sign in (1, -1)],
-        carts=system.carts,
-        edge=5.0,  # s between edges of the first steps
-        settle=_FIRST_SETTLE,
-    )
-
-
 def _steps(
     amplitudes: Sequence[float], *, carts: int, edge: float, settle: float
 ) -> list[Recording]:
@@ -303,7 +292,7 @@ def _reason(analysis: Analysis, *stages: Stage) -> str:
 
 def large_steps(chain: Chain, limits: PlanLimits) -> list[Recording]:
     """Return steps in both directions, as large as intended or as the input limit allows."""
-    settle = rounded(settling_wait(chain, time_constants=SETTLED))
+    settle = rounded(simulate.settling_wait(chain, time_constants=simulate.SETTLED))
     hold = AIM * limits.travel / float(np.max(np.abs(chain.static_gains())))
     size = min(_STEP * hold, limits.input)
     return _steps([size, -size], carts=chain.n, edge=settle, settle=settle)
@@ -312,13 +301,13 @@ def large_steps(chain: Chain, limits: PlanLimits) -> list[Recording]:
 def _driven(chain: Chain, limits: PlanLimits) -> list[Recording]:
     """Return steps and dwells in which the carts move as far as intended."""
     aim, furthest = AIM * limits.travel, FURTHEST * limits.travel
-    settle = rounded(settling_wait(chain, time_constants=SETTLED))
+    settle = rounded(simulate.settling_wait(chain, time_constants=simulate.SETTLED))
     recordings = large_steps(chain, limits)
-    wait = settling_wait(chain, time_constants=SETTLED_DWELL)
-    for number, hertz in enumerate(dwell_frequencies(chain, n=_DWELLS), start=1):
-        cycles = ceil(hertz * (wait + steady_time(hertz)))
+    wait = simulate.settling_wait(chain, time_constants=simulate.SETTLED_DWELL)
+    for number, hertz in enumerate(simulate.dwell_frequencies(chain, n=_DWELLS), start=1):
+        cycles = ceil(hertz * (wait + simulate.steady_time(hertz)))
         t = np.arange(0.0, cycles / hertz, min(0.005, 1 / (40 * hertz)))
-        unit = largest_motion(chain, t, shape=np.sin(2 * np.pi * hertz * t), wait=wait)
+        unit = simulate.largest_motion(chain, t, shape=np.sin(2 * np.pi * hertz * t), wait=wait)
         amplitude = min(aim / unit.steady, furthest / unit.furthest, limits.input)
         recordings.append(
             Recording(
@@ -365,14 +354,16 @@ def _loop(
         frequency=rounded_down(0.5 / edge),
         cycles=EDGES // 2,
         controller=StateLoop(cart=feedback.cart),
-        settle=rounded(settling_wait(identified_chain(analysis), time_constants=SETTLED)),
+        settle=rounded(
+            simulate.settling_wait(identified_chain(analysis), time_constants=simulate.SETTLED)
+        ),
     )
     if bench is None or "f" in bench.commands:
         return recording
-    pid = propose_pid(
-        recording, submission=submission, analysis=analysis, bench=bench, limits=limits
+    trial = LoopTrial(
+        recording=recording, submission=submission, analysis=analysis, bench=bench, limits=limits
     )
-    return recording.model_copy(update={"controller": pid})
+    return recording.model_copy(update={"controller": trial.propose_pid()})
 
 
 def rounded_down(value: float) -> float:

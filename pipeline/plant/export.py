@@ -18,20 +18,9 @@ import numpy as np
 
 from pipeline import __version__
 from pipeline.errors import DataError
+from pipeline.plant import effect
 from pipeline.plant.augmented import SteppedBench, rest_positions
 from pipeline.plant.chain import Chain
-from pipeline.plant.effect import (
-    AugmentedChain,
-    BuiltLaw,
-    ContactLaw,
-    EffectTerm,
-    ForceLaw,
-    FrictionLaw,
-    HysteresisLaw,
-    InputLaw,
-    input_steps,
-    names_in,
-)
 from pipeline.plant.simulator.laws import hysteresis
 from pipeline.resources import TEMPLATES
 from pipeline.setup import Units
@@ -266,7 +255,7 @@ class SpringTension:
     @property
     def needs_rate(self) -> bool:
         """Whether a part of the tension is a damper."""
-        return any(part.rate or "rate" in names_in(part.force) for part in self.tension)
+        return any(part.rate or "rate" in effect.names_in(part.force) for part in self.tension)
 
 
 @dataclass(frozen=True)
@@ -358,7 +347,7 @@ class Description:
 
 
 def describe(
-    model: AugmentedChain,
+    model: effect.AugmentedChain,
     *,
     units: Units,
     free: Collection[int] | None = None,
@@ -377,11 +366,11 @@ def describe(
     """
     chain, terms = model.chain, model.terms
     _refuse_lead(terms)
-    by_law: dict[type, list[EffectTerm]] = {}
+    by_law: dict[type, list[effect.EffectTerm]] = {}
     for term in terms:
         by_law.setdefault(type(term.effect.law), []).append(term)
     built = {
-        kind: [term for term in by_law.get(BuiltLaw, []) if term.effect.is_built(kind)]
+        kind: [term for term in by_law.get(effect.BuiltLaw, []) if term.effect.is_built(kind)]
         for kind in ("hidden mass", "play", "delay", "lag", "reading")
     }
     play = None
@@ -403,7 +392,7 @@ def describe(
         frictions=tuple(
             Force(_title(term), _law(term, term.effect.law.size), f"cart_{term.place}")
             for term in terms
-            if isinstance(term.effect.law, FrictionLaw)
+            if isinstance(term.effect.law, effect.FrictionLaw)
         ),
         bristles=tuple(
             Bristle(
@@ -414,12 +403,12 @@ def describe(
                 _law(term, term.effect.law.rate),
             )
             for term in terms
-            if isinstance(term.effect.law, HysteresisLaw)
+            if isinstance(term.effect.law, effect.HysteresisLaw)
         ),
         inputs=tuple(
             (_title(term), _law(term, term.effect.law.arrives))
-            for term in input_steps(terms)
-            if isinstance(term.effect.law, InputLaw)
+            for term in effect.input_steps(terms)
+            if isinstance(term.effect.law, effect.InputLaw)
         ),
         delay=_names(built["delay"][0])[0] if built["delay"] else "",
         lag=_names(built["lag"][0])[0] if built["lag"] else "",
@@ -430,7 +419,7 @@ def describe(
     )
 
 
-def _refuse_lead(terms: Sequence[EffectTerm]) -> None:
+def _refuse_lead(terms: Sequence[effect.EffectTerm]) -> None:
     """Refuse a model whose motor acts before its logged input.
 
     Raises
@@ -445,22 +434,22 @@ def _refuse_lead(terms: Sequence[EffectTerm]) -> None:
             )
 
 
-def _title(term: EffectTerm) -> str:
+def _title(term: effect.EffectTerm) -> str:
     at = f", {term.effect.place} {term.place}" if term.place else ""
     return f"{term.effect.title}{at}"
 
 
-def _names(term: EffectTerm) -> list[str]:
+def _names(term: effect.EffectTerm) -> list[str]:
     """Return the parameters of an effect as expressions, in the effect's order."""
     return [f"p.{_name(term, parameter)}" for parameter in term.effect.names]
 
 
-def _name(term: EffectTerm, parameter: str) -> str:
+def _name(term: effect.EffectTerm, parameter: str) -> str:
     at = f"_{term.place}" if term.place else ""
     return f"{term.effect.key}{at}_{parameter}"
 
 
-def _law(term: EffectTerm, text: str, **quantities: str) -> str:
+def _law(term: effect.EffectTerm, text: str, **quantities: str) -> str:
     """Return the expression of an effect's law, with the model's names of bodies and states."""
     place = f"cart_{term.place or 1}"
     known = {"x": f"x.{place}", "v": f"v.{place}", **quantities}
@@ -471,7 +460,7 @@ def _law(term: EffectTerm, text: str, **quantities: str) -> str:
 
 
 def _parameters(
-    chain: Chain, terms: Sequence[EffectTerm], units: Units, free: Sequence[int]
+    chain: Chain, terms: Sequence[effect.EffectTerm], units: Units, free: Sequence[int]
 ) -> list[Parameter]:
     return [
         *(Parameter(f"m{i}", chain.m[i - 1], units.mass, f"mass of cart {i}") for i in free),
@@ -493,7 +482,9 @@ def _parameters(
     ]
 
 
-def _acting_springs(chain: Chain, terms: Sequence[EffectTerm], free: Sequence[int]) -> list[int]:
+def _acting_springs(
+    chain: Chain, terms: Sequence[effect.EffectTerm], free: Sequence[int]
+) -> list[int]:
     """Return the springs that touch a free cart."""
     changed = {term.place for term in terms if term.effect.place == "spring"}
     there = (j for j, k in enumerate(chain.k, start=1) if k != 0.0 or j in changed)
@@ -507,7 +498,7 @@ def _between(j: int, n: int) -> str:
 
 
 def _bodies(
-    chain: Chain, built: Mapping[str, list[EffectTerm]], free: Sequence[int]
+    chain: Chain, built: Mapping[str, list[effect.EffectTerm]], free: Sequence[int]
 ) -> tuple[Body, ...]:
     carts = [
         Body(f"cart_{i}", f"cart {i}", f"{i}", f"p.m{i}", i - 1)
@@ -528,7 +519,7 @@ def _bodies(
 
 
 def _springs(
-    chain: Chain, terms: Sequence[EffectTerm], free: Sequence[int]
+    chain: Chain, terms: Sequence[effect.EffectTerm], free: Sequence[int]
 ) -> tuple[SpringTension, ...]:
     springs = []
     for j in _acting_springs(chain, terms, free):
@@ -537,9 +528,9 @@ def _springs(
         parts = [Force("", f"p.k{j} * d")]
         for term in here:
             law = term.effect.law
-            if isinstance(law, ForceLaw | ContactLaw):
+            if isinstance(law, effect.ForceLaw | effect.ContactLaw):
                 part = Force(_title(term), _law(term, law.force))
-                if isinstance(law, ContactLaw):
+                if isinstance(law, effect.ContactLaw):
                     side = _law(term, law.past)
                     part = replace(part, side=side, depth=f"d - {side}", rate="rate")
                 parts.append(part)
@@ -556,17 +547,19 @@ def _difference(letter: str, left: str, right: str) -> str:
     return f"{letter}.{right} - {letter}.{left}"
 
 
-def _forces(terms: Sequence[EffectTerm], *, driven: str, free: Sequence[int]) -> tuple[Force, ...]:
+def _forces(
+    terms: Sequence[effect.EffectTerm], *, driven: str, free: Sequence[int]
+) -> tuple[Force, ...]:
     forces = [Force("", f"-p.c{i} * v.cart_{i}", f"cart_{i}") for i in free]
     for term in terms:
         law, body = term.effect.law, f"cart_{term.place or 1}"
         if term.effect.place == "spring":
             continue
-        if isinstance(law, ForceLaw):
+        if isinstance(law, effect.ForceLaw):
             body = driven if law.on_motor else body
             moved = {"x": f"x.{body}", "v": f"v.{body}"}
             forces.append(Force(_title(term), _law(term, law.force, **moved), body))
-        elif isinstance(law, ContactLaw):
+        elif isinstance(law, effect.ContactLaw):
             side = _law(term, law.past)
             depth, rate = f"x.{body} - {side}", f"v.{body}"
             force = _law(term, law.force)
@@ -574,7 +567,7 @@ def _forces(terms: Sequence[EffectTerm], *, driven: str, free: Sequence[int]) ->
     return tuple(forces)
 
 
-def _link(term: EffectTerm) -> tuple[str, Force]:
+def _link(term: effect.EffectTerm) -> tuple[str, Force]:
     """Return the hidden mass of an effect, and the force on the cart to which it is attached."""
     cart, hidden = f"cart_{term.place}", f"hidden_{term.place}"
     _, k, c = _names(term)
@@ -582,7 +575,7 @@ def _link(term: EffectTerm) -> tuple[str, Force]:
     return hidden, Force(_title(term), force, cart)
 
 
-def _longest_step(model: AugmentedChain, free: Sequence[int]) -> float:
+def _longest_step(model: effect.AugmentedChain, free: Sequence[int]) -> float:
     """Return the longest time step in s.
 
     In one step, the fastest oscillation advances by a twentieth of a radian; in a contact, by a

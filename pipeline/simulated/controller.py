@@ -8,29 +8,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
 
+from pipeline import protocol
 from pipeline.plant.sampled_loop import VELOCITY_CORRECTION
-from pipeline.protocol import (
-    EXTENSIONS,
-    FREQUENCIES,
-    FULL_SCALE,
-    MOST_TONES,
-    WATCHDOG,
-    ChirpEnd,
-    Command,
-    Description,
-    Hands,
-    PidGains,
-    Reading,
-    Signal,
-    Start,
-    StateGains,
-    Tone,
-    Wave,
-    format_description,
-    format_reading,
-    nearest_count,
-    target_at,
-)
 
 # Limits of 32-bit firmware; no bench needs more.
 _LONGEST_FIELD = 32  # characters
@@ -56,23 +35,25 @@ class CommandReader:
         has no query either.
     """
 
-    def __init__(self, *, encoders: int, extensions: Collection[str] = EXTENSIONS) -> None:
+    def __init__(self, *, encoders: int, extensions: Collection[str] = protocol.EXTENSIONS) -> None:
         self._kinds = _field_kinds(encoders, extensions)
-        self._halts = tuple({Signal.STOP.value, Signal.RESET.value} & self._kinds.keys())
+        self._halts = tuple(
+            {protocol.Signal.STOP.value, protocol.Signal.RESET.value} & self._kinds.keys()
+        )
         self._rest = ""
         self._letter = ""
         self._values: list[str | float] = []
         self.rejected = 0
 
-    def feed(self, data: bytes) -> list[Command]:
+    def feed(self, data: bytes) -> list[protocol.Command]:
         """Return the commands that are now complete, in order."""
         *whole, rest = (self._rest + data.decode("latin-1")).split(";")
         # if the field is longer, it is refused anyway
         self._rest = rest[-_LONGEST_FIELD - 1 :]
         return [command for field in whole for command in self._take(field.strip(" \t\r\n"))]
 
-    def _take(self, field: str) -> list[Command]:
-        broken_off: list[Command] = []
+    def _take(self, field: str) -> list[protocol.Command]:
+        broken_off: list[protocol.Command] = []
         if self._letter:
             try:
                 self._values.append(self._kinds[self._letter][len(self._values)](field))
@@ -90,11 +71,11 @@ class CommandReader:
         letter, self._letter = self._letter, ""
         return [*broken_off, _command(letter, self._values)]
 
-    def _break_off(self) -> list[Command]:
+    def _break_off(self) -> list[protocol.Command]:
         self.rejected += 1
         self._letter = ""
-        misread = Signal.STOP.value in self._halts and self._values == [Wave.SINE]
-        return [Signal.STOP] if misread else []
+        misread = protocol.Signal.STOP.value in self._halts and self._values == [protocol.Wave.SINE]
+        return [protocol.Signal.STOP] if misread else []
 
 
 _Reader: TypeAlias = Callable[[str], str | float]
@@ -127,8 +108,12 @@ def _whole_within(lowest: int, highest: int) -> _Reader:
 
 def _field_kinds(encoders: int, extensions: Collection[str]) -> Mapping[str, tuple[_Reader, ...]]:
     """Return, for each letter, the kinds of the fields that follow it."""
-    waves = "".join(w for w in Wave if w not in (Wave.CHIRP, Wave.MULTISINE) or w in extensions)
-    frequency = _number_within(*FREQUENCIES)
+    waves = "".join(
+        w
+        for w in protocol.Wave
+        if w not in (protocol.Wave.CHIRP, protocol.Wave.MULTISINE) or w in extensions
+    )
+    frequency = _number_within(*protocol.FREQUENCIES)
     gain = _number_within(-_LARGEST_NUMBER, _LARGEST_NUMBER)
     amplitude = _whole_within(-_LARGEST_AMPLITUDE, _LARGEST_AMPLITUDE)
     cycles = _whole_within(1, 1_000_000)
@@ -153,28 +138,28 @@ def _field_kinds(encoders: int, extensions: Collection[str]) -> Mapping[str, tup
     return {**stock, **known, **({"?": ()} if known else {})}
 
 
-def _command(letter: str, values: list[Any]) -> Command:
+def _command(letter: str, values: list[Any]) -> protocol.Command:
     match letter, values:
         case "d", [wave, loop, encoder, frequency, amplitude, cycles]:
-            return Start(
-                wave=Wave(wave),
+            return protocol.Start(
+                wave=protocol.Wave(wave),
                 encoder=None if loop == "o" else 1 + (encoder == "t"),
                 frequency=frequency,
                 amplitude=amplitude,
                 cycles=cycles,
             )
         case "g", [kp, ki, kd]:
-            return PidGains(kp=kp, ki=ki, kd=kd)
+            return protocol.PidGains(kp=kp, ki=ki, kd=kd)
         case "f", [*gains, prefilter]:
-            return StateGains(gains=tuple(gains), prefilter=prefilter)
+            return protocol.StateGains(gains=tuple(gains), prefilter=prefilter)
         case "c", [frequency]:
-            return ChirpEnd(frequency=frequency)
+            return protocol.ChirpEnd(frequency=frequency)
         case "m", [harmonic, share, phase]:
-            return Tone(harmonic=harmonic, share=share, phase=phase)
+            return protocol.Tone(harmonic=harmonic, share=share, phase=phase)
         case "h", [mask, released]:
             held = tuple(c + 1 for c in range(mask.bit_length()) if mask >> c & 1)
-            return Hands(held=held, released=released)
-    return Signal(letter)
+            return protocol.Hands(held=held, released=released)
+    return protocol.Signal(letter)
 
 
 class Core(Protocol):
@@ -214,10 +199,10 @@ class ReferenceCore:
         without `commands` is a stock bench, which does not answer queries.
     """
 
-    def __init__(self, description: Description) -> None:
+    def __init__(self, description: protocol.Description) -> None:
         self._description = description
         self._reader = CommandReader(encoders=description.encoders, extensions=description.commands)
-        self._commands: list[Command] = []
+        self._commands: list[protocol.Command] = []
         self._sent = bytearray()
         self._reset()
 
@@ -238,7 +223,7 @@ class ReferenceCore:
         self._commands.clear()
         if self._zero is None:
             self._zero = tuple(counts)
-        if self._heard is not None and now - self._heard >= 1e3 * WATCHDOG:
+        if self._heard is not None and now - self._heard >= 1e3 * protocol.WATCHDOG:
             self._run = None
         run = self._run
         if run is None:
@@ -248,22 +233,26 @@ class ReferenceCore:
             self._run = None
             return 0
         y = tuple(count - zero for count, zero in zip(counts, self._zero, strict=True))
-        target = target_at(run.start, 1e-3 * ms, chirp_end=run.chirp_end, tones=run.tones)
-        duty = run.law.duty(target, y)
-        self._sent += format_reading(Reading(counts=y, target=target, duty=duty, ms=ms))
+        target = protocol.target_at(run.start, 1e-3 * ms, chirp_end=run.chirp_end, tones=run.tones)
+        duty = run.law(target, y)
+        self._sent += protocol.format_reading(
+            protocol.Reading(counts=y, target=target, duty=duty, ms=ms)
+        )
         return duty
 
     def _reset(self) -> None:
         self._run: _Run | None = None
-        self._gains: PidGains | StateGains = PidGains(kp=0.0, ki=0.0, kd=0.0)
+        self._gains: protocol.PidGains | protocol.StateGains = protocol.PidGains(
+            kp=0.0, ki=0.0, kd=0.0
+        )
         self._chirp_end: float | None = None
-        self._tones: tuple[Tone, ...] = ()
+        self._tones: tuple[protocol.Tone, ...] = ()
         self._zero: tuple[int, ...] | None = None  # None if the next counts are the zero
         self._heard: int | None = None  # last heartbeat, ms of wall time; None before
 
-    def _obey(self, command: Command, *, stamp: int, now: int) -> None:
+    def _obey(self, command: protocol.Command, *, stamp: int, now: int) -> None:
         match command:
-            case Start():
+            case protocol.Start():
                 self._run = _Run(
                     start=command,
                     since=stamp,
@@ -271,59 +260,52 @@ class ReferenceCore:
                     tones=self._tones,
                     law=self._loop(command),
                 )
-            case PidGains() | StateGains():
+            case protocol.PidGains() | protocol.StateGains():
                 self._gains = command
-            case ChirpEnd(frequency=frequency):
+            case protocol.ChirpEnd(frequency=frequency):
                 self._chirp_end = frequency
-            case Tone(harmonic=harmonic):
-                self._tones = (*self._tones, command)[-MOST_TONES:] if harmonic else ()
-            case Signal.RESET:
+            case protocol.Tone(harmonic=harmonic):
+                self._tones = (*self._tones, command)[-protocol.MOST_TONES :] if harmonic else ()
+            case protocol.Signal.RESET:
                 self._reset()
-            case Signal.STOP:
+            case protocol.Signal.STOP:
                 self._run = None
-            case Signal.HEARTBEAT:
+            case protocol.Signal.HEARTBEAT:
                 self._heard = now
-            case Signal.QUERY:
-                self._sent += format_description(self._description)
-            case Hands():
+            case protocol.Signal.QUERY:
+                self._sent += protocol.format_description(self._description)
+            case protocol.Hands():
                 pass  # carried out by the virtual bench around this controller
 
-    def _loop(self, start: Start) -> "_Law":
+    def _loop(self, start: protocol.Start) -> "_Law":
         if start.encoder is None:
-            return _OpenLoop()
-        if isinstance(self._gains, PidGains):
+            return lambda target, y: _clipped(target)
+        if isinstance(self._gains, protocol.PidGains):
             return _Pid(self._gains, row=start.encoder - 1, period=self._description.period)
         return _StateFeedback(self._gains, period=self._description.period)
 
 
-class _Law(Protocol):
-    def duty(self, target: int, y: Sequence[int]) -> int:
-        """Return the duty that acts from now on; called at every tick of a run."""
-        ...
+# Returns the duty that acts from now on, from target and positions; called at every tick of a run.
+_Law: TypeAlias = Callable[[int, Sequence[int]], int]
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Run:
-    start: Start
+    start: protocol.Start
     since: int  # ms of the bench's clock when it began
     chirp_end: float | None
-    tones: tuple[Tone, ...]
+    tones: tuple[protocol.Tone, ...]
     law: _Law
-
-
-class _OpenLoop:
-    def duty(self, target: int, y: Sequence[int]) -> int:
-        return _clipped(target)
 
 
 class _Pid:
     """The PID law of `pipeline.plant.sampled_loop`, which acts in the same tick."""
 
-    def __init__(self, gains: PidGains, *, row: int, period: float) -> None:
+    def __init__(self, gains: protocol.PidGains, *, row: int, period: float) -> None:
         self._gains, self._row, self._period = gains, row, period
         self._integral = self._last = 0.0
 
-    def duty(self, target: int, y: Sequence[int]) -> int:
+    def __call__(self, target: int, y: Sequence[int]) -> int:
         error = float(target - y[self._row])
         self._integral += error * self._period
         slope, self._last = (error - self._last) / self._period, error
@@ -334,12 +316,12 @@ class _Pid:
 class _StateFeedback:
     """The state feedback of `pipeline.plant.sampled_loop` without a model, one tick later."""
 
-    def __init__(self, gains: StateGains, *, period: float) -> None:
+    def __init__(self, gains: protocol.StateGains, *, period: float) -> None:
         self._gains, self._period = gains, period
         self._predicted: list[tuple[float, float]] = []  # position and velocity of each encoder
         self._next = 0
 
-    def duty(self, target: int, y: Sequence[int]) -> int:
+    def __call__(self, target: int, y: Sequence[int]) -> int:
         predicted = self._predicted or [(float(count), 0.0) for count in y]
         acting, effort = self._next, self._gains.prefilter * target
         correction = VELOCITY_CORRECTION / self._period
@@ -355,4 +337,4 @@ class _StateFeedback:
 
 
 def _clipped(effort: float) -> int:
-    return nearest_count(min(max(effort, -FULL_SCALE), FULL_SCALE))
+    return protocol.nearest_count(min(max(effort, -protocol.FULL_SCALE), protocol.FULL_SCALE))

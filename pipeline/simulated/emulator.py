@@ -10,20 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline import protocol
 from pipeline.arrays import Array
 from pipeline.errors import ConfigError
 from pipeline.plant.augmented import SteppedBench
 from pipeline.plant.effect import AugmentedChain
-from pipeline.protocol import (
-    EXTENSIONS,
-    FULL_SCALE,
-    Command,
-    Description,
-    Hands,
-    Signal,
-    Start,
-    Wave,
-)
 from pipeline.simulated.bench import ReleasingHand, SimulatedBench, before_stop
 from pipeline.simulated.controller import CommandReader, Core, ReferenceCore
 from pipeline.simulated.links import open_link
@@ -60,7 +51,7 @@ class VirtualCarts:
         self.input_per_count = input_per_count(bench)
         # At power-on, an encoder is at a random position between two counts.
         self._phase = self._noise_rng.uniform(-0.5, 0.5, size=n)
-        self.take_in_hand(Hands())
+        self.take_in_hand(protocol.Hands())
 
     def counts(self) -> tuple[int, ...]:
         """Return the encoder counts since power-on."""
@@ -89,7 +80,7 @@ class VirtualCarts:
         u = duty * self.input_per_count
         self._plant.step(u, following=u, interval=self._period)
 
-    def take_in_hand(self, hands: Hands) -> None:
+    def take_in_hand(self, hands: protocol.Hands) -> None:
         """Bring all carts to rest; hold some, and pull one out for release in the next run."""
         self._started = False
         n = self._bench.chain.n
@@ -145,7 +136,7 @@ def input_per_count(bench: SimulatedBench) -> float:
     duty counts.
     """
     hold = bench.travel / float(np.max(np.abs(bench.chain.static_gains())))
-    return 5.0 * 10.0 ** round(math.log10(REACH * hold / 5.0)) / FULL_SCALE
+    return 5.0 * 10.0 ** round(math.log10(REACH * hold / 5.0)) / protocol.FULL_SCALE
 
 
 # ---------------------------------------------------------------------- faults of the line
@@ -259,19 +250,18 @@ class Faults:
             line = b""
         if clock < self._until:
             self.injected["late"] += bool(line)
-        return self._hold(line, clock=clock), kind
+        return self.hold(line, clock=clock), kind
 
     def idle(self, *, clock: float) -> bytes:
         """Return bytes still due while the bench sends no line: a late chunk, a lost line end."""
         end, self._open = b"\n" * self._open, False
-        return self._hold(end, clock=clock)
+        return self.hold(end, clock=clock)
 
-    def behind(self, data: bytes, *, clock: float) -> bytes:
-        """Return the bytes to send now, given an answer; it must not overtake a delayed line."""
-        return self._hold(data, clock=clock)
+    def hold(self, data: bytes, *, clock: float) -> bytes:
+        """Return the bytes to send now: the held data and the new data, or nothing yet.
 
-    def _hold(self, data: bytes, *, clock: float) -> bytes:
-        """Return the bytes to send now: the held data and the new data, or nothing yet."""
+        An answer must not overtake a delayed line.
+        """
         self._held += data
         if not self._held or clock < self._until:
             return b""
@@ -367,7 +357,7 @@ class Server:
         bench: SimulatedBench,
         options: EmulatorOptions,
         *,
-        core: Callable[[Description], Core] = ReferenceCore,
+        core: Callable[[protocol.Description], Core] = ReferenceCore,
         on_event: Callable[[dict], None] = lambda event: None,
     ) -> None:
         bench.refuse_endless()
@@ -380,12 +370,12 @@ class Server:
             )
         self._carts = VirtualCarts(bench, seed=options.seed, period=options.period)
         self._carts.move(0)  # compiles the simulation before a host waits for it
-        self.description = Description(
+        self.description = protocol.Description(
             name=re.sub(r"[^\w.-]", "_", bench.name, flags=re.ASCII),
             encoders=self._carts.encoders,
             carts=bench.chain.n,
             period=max(1, round(1e3 * options.period)) / 1e3,
-            commands=frozenset() if options.stock else EXTENSIONS,
+            commands=frozenset() if options.stock else protocol.EXTENSIONS,
             input_unit=bench.input_unit,
             input_per_count=self._carts.input_per_count,
             position_unit=bench.position_unit,
@@ -399,7 +389,9 @@ class Server:
         self.events: list[dict] = []
         self._ticks = 0
         self._still_since = 0.0  # s of the bench's clock
-        self._start = Start(wave=Wave.DELTA, frequency=1.0, amplitude=0)  # the last start received
+        self._start = protocol.Start(
+            wave=protocol.Wave.DELTA, frequency=1.0, amplitude=0
+        )  # the last start received
         self._ending = ""  # why the run will end; "" if by itself
         self._lines = 0  # lines sent in this run
         self._heard: float | None = None  # s of wall time of the last heartbeat
@@ -462,21 +454,21 @@ class Server:
             for command in self._tap.feed(data):
                 self._overhear(command)
 
-    def _overhear(self, command: Command) -> None:
+    def _overhear(self, command: protocol.Command) -> None:
         """Note a command to the controller that concerns the hands or the log."""
         match command:
-            case Start():
+            case protocol.Start():
                 self._end_run("restarted")
                 self._start, self._ending = command, ""
                 self._carts.start()
-            case Hands():
+            case protocol.Hands():
                 self._carts.take_in_hand(command)
                 self._still_since = self._clock
-            case Signal.HEARTBEAT:
+            case protocol.Signal.HEARTBEAT:
                 self._heard = time.monotonic()
-            case Signal.STOP:
+            case protocol.Signal.STOP:
                 self._ending = "stopped"
-            case Signal.RESET:
+            case protocol.Signal.RESET:
                 self._ending, self._heard = "reset", None
 
     def _tick(self) -> bytes:
@@ -486,7 +478,7 @@ class Server:
         output = self._core.take().splitlines(keepends=True)
         readings = [line for line in output if not line.startswith(b"?")]
         answers = b"".join(line for line in output if line.startswith(b"?"))
-        out = self._faults.behind(answers, clock=self._clock)
+        out = self._faults.hold(answers, clock=self._clock)
         for line in readings if self._connected else ():
             struck, kind = self._faults.strike(line, clock=self._clock)
             out += struck

@@ -45,7 +45,7 @@ def _in_hertz(file: Path) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Example:
-    """One example: a preset, a seed, and the text of its students."""
+    """One example: a preset, a seed and its students, whose text stands in the folder itself."""
 
     folder: str
     preset: str
@@ -62,19 +62,6 @@ CATALOGUE = (
             title="One-cart system, bench 2",
             authors=("s1011", "s1012"),
             springs=(True, True),
-            notes="""\
-## Discussion
-
-Cart 1 sits between two springs. We let it go by hand twice and found a damping ratio near 0.1
-both times, and the Bode fit agrees with it. Only the sum of the two spring constants can be found
-from our data, because both push on the same cart.
-
-The static gain from the steps and from the fit differ by less than one percent. Near the
-resonance we had to turn the input down to 6 mV to stay within 1 cm.
-
-Under state feedback the cart settles about where the model says. It does **not** settle exactly
-there, which we put down to the error of our static gain.
-""",
         ),
     ),
     Example(
@@ -85,20 +72,6 @@ there, which we put down to the error of our static gain.
             title="Two-cart system, bench 4",
             authors=("s1024", "s1031"),
             springs=(False, True, True),
-            notes="""\
-## Discussion
-
-There is no spring between the wall and cart 1 on our bench, so cart 1 only feels the spring to
-cart 2. That is why K_1 is larger than K_2.
-
-- We guessed 0.10 for both damping ratios of the two-cart system, as in the handout. For the first
-  resonance this was a good guess, for the second it was three times too much.
-- The null of cart 1 lies at the frequency that cart 2 has on its own, as it should: there cart 2
-  works as an absorber.
-- Above the second resonance cart 2 moves less and less, so we had to turn the input up to 0.3 V.
-
-In closed loop cart 2 follows the step, while cart 1 goes half as far again to get it there.
-""",
         ),
     ),
     Example(
@@ -109,40 +82,27 @@ In closed loop cart 2 follows the step, while cart 1 goes half as far again to g
             title="Three-cart system, bench 7",
             authors=("s1042", "s1043", "s1057"),
             springs=(False, True, True, True),
-            notes="""\
-## Discussion
-
-We fitted cart 3 first, then cart 2, then cart 1. Our first estimates of the gains and of the
-frequencies were within a few percent of the fit. The damping ratios were not: we had guessed 0.10
-for all of them and found 0.25 for the slowest resonance but only 0.03 for the fastest.
-
-The 4 Hz run shows what steady state means. For the first two seconds the carts still swing at
-their own frequencies on top of the 4 Hz, and reading an amplitude there gives a wrong gain.
-
-We controlled cart 2. It follows the 1 cm step well; cart 3 goes only half as far, which no
-controller can change, because at rest the springs alone decide where cart 3 stands.
-
-## zeta_a
-
-Below 7 rad/s all three carts show it: they rise to only about twice their static gain there. With
-0.10 they would have risen to five times, so the two or three dwells nearest to 7 rad/s would do.
-""",
         ),
     ),
 )
 
 
 def write_examples(folder: Path) -> None:
-    """Write every example into its own folder in `folder`; the bytes are always the same."""
+    """Write every example into its own folder in `folder`; the bytes are always the same.
+
+    Their notes are those of the present examples.
+    """
     for example in CATALOGUE:
+        notes, own = (EXAMPLES / example.folder / "notes.md").read_bytes(), folder / example.folder
         write_submission(
-            folder / example.folder,
+            own,
             example.preset,
             seed=example.seed,
             compact=True,
             reported=True,
             students=example.students,
         )
+        (own / "notes.md").write_bytes(notes)
 
 
 if __name__ == "__main__":

@@ -10,17 +10,9 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.estimation.state_feedback import design_feedback
 from pipeline.names import read_name
+from pipeline.plant import simulate
 from pipeline.plant.chain import Chain, quadratic_factors
 from pipeline.plant.sampled_loop import StateFeedback
-from pipeline.plant.simulate import (
-    SETTLED,
-    SETTLED_DWELL,
-    dwell_frequencies,
-    largest_motion,
-    settling_wait,
-    simulate_linear,
-    steady_time,
-)
 from pipeline.results import FeedbackDesign
 from pipeline.simulated.bench import BenchRun, ReleasingHand, SimulatedBench, TrueMotion
 from pipeline.simulated.hidden import preset_bench
@@ -55,16 +47,6 @@ class SimulatedSession:
     transients: bool = True
     sweep_time: float = 20.0
 
-    @property
-    def chain(self) -> Chain:
-        """The linear model of the carts."""
-        return self.bench.chain
-
-    @property
-    def travel(self) -> float:
-        """The intended motion of the carts, position units."""
-        return self.bench.travel
-
     def clock(self, duration: float) -> Array:
         """Return sample times (n,) from 0 to about `duration`, s."""
         return self.bench.sample_time * np.arange(
@@ -77,7 +59,7 @@ def plan_decays(session: SimulatedSession, rng: np.random.Generator) -> list[Ben
 
     Carts without a spring are skipped.
     """
-    chain, runs = session.chain, []
+    chain, runs = session.bench.chain, []
     for cart in range(1, chain.n + 1):
         if chain.k[cart - 1] + chain.k[cart] == 0:
             continue
@@ -88,7 +70,7 @@ def plan_decays(session: SimulatedSession, rng: np.random.Generator) -> list[Ben
             side = 1 if rng.random() < 0.5 else -1
             hand = ReleasingHand(
                 cart=cart,
-                position=side * session.travel * rng.uniform(1.0, 1.8),
+                position=side * session.bench.travel * rng.uniform(1.0, 1.8),
                 release=float(rng.uniform(0.3, 0.6)),
                 fade=float(rng.uniform(0.01, 0.03)),
                 tremor=tuple(rng.uniform(0, 2 * np.pi, size=3).tolist()),
@@ -109,12 +91,12 @@ def plan_decays(session: SimulatedSession, rng: np.random.Generator) -> list[Ben
 
 def plan_steps(session: SimulatedSession) -> list[BenchRun]:
     """Return input steps, on and off: small ones, and larger ones in the other direction."""
-    chain = session.chain
-    wait = settling_wait(chain, time_constants=SETTLED)
+    chain = session.bench.chain
+    wait = simulate.settling_wait(chain, time_constants=simulate.SETTLED)
     t = session.clock(_REST + 2 * wait)
     on = (t >= _REST) & (t < _REST + wait)
     # Carts with little damping overshoot to nearly twice their final position.
-    unit = session.travel / float(np.max(np.abs(chain.static_gains())))
+    unit = session.bench.travel / float(np.max(np.abs(chain.static_gains())))
     small, large = _typed(0.5 * unit, session), _typed(0.9 * unit, session)
     return [
         BenchRun(
@@ -131,18 +113,22 @@ def plan_steps(session: SimulatedSession) -> list[BenchRun]:
 
 def plan_dwells(session: SimulatedSession) -> list[BenchRun]:
     """Return a dwell at each frequency, with an input that moves the carts far enough."""
-    chain, runs = session.chain, []
-    frequencies = dwell_frequencies(chain, n=session.n_dwells, among=[FIGURE_FREQUENCY])
+    chain, runs = session.bench.chain, []
+    frequencies = simulate.dwell_frequencies(chain, n=session.n_dwells, among=[FIGURE_FREQUENCY])
     for number, hertz in enumerate(frequencies, start=1):
         # A compact session records one dwell in ten from rest.
         whole = session.transients or hertz == FIGURE_FREQUENCY or number % 10 == 0
-        settled = SETTLED_DWELL if whole else 11.0  # time constants; then no transient is left
-        wait = settling_wait(chain, time_constants=settled)
-        t = session.clock(wait + steady_time(hertz))
+        settled = (
+            simulate.SETTLED_DWELL if whole else 11.0
+        )  # time constants; then no transient is left
+        wait = simulate.settling_wait(chain, time_constants=settled)
+        t = session.clock(wait + simulate.steady_time(hertz))
         shape = np.sin(2 * np.pi * hertz * t)
-        unit = largest_motion(chain, t, shape=shape, wait=wait)
+        unit = simulate.largest_motion(chain, t, shape=shape, wait=wait)
         # Far above the resonances, the carts swing far at first, then hardly move.
-        amplitude = _typed(session.travel * min(0.8 / unit.steady, 1.5 / unit.furthest), session)
+        amplitude = _typed(
+            session.bench.travel * min(0.8 / unit.steady, 1.5 / unit.furthest), session
+        )
         runs.append(
             BenchRun(
                 id=f"sine-{number:02d}",
@@ -160,15 +146,15 @@ def plan_dwells(session: SimulatedSession) -> list[BenchRun]:
 
 def plan_sweep(session: SimulatedSession) -> BenchRun:
     """Return a sweep from below the first resonance to above the last, and 2 s of ringing."""
-    chain = session.chain
+    chain = session.bench.chain
     omega = quadratic_factors(chain.poles)[0]
     low, high = 0.4 * omega[0], 1.4 * omega[-1]
     t = session.clock(session.sweep_time + 2.0)
     growth = np.log(high / low) / session.sweep_time
     phase = low / growth * np.expm1(growth * np.minimum(t, session.sweep_time))
     shape = np.sin(phase) * (t < session.sweep_time)
-    furthest = float(np.max(np.abs(simulate_linear(chain, t, shape))))
-    u = np.round(_typed(1.2 * session.travel / furthest, session) * shape, INPUT_DECIMALS)
+    furthest = float(np.max(np.abs(simulate.simulate_linear(chain, t, shape))))
+    u = np.round(_typed(1.2 * session.bench.travel / furthest, session) * shape, INPUT_DECIMALS)
     return BenchRun(
         id="sweep",
         kind="sweep",
@@ -191,14 +177,14 @@ def plan_closed_loop(
         u=np.zeros_like(t),
         free=_all(session),
         cart=cart,
-        reference=np.where(t >= _REST, session.travel, 0.0),
+        reference=np.where(t >= _REST, session.bench.travel, 0.0),
         controller=controller,
         input_limit=session.bench.input_limit,
     )
 
 
 def _all(session: SimulatedSession) -> tuple[int, ...]:
-    return tuple(range(1, session.chain.n + 1))
+    return tuple(range(1, session.bench.chain.n + 1))
 
 
 def _typed(value: float, session: SimulatedSession) -> float:
@@ -220,7 +206,6 @@ class Students:
     title : title of the submission. By default it names the bench and the seed.
     springs : whether they declare each spring as present. By default, they state the true springs.
     time_decimals : decimals of the log's time stamps. With 3, they are rounded as in an ECP export.
-    notes : text of `notes.md`. If it is empty, the file is not written.
     """
 
     authors: Sequence[str] = ()
@@ -228,7 +213,6 @@ class Students:
     section: str = "01"
     springs: Sequence[bool] = ()
     time_decimals: int = 5
-    notes: str = ""
 
 
 def write_submission(
@@ -290,8 +274,6 @@ def write_submission(
     for file, text in logs.items():
         _write(folder / file, text)
     _write(folder / "submission.toml", "\n".join(sections))
-    if students.notes:
-        _write(folder / "notes.md", students.notes)
 
 
 def _task(bench: SimulatedBench) -> Design:
@@ -415,9 +397,8 @@ def _write(path: Path, text: str) -> None:
 _FIT_ERROR_SPRING_OR_MASS = 0.005
 # Typical error of initial estimates that are read from plots of steps and decays.
 _HAND_ERROR = 0.007
-_GUESSED_ZETA = TypedNumber(
-    "0.10"
-)  # the paper: "we usually use the initial estimate that both are approximately 0.1"
+# the paper: "we usually use the initial estimate that both are approximately 0.1"
+_GUESSED_ZETA = TypedNumber("0.10")
 
 
 def believed_chain(chain: Chain, rng: np.random.Generator) -> Chain:

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.errors import DataError
-from pipeline.estimation.sine import fit_sine
+from pipeline.estimation.sine import Dwell
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear
 from tests.helpers.time_records import COUNT, record_of
@@ -43,7 +43,7 @@ def sampled(duration, *, fs=FS):
 def test_one_centimetre_is_measured_to_half_a_per_mille(hertz, fs):
     """A settled dwell of 1 cm gives amplitude, gain and phase to 0.0005, even at resonance."""
     run, truth = dwell(sampled(9.0, fs=fs), hertz=hertz)
-    got = fit_sine(run, cart=1)
+    got = Dwell(run).fit(cart=1)
     assert got.settled
     assert got.note == ""
     # The rounding of 200 or more samples causes 0.29 count · sqrt(2/200), or 7e-5 of 440 counts;
@@ -58,7 +58,7 @@ def test_a_smooth_input_is_taken_as_sampled():
     t, omega = sampled(4.0), 2 * np.pi * 5.0
     y = np.sin(omega * t - 1.0)[None]
     run = record_of(t, 0.5 * np.sin(omega * t), y, kind="sine", omega=omega, count=0.0)
-    got = fit_sine(replace(run, hold="band_limited"), cart=1)
+    got = Dwell(replace(run, hold="band_limited")).fit(cart=1)
     assert_allclose([got.input_amplitude, got.amplitude, got.phase], [0.5, 1.0, -1.0], rtol=1e-9)
 
 
@@ -66,7 +66,7 @@ def test_every_cart_of_a_chain_has_its_own_amplitude_and_phase():
     """Each cart of a chain gets its own amplitude and phase, even beyond a phase of π."""
     run, truth = dwell(sampled(12.0), chain=PRESETS["throne-3dof"], hertz=3.0)
     for cart in (1, 2, 3):
-        got = fit_sine(run, cart=cart)
+        got = Dwell(run).fit(cart=cart)
         assert_allclose(got.gain, abs(truth[cart - 1]), rtol=2e-3)
         assert_allclose(np.exp(1j * got.phase), np.exp(1j * np.angle(truth[cart - 1])), atol=2e-3)
 
@@ -74,7 +74,7 @@ def test_every_cart_of_a_chain_has_its_own_amplitude_and_phase():
 def test_the_transient_is_left_out():
     """The steady part begins when the transient from rest has died away."""
     run, _ = dwell(sampled(9.0), hertz=3.0)
-    got = fit_sine(run, cart=1)
+    got = Dwell(run).fit(cart=1)
     # The transient of 1 cm e^(-1.32 t) is one encoder step at 4.6 s.
     assert 3.0 < got.steady_from < 7.0
     # The last cycle is used up to 30 degrees before its end, which is 0.03 s at 3 Hz.
@@ -98,7 +98,7 @@ def test_what_often_happens_to_a_dwell_does_no_harm(spoilt):
         run = replace(run, y=COUNT * np.round((run.y + 0.7 + 0.02 * run.t) / COUNT))
     elif spoilt == "no frequency":
         run = replace(run, omega=None)
-    got = fit_sine(run, cart=1)
+    got = Dwell(run).fit(cart=1)
     assert_allclose(got.omega, 2 * np.pi * 3.0, rtol=1e-9)  # the input has no noise
     # The input is held for uneven times too.
     assert_allclose(got.gain, abs(truth[0]), rtol=2e-3 if spoilt in CLOCKS else 5e-4)
@@ -110,7 +110,7 @@ def test_a_stated_frequency_that_the_input_contradicts_is_not_used():
     The cause may be rad/s typed for Hz, or a wrong clock.
     """
     run, truth = dwell(sampled(9.0), hertz=3.0)
-    got = fit_sine(replace(run, omega=2 * np.pi * 3.0 * 1.01), cart=1)
+    got = Dwell(replace(run, omega=2 * np.pi * 3.0 * 1.01)).fit(cart=1)
     assert_allclose(got.omega, 2 * np.pi * 3.0, rtol=1e-6)
     assert_allclose(got.gain, abs(truth[0]), rtol=5e-4)
     assert "stated 3.03 Hz" in got.note
@@ -122,7 +122,7 @@ def test_with_a_noisy_input_the_stated_frequency_is_used():
     run, truth = dwell(sampled(9.0), hertz=3.0)
     assert run.u is not None
     noisy = run.u + 0.05 * np.ptp(run.u) * rng.normal(size=run.t.size)
-    got = fit_sine(replace(run, u=noisy), cart=1)
+    got = Dwell(replace(run, u=noisy)).fit(cart=1)
     assert got.omega == run.omega
     assert abs(got.gain - abs(truth[0])) < 4 * got.gain_std
     assert got.input_amplitude_std > 1e-3 * got.input_amplitude
@@ -134,7 +134,7 @@ def test_an_input_that_stops_ends_the_dwell():
     truth = CHAIN.frequency_response(np.array([omega]))[0, 0]
     u = np.where((t > 1.0) & (t < 10.0), np.sin(omega * t) / abs(truth), 0.0)
     run = record_of(t, u, simulate_linear(CHAIN, t, u), kind="sine", omega=omega)
-    got = fit_sine(run, cart=1)
+    got = Dwell(run).fit(cart=1)
     assert got.settled
     assert got.steady_from + (got.n_points - 1) / FS < 10.0
     assert_allclose(got.gain, abs(truth), rtol=5e-4)
@@ -143,7 +143,7 @@ def test_an_input_that_stops_ends_the_dwell():
 def test_a_dwell_that_is_too_short_is_called_unsettled():
     """If the transient has not died away, a note says so and the estimate has a large error."""
     run, truth = dwell(sampled(1.6), hertz=2.4)
-    got = fit_sine(run, cart=1)
+    got = Dwell(run).fit(cart=1)
     assert not got.settled
     assert "no steady state" in got.note
     assert abs(got.gain - abs(truth[0])) < 5 * got.gain_std
@@ -152,7 +152,7 @@ def test_a_dwell_that_is_too_short_is_called_unsettled():
 def test_an_amplitude_of_few_counts_is_noted():
     """If the amplitude is below twenty encoder counts, a note says so."""
     run, _ = dwell(sampled(9.0), amplitude=10 * COUNT)
-    got = fit_sine(run, cart=1)
+    got = Dwell(run).fit(cart=1)
     assert "10.0 encoder counts" in got.note
     assert_allclose(got.amplitude, 10 * COUNT, rtol=0.02)
 
@@ -161,7 +161,7 @@ def test_a_third_harmonic_is_noted():
     """If friction adds a third harmonic, a note gives its size."""
     t, omega = sampled(6.0), 2 * np.pi * 3.0
     y = (np.sin(omega * t) + 0.05 * np.sin(3 * omega * t))[None]
-    got = fit_sine(record_of(t, np.sin(omega * t), y, kind="sine", omega=omega), cart=1)
+    got = Dwell(record_of(t, np.sin(omega * t), y, kind="sine", omega=omega)).fit(cart=1)
     assert "3.5 % of the motion" in got.note  # 0.05 / sqrt(2)
     assert_allclose(got.amplitude, 1.0, rtol=1e-3)
 
@@ -184,7 +184,7 @@ def test_what_is_no_dwell_is_refused(change, needed):
     """A run without input, oscillation, motion or a full cycle is refused."""
     run, _ = dwell(T, hertz=1.0)
     with pytest.raises(DataError, match=needed):
-        fit_sine(replace(run, **change), cart=1)
+        Dwell(replace(run, **change)).fit(cart=1)
 
 
 def coverage(seeds, *, from_rest):
@@ -209,7 +209,7 @@ def coverage(seeds, *, from_rest):
         )
         if not from_rest:
             run = cut(run, t > wait)
-        got = fit_sine(run, cart=1)
+        got = Dwell(run).fit(cart=1)
         phase = np.angle(np.exp(1j * (got.phase - np.angle(truth[0]))))
         errors.append([(got.gain - abs(truth[0])) / got.gain_std, phase / got.phase_std])
     return np.array(errors)

@@ -10,10 +10,9 @@ from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.experiments.gains import (
     CountScales,
-    bench_gains,
+    LoopTrial,
     bench_scales,
     controller_table,
-    propose_pid,
 )
 from pipeline.experiments.plan import PidLoop, PlanLimits, Recording, StateLoop
 from pipeline.plant.chain import Chain
@@ -61,13 +60,13 @@ def closing(loop, *, carts=2, amplitude=1.0) -> Recording:
 
 def gains_of(identified, loop, *, limits=LIMITS, **changes):
     submission, analysis = identified
-    return bench_gains(
-        closing(loop, carts=analysis.bench.n, **changes),
+    return LoopTrial(
+        recording=closing(loop, carts=analysis.bench.n, **changes),
         submission=submission,
         analysis=analysis,
         bench=BENCH,
         limits=limits,
-    )
+    ).gains()
 
 
 def design_of(analysis: Analysis) -> FeedbackDesign:
@@ -217,13 +216,13 @@ def test_a_slow_bench_that_misses_the_goal_is_refused(identified):
     submission, analysis = identified
     slow = replace(BENCH, period=0.05)
     with pytest.raises(DataError, match=r"set design.sample_time = 0\.05 in submission.toml"):
-        bench_gains(
-            closing(StateLoop(cart=analysis.bench.n), carts=analysis.bench.n),
+        LoopTrial(
+            recording=closing(StateLoop(cart=analysis.bench.n), carts=analysis.bench.n),
             submission=submission,
             analysis=analysis,
             bench=slow,
             limits=LIMITS,
-        )
+        ).gains()
 
 
 @pytest.mark.parametrize("example", ["one-cart", "two-cart", "three-cart"])
@@ -233,9 +232,10 @@ def test_a_proposed_pid_brings_cart_1_to_the_level(example):
     analysis = analyse(submission)
     bench = replace(BENCH, encoders=max(2, analysis.bench.n), carts=analysis.bench.n)
     recording = closing(None, carts=analysis.bench.n)
-    pid = propose_pid(
-        recording, submission=submission, analysis=analysis, bench=bench, limits=LIMITS
+    trial = LoopTrial(
+        recording=recording, submission=submission, analysis=analysis, bench=bench, limits=LIMITS
     )
+    pid = trial.propose_pid()
     law = Pid(kp=pid.kp, ki=pid.ki, kd=pid.kd, scale=DUTY / COUNT)
     assert analysis.chain is not None
     t = np.arange(0, 5, BENCH.period)
@@ -250,4 +250,4 @@ def test_a_proposed_pid_brings_cart_1_to_the_level(example):
     assert run.x[0].max() < 1.1
     weak = PlanLimits(input=0.001, travel=2.5)
     with pytest.raises(DataError, match=r"no PID is proposed: .*input"):
-        propose_pid(recording, submission=submission, analysis=analysis, bench=bench, limits=weak)
+        replace(trial, limits=weak).propose_pid()

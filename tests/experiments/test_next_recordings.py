@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from pipeline.errors import ConfigError, DataError
-from pipeline.experiments.information import FisherInformation, Goal, choose, find_goal
+from pipeline.experiments.information import (
+    FisherInformation,
+    Goal,
+    choose,
+    find_goal,
+    sampled_input,
+)
 from pipeline.experiments.next_recordings import (
     choose_next,
     compare_recordings,
@@ -188,7 +194,7 @@ def test_no_choice_passes_a_limit(analysis):
         assert ("m" in commands) or all(r.wave != "multisine" for r in found.recordings)
         known = FisherInformation.of(analysis)
         for recording in found.recordings:
-            t, u = known.input(recording)
+            t, u = sampled_input(recording, period=known.sample_time)
             x = simulate_linear(known.chain, t, recording.amplitude * u)
             assert np.abs(x).max() <= 0.8 * LIMITS.travel
             assert abs(recording.amplitude) <= LIMITS.input
