@@ -5,7 +5,7 @@ import numpy as np
 from benchmarks.page import Table, share
 from pipeline.arrays import Array
 from pipeline.estimation.decay import fit_log_decrement
-from pipeline.estimation.sine import fit_sine
+from pipeline.estimation.sine import Dwell
 from pipeline.estimation.step_gain import fit_step_gain
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear
@@ -142,7 +142,7 @@ def _dwell_errors(seed: int, fs: float, from_rest: bool) -> list[float]:
     y = simulate_linear(chain, t, u)
     keep = t >= (0 if from_rest else wait)
     run = record(t[keep], y[:, keep], kind="sine", u=u[keep], omega=2 * np.pi * hertz)
-    got = fit_sine(run, cart=1)
+    got = Dwell(run).fit(cart=1)
     phase = float(np.angle(np.exp(1j * (got.phase - np.angle(truth)))))
     return [
         got.gain / abs(truth) - 1,

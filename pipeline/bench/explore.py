@@ -7,10 +7,9 @@ from pipeline.bench.acquire import acquire, ensure_plan
 from pipeline.bench.events import Buttons, Observer, Observers, Stopped
 from pipeline.bench.raw import known_commands
 from pipeline.bench.serial_line import Runaway
-from pipeline.experiments.exploration import Exploration, Recorded
+from pipeline.experiments.exploration import Exploration, Recorded, Turn
 from pipeline.experiments.information import ErrorGoal
 from pipeline.experiments.plan import Recording, session_time
-from pipeline.experiments.turn import Turn
 from pipeline.submission.load import NAME
 from pipeline.words.text import with_symbols
 

@@ -14,6 +14,7 @@ consider those with the smallest inputs, and choose the fastest.
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Literal
 
 import numpy as np
 from scipy.linalg import hadamard, hessenberg
@@ -208,6 +209,8 @@ def energy_weights(plant: SampledPlant, weights: Array) -> Array:
 
 
 # ---------------------------------------------------------------------- the stage
+
+Method = Literal["poles", "lqr"]
 
 _POINTS = 512  # points of a candidate's step; a power of two, because doubling computes them
 

@@ -1,6 +1,5 @@
 """The bench's end of a serial line: a TCP port for `socket://`, or a pseudo-terminal."""
 
-import contextlib
 import errno
 import json
 import os
@@ -9,12 +8,12 @@ import socket
 import sys
 import tempfile
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Protocol
 from urllib.parse import urlsplit
 
 import psutil
@@ -25,40 +24,55 @@ from pipeline.output import OWNERS_FOLDER
 _CHUNK = 65_536  # bytes
 
 
-class Link(Protocol):
-    """A bench's end of a line; one host is connected at a time, and the next one waits."""
+class Link(ABC):
+    """A bench's end of a line; one host is connected at a time, and the next one waits.
 
-    address: str
+    Attributes
+    ----------
+    connected : whether a host is connected; `receive` updates this.
+    """
 
-    @property
-    def connected(self) -> bool:
-        """Whether a host is connected; `receive` updates this."""
-        ...
+    def __init__(self, address: str) -> None:
+        self.address, self.connected = address, False
+        self._unsent = bytearray()
 
     @property
     def unsent(self) -> int:
         """The number of bytes that the host has not yet read."""
-        ...
-
-    def wait(self, seconds: float) -> None:
-        """Sleep until something arrives, or for `seconds`."""
-        ...
-
-    def receive(self) -> bytes:
-        """Return the bytes that arrived; b"" for nothing."""
-        ...
+        return len(self._unsent)
 
     def send(self, data: bytes) -> None:
         """Send bytes, or keep those that the host cannot take yet; without a host, drop them."""
-        ...
+        if not self.connected:
+            return
+        self._unsent += data
+        try:
+            while self._unsent:
+                del self._unsent[: self._write(self._unsent[:_CHUNK])]
+        except BlockingIOError:
+            return
+        except OSError:
+            self.hang_up()
 
     def hang_up(self) -> None:
-        """Disconnect the host, and drop the bytes that it has not read."""
-        ...
+        """Disconnect the host, if the line can, and drop the bytes that it has not read."""
+        self._unsent.clear()
 
+    @abstractmethod
+    def wait(self, seconds: float) -> None:
+        """Sleep until something arrives, or for `seconds`."""
+
+    @abstractmethod
+    def receive(self) -> bytes:
+        """Return the bytes that arrived; b"" for nothing."""
+
+    @abstractmethod
     def close(self) -> None:
         """Close the line."""
-        ...
+
+    @abstractmethod
+    def _write(self, data: bytearray) -> int:
+        """Write what the line takes now, and return how many bytes these are."""
 
 
 def open_link(port: str, *, remote: bool = False) -> Link:
@@ -70,7 +84,7 @@ def open_link(port: str, *, remote: bool = False) -> Link:
         although `remote` is False.
     """
     if port == "pty":
-        return _open_pty()
+        return _PtyLink()
     where = f"--port {port}"
     parts = urlsplit(port)
     try:
@@ -103,20 +117,12 @@ def open_link(port: str, *, remote: bool = False) -> Link:
     return _SocketLink(listener, address=f"socket://{name}:{listener.getsockname()[1]}")
 
 
-class _SocketLink:
+class _SocketLink(Link):
     def __init__(self, listener: socket.socket, *, address: str) -> None:
-        self.address, self._listener = address, listener
+        super().__init__(address)
+        self._listener = listener
         self._client: socket.socket | None = None
         self._ready = False  # whether bytes have arrived or a host is waiting
-        self._unsent = bytearray()
-
-    @property
-    def connected(self) -> bool:
-        return self._client is not None
-
-    @property
-    def unsent(self) -> int:
-        return len(self._unsent)
 
     def wait(self, seconds: float) -> None:
         reader = self._client or self._listener
@@ -144,55 +150,40 @@ class _SocketLink:
         return data
 
     def _accept(self) -> None:
-        with contextlib.suppress(BlockingIOError, ConnectionError):
+        with suppress(BlockingIOError, ConnectionError):
             self._client, _ = self._listener.accept()
             self._client.setblocking(False)
             self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.connected = self._client is not None
 
-    def send(self, data: bytes) -> None:
-        if self._client is None:
-            return
-        self._unsent += data
-        try:
-            while self._unsent:
-                del self._unsent[: self._client.send(self._unsent[:_CHUNK])]
-        except BlockingIOError:
-            return
-        except OSError:
-            self.hang_up()
+    def _write(self, data: bytearray) -> int:
+        assert self._client is not None
+        return self._client.send(data)
 
     def hang_up(self) -> None:
-        self._unsent.clear()
+        super().hang_up()
         if self._client is not None:
             self._client.close()
-            self._client = None
+            self._client, self.connected = None, False
 
     def close(self) -> None:
         self.hang_up()
         self._listener.close()
 
 
-def _open_pty() -> "Link":
-    if sys.platform == "win32":
-        raise ConfigError("--port pty: Windows has no pseudo-terminals; take socket://127.0.0.1:0")
-    return _PtyLink()
-
-
-class _PtyLink:
+class _PtyLink(Link):
     def __init__(self) -> None:
+        if sys.platform == "win32":
+            raise ConfigError(
+                "--port pty: Windows has no pseudo-terminals; take socket://127.0.0.1:0"
+            )
         import tty  # does not exist on Windows
 
         self._master, slave = os.openpty()
         tty.setraw(slave)
-        self.address = os.ttyname(slave)
+        super().__init__(os.ttyname(slave))
         os.close(slave)  # so that the master notices when no host has it open
         os.set_blocking(self._master, False)
-        self.connected = False
-        self._unsent = bytearray()
-
-    @property
-    def unsent(self) -> int:
-        return len(self._unsent)
 
     def wait(self, seconds: float) -> None:
         if self.connected:
@@ -215,17 +206,8 @@ class _PtyLink:
             self._unsent.clear()
         return data
 
-    def send(self, data: bytes) -> None:
-        if not self.connected:
-            return
-        self._unsent += data
-        with contextlib.suppress(BlockingIOError):
-            while self._unsent:
-                del self._unsent[: os.write(self._master, self._unsent[:_CHUNK])]
-
-    def hang_up(self) -> None:
-        """Drop the unsent data; the host still has the pseudo-terminal open."""
-        self._unsent.clear()
+    def _write(self, data: bytearray) -> int:
+        return os.write(self._master, data)
 
     def close(self) -> None:
         os.close(self._master)

@@ -8,7 +8,7 @@ from html import unescape
 import numpy as np
 from numpy.testing import assert_allclose
 
-from pipeline.experiments.turn import Turn, WeighedExplanation, deciding_trace, name_model
+from pipeline.experiments.exploration import Turn, WeighedExplanation, deciding_trace, name_model
 from pipeline.plant.catalogue import find_effect
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain, EffectTerm

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pipeline.experiments.turn import Turn, deciding_trace
+from pipeline.experiments.exploration import Turn, deciding_trace
 from pipeline.gap.types import Gap
 from pipeline.names import read_name
 from pipeline.output import write_file
