@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
-from pipeline.estimation.least_squares import minimise
+from pipeline.estimation.least_squares import MOST_EVALUATIONS, minimise
 from pipeline.estimation.parametrisation import (
     Parametrisation,
     even_chain,
@@ -287,8 +287,7 @@ def _fit(
     start = np.concatenate([[np.log(gain)], factors.ravel()])
     if omega.size < start.size:
         return gain, factors  # too few points for this stage; the joint fit sees all carts
-    # A fit that succeeds takes about ten evaluations.
-    found = minimise(evaluate, start, max_evaluations=_EVALUATIONS).x
+    found = minimise(evaluate, start).x
     # If a logarithm changes by 7, a factor of 1000, the fit has gone astray.
     if np.max(np.abs(found - start)) > 7.0:
         return gain, factors
@@ -341,7 +340,6 @@ _START_SPREAD = 0.5  # standard deviation of ln m and ln k in random starts
 _START_ZETAS = (0.02, 0.3)
 _SEED = 2005  # of the random starts; any number, but always the same
 _NEAR, _PRECISION = 1e-3, 1e-8  # relative change of the cost at the end of the first and last fit
-_EVALUATIONS = 100  # a successful fit takes about ten
 _SHARES, _SHARE_PRECISION = (1e-6, 10.0), 0.01  # bounds and precision of an added error
 
 
@@ -489,7 +487,6 @@ def _solve(P: Parametrisation, data: Points, theta: Array, scale: Scale) -> _Fit
             theta,
             scale="jac",
             tolerance=_NEAR if scale == "log" else _PRECISION,
-            max_evaluations=_EVALUATIONS,
         )
     return _Fitted(
         parametrisation=P,
@@ -654,7 +651,7 @@ def _result(
             "allow; the standard errors of the parameters include this"
         )
     if not fitted.converged:
-        remarks.append(f"not converged after {_EVALUATIONS} evaluations")
+        remarks.append(f"not converged after {MOST_EVALUATIONS} evaluations")
     return ChainFit(
         method="bode_fit",
         chain=chain,

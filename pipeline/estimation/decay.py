@@ -8,9 +8,9 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
+from pipeline.estimation import noise
 from pipeline.estimation.decay_laws import Explained, explain_decay
 from pipeline.estimation.least_squares import Ringing, fit_ringing
-from pipeline.estimation.noise import MEDIAN_TO_SIGMA, extrema, plateaus, resolution
 from pipeline.results import DecayLaw, LogDecrement, Record
 
 # -------------------------------------------------------------------- the free decay in a record
@@ -20,10 +20,8 @@ from pipeline.results import DecayLaw, LogDecrement, Record
 _ADEQUATE = 1.5
 # Smallest swing to count, in grains. A grain is the encoder step, or the step whose rounding error
 # equals the noise if this is larger.
-_PROMINENCE = 6.0
 _SMALLEST_SWING = 8.0
 _BASE_SKIPS, _BASE_NEEDS = 2, 4  # turning points skipped for the hand, and needed after them
-_MIN_SAMPLES = 12
 # Extended back in time, a fit may miss the record by this many of its own residuals. A share of the
 # amplitude is added while only the smaller swings were fitted, or if the residual exceeds the noise
 # anyway.
@@ -110,8 +108,8 @@ def _stretches(record: Record) -> list[list[Stretch]]:
     u = record.u
     parts = [
         Stretch(first=a, stop=b, level=float(np.mean(u[a:b])))
-        for a, b in plateaus(u)
-        if b - a >= _MIN_SAMPLES
+        for a, b in noise.plateaus(u)
+        if b - a >= noise.MIN_SAMPLES
     ]
     largest = float(np.max(np.abs(u)))
     # Below 2 % of the largest input, the input counts as zero.
@@ -125,7 +123,9 @@ def _decaying_run(t: Array, y: Array, stretch: Stretch, *, size: float) -> list[
     part = y[stretch.first : stretch.stop]
     # The first point is the start of the stretch, not a turning point. The last one is where the
     # cart came to rest; it counts if the cart came to rest in time.
-    turning = [i + stretch.first for i in extrema(part, prominence=_PROMINENCE * size)][1:]
+    turning = [i + stretch.first for i in noise.extrema(part, prominence=noise.PROMINENCE * size)][
+        1:
+    ]
     swings = np.abs(np.diff(y[turning]))
     times = np.diff(t[turning])
     best: list[int] = []
@@ -205,7 +205,7 @@ def fit_decay(
             stretch=stretch, first=first, stop=stop, turning=turning, fit=fit, explained=explained
         )
 
-    enough = max(stop - _MIN_SAMPLES, stretch.first)
+    enough = max(stop - noise.MIN_SAMPLES, stretch.first)
     latest = min(run[min(_BASE_SKIPS, max(len(run) - _BASE_NEEDS, 0))], enough)
     decay = fit_from(latest)
     if decay.rms(t, y) > _ADEQUATE * floor:
@@ -235,7 +235,7 @@ def _carried_back(
     head = slice(decay.stretch.first, latest)
     size = abs(decay.fit.amplitudes[0]) * decay.fit.growth(t[head])[0]
     # The median ignores a hold that the fit includes by mistake.
-    spread = MEDIAN_TO_SIGMA * float(np.median(np.abs(decay.residual(t, y))))
+    spread = noise.MEDIAN_TO_SIGMA * float(np.median(np.abs(decay.residual(t, y))))
     tolerance = _BACK_SIGMAS * max(spread, floor) + share * size
     bad = np.flatnonzero(np.abs(y[head] - decay.model(t[head])) > tolerance)
     return head.start + (int(bad[-1]) + 1 if bad.size else 0)
@@ -295,7 +295,7 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
         oscillation.
     """
     t, y = record.t, record.position(cart)
-    size = resolution(t, y, step=record.encoder_step(cart))
+    size = noise.resolution(t, y, step=record.encoder_step(cart))
     floor = size / np.sqrt(12)
     step = record.encoder_step(cart)
     stretch, run = find_decay(record, cart=cart, size=size)
@@ -449,7 +449,7 @@ def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
     per_log = _slope(amplitude)
     loss = -float(per_log @ np.log(amplitude))  # per half cycle
     sigma = max(decay.fit.rms, floor)  # noise of one turning point, at most
-    noise = sigma * float(np.linalg.norm((per_log / signed) @ swing))
+    loss_std = sigma * float(np.linalg.norm((per_log / signed) @ swing))
     per_time = _slope(np.abs(np.gradient(peak_y)))
     interval = float(per_time @ peak_t)
     count = np.arange(n) - (n - 1) / 2
@@ -459,7 +459,7 @@ def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
     return replace(
         peaks,
         delta=2 * loss,
-        delta_std=2 * float(np.hypot(noise, 1e-4 * loss)),
+        delta_std=2 * float(np.hypot(loss_std, 1e-4 * loss)),
         omega_d=np.pi / interval,
         omega_d_std=np.pi / interval**2 * interval_std,
     )

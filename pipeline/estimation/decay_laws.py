@@ -15,16 +15,8 @@ from numpy.typing import NDArray
 from scipy.special import fdtri
 
 from pipeline.arrays import Array, ComplexArray
-from pipeline.estimation.least_squares import (
-    MOST_GROWTH,
-    PRECISION,
-    Ringing,
-    SeparableModel,
-    Waves,
-    fit_separable,
-    inverse_normal,
-    solve_linear,
-)
+from pipeline.estimation import least_squares
+from pipeline.estimation.least_squares import MOST_GROWTH, Ringing
 from pipeline.results import DecayCause
 
 # ------------------------------------------------------------- the departure from an exponential
@@ -468,7 +460,6 @@ _MOST_LEFT, _MOST_LEFT_BY_FRICTION = 0.2, 0.5
 # Unknowns that a law may have beyond the number of swings, unless it leaves only noise.
 _MORE_UNKNOWNS = 3
 _FEWEST_SWINGS = 4  # with fewer, most laws leave only noise
-_MAX_EVALUATIONS = 100
 _ROUGH = 1e-4  # relative tolerance of the squares in the competition
 _SIGMAS = 3.0  # a damping ratio further below zero is impossible
 _LEAST_ROUNDING = 0.1  # share of the rounding error that any fit leaves
@@ -549,7 +540,7 @@ class _Candidate:
     """
 
     name: DecayCause
-    model: Callable[[Array, Array], SeparableModel]
+    model: Callable[[Array, Array], least_squares.SeparableModel]
     starts: Sequence[Array]
     scale: Array
     pole: Callable[[Array, Array], tuple[int, int]]
@@ -557,17 +548,18 @@ class _Candidate:
 
     def fit(self, t: Array, y: Array) -> LawFit | None:
         """Return a rough fit from the best start, None if it makes no sense."""
-        residuals = [solve_linear(y, partial(self.model, t), p).residual for p in self.starts]
+        residuals = [
+            least_squares.solve_linear(y, partial(self.model, t), p).residual for p in self.starts
+        ]
         best = int(np.argmin([residual @ residual for residual in residuals]))
         return self.fit_from(self.starts[best], t, y, precision=_ROUGH)
 
     def fit_from(self, start: Array, t: Array, y: Array, *, precision: float) -> LawFit | None:
         """Return the fit from a start, None if it makes no sense."""
-        fit = fit_separable(
+        fit = least_squares.fit_separable(
             y,
             partial(self.model, t),
             start=start,
-            max_evaluations=_MAX_EVALUATIONS,
             scale=self.scale,
             precision=precision,
         )
@@ -581,7 +573,7 @@ class _Candidate:
         gradient[0, list(at)] = np.array([omega_d**2, -decay * omega_d]) / omega_n**3
         gradient[1, list(at)] = decay / omega_n, omega_d / omega_n
         gradient[2] = weights
-        covariance = inverse_normal(fit.model, linear)
+        covariance = least_squares.inverse_normal(fit.model, linear)
         size = float(gradient[2] @ np.concatenate([p, linear]))
         return LawFit(
             name=self.name,
@@ -695,7 +687,7 @@ def explain_decay(
         law, tried_one = best
         most = _MOST_LEFT_BY_FRICTION if law.name == "dry_friction" else _MOST_LEFT
         if excess(law.squares) <= most * over:
-            full = tried_one.fit_from(law.p, t, y, precision=PRECISION)
+            full = tried_one.fit_from(law.p, t, y, precision=least_squares.PRECISION)
             name, over = (law.name, excess(law.squares)) if full else (name, over)
     return Explained(
         name=name,
@@ -764,7 +756,9 @@ def _candidates(
     others = _other_frequencies(t, y - fit(t), pole)
     yield _Candidate(
         name="second_mode",
-        model=lambda t, p: Waves.at(t - start, p, level=np.array([np.ones_like(t), t - start])),
+        model=lambda t, p: least_squares.Waves.at(
+            t - start, p, level=np.array([np.ones_like(t), t - start])
+        ),
         starts=[np.array([decay, decay, omega, other]) for other in others],
         scale=np.full(4, abs(pole)),
         pole=_main_mode,

@@ -15,12 +15,14 @@ from pipeline.estimation.noise import relative_psd
 
 T = TypeVar("T")
 
+MOST_EVALUATIONS = 100  # a fit that succeeds takes about ten
+
 
 def minimise(
     at: Callable[[Array], tuple[Array, Array]],
     start: Array,
     *,
-    max_evaluations: int,
+    max_evaluations: int = MOST_EVALUATIONS,
     bounds: tuple[Any, Any] = (-np.inf, np.inf),
     scale: float | Literal["jac"] = 1.0,
     tolerance: float = 1e-8,
@@ -101,7 +103,7 @@ def fit_separable(
     model: Callable[[Array], SeparableModel],
     *,
     start: Array,
-    max_evaluations: int,
+    max_evaluations: int = MOST_EVALUATIONS,
     scale: Array | float = 1.0,
     precision: float = PRECISION,
 ) -> SeparableFit:
@@ -158,7 +160,6 @@ def solve_linear(y: Array, model: Callable[[Array], SeparableModel], p: Array) -
 
 # ---------------------------------------------------------------- damped sinusoids about a level
 
-_MAX_EVALUATIONS = 100
 MOST_GROWTH = 50.0  # bound of an exponent, against overflow
 
 
@@ -218,9 +219,8 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
         y,
         lambda p: Waves.at(tau, p, level=level),
         start=np.append(np.maximum(-poles.real / scale, 1e-6), poles.imag / scale),
-        max_evaluations=_MAX_EVALUATIONS,
     )
-    linear, residual, waves = fit.linear, fit.residual, Waves.at(tau, fit.p, level=level)
+    linear, residual, waves = fit.linear, fit.residual, fit.model
     X = waves.columns
     full = np.column_stack([X[:, :k], waves.derivatives(linear) / scale, X[:, k:]])
     kept = [0, 1] if drift else [0]

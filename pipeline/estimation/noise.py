@@ -178,6 +178,10 @@ def _tapered_correlation(residual: Array) -> Array:
 # ----------------------------------------------- turning points, and stretches of constant input
 
 
+PROMINENCE = 6.0  # smallest significant changes by which the signal goes back at a turning point
+MIN_SAMPLES = 12  # of a stretch to fit; enough for five unknowns and a residual
+
+
 def extrema(y: Array, *, prominence: float) -> list[int]:
     """Return the indices of the turning points, ends included; maxima and minima alternate.
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.estimation.noise import relative_psd, resolution, rounding_left
+from pipeline.estimation.noise import MIN_SAMPLES, relative_psd, resolution, rounding_left
 from pipeline.results import Record, SinePoint
 
 # ---------------------------------------------------------------------- independent columns
@@ -36,7 +36,6 @@ def inverse_of(columns: Array) -> Array:
 # ---------------------------------------------------------------------- the stage
 
 FEW_COUNTS = 20  # encoder steps; smaller amplitudes are known only to a few percent
-_MIN_SAMPLES = 12  # enough for five unknowns and a residual that shows how good the fit is
 _WINDOW_CYCLES, _WINDOW_TIME = 3.0, 0.6  # of a sliding window: cycles or s; the longer one counts
 _HOP_CYCLES, _HOP_TIME = 1.0, 0.2
 _LAST_WINDOWS = 4
@@ -205,9 +204,9 @@ class Dwell:
         offset = (np.max(u) + np.min(u)) / 2
         # The dwell runs from the first to the last sample beyond half of the input's amplitude.
         first, last = np.flatnonzero(np.abs(u - offset) > 0.5 * np.ptp(u) / 2)[[0, -1]]
-        if last + 1 - first < _MIN_SAMPLES:
+        if last + 1 - first < MIN_SAMPLES:
             raise DataError(
-                f"{record.id}: a sine fit needs {_MIN_SAMPLES} samples of driven motion, found "
+                f"{record.id}: a sine fit needs {MIN_SAMPLES} samples of driven motion, found "
                 f"{last + 1 - first}"
             )
         return slice(int(first), int(last) + 1)
@@ -269,7 +268,7 @@ class Dwell:
         for _ in range(3):
             steady = self._fit(y, start)
             square = np.cumsum((y - self._columns @ steady.coefficients) ** 2)
-            hop = max((y.size - start) // stretches, _MIN_SAMPLES)
+            hop = max((y.size - start) // stretches, MIN_SAMPLES)
             edges = np.arange(start, -1, -hop)
             mean = -np.diff(square[edges]) / hop  # of the stretches before `start`, going back
             # A stretch with a mean square residual above this limit is not steady.
@@ -291,7 +290,7 @@ class Dwell:
         """
         while True:
             middle = (start + y.size) // 2
-            if y.size - middle < _MIN_SAMPLES:
+            if y.size - middle < MIN_SAMPLES:
                 return start, 0.0
             early = self._fit(y, start, middle)
             late = self._fit(y, middle)
@@ -399,5 +398,5 @@ def _windows(t: Array, *, omega: float) -> list[tuple[int, int]]:
     return [
         (int(a), int(b))
         for a, b in zip(first[::-1], stop[::-1], strict=True)
-        if b - a >= _MIN_SAMPLES
+        if b - a >= MIN_SAMPLES
     ] or whole

@@ -18,9 +18,7 @@ _MOVED = 6.0  # grains; a smaller motion does not count
 # Largest residual and standard error of an extrapolated level, as shares of the motion.
 _EXTRAPOLATES = 0.02
 _STICKS_SIGMAS = 4.0  # standard errors; by chance, one edge in 16,000 is as far off
-_MIN_SAMPLES = 12
 _FLAT = 3.0  # grains; a window with a smaller range is level
-_PROMINENCE = 6.0
 _ARITHMETIC = 1e-3  # scatter, in grains, of a level without noise or rounding
 _DRIFT_PASSES = 4
 _SAME_INPUT = 0.02  # share of the input's range
@@ -127,7 +125,7 @@ def _constant_parts(record: Record) -> list[tuple[int, int, float]]:
     long = [
         (a, b)
         for a, b in noise.plateaus(u)
-        if a == 0 or (b - a >= _MIN_SAMPLES and abs(_halves_differ(u[a:b])) <= creep)
+        if a == 0 or (b - a >= noise.MIN_SAMPLES and abs(_halves_differ(u[a:b])) <= creep)
     ]
     share = sum(b - a for a, b in long) / u.size
     parts = [(a, b, float(np.mean(u[a:b]))) for a, b in long]
@@ -176,7 +174,7 @@ def _level(t: Array, y: Array, *, n_modes: int, size: float, step: float) -> _Le
 
 def _pace(t: Array, y: Array, *, size: float) -> float:
     """Return how long (s) a window must be to prove rest: two periods, or two rise times."""
-    turning = noise.extrema(y, prominence=_PROMINENCE * size)
+    turning = noise.extrema(y, prominence=noise.PROMINENCE * size)
     if len(turning) > 3:  # the ends are not turning points
         return 2 * float(np.max(np.diff(t[turning[1:-1]])))
     risen = np.abs(y - y[0]) >= (1 - np.exp(-1)) * abs(y[-1] - y[0])
@@ -216,7 +214,7 @@ def _extrapolated(t: Array, y: Array, *, n_modes: int, floor: float) -> _Level |
     """
     motion = float(np.ptp(y))
     for n in range(n_modes, 0, -1):
-        if t.size < _MIN_SAMPLES * (n + 1):
+        if t.size < noise.MIN_SAMPLES * (n + 1):
             continue
         poles = find_poles(t, y, n_modes=n)
         if poles.size < n:
@@ -258,7 +256,7 @@ def _drift(t: Array, y: Array, levels: Sequence[_Level], *, size: float) -> floa
     """Return the slope, per second, that all settled windows share; 0 if they do not."""
     slopes, errors = [], []
     for level in levels:
-        if level.extrapolated or level.stop - level.first < _MIN_SAMPLES:
+        if level.extrapolated or level.stop - level.first < noise.MIN_SAMPLES:
             continue
         tau = t[level.first : level.stop] - t[level.first : level.stop].mean()
         window = y[level.first : level.stop]

@@ -21,17 +21,7 @@ from scipy.special import factorial
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.plant.effect import (
-    AugmentedChain,
-    BuiltLaw,
-    ContactLaw,
-    EffectTerm,
-    ForceLaw,
-    FrictionLaw,
-    HysteresisLaw,
-    InputLaw,
-    input_steps,
-)
+from pipeline.plant import effect
 
 if TYPE_CHECKING:
     import control
@@ -65,7 +55,7 @@ class _Expression:
         return float(eval(self.code, _FUNCTIONS, {**self.values, **quantities}))
 
 
-def _expression(text: str, term: EffectTerm, **more: float) -> _Expression:
+def _expression(text: str, term: effect.EffectTerm, **more: float) -> _Expression:
     symbols = [p.symbol for p in term.effect.parameters]
     values = dict(zip(symbols, term.values, strict=True))
     return _Expression(compile(text, "<law>", "eval"), {**values, **more})
@@ -81,7 +71,7 @@ class EquationsOfMotion:
         backlash, `u_lag`, `u_delay_1`, ….
     """
 
-    def __init__(self, model: AugmentedChain) -> None:
+    def __init__(self, model: effect.AugmentedChain) -> None:
         """Read the laws of a model.
 
         Raises
@@ -96,7 +86,7 @@ class EquationsOfMotion:
         self._forces = [
             (term, _expression(term.effect.law.force, term, **self._spring(term)))
             for term in terms
-            if isinstance(term.effect.law, ForceLaw)
+            if isinstance(term.effect.law, effect.ForceLaw)
         ]
         self._contacts = [
             (
@@ -106,35 +96,36 @@ class EquationsOfMotion:
                 term.effect.law.pulls,
             )
             for term in terms
-            if isinstance(term.effect.law, ContactLaw)
+            if isinstance(term.effect.law, effect.ContactLaw)
         ]
         self._frictions = [
             (term.place - 1, _expression(term.effect.law.size, term))
             for term in terms
-            if isinstance(term.effect.law, FrictionLaw)
+            if isinstance(term.effect.law, effect.FrictionLaw)
         ]
         self._inputs = [
             _expression(term.effect.law.arrives, term)
-            for term in input_steps(terms)
-            if isinstance(term.effect.law, InputLaw)
+            for term in effect.input_steps(terms)
+            if isinstance(term.effect.law, effect.InputLaw)
         ]
-        self._built: dict[str, list[tuple[EffectTerm, int]]] = {}
+        self._built: dict[str, list[tuple[effect.EffectTerm, int]]] = {}
         self._delay: tuple[Array, Array, Array, float] | None = None
         for term in terms:
-            if isinstance(term.effect.law, BuiltLaw):
+            if isinstance(term.effect.law, effect.BuiltLaw):
                 self._add(term, term.effect.law.kind)
         self._bristles = [
             (term.place - 1, _expression(term.effect.law.force, term),
              _expression(term.effect.law.rate, term), len(self.states) + q)
-            for q, term in enumerate(t for t in terms if isinstance(t.effect.law, HysteresisLaw))
-            if isinstance(term.effect.law, HysteresisLaw)
+            for q, term in enumerate(
+                one for one in terms if isinstance(one.effect.law, effect.HysteresisLaw))
+            if isinstance(term.effect.law, effect.HysteresisLaw)
         ]  # fmt: skip
         self.states += [f"z{i + 1}" for i, *_ in self._bristles]
 
-    def _spring(self, term: EffectTerm) -> dict[str, float]:
+    def _spring(self, term: effect.EffectTerm) -> dict[str, float]:
         return {"k": float(self._k[term.place - 1])} if term.effect.place == "spring" else {}
 
-    def _add(self, term: EffectTerm, kind: str) -> None:
+    def _add(self, term: effect.EffectTerm, kind: str) -> None:
         i, own = term.place, []
         match kind:
             case "reading":
@@ -193,7 +184,7 @@ class EquationsOfMotion:
             elif term.effect.place == "cart":
                 i = term.place - 1
                 force[i] += law(x=x[i], v=v[i], u=u)
-            elif isinstance(term.effect.law, ForceLaw) and term.effect.law.on_motor:
+            elif isinstance(term.effect.law, effect.ForceLaw) and term.effect.law.on_motor:
                 push += law(x=driven, v=state[play[0][1] + 1] if play else v[0], u=u)
             else:
                 force[0] += law(x=x[0], v=v[0], u=u, on=float(command != 0.0))
@@ -242,7 +233,7 @@ class EquationsOfMotion:
 
     def _across(
         self,
-        play: tuple[EffectTerm, int],
+        play: tuple[effect.EffectTerm, int],
         state: Array,
         push: float,
         out: Array,

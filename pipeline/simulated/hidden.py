@@ -43,14 +43,17 @@ def prepare_bench(
     bench = _read_model(model) if model is not None else preset_bench(preset or "")
     for text in hide:
         term, given = _named_effect(text, bench)
-        _refuse_second(term, bench.effects, where=f"--hide {text}")
-        sentences = _describe(term, bench, given=given)
-        bench = replace(
-            bench,
-            effects=(*bench.effects, term),
-            effect_sentences=(*bench.effect_sentences, sentences),
-        )
+        bench = _with_effect(bench, term, where=f"--hide {text}", given=given)
     return bench
+
+
+def _with_effect(
+    bench: SimulatedBench, term: EffectTerm, *, where: str, given: frozenset[str] | None = None
+) -> SimulatedBench:
+    """Return the bench with one more effect, which must not be there already."""
+    _refuse_second(term, bench.effects, where=where)
+    sentences = (*bench.effect_sentences, _describe(term, bench, given=given))
+    return replace(bench, effects=(*bench.effects, term), effect_sentences=sentences)
 
 
 def preset_bench(name: str) -> SimulatedBench:
@@ -159,10 +162,6 @@ def _place(effect: Effect, chain: Chain, at: float | None, *, where: str) -> int
     return int(at)
 
 
-def _is_hard_to_tell(term: EffectTerm, chain: Chain) -> bool:
-    return term.place not in term.effect.places(tuple(bool(k > 0) for k in chain.k))
-
-
 def _refuse_impossible(
     parameter: EffectParameter, value: float, scales: PlaceScales, *, where: str
 ) -> None:
@@ -243,7 +242,8 @@ def _describe(
         note = "" if given is None or parameter.name in given else "(default)"
         sizes.append(" ".join(filter(None, [parameter.name, f"{value:.4g}", unit, note])))
     place = f" on {_at(term)}" if term.place else ""
-    doubt = "; here the linear chain can do the same" if _is_hard_to_tell(term, bench.chain) else ""
+    clear = term.effect.places(tuple(bool(k > 0) for k in bench.chain.k))
+    doubt = "; here the linear chain can do the same" if term.place not in clear else ""
     return f"{term.effect.key}{place}: {', '.join(sizes)}{doubt}"
 
 
@@ -282,10 +282,8 @@ def _read_model(path: Path) -> SimulatedBench:
     if not isinstance(effects, list):
         raise ConfigError(f"{where}: effects must be a list")
     for number, entry in enumerate(effects, start=1):
-        term = _stored_effect(entry, bench, where=f"{where}: effects[{number}]")
-        _refuse_second(term, bench.effects, where=f"{where}: effects[{number}]")
-        sentences = (*bench.effect_sentences, _describe(term, bench))
-        bench = replace(bench, effects=(*bench.effects, term), effect_sentences=sentences)
+        place = f"{where}: effects[{number}]"
+        bench = _with_effect(bench, _stored_effect(entry, bench, where=place), where=place)
     return bench
 
 
