@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline import names
 from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
 from pipeline.estimation.least_squares import MOST_EVALUATIONS, minimise
@@ -20,15 +21,6 @@ from pipeline.estimation.parametrisation import (
     even_chain,
     named_estimates,
     physical_start,
-)
-from pipeline.names import (
-    NULLS,
-    gain_name,
-    mode_suffixes,
-    mode_zeta,
-    own_omega,
-    own_zeta,
-    read_name,
 )
 from pipeline.plant.chain import Chain, quadratic_factors
 from pipeline.plant.identities import recover_chain
@@ -234,7 +226,7 @@ def fit_stage_by_stage(
     like : a chain that gives start values for all other parameters.
     """
     known = {**like.parameters(), **initial}
-    gains = np.array([known[gain_name(i, n=n)] for i in range(1, n + 1)])
+    gains = np.array([known[names.gain_name(i, n=n)] for i in range(1, n + 1)])
     factors = [_start(known, i, n=n, like=like) for i in range(n)]
     for cart in range(n, 0, -1):
         i = cart % n  # T_1, the denominator, comes with the last cart
@@ -254,17 +246,17 @@ def _start(known: Mapping[str, float], i: int, *, n: int, like: Chain) -> Array:
     omega, zeta = quadratic_factors(roots)
     for j, suffix in enumerate(_suffixes(i, n=n)):
         omega[j] = known.get(f"omega_{suffix}", omega[j])
-        zeta[j] = known.get(mode_zeta(suffix), zeta[j])
+        zeta[j] = known.get(names.mode_zeta(suffix), zeta[j])
     return np.log([omega, np.clip(zeta, *_ZETA_RANGE)])
 
 
 def _suffixes(i: int, *, n: int) -> list[str]:
     """Return the suffixes that Throne's tables give to T_{i+1}'s quadratic factors, if any."""
     if i == 0:
-        return mode_suffixes(n)
+        return names.mode_suffixes(n)
     if i == n - 1:
         return [str(n)]
-    return list(NULLS) if n == 3 else []
+    return list(names.NULLS) if n == 3 else []
 
 
 def _fit(
@@ -318,19 +310,19 @@ def _named(gains: Array, factors: list[Array], tails: list[Array]) -> dict[str, 
     A frequency that does not exist is left out.
     """
     n = gains.size
-    values = {gain_name(i, n=n): float(gain) for i, gain in enumerate(gains, start=1)}
+    values = {names.gain_name(i, n=n): float(gain) for i, gain in enumerate(gains, start=1)}
     for i, factor in enumerate(factors):
         order = np.argsort(factor[0])
         for suffix, omega, zeta in zip(_suffixes(i, n=n), *np.exp(factor[:, order]), strict=False):
             values[f"omega_{suffix}"] = float(omega)
-            values[mode_zeta(suffix)] = float(zeta)
+            values[names.mode_zeta(suffix)] = float(zeta)
     found = recover_chain(gains, tails)
     for i in range(1, n if n > 1 else 0):
         stiffness = found.k[i - 1] + found.k[i]
         if stiffness > 0 and found.m[i - 1] > 0:
             omega = float(np.sqrt(stiffness / found.m[i - 1]))
-            values[own_omega(i, n=n)] = omega
-            values[own_zeta(i, n=n)] = float(found.c[i - 1] / (2 * found.m[i - 1] * omega))
+            values[names.own_omega(i, n=n)] = omega
+            values[names.own_zeta(i, n=n)] = float(found.c[i - 1] / (2 * found.m[i - 1] * omega))
     return values
 
 
@@ -588,8 +580,8 @@ def _hold_vanished(
         c = chain.c.copy()
         for cart, zeta in dampings.items():
             c[cart - 1] = 2 * zeta.value * np.sqrt(chain.m[cart - 1] * k[cart - 1])
-        names = {f"c_{cart}" for cart in dampings}
-        held = P.holding_at_zero(*(name for name in vanished if name not in names))
+        damped = {f"c_{cart}" for cart in dampings}
+        held = P.holding_at_zero(*(name for name in vanished if name not in damped))
         along = replace(data, decays=dampings)
         both = _solve(held, along, held.pack(replace(chain, c=c)), fitted.scale)
         # Each decay may add up to 9 to χ², which is three standard errors.
@@ -628,7 +620,7 @@ def _result(
     remark: str,
 ) -> ChainFit:
     P, chain = fitted.parametrisation, fitted.chain
-    names, covariance = _covariance(P, chain, data.widened(share), fitted.scale)
+    fitted_names, covariance = _covariance(P, chain, data.widened(share), fitted.scale)
     chi_square_per_dof = _chi_square(fitted, data) / fitted.dof
     if data.from_table:
         covariance *= chi_square_per_dof
@@ -641,9 +633,11 @@ def _result(
             "the frequency response alone puts a damping at zero, so the fit also uses the damping "
             f"ratios of decays ({', '.join(dampers)})"
         )
-    parameters = named_estimates(chain, names=names, covariance=covariance, source="bode_fit")
+    parameters = named_estimates(
+        chain, names=fitted_names, covariance=covariance, source="bode_fit"
+    )
     for cart in data.decays:
-        name = own_zeta(cart, n=chain.n)
+        name = names.own_zeta(cart, n=chain.n)
         parameters[name] = replace(parameters[name], source=data.decays[cart].source)
     if share > 0:
         remarks.append(
@@ -655,7 +649,7 @@ def _result(
     return ChainFit(
         method="bode_fit",
         chain=chain,
-        names=names,
+        names=fitted_names,
         covariance=covariance,
         at_bound=(*P.zero, *dampers),
         parameters=parameters,
@@ -682,7 +676,7 @@ def _covariance(
     cart has some damping. Numbers that depend on it must not look more certain than it is. A
     spring, however, may really be missing.
     """
-    springs = tuple(name for name in P.zero if read_name(name).symbol == "k")
+    springs = tuple(name for name in P.zero if names.read_name(name).symbol == "k")
     for Q in (replace(P, zero=springs), P):
         sizes = _natural_sizes(Q, chain, data)
         _, J = weighted_residuals(Q, data, scale, Q.physical(chain))

@@ -11,7 +11,6 @@ from functools import partial
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
-from numpy.typing import NDArray
 from scipy.special import fdtri
 
 from pipeline.arrays import Array, ComplexArray
@@ -171,12 +170,12 @@ def thinned(t: Array, y: Array, *, omega: float) -> tuple[Array, Array]:
 # Reference: B. F. Feeny and J. W. Liang, J. Sound and Vibration 195 (1996) 149-154.
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Swings:
-    """A decay cut into half cycles at its turning points.
+    """A decay, sampled at `t`, cut into half cycles at its turning points.
 
     In each half cycle, y = rest + drift + (amplitude kept + friction pushed) swing - friction side.
-    Here friction means the friction band d.
+    Here friction means the friction band d. After the turning point the cart moves in `direction`
+    (1 or -1), for so many half `cycles`.
 
     Attributes
     ----------
@@ -191,51 +190,26 @@ class Swings:
     held : whether the cart has stopped (n,); it then stays where the half cycle ended.
     """
 
-    p: Array
-    since: Array
-    tau: Array
-    swing: Array
-    sine: Array
-    cycle: NDArray[np.int64]
-    number: Array
-    kept: Array
-    pushed: Array
-    side: Array
-    held: NDArray[np.bool_]
-
-    @classmethod
-    def at(cls, t: Array, p: Array, *, direction: float, cycles: float = np.inf) -> "Swings":
-        """Cut the samples `t`.
-
-        After the turning point the cart moves in `direction` (1 or -1), for so many half `cycles`.
-        """
-        turning, decay, omega_d = p
-        since, half = t - turning, np.pi / omega_d
-        k = np.floor(since / half)
-        held = k >= cycles
+    def __init__(self, t: Array, p: Array, *, direction: float, cycles: float = np.inf) -> None:
+        turning, decay, omega_d = self.p = p
+        self.since, half = t - turning, np.pi / omega_d
+        k = np.floor(self.since / half)
+        self.held = k >= cycles
         k = np.minimum(k, cycles - 1)
-        tau = np.minimum(since - k * half, half)
-        number = np.arange(k.min(), k.max() + 1)
+        self.tau = tau = np.minimum(self.since - k * half, half)
+        self.number = number = np.arange(k.min(), k.max() + 1)
+        self.cycle = (k - number[0]).astype(np.int64)
         loss = np.clip(decay * half, -MOST_GROWTH, MOST_GROWTH)  # rho = exp(-loss)
         lost = np.clip(-loss * number, -MOST_GROWTH, MOST_GROWTH)
         # (1 - rho^k) / (1 - rho), which is k without viscous damping
         geometric = np.expm1(lost) / np.expm1(-loss) if loss else number
         sign = np.where(number % 2 == 0, 1.0, -1.0)
         left = np.exp(np.clip(-decay * tau, -MOST_GROWTH, MOST_GROWTH))
-        sine = left * np.sin(omega_d * tau)
-        return cls(
-            p=p,
-            since=since,
-            tau=tau,
-            swing=left * np.cos(omega_d * tau) + decay / omega_d * sine,
-            sine=sine,
-            cycle=(k - number[0]).astype(np.int64),
-            number=number,
-            kept=sign * np.exp(lost),
-            pushed=direction * sign * (1 + (1 + np.exp(-loss)) * geometric),
-            side=direction * sign,
-            held=held,
-        )
+        self.sine = left * np.sin(omega_d * tau)
+        self.swing = left * np.cos(omega_d * tau) + decay / omega_d * self.sine
+        self.kept = sign * np.exp(lost)
+        self.pushed = direction * sign * (1 + (1 + np.exp(-loss)) * geometric)
+        self.side = direction * sign
 
     @property
     def columns(self) -> Array:
@@ -292,7 +266,6 @@ SHIFTS_AGAIN = 5 / 12  # of a cubic spring
 DECAY, FREQUENCY, DRAG, SHIFT = range(4)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Modulated:
     """A decay y = drift + Re(amplitude E e^{i phi}), with envelope E and phase phi.
 
@@ -303,8 +276,7 @@ class Modulated:
     Attributes
     ----------
     tau : time (n_lead + n,) since the start, s. The first times lead from the start to the samples.
-    p : gamma, omega, b and shift, 1/s.
-    free : which of p are unknown. The others are zero.
+    p : gamma, omega, b and shift, 1/s; those in `free` are given, the others are zero.
     grown, below, bent : (1 - e^{-gamma tau}) / gamma, B and R (n_lead + n,).
     envelope, phase : E and phi (n_lead + n,).
     power : if positive, there is a third harmonic that follows E^power.
@@ -312,21 +284,8 @@ class Modulated:
     length : unit of time of these powers, s.
     """
 
-    tau: Array
-    p: Array
-    free: Sequence[int]
-    grown: Array
-    below: Array
-    bent: Array
-    envelope: Array
-    phase: Array
-    power: int
-    bends: int
-    length: float
-
-    @classmethod
-    def at(
-        cls,
+    def __init__(
+        self,
         tau: Array,
         p: Array,
         *,
@@ -334,35 +293,22 @@ class Modulated:
         power: int = 0,
         bends: int = 1,
         length: float = 1.0,
-    ) -> "Modulated":
-        """Return the oscillation at the unknowns p (n_free,)."""
-        full = np.zeros(4)
-        full[list(free)] = p
-        gamma, omega, b, shift = full
-        tau = np.append(np.linspace(0.0, tau[0], _LEAD), tau)
+    ) -> None:
+        self.free, self.power, self.bends, self.length = free, power, bends, length
+        self.p = np.zeros(4)
+        self.p[list(free)] = p
+        gamma, omega, b, shift = self.p
+        self.tau = tau = np.append(np.linspace(0.0, tau[0], _LEAD), tau)
         left = np.exp(-np.clip(gamma * tau, -MOST_GROWTH, MOST_GROWTH))
         flat = abs(gamma) * np.max(np.abs(tau)) <= _FLAT
-        grown = tau * (1 - gamma * tau / 2) if flat else (1 - left) / gamma
-        below = np.maximum(1 + b * grown, _LEAST)
-        bent = np.maximum(1 - (1 - left**2) * shift / omega, _LEAST)
-        envelope = left / below / np.sqrt(bent)
-        phase = omega * tau
+        self.grown = tau * (1 - gamma * tau / 2) if flat else (1 - left) / gamma
+        self.below = np.maximum(1 + b * self.grown, _LEAST)
+        self.bent = np.maximum(1 - (1 - left**2) * shift / omega, _LEAST)
+        self.envelope = left / self.below / np.sqrt(self.bent)
+        self.phase = omega * tau
         if b or shift:
-            turning = shift * envelope**2 - _slowed(envelope, full) / omega
-            phase = phase + _integral(turning, tau)
-        return cls(
-            tau=tau,
-            p=full,
-            free=free,
-            grown=grown,
-            below=below,
-            bent=bent,
-            envelope=envelope,
-            phase=phase,
-            power=power,
-            bends=bends,
-            length=length,
-        )
+            turning = shift * self.envelope**2 - _slowed(self.envelope, self.p) / omega
+            self.phase = self.phase + _integral(turning, tau)
 
     @property
     def columns(self) -> Array:
@@ -617,7 +563,7 @@ def explain_decay(
     n, size = coarse_t.size, t.size // coarse_t.size
     angle = omega * float(coarse_t[-1] - coarse_t[0]) / (n - 1)
     density_of = partial(noise_density, angle=angle, step=step / np.sqrt(size))
-    swings_at = partial(Swings.at, direction=-1.0 if falling else 1.0)
+    swings_at = partial(Swings, direction=-1.0 if falling else 1.0)
     around = np.array([turning[0], -fit.poles[0].real, omega])
     departure = find_departure(
         coarse_t,
@@ -724,7 +670,7 @@ def _candidates(
     ) -> _Candidate:
         return _Candidate(
             name=name,
-            model=lambda t, p: Modulated.at(
+            model=lambda t, p: Modulated(
                 t - start, p, free=free, power=power, bends=bends, length=length
             ),
             starts=[np.array(p)],
@@ -738,7 +684,7 @@ def _candidates(
     for cycles in [np.inf, *(turning.size - np.array([1.0, 0.0]) if stopped else [])]:
         yield _Candidate(
             name="dry_friction",
-            model=partial(Swings.at, direction=-1.0 if falling else 1.0, cycles=cycles),
+            model=partial(Swings, direction=-1.0 if falling else 1.0, cycles=cycles),
             starts=[np.array([turning[0], decay * share, omega]) for share in (1.0, 0.3)],
             scale=np.array([1 / omega, abs(pole), abs(pole)]),
             pole=lambda p, linear: (1, 2),
@@ -756,7 +702,7 @@ def _candidates(
     others = _other_frequencies(t, y - fit(t), pole)
     yield _Candidate(
         name="second_mode",
-        model=lambda t, p: least_squares.Waves.at(
+        model=lambda t, p: least_squares.Waves(
             t - start, p, level=np.array([np.ones_like(t), t - start])
         ),
         starts=[np.array([decay, decay, omega, other]) for other in others],

@@ -126,9 +126,8 @@ class RecordResidualForce:
         return _hop(self.record) * self.record.sample_time
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class WindowMeans:
-    """Means over windows (n,) of one record, for all carts' laws.
+    """Means over windows (n,) at times `t` of one record, for all carts' laws.
 
     Attributes
     ----------
@@ -137,18 +136,28 @@ class WindowMeans:
     u, on : the input (3, n) at each of `_LAGS`, and the share of the time in which it is not zero
         (n,).
     gain : standard deviation of the acceleration that white noise of size 1 causes.
+    jumps : whether the input jumps (n,), in the window or just before.
     """
 
-    record: Record
-    t: Array
-    x: Array
-    v: Array
-    acceleration: Array
-    span: Array
-    u: Array
-    on: Array
-    gain: float
-    jumps: NDArray[np.bool_]
+    def __init__(self, record: Record) -> None:
+        self.record = record
+        t, width = record.t, _width(record)
+        first = np.arange(0, t.size - width + 1, _hop(record))
+        u = np.zeros(t.size) if record.u is None else record.u
+        inputs = np.array([*(np.interp(t - lag, t, u) for lag in _LAGS), u != 0.0])
+        # At most 1000 windows are computed at once, to limit the memory for long recordings.
+        parts = np.array_split(first, -(-first.size // 1000))
+        means = np.hstack([_means(t, record.y, inputs, part[:, None] + np.arange(width))
+                           for part in parts])  # fmt: skip
+        self.t, self.u, self.on = means[0], means[1:4], means[4]
+        self.gain = float(np.median(means[5]))
+        moved = means[6:].reshape(4, len(record.carts), -1)
+        self.x, self.v, self.acceleration, self.span = moved
+        reach = round(_LAGS[-1] / record.sample_time) + 1
+        # A jump is a change by 30 % of the input's range from one sample to the next.
+        jump = np.abs(np.diff(u, prepend=u[0])) > 0.3 * np.ptp(u)
+        jumped = np.append(0, np.cumsum(jump))  # number of jumps before each sample
+        self.jumps = jumped[first + width] > jumped[np.maximum(first - reach, 0)]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -225,37 +234,9 @@ def record_residual_forces(
     return found, size
 
 
-def window_means(record: Record) -> WindowMeans | None:
-    """Return the means over a record's windows, or None if the record is shorter than a window."""
-    t, interval = record.t, record.sample_time
-    # number of samples in a window
-    width = max(round(_WINDOW / interval) + 1, 9)
-    if width >= t.size:
-        return None
-    first = np.arange(0, t.size - width + 1, _hop(record))
-    u = np.zeros(t.size) if record.u is None else record.u
-    inputs = np.array([*(np.interp(t - lag, t, u) for lag in _LAGS), u != 0.0])
-    # At most 1000 windows are computed at once, to limit the memory for long recordings.
-    parts = np.array_split(first, -(-first.size // 1000))
-    means = np.hstack([_means(t, record.y, inputs, part[:, None] + np.arange(width))
-                       for part in parts])  # fmt: skip
-    reach = round(_LAGS[-1] / interval) + 1
-    # A jump is a change by 30 % of the input's range from one sample to the next.
-    jump = np.abs(np.diff(u, prepend=u[0])) > 0.3 * np.ptp(u)
-    jumped = np.append(0, np.cumsum(jump))  # number of jumps before each sample
-    x, v, acceleration, span = means[6:].reshape(4, len(record.carts), -1)
-    return WindowMeans(
-        record=record,
-        t=means[0],
-        u=means[1:4],
-        on=means[4],
-        gain=float(np.median(means[5])),
-        x=x,
-        v=v,
-        acceleration=acceleration,
-        span=span,
-        jumps=jumped[first + width] > jumped[np.maximum(first - reach, 0)],
-    )
+def _width(record: Record) -> int:
+    """Return the number of samples in a window."""
+    return max(round(_WINDOW / record.sample_time) + 1, 9)
 
 
 def _between_neighbours(means: WindowMeans, cart: int) -> _CartWindows | None:
@@ -400,7 +381,7 @@ def _found_in(records: tuple[Record, ...]) -> tuple[Intervention, ...]:
     first = {record.id: _first_copy(record, open_loop) for record in open_loop}
     alone = [record for record in open_loop if first[record.id] == record.id]
     carts = sorted({cart for r in alone for cart in r.free if cart in r.carts})
-    seen = [one for one in map(window_means, alone) if one is not None]
+    seen = [WindowMeans(record) for record in alone if record.t.size > _width(record)]
     bursts = [one for cart in carts for one in _bursts(cart, seen)]
     found = [
         replace(one, experiment=name)

@@ -9,19 +9,11 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from pipeline import names
 from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
 from pipeline.estimation.noise import difference_gain
 from pipeline.estimation.parametrisation import ASSUMED_ZETA
-from pipeline.names import (
-    NULLS,
-    gain_name,
-    mode_suffixes,
-    mode_zeta,
-    omega_names,
-    own_omega,
-    parameter_names,
-)
 from pipeline.results import Estimate, FrequencyResponse, Record, SinePoint
 
 # ---------------------------------------------------- the response from one step or sweep record
@@ -391,41 +383,41 @@ def find_resonances(responses: Sequence[FrequencyResponse], *, n: int) -> dict[s
     """
     seen = [r.only(r.has_signal) for r in responses if r.has_signal.any()]
     by_cart = {response.cart: response for response in seen}
-    names = set(parameter_names(n))
+    wanted = set(names.parameter_names(n))
     found: dict[str, Estimate] = {}
     modes = _shared_peaks(seen, n=n)
     if len(modes) == n - 1 and n in by_cart:
         modes = _with_damped_mode(by_cart[n], modes)
     nulls = {cart: _between(_extrema(r, sign=-1), modes) for cart, r in by_cart.items()}
-    symbols = mode_suffixes(n)
+    symbols = names.mode_suffixes(n)
     if len(modes) == n:
-        found |= _estimates(omega_names(symbols), modes)
+        found |= _estimates(names.omega_names(symbols), modes)
     lowest = modes[0].omega if len(modes) == n else None
     for cart, response in sorted(by_cart.items()):
         gain = _low_frequency_gain(response, resonance=lowest)
-        found |= {gain_name(cart, n=n): gain} if gain else {}
+        found |= {names.gain_name(cart, n=n): gain} if gain else {}
     if n > 1 and n - 1 in by_cart:
-        found |= _estimates([own_omega(n, n=n)], _strongest(nulls[n - 1], 1))
+        found |= _estimates([names.own_omega(n, n=n)], _strongest(nulls[n - 1], 1))
     if n == 3 and 1 in by_cart:
-        found |= _estimates(omega_names(NULLS), _strongest(nulls[1], 2))
-    assumed = [mode_zeta(suffix) for suffix in (*symbols, *NULLS)]
+        found |= _estimates(names.omega_names(names.NULLS), _strongest(nulls[1], 2))
+    assumed = [names.mode_zeta(suffix) for suffix in (*symbols, *names.NULLS)]
     # The carts share the peaks, which also correct the gains.
     runs = tuple(dict.fromkeys(run for response in seen for run in response.experiments))
     measured = {name: replace(one, experiments=runs) for name, one in found.items()}
     return measured | {
         name: Estimate(value=ASSUMED_ZETA, std=None, source="assumed")
         for name in assumed
-        if by_cart and name in names
+        if by_cart and name in wanted
     }
 
 
-def _estimates(names: Sequence[str], extrema: Sequence[_Extremum]) -> Mapping[str, Estimate]:
-    """Name extrema in ascending order; {} if there are more or fewer extrema than names."""
-    if len(names) != len(extrema):
+def _estimates(labels: Sequence[str], extrema: Sequence[_Extremum]) -> Mapping[str, Estimate]:
+    """Name extrema in ascending order; {} if there are more or fewer extrema than labels."""
+    if len(labels) != len(extrema):
         return {}
     return {
         name: Estimate(value=e.omega, std=e.std, source="frequency_response")
-        for name, e in zip(names, sorted(extrema), strict=True)
+        for name, e in zip(labels, sorted(extrema), strict=True)
     }
 
 

@@ -217,7 +217,7 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
     # At the start, the decay rate is at least 1e-6 of the frequency.
     fit = fit_separable(
         y,
-        lambda p: Waves.at(tau, p, level=level),
+        lambda p: Waves(tau, p, level=level),
         start=np.append(np.maximum(-poles.real / scale, 1e-6), poles.imag / scale),
     )
     linear, residual, waves = fit.linear, fit.residual, fit.model
@@ -248,20 +248,17 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Waves:
-    """Damped waves (n_modes, n) at times `tau`, with a level (and drift)."""
+    """Damped waves (n_modes, n) at times `tau`, with a level (and drift).
 
-    tau: Array
-    level: Array
-    waves: ComplexArray
+    Decay rates and frequencies are p (2 n_modes,).
+    """
 
-    @classmethod
-    def at(cls, tau: Array, p: Array, *, level: Array) -> "Waves":
-        """Return the waves with decay rates and frequencies p (2 n_modes,)."""
+    def __init__(self, tau: Array, p: Array, *, level: Array) -> None:
+        self.tau, self.level = tau, level
         decay, frequency = p.reshape(2, -1, 1)
         growth = np.minimum(-decay * tau, MOST_GROWTH)
-        return cls(tau=tau, level=level, waves=np.exp(growth + 1j * frequency * tau))
+        self.waves: ComplexArray = np.exp(growth + 1j * frequency * tau)
 
     @property
     def columns(self) -> Array:

@@ -126,44 +126,30 @@ def _compliance(chain: Chain, gains: Array) -> Array:
     return np.asarray(np.linalg.inv(chain.stiffness + fed_back), dtype=np.float64)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class SampledPlant:
-    """The sampled plant in scaled units: v is divided by `rate`, u by `stiffness`."""
+    """A chain, sampled fast enough for its modes and for the desired settling time (s).
 
-    chain: Chain
-    cart: int
-    sample_time: float
-    rate: float  # rad/s
-    stiffness: float  # input unit per position unit
-    phi: Array  # (2n, 2n)
-    gamma: Array  # (2n,)
+    It is in scaled units: v is divided by `rate` (rad/s), and u by `stiffness` (input unit per
+    position unit). `phi` is (2n, 2n), `gamma` (2n,).
+    """
 
-    @classmethod
-    def of(
-        cls, chain: Chain, *, cart: int, settling: float, sample_time: float | None
-    ) -> "SampledPlant":
-        """Sample a chain fast enough for its modes and for the desired settling time (s)."""
+    def __init__(
+        self, chain: Chain, *, cart: int, settling: float, sample_time: float | None
+    ) -> None:
+        self.chain, self.cart = chain, cart
         speeds = np.maximum(np.abs(chain.poles), 4 / settling)
-        rate = float(np.exp(np.log(speeds).mean()))
+        self.rate = float(np.exp(np.log(speeds).mean()))
         if sample_time is None:
             # The laboratory controller's sample time, or less if modes are fast, or if the loop
             # would settle in less than 25 samples.
             sample_time = min(0.00884, sampled_loop.RADIANS_PER_STEP / speeds.max(), settling / 25)
+        self.sample_time = float(sample_time)
         tied = chain.k[0] > 0 or chain.k[-1] > 0
-        stiffness = 1 / chain.static_gains()[0] if tied else chain.m.sum() * rate**2
-        phi, gamma = sampled_loop.discretise(chain, sample_time)
-        if not (np.all(np.isfinite(phi)) and np.all(np.isfinite(gamma * stiffness))):
+        held = 1 / chain.static_gains()[0] if tied else chain.m.sum() * self.rate**2
+        self.stiffness = float(held)
+        self.phi, self.gamma = self.after(1.0)
+        if not (np.all(np.isfinite(self.phi)) and np.all(np.isfinite(self.gamma))):
             raise np.linalg.LinAlgError("the sampled plant is not finite")
-        unit = np.tile([1.0, rate], chain.n)
-        return cls(
-            chain=chain,
-            cart=cart,
-            sample_time=float(sample_time),
-            rate=rate,
-            stiffness=float(stiffness),
-            phi=phi * unit / unit[:, None],
-            gamma=gamma * stiffness / unit,
-        )
 
     @property
     def row(self) -> int:
@@ -253,7 +239,7 @@ def design_feedback(chain: Chain, task: Design) -> FeedbackDesign:
     try:
         # A candidate may be unstable and diverge, which its final numbers show.
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-            plant = SampledPlant.of(
+            plant = SampledPlant(
                 chain, cart=task.cart, settling=task.settling_time, sample_time=task.sample_time
             )
             design = _design(plant, task)
@@ -279,7 +265,7 @@ def _refuse_more_overshoot(plant: SampledPlant, task: Design, design: FeedbackDe
         return
     for halvings in range(1, _HALVINGS + 1):
         sample_time = plant.sample_time / 2**halvings
-        faster = SampledPlant.of(
+        faster = SampledPlant(
             plant.chain, cart=plant.cart, settling=task.settling_time, sample_time=sample_time
         )
         better = _design(faster, task)
