@@ -133,7 +133,7 @@ class LoopTrial:
 
     @cached_property
     def scales(self) -> CountScales:
-        """What a count is worth."""
+        """The size of a count in the units of the submission."""
         return bench_scales(self.submission, bench=self.bench, analysis=self.analysis)
 
     def gains(self) -> StateGains | PidGains:

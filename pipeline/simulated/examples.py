@@ -45,7 +45,7 @@ def _in_hertz(file: Path) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Example:
-    """One example: a preset, a seed and its students, whose text stands in the folder itself."""
+    """One example: a preset, a seed and its students. Their text is in the folder itself."""
 
     folder: str
     preset: str
