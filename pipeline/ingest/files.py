@@ -47,8 +47,6 @@ _OUT_OF_TIME = "signal 24"  # SIGXCPU, on Linux and macOS
 # Whether a file that crashes its reader may not end this process, as when it grades or imports.
 OF_STRANGERS: ContextVar[bool] = ContextVar("OF_STRANGERS", default=False)
 
-# A `.mat` file of version 4 begins with a type, two sizes, a flag, and the length of a name.
-_VERSION_4 = re.compile(rb"[\0-\x34]\0{3}.{8}[\0\1]\0{3}[\2-\x40]\0{3}[A-Za-z]", re.DOTALL)
 # First bytes of files that are submitted by mistake, and the advice to give.
 _BY_MISTAKE = (
     (b"PK\x03\x04", "a zip archive, or a document of LibreOffice: save the sheet as .xlsx or CSV"),
@@ -253,18 +251,11 @@ def parse_table(raw: bytes, *, source: str) -> FileTable:
 
 def parse_tables(raw: bytes, *, source: str) -> list[FileTable]:
     """Return the recordings of a data file from its bytes, each with its own `run`."""
-    if not raw.strip():
-        raise SubmissionError(f"{source}: the file is empty")
     read = next((read for is_theirs, read in _READERS if is_theirs(raw)), None)
     if read is None:
         for start, what in _BY_MISTAKE:
             if raw.startswith(start):
                 raise SubmissionError(f"{source}: {what}")
-        if _VERSION_4.match(raw):
-            raise SubmissionError(
-                f"{source}: a .mat file of version 4, which is too old; in MATLAB, load it and "
-                "save it again: save('new.mat', '-v7')"
-            )
         read = read_text
     tables = _joined(read(raw, source=source))
     if len(tables) == 1:

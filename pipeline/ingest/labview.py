@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.columns import is_time, join_unit
 from pipeline.ingest.table import (
@@ -25,12 +24,15 @@ from pipeline.ingest.table import (
     SETTING,
     FileTable,
     Format,
+    Signal,
     Variable,
     binary_table,
     checked_names,
+    even_times,
     not_read,
+    printable,
 )
-from pipeline.ingest.text import Block, Layout, decode, read_block
+from pipeline.ingest.text import Block, Layout, read_block, text_lines
 from pipeline.words.numbers import first_few
 
 if TYPE_CHECKING:
@@ -47,11 +49,6 @@ def is_lvm(raw: bytes) -> bool:
     return _START.match(raw) is not None
 
 
-def _even_times(n: int, *, start: float, interval: float) -> Array:
-    """Return n times in s, from the first time and the interval."""
-    return start + interval * np.arange(n, dtype=np.float64)
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Segment:
     """A segment: its header's tags, its column names and their line, and its numbered rows."""
@@ -61,23 +58,24 @@ class _Segment:
     line: int
     rows: list[tuple[int, str]] = field(default_factory=list)
 
-    def stated(self, tag: str, layout: Layout, *, source: str) -> float | None:
-        """Return the number that the header states for all channels; None if it states none.
+    def stated(self, tag: str, layout: Layout, *, source: str) -> float:
+        """Return the number that the header states for all channels; 0 if it states none.
 
         Raises
         ------
         SubmissionError : the entry is not a number, or differs between channels.
         """
-        place = f"{source} line {self.line}: the header above states {tag}"
-        typed = [value for value in self.tags.get(tag, []) if value]
+        typed = [value for value in self.tags.get(tag, []) if value] or ["0"]
         try:
             found = {layout.cell(value) for value in typed}
         except ValueError:
-            shown = first_few(typed, 3)[:60]
-            raise SubmissionError(f"{place} {shown!r}, which is not a number") from None
+            found = {np.nan}
         if len(found) > 1 or not all(map(np.isfinite, found)):
-            raise SubmissionError(f"{place} differently for each channel: {first_few(typed, 3)}")
-        return found.pop() if found else None
+            raise SubmissionError(
+                f"{source} line {self.line}: the header above states {tag} "
+                f"{first_few(typed, 3)[:60]!r}; expected the same number for all channels"
+            )
+        return found.pop()
 
 
 def read_lvm(raw: bytes, *, source: str) -> list[FileTable]:
@@ -87,127 +85,114 @@ def read_lvm(raw: bytes, *, source: str) -> list[FileTable]:
     ------
     SubmissionError : the file is broken; the message names the line.
     """
-    text = decode(raw, source=source).replace("\r\n", "\n").replace("\r", "\n")
-    lines = text.split("\n")
-    delimiter = "," if re.search(r"^Separator,Comma", text[:4000], re.MULTILINE) else "\t"
-    about, at = _header(lines, 0, delimiter, source=source)
-    comma = about.get("Decimal_Separator", [""])[0].startswith(",")
+    lines = text_lines(raw, source=source)
+    delimiter = "," if any(line.startswith("Separator,Comma") for _, line in lines[:40]) else "\t"
+    about, segments, special = _segments(lines, delimiter, source=source)
+    layout = Layout(delimiter, comma=about.get("Decimal_Separator", [""])[0].startswith(","))
     across = about.get("X_Columns", ["One"])[0].casefold()
     if across not in ("one", "multi", "no"):
         raise SubmissionError(f"{source}: X_Columns is {across[:20]!r}")
-    layout = Layout(delimiter, comma=comma)
-    segments = [one for one in _segments(lines, at, layout, source=source) if one.rows]
+    segments = [one for one in segments if one.rows]
     if not segments:
         raise SubmissionError(f"{source}: holds no rows of numbers")
-    tables = [_read(one, layout, across=across, source=source) for one in segments]
-    if any(line.startswith(_SPECIAL) for line in lines):
-        notes = (*tables[0].notes, "a special block of LabVIEW is not read")
-        tables[0] = replace(tables[0], notes=notes)
-    return tables
+    first, *others = [
+        _read(one, layout, has_times=across != "no", source=source) for one in segments
+    ]
+    return [replace(first, notes=(*first.notes, *special)), *others]
 
 
-def _header(
-    lines: Sequence[str], at: int, delimiter: str, *, source: str
-) -> tuple[dict[str, list[str]], int]:
-    """Return the tags of a header with their values, and the line (from 0) after it."""
+def _segments(
+    lines: Sequence[tuple[int, str]], delimiter: str, *, source: str
+) -> tuple[dict[str, list[str]], list[_Segment], list[str]]:
+    """Return the tags of the file, its segments, and a note on special blocks.
+
+    Rows without a header of their own belong to the segment before.
+
+    Raises
+    ------
+    SubmissionError : a header or a special block has no end.
+    """
+    about: dict[str, list[str]] | None = None
+    segments: list[_Segment] = []
+    special: list[str] = []
     tags: dict[str, list[str]] = {}
-    for i in range(at, len(lines)):
-        tag, *values = [part.strip() for part in lines[i].split(delimiter)]
-        if tag == _END:
-            return tags, i + 1
-        tags[tag] = values or [""]
-    raise SubmissionError(
-        f"{source} line {at + 1}: the header that begins here has no {_END}; "
-        "the file was cut short or edited"
-    )
+    part, begin, block, last = "header", 1, 0, 0
+    for number, line in lines:
+        fields = [one.strip() for one in line.split(delimiter)]
+        if block or line.startswith(_SPECIAL):
+            special = ["a special block of LabVIEW is not read"]
+            block = 0 if line.startswith(_END_OF_SPECIAL) else block or number
+        elif not any(fields):
+            continue
+        # A line directly after a row is a row, because an empty line comes before every header.
+        elif part == "rows" and (last == number - 1 or re.match(r"[-+.\d]|$", fields[0])):
+            segments[-1].rows.append((number, line))
+            last = number
+        elif part == "names":
+            segments.append(_Segment(tags=tags, names=fields, line=number))
+            part = "rows"
+        elif fields[0] == _END:
+            part, about = ("header", tags) if about is None else ("names", about)
+            begin, tags = (number + 1, {}) if part == "header" else (begin, tags)
+        else:
+            if part == "rows":
+                part, begin, tags = "header", number, {}
+            tags[fields[0]] = fields[1:] or [""]
+    if block or part == "header":
+        what, end = ("special block", _END_OF_SPECIAL) if block else ("header", _END)
+        raise SubmissionError(
+            f"{source} line {block or begin}: the {what} that begins here has no {end}; "
+            "the file was cut short or edited"
+        )
+    if part == "names":
+        raise SubmissionError(f"{source}: ends after the header of a segment")
+    return about or {}, segments, special
 
 
-def _segments(lines: Sequence[str], at: int, layout: Layout, *, source: str) -> Iterator[_Segment]:
-    """Yield the segments; rows without a header of their own belong to the segment before."""
-    segment: _Segment | None = None
-    while at < len(lines):
-        line = lines[at]
-        if line.startswith(_SPECIAL):
-            ends = (i for i in range(at, len(lines)) if lines[i].startswith(_END_OF_SPECIAL))
-            if (end := next(ends, None)) is None:
-                raise SubmissionError(
-                    f"{source} line {at + 1}: the special block that begins here has no "
-                    f"{_END_OF_SPECIAL}; the file was cut short or edited"
-                )
-            at = end
-        elif line.strip():
-            first = line.partition(str(layout.delimiter))[0].strip()
-            after_row = segment is not None and segment.rows[-1:] == [(at, lines[at - 1])]
-            # A line directly after a row is a row, because an empty line comes before every header.
-            if segment is not None and (after_row or not first or _is_number(first, layout)):
-                segment.rows.append((at + 1, line))
-            else:
-                if segment is not None:
-                    yield segment
-                tags, behind = _header(lines, at, str(layout.delimiter), source=source)
-                if behind >= len(lines) or not lines[behind].strip():
-                    raise SubmissionError(f"{source}: ends after the header of a segment")
-                names = [part.strip() for part in lines[behind].split(str(layout.delimiter))]
-                segment = _Segment(tags=tags, names=names, line=behind + 1)
-                at = behind
-        at += 1
-    if segment is not None:
-        yield segment
-
-
-def _is_number(field: str, layout: Layout) -> bool:
-    try:
-        layout.cell(field)
-    except ValueError:
-        return False
-    return True
-
-
-def _read(segment: _Segment, layout: Layout, *, across: str, source: str) -> FileTable:
+def _read(segment: _Segment, layout: Layout, *, has_times: bool, source: str) -> FileTable:
     """Return the table of one segment; comments and channels without values are left out."""
     names = segment.names[: len(segment.names) - (segment.names[-1].casefold() == "comment")]
     while names and not names[-1]:
         names = names[:-1]
-    has_times = across != "no"
     clocks = [i for i, name in enumerate(names) if name == "X_Value"]
     used = [i for i in range(len(names)) if i not in clocks[has_times:]]
     if len(used) <= has_times:
         raise SubmissionError(f"{source} line {segment.line}: names no channel")
-    rows, beside = [], False
+    rows, notes = [], list[str]()
     for number, line in segment.rows:
         fields = line.split(str(layout.delimiter))
-        beside = beside or any(one.strip() for one in fields[len(names) :])
+        if any(one.strip() for one in fields[len(names) :]):
+            notes = ["comments beside the rows are not read"]
         fields = fields[: len(names)]
-        full = len(fields) == len(names)
-        if full and has_times and any(fields[i] != fields[clocks[0]] for i in clocks[1:]):
+        is_full = len(fields) == len(names)
+        if is_full and has_times and len({fields[i] for i in clocks}) > 1:
+            place = number if number > segment.line + 1 else segment.line
             raise SubmissionError(
-                f"{source} line {number if number > segment.line + 1 else segment.line}: the "
-                "channels were sampled at different times; save them with X_Columns One"
+                f"{source} line {place}: the channels were sampled at different times; save them "
+                "with X_Columns One"
             )
-        rows.append((number, "\x01".join([fields[i] for i in used] if full else fields[:-1])))
-    block = Block(head=[(segment.line, "")], rows=rows, source=source)
-    headings = _headings(segment, [names[i] for i in used])
-    apart = Layout("\x01", comma=layout.comma)
-    table = read_block(block, apart, format=_LVM, names=headings)
+        rows.append((number, "\x01".join([fields[i] for i in used] if is_full else fields[:-1])))
+    block = Block(
+        head=[(segment.line, "")],
+        rows=rows,
+        layout=Layout("\x01", comma=layout.comma),
+        source=source,
+    )
+    table = read_block(block, format=_LVM, names=_headings(segment, [names[i] for i in used]))
     most = max((int(n) for n in segment.tags.get("Samples", []) if n.isdecimal()), default=0)
     complete = len(rows) - (rows[-1][1].count("\x01") != len(used) - 1)
     if complete < most:
-        cut = f"line {segment.rows[-1][0]}: {complete:,} of {most:,} samples"
+        cut = f"line {rows[-1][0]}: {complete:,} of {most:,} samples"
         table = replace(table, cut=cut)
-    notes = (*table.notes, *(["comments beside the rows are not read"] if beside else []))
     # All numbers have a decimal mark, whole or not.
-    table = replace(table, notes=notes, whole=(False,) * len(table.names))
-    interval = None if has_times else segment.stated("Delta_X", layout, source=source)
-    if not interval:
+    n = len(table.names)
+    table = replace(table, notes=(*table.notes, *notes), whole=(False,) * n)
+    if has_times or not (interval := segment.stated("Delta_X", layout, source=source)):
         return table
-    start = segment.stated("X0", layout, source=source) or 0.0
-    times = _even_times(table.values.shape[1], start=start, interval=interval)
-    return replace(
-        table,
-        names=("time", *table.names),
-        values=np.vstack([times, table.values]),
-        whole=(False, *table.whole),
-    )
+    start = segment.stated("X0", layout, source=source)
+    times = even_times(table.values.shape[1], start=start, interval=interval)
+    values = np.vstack([times, table.values])
+    return replace(table, names=("time", *table.names), values=values, whole=(False,) * (n + 1))
 
 
 def _headings(segment: _Segment, names: Sequence[str]) -> list[str]:
@@ -235,7 +220,7 @@ def is_tdms(raw: bytes) -> bool:
 
 
 def read_tdms(raw: bytes, *, source: str) -> list[FileTable]:
-    """Read the channels of each group that holds a recording.
+    """Read the channels of each group that holds a recording; a short channel holds settings.
 
     Raises
     ------
@@ -243,64 +228,62 @@ def read_tdms(raw: bytes, *, source: str) -> list[FileTable]:
     """
     _refuse_cut(raw, source=source)
     channels = _read_channels(raw, source=source)
-    groups = _recordings(channels, source=source)
-    used = [channel for read in groups.values() for channel in read]
-    longest = max(channel.samples for channel in used)
-    variables = tuple(
-        Variable(
-            name=f"{channel.group}/{channel.name}",
-            size=(channel.samples, 1),
-            kind=channel.kind,
-            read=channel in used,
-            advice="if it is a signal, write it as numbers"
-            if channel.values is None and channel.samples >= longest
-            else "",
+    signals = [one for one in channels if one.values is not None and one.samples > 1]
+    if not signals:
+        found = first_few([f"{one.group}/{one.name}" for one in channels], MOST_NAMED)
+        raise SubmissionError(f"{source}: holds no channel of numbers, but {found or 'nothing'}")
+    longest = max(one.samples for one in signals)
+    groups: dict[str, list[Signal]] = {}
+    for one in signals:
+        if one.samples > SETTING * longest:
+            groups.setdefault(one.group, []).append(one)
+    advice = "if it is a signal, write it as numbers"
+    variables = [
+        replace(one, name=f"{one.group}/{one.name}").entry(
+            read=one in groups.get(one.group, ()),
+            advice=advice if one.values is None and one.samples >= longest else "",
         )
-        for channel in channels
-    )
-    notes = tuple(not_read([variable for variable in variables if not variable.read]))
+        for one in channels
+    ]
     return [
-        replace(_table(group, read, source=source), variables=variables, notes=notes)
-        for group, read in groups.items()
+        _table(group, read, variables=variables, source=source) for group, read in groups.items()
     ]
 
 
-def _table(group: str, read: Sequence["_Channel"], *, source: str) -> FileTable:
-    """Return the channels of a group, with the time that they state."""
-    names = [channel.heading for channel in read]
-    columns = [channel.numbers for channel in read]
-    if not any(is_time(channel.name) for channel in read):
-        interval, start = _clock(read, source=source)
-        if interval:
+def _table(
+    group: str, read: Sequence[Signal], *, variables: Sequence[Variable], source: str
+) -> FileTable:
+    """Return the channels of a group, with the time that they state.
+
+    Raises
+    ------
+    SubmissionError : the channels differ in length, or state different times.
+    """
+    if len({one.samples for one in read}) > 1:
+        sizes = first_few([f"{one.name} ({one.samples:,})" for one in read], MOST_NAMED)
+        raise SubmissionError(f"{source}: the channels differ in length: {sizes}")
+    clocks = {(one.interval, one.start) for one in read if one.interval > 0}
+    names = [join_unit(one.name, one.unit) for one in read]
+    columns = [one.numbers[:, 0] for one in read]
+    if not any(is_time(one.name) for one in read):
+        if len(clocks) > 1:
+            shown = first_few([f"{interval:g} s" for interval, _ in sorted(clocks)], MOST_NAMED)
+            raise SubmissionError(
+                f"{source}: the channels were sampled at different times (wf_increment {shown}); "
+                "keep those of one rate"
+            )
+        for interval, start in clocks:
             names.insert(0, "time")
-            columns.insert(0, _even_times(read[0].samples, start=start, interval=interval))
-    names = checked_names(names, place=f"{source} group {group!r}")
-    return binary_table(columns, names=names, source=source, format=_TDMS, run=group)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Channel:
-    """A channel with its stated unit and clock; `values` is None if it holds no numbers."""
-
-    group: str
-    name: str
-    kind: str
-    samples: int
-    values: Array | None
-    unit: str
-    interval: float
-    start: float
-
-    @property
-    def numbers(self) -> Array:
-        """The numbers; the channel must have some."""
-        assert self.values is not None
-        return self.values
-
-    @property
-    def heading(self) -> str:
-        """The channel's name and unit."""
-        return join_unit(self.name, self.unit)
+            columns.insert(0, even_times(read[0].samples, start=start, interval=interval))
+    return binary_table(
+        columns,
+        names=checked_names(names, place=f"{source} group {group!r}"),
+        source=source,
+        format=_TDMS,
+        run=group,
+        variables=variables,
+        notes=not_read(variables),
+    )
 
 
 def _refuse_cut(raw: bytes, *, source: str) -> None:
@@ -325,7 +308,7 @@ def _refuse_cut(raw: bytes, *, source: str) -> None:
         at = end
 
 
-def _read_channels(raw: bytes, *, source: str) -> list[_Channel]:
+def _read_channels(raw: bytes, *, source: str) -> list[Signal]:
     """Return the channels of a file.
 
     Raises
@@ -349,34 +332,27 @@ def _read_channels(raw: bytes, *, source: str) -> list[_Channel]:
     return channels
 
 
-def _channel(one: "TdmsChannel") -> _Channel:
-    values, kind = np.asarray(one[:]), str(one.dtype)
+def _channel(one: "TdmsChannel") -> Signal:
+    values, unit = np.asarray(one[:]), str(one.properties.get("unit_string", ""))
+    kind = str(one.dtype)
     if values.dtype.kind == "M":
-        start = values[0] if values.size else None
-        values = (values - start) / np.timedelta64(1, "s") if values.size else values
-        kind = "times"
+        kind, unit = "times", "s"
+        values = (values - values[:1]) / np.timedelta64(1, "s")
     is_number = values.dtype.kind in "biuf" and values.ndim == 1
-    properties = one.properties
-    return _Channel(
-        group=_printable(one.group_name),
-        name=_printable(one.name),
-        kind=kind if is_number else "no numbers",
-        samples=values.size,
-        values=values.astype(np.float64) if is_number else None,
-        unit="s" if kind == "times" else _printable(str(properties.get("unit_string", ""))),
-        interval=_number(properties.get("wf_increment")),
-        start=_number(properties.get("wf_start_offset")),
+    interval, start = (
+        float(value) if isinstance(value, float | int | np.number) and np.isfinite(value) else 0.0
+        for value in map(one.properties.get, ("wf_increment", "wf_start_offset"))
     )
-
-
-def _printable(text: str) -> str:
-    return text if text.isprintable() else repr(text)[1:-1]
-
-
-def _number(value: object) -> float:
-    """Return a property if it is a finite number; 0 otherwise."""
-    known = isinstance(value, float | int | np.number) and bool(np.isfinite(value))
-    return float(value) if known else 0.0  # type: ignore[arg-type]
+    return Signal(
+        group=printable(one.group_name),
+        name=printable(one.name),
+        kind=kind if is_number else "no numbers",
+        size=(values.size, 1),
+        values=values.astype(np.float64)[:, None] if is_number else None,
+        unit=printable(unit),
+        interval=interval,
+        start=start,
+    )
 
 
 @contextmanager
@@ -393,45 +369,3 @@ def _complaints() -> Iterator[list[logging.LogRecord]]:
         yield listener.buffer
     finally:
         logger.removeHandler(listener)
-
-
-def _recordings(channels: Sequence[_Channel], *, source: str) -> dict[str, list[_Channel]]:
-    """Return the channels of each group that is a recording, without short channels.
-
-    A short channel holds settings.
-
-    Raises
-    ------
-    SubmissionError : there is no recording, or the channels of a group differ in length.
-    """
-    signals = [one for one in channels if one.values is not None and one.samples > 1]
-    if not signals:
-        found = first_few([f"{one.group}/{one.name}" for one in channels], MOST_NAMED)
-        raise SubmissionError(f"{source}: holds no channel of numbers, but {found or 'nothing'}")
-    longest = max(one.samples for one in signals)
-    groups: dict[str, list[_Channel]] = {}
-    for one in signals:
-        if one.samples > SETTING * longest:
-            groups.setdefault(one.group, []).append(one)
-    for read in groups.values():
-        if len({one.samples for one in read}) > 1:
-            sizes = first_few([f"{one.name} ({one.samples:,})" for one in read], MOST_NAMED)
-            raise SubmissionError(f"{source}: the channels differ in length: {sizes}")
-    return groups
-
-
-def _clock(channels: Sequence[_Channel], *, source: str) -> tuple[float, float]:
-    """Return the sample interval and the first time (s) of the channels; zeros if not stated.
-
-    Raises
-    ------
-    SubmissionError : the channels state different intervals or first times.
-    """
-    stated = {(one.interval, one.start) for one in channels if one.interval > 0}
-    if len(stated) > 1:
-        shown = first_few([f"{interval:g} s" for interval, _ in sorted(stated)], MOST_NAMED)
-        raise SubmissionError(
-            f"{source}: the channels were sampled at different times (wf_increment {shown}); "
-            "keep those of one rate"
-        )
-    return stated.pop() if stated else (0.0, 0.0)

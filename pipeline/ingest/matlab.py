@@ -6,7 +6,6 @@ process, so `files` reads files of strangers in a process of their own.
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from io import BytesIO
 from typing import Any
 
@@ -20,10 +19,11 @@ from pipeline.ingest.table import (
     SETTING,
     FileTable,
     Format,
-    Variable,
+    Signal,
     binary_table,
     checked_names,
     not_read,
+    printable,
 )
 from pipeline.words.numbers import first_few
 
@@ -36,50 +36,6 @@ _LONGEST_NAME, _DEEPEST = 64, 4  # characters; structs in structs
 _NUMBERS = frozenset(
     "double single logical int8 uint8 int16 uint16 int32 uint32 int64 uint64".split()
 )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MatVariable:
-    """A variable with its numbers (rows, columns), or with a description if `values` is None.
-
-    `bytes` is the variable's size if its numbers are not read. `elements` are those of a struct,
-    each with its fields by name; `text` is that of a text.
-    """
-
-    name: str
-    kind: str
-    values: np.ndarray | None = None
-    size: tuple[int, ...] = ()
-    bytes: int = 0
-    elements: tuple[dict[str, "MatVariable"], ...] = ()
-    text: str = ""
-
-    def __post_init__(self) -> None:
-        if not self.name.isprintable() or len(self.name) > _LONGEST_NAME:
-            raise ValueError(self.name)
-
-    @property
-    def numbers(self) -> np.ndarray:
-        """The numbers; the variable must have some."""
-        assert self.values is not None
-        return self.values
-
-    @property
-    def samples(self) -> int:
-        """The number of samples, if it is a signal or a matrix of signals."""
-        return max(self.numbers.shape)
-
-    @property
-    def is_vector(self) -> bool:
-        """Whether it is a single signal."""
-        return self.numbers.size > 1 and min(self.numbers.shape) == 1
-
-    def entry(self, *, read: bool, advice: str = "") -> Variable:
-        """Return the variable's entry in an inspection."""
-        return Variable(name=self.name, size=self.size, kind=self.kind, read=read, advice=advice)
-
-    def __str__(self) -> str:
-        return str(self.entry(read=False))
 
 
 def is_mat(raw: bytes) -> bool:
@@ -99,52 +55,52 @@ def read_mat(raw: bytes, *, source: str) -> list[FileTable]:
         return tables
     record = _record(variables, source=source)
     notes: list[str] = []
-    names, arrays = [], []
+    columns: dict[str, np.ndarray] = {}
     joined = len(record) > 1
-    for variable in record:
-        values = variable.numbers
-        if variable.is_vector:
-            names.append(variable.name)
-            arrays.append(values.ravel())
+    for signal in record:
+        if signal.is_vector:
+            columns[signal.name] = signal.numbers.ravel()
             continue
+        values = signal.numbers
         if values.shape[0] < values.shape[1]:
             values = values.T
-            notes.append(f"{variable.name} is transposed: its rows are read as columns")
-        arrays += list(values.T)
-        numbers = range(1, values.shape[1] + 1)
-        names += [f"{variable.name} column {i}" if joined else str(i) for i in numbers]
-    used = {variable.name for variable in record}
-    longest = max(variable.samples for variable in record)
+            notes.append(f"{signal.name} is transposed: its rows are read as columns")
+        for i, column in enumerate(values.T, start=1):
+            columns[f"{signal.name} column {i}" if joined else str(i)] = column
     format = _VECTORS if joined or record[0].is_vector else _MATRIX
-    if any(bench <= used for bench in _BENCH):
+    if any(bench <= {signal.name for signal in record} for bench in _BENCH):
         format = _BENCH_LOG
-    made = tuple(
-        v.entry(read=True)
-        if v in record
-        else v.entry(read=False, advice=_advice(v, longest=longest))
+    longest = max(signal.samples for signal in record)
+    entries = [
+        v.entry(read=v in record, advice="" if v in record else _advice(v, longest=longest))
         for v in variables
-    )
-    notes += not_read([variable for variable in made if not variable.read])
-    columns = [_unwrap(column) for column in arrays]
-    for name, column, unwrapped in zip(names, arrays, columns, strict=True):
-        if unwrapped is not column:
+    ]
+    notes += not_read(entries)
+    for name, column in columns.items():
+        columns[name] = _unwrap(column)
+        if columns[name] is not column:
             notes.append(f"{name}: a {column.dtype} counter that overflowed was made continuous")
     return [
         binary_table(
-            columns, names=names, source=source, format=format, notes=notes, variables=made
+            [*columns.values()],
+            names=[*columns],
+            source=source,
+            format=format,
+            notes=notes,
+            variables=entries,
         )
     ]
 
 
-def _structures(variables: Sequence[MatVariable], *, source: str) -> list[FileTable]:
+def _structures(variables: Sequence[Signal], *, source: str) -> list[FileTable]:
     """Return the recordings in structs, or nothing if the file also has vectors.
 
     Simulink's "structure with time" has the fields `time` and `signals`, whose elements have
     `values` and perhaps a `label`. Other structs have a vector for each signal.
     """
-    whole = {v.name: v for v in variables}
-    if (one := _structure("", whole, source=source)) is not None:
-        return [one]
+    own = {v.name: v for v in variables}
+    if "signals" in own and (table := _structure("", own, source=source)) is not None:
+        return [table]
     if sum(v.values is not None and v.samples > _MOST_SETTINGS for v in variables) > 1:
         return []
     found = (
@@ -153,17 +109,14 @@ def _structures(variables: Sequence[MatVariable], *, source: str) -> list[FileTa
     return [table for table in found if table is not None]
 
 
-def _structure(name: str, fields: Mapping[str, MatVariable], *, source: str) -> FileTable | None:
-    signals = fields.get("signals")
-    elements = signals.elements if signals else ()
+def _structure(name: str, fields: Mapping[str, Signal], *, source: str) -> FileTable | None:
+    elements = fields["signals"].elements if "signals" in fields else ()
     if not elements and not name:
         return None
-    time = next((fields[key] for key in fields if is_time(key)), None)
+    parts = [*fields.items()]
     if elements:
-        parts = [(_label(one), one["values"]) for one in elements if "values" in one]
-        parts = [("time", time), *parts] if time else parts
-    else:
-        parts = [*fields.items()]
+        parts = [("time", fields[key]) for key in fields if is_time(key)][:1]
+        parts += [(_label(one), one["values"]) for one in elements if "values" in one]
     parts = [(label, v) for label, v in parts if v.values is not None and v.samples > 1]
     longest = max((v.samples for _, v in parts), default=0)
     columns: list[tuple[str, np.ndarray]] = []
@@ -176,19 +129,21 @@ def _structure(name: str, fields: Mapping[str, MatVariable], *, source: str) -> 
         return None
     named = all(label for label, _ in columns)
     names = [label if named else str(i) for i, (label, _) in enumerate(columns, start=1)]
-    names = checked_names(names, place=f"{source} {name}".strip())
-    format = _VECTORS if named else _MATRIX
-    arrays = [column for _, column in columns]
-    return binary_table(arrays, names=names, source=source, format=format, run=name)
+    return binary_table(
+        [column for _, column in columns],
+        names=checked_names(names, place=f"{source} {name}".strip()),
+        source=source,
+        format=_VECTORS if named else _MATRIX,
+        run=name,
+    )
 
 
-def _label(element: Mapping[str, MatVariable]) -> str:
+def _label(element: Mapping[str, Signal]) -> str:
     """Return the label of a signal of Simulink, or ""."""
-    text = element["label"].text.strip() if "label" in element else ""
-    return text if text.isprintable() else ""
+    return printable(element["label"].text.strip()) if "label" in element else ""
 
 
-def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariable]:
+def _record(variables: Sequence[Signal], *, source: str) -> list[Signal]:
     """Return the variables that form the recording; all of them have the same number of samples.
 
     Raises
@@ -197,64 +152,57 @@ def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariabl
     """
     signals = [v for v in variables if v.values is not None and v.samples > 1]
     if not signals:
-        found = first_few([str(v) for v in variables], MOST_NAMED) or "nothing"
-        told = {v.name: advice for v in variables if (advice := _advice(v, longest=0))}
-        first = next((f"; {name}: {advice}" for name, advice in told.items()), "")
-        raise SubmissionError(f"{source}: holds no vector or matrix of numbers, but {found}{first}")
+        found = first_few([str(v.entry(read=False)) for v in variables], MOST_NAMED) or "nothing"
+        told = (f"; {v.name}: {advice}" for v in variables if (advice := _advice(v, longest=0)))
+        raise SubmissionError(
+            f"{source}: holds no vector or matrix of numbers, but {found}{next(told, '')}"
+        )
     signals = [v for v in signals if min(v.size) <= MOST_COLUMNS] or signals
     longest = max(v.samples for v in signals)
     signals = [v for v in signals if v.samples > SETTING * longest]
-    sizes = first_few([str(v) for v in signals], MOST_NAMED)
     vectors = [v for v in signals if v.is_vector]
     if all(v.samples < longest for v in vectors):  # the longest variable is a matrix
-        vectors, signals = [], [v for v in signals if v.samples == longest]
-    if len({v.samples for v in vectors}) > 1:
+        vectors = []
+    n = vectors[0].samples if vectors else longest
+    matrices = [v for v in signals if not v.is_vector and v.samples == n]
+    sizes = first_few([str(v.entry(read=True)) for v in signals], MOST_NAMED)
+    if any(v.samples != n for v in vectors):
         raise SubmissionError(f"{source}: the vectors differ in length: {sizes}")
-    matrices = [v for v in signals if not v.is_vector]
     if not vectors and len(matrices) > 1:
         raise SubmissionError(f"{source}: holds several matrices ({sizes}); keep one")
-    if len(vectors) > MOST_COLUMNS:
-        raise SubmissionError(f"{source}: holds more than {MOST_COLUMNS} vectors")
-    if not vectors:
-        if min(matrices[0].size) > MOST_COLUMNS:
-            raise SubmissionError(f"{source}: {matrices[0]} has more than {MOST_COLUMNS} columns")
-        return matrices
     if any(bench <= {v.name for v in vectors} for bench in _BENCH):
-        return vectors  # a bench log is complete; other variables were computed from it
-    matrices = [matrix for matrix in matrices if matrix.samples == vectors[0].samples]
-    columns = len(vectors) + sum(min(matrix.size) for matrix in matrices)
-    return [*vectors, *matrices] if columns <= MOST_COLUMNS else vectors
+        matrices = []  # a bench log is complete; other variables were computed from it
+    if vectors and len(vectors) + sum(min(v.size) for v in matrices) > MOST_COLUMNS:
+        matrices = []
+    if sum(min(v.size) for v in (*vectors, *matrices)) > MOST_COLUMNS:
+        raise SubmissionError(f"{source}: more than {MOST_COLUMNS} columns: {sizes}")
+    return [*vectors, *matrices]
 
 
-def _advice(variable: MatVariable, *, longest: int) -> str:
+# Advice on variables that may hold a recording, by kind.
+_ADVICE = {
+    "struct": "if the recording is in it, save its fields: save('new.mat', '-struct', '{name}')",
+    "object": "if it is a table or a timetable, write it as text: writetable({name}, 'new.csv') or "
+    "writetimetable({name}, 'new.csv')",
+    "cell": "if the recording is in it, save each of its vectors as a variable",
+    "sparse": "if it is a recording, save full({name})",
+    "complex": "if it is a recording, save it as real vectors, one per signal",
+    "array of more than two dimensions": "if it is a recording, save it as real vectors, one per "
+    "signal",
+}
+
+
+def _advice(variable: Signal, *, longest: int) -> str:
     """Return advice for a variable that may hold a recording; "" for others.
 
     `longest` is the number of samples of the recording found in the file.
     """
-    name = variable.name
     if variable.values is not None:
-        if variable.samples <= MOST_COLUMNS:
-            return ""
-        return f"if it is a recording, save it in a separate file: save('new.mat', '{name}')"
-    if variable.bytes < 8 * longest:  # too small to hold even the times
-        return ""
-    match variable.kind:
-        case "struct":
-            return (
-                f"if the recording is in it, save its fields: save('new.mat', '-struct', '{name}')"
-            )
-        case "object":
-            return (
-                "if it is a table or a timetable, write it as text: "
-                f"writetable({name}, 'new.csv') or writetimetable({name}, 'new.csv')"
-            )
-        case "cell":
-            return "if the recording is in it, save each of its vectors as a variable"
-        case "sparse":
-            return f"if it is a recording, save full({name})"
-        case "complex" | "array of more than two dimensions" | "no real matrix":
-            return "if it is a recording, save it as real vectors, one per signal"
-    return ""
+        large = "if it is a recording, save it in a separate file: save('new.mat', '{name}')"
+        advice = large if variable.samples > MOST_COLUMNS else ""
+    else:  # a smaller one cannot hold even the times
+        advice = _ADVICE.get(variable.kind, "") if variable.bytes >= 8 * longest else ""
+    return advice.format(name=variable.name)
 
 
 def _unwrap(values: np.ndarray) -> np.ndarray:
@@ -268,7 +216,7 @@ def _unwrap(values: np.ndarray) -> np.ndarray:
 # ------------------------------------------------------------------------------- variables
 
 
-def _read_variables(raw: bytes, *, source: str) -> list[MatVariable]:
+def _read_variables(raw: bytes, *, source: str) -> list[Signal]:
     """Return the variables of a `.mat` file, in the order of the file.
 
     Raises
@@ -277,14 +225,17 @@ def _read_variables(raw: bytes, *, source: str) -> list[MatVariable]:
     """
     is_7_3 = raw.startswith(b"MATLAB 7.3") or raw[512:516] == b"\x89HDF"
     try:
-        return _version_7_3(raw) if is_7_3 else _version_5(raw)
+        found = _version_7_3(raw) if is_7_3 else _version_5(raw)
+        if not all(v.name.isprintable() and len(v.name) <= _LONGEST_NAME for v in found):
+            raise ValueError("a name that MATLAB would not write")
     except MemoryError:
         raise
     except Exception:  # scipy and h5py raise many kinds
         raise SubmissionError(f"{source}: the .mat file is damaged or truncated") from None
+    return found
 
 
-def _version_5(raw: bytes) -> list[MatVariable]:
+def _version_5(raw: bytes) -> list[Signal]:
     from scipy.io import loadmat
 
     with warnings.catch_warnings(record=True) as said:
@@ -298,7 +249,7 @@ def _version_5(raw: bytes) -> list[MatVariable]:
     return [_of_scipy(name, one) for name, one in content.items() if not name.startswith("__")]
 
 
-def _of_scipy(name: str, value: Any, *, depth: int = 0) -> MatVariable:
+def _of_scipy(name: str, value: Any, *, depth: int = 0) -> Signal:
     """Return a variable as scipy reads it.
 
     Raises
@@ -308,27 +259,27 @@ def _of_scipy(name: str, value: Any, *, depth: int = 0) -> MatVariable:
     from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque
 
     if isinstance(value, MatlabOpaque):  # scipy gives its name as a value
-        return MatVariable(name=value.flat[0]["s0"].decode("ascii"), kind="object")
+        return Signal(name=value.flat[0]["s0"].decode("ascii"), kind="object")
     if not isinstance(value, np.ndarray):
         if isinstance(value, str):  # scipy's error
             raise ValueError(value)
-        return MatVariable(name=name, kind="sparse", size=value.shape, bytes=16 * value.nnz)
+        return Signal(name=name, kind="sparse", size=value.shape, bytes=16 * value.nnz)
     if value.dtype.kind == "U":
         text = "".join(value.ravel())[:_LONGEST_NAME]
-        return MatVariable(name=name, kind="text", size=value.shape, bytes=value.nbytes, text=text)
+        return Signal(name=name, kind="text", size=value.shape, bytes=value.nbytes, text=text)
     if not value.dtype.hasobject:
         return _matrix(name, value)
     taken = sum(getattr(leaf, "nbytes", 0) for leaf in _leaves(value))
     kind = "struct" if value.dtype.names else "cell"
     if isinstance(value, MatlabFunction | MatlabObject):
         kind = "function" if isinstance(value, MatlabFunction) else "object"
-    elements: tuple[dict[str, MatVariable], ...] = ()
+    elements: tuple[dict[str, Signal], ...] = ()
     if kind == "struct" and depth < _DEEPEST:
         elements = tuple(
             {key: _of_scipy(key, one[key], depth=depth + 1) for key in value.dtype.names or ()}
             for one in value.flat
         )
-    return MatVariable(name=name, kind=kind, size=value.shape, bytes=taken, elements=elements)
+    return Signal(name=name, kind=kind, size=value.shape, bytes=taken, elements=elements)
 
 
 def _leaves(value: Any) -> Iterator[Any]:
@@ -341,14 +292,14 @@ def _leaves(value: Any) -> Iterator[Any]:
             yield from _leaves(part)
 
 
-def _version_7_3(raw: bytes) -> list[MatVariable]:
+def _version_7_3(raw: bytes) -> list[Signal]:
     import h5py
 
     with h5py.File(BytesIO(raw), "r") as file:
         return [*_of_group(file, depth=0, seen=set()).values()]
 
 
-def _of_group(group: Any, *, depth: int, seen: set[int]) -> dict[str, MatVariable]:
+def _of_group(group: Any, *, depth: int, seen: set[int]) -> dict[str, Signal]:
     """Return the variables in an HDF5 file, or the fields of a struct in it.
 
     `seen` are the addresses of objects: MATLAB writes each once, a bomb gives one a million names.
@@ -359,7 +310,7 @@ def _of_group(group: Any, *, depth: int, seen: set[int]) -> dict[str, MatVariabl
     """
     import h5py
 
-    found: dict[str, MatVariable] = {}
+    found: dict[str, Signal] = {}
     for name in map(str, group):
         if name.startswith("#"):  # parts of MATLAB's cells and objects
             continue
@@ -377,13 +328,11 @@ def _of_group(group: Any, *, depth: int, seen: set[int]) -> dict[str, MatVariabl
             inner = _of_group(item, depth=depth + 1, seen=seen) if depth < _DEEPEST else {}
             taken = sum(v.bytes if v.values is None else v.values.nbytes for v in inner.values())
             elements = (inner,) if kind == "struct" else ()
-            found[name] = MatVariable(
-                name=name, kind=kind, size=(1, 1), bytes=taken, elements=elements
-            )
+            found[name] = Signal(name=name, kind=kind, size=(1, 1), bytes=taken, elements=elements)
     return found
 
 
-def _of_data_set(name: str, item: Any) -> MatVariable:
+def _of_data_set(name: str, item: Any) -> Signal:
     if item.is_virtual or item.external:
         raise ValueError(name)
     size = tuple(reversed(item.shape)) if len(item.shape) > 1 else (item.size, 1)
@@ -392,7 +341,7 @@ def _of_data_set(name: str, item: Any) -> MatVariable:
     if kind in _NUMBERS and not all(part.kind in "biuf" and not part.shape for part in parts):
         kind = "unknown"
     if kind not in _NUMBERS:
-        return MatVariable(name=name, kind=kind, size=size, bytes=item.nbytes)
+        return Signal(name=name, kind=kind, size=size, bytes=item.nbytes)
     values = np.atleast_1d(item[()])
     values = values["real"] + 1j * values["imag"] if pair else values
     return _matrix(name, values.T.reshape(size))
@@ -411,13 +360,13 @@ def _class_of(item: Any) -> str:
     return "text" if name == "char" else name
 
 
-def _matrix(name: str, values: np.ndarray) -> MatVariable:
+def _matrix(name: str, values: np.ndarray) -> Signal:
     """Return a variable with its numbers, or with a description if it is not a real matrix."""
     kind = "empty" if 0 in values.shape else "complex" if np.iscomplexobj(values) else ""
     if len(values.shape) != 2:
         kind = "array of more than two dimensions"
     if kind:
-        return MatVariable(name=name, kind=kind, size=values.shape, bytes=values.nbytes)
+        return Signal(name=name, kind=kind, size=values.shape, bytes=values.nbytes)
     dtype = np.dtype("u1") if values.dtype == bool else values.dtype.newbyteorder("=")
     values = values.astype(dtype)
-    return MatVariable(name=name, values=values, kind=str(dtype), size=values.shape)
+    return Signal(name=name, values=values, kind=str(dtype), size=values.shape)

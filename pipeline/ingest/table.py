@@ -71,6 +71,55 @@ class Variable:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Signal:
+    """A named array of a binary file: one signal, or one in each column.
+
+    Attributes
+    ----------
+    size : numbers of rows and columns.
+    kind : type of the numbers, or a description of other content.
+    values : the numbers (rows, columns); None if there are none that can be read.
+    bytes : memory of content other than numbers.
+    group, unit : as stated; "" if not stated.
+    interval, start : sample interval and first time in s, as stated; 0 if not stated.
+    elements : those of a struct, each with its fields by name.
+    text : the content of a text.
+    """
+
+    name: str
+    kind: str
+    size: tuple[int, ...] = ()
+    values: np.ndarray | None = None
+    bytes: int = 0
+    group: str = ""
+    unit: str = ""
+    interval: float = 0.0
+    start: float = 0.0
+    elements: "tuple[dict[str, Signal], ...]" = ()
+    text: str = ""
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The numbers; there must be some."""
+        assert self.values is not None
+        return self.values
+
+    @property
+    def samples(self) -> int:
+        """The number of samples, along rows or columns."""
+        return max(self.size, default=0)
+
+    @property
+    def is_vector(self) -> bool:
+        """Whether it is a single signal."""
+        return self.samples > 1 and min(self.size) == 1
+
+    def entry(self, *, read: bool, advice: str = "") -> Variable:
+        """Return the entry in an inspection."""
+        return Variable(name=self.name, size=self.size, kind=self.kind, read=read, advice=advice)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class FileTable:
     """The columns of one file.
 
@@ -183,7 +232,7 @@ def checked_names(
         )
     numbers = numbers if numbers is not None else range(len(names))
     clean = [name.strip(" \"'") or str(i + 1) for i, name in zip(numbers, names, strict=True)]
-    clean = [name if name.isprintable() else repr(name)[1:-1] for name in clean]
+    clean = [*map(printable, clean)]
     seen: set[str] = set()
     for name in clean:
         if name.casefold() in seen:
@@ -223,8 +272,19 @@ def binary_table(
     )
 
 
+def even_times(n: int, *, start: float, interval: float) -> Array:
+    """Return n times in s, from the first time and the interval."""
+    return start + interval * np.arange(n, dtype=np.float64)
+
+
+def printable(text: str) -> str:
+    """Return a text of a file without characters that cannot be shown."""
+    return text if text.isprintable() else repr(text)[1:-1]
+
+
 def not_read(variables: Sequence[Variable]) -> list[str]:
     """Return a note on each variable that is not read, the largest first."""
+    variables = [v for v in variables if not v.read]
     large = [v for v in variables if v.advice]
     large.sort(key=lambda v: -math.prod(v.size))
     notes = [f"not read: {v}; {v.advice}" for v in large[:MOST_NAMED]]

@@ -7,9 +7,9 @@ Another heading with another block begins another run.
 import csv
 import datetime as dt
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain, pairwise
 from operator import methodcaller
 
 import numpy as np
@@ -41,7 +41,8 @@ _HEADING_WORDS = re.compile(
     r"[^\s,;\[(]+(?: ?[\[(][^\[\]()]{0,20}[\])])?",
     re.IGNORECASE,
 )
-_OPENING = re.compile(r"^[^\S\n]*(?:[A-Za-z]\w*\s*=\s*)?\[", re.MULTILINE)
+# A bracket before numbers; one before a unit begins a row of units.
+_OPENING = re.compile(r"^[^\S\n]*(?:[A-Za-z]\w*\s*=\s*)?\[(?=\s*(?:[-+.\d%\]]|\Z))", re.MULTILINE)
 _MISSING = frozenset({"", "-", "--", "nan", "na", "n/a", "null", "none", "#n/a", "inf", "-inf"})
 _TIME_OF_DAY = re.compile(
     r"(?:(\d{4}[-/.]\d\d?[-/.]\d\d?|\d\d?[./-]\d\d?[./-]\d{4})[T ,]+)?"
@@ -63,56 +64,51 @@ def read_text(raw: bytes, *, source: str) -> list[FileTable]:
     SubmissionError : the file is not text or not a table, or too many rows do not fit; the message
         names the line.
     """
-    text = decode(raw, source=source).replace("\r\n", "\n").replace("\r", "\n")
-    if (
-        "[" in text
-        and (opening := _OPENING.search(text))
-        and (lines := _in_brackets(text, opening, source))
-    ):
-        head, rows, cut, notes = lines
-        layout = Layout(None, comma=False)
-        block = Block(head=head, rows=rows, source=source)
-        names = _names_above(block, layout)
-        table = read_block(block, layout, format=ECP, names=names, cut=cut)
-        return [replace(table, notes=(*table.notes, *notes))]
+    text = decode(raw, source=source)
+    if not text.strip().strip(' \t\n;,"'):
+        raise SubmissionError(f"{source}: the file is empty")
+    if "[" in text and (opening := _OPENING.search(text)):
+        block, end = _in_brackets(text, opening, source)
+        return [read_block(block, format=ECP, names=find_names(block), cut=end)]
     lines = [(i, line) for i, line in enumerate(text.split("\n"), 1) if line.strip(' \t;,"')]
     sample = [line for _, line in lines[:_SNIFFED_LINES]]
     layout = _sniff(sample[:_FEW_LINES], least=_LONG) or _sniff(sample)
     if layout is None:
         raise SubmissionError(_no_table(lines, source))
-    blocks = find_blocks(lines, layout, source=source)
-    return [table for block in blocks for table in read_runs(block, layout, format=CSV)]
+    return read_blocks(lines, layout, source=source, format=CSV)
+
+
+def text_lines(raw: bytes, *, source: str) -> list[tuple[int, str]]:
+    """Return the numbered lines of a text file; raises as `decode`."""
+    return [*enumerate(decode(raw, source=source).split("\n"), 1)]
 
 
 def decode(raw: bytes, *, source: str) -> str:
-    """Return the text of a file in UTF-8, UTF-16 or an old Windows encoding.
+    """Return the text of a file in UTF-8, UTF-16 or an old Windows encoding; LF ends its lines.
 
     Raises
     ------
     SubmissionError : the file is not text.
     """
-    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):  # Excel's "Unicode text"
-        try:
-            return raw.decode("utf-16")
-        except UnicodeDecodeError:
-            raise SubmissionError(f"{source}: broken UTF-16 text") from None
-    control = sum(raw[:4096].count(byte) for byte in (0, 1, 2, 3, 4, 5, 6, 7, 8, 14, 15, 27))
-    if control or b"\0" in raw:
+    is_utf16 = raw.startswith((b"\xff\xfe", b"\xfe\xff"))  # Excel's "Unicode text"
+    if not is_utf16 and (b"\0" in raw or re.search(rb"[\1-\x08\x0e\x0f\x1b]", raw[:4096])):
         raise SubmissionError(f"{source}: neither text nor a .mat file that can be read")
     try:
-        return raw.decode("utf-8-sig")
+        text = raw.decode("utf-16" if is_utf16 else "utf-8-sig")
     except UnicodeDecodeError:
-        return raw.decode("latin-1")  # such as a micro sign from an old Windows program
+        if is_utf16:
+            raise SubmissionError(f"{source}: broken UTF-16 text") from None
+        text = raw.decode("latin-1")  # such as a micro sign from an old Windows program
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _no_table(lines: Sequence[tuple[int, str]], source: str) -> str:
-    if not any(line.strip() for _, line in lines):
-        return f"{source}: the file is empty"
+    """Return why a text is refused: the last line, if it has headings, or else the second one."""
     if all(line.lstrip().startswith(("#", "%", "sep=")) for _, line in lines):
         return f"{source}: holds no rows of numbers"
     number, line = lines[-1]
     words = re.split(r"[,;\t]", line[:300])
-    if len(words) > 1 and parse_heading(words[0]).name.strip("\"' ").casefold() in ("t", "time"):
+    if len(words) > 1 and is_time(words[0]):
         return f"{source} line {number}: headings, but no rows of numbers below"
     number, line = lines[min(1, len(lines) - 1)]
     return f"{source} line {number}: not a table of numbers, found {line.strip()[:40]!r}"
@@ -168,51 +164,47 @@ class Layout:
             plain = f"{match[1]}e{match[2]}"
         return float(plain.replace(",", ".") if self.comma else plain)
 
+    def value(self, field: str) -> float | None:
+        """Return the number or the time of day in a field, NaN for an empty one, None for text."""
+        try:
+            return self.cell(field)
+        except ValueError:
+            return _time_of_day(field)
+
+    def signature(self, line: str) -> str:
+        """Return a letter a field: n number, - empty, x text; "" for a comment."""
+        if line.lstrip().startswith(("#", "%")):
+            return ""
+        try:
+            values: list[float | None] = list(map(float, self.fast(line)))
+        except ValueError:
+            values = [self.value(field) for field in self.split(line)]
+        return "".join("x" if v is None else "-" if v != v else "n" for v in values)
+
 
 def _time_of_day(field: str) -> float | None:
     """Return the seconds of a time of day, from midnight or, with a date, from 1900."""
     if ":" not in field or not (match := _TIME_OF_DAY.fullmatch(field.strip(" \"'"))):
         return None
     date, hour, minute, second, half = match.groups()
-    if second is None and (half is None or half == "Z"):
+    half = (half or "").strip().casefold()
+    if second is None and half in ("", "z"):
         return None
     seconds = float((second or "0").replace(",", ".").replace(":", "."))
-    hours = int(hour) % 12 + 12 * (half.strip().casefold() == "pm") if half and half != "Z" else (
-        int(hour)
-    )  # fmt: skip
-    days = 0
-    if date:
-        numbers = [int(part) for part in re.split(r"[-/.]", date)]
-        try:
-            year, *rest = numbers if numbers[0] > 31 else numbers[::-1]
-            days = (dt.date(year, *rest) - _FIRST_DAY).days if rest[0] <= 12 else (
-                (dt.date(year, rest[1], rest[0]) - _FIRST_DAY).days
-            )  # fmt: skip
-        except ValueError:
-            return None
-    return 86_400.0 * days + 3600.0 * hours + 60.0 * int(minute) + seconds
-
-
-def _value(layout: Layout, field: str) -> float | None:
-    """Return the number or the time of day in a field, NaN for an empty one, None for text."""
+    hours = int(hour) % 12 + 12 * (half == "pm") if half in ("am", "pm") else int(hour)
+    seconds += 3600.0 * hours + 60.0 * int(minute)
+    if not date:
+        return seconds
+    numbers = [int(part) for part in re.split(r"[-/.]", date)]
+    year, month, day = numbers if numbers[0] > 31 else numbers[::-1]
     try:
-        return layout.cell(field)
+        stamp = dt.date(year, month, day) if month <= 12 else dt.date(year, day, month)
     except ValueError:
-        return _time_of_day(field)
+        return None
+    return 86_400.0 * (stamp - _FIRST_DAY).days + seconds
 
 
 # ------------------------------------------------------------------------------- the layout
-
-
-def _signature(layout: Layout, line: str) -> str:
-    """Return a letter for each field of a line: n number, - empty, x text; "" for a comment."""
-    if line.lstrip().startswith(("#", "%")):
-        return ""
-    try:
-        values: list[float | None] = list(map(float, layout.fast(line)))
-    except ValueError:
-        values = [_value(layout, field) for field in layout.split(line)]
-    return "".join("x" if v is None else "-" if v != v else "n" for v in values)
 
 
 def _alike(a: str, b: str) -> bool:
@@ -221,22 +213,7 @@ def _alike(a: str, b: str) -> bool:
     return same and all(p == q or "-" in (p, q) for p, q in zip(a, b, strict=True))
 
 
-class _Signatures:
-    """The signatures of lines, found only as far as they are asked for."""
-
-    def __init__(self, layout: Layout, lines: Sequence[str]) -> None:
-        self._layout, self._lines, self._found = layout, lines, list[str]()
-
-    def __len__(self) -> int:
-        return len(self._lines)
-
-    def __getitem__(self, i: int) -> str:
-        while len(self._found) <= i:
-            self._found.append(_signature(self._layout, self._lines[len(self._found)]))
-        return self._found[i]
-
-
-def _start(signatures: Sequence[str] | _Signatures) -> tuple[int, int]:
+def _start(signatures: Sequence[str]) -> tuple[int, int]:
     """Return (start, length) of the first long run of similar rows, or of the longest.
 
     A row that does not fit does not end a run, unless it may be a heading.
@@ -274,9 +251,9 @@ def _sniff(sample: Sequence[str], *, least: int = 1) -> Layout | None:
             continue
         for comma in (False, True) if delimiter != "," or quoted else (False,):
             layout = Layout(delimiter, comma, quoted=quoted and delimiter is not None)
-            signatures = _Signatures(layout, sample)
+            signatures = [*map(layout.signature, sample)]
             start, length = _start(signatures)
-            found = [signatures[i] for i in range(start, start + length)]
+            found = signatures[start : start + length]
             rows = sample[start : start + length]
             plain = sum(_is_plain(field, comma) for row in rows for field in layout.split(row))
             share = plain / max(sum(map(len, found)), 1)
@@ -316,6 +293,7 @@ class Block:
 
     head: Sequence[tuple[int, str]]
     rows: Sequence[tuple[int, str]]
+    layout: Layout
     source: str
     line: str = "line"
     values: Array | None = None
@@ -326,47 +304,57 @@ class Block:
         return f"{self.source} {self.line} {number}"
 
 
-def find_blocks(
-    lines: Sequence[tuple[int, str]], layout: Layout, *, source: str, line: str = "line"
+def read_blocks(
+    lines: Sequence[tuple[int, str]],
+    layout: Layout,
+    *,
+    source: str,
+    format: Format,
+    line: str = "line",
+) -> list[FileTable]:
+    """Return the tables of a file: each begins with similar rows, below its heading.
+
+    Raises
+    ------
+    SubmissionError : as for `read_block`.
+    """
+    blocks = _find_blocks(lines, layout, source=source, line=line)
+    return [table for block in blocks for table in _read_runs(block, format=format)]
+
+
+def _find_blocks(
+    lines: Sequence[tuple[int, str]], layout: Layout, *, source: str, line: str
 ) -> Iterator[Block]:
-    """Yield the tables of a file: each begins with similar rows, below its heading."""
-    sample = [line for _, line in lines[:_SNIFFED_LINES]]
-    start, length = _start(_Signatures(layout, sample[:_FEW_LINES]))
-    if length < _LONG:
-        start, _ = _start(_Signatures(layout, sample))
-    head, rows = lines[:start], lines[start:]
-    width = len(layout.split(rows[0][1]))
-    values = _numbers([row for _, row in rows], layout, width)
+    sample = [layout.signature(line) for _, line in lines[:_SNIFFED_LINES]]
+    start, length = _start(sample[:_FEW_LINES])
+    start = start if length >= _LONG else _start(sample)[0]
+    rows = [row for _, row in lines[start:]]
+    values = _numbers(rows, layout, len(layout.split(rows[0])))
+    starts = [start, len(lines)]
     if values is None:
-        signatures = [_signature(layout, line) for _, line in rows]
-        at = 0
-        while at < len(rows):
-            texts = range(at + 1, len(rows) - _LONG)
-            again = next((i for i in texts if _begins(signatures, i)), None)
-            if again is None:
-                break
-            above = next(i for i in range(again, 0, -1) if "n" in signatures[i - 1])
-            head, said = _without_rows(head, layout, line=line)
-            yield Block(head=head, rows=rows[at:above], source=source, line=line, notes=said)
-            head, at = rows[above:again], again
-        rows = rows[at:]
-    head, said = _without_rows(head, layout, line=line)
-    yield Block(head=head, rows=rows, source=source, line=line, values=values, notes=said)
-
-
-def _without_rows(
-    head: Sequence[tuple[int, str]], layout: Layout, *, line: str
-) -> tuple[Sequence[tuple[int, str]], tuple[str, ...]]:
-    """Return the lines above a table without broken rows below its heading, and a note on these."""
-    end = len(head)
-    while end and _signature(layout, head[end - 1][1]).startswith("n"):
-        end -= 1
-    if end == len(head) or not end or not _is_name(head[end - 1][1]):
-        return head, ()
-    where = first_few([str(number) for number, _ in head[end:]], FEW_NAMED)
-    what = head[end][1].strip()[:30]
-    rows_are = "1 row was" if end == len(head) - 1 else f"{len(head) - end} rows were"
-    return head[:end], (f"{rows_are} skipped, {line} {where}: expected numbers, found {what!r}",)
+        signatures = [layout.signature(row) for _, row in lines]
+        again = (i for i in range(start + 1, len(lines) - _LONG) if _begins(signatures, i))
+        starts = [start, *again, len(lines)]
+    end = 0
+    for first, following in pairwise(starts):
+        head, end = lines[end:first], following
+        # Text above the next table is a part of its head.
+        while following < len(lines) and "n" not in signatures[end - 1]:
+            end -= 1
+        below = len(head)
+        while below and layout.signature(head[below - 1][1]).startswith("n"):
+            below -= 1
+        said = ()
+        if 0 < below < len(head) and _is_name(head[below - 1][1]):  # broken rows
+            where = first_few([str(number) for number, _ in head[below:]], FEW_NAMED)
+            what = head[below][1].strip()[:30]
+            rows_are = "1 row was" if below == len(head) - 1 else f"{len(head) - below} rows were"
+            said = (f"{rows_are} skipped, {line} {where}: expected numbers, found {what!r}",)
+            head = head[:below]
+        yield Block(
+            head=head, rows=lines[first:end], layout=layout, source=source, line=line,
+            values=values, notes=said,
+        )  # fmt: skip
 
 
 def _begins(signatures: Sequence[str], i: int) -> bool:
@@ -378,36 +366,28 @@ def _begins(signatures: Sequence[str], i: int) -> bool:
     return named and _start(signatures[i : i + _LONG]) == (0, _LONG)
 
 
-def read_runs(block: Block, layout: Layout, *, format: Format) -> list[FileTable]:
-    """Return the table of each run in a block: runs may stand side by side.
-
-    Raises
-    ------
-    SubmissionError : as for `read_block`.
-    """
-    names = number_repeats(_names_above(block, layout))
+def _read_runs(block: Block, *, format: Format) -> list[FileTable]:
+    """Return the table of each run in a block: runs may stand side by side."""
+    names = number_repeats(find_names(block))
     of_run = [parse_heading(name).run for name in names]
     runs = [run for run in dict.fromkeys(of_run) if run]
     if len(runs) < 2:
-        table = read_block(block, layout, format=format, names=names)
-        return [replace(table, run=runs[0] if runs else "")]
+        return [replace(read_block(block, format=format, names=names), run="".join(runs))]
     tables = []
-    rows = [(number, layout.split(row)) for number, row in block.rows]
+    rows = [(number, block.layout.split(row)) for number, row in block.rows]
+    rows = [(number, fields + [""] * (len(names) - len(fields))) for number, fields in rows]
     for run in runs:
         # A column that belongs to no run, such as the time, belongs to all.
         columns = [i for i, other in enumerate(of_run) if other in ("", run)]
-        own = [i for i in columns if of_run[i]]
-        parts = [
-            (number, [fields[i] if i < len(fields) else "" for i in columns])
+        lines = [
+            (number, "\x01".join(fields[i] for i in columns))
             for number, fields in rows
-            if any(fields[i].strip() for i in own if i < len(fields))
+            if any(fields[i].strip() for i in columns if of_run[i])
         ]
-        if parts:
-            apart = Layout("\x01", comma=layout.comma)
-            lines = [(number, "\x01".join(fields)) for number, fields in parts]
-            own_names = [names[i] for i in columns]
-            part = replace(block, rows=lines, values=None)
-            table = read_block(part, apart, format=format, names=own_names)
+        if lines:
+            layout = Layout("\x01", comma=block.layout.comma)
+            part = replace(block, rows=lines, layout=layout, values=None)
+            table = read_block(part, format=format, names=[names[i] for i in columns])
             tables.append(replace(table, run=run))
     return tables
 
@@ -422,19 +402,8 @@ def number_repeats(names: Sequence[str]) -> list[str]:
     return [*names]
 
 
-def _names_above(block: Block, layout: Layout) -> list[str]:
-    typed = layout.split(block.rows[0][1])
-    ends = len(typed) > 1 and not typed[-1].strip()  # a delimiter ends each row
-    return find_names(block, layout, width=len(typed), ends=ends)
-
-
 def read_block(
-    block: Block,
-    layout: Layout,
-    *,
-    format: Format,
-    names: Sequence[str],
-    cut: str | None = None,
+    block: Block, *, format: Format, names: Sequence[str], cut: str | None = None
 ) -> FileTable:
     """Return a table without the rows that do not fit; its notes name them.
 
@@ -446,25 +415,24 @@ def read_block(
     ------
     SubmissionError : more than one row in a hundred does not fit.
     """
-    lines = [number for number, _ in block.rows]
-    rows = [row for _, row in block.rows]
-    typed = layout.split(rows[0])
+    typed = block.layout.split(block.rows[0][1])
     width = len(typed)
     if width != len(names):
         raise SubmissionError(
-            f"{block.place(lines[0])}: expected {len(names)} columns as in the heading, "
+            f"{block.place(block.rows[0][0])}: expected {len(names)} columns as in the heading, "
             f"found {width}"
         )
-    notes: list[str] = []
-    partial: dict[str, str] = {}
-    values = _numbers(rows, layout, width) if block.values is None else block.values
-    used = list(range(width))
+    lines, rows = zip(*block.rows, strict=True)
+    values = _numbers(rows, block.layout, width) if block.values is None else block.values
     if values is None or not np.isfinite(values).all():
-        values, lines, used, names, notes, partial = _mend(block, layout, names=names, cut=cut)
+        mended = _mend(block, names=names, cut=cut)
+    else:
+        mended = _Mended(values=values, lines=lines, used=range(width), names=names)
+    lines, used = mended.lines, mended.used
     place = block.place(block.head[-1][0] if block.head else lines[0])
-    names = checked_names([names[i] for i in used], numbers=used, place=place)
-    refuse_unusable(values.T, names=names, place=lambda row: block.place(lines[row]))
-    values = np.ascontiguousarray(values.T)
+    names = checked_names([mended.names[i] for i in used], numbers=used, place=place)
+    values = np.ascontiguousarray(mended.values.T)
+    refuse_unusable(values, names=names, place=lambda row: block.place(lines[row]))
     whole = tuple(
         not set(typed[i]) & set(".,:") and bool((column == np.round(column)).all())
         for i, column in zip(used, values, strict=True)
@@ -479,8 +447,8 @@ def read_block(
         lines_are=block.line,
         cut=cut,
         ends_broken=lines[-1] != block.rows[-1][0],
-        notes=(*block.notes, *notes),
-        partial=partial,
+        notes=(*block.notes, *mended.notes),
+        partial=mended.partial,
     )
 
 
@@ -500,115 +468,142 @@ def _numbers(rows: Sequence[str], layout: Layout, width: int) -> Array | None:
         return None
 
 
-def _mend(
-    block: Block, layout: Layout, *, names: Sequence[str], cut: str | None
-) -> tuple[Array, list[int], list[int], list[str], list[str], dict[str, str]]:
-    """Return the rows that fit, with their lines, columns, names, notes, and partial columns."""
-    width, names = len(names), list(names)
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Mended:
+    """The rows of a block that fit.
+
+    Attributes
+    ----------
+    values : (n, columns), for the columns in `used`.
+    lines : (n,) their numbers.
+    names : of all columns, used or not.
+    notes : what was left out.
+    partial : see `FileTable`.
+    """
+
+    values: Array
+    lines: Sequence[int]
+    used: Sequence[int]
+    names: Sequence[str]
+    notes: Sequence[str] = ()
+    partial: Mapping[str, str] = field(default_factory=dict)
+
+
+def _mend(block: Block, *, names: Sequence[str], cut: str | None) -> _Mended:
+    """Return the rows of a block that fit.
+
+    Raises
+    ------
+    SubmissionError : no row fits, or more than one in a hundred does not.
+    """
+    layout, width, notes = block.layout, len(names), list[str]()
     lines, rows = zip(*block.rows, strict=True)
-    table = np.full((len(rows), width), np.nan)
-    texts = np.zeros((len(rows), width), dtype=np.bool_)
-    times = np.zeros_like(texts)
-    faults: dict[int, str] = {}
     end = len(rows)
-    while end > 1 and "n" not in _signature(layout, rows[end - 1]):
+    while end > 1 and "n" not in layout.signature(rows[end - 1]):
         end -= 1  # text below the table
     comments = {i for i, row in enumerate(rows) if i >= end or row.lstrip()[:1] in ("#", "%")}
-    for i, row in enumerate(rows):
+    if comments:
+        where = first_few([str(lines[i]) for i in sorted(comments)], FEW_NAMED)
+        notes.append(f"not read: text in {block.line} {where}")
+    table = np.full((len(rows), width), np.nan)
+    texts, times = np.zeros((2, len(rows), width), dtype=np.bool_)
+    faults: dict[int, str] = {}
+    kept = []
+    for i in range(len(rows)):
         if i in comments:
             continue
-        fields = layout.split(row)
+        fields = layout.split(rows[i])
         while len(fields) > width and not fields[-1].strip():
             fields.pop()
         if len(fields) != width:
             faults[i] = f"expected {width} columns, found {len(fields)}"
             continue
-        for j, field in enumerate(fields):
-            try:
-                table[i, j] = layout.cell(field)
-            except ValueError:
-                if (seconds := _time_of_day(field)) is None:
-                    texts[i, j] = True
-                else:
-                    table[i, j] = seconds
-                    times[i, j] = True
-    kept = np.array([i for i in range(len(rows)) if i not in faults and i not in comments])
-    notes = []
-    if comments:
-        where = first_few([str(lines[i]) for i in sorted(comments)], FEW_NAMED)
-        notes.append(f"not read: text in {block.line} {where}")
-    if not kept.size:
-        raise SubmissionError(f"{block.source}: holds no rows of numbers")
-    used, timed, partial = [], times.sum(axis=0), dict[str, str]()
-    for j in range(width):
-        good = np.isfinite(table[kept, j])
-        last = int(np.flatnonzero(good)[-1]) + 1 if good.any() else 0
-        name = names[j].strip(" \"'") or str(j + 1)
-        if good.mean() < 1 - _SPARSE or last < min((1 - _WORST) * kept.size, kept.size - 1):
-            if (good.any() and good.mean() >= 1 - _SPARSE) or good.mean() > 0.2:
-                said = f"{name!r} has {good.sum():,} of {kept.size:,} values"
-                if not good[:last].all():
-                    bad = [str(lines[i]) for i in kept[~good]]
-                    said += f", missing in {block.line} {first_few(bad, FEW_NAMED)}"
-                    partial[name] = said
-                notes.append(f"not read: {said}")
-            elif names[j].strip():
-                notes.append(f"not read: {name!r} has no numbers")
-            continue
-        used.append(j)
-        if 0 < timed[j] < 0.5 * good.sum():  # spreadsheets turn numbers such as 1.5 into dates
-            texts[times[:, j], j], table[times[:, j], j] = True, np.nan
-        elif timed[j]:
-            stamps = table[:, j]
-            first = stamps[np.isfinite(stamps)][0]
-            if first > _DATED:  # a date: rounded, because doubles keep a date to 1e-6 s
-                stamps[:] = np.round(stamps - first, 5)
-            names[j] = f"{parse_heading(name).name} [s]"
+        kept.append(i)
+        for j, typed in enumerate(fields):
+            value = layout.value(typed)
+            texts[i, j], times[i, j] = value is None, value is not None and ":" in typed
+            table[i, j] = np.nan if value is None else value
+    good = np.isfinite(table[kept])
+    used, partial = list[int](), dict[str, str]()
+    for j in range(width) if kept else ():
+        name, share = _named(names, j), good[:, j].mean()
+        last = int(np.flatnonzero(good[:, j])[-1]) + 1 if share else 0
+        if share >= 1 - _SPARSE and last >= min((1 - _WORST) * len(kept), len(kept) - 1):
+            used.append(j)
+        elif share > 0.2:
+            said = f"{name!r} has {good[:, j].sum():,} of {len(kept):,} values"
+            if not good[:last, j].all():
+                bad = [str(lines[i]) for i, fits in zip(kept, good[:, j], strict=True) if not fits]
+                said += f", missing in {block.line} {first_few(bad, FEW_NAMED)}"
+                partial[name] = said
+            notes.append(f"not read: {said}")
+        elif names[j].strip():
+            notes.append(f"not read: {name!r} has no numbers")
     if not used:
         raise SubmissionError(f"{block.source}: holds no rows of numbers")
-    first_rows = [layout.split(row)[:2] for row in rows[:_FEW_LINES]]
-    beside = {row[0].strip(): row[-1].strip() for row in first_rows if row}  # old Tektronix files
-    if len(used) == 2 and not {"Horizontal Units", "Vertical Units"} - beside.keys():
-        for j, name, unit in zip(
-            used, ("TIME", beside.get("Source", "CH1")), ("Horizontal", "Vertical"), strict=True
-        ):
-            names[j] = f"{name} [{beside[f'{unit} Units']}]"
+    names = _named_by_oscilloscope(block, names, used)
+    for j in used:
+        timed = times[:, j].sum()
+        if 0 < timed < 0.5 * np.isfinite(table[:, j]).sum():
+            # Spreadsheets turn numbers such as 1.5 into dates.
+            texts[times[:, j], j], table[times[:, j], j] = True, np.nan
+        elif timed:
+            first = table[kept, j][np.isfinite(table[kept, j])][0]
+            if first > _DATED:  # a date: rounded, because doubles keep a date to 1e-6 s
+                table[:, j] = np.round(table[:, j] - first, 5)
+            names[j] = f"{parse_heading(names[j]).name} [s]"
     for i in kept:
         bad = next((j for j in used if not np.isfinite(table[i, j])), None)
         if bad is not None:
-            name, field = names[bad].strip(" \"'") or str(bad + 1), layout.split(rows[i])[bad]
-            empty = field.strip(" \"'").casefold() in _MISSING
-            faults[i] = (
-                f"{name!r} is not a number: {field.strip()[:30]!r}" if texts[i, bad]
-                else f"{name!r} is empty" if not field.strip(" \"'")
-                else f"{name!r} is not a finite number" if empty or np.isinf(table[i, bad])
-                else f"{name!r} is too large"
-            )  # fmt: skip
-    fits = [int(i) for i in kept if i not in faults]
+            typed = layout.split(rows[i])[bad].strip(" \"'")
+            what = f"a number: {typed[:30]!r}" if texts[i, bad] else "a finite number"
+            faults[i] = f"{_named(names, bad)!r} is " + (f"not {what}" if typed else "empty")
+    fits = [i for i in kept if i not in faults]
     last = len(rows) - 1
     if faults.get(last, "").startswith("expected") and fits:
         what = faults.pop(last)
         if cut is None:
             notes.append(f"the last row, {block.line} {lines[last]}, is cut off: {what}")
     if faults:
-        bad_lines = [str(lines[i]) for i in sorted(faults)]
-        where, others = (first_few(some, FEW_NAMED) for some in (bad_lines, bad_lines[1:]))
-        first = min(faults)
+        first, *_ = bad_rows = sorted(faults)
+        where, others = (
+            first_few([str(lines[i]) for i in some], FEW_NAMED) for some in (bad_rows, bad_rows[1:])
+        )
         if len(faults) > _WORST * len(rows) or not fits:
-            more = f" (and {len(faults) - 1} more: {others})" if len(faults) > 1 else ""
+            more = f" (and {len(faults) - 1} more: {others})" if others else ""
             raise SubmissionError(f"{block.place(lines[first])}: {faults[first]}{more}")
         rows_are = "1 row was" if len(faults) == 1 else f"{len(faults)} rows were"
         notes.append(f"{rows_are} skipped, {block.line} {where}: {faults[first]}")
-    return table[np.ix_(fits, used)], [lines[i] for i in fits], used, names, notes, partial
+    return _Mended(
+        values=table[np.ix_(fits, used)],
+        lines=[lines[i] for i in fits],
+        used=used,
+        names=names,
+        notes=notes,
+        partial=partial,
+    )
+
+
+def _named(names: Sequence[str], j: int) -> str:
+    return names[j].strip(" \"'") or str(j + 1)
+
+
+def _named_by_oscilloscope(block: Block, names: Sequence[str], used: Sequence[int]) -> list[str]:
+    """Return the headings, or those that old Tektronix files state beside their first rows."""
+    named = [*names]
+    rows = [block.layout.split(row)[:2] for _, row in block.rows[:_FEW_LINES]]
+    said = {row[0].strip(): row[-1].strip() for row in rows if row}
+    if len(used) == 2 and {"Horizontal Units", "Vertical Units"} <= said.keys():
+        named[used[0]] = f"TIME [{said['Horizontal Units']}]"
+        named[used[1]] = f"{said.get('Source', 'CH1')} [{said['Vertical Units']}]"
+    return named
 
 
 # ------------------------------------------------------------------------------- headings
 
 
-def find_names(block: Block, layout: Layout, *, width: int, ends: bool) -> list[str]:
+def find_names(block: Block) -> list[str]:
     """Return the headings from the lines above a table; numbers without headings.
-
-    `ends` says that a delimiter ends each row.
 
     Below the names, a row may hold units; above them, a row may hold the numbers of runs.
 
@@ -616,6 +611,10 @@ def find_names(block: Block, layout: Layout, *, width: int, ends: bool) -> list[
     ------
     SubmissionError : the last line has another number of names than the table has columns.
     """
+    layout = block.layout
+    typed = layout.split(block.rows[0][1])
+    width = len(typed)
+    ends = width > 1 and not typed[-1].strip()  # a delimiter ends each row
     texts = [
         (line.strip(" ").lstrip("#%").strip(" "), line.lstrip().startswith(("#", "%")))
         for _, line in block.head
@@ -652,8 +651,8 @@ def _runs(fields: Sequence[str]) -> list[str]:
                            for f in held):  # fmt: skip
         return []
     runs = []
-    for field in fields:
-        runs.append(field.strip(" :;,") or (runs[-1] if runs else ""))
+    for text in fields:
+        runs.append(text.strip(" :;,") or (runs[-1] if runs else ""))
     return runs
 
 
@@ -714,10 +713,8 @@ def is_bench_log(names: Sequence[str]) -> bool:
 # ------------------------------------------------------------------------------ ECP exports
 
 
-def _in_brackets(
-    text: str, opening: re.Match[str], source: str
-) -> tuple[list[tuple[int, str]], list[tuple[int, str]], str | None, list[str]]:
-    """Return the lines above, the rows, a missing end and notes of `heading [ row; row; … ]`.
+def _in_brackets(text: str, opening: re.Match[str], source: str) -> tuple[Block, str | None]:
+    """Return the rows of `heading [ row; row; … ]`, and what is missing at their end.
 
     The ECP program and scripts of MATLAB write this.
 
@@ -725,27 +722,27 @@ def _in_brackets(
     ------
     SubmissionError : there are no rows, or two recordings.
     """
-    first_line = text.count("\n", 0, opening.end()) + 1
-    end = text.find("]", opening.end())
-    body = text[opening.end() : end if end >= 0 else len(text)]
+    first = text.count("\n", 0, opening.end()) + 1
+    body, closing, rest = text[opening.end() :].partition("]")
     rows = [
         (number, piece)
-        for number, line in enumerate(body.replace(",", " ").split("\n"), start=first_line)
+        for number, line in enumerate(body.replace(",", " ").split("\n"), start=first)
         for piece in line.partition("%")[0].split(";")
         if piece.strip()
     ]
     if not rows:
-        raise SubmissionError(f"{source} line {first_line}: no rows after the opening bracket")
-    above = list(enumerate(text[: opening.start()].split("\n"), start=1))
-    head = [one for one in above if re.search(r"(?i)\b(time|encoder)\b", one[1])][-1:]
-    if end < 0:
-        return head, rows, f"line {rows[-1][0]}: the closing bracket is missing", []
-    if (rest := text[end + 1 :].strip("; \t\n")) == "":
-        return head, rows, None, []
-    line = text.count("\n", 0, end) + 1
+        raise SubmissionError(f"{source} line {first}: no rows after the opening bracket")
+    last = first + body.count("\n")
     if "[" in rest:
         raise SubmissionError(
-            f"{source} line {line}: more data after the closing bracket: two recordings were "
-            f"pasted together"
+            f"{source} line {last}: more data after the closing bracket: two recordings were "
+            "pasted together"
         )
-    return head, rows, None, [f"text after line {line} is not data and was not read"]
+    above = enumerate(text[: opening.start()].split("\n"), start=1)
+    head = [one for one in above if re.search(r"(?i)\b(time|encoder)\b", one[1])][-1:]
+    notes = (
+        (f"text after line {last} is not data and was not read",) if rest.strip("; \t\n") else ()
+    )
+    cut = None if closing else f"line {rows[-1][0]}: the closing bracket is missing"
+    layout = Layout(None, comma=False)
+    return Block(head=head, rows=rows, layout=layout, source=source, notes=notes), cut

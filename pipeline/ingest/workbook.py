@@ -10,7 +10,7 @@ from typing import Any
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.table import MOST_NAMED, SETTING, FileTable, Format
-from pipeline.ingest.text import Layout, find_blocks, read_runs
+from pipeline.ingest.text import Layout, read_blocks
 from pipeline.words.numbers import first_few
 
 _FORMAT = Format(title="Excel workbook")
@@ -184,12 +184,10 @@ def _text(value: object) -> str:
 
 def _read_sheet(name: str, lines: Sequence[tuple[int, str]], *, source: str) -> list[FileTable]:
     """Return the tables of a sheet; no tables without headings."""
-    layout = Layout("\x01", comma=False)
-    where = f"{source} sheet {name!r}"
-    tables = []
-    for block in find_blocks(lines, layout, source=where, line="row"):
-        for table in read_runs(block, layout, format=_FORMAT):
-            if any(not heading.isdigit() for heading in table.names):
-                run = f"{name} {table.run}".strip() if table.run else name
-                tables.append(replace(table, source=source, run=run))
-    return tables
+    where, layout = f"{source} sheet {name!r}", Layout("\x01", comma=False)
+    found = read_blocks(lines, layout, source=where, format=_FORMAT, line="row")
+    return [
+        replace(table, source=source, run=f"{name} {table.run}".strip())
+        for table in found
+        if not all(heading.isdigit() for heading in table.names)
+    ]

@@ -56,6 +56,8 @@ DIALECTS = {
     "words": "time [msec],voltage [volts],displacement [inches]\n" + rows(1e3 * T, U, X / 2.54),
     "minutes": "time (minutes),input (V),x1 (cm)\n" + rows(T / 60, U, X, form="{:.9f}"),
     "German": "Zeit in ms;Spannung in V;Weg in mm\n" + GERMAN,
+    "row of units in brackets": "time;voltage;x1\n[ms];[mV];[mm]\n"
+    + rows(1e3 * T, 1e3 * U, 10 * X, sep=";"),
     "row of units": "Time\tVoltage\tPosition\n(ms)\t(mV)\t(mm)\n\n"
     + rows(1e3 * T, 1e3 * U, 10 * X, sep="\t"),
     "three rows": "Run #1,Run #1,Run #1\nTime,Voltage,Position\ns,V,mm\n" + rows(T, U, 10 * X),

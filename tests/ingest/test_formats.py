@@ -311,15 +311,6 @@ def test_the_fields_of_a_struct_are_columns():
     assert_array_equal(runs[1].values, [TIME, U])
 
 
-def test_a_mat_file_of_version_4_is_refused_with_advice():
-    """A .mat file of version 4 is not read, and the error says how to save it again."""
-    for values in (TIME, TIME.astype("i2")):
-        stream = BytesIO()
-        scipy.io.savemat(stream, {"time": values}, format="4")
-        with pytest.raises(SubmissionError, match=r"version 4, .*'-v7'"):
-            table(stream.getvalue())
-
-
 def test_a_file_that_crashes_its_reader_costs_only_itself(tmp_path):
     """A .mat file of a stranger that crashes scipy is refused, and the next one is read."""
     good = mat(time=TIME, x1=X1)
