@@ -331,6 +331,7 @@ def _find_blocks(
     rows = [row for _, row in lines[start:]]
     values = _numbers(rows, layout, len(layout.split(rows[0])))
     starts = [start, len(lines)]
+    signatures: list[str] = []
     if values is None:
         signatures = [layout.signature(row) for _, row in lines]
         again = (i for i in range(start + 1, len(lines) - _LONG) if _begins(signatures, i))
