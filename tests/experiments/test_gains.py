@@ -58,13 +58,13 @@ def closing(loop, *, carts=2, amplitude=1.0) -> Recording:
     )
 
 
-def gains_of(identified, loop, *, limits=LIMITS, **changes):
+def gains_of(identified, loop, *, limits=LIMITS, bench=BENCH, **changes):
     submission, analysis = identified
     return LoopTrial(
         recording=closing(loop, carts=analysis.bench.n, **changes),
         submission=submission,
         analysis=analysis,
-        bench=BENCH,
+        bench=bench,
         limits=limits,
     ).gains()
 
@@ -193,14 +193,14 @@ def test_the_scale_of_the_submission_replaces_that_of_the_bench(identified):
 @pytest.mark.parametrize(
     ("loop", "limits", "amplitude", "message"),
     [
-        (PidLoop(kp=0.1, kd=20.0), LIMITS, 1.0, "the loop is unstable"),
-        (PidLoop(kp=0.01, kd=-0.05), LIMITS, 1.0, "the loop is unstable"),
-        (PidLoop(kp=3.0, kd=0.02), PlanLimits(input=0.1, travel=2.5), 1.0, "needs an input of"),
-        (StateLoop(), PlanLimits(input=0.01, travel=2.5), 1.0, "needs an input of .* is 0.01"),
-        (StateLoop(), PlanLimits(input=0.5, travel=0.9), 1.0, "moves a cart by 1.* travel limit"),
-        (StateLoop(), LIMITS, 40.0, "(moves a cart|needs an input|would overshoot)"),
+        (PidLoop(kp=0.1, kd=20.0), LIMITS, 1.0, "unstable"),
+        (PidLoop(kp=0.01, kd=-0.05), LIMITS, 1.0, "unstable"),
+        (PidLoop(kp=3.0, kd=0.02), PlanLimits(input=0.1, travel=2.5), 1.0, "input"),
+        (StateLoop(), PlanLimits(input=0.01, travel=2.5), 1.0, "input .*0.01"),
+        (StateLoop(), PlanLimits(input=0.5, travel=0.9), 1.0, "travel limit"),
+        (StateLoop(), LIMITS, 40.0, "(cart|input|overshoot)"),
         (StateLoop(gains=(0.0, -1.0), prefilter=1.0), LIMITS, 1.0, "unstable"),
-        (StateLoop(cart=2), LIMITS, 1.0, "designed for cart 1, but the plan has cart 2"),
+        (StateLoop(cart=2), LIMITS, 1.0, "cart 2"),
     ],
 )
 def test_a_loop_that_would_do_harm_is_refused(loop, limits, amplitude, message):
@@ -213,16 +213,9 @@ def test_a_loop_that_would_do_harm_is_refused(loop, limits, amplitude, message):
 
 def test_a_slow_bench_that_misses_the_goal_is_refused(identified):
     """If the bench's rate is too low for the designed loop, the error says what to change."""
-    submission, analysis = identified
-    slow = replace(BENCH, period=0.05)
-    with pytest.raises(DataError, match=r"set design.sample_time = 0\.05 in submission.toml"):
-        LoopTrial(
-            recording=closing(StateLoop(cart=analysis.bench.n), carts=analysis.bench.n),
-            submission=submission,
-            analysis=analysis,
-            bench=slow,
-            limits=LIMITS,
-        ).gains()
+    loop, slow = StateLoop(cart=identified[1].bench.n), replace(BENCH, period=0.05)
+    with pytest.raises(DataError, match=r"sample_time = 0\.05"):
+        gains_of(identified, loop, bench=slow)
 
 
 @pytest.mark.parametrize("example", ["one-cart", "two-cart", "three-cart"])

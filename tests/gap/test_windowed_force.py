@@ -15,11 +15,11 @@ from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import Chain
 from pipeline.results import ExperimentKind, Record
 from pipeline.setup import Setup
+from tests.helpers.time_records import COUNT, record_of
 
 # Arguments: position, velocity and input of each run at one time; result: the force in each run.
 Law = Callable[[Array, Array, Array], Array]
 
-COUNT = 0.00227  # cm, one encoder step
 RATE, SUBSTEPS, DURATION = 250.0, 4, 8.0
 CARTS = {
     1: Chain(m=np.array([2e-4]), c=np.array([4e-4]), k=np.array([0.035, 0.0])),
@@ -63,26 +63,12 @@ def recordings(law: Law, *, carts: int = 1, cart: int = 1) -> list[Record]:
             a = acceleration(x, v, push)
             b = acceleration(x + h * v, v + h * a, push)
             x, v = x + h * v + 0.5 * h * h * a, v + 0.5 * h * (a + b)
-    free = tuple(range(1, carts + 1))
-    return [
-        Record(
-            id=f"{kind}-{seed}",
-            kind=kind,
-            t=t,
-            u=None if kind == "decay" else u[seed],
-            y=measured(y[seed], seed=seed),
-            carts=free,
-            free=free,
-            resolution=np.full(carts, COUNT),
-        )
-        for seed, (kind, _) in enumerate(PLAN)
-    ]
-
-
-def measured(y: Array, *, seed: int) -> Array:
-    """Return positions as an encoder reads them."""
-    noise = 0.3 * COUNT * np.random.default_rng(seed).standard_normal(y.shape)
-    return np.round((y + noise) / COUNT) * COUNT
+    records = []
+    for seed, (kind, _) in enumerate(PLAN):
+        noisy = y[seed] + 0.3 * COUNT * np.random.default_rng(seed).standard_normal(y[seed].shape)
+        driven = None if kind == "decay" else u[seed]
+        records.append(record_of(t, driven, noisy, kind=kind, id=f"{kind}-{seed}"))
+    return records
 
 
 def left_by_the_chain(records: list[Record], *, springs: tuple[bool, ...]) -> tuple[Residual, ...]:
