@@ -36,12 +36,12 @@ from pipeline.protocol import (
     parse_reading,
     target_at,
 )
-from pipeline.resources import EXAMPLES
 from pipeline.simulated.controller import ReferenceCore
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.commandline import cartlab_here
+from tests.helpers.desks import a_recorded_cart
 from tests.helpers.examples import analysed, recorded
 from tests.helpers.virtual import VirtualBench, new_folder
 
@@ -58,6 +58,11 @@ def analysis():
 @pytest.fixture(scope="module")
 def known(analysis):
     return FisherInformation.of(analysis)
+
+
+MINE = Recording(
+    id="mine", kind="sweep", carts=(1, 2), wave="square", amplitude=0.02, frequency=0.4, cycles=8
+)
 
 
 def multisine(known: FisherInformation, goal: Goal) -> Recording:
@@ -203,34 +208,30 @@ def test_no_choice_passes_a_limit(analysis):
 
 def test_a_users_proposal_is_compared_with_the_choice(analysis, known):
     """The error after a user's proposal is compared with that after the program's choice."""
-    mine = Recording(id="mine", kind="sweep", carts=(1, 2), wave="square", amplitude=0.02,
-                     frequency=0.4, cycles=8)  # fmt: skip
     plan = Plan(limits=LIMITS)
-    found = compare_recordings(analysis, mine, plan, goal="zeta_2", commands=COMMANDS)
+    found = compare_recordings(analysis, MINE, plan, goal="zeta_2", commands=COMMANDS)
     alone = choose_next(analysis, plan, n=1, goal="zeta_2", commands=COMMANDS)
     assert (found.now, found.best) == (alone.now, alone.errors[-1])
     assert found.chosen == alone.recordings[0]
     assert found.now > found.proposed > found.best
     error = find_goal("zeta_2", known, feedback=None).of
-    assert found.proposed == pytest.approx(error(known.information + known.of_recording(mine)))
+    assert found.proposed == pytest.approx(error(known.information + known.of_recording(MINE)))
     assert not found.why
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"kind": "decay", "wave": "delta", "amplitude": 0.0, "release": 1}, "this is a decay"),
-        ({"kind": "sine", "wave": "sine"}, "from steps and sweeps here, but this is a dwell"),
-        ({"carts": (1,)}, "all of them free"),
-        ({"amplitude": 0.5}, "stopped at the travel limit; with an amplitude up to"),
+        ({"kind": "decay", "wave": "delta", "amplitude": 0.0, "release": 1}, "decay"),
+        ({"kind": "sine", "wave": "sine"}, "dwell"),
+        ({"carts": (1,)}, "free"),
+        ({"amplitude": 0.5}, "travel limit"),
     ],
 )
 def test_a_useless_proposal_gets_a_reason(known, change, words):
     """If the fit cannot use a proposed recording, the answer says why."""
-    mine = Recording(id="mine", kind="sweep", carts=(1, 2), wave="square", amplitude=0.02,
-                     frequency=0.4, cycles=8)  # fmt: skip
-    assert why_useless(mine, known, limits=LIMITS) == ""
-    assert words in why_useless(mine.model_copy(update=change), known, limits=LIMITS)
+    assert why_useless(MINE, known, limits=LIMITS) == ""
+    assert words in why_useless(MINE.model_copy(update=change), known, limits=LIMITS)
 
 
 def test_only_dwells_are_chosen_if_dwells_identified_the_carts():
@@ -287,20 +288,8 @@ def test_a_bench_adds_the_requested_tones():
 
 @pytest.fixture
 def work(tmp_path):
-    """Return the shipped one-cart submission without its dwells, in a new folder."""
-    source = load_submission(EXAMPLES / "one-cart")
-    text = (EXAMPLES / "one-cart" / "submission.toml").read_text(encoding="utf-8")
-    head, *tables = text.split("[[experiments]]")
-    kept = [t for t in tables if 'kind = "sweep"' in t]
-    (tmp_path / "submission.toml").write_text(
-        head + "[[experiments]]" + "[[experiments]]".join(kept), encoding="utf-8"
-    )
-    for experiment in source.experiments:
-        if experiment.kind == "sweep":
-            there = tmp_path / experiment.file
-            there.parent.mkdir(exist_ok=True)
-            there.write_bytes((source.folder / experiment.file).read_bytes())
-    return tmp_path
+    """Return a submission of one recorded cart in a new folder."""
+    return a_recorded_cart(tmp_path / "work")
 
 
 def test_the_command_adds_its_choice_to_the_plan(work):

@@ -1,14 +1,12 @@
 """The plan that is proposed for a session at the bench, and its file."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.cli import main
 from pipeline.errors import ConfigError, DataError
 from pipeline.experiments.plan import (
     PidLoop,
@@ -41,6 +39,7 @@ from pipeline.submission import (
     load_submission,
     new_submission,
 )
+from tests.helpers.commandline import cartlab_here
 from tests.helpers.desks import a_recorded_cart
 from tests.helpers.examples import recorded
 
@@ -252,34 +251,23 @@ def test_a_plan_reads_back_as_it_was_written(
     """Every key of a plan survives writing and reading, and equal plans give equal bytes."""
     submission = bare().model_copy(update={"folder": tmp_path_factory.mktemp("plan")})
     common = {"frequency": frequency, "cycles": cycles, "note": note}
-    loop = {"kind": "closed_loop", "carts": (1, 2), "wave": "square", "amplitude": travel}
-    plan = Plan(
-        baud=9600,
-        limits=PlanLimits(input=input, travel=travel),
-        recordings=(
-            Recording(
-                id="d", kind="decay", carts=(2,), wave="delta", amplitude=0, release=2, **common
-            ),
-            Recording(
-                id="s",
-                kind="sweep",
-                carts=(1, 2),
-                wave="chirp",
-                amplitude=-input,
-                frequency_end=60.0,
-                settle=0.0,
-                **common,
-            ),
-            Recording(id="p", controller=PidLoop(kp=kp, cart=2), **loop, **common),
-            Recording(id="f", controller=StateLoop(cart=2), **loop, **common),
-            Recording(
-                id="g",
-                controller=StateLoop(gains=(kp, 0.0, 1.0, 2.0), prefilter=-1.0),
-                **loop,
-                **common,
-            ),
-        ),
+    loops = (
+        PidLoop(kp=kp, cart=2),
+        StateLoop(cart=2),
+        StateLoop(gains=(kp, 0.0, 1.0, 2.0), prefilter=-1.0),
     )
+    runs: list[dict[str, object]] = [
+        {"kind": "decay", "carts": (2,), "wave": "delta", "amplitude": 0, "release": 2},
+        {"kind": "sweep", "wave": "chirp", "amplitude": -input, "frequency_end": 60.0, "settle": 0},
+        *({"kind": "closed_loop", "wave": "square", "amplitude": travel, "controller": loop}
+          for loop in loops),
+    ]  # fmt: skip
+    recordings = tuple(
+        Recording.model_validate({"id": f"run-{i}", "carts": (1, 2), **common, **one})
+        for i, one in enumerate(runs)
+    )
+    limits = PlanLimits(input=input, travel=travel)
+    plan = Plan(baud=9600, limits=limits, recordings=recordings)
     path = save_plan(plan, submission)
     assert load_plan(submission) == plan
     assert path.read_text(encoding="utf-8") == plan_text(plan, submission.system)
@@ -335,15 +323,12 @@ amplitude = {amplitude}
 frequency = {frequency}
 {more}
 """
-GOOD = {
-    "id": "run",
-    "kind": "step",
-    "carts": "[1, 2]",
-    "wave": "square",
-    "amplitude": 0.2,
-    "frequency": 0.1,
-    "more": "",
-}
+GOOD: dict[str, object] = {
+    "id": "run", "kind": "step", "carts": "[1, 2]", "wave": "square", "amplitude": 0.2,
+    "frequency": 0.1, "more": "",
+}  # fmt: skip
+
+
 LOOP = {"kind": "closed_loop", "amplitude": 1.0}
 
 
@@ -424,28 +409,19 @@ def test_a_mistake_is_one_line_that_names_the_key(tmp_path, text, message):
 # ------------------------------------------------------------------- the command
 
 
-def run(monkeypatch, *arguments) -> str | int:
-    monkeypatch.setattr(sys, "argv", ["cartlab", *map(str, arguments)])
-    with pytest.raises(SystemExit) as end:
-        main()
-    return end.value.code or 0
-
-
-def test_the_command_writes_shows_and_extends(monkeypatch, capsys, tmp_path):
+def test_the_command_writes_shows_and_extends(tmp_path):
     """`plan` says which carts to hold and how long it takes; a second run changes nothing."""
     new_submission(tmp_path / "bench", carts=2)
-    assert run(monkeypatch, "plan", tmp_path / "bench") == 0
-    out, err = capsys.readouterr()
-    assert "hold cart 2, cart 1 free:" in out
-    assert "all carts free:" in out
-    assert "7 recordings, 0 done; they take 1 min 59 s" in out
-    assert "check its [limits]" in err
+    first = cartlab_here("plan", tmp_path / "bench")
+    assert first.returncode == 0
+    for told in ("hold cart 2", "all carts", "7 recordings", "1 min 59 s"):
+        assert told in first.stdout
+    assert "[limits]" in first.stderr
     raw = (tmp_path / "bench" / "plan.toml").read_bytes()
 
-    assert run(monkeypatch, "plan", tmp_path / "bench", "--json") == 0
-    out, err = capsys.readouterr()
-    data = json.loads(out)
+    again = cartlab_here("plan", tmp_path / "bench", "--json")
+    data = json.loads(again.stdout)
     assert data["recordings"][0]["held"] == [2]
     assert data["seconds_left"] == pytest.approx(119.0)
-    assert "0 recordings added" in err
+    assert "0 recordings" in again.stderr
     assert (tmp_path / "bench" / "plan.toml").read_bytes() == raw

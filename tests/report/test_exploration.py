@@ -44,7 +44,8 @@ def test_the_diary_marks_the_explanation_in_the_model(tmp_path):
     page = write_diary(turns, make_analysis(1), tmp_path, wanted=0.01).read_text(encoding="utf-8")
     page = page.replace("\u00a0", " ")
     first, second = re.findall(r"Effect 0[^<]*", page)
-    assert re.findall(r"[\w, ]+ %", first) == ["in the model, under 1 %", "100 %"]
+    assert first.startswith("Effect 0 (in the model,")
+    assert re.findall(r"\d+ %", first) == ["1 %", "100 %"]
     assert second == "Effect 0"
 
 
@@ -72,10 +73,10 @@ def test_the_diary_gives_the_answer_first(tmp_path):
 
     titles = re.findall(r"<h[23][^>]*>([^<]+)", page)
     assert titles[:2] == ["Results", "Turn by turn"]
-    assert titles[2].startswith("1. After 20")
+    assert re.findall(r"\d+", titles[2])[:2] == ["1", "20"]
     answer, story = page.split('<section id="turns"')
     assert "Coulomb" in answer
-    assert "The parameters as known so far" in answer
+
     decided = deciding_trace(gap, turns[0].recorded)
     assert decided is not None
     assert f"Cart {decided.cart} in {turns[0].recorded[0]}" in story
