@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 
-from pipeline.grading.grade import Grade
+from pipeline.grading.grade import Criterion, Grade
 from pipeline.grading.judge.run import Graded, grade_analysis, under_rubric
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric
@@ -67,6 +67,11 @@ class Student:
         reported = self.reported.model_copy(update={table: left})
         return replace(self, submission=self.submission.model_copy(update={"reported": reported}))
 
+    def under(self, **changed: object) -> "Student":
+        """Return the student under a rubric with changed keys."""
+        plain = self.rubric.model_dump(mode="json") | changed
+        return replace(self, rubric=Rubric.model_validate(plain))
+
     def grade(self, *, days_late: float = 0.0) -> Grade:
         """Grade the report against the recordings."""
         return self.graded(days_late=days_late).grade
@@ -76,6 +81,12 @@ class Student:
         return grade_analysis(
             self.submission, self.analysis, rubric=self.rubric, name="team-07", days_late=days_late
         )
+
+
+def criterion(grade: Grade, id_: str) -> Criterion:
+    """Return a criterion of a grade."""
+    (found,) = [c for c in grade.criteria if c.id == id_]
+    return found
 
 
 def typed(value: float | Decimal) -> Decimal:
