@@ -1,8 +1,8 @@
 """Grades and outcomes for tests of the gradebook and of the files written from it."""
 
 import sqlite3
-from collections.abc import Iterator, Sequence
-from contextlib import closing
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,6 +14,7 @@ from pipeline.grading.batch.task import Setup, Task
 from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.grade import Criterion, Flag, Grade, grade_text
 from pipeline.grading.gradebook.gradebook import Gradebook
+from pipeline.grading.gradebook.request_gradebook import RequestGradebook
 from pipeline.grading.gradebook.schema import FILE
 from pipeline.grading.gradings import Batch, Grading
 from pipeline.grading.publish.outputs import write_outputs
@@ -120,6 +121,40 @@ def make_outcome(grade: Grade, *, key: str = "", **changes: Any) -> Grading:
     return Grading(**{**fields, **changes})
 
 
+def finish(
+    book: Gradebook,
+    *class_: Grade | Grading,
+    rubric: Rubric | None = None,
+    shared: Mapping[str, Flag] | None = None,
+    moved: Mapping[str, str] | None = None,
+    key: str = "key",
+) -> list[str]:
+    """Store what is new and make it the class list; return the changes that the gradebook tells."""
+    outcomes = [
+        one if isinstance(one, Grading) else make_outcome(one, key=f"{key} of {one.submission}")
+        for one in class_
+    ]
+    for outcome in outcomes:
+        if book.known(outcome.key) is None:
+            book.put(outcome)
+    keys = tuple(outcome.key for outcome in outcomes)
+    batch = Batch(keys=keys, shared=shared or {}, moved=moved or {})
+    return book.finish(batch, rubric=rubric or two_cart_rubric())
+
+
+@contextmanager
+def book_of(
+    place: str | Path,
+    *class_: Grade | Grading,
+    rubric: Rubric | None = None,
+    shared: Mapping[str, Flag] | None = None,
+) -> Iterator[RequestGradebook]:
+    """Open a new gradebook of an assignment called `lab` with this class list."""
+    with RequestGradebook(place, assignment="lab", create=True) as book:
+        finish(book, *class_, rubric=rubric, shared=shared)
+        yield book
+
+
 def write_class(folder: Path, *, anonymous: bool = False) -> Path:
     """Write the pages of a varied class into a folder, with figures and hostile names."""
     for name, content in _class_files(anonymous=anonymous).items():
@@ -140,13 +175,14 @@ def write_class_of_two(folder: Path, *, anonymous: bool = False) -> None:
     rubric = honest.rubric.model_copy(update={"anonymous": anonymous})
     wrong = honest.reporting(final={"K": 1.1 * honest.value("final", "K")})
     folder.mkdir()
-    with Gradebook(folder, create=True, assignment="lab") as book:
-        for name, team, days_late in (("team-1", honest, 0.0), ("team-2", wrong, 1.3)):
-            graded = team.graded(days_late=days_late)
-            named = {"submission": name, "authors": (f"s {name}",)}
-            grade = graded.grade.model_copy(update=named)
-            book.put(make_outcome(grade, findings=findings_text(graded.judgements)))
-        book.finish(Batch(keys=("key of team-1", "key of team-2"), shared={}), rubric=rubric)
+    outcomes = []
+    for name, team, days_late in (("team-1", honest, 0.0), ("team-2", wrong, 1.3)):
+        graded = team.graded(days_late=days_late)
+        named = {"submission": name, "authors": (f"s {name}",)}
+        grade = graded.grade.model_copy(update=named)
+        outcomes.append(make_outcome(grade, findings=findings_text(graded.judgements)))
+    with book_of(folder, *outcomes, rubric=rubric):
+        pass
 
 
 @cache
@@ -177,11 +213,8 @@ def fill_book(place: str | Path, *, anonymous: bool = False) -> None:
     broken = failed_grade("broken", "submission.toml line 3: <b>cart</b> is no key")
     outcomes.append(make_outcome(broken))
     shared = {"team-02": shared_flag("team-03"), "team-03": shared_flag("team-02")}
-    with Gradebook(place, assignment="lab", create=True) as book:
-        for outcome in outcomes:
-            book.put(outcome)
-        keys = tuple(o.key for o in sorted(outcomes, key=lambda o: o.submission))
-        book.finish(Batch(keys=keys, shared=shared), rubric=rubric)
+    outcomes.sort(key=lambda outcome: outcome.submission)
+    with book_of(place, *outcomes, rubric=rubric, shared=shared) as book:
         book.override("team-02", "laws", 1.0, why="right, <i>as told</i>", by="Ada")
 
 

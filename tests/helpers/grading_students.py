@@ -14,7 +14,7 @@ from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.results import Analysis
 from pipeline.simulated.hidden import prepare_bench
-from pipeline.simulated.submission import write_submission
+from pipeline.simulated.submission import Students, write_submission
 from pipeline.submission import (
     Reported,
     ReportedFeedback,
@@ -106,3 +106,17 @@ def student(carts: int, *, hide: tuple[str, ...] = ()) -> Student:
         write_submission(Path(folder), bench, seed=3, compact=True, reported=True)
         submission, _ = under_rubric(load_submission(Path(folder)), rubric)
         return Student(submission=submission, analysis=analyse(submission), rubric=rubric)
+
+
+def write_team(folder: Path, seed: int) -> Path:
+    """Write an honest submission for one cart, whose author has the id "s" and the seed."""
+    write_submission(
+        folder, "throne-1dof", seed=seed, compact=True, reported=True,
+        students=Students(authors=(f"s{seed}",)),
+    )  # fmt: skip
+    return folder
+
+
+def copy_step(of: Path, to: Path) -> None:
+    """Put the first step of one submission in place of the second step of another."""
+    (to / "data" / "step-2.csv").write_bytes((of / "data" / "step-1.csv").read_bytes())

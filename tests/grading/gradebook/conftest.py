@@ -6,6 +6,7 @@ import pytest
 from sqlalchemy import create_engine, text
 
 from tests.helpers import postgres
+from tests.helpers.grades import book_of, make_grade
 
 
 @pytest.fixture(scope="session")
@@ -29,10 +30,17 @@ def place(request, tmp_path):
 @pytest.fixture
 def place_in_postgresql(server):
     """Yield the address of an empty database, and empty the database after the test."""
-    url = server
-    yield url
-    engine = create_engine(url.replace("postgresql:", "postgresql+psycopg:"))
+    yield server
+    engine = create_engine(server.replace("postgresql:", "postgresql+psycopg:"))
     with engine.begin() as connection:
         connection.execute(text("DROP SCHEMA public CASCADE"))
         connection.execute(text("CREATE SCHEMA public"))
     engine.dispose()
+
+
+@pytest.fixture
+def book(place):
+    """Return a class of two teams that lost half of all points; the grades are released."""
+    with book_of(place, *(make_grade(name, share=0.5) for name in ("team-1", "team-2"))) as opened:
+        opened.release(True, by="prof")
+        yield opened

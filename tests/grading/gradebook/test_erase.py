@@ -6,25 +6,25 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from sqlalchemy import create_engine, text
+from sqlalchemy import Engine, create_engine, text
 from sqlalchemy.exc import DBAPIError
 
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradebook.request_gradebook import RequestGradebook
 from pipeline.grading.gradebook.schema import FILE
-from pipeline.grading.gradings import Batch
 from pipeline.grading.publish.export import export
 from pipeline.grading.publish.outputs import write_outputs
 from tests.helpers.commandline import cartlab_here
-from tests.helpers.grades import make_grade, make_outcome, shared_flag, two_cart_rubric
+from tests.helpers.grades import (
+    book_of,
+    finish,
+    make_grade,
+    make_outcome,
+    shared_flag,
+    two_cart_rubric,
+)
 
 GONE, KEPT = "zebra-çelik", "team-2"
-TRACES = (
-    "zebra",
-    "s-zebra",
-    "31.41592",
-    "quagga",
-)  # a student's id, name, reported number and typed text
+TRACES = ("zebra", "s-zebra", "31.41592", "quagga")  # name, author, reported number, typed text
 
 
 def _fill(place: str, *, folder: Path | None = None) -> None:
@@ -32,22 +32,21 @@ def _fill(place: str, *, folder: Path | None = None) -> None:
 
     One team asks a question, gets points by hand and is marked as reviewed.
     """
-    with RequestGradebook(place, create=True, assignment="lab") as book:
-        gone = make_grade(GONE, share=0.5)
-        first = gone.criteria[0].model_copy(update={"found": {"omega_1": 31.41592}})
-        gone = gone.model_copy(update={"criteria": (first, *gone.criteria[1:])})
-        figure = ("fit.svg", "<svg><text>31.41592 quagga</text></svg>")
-        for grade, more in ((gone, {"figures": (figure,), "findings": "31.41592"}),
-                            (make_grade(KEPT), {})):  # fmt: skip
-            book.put(make_outcome(grade, **more))
-        keys = (f"key of {GONE}", f"key of {KEPT}")
-        shared = {KEPT: shared_flag(GONE), GONE: shared_flag(KEPT)}
-        book.finish(Batch(keys=keys, shared=shared), rubric=two_cart_rubric())
+    gone = make_grade(GONE, share=0.5)
+    first = gone.criteria[0].model_copy(update={"found": {"omega_1": 31.41592}})
+    gone = gone.model_copy(update={"criteria": (first, *gone.criteria[1:])})
+    figure = ("fit.svg", "<svg><text>31.41592 quagga</text></svg>")
+    class_ = (
+        make_outcome(gone, figures=(figure,), findings="31.41592"),
+        make_outcome(make_grade(KEPT)),
+    )
+    shared = {KEPT: shared_flag(GONE), GONE: shared_flag(KEPT)}
+    with book_of(place, *class_, shared=shared) as book:
         book.release(by="Ada", released=True)
         book.ask(GONE, first.id, why="quagga: it is right", by="s-zebra")
         book.set_reviewed(GONE, by="Ada", reviewed=True)
         book.override(GONE, gone.criteria[1].id, 0.5, why="quagga", by="Ada")
-        book.finish(Batch(keys=keys, shared=shared), rubric=two_cart_rubric())
+        finish(book, *class_, shared=shared)
         if folder:
             write_outputs(book, folder)
             for platform in ("canvas", "moodle", "gradescope"):
@@ -81,7 +80,7 @@ def test_no_file_of_a_folder_keeps_a_trace(tmp_path):
     with Gradebook(folder) as book:
         assert [one.submission for one in book.entries()] == [KEPT]
         flag = book.entry(KEPT).grade.flags[0]
-        assert flag.message == "The recording of step-1 stands in an erased submission too."
+        assert "an erased submission" in flag.message
     with closing(sqlite3.connect(folder / FILE)) as connection:
         with pytest.raises(sqlite3.IntegrityError, match="cannot be changed"):
             connection.execute("DELETE FROM gradings")
@@ -99,7 +98,7 @@ def test_no_row_in_postgresql_keeps_a_trace(server, place_in_postgresql):
     assert cartlab_here("remove", url, GONE, "--erase").returncode == 0
 
     assert _found(_dump(url)) == []
-    engine = create_engine(url.replace("postgresql:", "postgresql+psycopg:"))
+    engine = _engine(url)
     with engine.connect() as connection:
         connection.execution_options(isolation_level="AUTOCOMMIT").execute(text("CHECKPOINT"))
         with pytest.raises(DBAPIError, match="cannot be changed"):
@@ -129,7 +128,7 @@ def test_a_dump_of_a_database_is_the_same_gradebook(server, place_in_postgresql)
     with Gradebook(url) as book:
         entries, history = list(book.entries()), book.history(GONE)
     dumped = _dump(url)
-    engine = create_engine(url.replace("postgresql:", "postgresql+psycopg:"))
+    engine = _engine(url)
     with engine.begin() as connection:
         connection.execute(text("DROP SCHEMA public CASCADE"))
 
@@ -142,6 +141,10 @@ def test_a_dump_of_a_database_is_the_same_gradebook(server, place_in_postgresql)
     with engine.connect() as connection, pytest.raises(DBAPIError, match="cannot be changed"):
         connection.execute(text("DELETE FROM overrides"))
     engine.dispose()
+
+
+def _engine(url: str) -> Engine:
+    return create_engine(url.replace("postgresql:", "postgresql+psycopg:"))
 
 
 def _dump(url: str) -> bytes:

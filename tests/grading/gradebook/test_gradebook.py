@@ -7,7 +7,6 @@ import sqlite3
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from itertools import count
 
@@ -23,18 +22,21 @@ from pipeline.grading.gradebook.history import history_dict, history_text
 from pipeline.grading.gradebook.override import with_overrides
 from pipeline.grading.gradebook.request_gradebook import RequestGradebook
 from pipeline.grading.gradebook.schema import FILE, metadata
-from pipeline.grading.gradings import Batch
 from tests.helpers.grades import (
+    book_of,
     failed_grade,
+    finish,
     hertz_flag,
     make_grade,
     make_outcome,
     shared_flag,
     two_cart_rubric,
 )
+from tests.helpers.grading_students import criterion
 from tests.helpers.places import ROOT
 
 RUBRIC = two_cart_rubric()
+FORKS = pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
 
 
 @pytest.fixture
@@ -44,27 +46,18 @@ def open_book(place):
 
     def opener(assignment="lab", create=True):
         start = datetime(2026, 3, 1, tzinfo=UTC)
-        book = Gradebook(
-            place,
-            assignment=assignment,
-            create=create,
-            now=lambda: start + timedelta(minutes=next(tick)),
-        )
-        opened.append(book)
-        return book
+        now = lambda: start + timedelta(minutes=next(tick))  # noqa: E731
+        opened.append(Gradebook(place, assignment=assignment, create=create, now=now))
+        return opened[-1]
 
     yield opener
     for book in opened:
         book.close()
 
 
-def finish(book, *outcomes, shared=None):
-    """Store outcomes and make them the class list."""
-    for outcome in outcomes:
-        if book.known(outcome.key) is None:
-            book.put(outcome)
-    batch = Batch(keys=tuple(o.key for o in outcomes), shared=shared or {})
-    book.finish(batch, rubric=RUBRIC)
+def database(place):
+    url = place.replace("postgresql:", "postgresql+psycopg:")
+    return create_engine(url if "://" in url else f"sqlite:///{place}/{FILE}")
 
 
 def test_an_outcome_is_read_back_unchanged(open_book):
@@ -82,7 +75,6 @@ def test_an_outcome_is_read_back_unchanged(open_book):
     book = open_book()
     book.put(outcome)
     book.close()
-
     assert open_book().known(outcome.key) == outcome
     assert open_book().known("another key") is None
 
@@ -97,39 +89,22 @@ def test_runs_that_begin_at_once_make_one_gradebook(place):
         book.close()
 
 
-def test_a_folder_may_have_the_name_of_a_database(tmp_path):
-    """Whether a place is a folder or a file is decided by what exists there, not by its name."""
-    (tmp_path / "lab.db").mkdir()
-    Gradebook(tmp_path / "lab.db", create=True).close()
-    assert (tmp_path / "lab.db" / FILE).is_file()
-    Gradebook(tmp_path / "other.db", create=True).close()
-    assert (tmp_path / "other.db").is_file()
-
-
 def test_the_newest_of_a_key_counts(open_book):
     """If a submission is graded twice under the same key, the second outcome counts."""
-    book = open_book()
+    book, second = open_book(), make_outcome(make_grade("team-1"), key="k")
     book.put(make_outcome(failed_grade("team-1", "too slow"), key="k", settled=False))
-    second = make_outcome(make_grade("team-1"), key="k")
-
     book.put(second)
-
     assert book.known("k") == second
 
 
 def test_fingerprints_are_those_of_the_newest_outcomes(open_book):
-    """Only the newest outcome of each submission gives its fingerprints.
-
-    Fingerprints of other assignments are included.
-    """
+    """Each submission's newest outcome gives its fingerprints, also those of other assignments."""
     earlier = open_book("lab of last year")
     earlier.put(make_outcome(make_grade("team-1", authors=("old",)), key="1", fingerprints=b"o"))
     book = open_book()
     book.put(make_outcome(make_grade("team-1"), key="2", fingerprints=b"first"))
     book.put(make_outcome(make_grade("team-1"), key="3", fingerprints=b"second"))
-
     found = {(p.submission, p.authors): p.fingerprints for p in book.fingerprints()}
-
     assert found == {("team-1", ("old",)): b"o", ("team-1", ("s-team-1",)): b"second"}
 
 
@@ -141,39 +116,32 @@ def test_reading_fingerprints_does_not_keep_a_writer_waiting(open_book, monkeypa
         book.put(make_outcome(make_grade(f"team-{n}")))
     prints = book.fingerprints()
     next(prints)
-
     book.put(make_outcome(make_grade("another")))
-
     assert sum(1 for _ in prints) == 14
 
 
 def test_the_class_list_is_the_last_batch_that_ended(open_book):
-    """The class list is that of the last batch that ended.
-
-    Outcomes of a killed run count only if a later batch that ends includes them.
-    """
+    """Outcomes of a killed run count only if a later batch that ends includes them."""
     book = open_book()
-    with pytest.raises(ConfigError, match="no grading of 'lab' is complete"):
+    with pytest.raises(ConfigError, match="'lab'"):
         list(book.entries())
-    finish(book, make_outcome(make_grade("b"), key="b1"), make_outcome(make_grade("a"), key="a1"))
-    book.put(make_outcome(make_grade("a", share=0.0), key="a2"))
-
+    finish(book, make_grade("b"), make_grade("a"))
+    later = make_outcome(make_grade("a", share=0.0), key="a2")
+    book.put(later)
     assert [(e.submission, e.grade.points) for e in book.entries()] == [("b", 20), ("a", 20)]
-    finish(book, make_outcome(make_grade("a", share=0.0), key="a2"))
+    finish(book, later)
     assert [(e.submission, e.grade.points) for e in book.entries()] == [("a", 0)]
     assert book.rubric == RUBRIC
 
 
 def test_shared_data_is_flagged_in_the_class_list(open_book):
     """The class list has the flag for shared data until a later batch finds no shared data."""
-    book = open_book()
-    outcomes = [make_outcome(make_grade(name, flags=(hertz_flag(),))) for name in "ab"]
-    finish(book, *outcomes, shared={"a": shared_flag("b"), "b": shared_flag("a")})
-
+    book, teams = open_book(), [make_grade(name, flags=(hertz_flag(),)) for name in "ab"]
+    finish(book, *teams, shared={"a": shared_flag("b"), "b": shared_flag("a")})
     codes = [f.code for f in book.entry("a").grade.flags]
     assert codes == sorted(["shared_data", "hz_for_rad_s"], key=CODES.index)
     assert book.entry("a").grade.flags[1] == shared_flag("b")
-    finish(book, *outcomes)
+    finish(book, *teams)
     assert [f.code for f in book.entry("a").grade.flags] == ["hz_for_rad_s"]
 
 
@@ -184,317 +152,275 @@ def test_points_given_by_hand_survive_regrading(open_book):
     """
     book = open_book()
     # Lateness costs a tenth, rounded to the rubric's quarter of a point: 1.1 → 1 and 0.65 → 0.75.
-    first = make_grade("team-1", share=0.5, days_late=1.0)
-    finish(book, make_outcome(first, key="1"))
-
+    finish(book, make_grade("team-1", share=0.5, days_late=1.0))
     given = book.override("team-1", "state-model", 2.0, why="right in another order", by="Ada")
-
-    assert (given.by, given.why, given.at) == ("Ada", "right in another order", given.at)
+    assert (given.by, given.why) == ("Ada", "right in another order")
     assert book.entry("team-1").grade.points == pytest.approx(10 + 1 - 1)
-    finish(book, make_outcome(make_grade("team-1", share=0.25, days_late=1.0), key="2"))
+    again = make_grade("team-1", share=0.25, days_late=1.0)
+    finish(book, again, key="again")
     grade = book.entry("team-1").grade
     assert grade.points == pytest.approx(5 - 0.5 + 2 - 0.75)
     assert grade.deducted == pytest.approx(0.75)
-    (model,) = [c for c in grade.criteria if c.id == "state-model"]
+    model = criterion(grade, "state-model")
     assert (model.points, model.outcome) == (2.0, "pass")
-    assert model.message.endswith("Set by hand from 0.5 to 2 of 2: right in another order")
-    assert (
-        book.known("2").grade == make_outcome(make_grade("team-1", share=0.25, days_late=1.0)).grade
-    )
+    assert model.message.endswith("from 0.5 to 2 of 2: right in another order")
+    assert book.known("again of team-1").grade == make_outcome(again).grade
     book.override("team-1", "state-model", None, why="a mistake", by="Ada")
-    assert book.entry("team-1").grade == make_grade("team-1", share=0.25, days_late=1.0)
+    assert book.entry("team-1").grade == again
 
 
 def test_a_broken_submission_can_be_graded_by_hand(open_book):
     """A broken submission can get points by hand; it stays marked as not graded automatically."""
     book = open_book()
-    finish(book, make_outcome(failed_grade("team-1", "no submission.toml")))
-
+    finish(book, failed_grade("team-1", "no submission.toml"))
     book.override("team-1", "pieces", 1.0, why="on paper", by="Ada")
-
     grade = book.entry("team-1").grade
     assert (grade.status, grade.points, [c.id for c in grade.criteria]) == ("failed", 1, ["pieces"])
 
 
 def test_an_override_goes_with_the_people(open_book):
-    """An override belongs to the authors: a team that grows keeps it.
+    """An override belongs to the authors: a team that grows keeps it, another person does not.
 
-    A team of the same name in another year does not get it.
+    An id that differs in capitals and blanks is the same person.
     """
-    book = open_book()
-    finish(book, make_outcome(make_grade("team-1", share=0.0, authors=("ann",)), key="1"))
-    book.override("team-1", "pieces", 1.0, why="seen", by="Ada")
+    book, kept = open_book(), []
+    for who in (("ada 1",), (" Ada  1",), ("ada 1", "bo"), ("cy",)):
+        finish(book, make_grade("team-1", share=0.0, authors=who), key=f"{who}")
+        if not kept:
+            book.override("ADA 1", "pieces", 1.0, why="seen", by="Ada")
+        kept.append((book.entry("team-1").grade.points, bool(book.entry("team-1").overrides)))
+    assert kept == [(1, True), (1, True), (1, True), (0, False)]
 
-    finish(book, make_outcome(make_grade("team-1", share=0.0, authors=("ann", "bo")), key="2"))
-    assert book.entry("team-1").grade.points == 1
-    finish(book, make_outcome(make_grade("team-1", share=0.0, authors=("cy",)), key="3"))
-    assert book.entry("team-1").grade.points == 0
 
-
-def test_assignments_in_one_database_stay_apart(open_book):
-    """An override in one lab has no effect in another lab of the same database.
+@pytest.mark.parametrize("key", ["key", "key of {}"])
+def test_assignments_in_one_database_stay_apart(open_book, key):
+    """An override in one lab has no effect in another, even if the grades have the same key.
 
     If no lab is named, the latest one is opened.
     """
     one, two = open_book("lab 1"), open_book("lab 2")
-    finish(one, make_outcome(make_grade("team-1", share=0.0), key="1"))
-    finish(two, make_outcome(make_grade("team-1", share=0.0), key="2"))
-
+    for book, name in ((one, "1"), (two, "2")):
+        finish(book, make_grade("team-1", share=0.0), key=key.format(name))
     one.override("team-1", "pieces", 1.0, why="seen", by="Ada")
-
     assert one.entry("team-1").grade.points == 1
     assert two.entry("team-1").grade.points == 0
     assert open_book(None, create=False).entry("team-1").grade.points == 0
-
-
-def test_the_same_submission_has_a_grade_in_each_assignment(open_book):
-    """If a submission is graded in two assignments, each has its own grade and overrides.
-
-    This holds even if both assignments use the same rubric, so that the grades have the same key.
-    """
-    one, two = open_book("lab 1"), open_book("lab 2")
-    for book in (one, two):
-        finish(book, make_outcome(make_grade("team-1"), key="same"))
-
-    two.override("team-1", "pieces", 0.0, why="seen", by="Ada")
-
-    assert one.entry("team-1").grade.points == 20
-    assert two.entry("team-1").grade.points == 19
-    assert [event.what for event in one.history("team-1")[1]] == ["graded", "listed"]
+    assert [event.what for event in two.history("team-1")[1]] == ["graded", "listed"]
 
 
 def test_an_override_never_exceeds_the_points_of_the_rubric(open_book):
     """If a changed rubric has fewer points than an override, the override is lowered to them."""
     book = open_book()
-    outcome = make_outcome(make_grade("team-1", share=0.0))
-    finish(book, outcome)
+    finish(book, make_grade("team-1", share=0.0))
     book.override("team-1", "state-model", 2.0, why="seen", by="Ada")
-    (model,) = [c for c in book.entry("team-1").grade.criteria if c.id == "state-model"]
-    given = {"state-model": book.entry("team-1").overrides["state-model"]}
-
+    entry = book.entry("team-1")
+    model = criterion(entry.grade, "state-model")
     changed = model.model_copy(update={"points": 0.0, "out_of": 1.0})
     less = make_grade("team-1", criteria=(changed,))
-
-    (line,) = with_overrides(less, given, rubric=RUBRIC).criteria
+    (line,) = with_overrides(less, entry.overrides, rubric=RUBRIC).criteria
     assert (line.points, line.outcome) == (1.0, "pass")
 
 
 @pytest.mark.parametrize(
-    ("arguments", "why", "message"),
+    ("arguments", "why", "named"),
     [
-        (("team-2", "pieces", 1.0), "x", "team-2: no such submission; did you mean .team-1"),
-        (("team-01", "pieces", 1.0), "x", "no such submission; did you mean .team-1.?"),
-        (("team-1", "peices", 1.0), "x", "peices: the rubric has no such criterion; .*pieces"),
-        (("team-1", "xyz", 1.0), "x", "no such criterion; known: pieces, .*"),
-        (("team-1", "pieces", 1.5), "x", "pieces: expected 0 to 1 points, found 1.5"),
-        (("team-1", "pieces", -0.1), "x", "pieces: expected 0 to 1 points"),
-        (("team-1", "pieces", float("nan")), "x", "pieces: expected 0 to 1 points, found nan"),
-        (("team-1", "pieces", 1.0), " ", "needs a reason"),
-        (("team-1", "pieces", 0.3), "x", r"step, 0\.25: give 0\.25 or 0\.5"),
+        (("team-2", "pieces", 1.0), "x", "team-2: .*'team-1'"),
+        (("team-01", "pieces", 1.0), "x", "team-01: .*'team-1'"),
+        (("section", "pieces", 1.0), "x", "'mon-section' or 'tue-section'"),  # is in both
+        (("team-1", "peices", 1.0), "x", "peices: .*pieces"),
+        (("team-1", "xyz", 1.0), "x", "xyz: .*: pieces, "),
+        (("team-1", "pieces", 1.5), "x", "pieces: .*1.5"),
+        (("team-1", "pieces", -0.1), "x", "pieces: .*-0.1"),
+        (("team-1", "pieces", float("nan")), "x", "pieces: .*nan"),
+        (("team-1", "pieces", 1.0), " ", "--why"),
+        (("team-1", "pieces", 0.3), "x", r"0\.25 or 0\.5"),
     ],
 )
-def test_an_override_that_makes_no_sense_is_refused(open_book, arguments, why, message):
-    """An override that makes no sense is refused; the message says what is allowed."""
+def test_an_override_that_makes_no_sense_is_refused(open_book, arguments, why, named):
+    """An override that makes no sense is refused; the message names what is allowed."""
     book = open_book()
-    finish(book, make_outcome(make_grade("team-1")))
-
-    with pytest.raises(ConfigError, match=message):
+    finish(book, *map(make_grade, ("team-1", "mon-section", "tue-section")))
+    with pytest.raises(ConfigError, match=named):
         book.override(*arguments, why=why, by="Ada")
-
     assert [event.what for event in book.history("team-1")[1]] == ["graded", "listed"]
-
-
-def test_a_name_that_several_submissions_end_with_suggests_them(open_book):
-    """A team that is in two sections is suggested with both."""
-    book = open_book()
-    finish(book, *(make_outcome(make_grade(f"{at}-Team-13")) for at in ("mon", "tue")))
-    with pytest.raises(ConfigError, match=r"did you mean 'mon-Team-13' or 'tue-Team-13'\?"):
-        book.override("team-13", "pieces", 1.0, why="x", by="Ada")
 
 
 def test_points_between_two_steps_can_be_restored(open_book):
     """Points that were given before the step of the rubric changed can be given again."""
-    book = open_book()
-    fine = RUBRIC.model_copy(update={"step": 0.1})
-    outcome = make_outcome(make_grade("team-1"))
-    book.put(outcome)
-    book.finish(Batch(keys=(outcome.key,), shared={}), rubric=fine)
+    book, grade = open_book(), make_grade("team-1")
+    finish(book, grade, rubric=RUBRIC.model_copy(update={"step": 0.1}))
     book.override("team-1", "pieces", 0.3, why="x", by="Ada")
-    book.finish(Batch(keys=(outcome.key,), shared={}), rubric=RUBRIC)
-    book.override("team-1", "pieces", 1.0, why="x", by="Ada")
-    book.override("team-1", "pieces", 0.3, why="x", by="Ada")
+    finish(book, grade)
+    for points in (1.0, 0.3):
+        book.override("team-1", "pieces", points, why="x", by="Ada")
     assert book.entry("team-1").overrides["pieces"].points == 0.3
 
 
 def test_a_team_is_found_by_its_members(open_book):
     """A team can be named by one of its authors, unless the author is in several submissions."""
     book = open_book()
-    finish(
-        book,
-        make_outcome(make_grade("team-1", authors=("ann", "bo"))),
-        make_outcome(make_grade("team-2", authors=("bo",))),
-    )
-
+    finish(book, make_grade("team-1", authors=("ann", "bo")), make_grade("team-2", authors=("bo",)))
     assert book.entry("ann").submission == "team-1"
-    with pytest.raises(ConfigError, match="bo: is in several submissions"):
+    with pytest.raises(ConfigError, match="bo: "):
         book.entry("bo")
 
 
 def test_the_history_says_who_did_what_when_and_why(open_book):
     """The history lists every grading, override and change of the class list in order of time."""
-    book = open_book()
-    late = make_outcome(make_grade("team-1", share=0.5, flags=(hertz_flag(),)), key="1")
+    book, late = open_book(), make_grade("team-1", share=0.5, flags=(hertz_flag(),))
     finish(book, late)
     finish(book, late)  # nothing new
     book.override("team-1", "pieces", 1.0, why="all there", by="Ada")
     finish(book, late, shared={"team-1": shared_flag("team-9")})
     book.override("team-1", "pieces", None, why="was not", by="Bob")
-
     name, events = book.history("s-team-1")
-
     assert name == "team-1"
     assert [e.at for e in events] == sorted(e.at for e in events)
-    assert [(e.what, e.points) for e in events] == [
-        ("graded", 10.0),
-        ("listed", 10.0),
-        ("override", 1.0),
-        ("listed", 10.5),
-        ("override", None),
+    assert [(e.what, e.points, e.by) for e in events] == [
+        ("graded", 10.0, ""),
+        ("listed", 10.0, ""),
+        ("override", 1.0, "Ada"),
+        ("listed", 10.5, ""),
+        ("override", None, "Bob"),
     ]
-    lines = history_text(name, events).splitlines()
-    assert lines[1].endswith("UTC  graded    10 of 20  (hz_for_rad_s)")
-    assert lines[3].endswith("UTC  override  pieces: 1 by hand, by Ada: all there")
-    assert lines[4].endswith("UTC  listed    10.5 of 20  (shared_data)")
-    assert lines[5].endswith("UTC  override  pieces: automatic points again, by Bob: was not")
-    assert all(re.match(r"2026-03-01 00:\d\d:00 UTC  ", line) for line in lines[1:])
+    lines = history_text(name, events).splitlines()[1:]
+    parts = ("(hz_for_rad_s)", "10 of 20", "all there", "(shared_data)", "was not")
+    assert [part in line for part, line in zip(parts, lines, strict=True)] == [True] * 5
+    assert all(re.match(r"2026-03-01 00:\d\d:00 UTC  ", line) for line in lines)
     assert json.loads(json.dumps(history_dict(name, events)))["events"][2]["by"] == "Ada"
 
 
 def test_the_history_gives_the_new_name_of_a_team(open_book):
     """If a team's folder has a new name in the next run, the history says so under both names."""
-    book = open_book()
-    finish(
-        book, make_outcome(make_grade("team-1", authors=("ann",))), make_outcome(make_grade("b"))
-    )
-    finish(
-        book,
-        make_outcome(make_grade("group-1", authors=("ann",))),
-        make_outcome(make_grade("b")),
-        make_outcome(make_grade("c")),
-    )
-
-    assert [e.text for e in book.history("team-1")[1]][-1].endswith("continues as group-1")
-    assert "was team-1 before" in [e.text for e in book.history("group-1")[1]]
-    assert [e.text for e in book.history("c")[1]] == ["", ""]
+    book, other = open_book(), make_grade("b")
+    finish(book, make_grade("team-1", authors=("ann",)), other)
+    finish(book, make_grade("group-1", authors=("ann",)), other, make_grade("c"))
+    said = {name: [e.text for e in book.history(name)[1]] for name in ("team-1", "group-1", "c")}
+    assert said["team-1"][-1].endswith("group-1")
+    assert any("team-1" in text for text in said["group-1"])
+    assert said["c"] == ["", ""]
 
 
-def test_rows_are_only_added(open_book, place):
+def test_rows_are_only_added(book, place):
     """The database itself refuses to change or delete rows of any table."""
-    book = open_book()
-    figures = (("a.svg", "<svg/>"),)
-    graded = make_grade("team-1", flags=(hertz_flag(),))
-    finish(book, make_outcome(graded, figures=figures, findings="{}"))
-    book.override("team-1", "pieces", 0.0, why="x", by="y")
+    graded = make_grade("team-3", flags=(hertz_flag(),))
+    finish(book, make_outcome(graded, figures=(("a.svg", "<svg/>"),), findings="{}"))
+    book.override("team-3", "pieces", 0.0, why="x", by="y")
+    book.set_reviewed("team-3", by="y", reviewed=True)
+    book.ask("team-3", "pieces", why="x", by="z")
     book.close()
-    with closing(RequestGradebook(place)) as shared:
-        shared.set_reviewed("team-1", by="y", reviewed=True)
-        shared.release(True, by="y")
-        shared.ask("team-1", "pieces", why="x", by="z")
-
-    url = place.replace("postgresql:", "postgresql+psycopg:")
-    engine = create_engine(url if "://" in url else f"sqlite:///{place}/{FILE}")
-    assert len(metadata.sorted_tables) == 11
+    engine = database(place)
     for table in metadata.sorted_tables:
         column = table.columns.keys()[0]
         for attempt in (
             f"UPDATE {table.name} SET {column} = {column}",
             f"DELETE FROM {table.name}",
         ):
-            with (
-                pytest.raises(DBAPIError, match="entries of a gradebook cannot be changed"),
-                engine.begin() as connection,
-            ):
+            refused = pytest.raises(DBAPIError, match="cannot be changed")
+            with refused, engine.begin() as connection:
                 connection.execute(text(attempt))
         with engine.begin() as connection:
             assert connection.scalar(text(f"SELECT count(*) FROM {table.name}")) > 0
     engine.dispose()
 
 
-@pytest.mark.slow
-@pytest.mark.sample
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
-def test_a_dozen_kills_lose_nothing(place):
-    """After twelve kills of the writing process, each outcome is stored whole or not at all."""
-    assert_nothing_lost(place, kills=12)
+@pytest.mark.parametrize(
+    "added",
+    [
+        ["DROP TABLE request_events", "DROP TABLE releases"],
+        ["ALTER TABLE overrides DROP COLUMN comment"],
+    ],
+    ids=["requests", "comments"],
+)
+def test_a_gradebook_of_an_earlier_version_gets_what_is_new(place, added):
+    """A gradebook from before requests or comments gets them, and keeps its overrides."""
+    with book_of(place, make_grade("team-1", share=0.5)) as book:
+        book.override("team-1", "laws", 0.0, why="no", by="Ada")
+    engine = database(place)
+    with engine.begin() as old:
+        for change in added:
+            old.execute(text(change))
+    engine.dispose()
+    with RequestGradebook(place) as book:
+        assert (book.n_waiting(), book.released) == (0, False)
+        assert book.entry("team-1").overrides["laws"].points == 0.0
+        book.release(True, by="prof")
+        book.ask("team-1", "laws", why="x", by="s1")
+        (asked,) = book.queue().waiting
+        book.answer("team-1", "laws", 1.0, text="ok", by="Ada", version=asked.version)
+        seen = book.team("team-1").versions["pieces"]
+        book.change("team-1", "pieces", 0.5, why="Mind the unit.", by="Ada", version=seen)
+        grade = book.entry("team-1").grade
+    assert grade.points == 10.5
+    assert criterion(grade, "pieces").message.endswith(" Mind the unit.")
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
-def test_three_hundred_kills_lose_nothing(place):
-    """After 300 kills of the writing process, each outcome is stored whole or not at all."""
-    assert_nothing_lost(place, kills=300)
-
-
-def assert_nothing_lost(place: str, *, kills: int) -> None:
+@pytest.mark.parametrize("kills", [pytest.param(12, marks=pytest.mark.sample), 300])
+@FORKS
+def test_kills_lose_nothing(place, kills):
+    """After many kills of the writing process, each outcome is stored whole or not at all."""
     command = [sys.executable, "-m", "tests.helpers.gradebook_kills", place, str(kills)]
     said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert said.returncode == 0, said.stderr
     done, within, told, there = map(int, re.findall(r"\d+", said.stdout))
-    assert done == kills
-    assert there == told
+    assert (done, there) == (kills, told)
     assert within > kills // 4  # most processes lived long enough to write
 
 
 # --------------------------------------------------------- places without a gradebook
 
 
-def test_a_place_without_a_gradebook_is_an_error(tmp_path):
-    """If a place has no gradebook, reading it is an error and creates no file."""
-    with pytest.raises(ConfigError, match=r"holds no gradebook\.sqlite; give the --out folder"):
-        Gradebook(tmp_path)
-    assert list(tmp_path.iterdir()) == []
+def test_a_folder_may_have_the_name_of_a_database(tmp_path):
+    """Whether a place is a folder or a file is decided by what exists there, not by its name."""
+    (tmp_path / "lab.db").mkdir()
+    for name in ("lab.db", "other.db"):
+        Gradebook(tmp_path / name, create=True).close()
+    assert (tmp_path / "lab.db" / FILE).is_file()
+    assert (tmp_path / "other.db").is_file()
 
 
 @pytest.mark.parametrize(
-    ("url", "message"),
+    ("url", "named"),
     [
-        ("nonsense://", "nonsense://.*: no driver"),
-        ("mysql+pymysql://u:secret@h/d", r"mysql\+pymysql://u:\*\*\*@h/d: no driver"),
+        ("nonsense://", "nonsense://"),
+        ("mysql+pymysql://u:secret@h/d", r"mysql\+pymysql://u:\*\*\*@h/d"),
         ("postgresql://u:secret@localhost:1/d", r"u:\*\*\*@localhost:1/d: .*(refused|No module)"),
-        ("://", "not a database URL"),
+        ("://", "URL"),
     ],
 )
-def test_a_useless_address_is_an_error_without_the_password(url, message):
-    """An address that cannot be used gives an error of one line without the password.
-
-    For example, a driver is missing, no server answers, or the text is not a URL.
-    """
-    with pytest.raises(ConfigError, match=message) as error:
+def test_a_useless_address_is_an_error_without_the_password(url, named):
+    """If a driver or server is missing, or the text is no URL, one line says so."""
+    with pytest.raises(ConfigError, match=named) as error:
         Gradebook(url, create=True)
     assert "secret" not in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_a_file_that_is_not_a_gradebook_is_an_error(tmp_path):
-    """A file that is not a gradebook of this version is refused with an error.
+def test_a_place_without_a_gradebook_of_this_version_is_an_error(tmp_path):
+    """A missing gradebook, a text, another program's database and a later version are refused.
 
-    It may be a text file, another program's database, or a gradebook of a later version.
+    Nothing is created.
     """
     file = tmp_path / FILE
+
+    def refused(why: str) -> None:
+        with pytest.raises(ConfigError, match=why):
+            Gradebook(tmp_path)
+
+    refused(r"gradebook\.sqlite; .*--out")
+    assert list(tmp_path.iterdir()) == []
     file.write_text("name,points\n" * 100, encoding="utf-8")
-    with pytest.raises(ConfigError, match="file is not a database"):
-        Gradebook(tmp_path)
+    refused("database")
     file.unlink()
     with sqlite3.connect(file) as other:
         other.execute("CREATE TABLE songs (name TEXT)")
     other.close()
-    with pytest.raises(ConfigError, match="holds no gradebook"):
-        Gradebook(tmp_path)
+    refused("no gradebook")
     file.unlink()
     Gradebook(tmp_path, create=True).close()
     with sqlite3.connect(file) as book:
         book.execute("DROP TRIGGER settings_no_update")
         book.execute("UPDATE settings SET value = '2'")
     book.close()
-    with pytest.raises(ConfigError, match="is a gradebook of version 2, and this cartlab uses 1"):
-        Gradebook(tmp_path)
+    refused("version 2,")

@@ -16,11 +16,9 @@ from hypothesis import strategies as st
 from pipeline.errors import ConfigError
 from pipeline.grading.batch.grade_class import Options, grade_class
 from pipeline.grading.csv_table import read_table
-from pipeline.grading.grade import CODES, Adjustment, Criterion, Flag
+from pipeline.grading.grade import CODES, Adjustment, Criterion, Flag, Grade
 from pipeline.grading.gradebook.class_lines import GradeSummary
-from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.override import HandPoints, read_points, with_overrides
-from pipeline.grading.gradings import Batch
 from pipeline.grading.publish.anonymous import KEY_FILE, anonymise, pseudonyms
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.feedback import evidence_table, feedback_page, numbers_table
@@ -30,7 +28,9 @@ from pipeline.grading.words import WORDS
 from pipeline.setup import Units
 from pipeline.words.text import plain
 from tests.helpers.grades import (
+    book_of,
     failed_grade,
+    finish,
     hertz_flag,
     make_grade,
     make_outcome,
@@ -49,16 +49,16 @@ def test_the_evidence_of_a_flag_keeps_its_words():
     """
     evidence = {
         "parameter": "A[2,1]", "table": "initial", "reported": 3.0, "stable": False,
-        "slip": "rows 1 and 2 are exchanged", "also_in": "final", "ran": [1.0], "gone": "",
+        "slip": "rows exchanged", "also_in": "final", "ran": [1.0], "gone": "",
     }  # fmt: skip
     flag = Flag(code="wrong_state_space", parameters=(), message="x", evidence=evidence)
     table = evidence_table(flag, units=None, numbers=count(1))
     assert table is not None
-    shown = {plain(h.text): plain(c.text) for h, c in zip(table.head, table.rows[0], strict=True)}
-    assert shown == {
-        "Table": "initial", "Reported": "3", "Stable": "no",
-        "Mistake": "rows 1 and 2 are exchanged", "Also in": "final",
-    }  # fmt: skip
+    assert [plain(head.text) for head in table.head] == [
+        "Table", "Reported", "Stable", "Mistake", "Also in",
+    ]  # fmt: skip
+    shown = [plain(cell.text) for cell in table.rows[0]]
+    assert shown == ["initial", "3", "no", "rows exchanged", "final"]
     assert table.align == "lrlll"
 
 
@@ -161,11 +161,8 @@ def test_grade_json_says_what_was_given_by_hand(graded):
 
 def test_only_what_changed_is_written_again(tmp_path):
     """Only changed feedback is written again; missing files are made and outdated ones removed."""
-    with Gradebook(tmp_path, assignment="lab", create=True) as book:
-        outcomes = [make_outcome(make_grade(name, share=0.5)) for name in "abc"]
-        for outcome in outcomes:
-            book.put(outcome)
-        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=RUBRIC)
+    teams = [make_grade(name, share=0.5) for name in "abc"]
+    with book_of(tmp_path, *teams) as book:
         told: list[str] = []
         write_outputs(book, tmp_path, progress=told.append)
         first = tree(tmp_path)
@@ -178,7 +175,7 @@ def test_only_what_changed_is_written_again(tmp_path):
         write_outputs(book, tmp_path, progress=told.append)
         assert told[3:] == ["feedback: b", "feedback: c"]
 
-        book.finish(Batch(keys=(outcomes[1].key,), shared={}), rubric=RUBRIC)
+        finish(book, teams[1])
         write_outputs(book, tmp_path)
         assert sorted(p.name for p in (tmp_path / "feedback").iterdir()) == [".made.json", "a", "b"]
         assert [p.name for p in (tmp_path / "feedback" / "a").iterdir()] == ["notes.txt"]
@@ -187,11 +184,9 @@ def test_only_what_changed_is_written_again(tmp_path):
 @pytest.mark.parametrize("name", ["../out", "a/b", "..", ""])
 def test_a_name_that_leads_outside_the_folder_is_refused(tmp_path, name):
     """If a submission's name would lead outside the folder, nothing is written."""
-    with Gradebook(tmp_path / "g.sqlite", assignment="lab", create=True) as book:
-        book.put(make_outcome(make_grade(name), key="k"))
-        book.finish(Batch(keys=("k",), shared={}), rubric=RUBRIC)
+    with book_of(tmp_path / "g.sqlite", make_grade(name)) as book:
         (tmp_path / "out").mkdir()
-        with pytest.raises(ConfigError, match="cannot be the name of a feedback folder"):
+        with pytest.raises(ConfigError, match="feedback folder"):
             write_outputs(book, tmp_path / "out")
     assert [p.name for p in (tmp_path / "out").rglob("*") if p.is_file()] == []
 
@@ -204,24 +199,19 @@ def test_an_anonymous_grading_reveals_no_name(tmp_path):
 
     Only the key file does.
     """
-    outcomes = [
-        make_outcome(make_grade("zoe-lab", authors=("zoe",), share=0.5)),
-        make_outcome(make_grade("ann-lab", authors=("ann",))),
-        make_outcome(failed_grade("bob-lab", "bob-lab: no submission.toml")),
-    ]
+    zoe, ann = (
+        make_grade("zoe-lab", authors=("zoe",), share=0.5),
+        make_grade("ann-lab", authors=("ann",)),
+    )
+    bob = failed_grade("bob-lab", "bob-lab: no submission.toml")
     shared = {"zoe-lab": shared_flag("ann-lab"), "ann-lab": shared_flag("zoe-lab")}
-    with Gradebook(tmp_path / "g.sqlite", assignment="lab", create=True) as book:
-        for outcome in outcomes:
-            book.put(outcome)
-        rubric = RUBRIC.model_copy(update={"anonymous": True})
-        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared=shared), rubric=rubric)
-        out = tmp_path / "out"
-        out.mkdir()
+    rubric, out = RUBRIC.model_copy(update={"anonymous": True}), tmp_path / "out"
+    out.mkdir()
+    with book_of(tmp_path / "g.sqlite", zoe, ann, bob, rubric=rubric, shared=shared) as book:
         write_outputs(book, out)
         before = tree(out)
-        book.put(make_outcome(make_grade("ann-lab", authors=("ann",), share=0.2), key="later"))
-        keys = (outcomes[0].key, "later", outcomes[2].key)
-        book.finish(Batch(keys=keys, shared=shared), rubric=rubric)
+        later = make_outcome(make_grade("ann-lab", authors=("ann",), share=0.2), key="later")
+        finish(book, zoe, later, bob, rubric=rubric, shared=shared)
         write_outputs(book, out)
 
     key = {row["anonymous"]: row for row in rows_of(out / KEY_FILE)}
@@ -233,11 +223,10 @@ def test_an_anonymous_grading_reveals_no_name(tmp_path):
             told = re.sub(rb'url\("data:[^"]*"\)', b"", content)  # fonts are no text
             assert not re.search(rb"zoe|\bann\b|bob", told), name
             assert not re.search(r"zoe|ann-|bob", name)
-    (ann,) = [n for n, row in key.items() if row["authors"] == "ann"]
-    (zoe,) = [n for n, row in key.items() if row["authors"] == "zoe"]
-    flag = json.loads(before[f"feedback/{zoe}/grade.json"])["flags"][0]
-    assert flag["evidence"]["submissions"] == [ann]  # the pseudonym is as before
-    assert ann in flag["message"]
+    names = {row["authors"]: name for name, row in key.items()}
+    flag = json.loads(before[f"feedback/{names['zoe']}/grade.json"])["flags"][0]
+    assert flag["evidence"]["submissions"] == [names["ann"]]  # the pseudonym is as before
+    assert names["ann"] in flag["message"]
 
 
 def test_hiding_a_name_does_not_change_other_words():
@@ -272,6 +261,10 @@ def test_pseudonyms_are_all_different():
 # -------------------------------------------------------------------------- the pages
 
 
+def feedback_of(grade: Grade) -> str:
+    return feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
+
+
 def test_every_flag_has_a_name_and_a_place_to_look():
     """Every flag has a title and a place to look."""
     for said in ("title", "place"):
@@ -281,18 +274,14 @@ def test_every_flag_has_a_name_and_a_place_to_look():
 
 
 def test_the_feedback_compares_reported_and_recomputed_numbers():
-    """The feedback shows reported and recomputed numbers, their difference, a message and help.
-
-    It also shows the deduction for lateness.
-    """
-    grade = make_grade("team-1", share=0.5, days_late=1.5, deducted=2.0, flags=(hertz_flag(),))
-    html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
-
+    """The feedback shows both numbers, their difference, each flag with help, and lateness."""
+    flag = hertz_flag()
+    html = feedback_of(make_grade("t", share=0.5, days_late=1.5, deducted=2.0, flags=(flag,)))
     text = re.sub(r"<[^>]+>", "", html)
-    assert "this looks like Hz where rad/s is asked." in text
-    assert "Where to look: the unit of every frequency" in text
-    assert "1.5 days, −2 points" in text
-    assert re.search(r"YoursFrom your recordingsDifference\s+.*rad/s\]3\.1219\.6−84\.1 %", text)
+    assert flag.message.partition("this")[2] in text
+    assert WORDS.text(f"place_{flag.code}") in text
+    assert re.search("1.5 days.*−2 points", text)
+    assert re.search(r"\]3\.1219\.6−84\.1 %", text)
 
 
 @pytest.mark.parametrize(
@@ -311,33 +300,30 @@ def test_a_large_difference_is_a_ratio(found, shown):
 
 def test_feedback_on_shared_data_names_nobody_and_does_not_praise():
     """If data are shared, the feedback neither names the other team nor says "Well done"."""
-    grade = make_grade("team-1", flags=(shared_flag("b-team"),))
-    html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
-
-    assert "is also in another submission" in html
-    assert "All points were earned." in html
+    html = feedback_of(make_grade("team-1", flags=(shared_flag("b-team"),)))
+    assert "another submission" in html
+    assert "20 of 20" in html
     assert not re.search("b-team|Well done", html)
 
 
 def test_feedback_says_why_a_submission_was_not_graded():
-    """If a submission could not be graded, its feedback says why and what to do."""
-    grade = failed_grade("team-1", "no submission.toml in it")
-    html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
-    assert "No submission.toml in it." in html
-    assert "Fix it and hand it in again" in html
+    """It gives the reason; a mark is shown only if the submission is at fault or has points.
 
-
-def test_a_stopped_submission_shows_no_mark():
-    """If a limit ended the grading, the feedback shows no mark unless a person gave points."""
-    stopped = failed_grade("team-1", "stopped after 120 s").model_copy(update={"unsettled": True})
-    html = feedback_page(stopped, rubric=RUBRIC, figures=(), name="team-1")
-    assert "could not be graded yet" in html
-    assert "0 of 20" not in html
-    by_hand = stopped.model_copy(
-        update={"points": 5.0, "adjustments": (Adjustment(points=5.0, why="read by eye"),)}
-    )
-    html = feedback_page(by_hand, rubric=RUBRIC, figures=(), name="team-1")
-    assert "5 of 20" in html
+    If a limit ended the grading, the staff act; if a person gave points, nobody hands in again.
+    """
+    fault = failed_grade("team-1", "no submission.toml in it")
+    stopped = fault.model_copy(update={"unsettled": True})
+    adjusted = {"points": 5.0, "adjustments": (Adjustment(points=5.0, why="read by eye"),)}
+    given = HandPoints(criterion=RUBRIC.criteria[0].id, points=1.0, why="x", by="y", at="")
+    by_hand = with_overrides(fault, {given.criterion: given}, rubric=RUBRIC)
+    pages = [fault, stopped, stopped.model_copy(update=adjusted), by_hand]
+    texts = [re.sub(r"<[^>]+>", "", feedback_of(grade)) for grade in pages]
+    assert all("o submission.toml in it" in text for text in texts)
+    assert ["hand it in again" in text for text in texts] == [True, False, False, False]
+    marks = [found and found[0] for text in texts if (found := re.search(r"\d of 20", text)) or 1]
+    assert marks == ["0 of 20", None, "5 of 20", "1 of 20"]
+    told = json.loads(results_text(by_hand, rubric=RUBRIC, by_hand=True))["output"]
+    assert "given by hand" in told
 
 
 def test_feedback_lists_every_mistake_of_a_broken_submission(tmp_path):
@@ -350,12 +336,10 @@ def test_feedback_lists_every_mistake_of_a_broken_submission(tmp_path):
     text = 'version = 1\n[system]\ncarts = 2\nspring = [true]\n[design]\ncart = "two"\n[reportd]\n'
     (folder / "submission.toml").write_text(text, encoding="utf-8")
     out = tmp_path / "grades"
-    grade_class(
-        [folder], rubric_file=Path("throne-2dof"), out=out,
-        options=Options(figures=False),
-    )  # fmt: skip
+    options = Options(figures=False)
+    grade_class([folder], rubric_file=Path("throne-2dof"), out=out, options=options)
     html = (out / "feedback" / "team-1" / "feedback.html").read_text(encoding="utf-8")
-    wanted = ("system.spring: unknown key", "design.cart: expected", "reportd: unknown key")
+    wanted = ("system.spring: ", "design.cart: ", "reportd: ")
     for words in wanted:
         assert sum(words in item for item in re.findall(r"<li>(.*?)</li>", html)) == 1
     assert "more)" not in html
@@ -422,7 +406,7 @@ def test_any_numbers_can_be_shown(values):
     found = dict(reversed(values.items()))
     first = grade.criteria[0].model_copy(update={"expected": values, "found": found})
     grade = make_grade("team-1", criteria=(first, *grade.criteria[1:]))
-    html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
+    html = feedback_of(grade)
     assert not re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f]", html)
 
 
@@ -445,11 +429,8 @@ def test_the_class_page_shows_statistics():
     lines.append(GradeSummary.of(failed_grade("d", "broken")))
     html = re.sub(r"<[^>]+>", " ", class_page(lines, rubric=RUBRIC))
     text = " ".join(html.split())
-
-    assert "Could not be graded 1" in text
-    assert "Mean of the 3 graded 10.00 of 20" in text
-    assert "Median of the 3 graded 10.00 of 20" in text
-    assert "static gains from the steps 1 50 % 1 1 1 0" in text
+    assert re.search("graded 1 .*3 graded 10.00 of 20 .*3 graded 10.00 of 20", text)
+    assert "1 50 % 1 1 1 0" in text
     assert re.search(r"hz_for_rad_s \) 2 50 % b , c .* missing \) 1 25 % c ", text)
 
 
@@ -475,15 +456,12 @@ def test_the_class_page_lists_groups_that_share_recordings(tmp_path):
         "c": shares(("d", "b", "d")),
         "e": shares(("d", "old (an earlier batch)", "d")),
     }
-    outcomes = [make_outcome(make_grade(name)) for name in "abcde"]
-    with Gradebook(tmp_path / "g.sqlite", assignment="lab", create=True) as book:
-        for outcome in outcomes:
-            book.put(outcome)
-        batch = Batch(keys=tuple(o.key for o in outcomes), shared=shared)
+    class_ = [make_grade(name) for name in "abcde"]
+    with book_of(tmp_path / "g.sqlite") as book:
         texts = {}
         for anonymous in (False, True):
             rubric = RUBRIC.model_copy(update={"anonymous": anonymous})
-            book.finish(batch, rubric=rubric)
+            finish(book, *class_, rubric=rubric, shared=shared)
             write_outputs(book, tmp_path)
             html = (tmp_path / "class.html").read_text(encoding="utf-8")
             found = re.search(r'id="shared".*?(<tbody.*?)</table>', html, re.DOTALL)
@@ -505,13 +483,10 @@ def test_the_data_frame_has_a_row_for_each_criterion(tmp_path):
 
     A criterion that was never judged has no points.
     """
-    outcomes = [make_outcome(make_grade("a", authors=("ann", "bo"), flags=(hertz_flag(),))),
-                make_outcome(make_grade("b", share=0.5, days_late=1.0, deducted=1.0, points=9.0)),
-                make_outcome(failed_grade("c", "broken"))]  # fmt: skip
-    with Gradebook(tmp_path, assignment="lab", create=True) as book:
-        for outcome in outcomes:
-            book.put(outcome)
-        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=RUBRIC)
+    class_ = [make_grade("a", authors=("ann", "bo"), flags=(hertz_flag(),)),
+              make_grade("b", share=0.5, days_late=1.0, deducted=1.0, points=9.0),
+              failed_grade("c", "broken")]  # fmt: skip
+    with book_of(tmp_path, *class_) as book:
         book.override("c", "pieces", 0.75, why="x", by="y")
         write_outputs(book, tmp_path)
         frame = book.to_frame()
@@ -523,34 +498,16 @@ def test_the_data_frame_has_a_row_for_each_criterion(tmp_path):
     assert wide.count(axis="columns").to_dict() == {"a": len(ids), "b": len(ids), "c": 1}
     totals = frame.pivot(index="submission", columns="criterion", values="total")["pieces"]
     assert totals.to_list() == [20.0, 9.0, 0.75]
-    assert frame.loc[frame["by_hand"], ["submission", "criterion"]].to_numpy().tolist() == [
-        ["c", "pieces"]
-    ]
-    assert frame.loc[0, ["authors", "remarks", "outcome"]].to_list() == [
-        "ann bo", "hz_for_rad_s", "pass",
-    ]  # fmt: skip
+    by_hand = frame.loc[frame["by_hand"], ["submission", "criterion"]]
+    assert by_hand.to_numpy().tolist() == [["c", "pieces"]]
+    first = frame.loc[0, ["authors", "remarks", "outcome"]]
+    assert first.to_list() == ["ann bo", "hz_for_rad_s", "pass"]
     table = pd.read_csv(tmp_path / "grades.csv").set_index("submission")
     assert (table[ids].fillna(-1).to_numpy() == wide[ids].fillna(-1).to_numpy()).all()
 
 
 def missing_flag() -> Flag:
     return Flag(code="missing", parameters=("K_1",), message="K_1 is missing.", evidence={})
-
-
-def test_points_by_hand_need_no_new_submission():
-    """If points were given by hand, neither the page nor Gradescope asks for a new submission."""
-    grade = failed_grade("team-7", "no submission.toml in it")
-    given = HandPoints(criterion=RUBRIC.criteria[0].id, points=1.0, why="x", by="y", at="")
-    given = {given.criterion: given}
-    by_hand = with_overrides(grade, given, rubric=RUBRIC)
-    page = feedback_page(by_hand, rubric=RUBRIC, figures=(), name="team-7")
-    text = re.sub(r"<[^>]+>", "", page)
-    assert "could not be graded automatically" in text
-    assert "Its points were given by hand." in text
-    assert "Set by hand" in text
-    assert "hand it in again" not in text
-    told = json.loads(results_text(by_hand, rubric=RUBRIC, by_hand=True))["output"]
-    assert told.startswith("Could not be graded automatically, so points were given by hand: ")
 
 
 @pytest.mark.parametrize("grades", [[], [failed_grade("a", "broken")]])
@@ -560,15 +517,10 @@ def test_a_class_without_grades_has_a_page(grades):
     assert "Submissions" in html
 
 
-@pytest.mark.parametrize(("text", "points"), [("2", 2.0), ("1,5", 1.5), ("AUTO", None)])
-def test_points_are_read_as_typed(text, points):
+def test_points_are_read_as_typed():
     """Points are read with a decimal point or comma; `auto` means the automatic points."""
-    assert read_points(text) == points
-
-
-def test_a_text_that_is_not_points_is_refused():
-    """A text that is not a number of points is refused, and the message says what is allowed."""
-    with pytest.raises(ConfigError, match="two: expected a number of points, or auto"):
+    assert [read_points(text) for text in ("2", "1,5", "AUTO")] == [2.0, 1.5, None]
+    with pytest.raises(ConfigError, match="two: "):
         read_points("two")
 
 
@@ -585,9 +537,9 @@ def test_a_table_of_a_platform_is_read_whatever_its_separators(tmp_path):
     path.write_text("a,b\n1\n1,2,3\n", encoding="utf-8")
     assert list(read_table(path).itertuples(name=None)) == [(2, "1", ""), (3, "1", "2")]
     path.write_bytes(b"a,b\n\xff\xfe,1\n")
-    with pytest.raises(ConfigError, match=r"t\.csv: is not UTF-8"):
+    with pytest.raises(ConfigError, match=r"t\.csv: .*UTF-8"):
         read_table(path)
     for much in ("a\n" * 200_000, "," * 5_000):
         path.write_text(f"a{much}\n", encoding="utf-8")
-        with pytest.raises(ConfigError, match=r"t\.csv: has more than 2000 columns or 100000 rows"):
+        with pytest.raises(ConfigError, match=r"t\.csv: .* 2000 .* 100000"):
             read_table(path)
