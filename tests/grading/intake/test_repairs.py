@@ -64,10 +64,10 @@ def test_a_repair_is_saved_for_the_text_that_a_person_saw(tmp_path):
     repair, key = Repair(text="right", **BY_ADA), text_key("first\r\n")
     save_repair(tmp_path, "team-07", repair, of=key)
     assert read_repairs(tmp_path, "team-07") == {key: repair}
-    with pytest.raises(ConfigError, match="enter a reason"):
+    with pytest.raises(ConfigError, match="a reason"):
         save_repair(tmp_path, "team-07", Repair(text="x", by="Ada", why=" "), of=key)
     keep_original(tmp_path, "team-07", "second")
-    with pytest.raises(ConfigError, match="handed in again"):
+    with pytest.raises(ConfigError, match="again"):
         save_repair(tmp_path, "team-07", repair, of=key)
     assert read_repairs(tmp_path, "team-07") == {key: repair}  # kept for the first text
     keep_original(tmp_path, "team-07", "")

@@ -55,7 +55,7 @@ def test_a_path_that_leaves_the_archive_is_refused(tmp_path, name):
     """A member whose path leads outside the archive is not written; the other members are."""
     archive = zipped(tmp_path / "a.zip", {name: "evil", "good.txt": "good"})
     refused = unpack(archive, tmp_path / "in" / "out", limits=SMALL)
-    assert "points outside the archive" in "".join(refused.values())
+    assert "outside" in "".join(refused.values())
     assert files_below(tmp_path) == ["a.zip", "in/out/good.txt"]
 
 
@@ -66,7 +66,7 @@ def test_a_name_that_is_invalid_on_windows_is_refused_there(tmp_path, monkeypatc
     assert not unpack(packed, tmp_path / "here", limits=SMALL)
     monkeypatch.setattr("pipeline.grading.intake.unpack.sys.platform", "win32")
     (why,) = unpack(packed, tmp_path / "there", limits=SMALL).values()
-    assert why.endswith("is not a valid file name on Windows")
+    assert why.endswith("Windows")
     assert files_below(tmp_path / "there") == ["good.txt"]
 
 
@@ -84,9 +84,9 @@ def test_links_pipes_and_devices_are_refused(tmp_path, mode, reason):
 @pytest.mark.parametrize(
     ("members", "limits", "reason"),
     [
-        ({"zeros": "0" * 2_000_000}, SMALL, "unpacks to more than"),
-        ({"zeros": "0" * 20_000_000}, HAND_IN, "200 times its size"),
-        ({str(i): "" for i in range(21)}, SMALL, "more than 20 files"),
+        ({"zeros": "0" * 2_000_000}, SMALL, "unpacks to"),
+        ({"zeros": "0" * 20_000_000}, HAND_IN, "200 times"),
+        ({str(i): "" for i in range(21)}, SMALL, "20 files"),
     ],
 )
 def test_zip_bombs_are_stopped(tmp_path, members, limits, reason):
@@ -101,7 +101,7 @@ def test_zip_bombs_are_stopped(tmp_path, members, limits, reason):
 def test_the_64_bit_length_of_the_contents_is_limited_too(tmp_path):
     """A table of contents that is too long is refused even if only the 64-bit record says so."""
     archive = zipped(tmp_path / "a.zip", {"y" * 4_000 + str(i): "" for i in range(19)})
-    with pytest.raises(SubmissionError, match="table of contents"):
+    with pytest.raises(SubmissionError, match="of contents"):
         unpack(archive, tmp_path / "plain", limits=BRIEF)
     raw = archive.read_bytes()
     at = raw.rfind(b"PK\x05\x06")
@@ -112,29 +112,52 @@ def test_the_64_bit_length_of_the_contents_is_limited_too(tmp_path):
     archive.write_bytes(raw[:at] + new + old)
     with zipfile.ZipFile(archive) as opened:
         assert len(opened.infolist()) == 19
-    with pytest.raises(SubmissionError, match="table of contents"):
+    with pytest.raises(SubmissionError, match="of contents"):
         unpack(archive, tmp_path / "out", limits=BRIEF)
     assert member_names(archive, limits=BRIEF) == []
 
 
-def test_a_zip_bomb_with_a_false_size_is_refused(tmp_path):
-    """A zip bomb whose headers claim ten bytes is refused as a broken archive."""
-    archive = zipped(tmp_path / "a.zip", {"x": "0" * 3_000_000})
-    raw = archive.read_bytes().replace(struct.pack("<L", 3_000_000), struct.pack("<L", 10))
-    archive.write_bytes(raw)
-    with pytest.raises(SubmissionError, match=r"a\.zip"):
-        unpack(archive, tmp_path / "out", limits=SMALL)
+def forged_size(path):
+    """Claim ten bytes for a member of three million."""
+    raw = zipped(path, {"x": "0" * 3_000_000}).read_bytes()
+    path.write_bytes(raw.replace(struct.pack("<L", 3_000_000), struct.pack("<L", 10)))
 
 
-def test_an_encrypted_archive_is_refused(tmp_path):
-    """If an archive is encrypted, the reason says so."""
-    archive = zipped(tmp_path / "a.zip", {"x": "secret"})
-    raw = bytearray(archive.read_bytes())
+def encrypted(path):
+    raw = bytearray(zipped(path, {"x": "secret"}).read_bytes())
     raw[6] |= 1  # the flags in the local header; below, those in the table of contents
     raw[raw.find(b"PK\x01\x02") + 8] |= 1
-    archive.write_bytes(raw)
-    with pytest.raises(SubmissionError, match="encrypted"):
-        unpack(archive, tmp_path / "out", limits=SMALL)
+    path.write_bytes(raw)
+
+
+def packed_by(method):
+    """Pack by a method that can take much longer to unpack than deflate."""
+
+    def pack(path):
+        with zipfile.ZipFile(path, "w", method) as archive:
+            archive.writestr("submission.toml", "x")
+
+    return pack
+
+
+@pytest.mark.parametrize(
+    ("write", "reason"),
+    [
+        (forged_size, r"a\.zip"),
+        (encrypted, "encrypted"),
+        (packed_by(zipfile.ZIP_BZIP2), "Deflate"),
+        (packed_by(zipfile.ZIP_LZMA), "Deflate"),
+        (lambda path: path.write_bytes(overlapping(bytes(100), copies=2)), "same bytes"),
+        (lambda path: path.write_bytes(overlapping(bytes(100), copies=40)), "same bytes"),
+    ],
+)
+def test_an_archive_of_a_dangerous_kind_is_refused(tmp_path, write, reason):
+    """It is refused with its reason, before much of it is written."""
+    write(tmp_path / "a.zip")
+    with pytest.raises(SubmissionError, match=reason):
+        unpack(tmp_path / "a.zip", tmp_path / "out", limits=SMALL)
+    written = [path.stat().st_size for path in (tmp_path / "out").rglob("*") if path.is_file()]
+    assert sum(written) <= 10
 
 
 def test_unmarked_utf_8_names_are_recognised(tmp_path):
@@ -166,21 +189,3 @@ def test_any_bytes_are_unpacked_or_refused(tmp_path_factory, junk, at, patch):
         member_names(path)
         with suppress(SubmissionError):
             unpack(path, folder / str(number), limits=SMALL)
-
-
-@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_an_unusual_method_of_packing_is_refused(method, tmp_path):
-    """Only stored and deflated files are unpacked, because other methods can take much longer."""
-    with zipfile.ZipFile(tmp_path / "a.zip", "w", method) as archive:
-        archive.writestr("submission.toml", "x")
-    with pytest.raises(SubmissionError, match="method Deflate"):
-        unpack(tmp_path / "a.zip", tmp_path / "out", limits=HAND_IN)
-
-
-@pytest.mark.parametrize("copies", [2, 40])
-def test_files_that_share_bytes_are_refused(copies, tmp_path):
-    """An archive in which files overlap is refused before anything is unpacked."""
-    (tmp_path / "a.zip").write_bytes(overlapping(bytes(100), copies=copies))
-    with pytest.raises(SubmissionError, match="share the same bytes"):
-        unpack(tmp_path / "a.zip", tmp_path / "out", limits=HAND_IN)
-    assert files_below(tmp_path / "out") == []

@@ -1,14 +1,12 @@
 """Harmful models and flagged mistakes cost points, and points are rounded to a step."""
 
 import itertools
-from dataclasses import replace
 from decimal import Decimal
 from fractions import Fraction
 
 import numpy as np
 import pytest
 
-from pipeline.grading.grade import Criterion, Grade
 from pipeline.grading.mistakes.state_model import (
     StateMatrices,
     compare_entries,
@@ -16,10 +14,10 @@ from pipeline.grading.mistakes.state_model import (
     order_names,
 )
 from pipeline.grading.references.tolerance import exact, late_deduction, to_step
-from pipeline.grading.rubric import Late, Rubric
+from pipeline.grading.rubric import Late
 from pipeline.plant.chain import PRESETS
 from pipeline.submission import ReportedStateSpace
-from tests.helpers.grading_students import Student, student, typed
+from tests.helpers.grading_students import Student, criterion, student, typed
 
 
 def model(one: Student) -> tuple[np.ndarray, np.ndarray]:
@@ -40,56 +38,22 @@ def space_of(A: np.ndarray, B: np.ndarray) -> ReportedStateSpace:
     return ReportedStateSpace(A=rows, B=tuple(typed(float(b)) if b else Decimal(0) for b in B))
 
 
-def under(one: Student, **changed: object) -> Student:
-    """Return the student graded by a rubric with changed values."""
-    plain = one.rubric.model_dump(mode="json") | changed
-    return replace(one, rubric=Rubric.model_validate(plain))
-
-
-def criterion(grade: Grade, id_: str) -> Criterion:
-    """Return a criterion of a grade."""
-    (found,) = [c for c in grade.criteria if c.id == id_]
-    return found
-
-
 # ---------------------------------------------------------------------- harmful models
 
 
-def _flip_stiffness(A: np.ndarray, B: np.ndarray) -> None:
-    A[1, 0] *= -1
-
-
-def _flip_dampings(A: np.ndarray, B: np.ndarray) -> None:
-    A[1, 1] *= -1
-    A[3, 3] *= -1
-
-
-def _flip_input(A: np.ndarray, B: np.ndarray) -> None:
-    B *= -1
-
-
-def _flip_couplings(A: np.ndarray, B: np.ndarray) -> None:
-    A[1, 2] *= -1
-    A[3, 0] *= -1
-
-
-@pytest.mark.parametrize(
-    ("slip", "said"),
-    [
-        (_flip_stiffness, "is unstable"),
-        (_flip_dampings, "is unstable"),
-        (_flip_input, "the wrong way"),
-        (_flip_couplings, "the wrong way"),
-    ],
-)
-def test_a_harmful_model_keeps_a_quarter_at_most(slip, said):
+@pytest.mark.parametrize("entries", [[(1, 0)], [(1, 1), (3, 3)], [(1, 2), (3, 0)], "B"])
+def test_a_harmful_model_keeps_a_quarter_at_most(entries):
     """A wrong sign that makes the model unstable or reversed costs at least 75 % of the points."""
     one = student(2)
     A, B = model(one)
-    slip(A, B)
+    if entries == "B":
+        B *= -1
+    else:
+        A[tuple(zip(*entries, strict=True))] *= -1
     found = criterion(with_model(one, A, B).grade(), "state-model")
     assert found.points <= 0.25 * found.out_of
-    assert said in found.message
+    said = ("unstable", "wrong way")
+    assert [word in found.message for word in said].count(True) == 1
 
 
 @pytest.mark.parametrize("carts", [2, 3])
@@ -104,7 +68,7 @@ def test_states_may_have_any_order(carts):
         found = criterion(grade, "state-model")
         assert found.points == found.out_of
         assert grade.flags == ()
-        assert f"in the order {order_names(order)}, and" in found.message
+        assert order_names(order) in found.message
 
 
 def test_a_wrong_entry_in_another_order_costs_the_same():
@@ -130,7 +94,7 @@ def test_gains_may_have_the_order_of_the_states():
     listed = one.reporting(feedback=feedback.model_copy(update={"gains": gains}))
     grade = with_model(listed, A[np.ix_(order, order)], B[order]).grade()
     assert grade.points == one.grade().points
-    assert "x1, x2, v1, v2" in criterion(grade, "feedback").message
+    assert order_names(order) in criterion(grade, "feedback").message
     assert criterion(listed.grade(), "feedback").points == 0
 
 
@@ -163,7 +127,7 @@ def test_gains_that_only_work_on_paper_keep_a_quarter_at_most():
     wrong = one.reporting(final=heavy, feedback=feedback.model_copy(update={"gains": gains}))
     found = criterion(wrong.grade(), "feedback")
     assert found.points <= 0.25 * found.out_of
-    assert "On your carts: the loop is unstable" in found.message
+    assert "unstable" in found.message
 
 
 # -------------------------------------------------------------- the least cost of a flag
@@ -177,11 +141,11 @@ def test_a_wrong_model_costs_half_if_the_rubric_states_no_cost():
     one = student(2)
     A, B = model(one)
     A[1, 2] *= 0.5
-    plain = with_model(under(one, flags={}), A, B)
+    plain = with_model(one.under(flags={}), A, B)
     found = criterion(plain.grade(), "state-model")
     assert found.points == 0.5 * found.out_of
-    assert "costs at least 50 %" in found.message
-    free = criterion(under(plain, flags={"wrong_state_space": 0}).grade(), "state-model")
+    assert "50 %" in found.message
+    free = criterion(plain.under(flags={"wrong_state_space": 0}).grade(), "state-model")
     assert 0.5 * free.out_of < free.points < free.out_of
 
 
@@ -193,8 +157,8 @@ def test_a_flag_costs_only_the_criteria_of_its_numbers():
         for name in one.reported.final
         if name.startswith("omega")
     }
-    dear = under(one.reporting(final=hertz), flags={"hz_for_rad_s": 1.0, "final_off": 1.0})
-    grade = dear.grade()
+    costs = {"hz_for_rad_s": 1.0, "final_off": 1.0}
+    grade = one.reporting(final=hertz).under(flags=costs).grade()
     assert {flag.code for flag in grade.flags} == {"hz_for_rad_s"}
     for id_, kept in (("final-frequencies", 0), ("final-gains", 1), ("initial-decays", 1)):
         found = criterion(grade, id_)
@@ -207,7 +171,7 @@ def test_the_larger_cost_of_two_flags_counts():
     off = {"omega_1": one.value("final", "omega_1") / (2 * np.pi)}
     off |= {"omega_b": one.value("final", "omega_b") * 1.35}
     costs = {"hz_for_rad_s": 0.25, "final_off": 0.75, "physically_impossible": 0.5}
-    grade = under(one.reporting(final=off), flags=costs).grade()
+    grade = one.reporting(final=off).under(flags=costs).grade()
     worst = max(costs[flag.code] for flag in grade.flags if flag.code in costs)
     assert len(grade.flags) > 1
     assert criterion(grade, "final-frequencies").points == (1 - worst) * 2
@@ -219,18 +183,14 @@ def test_the_larger_cost_of_two_flags_counts():
 @pytest.mark.parametrize("step", [0.01, 0.1, 0.25, 0.5, 1.0])
 def test_points_are_multiples_of_the_step(step):
     """Points of each criterion and in total are multiples of the rubric's step."""
-    one = under(student(2), step=step)
+    one = student(2).under(step=step)
     off = {name: one.value("final", name) * 1.11 for name in one.reported.final}
     grade = one.reporting(final=off).grade(days_late=1.5)
     for points in (grade.points, grade.deducted, *(c.points for c in grade.criteria)):
         assert exact(points) % exact(step) == 0
-    outcomes = {(c.outcome, c.points == c.out_of, c.points == 0) for c in grade.criteria}
-    assert outcomes <= {
-        ("pass", True, False),
-        ("partial", False, False),
-        ("fail", False, True),
-        ("skip", False, True),
-    }
+    for c in grade.criteria:
+        whole, none = c.points == c.out_of, c.points == 0
+        assert c.outcome in (("pass",) if whole else ("fail", "skip") if none else ("partial",))
 
 
 def test_half_a_step_is_rounded_in_the_students_favour():

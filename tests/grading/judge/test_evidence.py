@@ -7,12 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.grading.grade import Criterion, Grade
+from pipeline.grading.grade import Grade
 from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.rubric import FlagCost, Rubric
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
+from tests.helpers.grading_students import criterion
+from tests.helpers.spoilt import files, spoil, times
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +39,6 @@ def grade(path: Path, *, data_problem: float = 0.0) -> Grade:
     ).grade
 
 
-def criterion(grade: Grade, id_: str) -> Criterion:
-    (found,) = [c for c in grade.criteria if c.id == id_]
-    return found
-
-
 def with_decays(folder: Path, path: Path, labels: dict[int, int]) -> Path:
     """Return a copy in which the decays of some carts are stated to be those of others."""
     shutil.copytree(folder, path)
@@ -55,14 +52,7 @@ def with_decays(folder: Path, path: Path, labels: dict[int, int]) -> Path:
     return path
 
 
-def kill_encoder(file: Path) -> None:
-    """Make the encoder of cart 2 read zero throughout a recording."""
-    heading, *rows = file.read_text("utf-8").splitlines()
-    column = heading.split(",").index("x2")
-    cells = [row.split(",") for row in rows]
-    for row in cells:
-        row[column] = "0"
-    file.write_text("\n".join([heading, *map(",".join, cells)]) + "\n", "utf-8", newline="\n")
+dead = times(0.0, "x2")  # the encoder of cart 2 reads zero throughout a recording
 
 
 def test_numbers_without_a_usable_recording_are_not_judged(folder, tmp_path):
@@ -74,11 +64,9 @@ def test_numbers_without_a_usable_recording_are_not_judged(folder, tmp_path):
     found = grade(with_decays(folder, tmp_path / "team-07", {1: 2, 2: 1}))
     decays, data = criterion(found, "initial-decays"), criterion(found, "data")
     assert (decays.outcome, decays.points) == ("skip", 0)
-    assert "Not checked, so it earns no points" in decays.message
-    assert "omega_1, zeta_1: no usable decay of cart 1" in decays.message
+    assert "omega_1, zeta_1: " in decays.message
     assert data.points == 0.6
-    assert data.message.count("cart 1 moves and cart 2 does not") == 1
-    assert data.message.count("cart 2 moves and cart 1 does not") == 1
+    assert data.message.count("cart 1 moves") == data.message.count("cart 2 moves") == 1
     assert "?." not in data.message
     lost = {c.id for c in found.criteria if c.points < c.out_of}
     assert lost == {"initial-decays", "data"}
@@ -89,20 +77,21 @@ def test_numbers_of_the_other_cart_are_still_judged(folder, tmp_path):
     found = grade(with_decays(folder, tmp_path / "team-07", {1: 2}))
     decays = criterion(found, "initial-decays")
     assert (decays.outcome, decays.points) == ("partial", 1)
-    assert "omega_1, zeta_1: no usable decay of cart 1" in decays.message
+    assert "omega_1, zeta_1: " in decays.message
     assert "omega_2" not in decays.message
-    assert "Count periods" not in decays.message  # the rubric's advice is for wrong numbers
+    asked = next(c for c in rubric(0.0).criteria if c.id == decays.id)
+    assert asked.message not in decays.message  # the rubric's advice is for wrong numbers
 
 
 @pytest.mark.parametrize("data_problem", [0.0, 0.25])
 def test_a_dead_channel_costs_less_than_six_wrong_labels(folder, tmp_path, data_problem):
     """One dead channel costs the least that the rubric states; six mislabelled decays cost more."""
     shutil.copytree(folder, tmp_path / "one")
-    kill_encoder(tmp_path / "one" / "data" / "sine-05.csv")
+    spoil(files(tmp_path / "one", "sine-05"), dead)
     one = grade(tmp_path / "one", data_problem=data_problem)
     six = grade(with_decays(folder, tmp_path / "six", {1: 2, 2: 1}), data_problem=data_problem)
     assert criterion(one, "data").points == 1 - data_problem
-    assert "encoder of cart 2 never changes" in criterion(one, "data").message
+    assert "cart 2" in criterion(one, "data").message
     assert criterion(six, "data").points == 0.6
     assert six.points < one.points - 1
 
@@ -111,12 +100,11 @@ def test_a_channel_that_is_dead_in_all_steps_costs_the_steps(folder, tmp_path):
     """An encoder that is dead in all steps costs one of five kinds, and the gains from steps."""
     path = tmp_path / "team-07"
     shutil.copytree(folder, path)
-    for step in sorted((path / "data").glob("step-*.csv")):
-        kill_encoder(step)
+    spoil(files(path, "step"), dead)
     found = grade(path)
     assert criterion(found, "data").points == 0.8
     assert criterion(found, "initial-gains").outcome == "skip"
-    assert "K_1, K_2: no usable step" in criterion(found, "initial-gains").message
+    assert "K_1, K_2: " in criterion(found, "initial-gains").message
     assert criterion(found, "initial-decays").outcome == "pass"
 
 

@@ -1,6 +1,7 @@
 """A submission is graded from its own files, and result files planted in it are ignored."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -28,7 +29,10 @@ from pipeline.submission import (
     load_submission,
 )
 from pipeline.workflow import analyse
-from tests.helpers.grading_students import student
+from tests.helpers.grading_students import criterion, student
+from tests.helpers.spoilt import change, files, spoil, times
+
+RUBRIC = load_rubric(Path("throne-1dof"))
 
 
 @pytest.fixture(scope="module")
@@ -45,9 +49,14 @@ def honest(folder) -> Grade:
     return grade(folder)
 
 
+@pytest.fixture
+def other(folder, tmp_path) -> Path:
+    """Return a copy of the submission for a test to change."""
+    return shutil.copytree(folder, tmp_path / folder.name)
+
+
 def grade(path: Path) -> Grade:
-    rubric = load_rubric(Path("throne-1dof"))
-    return grade_submission(load_submission(path), rubric=rubric, name=path.name).grade
+    return grade_submission(load_submission(path), rubric=RUBRIC, name=path.name).grade
 
 
 def test_the_same_submission_gives_the_same_bytes(folder, honest):
@@ -58,9 +67,8 @@ def test_the_same_submission_gives_the_same_bytes(folder, honest):
     assert document["schema"] == "cartlab-grade/1"
     assert document["status"] == "graded"
     assert document["points"] == document["out_of"] == 20
-    assert {"id", "outcome", "points", "out_of", "message", "expected", "found"} <= set(
-        document["criteria"][0]
-    )
+    keys = {"id", "outcome", "points", "out_of", "message", "expected", "found"}
+    assert keys <= set(document["criteria"][0])
 
 
 def test_grading_loads_neither_pandas_nor_control(folder):
@@ -89,14 +97,12 @@ print({{"pandas", "control", "scipy.signal"}} & set(sys.modules))
     assert done.stdout.strip() == "set()"
 
 
-def test_result_files_in_a_submission_are_ignored(folder, honest, tmp_path):
+def test_result_files_in_a_submission_are_ignored(other, honest):
     """Result files in a submission do not change its grade."""
-    planted = tmp_path / "team-07"
-    shutil.copytree(folder, planted)
     for name in ("results.json", "gap.json", "grade.json", "report/results.json", "gap/gap.json"):
-        (planted / name).parent.mkdir(exist_ok=True)
-        (planted / name).write_text('{"schema": "cartlab-results/1", "points": 20}', "utf-8")
-    assert grade_text(grade(planted)) == grade_text(honest)
+        (other / name).parent.mkdir(exist_ok=True)
+        (other / name).write_text('{"schema": "cartlab-results/1", "points": 20}', "utf-8")
+    assert grade_text(grade(other)) == grade_text(honest)
 
 
 def test_a_recordings_own_scale_counts_only_under_feedback(folder):
@@ -104,47 +110,26 @@ def test_a_recordings_own_scale_counts_only_under_feedback(folder):
 
     Under feedback, a bench may log another signal. In all other runs the rubric's scale counts.
     """
-    submission, rubric = load_submission(folder), load_rubric(Path("throne-1dof"))
-    system = rubric.system.model_copy(update={"input": InputScale(sign=1, per_count=1e-4)})
+    submission = load_submission(folder)
+    scale = InputScale(sign=1, per_count=1e-4)
+    rubric = RUBRIC.model_copy(update={"system": RUBRIC.system.model_copy(update={"input": scale})})
     own = InputOverride(sign=-1, per_count=0.5)
-    claiming = submission.model_copy(
-        update={
-            "experiments": tuple(
-                e.model_copy(update={"input": own}) for e in submission.experiments
-            )
-        }
-    )
-
-    read, notes = under_rubric(claiming, rubric.model_copy(update={"system": system}))
-
+    runs = tuple(e.model_copy(update={"input": own}) for e in submission.experiments)
+    read, notes = under_rubric(submission.model_copy(update={"experiments": runs}), rubric)
     for experiment in read.experiments:
         left = own if experiment.kind == "closed_loop" else InputOverride(sign=-1)
         assert experiment.input == left
-    assert any("scale of the input is the rubric's" in note for note in notes)
+    assert any("the rubric's" in note for note in notes)
 
 
 @pytest.mark.parametrize("turned", [True, False])
-def test_the_data_decide_between_two_stated_signs(folder, honest, tmp_path, turned):
+def test_the_data_decide_between_two_stated_signs(other, honest, turned):
     """If a step and the rubric state different signs, the sign that fits the data is used."""
-    other = tmp_path / "team-07"
-    shutil.copytree(folder, other)
-    for path in (other / "data").glob("step-*.csv") if turned else ():
-        heading, *rows = path.read_text("utf-8").splitlines()
-        column = heading.split(",").index("input")
-        cells = [row.split(",") for row in rows]
-        for row in cells:
-            row[column] = repr(-float(row[column]))
-        path.write_text("\n".join([heading, *map(",".join, cells)]) + "\n", "utf-8", newline="\n")
-    text = (other / "submission.toml").read_text("utf-8")
-    assert 'kind = "step"\n' in text
-    text = text.replace('kind = "step"\n', 'kind = "step"\ninput = { sign = -1 }\n')
-    (other / "submission.toml").write_text(text, "utf-8", newline="\n")
-    graded = grade_submission(
-        load_submission(other), rubric=load_rubric(Path("throne-1dof")), name="team-07"
-    )
+    spoil(files(other, "step") if turned else [], times(-1.0, "input"))
+    change(other, 'kind = "step"\n', 'kind = "step"\ninput = { sign = -1 }\n')
+    graded = grade_submission(load_submission(other), rubric=RUBRIC, name="team-07")
     assert graded.analysis is not None
-    assert graded.analysis.left_out == ()
-    assert graded.grade.flags == ()
+    assert (graded.analysis.left_out, graded.grade.flags) == ((), ())
     assert graded.grade.points == honest.points
 
 
@@ -159,20 +144,13 @@ def test_rounding_errors_in_a_model_are_not_errors():
     assert not any(entry.error for entry in compare_entries(space, models=[exactly], n=1))
 
 
-def test_springs_and_sign_come_from_the_rubric(folder, honest, tmp_path):
+def test_springs_and_sign_come_from_the_rubric(other, honest):
     """Springs and sign come from the rubric, even if the submission states others."""
-    other = tmp_path / "team-07"
-    shutil.copytree(folder, other)
-    toml = other / "submission.toml"
-    text = toml.read_text("utf-8")
-    changed = text.replace("springs = [true, false]", "springs = [false, true]")
-    changed = changed.replace("sign = 1", "sign = -1")
-    assert changed != text
-    toml.write_text(changed, "utf-8", newline="\n")
+    change(other, "springs = [true, false]", "springs = [false, true]")
+    change(other, "sign = 1", "sign = -1")
     found = grade(other)
     assert found.points == honest.points
-    assert found.flags == ()
-    assert found.notes == ()  # with one cart, only the sum of the two springs matters
+    assert (found.flags, found.notes) == ((), ())  # with one cart, only the springs' sum matters
 
 
 @pytest.mark.slow
@@ -205,22 +183,20 @@ def test_a_submission_for_another_bench_fails_with_its_reason(folder):
     rubric = load_rubric(Path("throne-2dof"))
     failed = grade_submission(load_submission(folder), rubric=rubric, name="team-07").grade
     assert (failed.status, failed.points, failed.out_of) == ("failed", 0.0, 20)
-    assert "is for 1 cart, the rubric for 2" in failed.reason
+    assert re.search("1 cart.* 2", failed.reason)
 
 
-def test_a_broken_file_costs_its_own_run_only(folder, tmp_path):
+def test_a_broken_file_costs_its_own_run_only(other):
     """A run with many broken rows is flagged with a line number; the other runs are graded.
 
     A last row that was cut off costs nothing.
     """
-    spoilt = tmp_path / "team-07"
-    shutil.copytree(folder, spoilt)
-    path = spoilt / "data" / "sine-05.csv"
+    (path,) = files(other, "sine-05")
     text = path.read_text("utf-8")
     path.write_text(text[: len(text) // 2].rsplit(",", 1)[0], "utf-8", newline="\n")
-    assert grade(spoilt).flags == ()
+    assert grade(other).flags == ()
     path.write_text(text.replace(".1", ".x"), "utf-8", newline="\n")
-    found = grade(spoilt)
+    found = grade(other)
     (flag,) = found.flags
     assert (flag.code, flag.parameters) == ("data_problem", ("sine-05",))
     assert "line" in flag.message
@@ -228,16 +204,14 @@ def test_a_broken_file_costs_its_own_run_only(folder, tmp_path):
     assert found.points > 19
 
 
-def test_a_missing_file_costs_its_run_and_its_criteria(folder, honest, tmp_path):
+def test_a_missing_file_costs_its_run_and_its_criteria(other, honest):
     """If a file cannot be read, its run is flagged; an unreadable closed loop is missing too."""
-    less = tmp_path / "team-07"
-    shutil.copytree(folder, less)
-    (less / "data" / "decay-1a.csv").unlink()
-    one = grade(less)
-    assert {(flag.code, flag.parameters) for flag in one.flags} == {("data_problem", ("decay-1a",))}
-    assert "there is no file 'data/decay-1a.csv'" in one.flags[0].message
-    (less / "data" / "control.csv").write_bytes(bytes(range(256)))
-    two = grade(less)
+    (other / "data" / "decay-1a.csv").unlink()
+    one = grade(other)
+    assert [(flag.code, flag.parameters) for flag in one.flags] == [("data_problem", ("decay-1a",))]
+    assert "data/decay-1a.csv" in one.flags[0].message
+    (other / "data" / "control.csv").write_bytes(bytes(range(256)))
+    two = grade(other)
     assert {(flag.code, flag.parameters) for flag in two.flags} == {
         ("data_problem", ("decay-1a", "control")),
         ("missing", ("closed_loop",)),
@@ -245,10 +219,8 @@ def test_a_missing_file_costs_its_run_and_its_criteria(folder, honest, tmp_path)
     assert honest.points > one.points > two.points > 15
 
 
-def test_a_decay_copied_as_a_step_gets_one_flag(folder, tmp_path):
+def test_a_decay_copied_as_a_step_gets_one_flag(other):
     """If a decay is copied in place of a step, one flag covers the copy and the missing step."""
-    other = tmp_path / "team-07"
-    shutil.copytree(folder, other)
     shutil.copyfile(other / "data" / "decay-1a.csv", other / "data" / "step-1.csv")
     (flag,) = grade(other).flags
     assert flag.code == "data_problem"
@@ -268,11 +240,10 @@ def test_criteria_that_depend_on_a_failed_one_are_skipped():
     random = [Decimal(f"{(-3) ** i * float(g):.4g}") for i, g in enumerate(feedback.gains)]
     wrong = feedback.model_copy(update={"gains": tuple(random)})
     graded = one.reporting(feedback=wrong).grade()
-    outcomes = {c.id: c for c in graded.criteria}
-    assert outcomes["feedback"].outcome == "fail"
-    assert outcomes["feedback-claims"].outcome == "skip"
-    assert outcomes["feedback-claims"].points == 0
-    assert "depends on 'feedback'" in outcomes["feedback-claims"].message
+    claims = criterion(graded, "feedback-claims")
+    assert criterion(graded, "feedback").outcome == "fail"
+    assert (claims.outcome, claims.points) == ("skip", 0)
+    assert "'feedback'" in claims.message
 
 
 @pytest.mark.parametrize("table", ["initial", "final"])
@@ -287,12 +258,9 @@ def test_points_never_rise_with_the_error(table, side):
     for error in errors:
         wrong = {"K": right * (1 + error) ** side}
         other = one.reporting(initial=wrong) if table == "initial" else one.reporting(final=wrong)
-        points.append(next(c.points for c in other.grade().criteria if c.id == name))
+        points.append(criterion(other.grade(), name).points)
     assert points == sorted(points, reverse=True)
-    assert (points[0], points[-1]) == (
-        next(c.points for c in one.rubric.criteria if c.id == name),
-        0,
-    )
+    assert (points[0], points[-1]) == (criterion(one.grade(), name).out_of, 0)
 
 
 def test_a_broken_law_is_explained_in_words():
@@ -304,9 +272,9 @@ def test_a_broken_law_is_explained_in_words():
     factors = (0.5, 1.7, 1.36, 0.72, 1.44, 0.63, 1.29, 0.7, 1.37, 0.66)
     names = honest.rubric.names
     off = {n: f * honest.value("final", n) for n, f in zip(names, factors, strict=True)}
-    (laws,) = [c for c in honest.reporting(final=off).grade().criteria if c.id == "laws"]
+    laws = criterion(honest.reporting(final=off).grade(), "laws")
     low, high = (f"{n} = {off[n]:.3g}" for n in ("K_2", "K_1"))
-    assert f"{low} is above {high} (a cart further from the motor is moved less" in laws.message
+    assert f"{low} is above {high} (" in laws.message
     assert "agree" not in laws.message
     assert not any(law in laws.message for law in laws.expected["laws"])
     assert "order.K_2.K_1" in laws.found["broken"]
@@ -341,7 +309,7 @@ def test_a_loop_without_a_model_is_not_judged(lacking):
     one = student(2)
     fit = None if lacking == "carts" else one.analysis.fit
     graded = replace(one, analysis=replace(one.analysis, fit=fit, hardware=())).grade()
-    (loop,) = [c for c in graded.criteria if c.id == "hardware"]
+    loop = criterion(graded, "hardware")
     assert (loop.outcome, loop.points) == ("skip" if lacking == "carts" else "fail", 0)
 
 
@@ -357,8 +325,6 @@ def test_further_flags_keep_the_order_of_the_codes():
 @pytest.mark.parametrize(("hide", "loosely"), [((), False), (("dead_zone",), True)])
 def test_a_message_says_if_numbers_are_judged_loosely(hide, loosely):
     """If no linear model fits the recordings, the message asks a person to check the numbers."""
-    criteria = {c.id: c for c in student(1, hide=hide).grade().criteria}
+    grade = student(1, hide=hide).grade()
     for name in ("final-gains", "final-frequencies", "final-dampings"):
-        message = criteria[name].message
-        assert ("A person should look at these numbers" in message) is loosely
-        assert ("Your values agree with your own recordings." in message) is not loosely
+        assert ("A person" in criterion(grade, name).message) is loosely

@@ -7,14 +7,12 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.grading.grade import Criterion, Grade
 from pipeline.grading.judge.run import grade_submission
-from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric, parse_rubric
 from pipeline.resources import RUBRICS
 from pipeline.simulated.submission import write_submission
 from pipeline.submission import Experiment, load_submission
-from tests.helpers.grading_students import Student, student
+from tests.helpers.grading_students import Student, criterion, student
 
 # The shipped rubrics with dwells as the main experiment, and what rests on the dwells in each.
 FROM_DWELLS = ("final-", "comparison", "laws", "state-model")
@@ -32,17 +30,6 @@ def with_dwells(one: Student, number: int) -> Student:
     return keeping(one, lambda e: e.kind != "sine" or e.id in dwells)
 
 
-def under(one: Student, **changed: object) -> Student:
-    """Return the student under a rubric with changed keys."""
-    plain = one.rubric.model_dump(mode="json") | changed
-    return replace(one, rubric=Rubric.model_validate(plain))
-
-
-def criterion(grade: Grade, id_: str) -> Criterion:
-    (found,) = [c for c in grade.criteria if c.id == id_]
-    return found
-
-
 PIECES = [{"id": "pieces", "check": "required", "points": 1}]
 
 
@@ -50,26 +37,25 @@ PIECES = [{"id": "pieces", "check": "required", "points": 1}]
 @pytest.mark.parametrize("dwells", [0, 1, 11])
 def test_nothing_required_is_missing_from_a_criterion_that_passes(step, dwells):
     """Rounding to a step never turns a missing item into a pass; with all items it is one."""
-    one = under(with_dwells(student(2), dwells), criteria=PIECES, step=step)
+    one = with_dwells(student(2), dwells).under(criteria=PIECES, step=step)
     assert criterion(one.grade(), "pieces").outcome in ("partial", "fail")
-    whole = under(with_dwells(student(2), 12), criteria=PIECES, step=step)
+    whole = with_dwells(student(2), 12).under(criteria=PIECES, step=step)
     assert criterion(whole.grade(), "pieces").outcome == "pass"
 
 
 def test_the_message_counts_what_is_there():
     """The message and the flag say "11 of 12 sine dwells", and name what is missing altogether."""
     less = keeping(with_dwells(student(2), 11), lambda e: e.kind != "closed_loop")
-    grade = under(less.without("final", "K_1"), criteria=PIECES).grade()
-    said = "Incomplete: 11 of 12 sine dwells. Missing: closed-loop run, final.K_1."
-    assert criterion(grade, "pieces").message == said
+    grade = less.without("final", "K_1").under(criteria=PIECES).grade()
     (flag,) = grade.flags
-    assert flag.message == said[0].lower() + said[1:]
+    for said in (criterion(grade, "pieces").message, flag.message):
+        assert [part in said for part in ("11 of 12", "closed-loop", "final.K_1")] == [True] * 3
     assert flag.parameters == ("12 sine", "closed_loop", "final.K_1")
 
 
 def test_recordings_and_typed_numbers_are_weighed_apart():
     """All numbers without a recording earn half, and so do all recordings without a number."""
-    one = under(student(2), criteria=PIECES, step=0.01)
+    one = student(2).under(criteria=PIECES, step=0.01)
     silent = replace(one, submission=one.submission.model_copy(update={"reported": None}))
     assert criterion(keeping(one, lambda e: False).grade(), "pieces").points == 0.5
     assert criterion(silent.grade(), "pieces").points == 0.5
@@ -88,7 +74,7 @@ def test_without_dwells_nothing_that_rests_on_them_is_judged(carts):
     assert criterion(less, "dwells").outcome == "fail"
     resting = [c for c in less.criteria if c.id.startswith(FROM_DWELLS)]
     assert all((c.outcome, c.points) == ("skip", 0) for c in resting)
-    assert all("depends on 'dwells'" in c.message for c in resting)
+    assert all("'dwells'" in c.message for c in resting)
     assert less.points <= 10
     lost = {c.id for c in less.criteria if c.points < c.out_of}
     assert lost == {c.id for c in resting} | {"dwells"}
@@ -113,11 +99,8 @@ def test_other_recordings_may_replace_dwells_if_the_rubric_requires_none(tmp_pat
         for c in rubric.criteria
         if c.id != "dwells"
     )
-    update = {
-        "required": rubric.required.model_copy(update={"experiments": required}),
-        "criteria": criteria,
-    }
-    rubric = rubric.model_copy(update=update)
+    needed = rubric.required.model_copy(update={"experiments": required})
+    rubric = rubric.model_copy(update={"required": needed, "criteria": criteria})
     grade = grade_submission(submission, rubric=rubric, name="team-07").grade
     assert (grade.points, grade.out_of, grade.flags) == (19.5, 19.5, ())
 

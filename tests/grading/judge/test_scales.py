@@ -1,8 +1,8 @@
 """Recordings may be in a wrong unit: counts stated as cm, or an input that is far too large."""
 
-import csv
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pipeline.grading.grade import Grade
@@ -11,22 +11,20 @@ from pipeline.grading.rubric_file import load_rubric
 from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
+from tests.helpers.spoilt import Columns, change, files, spoil
 
 COUNT = 0.00227  # cm
 
 
 def scaled(folder: Path, column: str, factor: float, *, whole: bool = False) -> Path:
     """Write a submission and multiply one column of each recording."""
+
+    def scale(columns: Columns) -> Columns:
+        values = factor * columns[column]
+        return {**columns, column: np.round(values) if whole else values}
+
     write_submission(folder, "throne-1dof", seed=3, compact=True, reported=True)
-    for path in (folder / "data").glob("*.csv"):
-        with path.open(encoding="utf-8", newline="") as file:
-            head, *rows = csv.reader(file)
-        at = head.index(column)
-        for row in rows:
-            value = factor * float(row[at])
-            row[at] = str(round(value)) if whole else f"{value:.10g}"
-        with path.open("w", encoding="utf-8", newline="") as file:
-            csv.writer(file).writerows([head, *rows])
+    spoil(files(folder), scale)
     return folder
 
 
@@ -73,27 +71,25 @@ def test_a_stated_length_of_a_count_makes_the_gain_known(in_counts):
     assert (off["initial-gains"], off["final-gains"]) == ("pass", "fail")
 
 
-def test_an_input_in_a_wrong_unit_is_flagged(tmp_path):
-    """If the input is 10,000 times too large, it is flagged, and no gain is judged."""
-    graded = grade(scaled(tmp_path / "team", "input", 1e4))
-    assert [flag.code for flag in graded.flags] == ["data_problem"]
-    assert {c.id: c.outcome for c in graded.criteria}["final-gains"] == "skip"
-
-
-@pytest.mark.parametrize("units", [1e3, 1e6])
-def test_a_time_in_milliseconds_costs_no_number_of_the_tables(tmp_path, units):
-    """If the clock counts milliseconds, one flag names it, and right numbers are right."""
-    graded = grade(scaled(tmp_path, "time", units))
+@pytest.mark.parametrize(
+    ("column", "factor", "skipped"),
+    [
+        ("input", 1e4, {"initial-gains", "final-gains", "hardware"}),
+        ("time", 1e3, {"hardware"}),
+        ("time", 1e6, {"hardware"}),
+    ],
+)
+def test_a_column_in_a_wrong_unit_costs_no_number_of_the_tables(tmp_path, column, factor, skipped):
+    """One flag names the recordings; no gain is judged by a wrong input, all else is right."""
+    graded = grade(scaled(tmp_path, column, factor))
     assert [flag.code for flag in graded.flags] == ["data_problem"]
     outcomes = {c.id: c.outcome for c in graded.criteria if c.outcome != "pass"}
-    assert outcomes == {"data": "partial", "hardware": "skip"}
+    assert outcomes == {"data": "partial"} | dict.fromkeys(skipped, "skip")
 
 
 def test_a_unit_that_the_encoder_contradicts_is_noted(tmp_path):
     """If positions in centimetres are stated as millimetres, the grade has a note."""
     folder = scaled(tmp_path, "x1", 1.0)
-    toml = folder / "submission.toml"
-    text = toml.read_text(encoding="utf-8")
-    toml.write_text(text.replace('unit = "cm"', 'unit = "mm"'), encoding="utf-8")
+    change(folder, 'unit = "cm"', 'unit = "mm"')
     (check,) = [c for c in analyse(load_submission(folder)).checks if c.kind == "position_unit"]
     assert check.message in grade(folder).notes

@@ -1,9 +1,8 @@
 """A recording that is not what it claims to be is named and left out; honest ones stay."""
 
-import csv
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.arrays import Array
 from pipeline.estimation.record_fit import find_correction, record_fits
+from pipeline.grading.grade import Grade
 from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.identify.recording_checks import find_bad_recordings
@@ -22,12 +21,10 @@ from pipeline.simulated.hidden import preset_bench
 from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
+from tests.helpers.spoilt import Columns, Spoil, change, files, spoil, times
 
 PRESET = "throne-2dof"
 TRUE = PRESETS[PRESET].parameters()
-
-Columns = dict[str, Array]
-Spoil = Callable[[Columns], Columns]
 
 
 @pytest.fixture(scope="module")
@@ -38,20 +35,40 @@ def bench(tmp_path_factory) -> Path:
     return folder
 
 
-def files(folder: Path, start: str) -> list[Path]:
-    return sorted((folder / "data").glob(f"{start}*.csv"))
+@pytest.fixture
+def session(bench, tmp_path) -> Path:
+    """Return a copy of the session for a test to spoil."""
+    return shutil.copytree(bench, tmp_path / "session")
 
 
-def spoil(path: Path, how: Spoil) -> None:
-    """Change a data file and write it again."""
-    with path.open(encoding="utf-8", newline="") as text:
-        heading, *rows = csv.reader(text)
-    values = how(dict(zip(heading, np.array(rows, dtype=np.float64).T, strict=True)))
-    lines = [
-        ",".join(heading),
-        *(",".join(map(repr, r.tolist())) for r in np.array([*values.values()]).T),
-    ]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+def analysed(folder: Path) -> Analysis:
+    return analyse(load_submission(folder), design=False)
+
+
+def graded(folder: Path) -> tuple[Analysis, Grade]:
+    rubric = load_rubric(Path(PRESET))
+    found = grade_submission(load_submission(folder), rubric=rubric, name="team")
+    assert found.analysis is not None
+    return found.analysis, found.grade
+
+
+def left_out(analysis: Analysis, *, is_wrong: bool = True) -> dict[str, str]:
+    """Return the reason of each recording that is left out, all of them wrong, or none."""
+    assert {one.is_wrong for one in analysis.left_out} <= {is_wrong}
+    return {one.experiment: one.reason for one in analysis.left_out}
+
+
+def failed(analysis: Analysis) -> set[str]:
+    return {check.id for check in analysis.checks if check.outcome == "fail"}
+
+
+def assert_right(analysis: Analysis) -> None:
+    """Check that no estimate uses a spoilt recording."""
+    for row in analysis.rows:
+        assert row.final is not None
+        assert row.final.value == pytest.approx(TRUE[row.name], rel=0.02)
+        if row.initial is not None and row.initial.source in ("step", "log_decrement"):
+            assert row.initial.value == pytest.approx(TRUE[row.name], rel=0.02)
 
 
 def exchanged(columns: Columns) -> Columns:
@@ -64,10 +81,6 @@ def in_milliseconds(columns: Columns) -> Columns:
 
 def dead(name: str) -> Spoil:
     return lambda columns: {**columns, name: 0 * columns[name]}
-
-
-def times(factor: float, *names: str) -> Spoil:
-    return lambda columns: {**columns, **{name: factor * columns[name] for name in names}}
 
 
 def cut(columns: Columns) -> Columns:
@@ -144,62 +157,28 @@ def _cases() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize(("case", "sign"), [*_cases()])
-def test_spoilt_recordings_are_named_left_out_and_flagged(case, sign, bench, tmp_path):
+def test_spoilt_recordings_are_named_left_out_and_flagged(case, sign, session):
     """Only the spoilt recordings are named, left out of all estimates and flagged.
 
     The report and the grade give the reason.
     """
     kind, which, how, word = SPOILT[case]
-    folder = shutil.copytree(bench, tmp_path / "spoilt")
-    _change(folder, ", sign = 1", sign)
-    paths = files(folder, kind)[which]
-    for path in paths:
-        spoil(path, how)
-    graded = grade_submission(
-        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
-    )
-    analysis = graded.analysis
-    assert analysis is not None
-    assert {one.experiment for one in analysis.left_out} == {path.stem for path in paths}
-    assert all(one.is_wrong and word in one.reason for one in analysis.left_out)
-    assert f"record.{paths[0].stem}" in _failed(analysis)
-    (flag,) = graded.grade.flags
-    assert flag.code == "data_problem"
-    assert set(flag.parameters) == {path.stem for path in paths}
-    _numbers_are_right(analysis)
+    change(session, ", sign = 1", sign)
+    names = spoil(files(session, kind)[which], how)
+    analysis, grade = graded(session)
+    assert left_out(analysis).keys() == names
+    assert all(word in reason for reason in left_out(analysis).values())
+    assert f"record.{min(names)}" in failed(analysis)
+    assert [(flag.code, set(flag.parameters)) for flag in grade.flags] == [("data_problem", names)]
+    assert_right(analysis)
 
 
-def _change(folder: Path, old: str, new: str) -> None:
-    path = folder / "submission.toml"
-    text = path.read_text(encoding="utf-8")
-    assert old in text
-    path.write_text(text.replace(old, new), encoding="utf-8")
-
-
-def _failed(analysis: Analysis) -> set[str]:
-    return {check.id for check in analysis.checks if check.outcome == "fail"}
-
-
-def _numbers_are_right(analysis: Analysis) -> None:
-    """Check that no estimate uses a spoilt recording."""
-    for row in analysis.rows:
-        assert row.final is not None
-        assert row.final.value == pytest.approx(TRUE[row.name], rel=0.02)
-        if row.initial is not None and row.initial.source in ("step", "log_decrement"):
-            assert row.initial.value == pytest.approx(TRUE[row.name], rel=0.02)
-
-
-def test_dwells_that_are_too_short_are_flagged(bench, tmp_path):
+def test_dwells_that_are_too_short_are_flagged(session):
     """A dwell with less than 1.5 cycles is flagged as too short for a steady state."""
-    folder = shutil.copytree(bench, tmp_path / "cut")
-    for path in files(folder, "sine"):
-        spoil(path, cut)
-    graded = grade_submission(
-        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
-    )
-    assert graded.analysis is not None
-    (flag,) = graded.grade.flags
-    frequency = {r.id: (r.omega or 0.0) / (2 * np.pi) for r in graded.analysis.records}
+    spoil(files(session, "sine"), cut)
+    analysis, grade = graded(session)
+    (flag,) = grade.flags
+    frequency = {r.id: (r.omega or 0.0) / (2 * np.pi) for r in analysis.records}
     assert len(flag.parameters) >= 8
     assert all(60 * 0.00884 * frequency[name] < 1.5 for name in flag.parameters)
 
@@ -208,211 +187,158 @@ def test_dwells_that_are_too_short_are_flagged(bench, tmp_path):
     ("kind", "stated", "word"),
     [("step", "decay", "free decay"), ("sine", "step", "not a step"), ("step", "cut", "truncated")],
 )
-def test_a_cut_recording_or_one_of_another_kind_is_flagged(kind, stated, word, bench, tmp_path):
-    """A recording that is cut off or of another kind is flagged, and a check of the report fails.
-
-    No estimate uses the recording.
-    """
-    folder = shutil.copytree(bench, tmp_path / "kind")
-    path = files(folder, kind)[1]
+def test_a_cut_recording_or_one_of_another_kind_is_flagged(kind, stated, word, session):
+    """A recording that is cut off or of another kind is left out, flagged, and fails a check."""
+    path = files(session, kind)[1]
     if stated == "cut":
-        spoil(path, lambda columns: {k: v[: v.size // 3] for k, v in columns.items()})
+        spoil([path], lambda columns: {k: v[: v.size // 3] for k, v in columns.items()})
     else:
         table = f'id = "{path.stem}"\nkind = '
-        _change(folder, f'{table}"{kind}"', f'{table}"{stated}"')
-    graded = grade_submission(
-        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
-    )
-    assert graded.analysis is not None
-    (one,) = graded.analysis.left_out
-    assert (one.experiment, one.is_wrong) == (path.stem, True)
-    assert word in one.reason
-    assert f"record.{path.stem}" in _failed(graded.analysis)
-    assert path.stem in {name for flag in graded.grade.flags for name in flag.parameters}
-    _numbers_are_right(graded.analysis)
+        change(session, f'{table}"{kind}"', f'{table}"{stated}"')
+    analysis, grade = graded(session)
+    ((name, reason),) = left_out(analysis).items()
+    assert name == path.stem
+    assert word in reason
+    assert f"record.{name}" in failed(analysis)
+    assert name in {name for flag in grade.flags for name in flag.parameters}
+    assert_right(analysis)
 
 
 @pytest.mark.parametrize("which", [slice(1), slice(None)])
-def test_decays_in_millimetres_give_a_warning_and_are_used(which, bench, tmp_path):
+def test_decays_in_millimetres_give_a_warning_and_are_used(which, session):
     """If one or all decays are in millimetres, a warning names them, and no check fails."""
-    folder = shutil.copytree(bench, tmp_path / "spoilt")
-    paths = files(folder, "decay")[which]
-    for path in paths:
-        spoil(path, times(10, "x1", "x2"))
-    analysis = analyse(load_submission(folder), design=False)
+    names = spoil(files(session, "decay")[which], times(10, "x1", "x2"))
+    analysis = analysed(session)
     assert not analysis.left_out
-    assert not _failed(analysis)
-    told = [text for text in analysis.warnings if "another unit" in text]
-    assert paths[0].stem in told[0]
+    assert not failed(analysis)
+    assert any(min(names) in text and "another unit" in text for text in analysis.warnings)
 
 
-def test_frequencies_in_rad_per_s_stated_as_hz_are_named(bench, tmp_path):
+def test_frequencies_in_rad_per_s_stated_as_hz_are_named(session):
     """If frequencies in rad/s were stated as Hz, the reason given for each file says so."""
-    folder = shutil.copytree(bench, tmp_path / "spoilt")
-    path = folder / "submission.toml"
-    path.write_text(
-        re.sub(
-            r"frequency = ([\d.]+)",
-            lambda found: f"frequency = {2 * np.pi * float(found[1]):.3f}",
-            path.read_text(encoding="utf-8"),
-        ),
-        encoding="utf-8",
+    path = session / "submission.toml"
+    text = re.sub(
+        r"frequency = ([\d.]+)",
+        lambda found: f"frequency = {2 * np.pi * float(found[1]):.3f}",
+        path.read_text(encoding="utf-8"),
     )
-    problems = find_bad_recordings(analyse(load_submission(folder), design=False))
+    path.write_text(text, encoding="utf-8")
+    problems = find_bad_recordings(analysed(session))
     assert problems
     assert all("rad/s" in one.reason for one in problems.values())
 
 
-def test_a_missing_list_of_free_carts_is_named_with_its_fix(bench, tmp_path):
-    """If the key `carts` is missing although a cart was held, the message gives the line to add.
-
-    Without this key, all carts count as free.
-    """
-    folder = shutil.copytree(bench, tmp_path / "spoilt")
-    path = folder / "submission.toml"
-    text = path.read_text(encoding="utf-8").replace("carts = [1]\n", "", 1)
-    path.write_text(text, encoding="utf-8")
-    (one,) = analyse(load_submission(folder), design=False).left_out
-    assert "write carts = [1]" in one.reason
+def test_a_missing_list_of_free_carts_is_named_with_its_fix(session):
+    """If the key `carts` is missing although a cart was held, the message gives the line to add."""
+    change(session, "carts = [1]\n", "", 1)  # without this key, all carts count as free
+    (reason,) = left_out(analysed(session)).values()
+    assert "carts = [1]" in reason
 
 
-def test_a_loop_that_is_left_out_is_not_compared(bench, tmp_path):
+def test_a_loop_that_is_left_out_is_not_compared(session):
     """A closed loop with a clock in milliseconds is not compared with the model."""
-    folder = shutil.copytree(bench, tmp_path / "loop")
-    for path in files(folder, "control"):
-        spoil(path, in_milliseconds)
-    analysis = analyse(load_submission(folder))
-    assert [one.experiment for one in analysis.left_out] == ["control"]
+    names = spoil(files(session, "control"), in_milliseconds)
+    analysis = analyse(load_submission(session))
+    assert left_out(analysis).keys() == names == {"control"}
     assert analysis.hardware == ()
-    (skip,) = [s for s in analysis.skipped if s.name == "hardware check, control"]
+    (skip,) = [s for s in analysis.skipped if s.name.endswith(", control")]
     assert "milliseconds" in skip.reason
 
 
-def test_a_sound_repeat_is_kept_if_most_have_swapped_columns(bench, tmp_path):
-    """If three of four steps have swapped columns, only these three are left out.
-
-    The report does not advise another sign.
-    """
-    folder = shutil.copytree(bench, tmp_path / "most")
-    steps = files(folder, "step")
-    for path in steps[:3]:
-        spoil(path, exchanged)
-    analysis = analyse(load_submission(folder), design=False)
-    assert {one.experiment for one in analysis.left_out} == {path.stem for path in steps[:3]}
+def test_a_sound_repeat_is_kept_if_most_have_swapped_columns(session):
+    """If three of four steps have swapped columns, only they are left out; no sign is advised."""
+    steps = files(session, "step")
+    names = spoil(steps[:3], exchanged)
+    analysis = analysed(session)
+    assert left_out(analysis).keys() == names
     assert {gain.experiment for gain in analysis.step_gains} == {steps[3].stem}
-    assert not any("sign = " in warning for warning in analysis.warnings)
+    assert not any("sign" in warning for warning in analysis.warnings)
 
 
-def test_times_in_milliseconds_throughout_fail_a_check(bench, tmp_path):
+def test_times_in_milliseconds_throughout_fail_a_check(session):
     """If all times are in milliseconds, a check finds all dwell frequencies 1000 times off."""
-    folder = shutil.copytree(bench, tmp_path / "slow")
-    for path in files(folder, ""):
-        spoil(path, in_milliseconds)
-    graded = grade_submission(
-        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
-    )
-    assert graded.grade.status == "graded"
-    assert graded.analysis is not None
-    (check,) = [c for c in graded.analysis.checks if c.id == "dwells.frequency"]
+    spoil(files(session, ""), in_milliseconds)
+    analysis, grade = graded(session)
+    assert grade.status == "graded"
+    (check,) = [c for c in analysis.checks if c.id == "dwells.frequency"]
     assert check.outcome == "fail"
     assert check.value == pytest.approx(1000, rel=0.01)
-    assert "milliseconds" in check.message
 
 
-def test_one_recording_in_two_experiments_counts_once(bench, tmp_path):
+def test_one_recording_in_two_experiments_counts_once(session):
     """If two repeats name the same file, the second is left out and flagged."""
-    folder = shutil.copytree(bench, tmp_path / "copied")
-    _change(folder, "data/step-2.csv", "data/step-1.csv")
-    graded = grade_submission(
-        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
-    )
-    assert graded.analysis is not None
-    assert {one.experiment for one in graded.analysis.left_out} == {"step-2"}
-    assert ["step-2"] in [list(f.parameters) for f in graded.grade.flags]
+    change(session, "data/step-2.csv", "data/step-1.csv")
+    analysis, grade = graded(session)
+    assert [one.experiment for one in analysis.left_out] == ["step-2"]
+    assert ("step-2",) in [flag.parameters for flag in grade.flags]
 
 
 @pytest.mark.slow
 @pytest.mark.sample
-def test_columns_swapped_in_every_recording_are_named(bench, tmp_path):
-    """If the columns of all driven recordings are swapped, the reason says so.
+def test_columns_swapped_in_every_recording_are_named(session):
+    """If the columns of all driven recordings are swapped, one reason says so for all of them.
 
     Then no parameters are identified.
     """
-    folder = shutil.copytree(bench, tmp_path / "exchanged")
-    driven = [*files(folder, "step"), *files(folder, "sine"), *files(folder, "sweep")]
-    for path in driven:
-        spoil(path, exchanged)
-    analysis = analyse(load_submission(folder), design=False)
-    assert {one.experiment for one in analysis.left_out} == {path.stem for path in driven}
-    assert {one.reason for one in analysis.left_out} == {analysis.left_out[0].reason}
-    assert 'columns = { x1 = "x2", x2 = "x1" }' in analysis.left_out[0].reason
-    assert "fit.identified" in _failed(analysis)
+    names = spoil(
+        [p for kind in ("step", "sine", "sweep") for p in files(session, kind)], exchanged
+    )
+    analysis = analysed(session)
+    assert left_out(analysis).keys() == names
+    (reason,) = set(left_out(analysis).values())
+    assert '{ x1 = "x2", x2 = "x1" }' in reason
+    assert "fit.identified" in failed(analysis)
 
 
-def test_contradicting_dwells_and_steps_identify_nothing(bench, tmp_path):
-    """If the inputs of dwells and steps disagree by a factor of ten, nothing is identified.
-
-    The report gives two possible explanations: wrong dwells or wrong steps.
-    """
-    folder = shutil.copytree(bench, tmp_path / "undecided")
-    for path in files(folder, "sine"):
-        spoil(path, times(10, "input"))
-    path = folder / "submission.toml"
-    text = path.read_text(encoding="utf-8")
-    runs = text.split("[[experiments]]")
+def test_contradicting_dwells_and_steps_identify_nothing(session):
+    """If the inputs of dwells and steps disagree by a factor of ten, nothing is identified."""
+    names = spoil(files(session, "sine"), times(10, "input"))
+    path = session / "submission.toml"
+    runs = path.read_text(encoding="utf-8").split("[[experiments]]")
     kept = [run for run in runs if 'kind = "sweep"' not in run]
     assert len(kept) == len(runs) - 1
     path.write_text("[[experiments]]".join(kept), encoding="utf-8")
-    analysis = analyse(load_submission(folder), design=False)
-    both = {path.stem for path in [*files(folder, "sine"), *files(folder, "step")]}
-    assert {one.experiment for one in analysis.left_out} == both
+    analysis = analysed(session)
+    assert {one.experiment for one in analysis.left_out} == names | {
+        path.stem for path in files(session, "step")
+    }
     assert {one.code for one in analysis.left_out} == {"contradicting_kinds"}
     assert analysis.chain is None
     initial = {row.name for row in analysis.rows if row.initial is not None}
     assert initial == {"omega_1", "omega_2", "zeta_1", "zeta_2"}
 
 
-def test_a_recording_of_no_linear_carts_is_left_out_but_not_called_wrong(bench, tmp_path):
-    """A recording that linear carts cannot produce is left out, but not called wrong.
-
-    In the test, something besides the input moves the cart.
-    """
-    folder = shutil.copytree(bench, tmp_path / "stray")
-    path = files(folder, "sine")[4]
+def test_a_recording_of_no_linear_carts_is_left_out_but_not_called_wrong(session):
+    """A recording that linear carts cannot produce is left out, but not called wrong."""
 
     def another(columns: Columns) -> Columns:
+        """Return what something besides the input moved."""
         x = 2 * np.sin(17 * columns["time"] + 5 * columns["time"] ** 2)
         return {**columns, "x1": x, "x2": x}
 
-    spoil(path, another)
-    analysis = analyse(load_submission(folder), design=False)
-    assert [(one.experiment, one.is_wrong) for one in analysis.left_out] == [(path.stem, False)]
-    _numbers_are_right(analysis)
+    names = spoil(files(session, "sine")[4:5], another)
+    analysis = analysed(session)
+    assert left_out(analysis, is_wrong=False).keys() == names
+    assert_right(analysis)
 
 
-def test_without_recordings_of_the_last_cart_nothing_is_identified(bench, tmp_path):
+def test_without_recordings_of_the_last_cart_nothing_is_identified(session):
     """If the last cart has no recording, nothing is identified and the report fails."""
-    folder = shutil.copytree(bench, tmp_path / "three")
-    path = folder / "submission.toml"
+    path = session / "submission.toml"
     text = path.read_text(encoding="utf-8").partition('[[experiments]]\nid = "control"')[0]
-    text = text.replace("carts = 2", "carts = 3")
-    text = text.replace("springs = [false, true, true]", "springs = [false, true, true, true]")
     path.write_text(text, encoding="utf-8")
-    analysis = analyse(load_submission(folder))
-    assert analysis.chain is None
-    assert analysis.feedback is None
-    assert "fit.identified" in _failed(analysis)
-    assert any("cart 3 moves in no recording" in skip.reason for skip in analysis.skipped)
+    change(session, "carts = 2", "carts = 3")
+    change(session, "springs = [false, true, true]", "springs = [false, true, true, true]")
+    analysis = analyse(load_submission(session))
+    assert (analysis.chain, analysis.feedback) == (None, None)
+    assert "fit.identified" in failed(analysis)
+    assert any("cart 3" in skip.reason for skip in analysis.skipped)
 
 
 @pytest.mark.parametrize("kind", ["step-3", "sine-05"])
 def test_a_coarse_encoder_that_freezes_for_half_a_second_is_found(kind, tmp_path):
-    """A freeze of half a second is found even with a coarse encoder.
-
-    In the test, the cart has moved far before the encoder counts again.
-    """
+    """A freeze of half a second is found, if the cart moves far before the encoder counts again."""
     write_submission(tmp_path, replace(preset_bench(PRESET), count=0.03), seed=5, compact=True)
-    (path,) = files(tmp_path, kind)
 
     def freeze(columns: Columns) -> Columns:
         x = columns["x1"].copy()
@@ -420,27 +346,24 @@ def test_a_coarse_encoder_that_freezes_for_half_a_second_is_found(kind, tmp_path
         x[first : first + 60] = x[first]
         return {**columns, "x1": x}
 
-    spoil(path, freeze)
-    analysis = analyse(load_submission(tmp_path), design=False)
-    (one,) = analysis.left_out
-    assert (one.run, one.excludes) == (path.stem, "wrong")
+    (name,) = spoil(files(tmp_path, kind), freeze)
+    (one,) = analysed(tmp_path).left_out
+    assert (one.run, one.excludes) == (name, "wrong")
     assert one.code.startswith("froze")
 
 
-def test_files_with_fewer_decimals_are_not_in_another_unit(bench, tmp_path):
-    folder = shutil.copytree(bench, tmp_path / "rounded")
+def test_files_with_fewer_decimals_are_not_in_another_unit(session):
+    """Rounded recordings are honest."""
     for kind, decimals in {"decay": 1, "step": 1, "sine": 2}.items():
-        for path in files(folder, kind):
-            spoil(path, lambda c, d=decimals: {**c, **{x: c[x].round(d) for x in ("x1", "x2")}})
-    assert analyse(load_submission(folder), design=False).left_out == ()
+        rounded = lambda c, d=decimals: {**c, **{x: c[x].round(d) for x in ("x1", "x2")}}  # noqa: E731
+        spoil(files(session, kind), rounded)
+    assert analysed(session).left_out == ()
 
 
 def test_sticking_carts_are_not_in_another_unit_of_time(bench):
     """If carts stick and creep, the recording is not taken for one in another unit of time."""
     chain = PRESETS[PRESET]
-    dwell = next(
-        r for r in analyse(load_submission(bench), design=False).records if r.kind == "sine"
-    )
+    dwell = next(r for r in analysed(bench).records if r.kind == "sine")
     creep = 0.02 * dwell.t / dwell.t[-1]  # in cm; nine encoder steps in total
     stuck = replace(dwell, y=np.array([creep, 0.7 * creep]))
     assert find_correction(stuck, chain, record_fits([stuck], chain)[stuck.id]) is None
@@ -448,21 +371,14 @@ def test_sticking_carts_are_not_in_another_unit_of_time(bench):
 
 @pytest.mark.slow
 @pytest.mark.sample
-def test_a_cart_moving_too_far_blames_no_gain(bench, tmp_path):
-    """If cart 2 seems to move farther than the cart that pulls it, no gain is called wrong.
+def test_a_cart_moving_too_far_blames_no_gain(session):
+    """If cart 2 seems to move farther than the cart that pulls it, only the data are flagged.
 
-    In the test, the column of cart 2 is in millimetres in every file. Only the data are flagged.
+    In the test, the column of cart 2 is in millimetres in every file.
     """
-    folder = shutil.copytree(bench, tmp_path / "millimetres")
-    for path in files(folder, ""):
-        head = path.read_text(encoding="utf-8").partition("\n")[0]
-        if "x2" in head.split(","):
-            spoil(path, times(10, "x2"))
-    graded = grade_submission(
-        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
-    )
-    assert graded.analysis is not None
-    steps = [one for one in graded.analysis.left_out if one.experiment.startswith("step")]
-    assert len(steps) == len(files(folder, "step"))
-    assert all("cart 2" in one.reason for one in steps)
-    assert [flag.code for flag in graded.grade.flags] == ["data_problem"]
+    spoil([p for p in files(session, "") if "x2" in p.read_text("utf-8")[:99]], times(10, "x2"))
+    analysis, grade = graded(session)
+    found = {one.experiment: one.reason for one in analysis.left_out}
+    steps = [path.stem for path in files(session, "step")]
+    assert all("cart 2" in found[name] for name in steps)
+    assert [flag.code for flag in grade.flags] == ["data_problem"]

@@ -13,8 +13,8 @@ from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.publish.rubric_preview import preview_rubric
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.simulated.submission import Students, write_submission
 from tests.helpers.grades import fill_book, in_this_process
+from tests.helpers.grading_students import write_team
 
 RUBRIC = load_rubric(Path("throne-1dof"))
 LATE = {"team-1": 1.3}
@@ -25,11 +25,7 @@ def school(tmp_path_factory) -> Path:
     """Write four teams: honest, late with numbers in Hz, with a wrong gain, and unreadable."""
     folder = tmp_path_factory.mktemp("class")
     for number in range(3):
-        own = folder / f"team-{number}"
-        students = Students(authors=(f"s{number}",))
-        write_submission(
-            own, "throne-1dof", seed=number, compact=True, reported=True, students=students
-        )
+        own = write_team(folder / f"team-{number}", number)
         file = own / "submission.toml"
         text = file.read_text(encoding="utf-8")
         if number == 1:
