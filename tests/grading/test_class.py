@@ -82,32 +82,27 @@ def test_a_model_from_coarse_numbers_is_not_flagged(seed, digits):
 
     In the test, rounding alone changes the couplings by a third.
     """
-    team = make_team(seed, digits=digits)
-    assert [f for f in flags(team) if f.startswith("wrong_state_space")] == []
+    flags = make_team(seed, digits=digits).grade().flags
+    assert "wrong_state_space" not in [flag.code for flag in flags]
 
 
 @pytest.mark.parametrize(
-    ("seed", "turn", "slips", "codes"),
+    ("seed", "turn", "slips"),
     [
-        pytest.param(
-            72014, 6, ("peak_count", "log10_for_ln"), {"peak_count", "log10_for_ln"}, marks=LONG
-        ),
-        (73025, 0, ("hz_for_rad_s",), {"hz_for_rad_s"}),  # one resonance read anywhere by eye
-        # one decay read at its seventh period
-        pytest.param(73026, 0, ("peak_count",), {"peak_count"}, marks=LONG),
+        pytest.param(72014, 6, ("peak_count", "log10_for_ln"), marks=LONG),
+        (73025, 0, ("hz_for_rad_s",)),  # one resonance read anywhere by eye
+        pytest.param(73026, 0, ("peak_count",), marks=LONG),  # a decay read at its seventh period
         # typed too coarsely to rule out a factor of 6/5
-        pytest.param(72007, 3, ("initial_off",), {"initial_off"}, marks=LONG),
-        pytest.param(
-            72021, 0, ("hz_for_rad_s", "log10_for_ln"), {"hz_for_rad_s", "log10_for_ln"}, marks=LONG
-        ),
+        pytest.param(72007, 3, ("initial_off",), marks=LONG),
+        pytest.param(72021, 0, ("hz_for_rad_s", "log10_for_ln"), marks=LONG),
     ],
 )
-def test_the_flags_are_those_that_explain_a_table_best(seed, turn, slips, codes):
+def test_the_flags_are_those_that_explain_a_table_best(seed, turn, slips):
     """If several mistakes overlap, the flags are those that explain the whole table best."""
     team = replace(make_team(seed), rng=np.random.default_rng([9, seed, turn]))
     for slip in slips:
         team = SLIPS[slip](team)
-    assert {flag.code for flag in team.grade().flags} == codes
+    assert {flag.code for flag in team.grade().flags} == set(slips)
 
 
 def test_a_gain_that_two_mistakes_explain_names_both():
@@ -146,7 +141,7 @@ def test_a_spring_that_the_rubric_lacks_flags_nobody():
     assert grade.points >= 0.95 * grade.out_of
     assert "wall-1" in wrong_springs([grade.springs, ()])
     lines = [GradeSummary.of(grade)]
-    assert "1 of 1 submissions" in class_page(lines, rubric=team.rubric)
+    assert "wall-1" in class_page(lines, rubric=team.rubric)
     assert wrong_springs([(), ()]) == ""
 
 

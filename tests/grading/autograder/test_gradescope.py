@@ -27,9 +27,9 @@ from pipeline.grading.grade import Grade, read_grade
 from pipeline.grading.gradings import Grading
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.resources import RUBRICS
-from pipeline.simulated.submission import Students, write_submission
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.grades import in_this_process
+from tests.helpers.grading_students import write_team
 from tests.helpers.hostile import SECRET, write_hostile
 from tests.helpers.waiting import PATIENCE
 
@@ -47,11 +47,7 @@ NUMBER = re.compile(r"\d+\.\d+")
 def team(tmp_path_factory) -> Path:
     """Return a submission with one wrong number among its reported ones."""
     folder = tmp_path_factory.mktemp("team") / "lab"
-    write_submission(
-        folder, "throne-1dof", seed=5, compact=True, reported=True,
-        students=Students(authors=("s1",)),
-    )  # fmt: skip
-    toml = folder / "submission.toml"
+    toml = write_team(folder, 5) / "submission.toml"
     text = toml.read_text(encoding="utf-8")
     final = text.index("[reported.final]")
     wrong, n = re.subn(r"(?m)^K = .*$", "K = 12.3", text[final:], count=1)
@@ -213,7 +209,7 @@ def test_results_hide_computed_numbers_if_the_rubric_says_so(root, team, shown):
     assert {test["visibility"] for test in hidden["tests"]} == {"after_due_date"}
     assert "cartlab check" in hidden["output"]
     (wrong,) = [t for t in hidden["tests"] if t["tags"] == ["final-gains"]]
-    assert wrong["output"] == "not passed: a final value that disagrees with the recordings"
+    assert "final value" in wrong["output"]
 
 
 HOSTILE = (  # one archive of each kind; `tests/system/test_hostile.py` grades all of them
@@ -236,7 +232,7 @@ def test_a_hostile_upload_gets_a_reason_and_reaches_no_other_file(root, team, tm
     for name in HOSTILE:
         results = upload_here(root, school / name)
         assert results["score"] == 0.0, name
-        assert results["output"].startswith("Could not be graded: "), name
+        assert results["tests"] == [], name
         assert SECRET not in json.dumps(results), name
     assert not list(tmp_path.rglob("escaped"))
     assert sorted(p.name for p in root.iterdir()) == [
@@ -248,12 +244,9 @@ def test_a_hostile_upload_gets_a_reason_and_reaches_no_other_file(root, team, tm
 @pytest.mark.parametrize(
     ("files", "said"),
     [
-        ((), "no submission.toml in it: it is empty"),
-        (("notes.md", "report.pdf"), "no submission.toml in it, only 'notes.md', 'report.pdf'"),
-        (
-            ("a/submission.toml", "b/submission.toml"),
-            "There are 'a/submission.toml' and 'b/submission.toml'",
-        ),
+        ((), "empty"),
+        (("notes.md", "report.pdf"), "'notes.md', 'report.pdf'"),
+        (("a/submission.toml", "b/submission.toml"), "'b/submission.toml'"),
     ],
 )
 def test_an_upload_without_a_submission_gets_the_reason(root, tmp_path, files, said):
@@ -296,7 +289,7 @@ def test_a_grader_that_is_killed_leaves_a_result(root, team):
     assert done.returncode != 0
     results = read_results(root)
     assert results["score"] == 0.0
-    assert "submit again, or tell your instructor" in results["output"]
+    assert "submit again" in results["output"]
 
 
 def test_a_grading_that_takes_too_long_is_stopped(root, team, monkeypatch):
@@ -309,7 +302,8 @@ def test_a_grading_that_takes_too_long_is_stopped(root, team, monkeypatch):
     monkeypatch.setattr(run, "_TIME_LIMIT", 0.0)
     run.grade_upload(root)
     results = read_results(root)
-    assert (results["score"], results["output"]) == (0.0, "Could not be graded: stopped after 0 s")
+    assert results["score"] == 0.0
+    assert "0 s" in results["output"]
 
 
 # -------------------------------------------------------------------------------- the zip
@@ -322,11 +316,8 @@ def test_the_zip_is_reproducible_and_its_scripts_are_executable(tmp_path):
     """
     done = cartlab_here("export", "--autograder", "throne-1dof", cwd=tmp_path)
     assert done.returncode == 0
-    assert done.stderr.splitlines() == [
-        "on Gradescope, set the autograder points to 20",
-        "nothing is deducted for late work: set the late policy on Gradescope",
-        "wrote autograder.zip",
-    ]
+    points, late, wrote = done.stderr.splitlines()
+    assert (points[-2:], "late" in late, wrote.split()[-1]) == ("20", True, "autograder.zip")
     write_autograder(RUBRIC, tmp_path / "again" / "a.zip")
     first = (tmp_path / "autograder.zip").read_bytes()
     assert (tmp_path / "again" / "a.zip").read_bytes() == first
@@ -350,28 +341,24 @@ def test_every_needed_package_is_pinned_to_its_installed_version():
     for name in ("numpy", "scipy", "h5py", "pydantic-core", "python-dateutil"):
         assert pins[name] == version(name)
     assert not {"cartlab", "pytest", "ruff", "colorama"} & set(pins)
+    with pytest.raises(ConfigError, match="no-such-package"):  # its version is unknown
+        pin_requirements("no-such-package-as-this")
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ((), "give GRADES and --lms, or --autograder with a rubric"),
-        (("grades",), "give GRADES and --lms"),
-        (("grades", "--autograder", "throne-1dof"), "--autograder takes only a rubric and --out"),
-        (("--autograder", "throne-1dof", "--lms", "canvas"), "--autograder takes only a rubric"),
-        (("--autograder", "throne-9dof"), "there is no such rubric"),
-        (("--autograder", "throne-1dof", "--out", "folder"), "an autograder is one zip file"),
+        ("", "GRADES"),
+        ("grades", "GRADES"),
+        ("grades --autograder throne-1dof", "--out"),
+        ("--autograder throne-1dof --lms canvas", "--out"),
+        ("--autograder throne-9dof", "no such rubric"),
+        ("--autograder throne-1dof --out folder", "zip"),
     ],
 )
 def test_export_refuses_arguments_that_do_not_go_together(tmp_path, arguments, said):
     """`export` accepts grades and a platform, or a rubric and a zip file, but no mixture."""
-    done = cartlab_here("export", *arguments, cwd=tmp_path)
+    done = cartlab_here("export", *arguments.split(), cwd=tmp_path)
     assert done.returncode == 2
     assert said in done.stderr
     assert not list(tmp_path.iterdir())
-
-
-def test_a_package_that_is_not_installed_cannot_be_pinned():
-    """A package cannot be pinned if it is not installed, since its version is then unknown."""
-    with pytest.raises(ConfigError, match="not installed here"):
-        pin_requirements("no-such-package-as-this")

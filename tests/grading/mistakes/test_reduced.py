@@ -26,17 +26,11 @@ def reduced(analysis: Analysis) -> tuple[FrequencyResponse, ...]:
             last = record.t >= record.t[-1] - 3 * TURN / point.omega
             ratios.append(np.ptp(record.position(cart)[last]) / np.ptp(record.u[last]))
         magnitude = np.array(ratios) * (1 + 0.01 * rng.standard_normal(len(ratios)))
-        tables.append(
-            FrequencyResponse(
-                cart=cart,
-                omega=np.array([p.omega for p in points]),
-                magnitude=magnitude,
-                magnitude_std=0.01 * magnitude,
-                phase=None,
-                phase_std=None,
-                source="table",
-            )
-        )
+        table = FrequencyResponse(
+            cart=cart, omega=np.array([p.omega for p in points]), magnitude=magnitude,
+            magnitude_std=0.01 * magnitude, phase=None, phase_std=None, source="table",
+        )  # fmt: skip
+        tables.append(table)
     return tuple(tables)
 
 

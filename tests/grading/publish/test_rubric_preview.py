@@ -73,13 +73,10 @@ def test_the_preview_gives_the_points_of_a_new_grading(school, tmp_path):
 
     with _grade(school, tmp_path, now) as book:
         again = {entry.submission: entry.grade for entry in book.entries()}
-    assert {team.submission: (team.before, team.after) for team in shown.teams} == {
-        name: (before[name], grade.points)
+    assert {t.submission: (t.before, t.after, t.late_after) for t in shown.teams} == {
+        name: (before[name], grade.points, grade.deducted)
         for name, grade in again.items()
         if grade.status == "graded"
-    }
-    assert {team.submission: team.late_after for team in shown.teams} == {
-        name: grade.deducted for name, grade in again.items() if grade.status == "graded"
     }
     for team in shown.teams:
         points = {criterion.id: criterion.points for criterion in again[team.submission].criteria}

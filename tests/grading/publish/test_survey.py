@@ -14,11 +14,7 @@ TABLE_4 = {
     "limitations of models": (58, 33, 8, 0, 0),
     "frequency response": (42, 58, 0, 0, 0),
 }
-COUNTS = {
-    "uses of models": (9, 3, 0, 0, 0),
-    "limitations of models": (7, 4, 1, 0, 0),
-    "frequency response": (5, 7, 0, 0, 0),
-}
+COUNTS = {question: [round(12 * p / 100) for p in row] for question, row in TABLE_4.items()}
 # The averages in Table 5 have two decimals; each is a multiple of 1/12.
 TABLE_5 = {
     "approaches to modeling": ("2.83", "2.75", "3.67", "3.67"),
@@ -81,13 +77,13 @@ def test_the_tables_are_printed_as_markdown(tmp_path):
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        ("Q\nAgree\nAgree\nPerhaps\n", "line 4, 'Q': 'Perhaps' is not one of Strongly Agree"),
-        ("Pre knowledge: x\n3\n5\n", "line 3, 'Pre knowledge: x': '5' is no score from 1 to 4"),
-        ("Pre knowledge: x\n3.5\n", "'3.5' is no score from 1 to 4"),
-        ("Pre knowledge: x,pre-course Knowledge [x]\n3,4\n", "two columns are"),
-        ("name,age\nann,20\n", "contains no question"),
-        ("Q\n", "needs a heading and at least one row"),
-        ("", "needs a heading and at least one row"),
+        ("Q\nAgree\nAgree\nPerhaps\n", "4, 'Q': 'Perhaps'"),
+        ("Pre knowledge: x\n3\n5\n", "x': '5'"),
+        ("Pre knowledge: x\n3.5\n", "'3.5'"),
+        ("Pre knowledge: x,pre-course Knowledge [x]\n3,4\n", "two columns"),
+        ("name,age\nann,20\n", "no question"),
+        ("Q\n", "one row"),
+        ("", "one row"),
     ],
 )
 def test_answers_off_the_scale_are_an_error(tmp_path, rows, message):
@@ -101,10 +97,10 @@ def test_answers_off_the_scale_are_an_error(tmp_path, rows, message):
 def test_answers_may_be_written_in_many_ways(tmp_path):
     """Capitals and the kind of apostrophe do not matter in answers, and scores may be words."""
     path = tmp_path / "a.csv"
-    path.write_text(
-        "Q;post_knowledge: x\nstrongly agree;Moderate\nI don’t know;4\nDon't know.;high, used it\n",
-        encoding="utf-8",
+    text = (
+        "Q;post_knowledge: x\nstrongly agree;Moderate\nI don’t know;4\nDon't know.;high, used it\n"
     )
+    path.write_text(text, encoding="utf-8")
     survey = read_survey(path)
     assert survey.opinions.loc["Q"].tolist() == [1, 0, 0, 0, 2]
     assert survey.means.loc["x", "Post Course Knowledge"] == 3.67

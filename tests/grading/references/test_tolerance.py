@@ -69,29 +69,30 @@ def test_the_error_grows_with_the_distance(value, steps, sign):
     assert errors[0] <= errors[1]
 
 
-def test_rounding_and_standard_errors_are_subtracted_first():
+@pytest.mark.parametrize(
+    ("typed", "value", "std", "error"),
+    [
+        ("105", 100.0, 0.0, Fraction(9, 2)),  # rounding is subtracted
+        ("105", 100.0, 1.0, 100 * (Fraction(209, 2) / 103 - 1)),  # then three standard errors
+        ("3e1", 35.0, 0.0, 100 * (Fraction(70, 63) - 1)),  # stands for 28.5 to 31.5
+    ],
+)
+def test_rounding_and_standard_errors_are_subtracted_first(typed, value, std, error):
     """Rounding and then the standard errors are subtracted from the difference.
 
-    A typed 105 is 4.5 % off 100. With a standard error of 1 and 3 sigmas, the error is
-    104.5/103 − 1.
+    A number typed with one digit gets the rounding allowance of one with two digits.
     """
-    assert percent_off(Decimal("105"), at(100.0), sigmas=3.0) == Fraction(9, 2)
-    error = percent_off(Decimal("105"), at(100.0, std=1.0), sigmas=3.0)
-    assert error == 100 * (Fraction(209, 2) / 103 - 1)
+    assert percent_off(Decimal(typed), at(value, std=std), sigmas=3.0) == error
 
 
-def test_too_small_and_too_large_by_one_factor_are_the_same_error():
-    """A number too small by some factor has the same error as one too large by that factor."""
+def test_the_sign_of_an_error_does_not_matter_but_that_of_the_number_does():
+    """Too small or too large by some factor is the same error; a wrong sign earns nothing."""
     high = percent_off(Decimal("120.0000"), at(100.0), sigmas=0.0)
     low = percent_off(Decimal("83.33333"), at(100.0), sigmas=0.0)
     # The numbers have different digits, which changes the errors by up to 1e-4 percent.
     assert abs(high - low) < Fraction(2, 10**4)
-
-
-def test_a_wrong_sign_earns_nothing():
-    """A number with the wrong sign earns nothing, however wide the tolerance."""
-    error = percent_off(Decimal("-24.3"), at(24.3), sigmas=3.0)
-    assert credit(error, full=1000.0, none=1000.0) == 0
+    wrong = percent_off(Decimal("-24.3"), at(24.3), sigmas=3.0)
+    assert credit(wrong, full=1000.0, none=1000.0) == 0
 
 
 @pytest.mark.parametrize("vague", ["0e2", "0", "0.0", "-0.0"])
@@ -99,15 +100,6 @@ def test_a_typed_zero_earns_nothing(vague):
     """A typed zero earns nothing, since rounding may excuse only a share of the number."""
     assert rounding(Decimal(vague)) == 0
     assert credit(percent_off(Decimal(vague), at(0.1), sigmas=0.0), full=50.0, none=200.0) == 0
-
-
-def test_one_digit_is_excused_no_more_than_two():
-    """A number typed with one digit gets the rounding allowance of one with two digits.
-
-    So 3e1 stands for 28.5 to 31.5, not for 25 to 35.
-    """
-    assert rounding(Decimal("3e1")) == Fraction(3, 2)
-    assert percent_off(Decimal("3e1"), at(35.0), sigmas=0.0) == 100 * (Fraction(70, 63) - 1)
 
 
 @pytest.mark.parametrize("typed", ["0e2", "25.60", "1e-7", "3e5"])

@@ -16,16 +16,17 @@ from pipeline.resources import RUBRICS
 from tests.helpers.commandline import Done, cartlab_here
 from tests.helpers.desks import a_submission
 from tests.helpers.places import ROOT
+from tests.helpers.spoilt import change
 
 RUBRIC = RUBRICS / "throne-1dof.toml"
 
 
-def change(folder, old, new):
-    """Replace one text in `submission.toml`, once."""
-    path = folder / "submission.toml"
-    text = path.read_text(encoding="utf-8")
-    assert old in text
-    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+def refused(folder, *more) -> str:
+    """Return why the check is refused, in one line."""
+    done = cartlab_here("check", folder, *more)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    return done.stderr
 
 
 def check(folder, *more) -> Done:
@@ -49,7 +50,7 @@ def test_correct_numbers_end_with_status_0(honest):
     """If all numbers agree, the exit status is 0, and the folder records one check."""
     done = check(honest, "--rubric", RUBRIC)
     assert done.returncode == 0
-    assert re.match(r"All \d+ numbers that were checked agree", done.stdout)
+    assert re.match(r"All \d+ ", done.stdout)
     assert len(read_answers(honest)) == 1
 
 
@@ -58,7 +59,7 @@ def test_an_unreadable_recording_is_named_with_its_reason(honest):
     change(honest, "data/step-1.csv", "data/stp-1.csv")
     done = check(honest, "--rubric", RUBRIC)
     assert "data/stp-1.csv" in done.stdout
-    assert "did you mean 'data/step-1.csv'" in done.stdout
+    assert "'data/step-1.csv'" in done.stdout
 
 
 def test_the_second_answer_says_where_to_look(in_hertz):
@@ -70,9 +71,7 @@ def test_the_second_answer_says_where_to_look(in_hertz):
     assert (first.returncode, second.returncode) == (1, 1)
     assert "initial.omega_n" in first.stdout
     assert "Hz" not in first.stdout
-    assert "initial.omega_n: Hz where rad/s is asked" in second.stdout
-    assert re.search(r"Look at (decay-|every decay)", second.stdout)
-    assert "run 2 times." in second.stdout
+    assert re.search(r"initial\.omega_n: Hz(.|\n)*decay(.|\n)* 2 times", second.stdout)
     for said in (first.stdout, second.stdout, (in_hertz / FILE).read_text(encoding="utf-8")):
         assert not re.search(r"13[.\d]|6\.28", said)
 
@@ -85,7 +84,7 @@ def test_after_a_change_the_answer_only_names_the_number(in_hertz):
     check(in_hertz)
     change(in_hertz, "omega_n = 2.085", "omega_n = 9.0")
     again = check(in_hertz)
-    assert "Where to look" not in again.stdout
+    assert "Hz" not in again.stdout
     assert [one.stage for one in read_answers(in_hertz)] == ["which", "which"]
 
 
@@ -104,20 +103,16 @@ def test_json_prints_the_line_that_is_added(in_hertz):
 
 def test_a_rubric_for_other_carts_is_refused(honest):
     """If the rubric is for another number of carts, one line says so and nothing is counted."""
-    done = check(honest, "--rubric", "throne-2dof")
-    assert done.returncode == 2
-    assert "the submission is for 1 cart, the rubric for 2" in done.stderr
+    assert re.search("1 cart.* 2", refused(honest, "--rubric", "throne-2dof"))
     assert not (honest / FILE).exists()
 
 
 def test_nothing_reported_cannot_be_checked(honest):
-    """If no number is reported, the message says what to write and where."""
+    """If no number is reported, the message says so."""
     path = honest / "submission.toml"
     text = path.read_text(encoding="utf-8").partition("[reported")[0]
     path.write_text(text, encoding="utf-8")
-    done = check(honest)
-    assert done.returncode == 2
-    assert "no number is reported yet: enter what you found under" in done.stderr
+    assert "no number" in refused(honest)
 
 
 @pytest.mark.parametrize(
@@ -129,13 +124,11 @@ def test_an_edited_file_of_answers_is_refused(honest, text):
     An empty file is accepted.
     """
     (honest / FILE).write_text(text, encoding="utf-8")
-    done = check(honest)
     if text:
-        assert done.returncode == 2
-        assert f"{FILE}, line 1: this line was not written by `cartlab check`" in done.stderr
+        assert f"{FILE}, line 1: " in refused(honest)
         assert (honest / FILE).read_text(encoding="utf-8") == text
     else:
-        assert done.returncode == 0
+        assert check(honest).returncode == 0
 
 
 def test_a_missing_line_is_refused(in_hertz):
@@ -147,7 +140,7 @@ def test_a_missing_line_is_refused(in_hertz):
         check(in_hertz)
     _, *rest = (in_hertz / FILE).read_text(encoding="utf-8").splitlines(keepends=True)
     (in_hertz / FILE).write_text("".join(rest), encoding="utf-8")
-    assert check(in_hertz).returncode == 2
+    assert FILE in refused(in_hertz)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links of POSIX")
@@ -156,9 +149,7 @@ def test_a_link_is_not_followed(honest, tmp_path):
     other = tmp_path / "other.txt"
     other.write_text("mine", encoding="utf-8")
     (honest / FILE).symlink_to(other)
-    done = check(honest)
-    assert done.returncode == 2
-    assert f"{FILE}: is a link" in done.stderr
+    assert f"{FILE}: " in refused(honest)
     assert other.read_text(encoding="utf-8") == "mine"
 
 
@@ -170,15 +161,14 @@ def test_the_grade_says_how_often_the_check_was_run(in_hertz, tmp_path):
     check(in_hertz)
     check(in_hertz)
 
-    def notes() -> tuple[str, ...]:
+    def note() -> str:
         task = Task(id="team", key="k", sources=(str(in_hertz),))
-        return read_grade(
-            grade_task(task, rubric=load_rubric(RUBRIC), scratch=tmp_path).grade
-        ).notes
+        graded = grade_task(task, rubric=load_rubric(RUBRIC), scratch=tmp_path)
+        return read_grade(graded.grade).notes[-1]
 
-    assert "cartlab check was run 2 times." in notes()
+    assert "2 times" in note()
     (in_hertz / FILE).write_text("{}\n", encoding="utf-8")
-    assert "was changed and cannot be read" in notes()[-1]
+    assert "was changed" in note()
 
 
 def test_a_wrong_value_of_see_is_refused(honest, tmp_path):
@@ -186,13 +176,9 @@ def test_a_wrong_value_of_see_is_refused(honest, tmp_path):
     rubric = tmp_path / "lab.toml"
     text = RUBRIC.read_text(encoding="utf-8")
     rubric.write_text(text + '\n[students]\nsee = "chekc"\n', encoding="utf-8")
-    done = check(honest, "--rubric", rubric)
-    assert done.returncode == 2
-    expected = "students.see: expected 'report' or 'check', found"
-    assert re.search(rf"lab\.toml line \d+: {expected} 'chekc'", done.stderr)
+    wrong = r"students\.see: .*'report' or 'check'.* 'chekc'"
+    assert re.search(rf"lab\.toml line \d+: {wrong}", refused(honest, "--rubric", rubric))
     rubric.write_text(text + '\n[students]\nsee = "check"\n', encoding="utf-8")
     assert load_rubric(rubric).students.see == "check"
     change(honest, "[system]", '[students]\nsee = "all"\n\n[system]')
-    done = check(honest)
-    assert done.returncode == 2
-    assert expected in done.stderr
+    assert re.search(wrong.replace("chekc", "all"), refused(honest))

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradings import Batch, Member
+from pipeline.grading.gradings import Member
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.similarity.fingerprints import fingerprint
 from pipeline.grading.similarity.repeated_authors import (
@@ -18,9 +17,7 @@ from pipeline.grading.similarity.repeated_authors import (
 from pipeline.ingest.read import read_data
 from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
-from tests.helpers.grades import make_grade, make_outcome, two_cart_rubric
-
-RUBRIC = two_cart_rubric()
+from tests.helpers.grades import book_of, make_grade, make_outcome, two_cart_rubric
 
 
 @pytest.fixture(scope="module")
@@ -36,15 +33,12 @@ def told(folder: Path, recordings, *, anonymous: bool = False) -> list[RepeatedA
     """Write a class in which Eve submits Bob's recordings and names Bob and herself as authors."""
     teams = {"team-1": ("bob",), "team-2": ("carl",), "team-9": ("eve", "Bob ")}
     prints = {"team-1": recordings[0], "team-2": recordings[1], "team-9": recordings[0]}
-    outcomes = [
+    class_ = [
         make_outcome(make_grade(name, authors=authors), fingerprints=prints[name])
         for name, authors in teams.items()
     ]
-    with Gradebook(folder, assignment="lab", create=True) as book:
-        for outcome in outcomes:
-            book.put(outcome)
-        rubric = RUBRIC.model_copy(update={"anonymous": anonymous})
-        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=rubric)
+    rubric = two_cart_rubric().model_copy(update={"anonymous": anonymous})
+    with book_of(folder, *class_, rubric=rubric) as book:
         return write_outputs(book, folder)
 
 
@@ -56,19 +50,18 @@ def test_a_copy_that_names_its_victim_is_reported(recordings, tmp_path):
     (double,) = told(tmp_path, recordings)
     assert (double.authors, double.submissions) == (("bob",), ("team-1", "team-9"))
     assert double.recordings >= 3
-    said = f"bob is in team-1 and team-9, and these share {double.recordings} recordings"
-    assert str(double) == said
-    assert said in re.sub(r"<[^>]+>", "", (tmp_path / "class.html").read_text(encoding="utf-8"))
+    assert re.match(rf"bob .*team-1 and team-9, .* {double.recordings} ", str(double))
+    page = re.sub(r"<[^>]+>", "", (tmp_path / "class.html").read_text(encoding="utf-8"))
+    assert str(double) in page
     feedback = (tmp_path / "feedback/team-9/feedback.html").read_text(encoding="utf-8")
-    assert "these share" not in feedback
+    assert "team-1" not in feedback
 
 
 def test_without_names_nobody_is_named(recordings, tmp_path):
     """In an anonymous grading, the message has the submissions' pseudonyms and names no person."""
     (double,) = told(tmp_path, recordings, anonymous=True)
-    assert re.fullmatch(
-        r"One person is in anon-\w+ and anon-\w+, and these share \d+ recordings", str(double)
-    )
+    assert len(re.findall(r"anon-\w+", str(double))) == 2
+    assert not re.search("bob|eve|team", str(double))
 
 
 def test_each_common_recording_is_counted_once(recordings):
@@ -92,7 +85,7 @@ def test_a_submission_without_fingerprints_was_not_compared(recordings):
         ]
         (double,) = with_recordings(find_repeated_authors({"a": ("s1",), "b": ("s1",)}), prints)
         assert (double.recordings, double.compared) == (0, compared)
-        assert ("could not be compared" in str(double)) is not compared
+        assert ("compared" in str(double)) is not compared
 
 
 def test_partners_in_two_submissions_are_reported_once():
@@ -104,8 +97,8 @@ def test_partners_in_two_submissions_are_reported_once():
     both, alone = find_repeated_authors(teams)
     assert (both.authors, both.submissions) == (("x", "y"), ("a", "b"))
     assert (alone.authors, alone.submissions) == (("z",), ("c", "d"))
-    assert str(both).startswith("x and y are in a and b")
-    assert str(replace(both, authors=("", ""))).startswith("2 people are in a and b")
+    assert str(both).startswith("x and y ")
+    assert str(replace(both, authors=("", ""))).startswith("2 people ")
 
 
 def test_nobody_is_reported_for_one_submission():
@@ -115,5 +108,5 @@ def test_nobody_is_reported_for_one_submission():
     """
     assert find_repeated_authors({"a": ("x", "y"), "b": ("z", "Z ")}) == []
     (double,) = find_repeated_authors({f"t{i}": ("S\n1",) for i in range(10)})
-    assert str(double).startswith("S 1 is in t0, t1, ")
-    assert str(double).endswith("and 2 more, and these share no recording")
+    assert str(double).startswith("S 1 ")
+    assert "2 more" in str(double)

@@ -131,7 +131,7 @@ def test_one_faulty_program_is_a_possible_reason_for_equal_tables(digits):
         assert all(one.one_program for tables in found.values() for one in tables)
         if found:
             asked += 1
-            assert "one faulty program" in shared_flag([], found["t000"]).message
+            assert "program" in shared_flag([], found["t000"]).message
     assert asked or digits > 3
 
 
@@ -199,14 +199,8 @@ def test_the_flag_reads_well_and_students_learn_no_name(with_recording):
     numbers[3] = copied(numbers[3], numbers[1])
     found = shared(numbers)
     flag = shared_flag([record("t001")] if with_recording else [], found["t003"])
-    tables = "The initial and final tables report the same numbers as t001: all 20 are equal."
-    about = (
-        "step-1 is also in t001: 800 consecutive rows are equal, from 0 s to 4 s in step-1. "
-        f"{tables} This does not show whose recording it is; if it was"
-        if with_recording
-        else f"{tables} This does not show whose numbers they are; if they were"
-    )
-    assert flag.message == f"{about} shared for a reason, say so."
+    assert "all 20 " in flag.message
+    assert ("step-1" in flag.message, "recording" in flag.message) == (with_recording,) * 2
     assert student_message(flag) == flag.message.replace("t001", "another submission")
     hidden = anonymise(make_grade("t003", flags=(flag,)), {"t003": "anon-3", "t001": "anon-1"})
     assert "t001" not in repr(hidden)
@@ -229,21 +223,17 @@ def test_a_class_with_a_copied_table_is_flagged_as_it_is_graded(tmp_path):
         (tmp_path / "in" / f"t{number}").mkdir(parents=True)
         (tmp_path / "in" / f"t{number}" / "submission.toml").write_text(f"# {number}")
 
+    def judged(criterion, own):
+        typed = {name: x for (table, name), x in own.items() if table == tables[criterion.id]}
+        found = {name: x.value for name, x in typed.items()}
+        expected = {name: x.recomputed for name, x in typed.items()}
+        return criterion.model_copy(update={"found": found, "expected": expected})
+
     def execute(tasks, setup):
         for task in tasks:
-            own = numbers[int(task.id[1:])]
             grade = make_grade(task.id)
-            criteria = [
-                criterion.model_copy(
-                    update={
-                        "found": {n: x.value for (t, n), x in own.items() if t == table},
-                        "expected": {n: x.recomputed for (t, n), x in own.items() if t == table},
-                    }
-                )
-                for criterion in grade.criteria
-                for table in [tables[criterion.id]]
-            ]
-            grade = grade.model_copy(update={"criteria": tuple(criteria)})
+            criteria = tuple(judged(c, numbers[int(task.id[1:])]) for c in grade.criteria)
+            grade = grade.model_copy(update={"criteria": criteria})
             yield make_outcome(grade, key=task.key, fingerprints=b"")
 
     flagged = []
