@@ -10,6 +10,7 @@ import pytest
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Criterion, Grade, read_grade
 from pipeline.grading.gradebook.class_lines import GradeSummary
+from pipeline.grading.gradebook.history import history_text
 from pipeline.grading.gradebook.override import TOTAL, read_wishes
 from pipeline.grading.gradebook.request_gradebook import points_lost
 from pipeline.grading.gradebook.shared_gradebook import Conflict
@@ -137,6 +138,7 @@ def test_adjustments_add_up_and_survive_regrading(book):
     assert adjusted == [(1.5, "a fine plot"), (-100, "copied")]
     events = [(e.points, e.by) for e in book.history("team-1")[1] if e.what == "adjusted"]
     assert events == [(1.5, "Ada"), (-100, "Bob")]
+    assert re.search(r"-100 .*Bob: copied\n", history_text(*book.history("team-1")))
     book.adjust("team-1", 100, why="it was not", by="Bob")
     assert book.entry("team-1").grade.points == 11.5
     assert read_grade(entry.grade.model_dump_json(by_alias=True)) == entry.grade

@@ -2,6 +2,7 @@
 
 import pytest
 
+from pipeline.grading.gradebook.history import history_text
 from pipeline.grading.gradebook.override import WantedPoints
 from tests.helpers.grades import finish, make_grade
 from tests.helpers.grading_students import criterion
@@ -51,6 +52,7 @@ def test_a_comment_does_not_freeze_points(book, say):
     assert pieces(book).message == f"As expected. {NOTE}"
     (said,) = [event for event in book.history("team-1")[1] if event.what == "comment"]
     assert (said.by, said.text) == ("Ada", NOTE)
+    assert f"Ada: {NOTE}" in history_text(*book.history("team-1"))
 
 
 @pytest.mark.parametrize("say", [lambda book: change(book, 0.0), comment_all])

@@ -108,6 +108,7 @@ def test_a_class_may_mix_folders_and_archives(tmp_path):
         ("two", "which one"),
     ):
         assert word in why_not(tmp_path, found[name])
+    assert [h.id for h in hand_ins(tmp_path, tmp_path / "c" / "team-5.zip")] == ["team-5"]
 
 
 @pytest.mark.parametrize("name", ["t.tar.gz", "t.tgz", "t.7z", "t.rar", "t.tar"])
@@ -362,6 +363,9 @@ def test_archives_in_archives_are_opened_to_a_limited_depth(tmp_path):
         if depth == 1:
             assert opened(tmp_path, found) == [NAME]
     assert "no submission" in why_not(tmp_path, found)
+    beside = {"lab/notes.md": "", "lab.zip": zip_bytes(tmp_path, [NAME])}  # a folder of its name
+    (found,) = hand_ins(tmp_path, archive(tmp_path / "own.zip", beside))
+    assert opened(tmp_path, found) == [NAME]
 
 
 # ------------------------------------------------------------------------- one submission
