@@ -29,7 +29,7 @@ from pipeline.submission import (
     load_submission,
 )
 from pipeline.workflow import analyse
-from tests.helpers.grading_students import criterion, student
+from tests.helpers.grading_students import criterion, student, typed
 from tests.helpers.spoilt import change, files, spoil, times
 
 RUBRIC = load_rubric(Path("throne-1dof"))
@@ -176,6 +176,8 @@ def test_two_gains_of_reversed_sign_agree(folder):
 
     assert apart("-24.4", "-24.3") == apart("24.4", "24.3")
     assert apart("-24.4", "24.3") == apart("0", "24.3")
+    # 10.95 against 10.05: the rounding of each number is subtracted once
+    assert float(apart("10.0", "11.0")) == pytest.approx(100 * (10.95 / 10.05 - 1), rel=1e-12)
 
 
 def test_a_submission_for_another_bench_fails_with_its_reason(folder):
@@ -328,3 +330,35 @@ def test_a_message_says_if_numbers_are_judged_loosely(hide, loosely):
     grade = student(1, hide=hide).grade()
     for name in ("final-gains", "final-frequencies", "final-dampings"):
         assert ("A person" in criterion(grade, name).message) is loosely
+
+
+def test_an_overshoot_below_the_goal_costs_nothing():
+    """Gains are judged by the goal of the design, not by an overshoot of 0."""
+    one = student(1)
+    fit, loop = one.analysis.fit, one.reported.feedback
+    assert fit is not None
+    assert loop is not None
+    # poles of x'' + 2 zeta omega x' + omega²: overshoots by 7 %, more if sampled, and settles fast
+    (m,), (c,), k = fit.chain.m, fit.chain.c, float(np.sum(fit.chain.k))
+    omega, zeta = 1.5 * float(np.sqrt(k / m)), 0.65
+    gains = (typed(m * omega**2 - k), typed(2 * zeta * omega * m - c))
+    update = {"gains": gains, "prefilter": typed(m * omega**2)}
+    grade = one.reporting(feedback=loop.model_copy(update=update)).grade()
+    found = criterion(grade, "feedback")
+    assert 5.0 < found.found["overshoot_percent"] < found.expected["overshoot_percent"]
+    assert found.points == found.out_of
+
+
+def test_the_best_closed_loop_counts():
+    """If a second run of the loop fits the model worse, the better one earns the points."""
+    one = student(2)
+    runs, checks = one.submission.experiments, one.analysis.hardware
+    loop = next(run for run in runs if run.kind == "closed_loop")
+    again = loop.model_copy(update={"id": "again"})
+    worse = tuple(replace(check, experiment="again", nrmse=1.0) for check in checks)
+    two = replace(
+        one,
+        submission=one.submission.model_copy(update={"experiments": (*runs, again)}),
+        analysis=replace(one.analysis, hardware=(*checks, *worse)),
+    )
+    assert criterion(two.grade(), "hardware") == criterion(one.grade(), "hardware")
