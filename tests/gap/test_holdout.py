@@ -14,7 +14,7 @@ from pipeline.plant.chain import PRESETS, Chain
 from pipeline.results import Intervention
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
-from tests.helpers.time_records import decay_record, step_record
+from tests.helpers.time_records import decay_record, step_record, write_records
 
 CHAIN = PRESETS["throne-1dof"]
 HEAVIER = Chain(m=1.4 * CHAIN.m, c=CHAIN.c, k=CHAIN.k)  # an extra weight on the cart
@@ -23,7 +23,6 @@ HEAVIER = Chain(m=1.4 * CHAIN.m, c=CHAIN.c, k=CHAIN.k)  # an extra weight on the
 @pytest.fixture(scope="module")
 def analysis(tmp_path_factory):
     """Return the analysis of a linear bench; one repeat was recorded with an extra weight."""
-    folder = tmp_path_factory.mktemp("bench")
     rng = np.random.default_rng(5)
     records = [
         *(step_record(CHAIN, rng=rng, id=f"step-{i}") for i in (1, 2, 3)),
@@ -31,17 +30,7 @@ def analysis(tmp_path_factory):
         step_record(CHAIN, rng=rng, swing=0.5, id="half"),
         *(decay_record(CHAIN, free=(1,), rng=rng, id=f"decay-{i}") for i in (1, 2)),
     ]
-    toml = "version = 1\n[system]\ncarts = 1\ninput = { sign = 1 }\n"
-    for record in records:
-        u = np.zeros(record.t.size) if record.u is None else record.u
-        rows = [
-            f"{t:.6f},{v:.6f},{x:.5f}" for t, v, x in zip(record.t, u, record.y[0], strict=True)
-        ]
-        text = "\n".join(["time,input,x1", *rows]) + "\n"
-        (folder / f"{record.id}.csv").write_text(text, encoding="utf-8")
-        toml += f'[[experiments]]\nid = "{record.id}"\nkind = "{record.kind}"\n'
-        toml += f'file = "{record.id}.csv"\n'
-    (folder / "submission.toml").write_text(toml, encoding="utf-8")
+    folder = write_records(tmp_path_factory.mktemp("bench"), records, carts=1)
     return analyse(load_submission(folder), design=False)
 
 

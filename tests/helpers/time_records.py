@@ -1,5 +1,8 @@
 """Simulated time records of a chain: steps and hand-released decays."""
 
+from collections.abc import Iterable
+from pathlib import Path
+
 import numpy as np
 
 from pipeline.arrays import Array
@@ -106,3 +109,21 @@ def random_chain(n: int, rng: np.random.Generator) -> tuple[Chain, tuple[bool, .
     zeta = np.exp(rng.uniform(np.log(0.01), np.log(0.3), n))
     c = 2 * zeta * np.sqrt((k[:-1] + k[1:]) * m)
     return Chain(m=m, c=c, k=k), tuple(bool(stiffness > 0) for stiffness in k)
+
+
+def write_records(folder: Path, records: Iterable[Record], *, carts: int) -> Path:
+    """Write records as a submission in cm and V, with the sign of the input stated."""
+    (folder / "data").mkdir(parents=True, exist_ok=True)
+    toml = f"version = 1\n[system]\ncarts = {carts}\ninput = {{ sign = 1 }}\n"
+    for record in records:
+        u = np.zeros(record.t.size) if record.u is None else record.u
+        columns = {"time": record.t, "input": u}
+        if record.reference is not None:
+            columns["reference"] = record.reference
+        columns |= {f"x{cart}": record.position(cart) for cart in record.carts}
+        file = f"data/{record.id}.csv"
+        rows = np.transpose([*columns.values()])
+        np.savetxt(folder / file, rows, "%.6f", ",", header=",".join(columns), comments="")
+        toml += f'[[experiments]]\nid = "{record.id}"\nkind = "{record.kind}"\nfile = "{file}"\n'
+    (folder / "submission.toml").write_text(toml, encoding="utf-8")
+    return folder

@@ -49,6 +49,7 @@ from tests.helpers.commandline import cartlab_here
 from tests.helpers.effects import make_term
 from tests.helpers.gaps import CHAIN, RESIDUAL, T, U, make_gap, two_cart_analysis, usual_terms
 from tests.helpers.pages import HOSTILE, Page, pictures, rows, sections, tiles
+from tests.helpers.time_records import write_records
 from tests.truth.cases import make_case
 
 SUSPECT = Alternative(effect=find_effect("backlash"), where={}, nrmse_after=0.12, confidence=0.9)
@@ -452,26 +453,15 @@ def test_a_file_that_is_not_gap_json_is_refused(text):
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
     """Write a submission of one cart with dry friction and run `cartlab gap` on it."""
-    folder = tmp_path_factory.mktemp("bench")
-    (folder / "data").mkdir()
     case = make_case(seed=41, n=1, effects=["coulomb_friction"], rate=113.1)
-    toml = (
-        'version = 1\ntitle = "Bench 7"\n[system]\ncarts = 1\n'
-        'position = { unit = "cm" }\ninput = { unit = "V", sign = 1 }\n'
-    )
-    for record in case.records:
-        if record.id == "sweep":
-            continue
-        # The last step is stated to be a closed loop, since its input was measured.
-        kind = "closed_loop" if record.id == "step-d" else record.kind
-        reference = np.zeros(record.t.size)
-        columns = [record.t, record.u, reference, record.y[0]]
-        rows = [f"{t:.6f},{u:.6f},{r:.1f},{x:.5f}" for t, u, r, x in zip(*columns, strict=True)]
-        name = f"data/{record.id}.csv"
-        text = "\n".join(["time,input,reference,x1", *rows]) + "\n"
-        (folder / name).write_text(text, encoding="utf-8")
-        toml += f'[[experiments]]\nid = "{record.id}"\nkind = "{kind}"\nfile = "{name}"\n'
-    (folder / "submission.toml").write_text(toml, encoding="utf-8")
+    # The last step is stated to be a closed loop, since its input was measured.
+    records = [
+        replace(one, kind="closed_loop", reference=np.zeros(one.t.size)) if one.id == "step-d"
+        else one
+        for one in case.records
+        if one.id != "sweep"
+    ]  # fmt: skip
+    folder = write_records(tmp_path_factory.mktemp("bench"), records, carts=1)
     done = cartlab_here("gap", folder, "--json", "--model")
     (hidden,) = case.hidden
     return SimpleNamespace(folder=folder, done=done, force=hidden.parameters["force"])
