@@ -8,6 +8,8 @@ from numpy.testing import assert_allclose
 import pipeline
 from pipeline.errors import ConfigError
 from pipeline.notebook import ExplainedGap, explain
+from pipeline.plant.catalogue import find_effect
+from pipeline.plant.effect import effect_name
 from pipeline.report.plots.runs import compare_runs
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.simulated.submission import write_submission
@@ -41,7 +43,7 @@ def test_effects_are_a_table(gap):
     assert values.loc["force", "cart"] == 1
     assert values.loc["time_constant", "value"] == pytest.approx(LAG, rel=0.02)
     assert list(gap.parameters["unit"].sort_values()) == ["V", "s"]
-    assert "Dry (Coulomb) friction on cart 1" in repr(gap)
+    assert effect_name(find_effect("coulomb_friction"), {"cart": 1})[1:] in repr(gap)
 
 
 def test_a_recording_is_simulated_by_both_models(gap):

@@ -69,32 +69,20 @@ def test_a_link_is_replaced_not_followed(tmp_path):
     assert (link.read_text(), link.is_symlink()) == ("ours", False)
 
 
-def test_a_linked_folder_inside_a_submission_is_refused(tmp_path):
-    """If a submission's default output folder is a link to elsewhere, it is refused."""
-    elsewhere = tmp_path / "elsewhere"
+def test_a_folder_that_may_not_be_used_is_refused(tmp_path):
+    """A link to elsewhere, a file in the way and a submission's full folder are refused."""
+    elsewhere, link, file = (tmp_path / name for name in ("elsewhere", "report", "out"))
     elsewhere.mkdir()
-    (tmp_path / "report").symlink_to(elsewhere)
-    with pytest.raises(ConfigError, match="is a link; choose another folder with --out"):
+    link.symlink_to(elsewhere)
+    file.write_text("")
+    with pytest.raises(ConfigError, match=r"link.*--out"):
         own_folder(tmp_path, "report")
-    assert check_folder(tmp_path / "report").is_dir()  # allowed if the user names it
-
-
-def test_a_file_in_the_way_is_refused(tmp_path):
-    """If the output folder's name is that of an existing file, the error names the file."""
-    (tmp_path / "out").write_text("")
+    assert check_folder(link).is_dir()  # allowed if the user names it
     with pytest.raises(ConfigError, match="out: is a file"):
-        check_folder(tmp_path / "out")
-
-
-def test_a_folder_with_files_is_refused(tmp_path):
-    """A submission is never written into a folder that holds something.
-
-    An empty folder is accepted.
-    """
+        check_folder(file)
     assert new_folder(tmp_path / "fresh") == tmp_path / "fresh"
-    assert new_folder(tmp_path) == tmp_path
-    (tmp_path / "submission.toml").write_text("")
-    with pytest.raises(ConfigError, match="is not empty"):
+    assert new_folder(elsewhere) == elsewhere
+    with pytest.raises(ConfigError, match="not empty"):
         new_folder(tmp_path)
 
 

@@ -31,6 +31,10 @@ def matlab(analysis: Analysis) -> dict:
     )
 
 
+def content(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*.*") if path.is_file()}
+
+
 def test_the_saved_tables_hold_the_analysis(analysis, tmp_path):
     """Saved tables hold the analysis to ten digits, and saving again gives the same bytes."""
     save_tables(analysis, tmp_path)
@@ -40,9 +44,9 @@ def test_the_saved_tables_hold_the_analysis(analysis, tmp_path):
     assert_allclose(dwells["omega [rad/s]"], own["omega"], rtol=1e-9)  # ten digits
     assert_allclose(dwells["gain [cm/V]"], own["gain"], rtol=1e-9)
     assert list(dwells["experiment"]) == list(own["experiment"])
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
+    before = content(tmp_path)
     save_tables(analysis, tmp_path)
-    assert before == {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
+    assert content(tmp_path) == before
 
 
 def test_matlab_finds_the_names_of_the_report(analysis):
