@@ -75,8 +75,8 @@ def test_a_full_disk_costs_nobody_a_grade(zips, tmp_path):
     with small_disk(disk, size="1200k"):
         full = grade(zips, disk / "out")
         assert full.returncode == 1
-        assert "No space left" in full.stderr
-        assert "disk is full" in full.stderr
+        assert "space left" in full.stderr
+        assert "is full" in full.stderr
         assert "the rubric" not in full.stderr
         subprocess.run(["mount", "-o", "remount,size=60m", disk], check=True)
         again = grade(zips, disk / "out")

@@ -9,24 +9,31 @@ import sys
 import time
 from contextlib import closing
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pipeline.grading.batch.runner import Grader, grade_batch, run_here
+from pipeline.grading.batch.runner import Grader, code_version, grade_batch, run_here
 from pipeline.grading.batch.task import Setup, Task
 from pipeline.grading.batch.worker import grade_task, named_authors, read_authors
 from pipeline.grading.grade import grade_text, read_grade
 from pipeline.grading.gradebook.gradebook import Gradebook
+from pipeline.grading.gradings import Example
+from pipeline.grading.intake.files import digest, packed, unpacked
 from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.publish import feedback_figures
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.publish.students import students_of
 from pipeline.grading.rubric_file import load_rubric
+from pipeline.grading.similarity.fingerprints import fingerprint
+from pipeline.ingest.read import read_data
 from pipeline.processes import LineProcess
+from pipeline.submission import load_submission
 from tests.helpers.grades import in_this_process, n_graded
 from tests.helpers.grading_students import copy_step, write_team
+from tests.helpers.spoilt import change
 from tests.helpers.waiting import PATIENCE, started, until
 
 RUBRIC = load_rubric(Path("throne-1dof"))
@@ -178,7 +185,7 @@ def test_a_fault_of_this_machine_is_tried_again(task, tmp_path):
     (tmp_path / "scratch").touch()  # no folder can be made in a file
     outcome = grade_task(task, rubric=RUBRIC, scratch=tmp_path / "scratch")
     assert (outcome.status, outcome.settled) == ("failed", False)
-    assert "cannot be read" in outcome.reason
+    assert "be read" in outcome.reason
 
 
 @pytest.mark.slow
@@ -258,6 +265,76 @@ def test_strange_authors_are_no_authors(text, tmp_path):
     """If `authors` is no list of tables with ids, nobody is named and nothing fails."""
     (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
     assert named_authors(tmp_path) == ()
+
+
+def test_an_error_of_the_grader_is_tried_again(task, tmp_path):
+    """If the grader itself fails, the traceback is kept, and the next run tries again."""
+    broken = RUBRIC.model_copy(update={"system": None})  # stands for an invalid rubric
+    outcome = grade_task(task, rubric=broken, scratch=tmp_path)
+    assert (outcome.status, outcome.settled) == ("failed", False)
+    assert "AttributeError" in outcome.reason
+    assert "Traceback" in outcome.detail
+
+
+@pytest.mark.parametrize(
+    ("slip", "typed"),
+    [("carts = 1", "carts = ?"), ("carts = 1", "cart = 1"), ("data/step-1.csv", "data/none.csv"),
+     ("version = 1", "version = 1,0"), ('id = "s0"', "id = s0  # me"), ('"s0"', "“s0”")],
+)  # fmt: skip
+def test_an_unreadable_submission_keeps_its_authors(school, tmp_path, slip, typed):
+    """The authors of an unreadable submission are still known, so points by hand reach them."""
+    own = shutil.copytree(school / "team-0", tmp_path / "team-0")
+    change(own, slip, typed)
+    task = Task(id="team-0", key="k", sources=(str(own),))
+    outcome = grade_task(task, rubric=RUBRIC, scratch=tmp_path)
+    assert outcome.authors == ("s0",)
+
+
+def test_files_that_change_during_the_grading_are_not_graded(task, tmp_path, school):
+    """If a file changes between the hash and the copy, the submission is left for the next run."""
+    own = shutil.copytree(school / "team-0", tmp_path / "team-0")
+    if sys.platform == "linux":  # only Linux allows this file name
+        (own / "n\udcff").write_text("no name in any encoding", encoding="utf-8")
+    known = replace(task, sources=(str(own),), digest=digest([own]))
+    assert grade_task(known, rubric=RUBRIC, scratch=tmp_path).status == "graded"
+    unpacked(packed([own]), tmp_path / "travelled")  # as on a cluster
+    there = replace(known, sources=(str(tmp_path / "travelled"),))
+    assert grade_task(there, rubric=RUBRIC, scratch=tmp_path).status == "graded"
+    (own / "notes.md").write_text("one more word", encoding="utf-8")
+    outcome = grade_task(known, rubric=RUBRIC, scratch=tmp_path)
+    assert (outcome.status, outcome.settled) == ("failed", False)
+    assert "changed" in outcome.reason
+
+
+def test_another_version_of_numpy_grades_everything_again(monkeypatch):
+    """If numpy or scipy has another version, everything is graded again."""
+    before = code_version()
+    assert code_version() == before
+    for name in ("numpy", "scipy"):
+        with monkeypatch.context() as other:
+            other.setattr(
+                "pipeline.grading.batch.runner.version",
+                lambda asked, name=name: "0" if asked == name else version(asked),
+            )
+            assert code_version() != before
+
+
+def test_a_handed_out_recording_is_not_flagged(school, tmp_path):
+    """A recording that was handed out to everybody is not flagged in two submissions."""
+    records = read_data(load_submission(school / "team-0")).records
+    given = Example(fingerprints=fingerprint(records))
+    shared = []
+    for examples in ((), (given,)):
+        with Gradebook(tmp_path, create=True) as book:
+            batch = grade_batch(
+                find_hand_ins([school], scratch=tmp_path),
+                setup=Setup(rubric=RUBRIC, scratch=tmp_path),
+                book=book,
+                execute=in_this_process,
+                examples=lambda examples=examples: examples,
+            )
+        shared.append(set(batch.shared))
+    assert shared == [{"team-0", "team-2"}, set()]
 
 
 def killed_within(rng, book, command):

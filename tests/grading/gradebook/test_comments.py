@@ -79,8 +79,8 @@ def test_undo_brings_back_the_earlier_comment(book):
     undo()
     assert notes(book) == NOTE
     assert (pieces(book).points, book.entry("team-1").overrides) == (0.5, {})
-    together = comment_all(book, why="See page 3.")
-    assert comment_all(book, why="See page 3.").teams == 0
+    together = comment_all(book, why="Page 3.")
+    assert comment_all(book, why="Page 3.").teams == 0
     book.undo_all(together.at, by="Ada")
     assert notes(book) == NOTE
 

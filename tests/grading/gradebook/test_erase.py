@@ -80,9 +80,9 @@ def test_no_file_of_a_folder_keeps_a_trace(tmp_path):
     with Gradebook(folder) as book:
         assert [one.submission for one in book.entries()] == [KEPT]
         flag = book.entry(KEPT).grade.flags[0]
-        assert "an erased submission" in flag.message
+        assert "erased submission" in flag.message
     with closing(sqlite3.connect(folder / FILE)) as connection:
-        with pytest.raises(sqlite3.IntegrityError, match="cannot be changed"):
+        with pytest.raises(sqlite3.IntegrityError, match="be changed"):
             connection.execute("DELETE FROM gradings")
         assert connection.execute("PRAGMA freelist_count").fetchone() == (0,)
 
@@ -101,7 +101,7 @@ def test_no_row_in_postgresql_keeps_a_trace(server, place_in_postgresql):
     engine = _engine(url)
     with engine.connect() as connection:
         connection.execution_options(isolation_level="AUTOCOMMIT").execute(text("CHECKPOINT"))
-        with pytest.raises(DBAPIError, match="cannot be changed"):
+        with pytest.raises(DBAPIError, match="be changed"):
             connection.execute(text("DELETE FROM gradings"))
     engine.dispose()
     tables = Path(url.partition("host=")[2], "data", "base").rglob("*")
@@ -138,7 +138,7 @@ def test_a_dump_of_a_database_is_the_same_gradebook(server, place_in_postgresql)
     with Gradebook(url) as book:
         assert (list(book.entries()), book.history(GONE)) == (entries, history)
         book.override(KEPT, two_cart_rubric().criteria[0].id, 1, why="new", by="Ada")
-    with engine.connect() as connection, pytest.raises(DBAPIError, match="cannot be changed"):
+    with engine.connect() as connection, pytest.raises(DBAPIError, match="be changed"):
         connection.execute(text("DELETE FROM overrides"))
     engine.dispose()
 

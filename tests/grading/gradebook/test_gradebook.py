@@ -153,8 +153,8 @@ def test_points_given_by_hand_survive_regrading(open_book):
     book = open_book()
     # Lateness costs a tenth, rounded to the rubric's quarter of a point: 1.1 → 1 and 0.65 → 0.75.
     finish(book, make_grade("team-1", share=0.5, days_late=1.0))
-    given = book.override("team-1", "state-model", 2.0, why="right in another order", by="Ada")
-    assert (given.by, given.why) == ("Ada", "right in another order")
+    given = book.override("team-1", "state-model", 2.0, why="right", by="Ada")
+    assert (given.by, given.why) == ("Ada", "right")
     assert book.entry("team-1").grade.points == pytest.approx(10 + 1 - 1)
     again = make_grade("team-1", share=0.25, days_late=1.0)
     finish(book, again, key="again")
@@ -163,7 +163,7 @@ def test_points_given_by_hand_survive_regrading(open_book):
     assert grade.deducted == pytest.approx(0.75)
     model = criterion(grade, "state-model")
     assert (model.points, model.outcome) == (2.0, "pass")
-    assert model.message.endswith("from 0.5 to 2 of 2: right in another order")
+    assert model.message.endswith("from 0.5 to 2 of 2: right")
     assert book.known("again of team-1").grade == make_outcome(again).grade
     book.override("team-1", "state-model", None, why="a mistake", by="Ada")
     assert book.entry("team-1").grade == again
@@ -316,7 +316,7 @@ def test_rows_are_only_added(book, place):
             f"UPDATE {table.name} SET {column} = {column}",
             f"DELETE FROM {table.name}",
         ):
-            refused = pytest.raises(DBAPIError, match="cannot be changed")
+            refused = pytest.raises(DBAPIError, match="be changed")
             with refused, engine.begin() as connection:
                 connection.execute(text(attempt))
         with engine.begin() as connection:

@@ -40,12 +40,12 @@ def test_an_answer_and_its_points_count_at_once(book):
     assert book.n_waiting() == 1
     (asked,) = book.queue().waiting
     assert (asked.entry.submission, asked.request.events[0].text) == ("team-1", "see\npage 3")
-    answer(book, 1.0, text="you are right")
+    answer(book, 1.0, text="right")
     own = book.own_feedback("team-1")
     assert own.requests["laws"].state == "answered"
     laws = criterion(own.entry.grade, "laws")
     assert laws.points == 1.0
-    assert laws.message.endswith("you are right")
+    assert laws.message.endswith("right")
     events = [(e.what, e.points, e.by) for e in book.history("team-1")[1][-3:]]
     assert events == [("asked", None, "s1"), ("override", 1.0, "Ada"), ("answered", 1.0, "Ada")]
     finish(book, make_grade("team-1", share=0.25), make_grade("team-2", share=0.5), key="again")
@@ -93,8 +93,8 @@ def test_a_criterion_is_asked_for_once_unless_reopened(book):
         ("laws", " \n", "write what"),
         ("laws", "", "write what"),
         ("laws", "x" * (MOST_LETTERS + 1), "1,000 characters, .*1,001"),
-        ("nothing", "x", "points were lost"),
-        ("", "x", "points were lost"),
+        ("nothing", "x", "were lost"),
+        ("", "x", "were lost"),
     ],
 )
 def test_a_request_that_makes_no_sense_is_refused(book, criterion, why, said):
@@ -107,7 +107,7 @@ def test_a_request_that_makes_no_sense_is_refused(book, criterion, why, said):
 def test_a_criterion_with_all_points_cannot_be_asked_about(book):
     """A criterion that was never judged can be asked about, since its points are lost too."""
     finish(book, make_grade("team-1"), failed_grade("team-2", "no submission.toml"), key="new")
-    with pytest.raises(RequestRefused, match="points were lost"):
+    with pytest.raises(RequestRefused, match="were lost"):
         book.ask("team-1", "laws", why="more", by="s1")
     book.ask("team-2", "laws", why="the file was in the zip", by="s2")
     answer(book, 0.5, text="found it")
@@ -248,7 +248,7 @@ def test_a_criterion_that_is_gone_can_still_be_answered(book):
     book.ask("team-1", "laws", why="x", by="s1")
     less = tuple(c for c in RUBRIC.criteria if c.id != "laws")
     finish(book, HALF, rubric=RUBRIC.model_copy(update={"criteria": less}))
-    with pytest.raises(ConfigError, match="no such criterion"):
+    with pytest.raises(ConfigError, match="such criterion"):
         answer(book, 1.0)
     answer(book, None, text="nobody loses points for it now")
     assert book.n_waiting() == 0

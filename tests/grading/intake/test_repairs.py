@@ -21,7 +21,7 @@ from pipeline.grading.intake.repairs import (
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.simulated.submission import write_submission
 
-BY_ADA = {"by": "Ada", "why": "the decimal comma"}
+BY_ADA = {"by": "Ada", "why": "comma"}
 
 
 def test_a_repair_counts_only_for_its_text(tmp_path):
@@ -48,7 +48,7 @@ def test_a_repair_counts_only_for_its_text(tmp_path):
     repairs = {text_key(wrong): Repair(text=right, **BY_ADA)}
     repaired = graded(wrong, **repairs)
     grade = json.loads(repaired.grade)
-    assert (grade["points"], grade["repaired"]) == (20, "by Ada: the decimal comma")
+    assert (grade["points"], grade["repaired"]) == (20, "by Ada: comma")
     assert (repaired.original, toml.read_bytes().decode()) == (wrong, wrong)
     other = graded(right.replace("carts = 1", "carst = 1"), **repairs)
     assert other.status == "failed"
