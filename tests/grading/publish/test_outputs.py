@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from pipeline.errors import ConfigError
 from pipeline.grading.batch.grade_class import Options, grade_class
 from pipeline.grading.csv_table import read_table
-from pipeline.grading.grade import CODES, Adjustment, Criterion, Flag, Grade
+from pipeline.grading.grade import CODES, Adjustment, Flag, Grade
 from pipeline.grading.gradebook.class_lines import GradeSummary
 from pipeline.grading.gradebook.override import HandPoints, read_points, with_overrides
 from pipeline.grading.publish.anonymous import KEY_FILE, anonymise, pseudonyms
@@ -284,20 +284,6 @@ def test_the_feedback_compares_reported_and_recomputed_numbers():
     assert re.search(r"\]3\.1219\.6−84\.1 %", text)
 
 
-@pytest.mark.parametrize(
-    ("found", "shown"), [(20.0, "+900 %"), (2538.0, "1269 times"), (-2538.0, "−1269 times")]
-)
-def test_a_large_difference_is_a_ratio(found, shown):
-    """Above ten times the recomputed number, the feedback gives the ratio, not percent."""
-    criterion = Criterion(
-        id="gains", title="", outcome="fail", points=0.0, out_of=1.0, message="",
-        expected={"K_1": 2.0}, found={"K_1": found},
-    )  # fmt: skip
-    table = numbers_table(criterion, check="initial", units=None, numbers=count(1))
-    assert table is not None
-    assert shown in str(table)
-
-
 def test_feedback_on_shared_data_names_nobody_and_does_not_praise():
     """If data are shared, the feedback neither names the other team nor says "Well done"."""
     html = feedback_of(make_grade("team-1", flags=(shared_flag("b-team"),)))
@@ -347,25 +333,34 @@ def test_feedback_lists_every_mistake_of_a_broken_submission(tmp_path):
     assert all(words in row["reason"] for words in wanted)
 
 
-def test_numbers_of_a_criterion_have_words_and_units():
-    """A criterion's numbers have labels and units, and an overshoot of 10⁻⁷ % is shown as 0."""
+def shown_numbers(name: str, found: float | None, expected: float, *, check: str) -> list[str]:
+    """Return the cells of the feedback's row for one number."""
+    own = make_grade("a").criteria[0]
+    typed = {} if found is None else {name: found}
+    own = own.model_copy(update={"expected": {name: expected}, "found": typed})
     units = Units(position="cm", input="V")
-    claims = Criterion(
-        id="c", title="claims", outcome="partial", points=1, out_of=2, message="",
-        expected={"overshoot_percent": 3.7e-7, "settling_time": 0.5, "prefilter": 0.07},
-        found={"overshoot_percent": 0.0, "settling_time": 0.6, "prefilter": 0.14},
-    )  # fmt: skip
-    shown = numbers_table(claims, check="claims", units=units, numbers=count(1))
-    assert shown is not None
-    assert [[plain(cell.text) for cell in row] for row in shown.rows] == [
-        ["Overshoot [%]", "0", "0", "0"],
-        ["Settling time [s]", "0.6", "0.5", "+20.0 %"],
-        ["Prefilter [V/cm]", "0.14", "0.07", "+100 %"],
-    ]
-    off = claims.model_copy(update={"found": {"overshoot_percent": 22.0}})
-    shown = numbers_table(off, check="claims", units=units, numbers=count(1))
-    assert shown is not None
-    assert plain(shown.rows[0][3].text) == "+22 percentage points"
+    table = numbers_table(own, check=check, units=units, numbers=count(1))
+    assert table is not None
+    return [plain(cell.text) for cell in table.rows[0]]
+
+
+@pytest.mark.parametrize(
+    ("name", "found", "expected", "cells"),
+    [
+        # an overshoot of 10⁻⁷ % is shown as 0, and differs by percentage points
+        ("overshoot_percent", 0.0, 3.7e-7, ["Overshoot [%]", "0", "0", "0"]),
+        ("overshoot_percent", 22.0, 3.7e-7, ["Overshoot [%]", "22", "0", "+22 percentage points"]),
+        ("settling_time", 0.6, 0.5, ["Settling time [s]", "0.6", "0.5", "+20.0 %"]),
+        ("prefilter", 0.14, 0.07, ["Prefilter [V/cm]", "0.14", "0.07", "+100 %"]),
+        # above ten times the recomputed number, the ratio is given instead of percent
+        ("settling_time", 20.0, 2.0, ["Settling time [s]", "20", "2", "+900 %"]),
+        ("settling_time", 2538.0, 2.0, ["Settling time [s]", "2538", "2", "1269 times"]),
+        ("settling_time", -2538.0, 2.0, ["Settling time [s]", "−2538", "2", "−1269 times"]),
+    ],
+)
+def test_numbers_of_a_criterion_have_words_and_units(name, found, expected, cells):
+    """A criterion's number has a label, its unit, both values and their difference."""
+    assert shown_numbers(name, found, expected, check="claims") == cells
 
 
 @pytest.mark.parametrize(
@@ -378,11 +373,7 @@ def test_numbers_of_a_criterion_have_words_and_units():
 )  # fmt: skip
 def test_a_number_has_its_unit(name, unit):
     """Each parameter and each entry of A and B is shown with its unit."""
-    one = make_grade("a").criteria[0].model_copy(update={"expected": {name: 1.0}, "found": {}})
-    units = Units(position="cm", input="V")
-    shown = numbers_table(one, check="final", units=units, numbers=count(1))
-    assert shown is not None
-    label = plain(shown.rows[0][0].text)
+    label = shown_numbers(name, None, 1.0, check="final")[0]
     assert label.endswith(f" [{unit}]") if unit else "[" not in label
 
 
