@@ -134,8 +134,8 @@ def test_canvas_gets_a_row_for_each_author(tmp_path, class_, overrides, cells, a
     assert not any(remark.left_out for remark in remarks)
 
 
-def test_authors_that_are_not_read_yet_are_not_said_to_be_none(tmp_path):
-    """Whether a submission names no author, or its authors could not be read yet, is told apart."""
+def test_unread_authors_are_not_missing_authors(tmp_path):
+    """The remark tells authors that could not be read yet from authors that are not named."""
     said = {write(tmp_path, one, platform="canvas")[1][0].text for one in (stopped(), NOBODY)}
     assert len(said) == 2
 

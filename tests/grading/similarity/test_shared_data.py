@@ -13,7 +13,7 @@ from pipeline.grading.similarity.copies import find_copies, same_recordings
 from pipeline.grading.similarity.fingerprints import fingerprint, unpack
 from pipeline.grading.similarity.flag import shared_flag
 from pipeline.ingest.read import read_data
-from pipeline.simulated.bench import COUNT
+from pipeline.simulated.bench import COUNT, SimulatedBench
 from pipeline.simulated.hidden import preset_bench
 from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
@@ -23,7 +23,7 @@ from tests.helpers.ucsd import write_two_cart_submission
 LONG = [pytest.mark.slow, pytest.mark.sample]
 
 
-def recorded(folder, bench="throne-2dof", *, seeds):
+def recorded(folder, bench: str | SimulatedBench = "throne-2dof", *, seeds):
     """Return the recordings of teams that used the same bench in the same way."""
     for seed in seeds:
         write_submission(folder / str(seed), bench, seed=seed, compact=True)
