@@ -343,7 +343,7 @@ def test_an_overshoot_below_the_goal_costs_nothing():
     omega, zeta = 1.5 * float(np.sqrt(k / m)), 0.65
     gains = (typed(m * omega**2 - k), typed(2 * zeta * omega * m - c))
     update = {"gains": gains, "prefilter": typed(m * omega**2)}
-    grade = one.reporting(feedback=loop.model_copy(update=update)).grade()
+    grade = one.reporting(feedback=loop.model_copy(update=update)).under(step=0.01).grade()
     found = criterion(grade, "feedback")
     assert 5.0 < found.found["overshoot_percent"] < found.expected["overshoot_percent"]
     assert found.points == found.out_of

@@ -231,6 +231,13 @@ def test_a_slip_in_a_table_gets_its_flag(code, table, carts):
 
 
 @pytest.mark.parametrize("carts", CARTS)
+@pytest.mark.parametrize("table", TABLES)
+def test_frequencies_that_were_converted_twice_are_flagged(carts, table):
+    """Frequencies in rad/s that were multiplied by 2π once more get the flag of a unit."""
+    assert flags(scaled(TURN, "omega")(student(carts), table)) == ["hz_for_rad_s"]
+
+
+@pytest.mark.parametrize("carts", CARTS)
 @pytest.mark.parametrize("k", [1, 3])
 def test_one_period_too_many_is_flagged(carts, k):
     """The count of periods is named, whether there are one, two or three."""
