@@ -6,7 +6,7 @@ from benchmarks.page import Table, share
 from pipeline.arrays import Array
 from pipeline.estimation.decay import fit_log_decrement
 from pipeline.estimation.sine import Dwell
-from pipeline.estimation.step_gain import fit_step_gain
+from pipeline.estimation.static_gain import fit_static_gain
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import ExperimentKind, Record
@@ -161,7 +161,7 @@ def _step_errors() -> list[tuple[float, float]]:
         for chain in PRESETS.values():
             run = record(t, simulate_linear(chain, t, u), kind="step", u=u)
             for cart, truth in enumerate(chain.static_gains(), start=1):
-                got = fit_step_gain(run, cart=cart)
+                got = fit_static_gain(run, cart=cart)
                 found.append((got.gain / truth - 1, (got.gain - truth) / got.gain_std))
     return found
 

@@ -4,7 +4,7 @@ import pytest
 
 from pipeline.names import gain_name, own_omega, own_zeta, parameter_names, read_name
 from pipeline.plant.chain import PRESETS
-from pipeline.plant.identities import brackets, orders
+from pipeline.plant.identities import interlacing_brackets, parameter_orders
 from pipeline.setup import PAPER_UNITS
 
 
@@ -32,7 +32,7 @@ def test_a_rigid_body_has_a_damping_but_no_ratio():
 def test_a_table_without_its_last_resonance_sets_no_upper_bound():
     """Without the last resonance, single carts' frequencies have only a lower bound."""
     names = ["K_1", "K_2", "omega_1", "omega_2", "omega_a"]
-    found = [(lesser, greater) for lesser, greater, _ in orders(names)]
+    found = [(lesser, greater) for lesser, greater, _ in parameter_orders(names)]
     assert found == [("K_2", "K_1"), ("omega_a", "omega_1"), ("omega_a", "omega_2")]
 
 
@@ -40,7 +40,7 @@ def test_a_table_without_its_last_resonance_sets_no_upper_bound():
 def test_real_chains_obey_the_inequalities(preset):
     """The carts of the paper satisfy every inequality between named parameters."""
     values = PRESETS[preset].parameters()
-    for low, middle, high, _ in brackets(PRESETS[preset].n):
+    for low, middle, high, _ in interlacing_brackets(PRESETS[preset].n):
         assert values[low] < values[middle] < values[high]
-    for lesser, greater, _ in orders(list(values)):
+    for lesser, greater, _ in parameter_orders(list(values)):
         assert values[lesser] <= values[greater]

@@ -4,7 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from docs.codegen.laws import columns_source, laws_source, terms_source
+from docs.codegen.forces import columns_source, forces_source, terms_source
 from pipeline.output import write_file
 from pipeline.plant import simulator
 from pipeline.plant.catalogue import CATALOGUE
@@ -12,7 +12,7 @@ from pipeline.plant.catalogue import CATALOGUE
 ROOM = Path(simulator.__file__).parent
 MADE = {
     "columns.py": columns_source,
-    "laws.py": laws_source,
+    "generated_forces.py": forces_source,
     "terms.py": terms_source,
 }
 

@@ -94,7 +94,7 @@ def inspect(
 @app.command()
 def fill(folder: Folder, as_json: AsJson = False) -> None:
     """Find out what the files in DIR/data are and add their entries to submission.toml."""
-    from pipeline.identify.springs import fill as fill_folder
+    from pipeline.identify.springs import fill_folder
     from pipeline.ingest.fill import format_found, format_passed_over
 
     toml = folder / "submission.toml"

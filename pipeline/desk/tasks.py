@@ -22,7 +22,7 @@ from pipeline.desk.form_input import read_path
 from pipeline.desk.last_report import FINDINGS, PLOTS_OF, stat_sources
 from pipeline.desk.student.folder_tasks import FOLDER_TASKS
 from pipeline.errors import ConfigError, SubmissionError
-from pipeline.identify.springs import fill as fill_folder
+from pipeline.identify.springs import fill_folder
 from pipeline.ingest.channels import never_changes
 from pipeline.ingest.columns import assign_columns
 from pipeline.ingest.files import OF_STRANGERS, read_table

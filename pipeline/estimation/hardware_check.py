@@ -545,8 +545,10 @@ def _compare(
         motion = float(np.sum((measured - run.rest[row]) ** 2))
         if motion == 0:
             continue
-        step_measured = _judge(run, measured, row=row, window=window, noise=3 * run.noise[row])
-        step_model = _judge(run, model, row=row, window=window, noise=0.0)
+        step_measured = _overshoot_and_settling(
+            run, measured, row=row, window=window, noise=3 * run.noise[row]
+        )
+        step_model = _overshoot_and_settling(run, model, row=row, window=window, noise=0.0)
         checks.append(
             HardwareCheck(
                 experiment=record.id,
@@ -581,7 +583,9 @@ class _Step(NamedTuple):
     level: float | None = None
 
 
-def _judge(run: MeasuredRun, y: Array, *, row: int, window: slice | None, noise: float) -> _Step:
+def _overshoot_and_settling(
+    run: MeasuredRun, y: Array, *, row: int, window: slice | None, noise: float
+) -> _Step:
     """Return the step measures of one cart's readings `y` (n,) in the window."""
     if window is None:
         return _Step()

@@ -34,7 +34,7 @@ from pipeline.gap.parameters import (
 )
 from pipeline.gap.runs import GapRun, cut_shots
 from pipeline.plant.chain import Chain
-from pipeline.plant.simulator.laws import hysteresis, sliding, stribeck
+from pipeline.plant.simulator.generated_forces import hysteresis, sliding, stribeck
 from pipeline.plant.simulator.tables import Drive, Tables
 
 # ---------------------------------------------------------------------- one step within bounds

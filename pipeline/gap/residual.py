@@ -24,7 +24,7 @@ from pipeline.gap.types import (
     WindowedResidualForce,
 )
 from pipeline.plant.effect import AugmentedChain
-from pipeline.plant.simulator.laws import shaped_input
+from pipeline.plant.simulator.generated_forces import shaped_input
 from pipeline.setup import Setup
 
 # ------------------------------------------------------- the force over time, without simulation

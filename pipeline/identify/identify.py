@@ -22,7 +22,7 @@ from pipeline.estimation.frequency_response import (
 )
 from pipeline.estimation.record_fit import RecordFit, most_are_consistent, record_fits
 from pipeline.estimation.sine import Dwell
-from pipeline.estimation.step_gain import fit_step_gain
+from pipeline.estimation.static_gain import fit_static_gain
 from pipeline.identify.corrections import (
     find_faults,
     find_impossible_gains,
@@ -258,7 +258,7 @@ def _step_gains(runs: Runs, *, bench: Setup, log: Log) -> list[StepGain]:
     gains = []
     for run in steps:
         for cart in run.carts:
-            fit = partial(fit_step_gain, run, cart=cart)
+            fit = partial(fit_static_gain, run, cart=cart)
             gain = log.attempt_once(Stage.STEP_GAIN, fit, log.measured.gains, of=run.id, cart=cart)
             if gain:
                 gains.append(gain)

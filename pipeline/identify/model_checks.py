@@ -18,7 +18,7 @@ from pipeline.estimation.estimates import SIGMA_LIMIT, change_limit
 from pipeline.identify.findings import say
 from pipeline.names import gain_name, own_zeta, read_name, toml_flags
 from pipeline.plant.chain import Chain
-from pipeline.plant.identities import brackets, recover_from_parameters
+from pipeline.plant.identities import interlacing_brackets, recover_from_parameters
 from pipeline.plant.limits import HEAVY_DAMPING
 from pipeline.plant.margins import Margins, stability_margins
 from pipeline.plant.sampled_loop import discretise
@@ -256,7 +256,7 @@ def _frequency_order_checks(values: Mapping[str, float], *, n: int) -> list[Chec
     """
     damped = any(v > HEAVY_DAMPING for name, v in values.items() if read_name(name).is_ratio)
     checks = []
-    for low, middle, high, _ in brackets(n):
+    for low, middle, high, _ in interlacing_brackets(n):
         # Distance of the frequency from its allowed range, in percent of the frequency.
         excess = max(values[low] / values[middle], values[middle] / values[high]) - 1
         good = excess <= _REDUNDANCY

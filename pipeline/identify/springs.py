@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.errors import DataError, SubmissionError
 from pipeline.estimation.bode_fit import fit_bode
 from pipeline.estimation.estimates import SIGMA_LIMIT
-from pipeline.estimation.step_gain import fit_step_gain
+from pipeline.estimation.static_gain import fit_static_gain
 from pipeline.identify.model_checks import NEGLIGIBLE, check_vanishing
 from pipeline.ingest.fill import (
     Found,
@@ -91,7 +91,7 @@ class _BetterSprings:
         return max(self.after, EXPLAINED)
 
 
-def fill(folder: Path) -> Filled:
+def fill_folder(folder: Path) -> Filled:
     """Write the tables of the files in `data/`, and the springs if `submission.toml` is new.
 
     Raises
@@ -323,7 +323,7 @@ def _stays_away(step: Record) -> bool:
 def _gains(step: Record) -> list[StepGain]:
     """Return the static gains of all carts, or [] if a cart does not settle."""
     try:
-        return [fit_step_gain(step, cart=cart) for cart in sorted(step.carts)]
+        return [fit_static_gain(step, cart=cart) for cart in sorted(step.carts)]
     except DataError:
         return []
 

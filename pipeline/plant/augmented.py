@@ -15,8 +15,8 @@ from pipeline.errors import DataError
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import AugmentedChain
 from pipeline.plant.simulator import kernel
+from pipeline.plant.simulator.generated_forces import hysteresis, longest_step, shaped_input
 from pipeline.plant.simulator.kernel import advance, contact_gap, smooth_forces, toggle_contact
-from pipeline.plant.simulator.laws import hysteresis, longest_step, shaped_input
 from pipeline.plant.simulator.sensitivity import Push, make_sensitivities
 from pipeline.plant.simulator.tables import DRY, Cart, Drive, Spring, Tables
 

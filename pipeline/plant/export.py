@@ -21,7 +21,7 @@ from pipeline.errors import DataError
 from pipeline.plant import effect
 from pipeline.plant.augmented import SteppedBench, rest_positions
 from pipeline.plant.chain import Chain
-from pipeline.plant.simulator.laws import hysteresis
+from pipeline.plant.simulator.generated_forces import hysteresis
 from pipeline.resources import TEMPLATES
 from pipeline.setup import Units
 

@@ -35,7 +35,7 @@ class Bracket(NamedTuple):
     why: str
 
 
-def brackets(n: int) -> list[Bracket]:
+def interlacing_brackets(n: int) -> list[Bracket]:
     """Return the brackets of a chain of two or more carts that has all its springs."""
     modes, alone = omega_names(MODES[:n]), omega_names(map(str, range(1, n + 1)))
     found = [Bracket(modes[0], name, modes[-1], _ALONE) for name in alone]
@@ -47,7 +47,7 @@ def brackets(n: int) -> list[Bracket]:
     return found
 
 
-def orders(names: Sequence[str]) -> list[tuple[str, str, str]]:
+def parameter_orders(names: Sequence[str]) -> list[tuple[str, str, str]]:
     """Return (lesser, greater, why) for every order that the named parameters must obey.
 
     The names may have any order, and some of a chain's names may be missing.
@@ -62,7 +62,7 @@ def orders(names: Sequence[str]) -> list[tuple[str, str, str]]:
     )
     found = [(far, near, _GAINS) for near, far in pairwise(gains)]
     found += [(a, b, "the resonances are listed in rising order") for a, b in pairwise(modes)]
-    between = brackets(n) if n > 1 else []
+    between = interlacing_brackets(n) if n > 1 else []
     alone, others = [b for b in between if b.why == _ALONE], [b for b in between if b.why != _ALONE]
     found += [(b.low, b.middle, b.why) for b in alone]
     found += [(b.middle, b.high, b.why) for b in alone]

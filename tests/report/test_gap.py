@@ -31,7 +31,7 @@ from pipeline.json_files import json_text
 from pipeline.plant.augmented import simulate_augmented
 from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.plant.effect import AugmentedChain, effect_name, input_steps
-from pipeline.plant.simulator.laws import shaped_input
+from pipeline.plant.simulator.generated_forces import shaped_input
 from pipeline.report.document import Document, Formula, paragraph, plain_lines
 from pipeline.report.equations.effects import augmented_equations, in_order, law
 from pipeline.report.figures.gap import predicted_figure

@@ -390,7 +390,7 @@ def is_rough(fit: PemFit) -> bool:
     return bool(meets) and fit.chi > limits.AT_FLOOR
 
 
-def criterion(fit: PemFit, n_independent: float) -> float:
+def bic(fit: PemFit, n_independent: float) -> float:
     """Return the Bayesian criterion for `n_independent` readings, with a penalty for every effect.
 
     Two models are compared with the fuller model's `n_independent`, because only its residual is
@@ -407,17 +407,17 @@ def criterion(fit: PemFit, n_independent: float) -> float:
 
 def is_better(fuller: PemFit, other: PemFit) -> bool:
     """Return whether the criterion prefers the fuller of two models."""
-    return criterion(fuller, fuller.n_independent) < criterion(other, fuller.n_independent)
+    return bic(fuller, fuller.n_independent) < bic(other, fuller.n_independent)
 
 
 def drop_needless(fit: PemFit, records: Records) -> PemFit:
     """Drop every law that the criterion does not need, the least needed first; refit the others."""
     while order := _needless(fit, records):
-        here, rough = criterion(fit, fit.n_independent), is_rough(fit)
+        here, rough = bic(fit, fit.n_independent), is_rough(fit)
         while order:
             laws, p = fit.laws.without(fit.p, order)
             trial = records.refit(fit, laws, p)
-            if rough or criterion(trial, fit.n_independent) < here:
+            if rough or bic(trial, fit.n_independent) < here:
                 fit = trial
                 break
             if len(order) == 1:
@@ -541,7 +541,7 @@ def add_shaped(fit: PemFit, records: Records) -> PemFit | None:
     for law in (*trials, *backlash_laws(fit, records)):
         laws, p = fit.laws.with_laws(fit.p, [law])
         trial = records.refit(fit, laws, p, iterations=8)
-        if best is None or criterion(trial, fit.n_independent) < criterion(best, fit.n_independent):
+        if best is None or bic(trial, fit.n_independent) < bic(best, fit.n_independent):
             best = trial
     if best is None or not is_better(best, fit):
         return None

@@ -18,7 +18,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.grading.mistakes.undo import Number
 from pipeline.names import parameter_names, read_name
-from pipeline.plant.identities import orders, recover_from_parameters
+from pipeline.plant.identities import parameter_orders, recover_from_parameters
 
 MOST_WIDENING = 4  # tolerances; a law that needs this much widening earns no points
 _PER_TOLERANCE = 2  # steps of widening per tolerance
@@ -92,7 +92,7 @@ def _evaluate(
     results: dict[str, tuple[str, bool]] = {}
     for name in parameter_names(n):
         results[f"positive.{name}"] = (f"{name} is not positive", value[name] > 0)
-    for lesser, greater, reason in orders(parameter_names(n)):
+    for lesser, greater, reason in parameter_orders(parameter_names(n)):
         holds = value[lesser] - half[lesser] <= value[greater] + half[greater]
         said = (
             f"{lesser} = {value[lesser]:.4g} is above {greater} = {value[greater]:.4g} ({reason})"

@@ -8,7 +8,7 @@ from pipeline.grading.grade import Flag
 from pipeline.grading.references.tolerance import as_typed, rounding
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
-from pipeline.plant.identities import orders
+from pipeline.plant.identities import parameter_orders
 from pipeline.plant.limits import HEAVY_DAMPING
 
 
@@ -78,7 +78,7 @@ def broken_orders(table: Mapping[str, Decimal], *, initial: bool) -> list[Broken
     slack = 1.2 if initial else 1.1
     heavy = any(v > HEAVY_DAMPING for n, v in table.items() if read_name(n).is_ratio)
     broken = []
-    for lesser, greater, reason in orders(list(table)):
+    for lesser, greater, reason in parameter_orders(list(table)):
         if heavy and read_name(lesser).is_frequency:
             continue
         low, high = table[lesser], table[greater]

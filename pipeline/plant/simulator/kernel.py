@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from pipeline.arrays import Array
 from pipeline.plant.simulator.columns import DRY, Cart, Drive, Spring
 from pipeline.plant.simulator.compiler import inlined, jit
-from pipeline.plant.simulator.laws import (
+from pipeline.plant.simulator.generated_forces import (
     ON_CARTS,
     ON_DRIVE,
     ON_SPRINGS,

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 from pipeline.plant.simulator.compiler import jit
-from pipeline.plant.simulator.laws import (
+from pipeline.plant.simulator.generated_forces import (
     ON_CARTS,
     ON_DRIVE,
     ON_SPRINGS,

@@ -163,7 +163,7 @@ _SIMULATED = (
 )
 
 
-def laws_source(catalogue: Sequence[Effect]) -> str:
+def forces_source(catalogue: Sequence[Effect]) -> str:
     """Return the source of the laws."""
     out = [
         _HEAD.format("The laws of the effects, for the compiled simulators."),

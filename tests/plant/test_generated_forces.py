@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from docs.codegen.__main__ import MADE, ROOM
 from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.plant.effect import ContactLaw, Effect, ForceLaw, FrictionLaw, HysteresisLaw, evaluate
-from pipeline.plant.simulator import laws, terms
+from pipeline.plant.simulator import generated_forces, terms
 from pipeline.plant.simulator.tables import TABLES
 from pipeline.words.math import to_tex
 
@@ -78,8 +78,8 @@ def test_hysteresis_settles_at_the_rate_of_its_law(v):
     cart = np.zeros((1, len(TABLES["cart"])))
     for column, value in effect.columns({"force": p[0], "distance": p[1]}).items():
         cart[0, column] = value
-    assert_allclose(laws.hysteresis(cart, 0, v), out[:3], rtol=1e-12)
-    assert_allclose(laws.hysteresis_slopes(cart, 0, v), out[3:5], rtol=1e-12)
+    assert_allclose(generated_forces.hysteresis(cart, 0, v), out[:3], rtol=1e-12)
+    assert_allclose(generated_forces.hysteresis_slopes(cart, 0, v), out[3:5], rtol=1e-12)
     step = 1e-6
     by_v = (settled(p, v + step) - settled(p, v - step)) / (2 * step)
     assert_allclose(out[3:5], by_v[1:3], atol=1e-8)

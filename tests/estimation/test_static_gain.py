@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.errors import DataError
-from pipeline.estimation.step_gain import fit_step_gain
+from pipeline.estimation.static_gain import fit_static_gain
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.simulate import simulate_linear
@@ -68,7 +68,7 @@ def test_every_cart_has_its_static_gain(chain, size):
     t = seconds(14.0)
     run = run_of(chain, t, staircase(t, (0.5, size), (7.0, 0.0)), offset=0.3)
     for cart, truth in enumerate(chain.static_gains(), start=1):
-        got = fit_step_gain(run, cart=cart)
+        got = fit_static_gain(run, cart=cart)
         # Rounding moves each of the two levels by up to half a count, together by one count.
         assert_allclose(got.gain, truth, atol=COUNT / abs(size))
         assert abs(got.gain - truth) < 3 * got.gain_std
@@ -83,7 +83,7 @@ def test_an_exact_record_gives_the_exact_gain():
     """Without rounding, the gain is exact even if the record ends before the carts settle."""
     chain, t = PRESETS["throne-2dof"], seconds(5.0)
     run = run_of(chain, t, staircase(t, (0.5, 0.03)), count=0.0)
-    got = fit_step_gain(run, cart=2)
+    got = fit_static_gain(run, cart=2)
     assert_allclose(got.gain, chain.static_gains()[1], rtol=1e-7)
 
 
@@ -91,7 +91,7 @@ def test_each_step_in_a_record_gives_a_gain():
     """If a record has several steps of different size and sign, each of them gives a gain."""
     chain, t = PRESETS["throne-1dof"], seconds(24.0)
     u = staircase(t, (0.5, 0.02), (5.0, 0.04), (10.0, -0.03), (15.0, 0.0), (20.0, -0.01))
-    got = fit_step_gain(run_of(chain, t, u), cart=1)
+    got = fit_static_gain(run_of(chain, t, u), cart=1)
     sizes = [edge.u_after - edge.u_before for edge in got.edges]
     assert_allclose(sizes, [0.02, 0.02, -0.07, 0.03, -0.01], atol=1e-12)
     assert_allclose(got.gain, chain.static_gains()[0], rtol=2e-3)
@@ -102,7 +102,7 @@ def test_a_level_is_read_while_nothing_moves():
     """A level is read while nothing moves: just before an edge, and after the ringing."""
     t = seconds(14.0)
     run = run_of(PRESETS["throne-1dof"], t, staircase(t, (2.0, 0.03), (8.0, 0.0)))
-    on, off = fit_step_gain(run, cart=1).edges
+    on, off = fit_static_gain(run, cart=1).edges
     assert on.window_before == (0.0, t[t < 2.0][-1])
     # The ringing of 0.87 cm e^(-1.32 t) is 1.5 counts at 4.2 s.
     assert 5.0 < on.window_after[0] < 7.0
@@ -123,7 +123,7 @@ def test_if_a_record_ends_early_a_fit_gives_the_level(name, wait):
     chain, t = PRESETS[name], seconds(0.5 + wait)
     run = run_of(chain, t, staircase(t, (0.5, 0.03)), noise=0.2 * COUNT)
     for cart, truth in enumerate(chain.static_gains(), start=1):
-        got = fit_step_gain(run, cart=cart)
+        got = fit_static_gain(run, cart=cart)
         assert abs(got.gain - truth) < 4 * got.gain_std
         assert_allclose(got.gain, truth, rtol=1e-2)
         assert "still oscillates" in got.note
@@ -150,7 +150,7 @@ def test_an_unusual_step_gives_the_gain(name):
     t, u, noise, rest, edges, note = UNUSUAL[name]
     chain = PRESETS["throne-1dof"]
     noisy = u + noise * np.random.default_rng(0).normal(size=t.size)
-    got = fit_step_gain(replace(run_of(chain, t, u, offset=rest), u=noisy), cart=1)
+    got = fit_static_gain(replace(run_of(chain, t, u, offset=rest), u=noisy), cart=1)
     assert len(got.edges) == edges
     # Half a count at each level; a drift and an input's noise move the level by about as much.
     assert_allclose(got.gain, chain.static_gains()[0], atol=1.1 * COUNT / 0.03)
@@ -163,7 +163,7 @@ def test_noise_is_averaged(noise):
     """Noise on the position is averaged, and the gain is right to four standard errors."""
     chain, t = PRESETS["throne-2dof"], seconds(14.0)
     u = staircase(t, (1.0, 0.03), (7.0, 0.0))
-    got = fit_step_gain(run_of(chain, t, u, noise=noise * COUNT), cart=1)
+    got = fit_static_gain(run_of(chain, t, u, noise=noise * COUNT), cart=1)
     assert abs(got.gain - chain.static_gains()[0]) < 4 * got.gain_std
     assert got.gain_std < noise * COUNT / 0.03 / 1.5  # below the noise of a single sample
 
@@ -184,7 +184,7 @@ def test_a_cart_that_sticks_gets_an_interval():
     """If a cart sticks, its gain gets an interval that contains the gain without friction."""
     t = seconds(11.0)
     u = staircase(t, (1.0, 0.03), (6.0, 0.0))
-    got = fit_step_gain(record(t, u, sticking(t, rests=(0.0, -0.01, 0.03))[None]), cart=1)
+    got = fit_static_gain(record(t, u, sticking(t, rests=(0.0, -0.01, 0.03))[None]), cart=1)
     assert got.rest_shift is not None
     assert_allclose(got.rest_shift, 0.03, atol=COUNT)
     assert got.interval is not None
@@ -200,7 +200,7 @@ def test_a_step_too_small_to_move_the_cart_is_not_used():
     """If friction holds the cart at an edge, a note names the edge, and the edge is not used."""
     t = seconds(11.0)
     u = staircase(t, (1.0, 0.03), (6.0, 0.035))
-    got = fit_step_gain(
+    got = fit_static_gain(
         record(t, u, sticking(t, rests=(0.0, 0.0, 0.0), levels=(0, 0.9, 0.9))[None]), cart=1
     )
     assert_allclose(got.gain, 30.0, atol=COUNT / 0.03)
@@ -233,7 +233,7 @@ RIGID = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.zeros(2))
 def test_what_gives_no_gain_is_refused(run, message):
     """Without an input that steps, or a free cart that moves and settles, there is no gain."""
     with pytest.raises(DataError, match=message):
-        fit_step_gain(run, cart=1)
+        fit_static_gain(run, cart=1)
 
 
 # -------------------------------------------------------------------- real carts
@@ -247,7 +247,7 @@ def test_real_steps_agree_within_their_spread(real_data, tmp_path):
     folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(2, 3, 4, 5))
     runs = [r for r in read_data(load_submission(folder)).records if r.id.startswith("both")]
     for cart, truth in ((1, 560.0), (2, 550.0)):  # in counts per volt
-        got = [fit_step_gain(run, cart=cart) for run in runs]
+        got = [fit_static_gain(run, cart=cart) for run in runs]
         assert_allclose([abs(g.gain) for g in got], truth, rtol=0.05)
         assert all(g.rest_shift is not None and abs(g.rest_shift) < 10 for g in got)
         assert any(g.interval is not None for g in got)
@@ -260,7 +260,7 @@ def test_a_real_repeat_that_sticks_has_a_wide_interval(real_data, tmp_path):
     """
     folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(1,))
     run = next(r for r in read_data(load_submission(folder)).records if r.id == "both-1")
-    got = fit_step_gain(run, cart=2)
+    got = fit_static_gain(run, cart=2)
     assert got.rest_shift is not None
     assert abs(abs(got.rest_shift) - 32) < 1
     assert got.interval is not None

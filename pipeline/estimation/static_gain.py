@@ -48,7 +48,7 @@ class _Plateau:
     level: _Level | None
 
 
-def fit_step_gain(record: Record, *, cart: int) -> StepGain:
+def fit_static_gain(record: Record, *, cart: int) -> StepGain:
     """Estimate the static gain of one cart from every edge of a stepped input.
 
     A level is the mean of the samples after the last motion. If the record or the input ends a
