@@ -1,7 +1,7 @@
 """Free decay of one cart: logarithmic decrement, exponential fit, and why it may not be one."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -252,17 +252,43 @@ def _ratio(y: Array, run: list[int]) -> float:
 _PEAKS_FOR_REGRESSION = 4  # enough for two amplitudes
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Peaks:
-    """Turning points, and the decrement and damped frequency from them, with standard errors."""
+    """Turning points, and the decrement and damped frequency from them, with standard errors.
 
-    t: Array
-    y: Array
-    amplitude: Array
-    delta: float
-    delta_std: float
-    omega_d: float
-    omega_d_std: float
+    The turning points are located between samples, and the log amplitude is regressed on their
+    number. With fewer than four turning points, the values are those of the exponential fit.
+    """
+
+    def __init__(self, t: Array, y: Array, decay: FreeDecay, *, floor: float) -> None:
+        pole = complex(decay.fit.poles[0])
+        # Within half a radian of a turning point, a cosine is nearly a parabola.
+        located = [_vertex(t, y, i, half_width=0.5 / pole.imag) for i in decay.turning]
+        self.t, self.y = np.array(located).reshape(-1, 2).T
+        n = self.t.size
+        swing = _half_swing(n)
+        signed = swing @ self.y
+        self.amplitude = np.abs(signed)
+        if n < _PEAKS_FOR_REGRESSION:
+            decay_std, omega_d_std = np.sqrt(np.diag(decay.fit.covariance)[2:])
+            self.delta = -2 * np.pi * pole.real / pole.imag
+            self.delta_std = float(2 * np.pi * decay_std / pole.imag)
+            self.omega_d, self.omega_d_std = pole.imag, float(omega_d_std)
+            return
+        # The noise of the amplitude A is constant, so ln A has the weight A². The standard errors
+        # follow from the errors of the turning points, because neighbouring amplitudes share them.
+        per_log = _slope(self.amplitude)
+        loss = -float(per_log @ np.log(self.amplitude))  # per half cycle
+        sigma = max(decay.fit.rms, floor)  # noise of one turning point, at most
+        loss_std = sigma * float(np.linalg.norm((per_log / signed) @ swing))
+        per_time = _slope(np.abs(np.gradient(self.y)))
+        interval = float(per_time @ self.t)
+        count = np.arange(n) - (n - 1) / 2
+        late = self.t - self.t.mean() - interval * count
+        interval_std = float(np.linalg.norm(per_time * late)) * np.sqrt(n / (n - 2))
+        # Because samples meet the motion at any phase, the decrement can still differ by 1e-4 of
+        # it.
+        self.delta, self.delta_std = 2 * loss, 2 * float(np.hypot(loss_std, 1e-4 * loss))
+        self.omega_d, self.omega_d_std = np.pi / interval, np.pi / interval**2 * interval_std
 
     @property
     def zeta(self) -> tuple[float, float]:
@@ -315,7 +341,7 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
             f"{record.id}: log decrement needs a decaying oscillation of cart {cart}, found "
             f"{_motion(fitted.zeta)} with {100 * unexplained:.0f} % of it unexplained"
         )
-    peaks = _peaks(t, y, decay, floor=floor)
+    peaks = _Peaks(t, y, decay, floor=floor)
     end = t[decay.stop - 1]
     n_figure = int(60 * pole.imag * (end - fit.t0) / (2 * np.pi)) + 2  # 60 points per period
     fit_t = np.linspace(fit.t0, end, min(n_figure, 3000))
@@ -417,52 +443,6 @@ def _motion(zeta: float) -> str:
 
 
 # -------------------------------------------------------------------- the peaks
-
-
-def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
-    """Locate the turning points between samples, and regress the log amplitude on their number.
-
-    With fewer than four turning points, the values are those of the exponential fit.
-    """
-    pole = complex(decay.fit.poles[0])
-    # Within half a radian of a turning point, a cosine is nearly a parabola.
-    located = [_vertex(t, y, i, half_width=0.5 / pole.imag) for i in decay.turning]
-    peak_t, peak_y = np.array(located).reshape(-1, 2).T
-    n = peak_t.size
-    swing = _half_swing(n)
-    signed = swing @ peak_y
-    amplitude = np.abs(signed)
-    decay_std, omega_d_std = np.sqrt(np.diag(decay.fit.covariance)[2:])
-    peaks = _Peaks(
-        t=peak_t,
-        y=peak_y,
-        amplitude=amplitude,
-        delta=-2 * np.pi * pole.real / pole.imag,
-        delta_std=float(2 * np.pi * decay_std / pole.imag),
-        omega_d=pole.imag,
-        omega_d_std=float(omega_d_std),
-    )
-    if n < _PEAKS_FOR_REGRESSION:
-        return peaks
-    # The noise of the amplitude A is constant, so ln A has the weight A². The standard errors
-    # follow from the errors of the turning points, because neighbouring amplitudes share them.
-    per_log = _slope(amplitude)
-    loss = -float(per_log @ np.log(amplitude))  # per half cycle
-    sigma = max(decay.fit.rms, floor)  # noise of one turning point, at most
-    loss_std = sigma * float(np.linalg.norm((per_log / signed) @ swing))
-    per_time = _slope(np.abs(np.gradient(peak_y)))
-    interval = float(per_time @ peak_t)
-    count = np.arange(n) - (n - 1) / 2
-    late = peak_t - peak_t.mean() - interval * count
-    interval_std = float(np.linalg.norm(per_time * late)) * np.sqrt(n / (n - 2))
-    # Because samples meet the motion at any phase, the decrement can still differ by 1e-4 of it.
-    return replace(
-        peaks,
-        delta=2 * loss,
-        delta_std=2 * float(np.hypot(loss_std, 1e-4 * loss)),
-        omega_d=np.pi / interval,
-        omega_d_std=np.pi / interval**2 * interval_std,
-    )
 
 
 def _slope(weight: Array) -> Array:

@@ -89,9 +89,10 @@ _ROUNDS, _SETTLED = 30, 1e-3  # most rounds of reweighting; change of the bulk a
 _BULK = 2.0  # standard deviations of the residual; data beyond have little weight
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class RecordResidualForce:
-    """The unexplained force on one cart in one record, over windows at `t` (n,).
+    """The force on one cart in one record that a law leaves unexplained, over windows at `t` (n,).
+
+    `columns` (n, unknowns) are the law's, and `size` is the usual residual.
 
     Attributes
     ----------
@@ -106,14 +107,21 @@ class RecordResidualForce:
     idle : whether the cart rests without an input (n,).
     """
 
-    record: Record
-    t: Array
-    residual: Array
-    acting: Array
-    state: Array
-    moves: NDArray[np.bool_]
-    jumps: NDArray[np.bool_]
-    idle: NDArray[np.bool_]
+    def __init__(self, windows: "_CartWindows", columns: Array, law: Array, *, size: float) -> None:
+        self.record, self.t, self.jumps = windows.means.record, windows.means.t, windows.means.jumps
+        self.moves, u, x = windows.moves, windows.means.u, windows.x
+        asked = columns[:, _SPRINGS] @ law[_SPRINGS]
+        free = windows.acceleration - asked - columns[:, _DAMPERS] @ law[_DAMPERS]
+        rubs, by_load = np.abs(law[_DRY])
+        # The largest static friction is assumed to be three times the friction in motion.
+        holds = 3.0 * (rubs + by_load * np.abs(u[0]))
+        at_rest = np.sign(free) * np.maximum(np.abs(free) - holds, 0.0)
+        offset, stiffness = law[0], -law[_POSITION]
+        rest = offset / stiffness if stiffness * np.ptp(x[1]) > size else 0.0
+        self.residual = np.where(self.moves, free - columns[:, _DRY] @ law[_DRY], at_rest)
+        self.acting = np.maximum(np.abs(windows.acceleration), np.abs(asked))
+        self.state = np.array([x[1] - rest, *np.diff(x, axis=0), windows.v[1], u[0]])
+        self.idle = ~self.moves & ~np.any(u, axis=0)
 
     @property
     def follows(self) -> NDArray[np.bool_]:
@@ -160,16 +168,22 @@ class WindowMeans:
         self.jumps = jumped[first + width] > jumped[np.maximum(first - reach, 0)]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _CartWindows:
     """Means over windows (n,) for one cart's law; `x` and `v` (3, n) include its neighbours."""
 
-    means: WindowMeans
-    x: Array
-    v: Array
-    acceleration: Array
-    noise: float
-    moves: NDArray[np.bool_]
+    def __init__(self, means: WindowMeans, cart: int) -> None:
+        record, self.means = means.record, means
+        near = [record.carts.index(c) if c in record.carts else None
+                for c in (cart - 1, cart, cart + 1)]  # fmt: skip
+        still = np.zeros(means.t.size)
+        row = record.carts.index(cart)
+        step = resolution(record.t, record.position(cart), step=record.encoder_step(cart))
+        self.x = np.array([still if i is None else means.x[i] for i in near])
+        self.v = np.array([still if i is None else means.v[i] for i in near])
+        self.acceleration = means.acceleration[row]
+        self.noise = means.gain * step / np.sqrt(12.0)
+        # A cart rests if its readings change by at most three steps in a window.
+        self.moves = means.span[row] > 3.0 * step
 
     def columns(self, *, driven: bool) -> Array:
         """Return the columns (n, unknowns) of the law: those of `_SPRINGS`, `_DAMPERS` and `_DRY`.
@@ -195,8 +209,7 @@ def record_residual_forces(
     One law is fitted to all records. Records in which a free neighbour was not measured are left
     out. The list is empty if the cart moves too little to fit the law.
     """
-    cut = [_between_neighbours(one, cart) for one in means if cart in one.record.free]
-    windows = [one for one in cut if one is not None]
+    windows = [_CartWindows(one, cart) for one in means if _forces_are_measured(one.record, cart)]
     if not windows:
         return [], 0.0
     columns = [one.columns(driven=cart == 1) for one in windows]
@@ -208,29 +221,10 @@ def record_residual_forces(
     if sum(target.size for _, target in parts) < 3 * unknowns:
         return [], 0.0
     laws, size = _fit(parts, least=_BULK * float(np.median([w.noise for w in windows])))
-    found = []
-    for one, column, law in zip(windows, columns, laws, strict=True):
-        asked = column[:, _SPRINGS] @ law[_SPRINGS]
-        free = one.acceleration - asked - column[:, _DAMPERS] @ law[_DAMPERS]
-        rubs, by_load = np.abs(law[_DRY])
-        # The largest static friction is assumed to be three times the friction in motion.
-        u = one.means.u
-        holds = 3.0 * (rubs + by_load * np.abs(u[0]))
-        at_rest = np.sign(free) * np.maximum(np.abs(free) - holds, 0.0)
-        offset, stiffness = law[0], -law[_POSITION]
-        rest = offset / stiffness if stiffness * np.ptp(one.x[1]) > size else 0.0
-        found.append(
-            RecordResidualForce(
-                record=one.means.record,
-                t=one.means.t,
-                residual=np.where(one.moves, free - column[:, _DRY] @ law[_DRY], at_rest),
-                acting=np.maximum(np.abs(one.acceleration), np.abs(asked)),
-                state=np.array([one.x[1] - rest, *np.diff(one.x, axis=0), one.v[1], u[0]]),
-                moves=one.moves,
-                jumps=one.means.jumps,
-                idle=~one.moves & ~np.any(u, axis=0),
-            )
-        )
+    found = [
+        RecordResidualForce(one, column, law, size=size)
+        for one, column, law in zip(windows, columns, laws, strict=True)
+    ]
     return found, size
 
 
@@ -239,24 +233,10 @@ def _width(record: Record) -> int:
     return max(round(_WINDOW / record.sample_time) + 1, 9)
 
 
-def _between_neighbours(means: WindowMeans, cart: int) -> _CartWindows | None:
-    """Return the data to which one cart's law is fitted; None if a free neighbour is unmeasured."""
-    record, neighbours = means.record, (cart - 1, cart, cart + 1)
-    if any(c in record.free and c not in record.carts for c in neighbours):
-        return None
-    rows = [record.carts.index(c) if c in record.carts else None for c in neighbours]
-    still = np.zeros(means.t.size)
-    row = record.carts.index(cart)
-    step = resolution(record.t, record.position(cart), step=record.encoder_step(cart))
-    # A cart rests if its readings change by at most three steps in a window.
-    return _CartWindows(
-        means=means,
-        x=np.array([still if i is None else means.x[i] for i in rows]),
-        v=np.array([still if i is None else means.v[i] for i in rows]),
-        acceleration=means.acceleration[row],
-        noise=means.gain * step / np.sqrt(12.0),
-        moves=means.span[row] > 3.0 * step,
-    )
+def _forces_are_measured(record: Record, cart: int) -> bool:
+    """Return whether a cart is free, and it and its free neighbours were measured."""
+    near = (c for c in (cart - 1, cart, cart + 1) if c in record.free)
+    return cart in record.free and all(c in record.carts for c in near)
 
 
 def _hop(record: Record) -> int:
@@ -653,9 +633,7 @@ def _shows_delay(record: Record, cart: int) -> bool:
     All forces on the cart must have been measured, and both this cart and the cart before it must
     move far.
     """
-    if any(c not in record.carts or c not in record.free for c in (cart - 1, cart)):
-        return False
-    if cart + 1 in record.free and cart + 1 not in record.carts:
+    if cart - 1 not in record.free or not _forces_are_measured(record, cart):
         return False
     # The motion must span at least this many encoder steps.
     return all(np.ptp(record.position(c)) > 20.0 * record.encoder_step(c) for c in (cart - 1, cart))

@@ -12,7 +12,7 @@ consider those with the smallest inputs, and choose the fastest.
 """
 
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from typing import Literal
 
@@ -292,19 +292,19 @@ def _design(plant: SampledPlant, task: Design) -> FeedbackDesign:
     """Choose among the candidates of the task's method, and simulate the chosen one."""
     if task.method == "lqr":
         requested, costs = None, energy_weights(plant, _WEIGHTS)
-        candidates = _try_step(plant, lqr_gains(plant.phi, plant.gamma, costs), task)
+        candidates = _Candidates(plant, lqr_gains(plant.phi, plant.gamma, costs), task)
         best, met = _choose(plant, candidates, task)
         if not met:  # the goal may be much faster than the plant
             heavy = energy_weights(plant, _HEAVY_WEIGHTS)
             # At slow sampling, the heaviest weights have no solution in double precision.
             with suppress(np.linalg.LinAlgError):
-                candidates = _try_step(plant, lqr_gains(plant.phi, plant.gamma, heavy), task)
+                candidates = _Candidates(plant, lqr_gains(plant.phi, plant.gamma, heavy), task)
                 best, met = _choose(plant, candidates, task)
                 costs = heavy
     else:
         requested, costs = _pole_candidates(plant, task), None
         z = np.exp(requested * plant.sample_time)
-        candidates = _try_step(plant, place_poles(plant.phi, plant.gamma, z), task)
+        candidates = _Candidates(plant, place_poles(plant.phi, plant.gamma, z), task)
         best, met = _choose(plant, candidates, task)
     design = _finish(
         plant,
@@ -354,60 +354,57 @@ def _pair(omega: Array, zeta: Array) -> ComplexArray:
 # ------------------------------------------------------------ judging candidates
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Candidates:
-    """The response of each set of gains (n_candidates, 2n) to the goal's step."""
-
-    gains: Array
-    overshoot: Array  # percent
-    settling: Array  # s; estimated from the slowest pole if the simulated step ends earlier
-    peak: Array  # input units
-    level_error: Array  # percent of the step, due to errors in the model
-
-
-def _try_step(plant: SampledPlant, gains: Array, task: Design) -> _Candidates:
-    """Simulate the step of every candidate at once, exactly at the simulated points.
+    """The response of each set of gains (n_candidates, 2n) to the goal's step, exact at its points.
 
     The points are close enough to show every peak, also between the ticks of a slow clock. If the
     simulation therefore ends before the goal's settling time, the settling time is estimated.
+
+    Attributes
+    ----------
+    overshoot, level_error : percent of the step; the latter is due to errors in the model.
+    settling : s; estimated from the slowest pole if the simulated step ends earlier.
+    peak : input units.
     """
-    loop = plant.phi - plant.gamma[:, None] * gains[:, None, :]
-    fastest = np.abs(plant.chain.poles).max() + 4 / task.settling_time
-    # The step is simulated for three times the goal's settling time, if there are enough points for
-    # this.
-    apart = min(3.0 * task.settling_time / _POINTS, sampled_loop.RADIANS_PER_STEP / fastest)
-    stride = max(1, round(apart / plant.sample_time))
-    parts = sampled_loop.parts_per_sample(plant.chain, plant.sample_time)
-    level = np.linalg.solve(np.eye(plant.gamma.size) - loop, plant.gamma[:, None])
-    prefilter = 1 / level[:, plant.row]
-    level = level * prefilter[:, None]
-    # In each sample, the distance to the level is multiplied by `loop`. Each pass doubles the
-    # points.
-    to_go, ahead = -level, np.linalg.matrix_power(loop, stride)
-    while to_go.shape[-1] * parts < _POINTS:
-        to_go, ahead = np.concatenate([to_go, ahead @ to_go], axis=-1), ahead @ ahead
-    points = np.arange(to_go.shape[-1], dtype=np.float64)[:, None] + np.arange(parts) / parts
-    t = plant.sample_time * (1 + stride * points.ravel())  # the first sample is the delay
-    # The effort is held from tick to tick, so it belongs to the distance at the last tick.
-    rows = [
-        phi[plant.row] - gamma[plant.row] * gains
-        for phi, gamma in (plant.after(part / parts) for part in range(parts))
-    ]
-    y = 1 + np.einsum("pci,cin->cnp", rows, to_go).reshape(len(gains), -1)
-    # The input that holds the level is included, because a slow candidate may not be there yet.
-    u = prefilter - np.einsum("ci,cin->cn", gains, np.append(to_go, 0 * level, axis=-1) + level)
-    one = np.ones(len(gains))
-    settling = t[0] + simulate.settling_time(t, y, before=0.0, level=one)
-    radius = np.abs(np.linalg.eigvals(loop)).max(-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        slowest = -4 * plant.sample_time / np.log(radius)
-    return _Candidates(
-        gains=gains,
-        overshoot=simulate.overshoot_percent(y, before=0.0, level=one),
-        settling=np.where(np.isnan(settling), np.where(radius < 1, slowest, np.inf), settling),
-        peak=np.abs(u).max(-1) * plant.stiffness * abs(task.reference),
-        level_error=level_error_percent(plant.chain, plant.to_units(gains), cart=plant.cart),
-    )
+
+    def __init__(self, plant: SampledPlant, gains: Array, task: Design) -> None:
+        self.gains = gains
+        loop = plant.phi - plant.gamma[:, None] * gains[:, None, :]
+        fastest = np.abs(plant.chain.poles).max() + 4 / task.settling_time
+        # The step is simulated for three times the goal's settling time, if there are enough points
+        # for this.
+        apart = min(3.0 * task.settling_time / _POINTS, sampled_loop.RADIANS_PER_STEP / fastest)
+        stride = max(1, round(apart / plant.sample_time))
+        parts = sampled_loop.parts_per_sample(plant.chain, plant.sample_time)
+        level = np.linalg.solve(np.eye(plant.gamma.size) - loop, plant.gamma[:, None])
+        prefilter = 1 / level[:, plant.row]
+        level = level * prefilter[:, None]
+        # In each sample, the distance to the level is multiplied by `loop`. Each pass doubles the
+        # points.
+        to_go, ahead = -level, np.linalg.matrix_power(loop, stride)
+        while to_go.shape[-1] * parts < _POINTS:
+            to_go, ahead = np.concatenate([to_go, ahead @ to_go], axis=-1), ahead @ ahead
+        points = np.arange(to_go.shape[-1], dtype=np.float64)[:, None] + np.arange(parts) / parts
+        t = plant.sample_time * (1 + stride * points.ravel())  # the first sample is the delay
+        # The effort is held from tick to tick, so it belongs to the distance at the last tick.
+        rows = [
+            phi[plant.row] - gamma[plant.row] * gains
+            for phi, gamma in (plant.after(part / parts) for part in range(parts))
+        ]
+        y = 1 + np.einsum("pci,cin->cnp", rows, to_go).reshape(len(gains), -1)
+        # The input that holds the level is included, because a slow candidate may not be there yet.
+        u = prefilter - np.einsum("ci,cin->cn", gains, np.append(to_go, 0 * level, axis=-1) + level)
+        one = np.ones(len(gains))
+        settling = t[0] + simulate.settling_time(t, y, before=0.0, level=one)
+        radius = np.abs(np.linalg.eigvals(loop)).max(-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slowest = -4 * plant.sample_time / np.log(radius)
+        self.overshoot = simulate.overshoot_percent(y, before=0.0, level=one)
+        estimated = np.where(radius < 1, slowest, np.inf)
+        self.settling = np.where(np.isnan(settling), estimated, settling)
+        self.peak = np.abs(u).max(-1) * plant.stiffness * abs(task.reference)
+        unscaled = plant.to_units(gains)
+        self.level_error = level_error_percent(plant.chain, unscaled, cart=plant.cart)
 
 
 def _choose(plant: SampledPlant, candidates: _Candidates, task: Design) -> tuple[int, bool]:
