@@ -33,9 +33,15 @@ SECOND = 0.3, 3.0  # frequencies where a second mode may be, relative to that of
 UNKNOWNS = 6  # of an exponential decay with a drift
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Departure:
-    """The residual of an exponential fit to a decay, relative to the noise.
+    """Whether the residual of an exponential fit to the decay `y` exceeds the noise.
+
+    Parameters
+    ----------
+    step : the encoder step.
+    floor : the noise between neighbouring samples (root mean square).
+    friction : what a little dry friction adds to the decay, shape (n,). This one column shows less
+        friction than the many of the flexible change.
 
     Attributes
     ----------
@@ -47,67 +53,46 @@ class Departure:
     noise : residual (n,) of the flexible change.
     """
 
-    statistic: float
-    limit: float
-    columns: int
-    left: Array
-    noise: Array
+    def __init__(
+        self, t: Array, y: Array, fit: Ringing, *, step: float, floor: float, friction: Array
+    ) -> None:
+        tau, residual, pole = t - t[0], y - fit(t), complex(fit.poles[0])
+        n, angle = t.size, pole.imag * float(t[-1] - t[0]) / (t.size - 1)
+        orders = int(np.clip(angle * n / (2 * np.pi), *_ORDERS))
+        slow = legvander(2 * tau / tau[-1] - 1, orders).T
+        turning, decaying = np.exp(1j * pole.imag * tau), np.exp(pole.real * tau)
+        own = _columns(slow[:2], slow[:2] * decaying * turning)
+        flexible = _columns(
+            slow[2:4], slow * turning, slow[2:4] * decaying * turning, turning[None] ** 2,
+            turning[None] ** 3,
+        )  # fmt: skip
+        basis = np.linalg.qr(own)[0]
+        self.left = left = residual - basis @ (basis.T @ residual)
+        flexible /= np.linalg.norm(flexible, axis=0)
+        flexible -= basis @ (basis.T @ flexible)
+        added, sizes, _ = np.linalg.svd(flexible, full_matrices=False)
+        added = added[:, sizes > _SAME]
+        along = added.T @ left
+        self.columns = along.size
+        self.noise = noise = left - added @ along
+        density = noise_density(noise, angle=angle, step=step, unknowns=UNKNOWNS + along.size)
+        freedom = min(2.0 * _BINS, max(n - UNKNOWNS - along.size, 2.0))
+        self.limit = limit = float(fdtri(along.size, freedom, 1 - _CHANCE))
+        friction = friction - basis @ (basis.T @ friction)
+        # Friction only ever brakes, so chance has twice its share on this side.
+        rubbed = max(float(friction @ left), 0.0) ** 2 / float(friction @ friction) / density
+        most = max(_NOISE_SHARE * float(np.ptp(y)), _NOISE_RATIO * floor)
+        self.statistic = max(
+            float(along @ along) / along.size / density,
+            limit / float(fdtri(1, freedom, 1 - 2 * _CHANCE)) * rubbed,
+            limit / _LINE * _highest_line(noise, angle=angle),
+            limit * (float(np.std(noise)) / most) ** 2 if most > 0 else 0.0,
+        )
 
     @property
     def present(self) -> bool:
         """Whether more is left than noise."""
         return self.statistic > self.limit
-
-
-def find_departure(
-    t: Array, y: Array, fit: Ringing, *, step: float, floor: float, friction: Array
-) -> Departure:
-    """Test whether the residual of an exponential exceeds the noise of the decay `y`.
-
-    Parameters
-    ----------
-    step : the encoder step.
-    floor : the noise between neighbouring samples (root mean square).
-    friction : what a little dry friction adds to the decay, shape (n,). This one column shows less
-        friction than the many of the flexible change.
-    """
-    tau, residual, pole = t - t[0], y - fit(t), complex(fit.poles[0])
-    n, angle = t.size, pole.imag * float(t[-1] - t[0]) / (t.size - 1)
-    orders = int(np.clip(angle * n / (2 * np.pi), *_ORDERS))
-    slow = legvander(2 * tau / tau[-1] - 1, orders).T
-    turning, decaying = np.exp(1j * pole.imag * tau), np.exp(pole.real * tau)
-    own = _columns(slow[:2], slow[:2] * decaying * turning)
-    flexible = _columns(
-        slow[2:4], slow * turning, slow[2:4] * decaying * turning, turning[None] ** 2,
-        turning[None] ** 3,
-    )  # fmt: skip
-    basis = np.linalg.qr(own)[0]
-    left = residual - basis @ (basis.T @ residual)
-    flexible /= np.linalg.norm(flexible, axis=0)
-    flexible -= basis @ (basis.T @ flexible)
-    added, sizes, _ = np.linalg.svd(flexible, full_matrices=False)
-    added = added[:, sizes > _SAME]
-    along = added.T @ left
-    noise = left - added @ along
-    density = noise_density(noise, angle=angle, step=step, unknowns=UNKNOWNS + along.size)
-    freedom = min(2.0 * _BINS, max(n - UNKNOWNS - along.size, 2.0))
-    limit = float(fdtri(along.size, freedom, 1 - _CHANCE))
-    friction = friction - basis @ (basis.T @ friction)
-    # Friction only ever brakes, so chance has twice its share on this side.
-    rubbed = max(float(friction @ left), 0.0) ** 2 / float(friction @ friction) / density
-    most = max(_NOISE_SHARE * float(np.ptp(y)), _NOISE_RATIO * floor)
-    return Departure(
-        statistic=max(
-            float(along @ along) / along.size / density,
-            limit / float(fdtri(1, freedom, 1 - 2 * _CHANCE)) * rubbed,
-            limit / _LINE * _highest_line(noise, angle=angle),
-            limit * (float(np.std(noise)) / most) ** 2 if most > 0 else 0.0,
-        ),
-        limit=limit,
-        columns=along.size,
-        left=left,
-        noise=noise,
-    )
 
 
 def _highest_line(residual: Array, *, angle: float) -> float:
@@ -565,7 +550,7 @@ def explain_decay(
     density_of = partial(noise_density, angle=angle, step=step / np.sqrt(size))
     swings_at = partial(Swings, direction=-1.0 if falling else 1.0)
     around = np.array([turning[0], -fit.poles[0].real, omega])
-    departure = find_departure(
+    departure = Departure(
         coarse_t,
         coarse_y,
         fit,

@@ -155,13 +155,12 @@ def measured_run(record: Record, chain: Chain) -> MeasuredRun:
     ------
     DataError : cart 1 was held, or no free cart was measured or moved.
     """
-    free = tuple(sorted(set(record.free)))
-    if 1 not in free:
+    if 1 not in record.free:
         raise DataError(
             f"{record.id}: the hardware check needs cart 1, which the motor drives, to be free, "
-            f"found free {list(free)}"
+            f"found free {sorted(set(record.free))}"
         )
-    run = _begin(record, chain, free=free)
+    run = _begin(record, chain)
     # A range of more than six standard deviations is not due to chance.
     at_rest = np.all(np.ptp(run.y[:, : run.quiet], axis=1) <= 6 * run.noise)
     # At least five samples are needed to determine a rest.
@@ -180,12 +179,12 @@ def released_run(record: Record, chain: Chain) -> MeasuredRun:
     ------
     DataError : no free cart was measured or moved.
     """
-    return _begin(record, chain, free=tuple(sorted(set(record.free)))).begun_in_motion()
+    return _begin(record, chain).begun_in_motion()
 
 
-def _begin(record: Record, chain: Chain, *, free: tuple[int, ...]) -> MeasuredRun:
+def _begin(record: Record, chain: Chain) -> MeasuredRun:
     """Return the run under the assumption that it began at rest."""
-    t = record.t
+    t, free = record.t, tuple(sorted(set(record.free)))
     seen = np.array([cart in record.carts for cart in free])
     y = np.array([record.position(c) if c in record.carts else np.zeros(t.size) for c in free])
     if not np.any(np.ptp(y, axis=1) > 0):

@@ -43,7 +43,6 @@ _PEAK_LINES = 4  # lines of the padded spectrum; a sine's frequency is no furthe
 _ITERATIONS = 20
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Part:
     """A range of samples with the columns to fit, prepared once for all signals.
 
@@ -51,27 +50,16 @@ class _Part:
     phase of the sine advances by `angle` (rad) per sample.
     """
 
-    columns: Array
-    inverse: Array
-    angle: float
-
-    @classmethod
-    def of(cls, columns: Array, *, angle: float) -> "_Part":
-        return cls(columns=columns, inverse=inverse_of(columns), angle=angle)
-
-    def fit(self, y: Array) -> "_Sine":
-        coefficients = self.inverse @ y
-        residual = y - self.columns @ coefficients
-        return _Sine(part=self, coefficients=coefficients, residual=residual)
+    def __init__(self, columns: Array, *, angle: float) -> None:
+        self.columns, self.inverse, self.angle = columns, inverse_of(columns), angle
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Sine:
-    """A fitted sine with offset and linear drift: coefficients and residual."""
+    """A sine with offset and linear drift, fitted to y (n,): coefficients and residual."""
 
-    part: _Part
-    coefficients: Array
-    residual: Array
+    def __init__(self, part: _Part, y: Array) -> None:
+        self.part, self.coefficients = part, part.inverse @ y
+        self.residual = y - part.columns @ self.coefficients
 
     @property
     def z(self) -> complex:
@@ -234,8 +222,8 @@ class Dwell:
         if span not in self._parts:
             t = self._t[slice(*span)]
             angle = self._frequency[0] * (t[-1] - t[0]) / (t.size - 1)
-            self._parts[span] = _Part.of(self._columns[slice(*span)], angle=float(angle))
-        return self._parts[span].fit(y[slice(*span)])
+            self._parts[span] = _Part(self._columns[slice(*span)], angle=float(angle))
+        return _Sine(self._parts[span], y[slice(*span)])
 
     # ------------------------------------------------------------------ the steady part
 
@@ -317,12 +305,12 @@ def _refined(t: Array, y: Array, *, omega: float) -> tuple[float, float]:
     """Return the frequency of the sine near `omega`, and its standard error, rad/s."""
     half, angle = (t[-1] - t[0]) / 2, omega * (t[-1] - t[0]) / (t.size - 1)
     X = _columns(t, omega=omega)
-    fit = _Part.of(X, angle=angle).fit(y)
+    fit = _Sine(_Part(X, angle=angle), y)
     for _ in range(_ITERATIONS):
         # Change of the sine when omega changes by 1 rad at the ends of the record.
         turned = X[:, 3] * (fit.coefficients[0] * X[:, 1] - fit.coefficients[1] * X[:, 0])
         X = np.column_stack([_columns(t, omega=omega), turned])
-        fit = _Part.of(X, angle=angle).fit(y)
+        fit = _Sine(_Part(X, angle=angle), y)
         omega += fit.coefficients[4] / half
         # The change is below 1e-9 rad at the ends of the record.
         if abs(fit.coefficients[4]) < 1e-9:

@@ -10,7 +10,7 @@ J. Hill, Technometrics 9 (1967), 57-71.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from math import ceil
 from typing import Literal
@@ -50,17 +50,24 @@ _LEAST_WEIGHT = 0.1
 _SAME = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Weighed:
-    """A recording, its value, the pair of models that it separates best, and the separation."""
+    """A recording, its value, the pair of models that it separates best, and the separation.
 
-    worth: tuple[float, float]
-    recording: Recording
-    pair: tuple[int, int]
-    separation: float
-    t: Array
-    u: Array
-    predicted: Array
+    `weight` (models,) is that of each model; the other arguments come from `_separate`.
+    """
+
+    def __init__(
+        self, recording: Recording, *, weight: Array, separation: Array,
+        t: Array, u: Array, predicted: Array,
+    ) -> None:  # fmt: skip
+        self.recording, self.t, self.u, self.predicted = recording, t, u, predicted
+        counted = np.outer(weight, weight)
+        score = counted * separation
+        # First settle as many pairs as possible, then separate them as far as possible.
+        settled = float((counted * np.minimum(separation, _DECIDED)).sum())
+        self.worth = settled, float(score.sum())
+        self.pair = divmod(int(np.argmax(score)), weight.size)
+        self.separation = float(separation[self.pair])
 
 
 def propose_for(gap: Gap, submission: Submission, *, without: Sequence[Recording] = ()) -> Gap:
@@ -100,18 +107,8 @@ def with_proposal(gap: Gap, *, limits: PlanLimits, without: Sequence[Recording] 
         if found is None or np.abs(found[3][weight > 0.0]).max() > limits.travel:
             return None
         separation, t, u, predicted = found
-        counted = np.outer(weight, weight)
-        score = counted * separation
-        i, j = divmod(int(np.argmax(score)), len(models))
         return _Weighed(
-            # First settle as many pairs as possible, then separate them as far as possible.
-            worth=(float((counted * np.minimum(separation, _DECIDED)).sum()), float(score.sum())),
-            recording=recording,
-            pair=(i, j),
-            separation=float(separation[i, j]),
-            t=t,
-            u=u,
-            predicted=predicted,
+            recording, weight=weight, separation=separation, t=t, u=u, predicted=predicted
         )
 
     options = [

@@ -116,8 +116,10 @@ def propose_plan(submission: Submission, *, bench: Description | None = None) ->
     kinds = {e.kind for e in recorded if len(e.carts) == system.carts}
     proposed: list[Recording] = []
     for cart in range(1, system.carts + 1):
-        if not any(e.kind == "decay" and e.carts == (cart,) for e in recorded):
-            proposed += _decays(cart, system)
+        moves_back = system.springs[cart - 1] or system.springs[cart]
+        if moves_back and not any(e.kind == "decay" and e.carts == (cart,) for e in recorded):
+            names = [f"decay-{cart}{repeat}" for repeat in _REPEATS]
+            proposed += [release_by_hand(cart, name=name, seconds=10.0) for name in names]
     if system.bench.tied and not kinds & {"step", "sine", "bode"}:
         proposed += _steps(
             [sign * _FIRST_STEP * limits.input for sign in (1, -1)],
@@ -202,15 +204,6 @@ def _limits(system: System, design: Design | None, bench: Description | None) ->
     if design:
         travel = max(travel, asked / FURTHEST)
     return PlanLimits(input=min(most, stated or most), travel=rounded(travel))
-
-
-def _decays(cart: int, system: System) -> list[Recording]:
-    """Return releases of one cart by hand; a cart without a spring gives no release."""
-    if not (system.springs[cart - 1] or system.springs[cart]):
-        return []
-    return [
-        release_by_hand(cart, name=f"decay-{cart}{repeat}", seconds=10.0) for repeat in _REPEATS
-    ]
 
 
 def release_by_hand(cart: int, *, name: str, seconds: float) -> Recording:

@@ -291,35 +291,86 @@ class Bristle:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
 class Description:
     """The data of a model for the templates.
 
+    Parameters
+    ----------
+    free : the carts that may move, by default all. The parameters of other carts are unknown.
+    sign_reversed : whether the input has the opposite sign in the recordings.
+
+    Raises
+    ------
+    DataError : the motor acts before its logged input, so the model would need future inputs.
+
     Attributes
     ----------
+    play : gap, stiffness and damping; None if there is no play.
+    delay, lag : expressions, or "".
     links : each hidden mass, with the force on its cart. The opposite force acts on the mass.
     inputs : title and law of each step from the input to the force `u`.
     rest : (n_carts,) rest positions, computed without dry friction.
-    sign_reversed : whether the input has the opposite sign in the recordings.
     """
 
-    units: Units
-    n: int
-    parameters: tuple[Parameter, ...]
-    bodies: tuple[Body, ...]
-    springs: tuple[SpringTension, ...]
-    forces: tuple[Force, ...]
-    links: tuple[tuple[str, Force], ...]
-    play: tuple[str, str, str] | None  # gap, stiffness, damping; None if there is no play
-    frictions: tuple[Force, ...]
-    bristles: tuple[Bristle, ...]
-    inputs: tuple[tuple[str, str], ...]
-    delay: str  # an expression, or ""
-    lag: str
-    readings: tuple[str, ...]
-    rest: tuple[str, ...]
-    titles: tuple[str, ...]
-    sign_reversed: bool
+    def __init__(
+        self,
+        model: effect.AugmentedChain,
+        *,
+        units: Units,
+        free: Collection[int] | None = None,
+        sign_reversed: bool = False,
+    ) -> None:
+        chain, terms = model.chain, model.terms
+        _refuse_lead(terms)
+        by_law: dict[type, list[effect.EffectTerm]] = {}
+        for term in terms:
+            by_law.setdefault(type(term.effect.law), []).append(term)
+        built = {
+            kind: [term for term in by_law.get(effect.BuiltLaw, []) if term.effect.is_built(kind)]
+            for kind in ("hidden mass", "play", "delay", "lag", "reading")
+        }
+        play = None
+        for term in built["play"]:
+            gap, _, stiffness, damping = _names(term)
+            play = gap, stiffness, damping
+        free = sorted(range(1, chain.n + 1) if free is None else free)
+        gains = {term.place: f"{_names(term)[0]} * " for term in built["reading"]}
+        step = Parameter("max_step", _longest_step(model, free), "s", "longest step inside")
+        self.units = units
+        self.n = chain.n
+        self.parameters = (*_parameters(chain, terms, units, free), step)
+        self.bodies = _bodies(chain, built, free)
+        self.springs = _springs(chain, terms, free)
+        self.forces = _forces(terms, driven="motor" if play else "cart_1", free=free)
+        self.links = tuple(_link(term) for term in built["hidden mass"])
+        self.play = play
+        self.frictions = tuple(
+            Force(_title(term), _law(term, term.effect.law.size), f"cart_{term.place}")
+            for term in terms
+            if isinstance(term.effect.law, effect.FrictionLaw)
+        )
+        self.bristles = tuple(
+            Bristle(
+                f"z{term.place}",
+                _title(term),
+                f"cart_{term.place}",
+                _law(term, term.effect.law.force),
+                _law(term, term.effect.law.rate),
+            )
+            for term in terms
+            if isinstance(term.effect.law, effect.HysteresisLaw)
+        )
+        self.inputs = tuple(
+            (_title(term), _law(term, term.effect.law.arrives))
+            for term in effect.input_steps(terms)
+            if isinstance(term.effect.law, effect.InputLaw)
+        )
+        self.delay = _names(built["delay"][0])[0] if built["delay"] else ""
+        self.lag = _names(built["lag"][0])[0] if built["lag"] else ""
+        self.readings = tuple(f"{gains.get(i, '')}x.cart_{i}" for i in range(1, chain.n + 1))
+        self.rest = tuple(f"{x + 0.0:.{_DIGITS}g}" for x in rest_positions(model, free=free))
+        self.titles = tuple(_title(term) for term in terms)
+        self.sign_reversed = sign_reversed
 
     @property
     def driven(self) -> str:
@@ -344,79 +395,6 @@ class Description:
         texts = [part.force for part in (*parts, *self.frictions)]
         texts += [text for bristle in self.bristles for text in (bristle.force, bristle.rate)]
         return texts + [text for _, text in self.inputs]
-
-
-def describe(
-    model: effect.AugmentedChain,
-    *,
-    units: Units,
-    free: Collection[int] | None = None,
-    sign_reversed: bool = False,
-) -> Description:
-    """Return the content of a model for export.
-
-    Parameters
-    ----------
-    free : the carts that may move, by default all. The parameters of other carts are unknown.
-    sign_reversed : whether the input has the opposite sign in the recordings.
-
-    Raises
-    ------
-    DataError : the motor acts before its logged input, so the model would need future inputs.
-    """
-    chain, terms = model.chain, model.terms
-    _refuse_lead(terms)
-    by_law: dict[type, list[effect.EffectTerm]] = {}
-    for term in terms:
-        by_law.setdefault(type(term.effect.law), []).append(term)
-    built = {
-        kind: [term for term in by_law.get(effect.BuiltLaw, []) if term.effect.is_built(kind)]
-        for kind in ("hidden mass", "play", "delay", "lag", "reading")
-    }
-    play = None
-    for term in built["play"]:
-        gap, _, stiffness, damping = _names(term)
-        play = gap, stiffness, damping
-    free = sorted(range(1, chain.n + 1) if free is None else free)
-    gains = {term.place: f"{_names(term)[0]} * " for term in built["reading"]}
-    step = Parameter("max_step", _longest_step(model, free), "s", "longest step inside")
-    return Description(
-        units=units,
-        n=chain.n,
-        parameters=(*_parameters(chain, terms, units, free), step),
-        bodies=_bodies(chain, built, free),
-        springs=_springs(chain, terms, free),
-        forces=_forces(terms, driven="motor" if play else "cart_1", free=free),
-        links=tuple(_link(term) for term in built["hidden mass"]),
-        play=play,
-        frictions=tuple(
-            Force(_title(term), _law(term, term.effect.law.size), f"cart_{term.place}")
-            for term in terms
-            if isinstance(term.effect.law, effect.FrictionLaw)
-        ),
-        bristles=tuple(
-            Bristle(
-                f"z{term.place}",
-                _title(term),
-                f"cart_{term.place}",
-                _law(term, term.effect.law.force),
-                _law(term, term.effect.law.rate),
-            )
-            for term in terms
-            if isinstance(term.effect.law, effect.HysteresisLaw)
-        ),
-        inputs=tuple(
-            (_title(term), _law(term, term.effect.law.arrives))
-            for term in effect.input_steps(terms)
-            if isinstance(term.effect.law, effect.InputLaw)
-        ),
-        delay=_names(built["delay"][0])[0] if built["delay"] else "",
-        lag=_names(built["lag"][0])[0] if built["lag"] else "",
-        readings=tuple(f"{gains.get(i, '')}x.cart_{i}" for i in range(1, chain.n + 1)),
-        rest=tuple(f"{x + 0.0:.{_DIGITS}g}" for x in rest_positions(model, free=free)),
-        titles=tuple(_title(term) for term in terms),
-        sign_reversed=sign_reversed,
-    )
 
 
 def _refuse_lead(terms: Sequence[effect.EffectTerm]) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 from pipeline.errors import DataError
 from pipeline.output import write_file
 from pipeline.plant.effect import AugmentedChain
-from pipeline.plant.export import c_sources, describe, fmu, matlab_source
+from pipeline.plant.export import Description, c_sources, fmu, matlab_source
 from pipeline.results import Analysis
 
 FILES = ("model.fmu", "model.c", "model.h", "model.m")
@@ -22,7 +22,7 @@ def save_model(
     driven = [record.input_scale for record in analysis.records if record.u is not None]
     sign_reversed = sum(scale > 0 for scale in driven) < sum(scale < 0 for scale in driven)
     try:
-        description = describe(
+        description = Description(
             model, units=analysis.bench.units, free=free, sign_reversed=sign_reversed
         )
     except DataError as error:

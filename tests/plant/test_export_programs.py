@@ -24,7 +24,7 @@ from pipeline.plant.augmented import simulate_augmented
 from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain, Effect
-from pipeline.plant.export import describe, fmu, matlab_source
+from pipeline.plant.export import Description, fmu, matlab_source
 from pipeline.setup import PAPER_UNITS
 from tests.helpers.effects import SIZES, make_term
 from tests.helpers.exported import OCTAVE, CompiledModel, no_compiler, no_octave
@@ -55,7 +55,7 @@ def model_of(*keys: str, last: bool = True) -> AugmentedChain:
 def compiled(
     model: AugmentedChain, folder: Path, *, free: Collection[int] | None = None
 ) -> CompiledModel:
-    return CompiledModel(describe(model, units=PAPER_UNITS, free=free), folder)
+    return CompiledModel(Description(model, units=PAPER_UNITS, free=free), folder)
 
 
 def off(found: Array, expected: Array) -> float:
@@ -75,7 +75,7 @@ def test_c_moves_as_the_simulator_does(effect: Effect, tmp_path):
     """
     model = model_of(effect.key)
     in_c = compiled(model, tmp_path)
-    step = float(describe(model, units=PAPER_UNITS).parameters[-1].text)
+    step = float(Description(model, units=PAPER_UNITS).parameters[-1].text)
     for u, x0 in RUNS.values():
         expected = simulate_augmented(model, T, u, x0=x0)
         limit = KNOCKS if effect.has_play else SMOOTH
@@ -88,7 +88,7 @@ def test_c_moves_as_the_simulator_does(effect: Effect, tmp_path):
 def test_a_cart_that_was_always_held_does_not_move(free, tmp_path):
     """A cart that is held in all runs does not move and adds no parameters to the model."""
     model = model_of("coulomb_friction", "cubic_spring", last=free == 2)
-    names = {p.name for p in describe(model, units=PAPER_UNITS, free=(free,)).parameters}
+    names = {p.name for p in Description(model, units=PAPER_UNITS, free=(free,)).parameters}
     assert f"m{free}" in names
     assert not {f"m{3 - free}", f"c{3 - free}", "k1" if free == 2 else "k3"} & names
     in_c = compiled(model, tmp_path, free=(free,))
@@ -132,7 +132,7 @@ def in_octave(models: dict[str, AugmentedChain], runs: str, folder: Path) -> dic
     for name, model in models.items():
         home = folder / name
         home.mkdir()
-        source = matlab_source(describe(model, units=PAPER_UNITS))
+        source = matlab_source(Description(model, units=PAPER_UNITS))
         (home / "model.m").write_text(source, encoding="ascii")
     script = "".join(
         f"cd('{folder / name}'); clear model\n{runs.format(out=f'{name}.txt')}" for name in models
@@ -174,7 +174,7 @@ def test_octave_moves_as_c_does_with_every_effect(tmp_path):
 
 @pytest.fixture(scope="module")
 def hard_fmu(tmp_path_factory) -> Path:
-    whole, _ = fmu(describe(HARD, units=PAPER_UNITS))
+    whole, _ = fmu(Description(HARD, units=PAPER_UNITS))
     path = tmp_path_factory.mktemp("fmu") / "model.fmu"
     path.write_bytes(whole)
     return path
@@ -223,7 +223,7 @@ def test_fmpy_finds_no_fault_in_the_fmu(hard_fmu, tmp_path):
     assert validate_fmu(str(hard_fmu)) == []
     everything = model_of(*(effect.key for effect in CATALOGUE))
     for name, model in (("all", everything), ("none", model_of())):
-        whole, compiled_too = fmu(describe(model, units=PAPER_UNITS, sign_reversed=True))
+        whole, compiled_too = fmu(Description(model, units=PAPER_UNITS, sign_reversed=True))
         (tmp_path / f"{name}.fmu").write_bytes(whole)
         assert compiled_too
         assert validate_fmu(str(tmp_path / f"{name}.fmu")) == []
@@ -261,7 +261,7 @@ def test_an_fmu_can_be_reset_and_returned_to_a_state(hard_fmu):
 def test_without_a_compiler_the_fmu_has_only_sources(monkeypatch):
     """Without a compiler the FMU has only sources, and `fmu` reports that nothing was compiled."""
     monkeypatch.setattr(fmu_module.shutil, "which", lambda name: None)
-    whole, compiled_too = fmu(describe(HARD, units=PAPER_UNITS))
+    whole, compiled_too = fmu(Description(HARD, units=PAPER_UNITS))
     assert not compiled_too
     names = zipfile.ZipFile(io.BytesIO(whole)).namelist()
     assert {f"sources/{n}" for n in ("model.c", "model.h", "fmi2.c", "fmi2.h")} <= {*names}

@@ -10,7 +10,7 @@ from fmpy.validation import validate_fmu
 from pipeline.plant.catalogue import find_effect
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain
-from pipeline.plant.export import c_sources, describe
+from pipeline.plant.export import Description, c_sources
 from pipeline.report.model_files import FILES, clear_model, save_model
 from pipeline.results import Analysis
 from pipeline.setup import Units
@@ -76,7 +76,7 @@ def test_no_unit_can_break_a_file(unit, analysis, tmp_path):
     bench = replace(analysis.bench, units=units)
     save_model(with_effect("cubic_spring"), replace(analysis, bench=bench), tmp_path, free=(1,))
     (tmp_path / "c").mkdir()
-    CompiledModel(describe(with_effect("cubic_spring"), units=units), tmp_path / "c")
+    CompiledModel(Description(with_effect("cubic_spring"), units=units), tmp_path / "c")
     assert validate_fmu(str(tmp_path / "model.fmu")) == []
     assert {v.unit for v in read(tmp_path) if v.name == "u"} == {unit or None}
 
@@ -84,6 +84,6 @@ def test_no_unit_can_break_a_file(unit, analysis, tmp_path):
 def test_every_parameter_has_its_unit_in_the_header():
     """The C header states the submission's unit of every parameter."""
     units = Units(position="mm", input="N")
-    header = c_sources(describe(with_effect("quadratic_drag"), units=units))["model.h"]
+    header = c_sources(Description(with_effect("quadratic_drag"), units=units))["model.h"]
     assert "double m1; /* N s^2/mm: mass of cart 1 */" in header
     assert "quadratic_drag_1_coefficient; /* N s^2/mm^2: Quadratic drag, cart 1:" in header
