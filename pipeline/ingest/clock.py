@@ -1,11 +1,11 @@
-"""Check sample times, and straighten them if the file has rounded them.
+"""The clock of a recording: its stamps are a rounded, sometimes interrupted view of even times.
 
 Near 1 kHz, stamps in whole milliseconds hardly show the clock's true period: a short record looks
 perfectly even. The records of a session share one clock, so together they reveal its period.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -42,27 +42,17 @@ class Clock:
     rounding : decimal step in s of which all stamps are multiples; zero if there is no such step.
     pieces : number of straight lines that replaced the rounded stamps; zero if they are unchanged.
     period : interval of these lines in s if it is common to the session; otherwise None.
-    stopped : index (from 0) of the first sample at which time does not advance; None if it always
-        does.
-    gaps : indices (from 0) of the samples before which time is missing.
     """
 
     t: Array
     rounding: float
     pieces: int
     period: float | None
-    stopped: int | None
-    gaps: tuple[int, ...]
-
-    @property
-    def interval(self) -> float:
-        """The usual sample interval in s."""
-        return float(np.median(np.diff(self.t))) if self.pieces == 0 else self.mean_interval
 
     @property
     def mean_interval(self) -> float:
         """The mean sample interval in s."""
-        return float((self.t[-1] - self.t[0]) / (self.t.size - 1))
+        return _mean_step(self.t)
 
     @property
     def jitter(self) -> float:
@@ -70,6 +60,17 @@ class Clock:
         steps = np.diff(self.t)
         usual = np.median(steps)
         return float(np.sqrt(np.mean((steps[steps < _GAP * usual] - usual) ** 2)))
+
+    @property
+    def stopped(self) -> int | None:
+        """Index (from 0) of the first sample at which time does not advance; None if it does."""
+        return next(iter((np.flatnonzero(np.diff(self.t) <= 0) + 1).tolist()), None)
+
+    @property
+    def gaps(self) -> tuple[int, ...]:
+        """Indices (from 0) of the samples before which time is missing."""
+        usual = float(np.median(np.diff(self.t)))
+        return tuple(_late(self.t, usual, self.rounding).tolist()) if usual > 0 else ()
 
 
 def time_stamps(table: FileTable, column: Column | None, *, sample_rate: float | None) -> Array:
@@ -109,76 +110,50 @@ def clock_notes(
     ------
     SubmissionError : time stands still or goes back; the message names the line.
     """
-    if clock.stopped is not None:
-        i = clock.stopped
+    if (i := clock.stopped) is not None:
         before, after = clock.t[i - 1], clock.t[i]
         what = "stands still" if after == before else "goes back"
         hint = "; were two recordings pasted together?" if after < before else ""
         raise SubmissionError(
             f"{table.source} {table.place(i)}: time {what}, from {before:g} s to {after:g} s{hint}"
         )
-    notes = []
-    if clock.mean_interval > SLOW:
-        notes.append(
-            f"samples are {clock.mean_interval:.4g} s apart: is {column.name!r} in other units?"
-        )
+    notes, interval, gaps = [], clock.mean_interval, clock.gaps
+    if interval > SLOW:
+        notes.append(f"samples are {interval:.4g} s apart: is {column.name!r} in other units?")
     if clock.pieces:
         even = "" if clock.pieces == 1 else f", in {clock.pieces} pieces"
         notes.append(
             f"time stamps rounded to {clock.rounding:g} s were replaced by even ones: "
-            f"one sample every {1e3 * (clock.period or clock.mean_interval):.6g} ms{even}"
+            f"one sample every {1e3 * (clock.period or interval):.6g} ms{even}"
         )
-    for i in clock.gaps[:3]:
-        notes.append(
-            f"there is a gap in time between {clock.t[i - 1]:.4g} s and {clock.t[i]:.4g} s"
-        )
-    if len(clock.gaps) > 3:
-        notes.append(f"and {len(clock.gaps) - 3} more gaps in time")
+    notes += [
+        f"there is a gap in time between {clock.t[i - 1]:.4g} s and {clock.t[i]:.4g} s"
+        for i in gaps[:3]
+    ]
+    if len(gaps) > 3:
+        notes.append(f"and {len(gaps) - 3} more gaps in time")
     # A stated rate may differ by 1 % from the time column.
-    if sample_rate is not None and abs(sample_rate * clock.mean_interval - 1) > 0.01:
+    if sample_rate is not None and abs(sample_rate * interval - 1) > 0.01:
         notes.append(
             f"sample_rate = {sample_rate:g} Hz is not used: the time column says "
-            f"{1 / clock.mean_interval:.5g} Hz"
+            f"{1 / interval:.5g} Hz"
         )
     return notes
 
 
-def read_clock(stamps: Array) -> Clock:
-    """Check the time stamps (n,) of one record and undo their rounding."""
-    return read_clocks([stamps])[0]
+def unroll(stamps: Array) -> Array:
+    """Return stamps (n,) in s without the overflow of a counter, and across midnight.
 
-
-def read_clocks(session: Sequence[Array]) -> list[Clock]:
-    """Check the time stamps of every record of a session and undo their rounding.
-
-    Stamps are straightened if their rounding step matters compared with the sample interval. They
-    are replaced by straight lines that differ from them by no more than the rounding: one line if
-    the clock is even, several if it drifts or missed a tick. If a single period explains all lines,
-    they share it. If no such lines explain a clock, it is really uneven, and its stamps are kept.
+    Time goes back by a counter's range, of which all but one usual interval is missing.
     """
-    rounded = [_rounded(stamps) for stamps in session]
-    clocks: list[Clock] = []
-    for record, period in zip(rounded, _periods(rounded), strict=True):
-        t, pieces = record.straight(period)
-        if (np.diff(t) <= 0).any():
-            t, pieces = _steady(record.stamps, record.rounding)
-        clocks.append(_checked(t, record.rounding, pieces=pieces, period=period))
-    return clocks
-
-
-def _checked(t: Array, rounding: float, *, pieces: int, period: float | None) -> Clock:
-    steps = np.diff(t)
-    stopped = int(np.argmax(steps <= 0)) + 1 if (steps <= 0).any() else None
-    usual = np.median(steps)
-    gaps = np.flatnonzero(steps > _GAP * usual + 1.5 * rounding) + 1 if usual > 0 else ()
-    return Clock(
-        t=t,
-        rounding=rounding,
-        pieces=pieces,
-        period=period if pieces else None,
-        stopped=stopped,
-        gaps=tuple(int(i) for i in gaps),
-    )
+    steps = np.diff(stamps)
+    back, forward = steps < 0, steps[steps > 0]
+    usual = float(np.median(forward)) if forward.size else 0.0
+    for range_ in _RANGES if back.any() else ():
+        missing = steps[back] + range_
+        if missing.min() >= 0 and missing.max() <= _GAP * usual + 1e-9 * range_:
+            return stamps + range_ * np.cumsum(np.append(False, back))
+    return stamps
 
 
 def decimal_step(values: Array) -> float:
@@ -196,12 +171,41 @@ def decimal_step(values: Array) -> float:
     return 0.0
 
 
-# ------------------------------------------------------------------- one record
+# -------------------------------------------------------------------- even times behind the stamps
+
+
+def read_clock(stamps: Array) -> Clock:
+    """Check the time stamps (n,) of one record and undo their rounding."""
+    return read_clocks([stamps])[0]
+
+
+def read_clocks(session: Sequence[Array]) -> list[Clock]:
+    """Check the time stamps of every record of a session and undo their rounding.
+
+    Stamps are straightened if their rounding step matters compared with the sample interval. They
+    are replaced by straight lines that differ from them by no more than the rounding: one line if
+    the clock is even, several if it drifts or missed a tick. If a single period explains all lines,
+    they share it. If no such lines explain a clock, it is really uneven, and its stamps are kept.
+    """
+    lines = [_lines(stamps, decimal_step(stamps)) for stamps in session]
+    clocks: list[Clock] = []
+    for one, period in zip(lines, _periods(lines), strict=True):
+        # Without a period, each line has its own slope; stamps on one line need none.
+        t, pieces = one.stamps, 0 if one.even and period is None else len(one.pieces)
+        if pieces:
+            t = t.copy()
+            for piece in one.pieces:
+                t[piece] = _line(one.stamps[piece], slope=period)
+        if (np.diff(t) <= 0).any():
+            t, pieces = _steady(one.stamps, one.rounding)
+        period = period if pieces else None
+        clocks.append(Clock(t=t, rounding=one.rounding, pieces=pieces, period=period))
+    return clocks
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Rounded:
-    """The stamps of a record, and its stretches (start, end) that are straight but for rounding.
+class _Lines:
+    """The stamps of a record, and its pieces that are straight but for rounding.
 
     `even` means that the stamps already are on a line. They are then straightened only if other
     records give a better period.
@@ -209,74 +213,77 @@ class _Rounded:
 
     stamps: Array
     rounding: float
-    stretches: tuple[tuple[int, int], ...]
+    pieces: tuple[slice, ...]
     even: bool
 
-    def straight(self, period: float | None) -> tuple[Array, int]:
-        """Return the times and the number of straight lines.
-
-        Without `period`, each line has its own slope.
-        """
-        if self.even and period is None:
-            return self.stamps, 0
-        t = self.stamps.copy()
-        for start, end in self.stretches:
-            t[start:end] = _line(self.stamps[start:end], slope=period)
-        return t, len(self.stretches)
-
     def slopes(self, band: float) -> tuple[float, float]:
-        """Return the least and greatest period that fit all stretches; (inf, 0) if no period fits.
+        """Return the least and greatest period that fit all pieces; (inf, 0) if no period fits.
 
         The usual stamps must be within a strip of `band` rounding steps around one line.
         """
         least, greatest = 0.0, np.inf
-        for start, end in self.stretches:
-            stamps = self.stamps[start:end]
-            usual = _usual(stamps, self.rounding)
-            low, high = _slopes(stamps, usual, width=band * self.rounding)
+        for piece in self.pieces:
+            stamps = self.stamps[piece]
+            usual = np.flatnonzero(_usual(stamps, self.rounding))
+            low, high = _slopes(usual, stamps[usual], width=band * self.rounding)
             if (high - low) * stamps.size < _NO_ROOM * self.rounding:
                 return np.inf, 0.0
             least, greatest = max(least, low), min(greatest, high)
         return least, greatest
 
 
-def _rounded(stamps: Array) -> _Rounded:
-    rounding = decimal_step(stamps)
-    record = _Rounded(stamps=stamps, rounding=rounding, stretches=(), even=False)
-    mean = (stamps[-1] - stamps[0]) / (stamps.size - 1)
-    steps = np.diff(stamps)
+def _lines(stamps: Array, rounding: float) -> _Lines:
+    """Return the pieces that straight lines explain; none if they cover too little."""
+    found: list[slice] = []
+    mean, steps = _mean_step(stamps), np.diff(stamps)
     # A rounding step of up to 0.2 % of the interval does no harm.
-    if (steps < 0).any() or mean <= 0 or rounding <= 2e-3 * mean:
-        return record
-    if np.ptp(steps) <= 1e-6 * mean:
-        return replace(record, stretches=((0, stamps.size),), even=True)
-    return replace(record, stretches=_stretches(stamps, rounding))
-
-
-def _stretches(stamps: Array, rounding: float) -> tuple[tuple[int, int], ...]:
-    """Return the stretches that straight lines explain; () if they cover too little."""
-    found = []
-    waiting = [(0, stamps.size)]
+    matters = steps.min() >= 0 and mean > 0 and rounding > 2e-3 * mean
+    waiting = [(0, stamps.size)] if matters else []
     while waiting:
         start, end = waiting.pop()
-        if _usual(stamps[start:end], rounding).any():
-            found.append((start, end))
+        piece = stamps[start:end]
+        if _usual(piece, rounding).any():
+            found.append(slice(start, end))
         # Pieces of fewer than 32 samples would fit a line by chance.
-        elif end - start >= 2 * 32:
-            pauses = _pauses(stamps[start:end], rounding)
-            middle = start + int(pauses[0]) if pauses.size else (start + end) // 2
-            waiting += [(start, middle), (middle, end)]
-    explained = sum(end - start for start, end in found)
+        elif piece.size >= 2 * 32:
+            pauses = _pauses(piece, rounding)
+            middle = start + (int(pauses[0]) if pauses.size else piece.size // 2)
+            waiting += [(middle, end), (start, middle)]
     # If straight pieces cover less than 80 %, the clock itself is uneven.
-    return tuple(sorted(found)) if explained >= 0.8 * stamps.size else ()
+    explained = sum(piece.stop - piece.start for piece in found) >= 0.8 * stamps.size
+    return _Lines(
+        stamps=stamps,
+        rounding=rounding,
+        pieces=tuple(found) if explained else (),
+        even=bool(np.ptp(steps) <= 1e-6 * mean),
+    )
 
 
-def _pauses(stamps: Array, rounding: float) -> NDArray[np.intp]:
-    """Return the samples before which time is missing."""
-    mean = (stamps[-1] - stamps[0]) / (stamps.size - 1)
-    steps = np.diff(stamps)
-    usual = min(float(np.median(steps)) or mean, mean) + rounding
-    return np.flatnonzero(steps > _GAP * usual + 1.5 * rounding) + 1
+def _periods(records: Sequence[_Lines]) -> list[float | None]:
+    """Return the period of each record's clock; records that allow the same period share it.
+
+    Each record confines the period to an interval, which is wider for a shorter record. Records
+    with narrow intervals come first. Each joins the first group whose period it allows, or starts a
+    new group. None means that the stamps are kept or no single period explains the record.
+    """
+    groups: list[tuple[float, float, list[int]]] = []
+    told = {i: [r.slopes(band) for band in _BANDS] for i, r in enumerate(records) if r.pieces}
+    for i, bounds in sorted(told.items(), key=lambda item: item[1][-1][1] - item[1][-1][0]):
+        for j, (least, greatest, members) in enumerate(groups):
+            shared = [(max(least, low), min(greatest, high)) for low, high in bounds]
+            allowed = [(low, high) for low, high in shared if low <= high]
+            if allowed and records[members[0]].rounding == records[i].rounding:
+                groups[j] = (*allowed[0], [*members, i])
+                break
+        else:
+            groups += [(low, high, [i]) for low, high in bounds if low <= high][:1]
+    common = {
+        i: (least + greatest) / 2
+        for least, greatest, members in groups
+        if not all(records[i].even for i in members)
+        for i in members
+    }
+    return [common.get(i) for i in range(len(records))]
 
 
 def _steady(stamps: Array, rounding: float) -> tuple[Array, int]:
@@ -290,7 +297,8 @@ def _steady(stamps: Array, rounding: float) -> tuple[Array, int]:
     repeats = np.mean(np.diff(stamps) == 0) if (np.diff(stamps) >= 0).all() else 0.0
     if repeats < _REPEATS or min(piece.size for piece in pieces) < FEWEST_SAMPLES:
         return stamps, 0
-    slope = _common_slope(pieces)
+    moments = [(_centred(piece.size), piece) for piece in pieces]
+    slope = float(sum(i @ p for i, p in moments) / sum(i @ i for i, _ in moments))
     t = np.concatenate([_line(piece, slope=slope) for piece in pieces])
     scatter = float(np.sqrt(np.mean((t - stamps) ** 2)))
     if rounding < 0.4 * slope or scatter > 2 * (rounding + slope) or (np.diff(t) <= 0).any():
@@ -298,29 +306,18 @@ def _steady(stamps: Array, rounding: float) -> tuple[Array, int]:
     return t, len(pieces)
 
 
-def _common_slope(pieces: Sequence[Array]) -> float:
-    """Return the least-squares slope that all pieces share."""
-    moments = [(np.arange(p.size) - (p.size - 1) / 2, p) for p in pieces]
-    return float(sum(i @ p for i, p in moments) / sum(i @ i for i, _ in moments))
+def _mean_step(stamps: Array) -> float:
+    return float((stamps[-1] - stamps[0]) / (stamps.size - 1))
 
 
-def unroll(stamps: Array) -> Array:
-    """Return stamps (n,) in s without the overflow of a counter, and across midnight.
+def _late(stamps: Array, usual: float, rounding: float) -> NDArray[np.intp]:
+    """Return the samples before which time is missing, from the usual interval."""
+    return np.flatnonzero(np.diff(stamps) > _GAP * usual + 1.5 * rounding) + 1
 
-    Time goes back by a counter's range, of which all but one usual interval is missing.
-    """
-    steps = np.diff(stamps)
-    if not (back := np.flatnonzero(steps < 0)).size:
-        return stamps
-    forward = steps[steps > 0]
-    usual = float(np.median(forward)) if forward.size else 0.0
-    for range_ in _RANGES:
-        missing = steps[back] + range_
-        if (missing >= 0).all() and (missing <= _GAP * usual + 1e-9 * range_).all():
-            wraps = np.zeros(stamps.size)
-            wraps[back + 1] = range_
-            return stamps + np.cumsum(wraps)
-    return stamps
+
+def _pauses(stamps: Array, rounding: float) -> NDArray[np.intp]:
+    mean = _mean_step(stamps)
+    return _late(stamps, min(float(np.median(np.diff(stamps))) or mean, mean) + rounding, rounding)
 
 
 def _usual(stamps: Array, rounding: float) -> NDArray[np.bool_]:
@@ -335,75 +332,41 @@ def _usual(stamps: Array, rounding: float) -> NDArray[np.bool_]:
     if off.max() <= 1.5 and near.mean() >= 0.99:
         return near
     # If a few stamps jump, a least-squares line tilts, but a strip of the rounding's width does
-    # not.
-    every = np.ones(stamps.size, dtype=np.bool_)
-    low, high = _slopes(stamps, every, width=_BANDS[-1] * rounding)
-    # A stamp further from the line than this (in steps) did not advance.
-    return every & (low <= high and off.max() < 0.9)
+    # not. A stamp further from the line than 0.9 steps did not advance.
+    low, high = _slopes(np.arange(stamps.size), stamps, width=_BANDS[-1] * rounding)
+    return np.full(stamps.size, low <= high and off.max() < 0.9)
+
+
+def _centred(n: int) -> Array:
+    return np.arange(n) - (n - 1) / 2
 
 
 def _line(stamps: Array, *, slope: float | None = None) -> Array:
     """Return the least-squares straight line through the stamps, at each sample."""
-    i = np.arange(stamps.size) - (stamps.size - 1) / 2
+    i = _centred(stamps.size)
     return stamps.mean() + i * ((i @ stamps) / (i @ i) if slope is None else slope)
 
 
-# ------------------------------------------------------------------- the session
+def _slopes(index: NDArray[np.intp], stamps: Array, *, width: float) -> tuple[float, float]:
+    """Return the least and the greatest slope of a strip of this width that holds all stamps.
 
-
-def _periods(records: Sequence[_Rounded]) -> list[float | None]:
-    """Return the period of each record's clock; records that allow the same period share it.
-
-    Each record confines the period to an interval, which is wider for a shorter record. Records
-    with narrow intervals come first. Each joins the first group whose period it allows, or starts a
-    new group. None means that the stamps are kept or no single period explains the record.
+    The width that they need is a convex, piecewise linear function of the slope, so Newton's method
+    from outside reaches each bound exactly. If there is no such strip, the least slope is inf and
+    the greatest is -inf.
     """
-    groups: list[tuple[float, float, list[int]]] = []
-    told = {
-        i: [record.slopes(band) for band in _BANDS]
-        for i, record in enumerate(records)
-        if record.stretches
-    }
-    for i, bounds in sorted(told.items(), key=lambda item: item[1][-1][1] - item[1][-1][0]):
-        for j, (least, greatest, members) in enumerate(groups):
-            shared = [(max(least, low), min(greatest, high)) for low, high in bounds]
-            allowed = [(low, high) for low, high in shared if low <= high]
-            if allowed and records[members[0]].rounding == records[i].rounding:
-                groups[j] = (*allowed[0], [*members, i])
-                break
-        else:
-            groups += [(low, high, [i]) for low, high in bounds if low <= high][:1]
-    periods: list[float | None] = [None] * len(records)
-    for least, greatest, members in groups:
-        if not all(records[i].even for i in members):
-            for i in members:
-                periods[i] = (least + greatest) / 2
-    return periods
-
-
-def _slopes(stamps: Array, usual: NDArray[np.bool_], *, width: float) -> tuple[float, float]:
-    """Return the least and greatest slope of a strip of this width that holds the usual stamps."""
-    index = np.flatnonzero(usual).astype(np.float64)
-    low, high = (_extreme_slope(index, stamps[usual], width=width, side=side) for side in (-1, 1))
-    return low, high
-
-
-def _extreme_slope(index: Array, stamps: Array, *, width: float, side: int) -> float:
-    """Return the least (side -1) or greatest (1) slope of a strip of this width.
-
-    The strip must hold all stamps. The width that they need is a convex, piecewise linear function
-    of the slope, so Newton's method from outside reaches the bound exactly. If there is no such
-    strip, the least slope is inf and the greatest is -inf.
-    """
-    slope = (stamps[-1] - stamps[0] + side * 2 * width) / (index[-1] - index[0])
     hair = _HAIR * width + 8 * np.finfo(np.float64).eps * np.abs(stamps).max()
-    while True:
-        off = stamps - slope * index
-        top, bottom = int(np.argmax(off)), int(np.argmin(off))
-        excess = off[top] - off[bottom] - width
-        run = index[bottom] - index[top]
-        if excess <= hair:
-            return slope
-        if run * side <= 0:
-            return -side * np.inf
-        slope -= excess / run
+    bounds = []
+    for side in (-1, 1):
+        slope = float((stamps[-1] - stamps[0] + side * 2 * width) / (index[-1] - index[0]))
+        while True:
+            off = stamps - slope * index
+            top, bottom = int(np.argmax(off)), int(np.argmin(off))
+            excess, run = off[top] - off[bottom] - width, index[bottom] - index[top]
+            if excess <= hair:
+                break
+            if run * side <= 0:
+                slope = -side * np.inf
+                break
+            slope -= excess / run
+        bounds.append(slope)
+    return bounds[0], bounds[1]
