@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.bode_table import Points, frequency_responses, read_points
-from pipeline.ingest.channels import channel_problems, encoder_step, mirrors, repair_positions
+from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
 from pipeline.ingest.clock import FEWEST_SAMPLES, Clock, clock_notes, read_clocks, time_stamps
 from pipeline.ingest.columns import (
     Column,
@@ -22,6 +22,7 @@ from pipeline.ingest.columns import (
     refuse_unknown_unit,
 )
 from pipeline.ingest.files import choose_run, read_tables
+from pipeline.ingest.jumps import repair_positions
 from pipeline.ingest.sign import Signs, with_signs
 from pipeline.ingest.table import FileTable, refuse_extreme
 from pipeline.results import FrequencyResponse, HeadingUnit, Record
