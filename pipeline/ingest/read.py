@@ -1,6 +1,6 @@
 """Read the files of a submission into records; all conversions of units happen here."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -70,13 +70,13 @@ def read_data(submission: Submission) -> Ingested:
             f"{submission.folder.resolve().name}/submission.toml: it has no [[experiments]] "
             f"table yet; add one for each data file, as `cartlab fill` does"
         )
+    system, taken = submission.system, {experiment.file for experiment in submission.experiments}
     tables: dict[str, tuple[list[FileTable], str]] = {}
     opened: list[_Opened] = []
     points: Points = {}
     warnings: list[str] = []
     unreadable: dict[str, str] = {}
     tables_read: list[str] = []
-    taken = {experiment.file for experiment in submission.experiments}
     for experiment in submission.experiments:
         with _noted(experiment, unreadable):
             if experiment.file not in tables:
@@ -84,19 +84,40 @@ def read_data(submission: Submission) -> Ingested:
                     submission.folder, experiment.file, taken=taken
                 )
             table = choose_run(tables[experiment.file][0], experiment.run)
+            if experiment.kind == "bode" and len(experiment.carts) < system.carts:
+                warnings.append(
+                    f"{experiment.id}: not used: a bode table needs all carts free, here only "
+                    f"{list(experiment.carts)} are"
+                )
+                continue
+            if table.cut_short:
+                raise SubmissionError(f"{table.source} {table.cut_short}")
             if experiment.kind == "bode":
-                if _read_bode(table, experiment, submission.system, points, warnings):
-                    tables_read.append(experiment.id)
+                warnings += _read_bode(table, experiment, points)
+                tables_read.append(experiment.id)
             else:
-                opened.append(_open(table, experiment, submission.system))
+                opened.append(_open(table, experiment, system))
     records: list[Record] = []
     clocks = read_clocks([o.stamps for o in opened])  # the files of a session share one clock
     for one, clock in zip(opened, clocks, strict=True):
         with _noted(one.experiment, unreadable):
             records.append(_read_record(one, clock))
     if len(unreadable) == len(submission.experiments):
-        raise SubmissionError(_none_readable(unreadable))
-    warnings += _unused_scale(records, submission.system)
+        (name, reason), *others = unreadable.items()
+        raise SubmissionError(f"{name}: {reason}{f' (and {len(others)} more)' if others else ''}")
+    per_count = system.input.per_count
+    driven = [record for record in records if record.u is not None and np.any(record.u)]
+    if per_count is not None and driven and all(r.input_scale != per_count for r in driven):
+        warnings.append(
+            f"system.input.per_count = {per_count:g} is not used: no input holds counts (whole "
+            f"numbers beyond ±{_FEW_COUNTS:g}); every input is read in {system.input.unit}"
+        )
+    first: dict[str, str] = {}
+    warnings += [
+        f"{name} is a copy of {original}; a repeat must be recorded separately"
+        for name, (_, digest) in tables.items()
+        if (original := first.setdefault(digest, name)) != name
+    ]
     records, found, signs = with_signs(records, submission)
     responses, spread = frequency_responses(points, experiments=tables_read)
     return Ingested(
@@ -105,7 +126,7 @@ def read_data(submission: Submission) -> Ingested:
         files={name: digest for name, (_, digest) in sorted(tables.items())},
         unreadable=unreadable,
         signs=signs,
-        warnings=(*warnings, *_copies(tables), *found, *((spread,) if responses else ())),
+        warnings=(*warnings, *found, *((spread,) if responses else ())),
     )
 
 
@@ -118,55 +139,12 @@ def _noted(experiment: Experiment, unreadable: dict[str, str]) -> Iterator[None]
         unreadable[experiment.id] = str(error)
 
 
-def _none_readable(unreadable: Mapping[str, str]) -> str:
-    (name, reason), *others = unreadable.items()
-    return f"{name}: {reason}{f' (and {len(others)} more)' if others else ''}"
-
-
-def _unused_scale(records: Sequence[Record], system: System) -> list[str]:
-    """Return a warning if no record uses the stated scale of the input."""
-    per_count = system.input.per_count
-    driven = [record for record in records if record.u is not None and np.any(record.u)]
-    if per_count is None or not driven or any(r.input_scale == per_count for r in driven):
-        return []
-    return [
-        f"system.input.per_count = {per_count:g} is not used: no input holds counts (whole "
-        f"numbers beyond ±{_FEW_COUNTS:g}); every input is read in {system.input.unit}"
-    ]
-
-
-def _copies(tables: Mapping[str, tuple[Sequence[FileTable], str]]) -> list[str]:
-    """Return a warning for every file that is a copy of another."""
-    first: dict[str, str] = {}
-    return [
-        f"{name} is a copy of {original}; a repeat must be recorded separately"
-        for name, (_, digest) in tables.items()
-        if (original := first.setdefault(digest, name)) != name
-    ]
-
-
-def _read_bode(
-    table: FileTable, experiment: Experiment, system: System, points: Points, warnings: list[str]
-) -> bool:
-    """Add the rows of a Bode table to `points`; return whether the table can be used."""
-    if len(experiment.carts) < system.carts:
-        warnings.append(
-            f"{experiment.id}: not used: a bode table needs all carts free, here only "
-            f"{list(experiment.carts)} are"
-        )
-        return False
-    _refuse_cut(table)
+def _read_bode(table: FileTable, experiment: Experiment, points: Points) -> list[str]:
+    """Add the rows of a Bode table to `points`; return the warnings."""
     columns, unused = assign_columns(table, explicit=experiment.columns, free=experiment.carts)
     for cart, rows in read_points(table, columns, carts=experiment.carts).items():
         points.setdefault(cart, []).extend(rows)
-    if unused:
-        warnings.append(f"{experiment.id}: columns not used: {', '.join(unused)}")
-    return True
-
-
-def _refuse_cut(table: FileTable) -> None:
-    if table.cut_short:
-        raise SubmissionError(f"{table.source} {table.cut_short}")
+    return [f"{experiment.id}: columns not used: {', '.join(unused)}"] if unused else []
 
 
 # ------------------------------------------------------------------------------ one record
@@ -184,153 +162,122 @@ class _Opened:
     experiment: Experiment
     columns: dict[str, Column]
     positions: list[Column]
-    unused: tuple[str, ...]
     stamps: Array
-    notes: list[str] = field(default_factory=list)
+    notes: list[str]
     headed: list[HeadingUnit] = field(default_factory=list)
 
 
 def _open(table: FileTable, experiment: Experiment, system: System) -> _Opened:
-    _refuse_cut(table)
-    own = experiment.columns or {}
+    own, free = experiment.columns or {}, experiment.carts
     shared = {
         role: column
         for role, column in system.columns.items()
         if table.has(column) and column not in own.values()
     }
-    columns, unused = assign_columns(table, explicit=shared | own, free=experiment.carts)
-    _refuse_partial(table, columns, experiment)
-    positions = sorted(
-        (c for role, c in columns.items() if role[0] == "x" and c.cart <= system.carts),
-        key=lambda column: column.cart,
-    )
-    _check_carts(table, experiment, positions)
+    columns, unused = assign_columns(table, explicit=shared | own, free=free)
+    # A column that the experiment needs may not have empty or broken cells.
+    left_out = replace(table, names=tuple(table.partial), values=np.zeros((len(table.partial), 1)))
+    needed = {"time", *(f"x{cart}" for cart in free)} - columns.keys()
+    needed |= {"input"} - columns.keys() if experiment.kind in _NEED_INPUT else set()
+    partial, _ = assign_columns(left_out, explicit=None, free=free)
+    table.refuse_partial(column.name for role, column in partial.items() if role in needed)
+    measured = {c.cart: c for role, c in columns.items() if role[0] == "x"}
+    positions = [measured[cart] for cart in sorted(measured) if cart <= system.carts]
+    if not positions:
+        raise SubmissionError(
+            f"{table.source}: no column is a cart's position; it has {table.headings()}; "
+            f'say which: columns = {{ time = "…", input = "…", x{free[0]} = "…" }}'
+        )
+    if not {column.cart for column in positions} & set(free):
+        raise SubmissionError(
+            f"{table.source}: the free carts are {list(free)}, but the file measures "
+            f"{[column.cart for column in positions]}; check `carts` and `file`"
+        )
+    notes, extra = list(table.notes), [c.name for c in measured.values() if c not in positions]
+    if unused or extra:
+        notes.append(f"columns not used: {', '.join([*unused, *extra])}")
     return _Opened(
         system=system,
         table=table,
         experiment=experiment,
         columns=columns,
         positions=positions,
-        unused=unused,
         stamps=time_stamps(table, columns.get("time"), sample_rate=experiment.sample_rate),
-    )
-
-
-def _refuse_partial(
-    table: FileTable, columns: Mapping[str, Column], experiment: Experiment
-) -> None:
-    """Refuse a file in which a column that the experiment needs has empty or broken cells."""
-    if not table.partial:
-        return
-    names = tuple(table.partial)
-    left_out = replace(table, names=names, values=np.zeros((len(names), 1)))
-    roles, _ = assign_columns(left_out, explicit=None, free=experiment.carts)
-    needed = {"time", *(f"x{cart}" for cart in experiment.carts)}
-    needed |= {"input"} if experiment.kind in _NEED_INPUT else set()
-    table.refuse_partial(
-        column.name for role, column in roles.items() if role in needed - columns.keys()
+        notes=notes,
     )
 
 
 def _read_record(opened: _Opened, clock: Clock) -> Record:
     """Return the record with the input's scale applied, but without an unknown sign."""
     table, experiment, columns = opened.table, opened.experiment, opened.columns
-    positions, notes = opened.positions, opened.notes
-    notes += table.notes
-    extra = [c.name for role, c in columns.items() if role[0] == "x" and c not in positions]
-    if opened.unused or extra:
-        notes.append(f"columns not used: {', '.join([*opened.unused, *extra])}")
+    positions, notes, t = opened.positions, opened.notes, clock.t
     if (time := columns.get("time")) is not None:
         notes += clock_notes(table, time, clock, sample_rate=experiment.sample_rate)
-    inside = np.zeros(clock.t.size, dtype=np.bool_)
-    inside[_window(clock, experiment)] = True
-    scales = [_position_scale(opened, column) for column in positions]
-    y = np.array(
-        [table.values[c.index] * scale for c, scale in zip(positions, scales, strict=True)]
-    )
+    inside = _window(clock, experiment)
+    scales = {c.name: _position_scale(opened, c) for c in positions}
     drive = columns.get("input")
-    given = {c.name: row for c, row in zip(positions, y, strict=True)}
-    repaired, good, said = repair_positions(
-        clock.t,
-        given,
+    y, good, said = repair_positions(
+        t,
+        {c.name: table.values[c.index] * scales[c.name] for c in positions},
         None if drive is None else table.values[drive.index],
         unit=opened.system.position.unit,
-        scales={c.name: scale for c, scale in zip(positions, scales, strict=True)},
+        scales=scales,
         wanted=experiment.repair.model_dump(),
     )
     notes += said
-    y = np.array([repaired[c.name] for c in positions])
     keep = np.flatnonzero(good & inside)
-    resolution = [
-        scale if holds_counts(table, c) else encoder_step(row)
-        for c, row, scale in zip(positions, y, scales, strict=True)
-    ]
     u, input_scale = _input(opened)
     reference = _reference(opened, keep)
-    measured = {f"the position of cart {c.cart}": row for c, row in zip(positions, y, strict=True)}
-    measured |= {"the input": u, "the reference": reference, "the time": clock.t - clock.t[0]}
+    measured = {f"the position of cart {c.cart}": y[c.name] for c in positions}
+    measured |= {"the input": u, "the reference": reference, "the time": t - t[0]}
     for what, values in measured.items():
         if values is not None:
             refuse_extreme(values, what=f"{table.source}: {what}")
-    names = {column.name: row[keep] for column, row in zip(positions, y, strict=True)}
-    held = {c.name for c in positions if c.cart not in experiment.carts}
-    moving = {name: row for name, row in names.items() if name not in held}
-    notes += channel_problems(clock.t[keep], None if u is None else u[keep], moving)
+    t, u = t[keep], None if u is None else u[keep]
+    free = {c.name: y[c.name][keep] for c in positions if c.cart in experiment.carts}
+    notes += channel_problems(t, u, free)
     return Record(
         id=experiment.id,
         kind=experiment.kind,
-        t=clock.t[keep],
-        u=None if u is None else u[keep],
-        y=y[:, keep],
+        t=t,
+        u=u,
+        y=np.array([y[c.name][keep] for c in positions]),
         carts=tuple(column.cart for column in positions),
         free=experiment.carts,
         reference=reference,
         omega=None if experiment.frequency is None else 2 * np.pi * experiment.frequency,
-        resolution=np.array(resolution),
+        resolution=np.array([
+            scales[c.name] if holds_counts(table, c) else encoder_step(y[c.name])
+            for c in positions
+        ]),
         hold=experiment.hold,
         source=experiment.file,
         notes=tuple(notes),
-        position_scale=scales[0],
+        position_scale=scales[positions[0].name],
         input_scale=input_scale,
         heading_units=tuple(dict.fromkeys(opened.headed)),
-    )
+    )  # fmt: skip
 
 
-def _check_carts(table: FileTable, experiment: Experiment, positions: list[Column]) -> None:
-    if not positions:
-        raise SubmissionError(
-            f"{table.source}: no column is a cart's position; it has {table.headings()}; "
-            f'say which: columns = {{ time = "…", input = "…", x{experiment.carts[0]} = "…" }}'
-        )
-    measured = {column.cart for column in positions}
-    if not measured & set(experiment.carts):
-        raise SubmissionError(
-            f"{table.source}: the free carts are {list(experiment.carts)}, but the file measures "
-            f"{sorted(measured)}; check `carts` and `file`"
-        )
-
-
-def _window(clock: Clock, experiment: Experiment) -> slice:
-    """Return the samples inside the experiment's window, or all samples if it has no window."""
-    if experiment.window is None:
-        return slice(None)
-    start, end = experiment.window
+def _window(clock: Clock, experiment: Experiment) -> NDArray[np.bool_]:
+    """Return which samples are inside the experiment's window; all if it has no window."""
+    start, end = experiment.window or (-np.inf, np.inf)
     first, last = float(clock.t[0]), float(clock.t[-1])
+    what = f"submission.toml: window = [{start:g}, {end:g}]"
     # 1 % of the length, since the end of the window is often rounded up.
     slack = max(0.01 * (last - first), 2 * clock.mean_interval)
-    if start < first - slack or end > last + slack:
+    if experiment.window and (start < first - slack or end > last + slack):
         raise SubmissionError(
-            f"submission.toml: window = [{start:g}, {end:g}] lies outside the data of "
-            f"{experiment.file}, which run from {first:.4g} s to {last:.4g} s"
+            f"{what} lies outside the data of {experiment.file}, which run from {first:.4g} s to "
+            f"{last:.4g} s"
         )
     half = 0.5 * clock.rounding if clock.pieces else 1e-9
-    inside = np.flatnonzero((clock.t >= start - half) & (clock.t <= end + half))
-    if inside.size < FEWEST_SAMPLES:
+    inside = (clock.t >= start - half) & (clock.t <= end + half)
+    if inside.sum() < FEWEST_SAMPLES:
         raise SubmissionError(
-            f"submission.toml: window = [{start:g}, {end:g}] holds {inside.size} samples of "
-            f"{experiment.file}, {FEWEST_SAMPLES} are needed"
+            f"{what} holds {inside.sum()} samples of {experiment.file}, {FEWEST_SAMPLES} are needed"
         )
-    return slice(int(inside[0]), int(inside[-1]) + 1)
+    return inside
 
 
 # ------------------------------------------------------------------------ units and signs
@@ -340,17 +287,17 @@ def _position_scale(opened: _Opened, column: Column) -> float:
     """Return position units per number in the file."""
     table, stated = opened.table, opened.system.position
     unit, per_count = stated.unit, stated.per_count
-    if holds_counts(table, column):
-        if per_count is not None:
-            return per_count
-        if is_count(unit) or not (table.format.positions == "count" or column.is_counted):
-            return 1.0
-        raise SubmissionError(
-            f"{table.source}: {column.name!r} holds encoder counts; state how many {unit} one "
-            f"count is: position = {{ unit = {unit!r}, per_count = … }}; or use counts: "
-            "position = { unit = 'count' }"
-        )
-    return _unit_scale(opened, column, unit, "position")
+    if not holds_counts(table, column):
+        return _unit_scale(opened, column, unit, "position")
+    if per_count is not None:
+        return per_count
+    if is_count(unit) or not (table.format.positions == "count" or column.is_counted):
+        return 1.0
+    raise SubmissionError(
+        f"{table.source}: {column.name!r} holds encoder counts; state how many {unit} one "
+        f"count is: position = {{ unit = {unit!r}, per_count = … }}; or use counts: "
+        "position = { unit = 'count' }"
+    )
 
 
 def _unit_scale(
@@ -364,11 +311,9 @@ def _unit_scale(
         opened.headed.append(
             HeadingUnit(role=role, heading=column.name, unit=column.unit, converts=converts)
         )
-    if factor is None:
-        return 1.0
-    if factor != 1.0:
+    if factor not in (None, 1.0):
         opened.notes.append(f"{column.name!r} was converted from {column.unit} to {unit}")
-    return factor
+    return 1.0 if factor is None else factor
 
 
 def _input(opened: _Opened) -> tuple[Array | None, float]:
@@ -409,19 +354,12 @@ def _reference(opened: _Opened, keep: NDArray[np.intp]) -> Array | None:
     table, experiment, columns = opened.table, opened.experiment, opened.columns
     if experiment.kind != "closed_loop":
         return None
-    n = table.values[0, keep].size
     if experiment.reference is not None:
-        return np.full(n, experiment.reference)
-    column = columns.get("reference")
-    if column is None:
+        return np.full(keep.size, experiment.reference)
+    if (column := columns.get("reference")) is None:
         return None
-    values = table.values[column.index]
-    first = columns.get("x1")
-    if (
-        first is not None
-        and holds_counts(table, column)
-        and mirrors(values, table.values[first.index])
-    ):
+    values, first = table.values[column.index], columns.get("x1")
+    if first and holds_counts(table, column) and mirrors(values, table.values[first.index]):
         opened.notes.append(f"{column.name!r} only copies {first.name!r}, so it is not a reference")
         return None
     return values[keep] * _position_scale(opened, column)
