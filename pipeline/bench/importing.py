@@ -12,7 +12,7 @@ from pipeline.bench.experiments import add_experiment
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.experiments.plan import Plan, Recording, hold_words, load_plan, plan_path
 from pipeline.ingest.files import ENDINGS, OF_STRANGERS
-from pipeline.ingest.fill import experiment_entry, free_carts, free_id
+from pipeline.ingest.fill import experiment_entry, free_id
 from pipeline.ingest.inspect import Inspection, inspect_file
 from pipeline.output import own_folder
 from pipeline.results import ExperimentKind
@@ -248,7 +248,7 @@ def _entry(
 ) -> dict[str, Value]:
     """Return the keys of the `[[experiments]]` table of an imported file."""
     n = submission.system.carts
-    carts = planned.carts if planned else free_carts(inspection)[0]
+    carts = planned.carts if planned else inspection.moving
     file = f"data/{target.name}"
     entry = experiment_entry(inspection, name=name, kind=kind, file=file, carts=carts, n=n)
     if kind == "sine" and (hertz := planned.frequency if planned else inspection.frequency):

@@ -30,8 +30,6 @@ from pipeline.ingest.fill import (
     Found,
     data_files,
     examine_runs,
-    hardly_moving,
-    has_fractions,
     passed_over,
 )
 from pipeline.ingest.read import read_data
@@ -348,7 +346,7 @@ def _describe(found: Found) -> dict[str, Any]:
         "remarks": list(found.remarks),
         "unusable": inspection.unusable if inspection else (),
         "unsure": list(found.unsure),
-        "hardly": hardly_moving(inspection) if inspection else (),
+        "hardly": inspection.hardly_moving if inspection else (),
         "still": {
             cart: never_changes(column.name)
             for cart, column in (inspection.positions if inspection else {}).items()
@@ -356,7 +354,7 @@ def _describe(found: Found) -> dict[str, Any]:
         },
         "needs": inspection.needs if inspection else (),
         "frequency": inspection.frequency if inspection else None,
-        "fractions": has_fractions(found),
+        "fractions": found.has_fractions,
         "format": inspection.format if inspection else "",
         "duration": inspection.duration if inspection else None,
     }

@@ -17,14 +17,13 @@ from pipeline.estimation.estimates import SIGMA_LIMIT
 from pipeline.estimation.static_gain import fit_static_gain
 from pipeline.identify.model_checks import NEGLIGIBLE, check_vanishing
 from pipeline.ingest.fill import (
+    UNSURE,
     Found,
     fill_submission,
-    has_fractions,
     heading_doubts,
     mark_system,
     system_doubts,
     unit_doubt,
-    unsure,
 )
 from pipeline.ingest.read import read_data
 from pipeline.names import toml_flags
@@ -101,14 +100,14 @@ def fill_folder(folder: Path) -> Filled:
     new = not (folder / NAME).exists()
     files = fill_submission(folder)
     submission = load_submission(folder)
-    fractions = [found.file for found in files if has_fractions(found)]
+    fractions = [found.file for found in files if found.has_fractions]
     doubt = unit_doubt(submission.system.position.unit, fractions=fractions)
     own = {"position": doubt} if doubt else {}
     if new:
         _state_springs(submission)
         own = heading_doubts(files) | own
         for key, why in own.items():
-            mark_system(folder, key, doubt=unsure(why))
+            mark_system(folder, key, doubt=UNSURE + why)
     doubts = own | system_doubts(folder)
     return Filled(files=files, doubts=tuple(f"{key}: {one}" for key, one in doubts.items()))
 
@@ -128,7 +127,7 @@ def _state_springs(submission: Submission) -> None:
     names = spring_names(submission.system.carts)
     if found.open:
         which = " or ".join(names[i - 1] for i in found.open)
-        comment = unsure(f"is there a spring {which}? {found.why} ({', '.join(names)})")
+        comment = f"{UNSURE}is there a spring {which}? {found.why} ({', '.join(names)})"
     else:
         comment = f"{', '.join(names)}: {found.why}"
     mark_system(submission.folder, "springs", doubt=comment, value=list(found.present))

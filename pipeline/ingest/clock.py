@@ -338,13 +338,14 @@ def _usual(stamps: Array, rounding: float) -> NDArray[np.bool_]:
 
 
 def _centred(n: int) -> Array:
-    return np.arange(n) - (n - 1) / 2
+    return np.arange(n, dtype=np.float64) - (n - 1) / 2
 
 
 def _line(stamps: Array, *, slope: float | None = None) -> Array:
     """Return the least-squares straight line through the stamps, at each sample."""
     i = _centred(stamps.size)
-    return stamps.mean() + i * ((i @ stamps) / (i @ i) if slope is None else slope)
+    slope = float((i @ stamps) / (i @ i)) if slope is None else slope
+    return float(stamps.mean()) + slope * i
 
 
 def _slopes(index: NDArray[np.intp], stamps: Array, *, width: float) -> tuple[float, float]:

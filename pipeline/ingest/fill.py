@@ -16,20 +16,18 @@ from typing import Any, Literal
 import tomlkit
 
 from pipeline.errors import ConfigError, SubmissionError
-from pipeline.ingest.channels import little_motion, never_changes
+from pipeline.ingest.channels import never_changes
 from pipeline.ingest.columns import is_count, is_known, position_units
 from pipeline.ingest.files import (
     ENDINGS,
     NotRead,
-    choose_run,
     data_files_in,
     files_not_read,
     not_read_notes,
-    read_tables,
     recordings_beside,
     refused,
 )
-from pipeline.ingest.inspect import NO_CLOCK, Inspection, inspect_runs
+from pipeline.ingest.inspect import NO_CLOCK, Inspection, align_rows, inspect_runs
 from pipeline.ingest.table import FEW_NAMED
 from pipeline.results import ExperimentKind
 from pipeline.submission.edit import (
@@ -89,16 +87,28 @@ class Found:
         """The run in a file that holds several; "" in others."""
         return self.inspection.run if self.inspection else ""
 
+    @property
+    def has_fractions(self) -> bool:
+        """Whether a position has values that are not whole numbers, unlike counts."""
+        if self.inspection is None or self.kind == "bode":
+            return False
+        return not all(column.whole for column in self.inspection.positions.values())
+
     def to_dict(self) -> dict[str, Any]:
         """Return the findings as plain values for JSON."""
-        return asdict(self)
+        shown = asdict(self)
+        if self.inspection:
+            del shown["inspection"]["digest"]
+        return shown
+
+
+def _in_data(folder: Path) -> list[str]:
+    return [path.relative_to(folder).as_posix() for path in data_files_in(folder / "data")]
 
 
 def data_files(folder: Path) -> list[str]:
     """Return the recordings in `data/`, as paths for `submission.toml`."""
-    found = data_files_in(folder / "data")
-    names = [path.relative_to(folder).as_posix() for path in found]
-    return [name for name in names if file_problem(folder, name) is None]
+    return [name for name in _in_data(folder) if file_problem(folder, name) is None]
 
 
 def passed_over(folder: Path, *, named: Collection[str] = ()) -> list[Found]:
@@ -108,17 +118,16 @@ def passed_over(folder: Path, *, named: Collection[str] = ()) -> list[Found]:
     """
     if problem := path_problem(folder, "data"):  # `data` is a link that leads out of the submission
         return [Found(file="data", state="refused", remarks=(problem,))]
-    names = [path.relative_to(folder).as_posix() for path in data_files_in(folder / "data")]
-    closed = [one for name in names if name not in named and (one := refused(folder, name))]
+    closed = [refused(folder, name) for name in _in_data(folder) if name not in named]
     others = [
         *files_not_read(folder / "data", root=folder),
         *recordings_beside(folder, named=named),
     ]
-    listed: list[tuple[State, list[NotRead]]] = [("refused", closed), ("not_read", others)]
+    listed: dict[State, Sequence[NotRead | None]] = {"refused": closed, "not_read": others}
     return [
         Found(file=one.file, state=state, remarks=(one.reason,), advice=one.advice)
-        for state, ones in listed
-        for one in ones
+        for state, ones in listed.items()
+        for one in filter(None, ones)
     ]
 
 
@@ -134,55 +143,26 @@ def examine_runs(folder: Path, file: str, *, columns: Mapping[str, str | int] = 
     except SubmissionError as error:
         reason = str(error).removeprefix(str(folder / file)).lstrip(": ")
         return [Found(file=file, state="broken", remarks=(reason,))]
-    return [_found(file, inspection) for inspection in runs]
+    return [
+        Found(
+            file=file,
+            state="unknown",
+            kind=one.kind,
+            carts=one.moving,
+            inspection=one,
+            remarks=tuple(filter(None, (*one.problems, one.ranges))),
+            unsure=tuple(_ask_held(one)),
+        )
+        for one in runs
+    ]
 
 
-def _found(file: str, inspection: Inspection) -> Found:
-    carts, unsure = free_carts(inspection)
-    return Found(
-        file=file,
-        state="unknown",
-        kind=inspection.kind,
-        carts=carts,
-        inspection=inspection,
-        remarks=(*inspection.problems, *filter(None, [inspection.ranges])),
-        unsure=unsure,
-    )
-
-
-def free_carts(inspection: Inspection) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Return the carts that move in a file, and questions about them.
-
-    () means all carts. It is also returned for a table of ratios, and if no cart moves: that does
-    not prove that any cart was held.
-    """
-    carts = _moving(inspection)
-    little = hardly_moving(inspection)
-    if not little:
-        return carts, ()
-    others = [cart for cart in carts if cart not in little]
-    which = " and ".join(map(str, little))
-    return carts, (f"cart {which} hardly moves; if it was held: carts = {others}",)
-
-
-def hardly_moving(inspection: Inspection) -> tuple[int, ...]:
-    """Return the carts that move so little that they may have been held."""
-    if inspection.kind == "sine":  # near a null, a free cart hardly moves
-        return ()
-    ranges, carts = _ranges(inspection), _moving(inspection)
-    return tuple(cart for cart in little_motion(ranges) if cart in carts)
-
-
-def _moving(inspection: Inspection) -> tuple[int, ...]:
-    if inspection.kind == "bode":
-        return ()
-    step = max((column.step or 0.0 for column in inspection.positions.values()), default=0.0)
-    # A free cart moves more than two encoder steps over a whole record.
-    return tuple(cart for cart, travel in _ranges(inspection).items() if travel > 2.0 * step)
-
-
-def _ranges(inspection: Inspection) -> dict[int, float]:
-    return {cart: column.high - column.low for cart, column in inspection.positions.items()}
+def _ask_held(inspection: Inspection) -> Iterator[str]:
+    """Yield a question if a cart moves so little that it may have been held."""
+    if little := inspection.hardly_moving:
+        others = [cart for cart in inspection.moving if cart not in little]
+        which = " and ".join(map(str, little))
+        yield f"cart {which} hardly moves; if it was held: carts = {others}"
 
 
 def experiment_entry(
@@ -237,16 +217,20 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
         for one in examine_runs(folder, file, columns=stated_columns(document, file))
     ]
     if not looked:
-        what = "; ".join(_not_looked_into(passed_over(folder)))
-        what = what or f"copy yours there ({', '.join(ENDINGS)})"
+        unread = [(one.file, one.remarks[0], one.advice) for one in passed_over(folder)]
+        what = "; ".join(not_read_notes(unread)) or f"copy yours there ({', '.join(ENDINGS)})"
         raise ConfigError(f"{folder / 'data'}: contains no recordings; {what}")
     if new:
-        write_templates(folder, carts=_carts_seen(looked))
+        # Exports may also have columns for carts that the bench lacks.
+        carts = {cart for f in looked if (i := f.inspection) for cart in i.moving or i.positions}
+        write_templates(folder, carts=max((n for n in carts if n <= MOST_CARTS), default=1))
     found: list[Found] = []
 
     def change(document: tomlkit.TOMLDocument) -> None:
-        if new:
-            _state_units(document, looked)
+        system: Any = document.get("system", {})
+        for key, units in _headed_units(looked).items() if new else ():
+            if units[1]:
+                system[key]["unit"] = units[1][0]
         filling = _Filling(document, folder, looked)
         # done first, so that a renamed file does not get a second table
         missing = list(filling.missing())
@@ -264,9 +248,7 @@ class _Filling:
         self, document: tomlkit.TOMLDocument, folder: Path, looked: Sequence[Found]
     ) -> None:
         self._document, self._folder = document, folder
-        self._inspections = {
-            (one.file, one.run): one.inspection for one in looked if one.inspection
-        }
+        self._digests = {(f.file, f.run): f.inspection.digest for f in looked if f.inspection}
         system: Any = document.get("system", {})
         self._n = system.get("carts", 1)
 
@@ -274,66 +256,65 @@ class _Filling:
     def _tables(self) -> list[Any]:
         return [table for table in self._document.get("experiments", ()) if "file" in table]
 
+    def _free_id(self, *words: str) -> str:
+        taken = [str(table.get("id", "")) for table in self._tables]
+        return free_id(" ".join(words).strip(), taken)
+
     def add(self, found: Found) -> Found:
         """Add the table of one file, or complete the existing one; return what was done."""
-        if found.inspection is None:
+        if (inspection := found.inspection) is None:
             return found
         for table in self._tables:
             if _place(table) in ((found.file, found.run), (found.file, "")):
-                return self._complete(table, found, found.inspection)
+                return self._complete(table, found, inspection)
         if (same := self._same(found)) is not None:
             remark = f"is a copy of {same}; one entry is enough"
             return replace(found, state="copy", remarks=(remark,))
         if found.kind is None:
             self._say_unknown(found)
             return found
-        taken = [str(table.get("id", "")) for table in self._tables]
-        name = free_id(" ".join((PurePosixPath(found.file).stem, found.run)).strip(), taken)
+        name, n = self._free_id(PurePosixPath(found.file).stem, found.run), self._n
         entry = experiment_entry(
-            found.inspection,
-            name=name,
-            kind=found.kind,
-            file=found.file,
-            carts=found.carts,
-            n=self._n,
+            inspection, name=name, kind=found.kind, file=found.file, carts=found.carts, n=n
         )
         if len(self._tables) >= MOST_EXPERIMENTS:
             full = f"not added: at most {MOST_EXPERIMENTS} experiments are allowed"
             return replace(found, remarks=(*found.remarks, full))
-        unsure = (*found.unsure, *_unsure(found, self._n))
+        unsure = (*found.unsure, *_ask(found, inspection, n))
         append_experiment(self._document, entry, remarks=[UNSURE + one for one in unsure])
-        carts = found.carts or range(1, self._n + 1)
+        carts = found.carts or range(1, n + 1)
         held = [
             f"{column.name!r} never changes, so cart {cart} is written as held"
-            for cart, column in found.inspection.positions.items()
-            if cart <= self._n and cart not in carts and column.low == column.high
+            for cart, column in inspection.positions.items()
+            if cart <= n and cart not in carts and column.low == column.high
         ]
-        remarks = (*_beside_held(found, carts), *held)
+        remarks = (*_beside_held(found, inspection, carts), *held)
         return replace(found, state="new", experiment=name, remarks=remarks, unsure=unsure)
 
     def _complete(self, table: Any, found: Found, inspection: Inspection) -> Found:
         """Add the missing keys of a table that can be found from its file."""
         before = len(table)
-        if "id" not in table:
-            taken = [str(one.get("id", "")) for one in self._tables]
-            table["id"] = free_id(PurePosixPath(found.file).stem, taken)
-        if "kind" not in table and found.kind is not None:
-            table["kind"] = found.kind
-        if "columns" not in table and inspection.guessed:
-            table["columns"] = toml_item(inspection.guessed)
-        if "run" not in table and found.run:
-            table["run"] = found.run
+        own = {
+            "id": self._free_id(PurePosixPath(found.file).stem),
+            "kind": found.kind,
+            "columns": inspection.guessed,
+            "run": found.run,
+        }
+        for key, value in own.items():
+            if key not in table and value:
+                table[key] = toml_item(value)
         carts = tuple(table.get("carts", range(1, self._n + 1)))
         known = {NO_CLOCK} if "sample_rate" in table else set()  # already stated in the table
         if "columns" in table and not inspection.guessed:
             known.add(inspection.ranges)
+        remarks = _beside_held(found, inspection, carts)
         return replace(
             found,
             state="completed" if len(table) > before else "there",
             experiment=str(table["id"]),
             kind=table.get("kind"),
             carts=carts,
-            remarks=tuple(one for one in _beside_held(found, carts) if one not in known),
+            remarks=tuple(one for one in remarks if one not in known),
             unsure=_marked(table),
         )
 
@@ -350,31 +331,17 @@ class _Filling:
 
     def _same(self, found: Found) -> str | None:
         """Return another file of the submission that has the same samples, in any format."""
-        here = (found.file, found.run)
-        for there in map(_place, self._tables):
-            name, run = there
-            if name == found.file and run != found.run:
-                continue
+        digest, here = self._digests[found.file, found.run], self._folder / found.file
+        for place in map(_place, self._tables):
+            name, run = place
             other = self._folder / name
-            if other.is_file() and not run and filecmp.cmp(other, self._folder / found.file, False):
+            if name == found.file:
+                continue
+            if other.is_file() and not run and filecmp.cmp(other, here, shallow=False):
                 return name
-            if self._same_ranges(there, here) and self._signals(there) == self._signals(here):
+            if digest and self._digests.get(place) == digest:
                 return name
         return None
-
-    def _same_ranges(self, *places: tuple[str, str]) -> bool:
-        """Return whether files may hold the same samples, judged by the ranges of their columns."""
-        seen = [
-            one and {c.role: (one.samples, c.low, c.high) for c in one.columns if c.role}
-            for one in map(self._inspections.get, places)
-        ]
-        return bool(seen[0]) and seen[0] == seen[1]
-
-    def _signals(self, place: tuple[str, str]) -> dict[str, bytes]:
-        """Return the samples of each column that has a role."""
-        tables, _ = read_tables(self._folder, place[0], shown=place[0])
-        table, columns = choose_run(tables, place[1] or None), self._inspections[place].columns
-        return {c.role: table.values[i].tobytes() for i, c in enumerate(columns) if c.role}
 
     def _say_unknown(self, found: Found) -> None:
         """Add a table as a comment, unless it is there; a person can complete it."""
@@ -395,19 +362,30 @@ def _place(table: Any) -> tuple[str, str]:
     return posix(str(table["file"])), str(table.get("run", ""))
 
 
-def _beside_held(found: Found, carts: Collection[int]) -> tuple[str, ...]:
+def _beside_held(found: Found, inspection: Inspection, carts: Collection[int]) -> list[str]:
     """Return the remarks except those on carts that are declared as held."""
-    assert found.inspection is not None
-    positions = found.inspection.positions.items()
-    known = {never_changes(column.name) for cart, column in positions if cart not in carts}
-    return tuple(remark for remark in found.remarks if remark not in known)
+    held = [column for cart, column in inspection.positions.items() if cart not in carts]
+    known = {never_changes(column.name) for column in held}
+    return [remark for remark in found.remarks if remark not in known]
 
 
-def has_fractions(found: Found) -> bool:
-    """Whether a position has values that are not whole numbers, unlike counts."""
-    if found.inspection is None or found.kind == "bode":
-        return False
-    return not all(column.whole for column in found.inspection.positions.values())
+def _ask(found: Found, inspection: Inspection, n: int) -> Iterator[str]:
+    """Yield questions on facts that a person knows but no file shows."""
+    if inspection.guessed:
+        yield from (f"columns: {doubt}" for doubt in inspection.doubts)
+    if found.kind == "closed_loop":
+        yield "which controller ran? controller = { type = … }" + (
+            ", controlled_cart = …" if n > 1 else ""
+        )
+    positions = inspection.positions
+    for cart in (cart for cart in found.carts if cart > n):
+        renamed = ", or columns = { x1 = … }" if n == 1 else ""
+        yield f"{positions[cart].name!r} moves, but carts = {n}: more carts{renamed}?"
+    if n > 1 and list(positions) == [1] and not re.search(r"\d", positions[1].name):
+        yield "does it measure cart 1? If not, columns = { x2 = … }"
+
+
+# ------------------------------------------------------------------------------------------- doubts
 
 
 def unit_doubt(unit: str, *, fractions: Sequence[str]) -> str:
@@ -423,6 +401,42 @@ def unit_doubt(unit: str, *, fractions: Sequence[str]) -> str:
         return ""
     have = "has" if len(fractions) == 1 else "have"
     return f"counts are whole numbers, but {first_few(fractions, 1)} {have} decimals: is it cm?"
+
+
+def heading_doubts(found: Sequence[Found]) -> dict[str, str]:
+    """Return why units from headings are doubtful, by key of `[system]`."""
+    doubts: dict[str, str] = {}
+    for key, (stated, units) in _headed_units(found).items():
+        if len(units) > 1:
+            said = first_few([f"{unit} ({stated[unit]})" for unit in units], FEW_NAMED)
+            doubts[key] = f"headings state different units, {said}: is {units[0]} right?"
+        elif units and stated[""] > stated[units[0]]:
+            doubts[key] = (
+                f"only {stated[units[0]]} of {stated.total()} recordings state the unit "
+                f"{units[0]}, the others none: is it right?"
+            )
+    return doubts
+
+
+def _headed_units(found: Sequence[Found]) -> dict[str, tuple[Counter[str], list[str]]]:
+    """Return for "position" and "input" how many recordings state which unit, and the units.
+
+    The unit is "" for none. Most recordings state the first unit. Counts are a matter of each file,
+    so they are not listed.
+    """
+    stated: dict[str, Counter[str]] = {"position": Counter(), "input": Counter()}
+    for inspection in (one.inspection for one in found if one.inspection):
+        units = {
+            ("input" if column.role == "input" else "position", column.unit or "")
+            for column in inspection.columns
+            if (column.role or "").startswith(("x", "input"))
+        }
+        for key, unit in units:
+            stated[key][unit] += not unit.startswith("count")
+    return {
+        key: (units, [unit for unit, n in units.most_common() if unit and n])
+        for key, units in stated.items()
+    }
 
 
 def system_doubts(folder: Path) -> dict[str, str]:
@@ -442,6 +456,13 @@ def _read(folder: Path) -> tomlkit.TOMLDocument:
     return tomlkit.parse(submission_text(folder).replace("\r\n", "\n"))
 
 
+def _marked(table: Any) -> tuple[str, ...]:
+    """Return the doubts marked directly below a table."""
+    own = table.as_string().partition("\n\n")[0]
+    lines = [line.strip().removeprefix("# ") for line in own.splitlines()]
+    return tuple(line.removeprefix(UNSURE) for line in lines if line.startswith(UNSURE))
+
+
 def mark_system(folder: Path, key: str, *, doubt: str, value: "Value | None" = None) -> None:
     """Write a value into `[system]`, followed by a doubt or a reason as a comment."""
 
@@ -454,88 +475,7 @@ def mark_system(folder: Path, key: str, *, doubt: str, value: "Value | None" = N
     edit_submission(folder, change)
 
 
-def unsure(doubt: str) -> str:
-    """Return a comment that marks a doubt; a person who knows the answer removes it."""
-    return UNSURE + doubt
-
-
-def _marked(table: Any) -> tuple[str, ...]:
-    """Return the doubts marked directly below a table."""
-    own = table.as_string().partition("\n\n")[0]
-    lines = [line.strip().removeprefix("# ") for line in own.splitlines()]
-    return tuple(line.removeprefix(UNSURE) for line in lines if line.startswith(UNSURE))
-
-
-def _unsure(found: Found, n: int) -> Iterator[str]:
-    """Yield questions on facts that a person knows but no file shows."""
-    assert found.inspection is not None
-    if found.inspection.guessed:
-        yield from (f"columns: {doubt}" for doubt in found.inspection.doubts)
-    if found.kind == "closed_loop":
-        yield "which controller ran? controller = { type = … }" + (
-            ", controlled_cart = …" if n > 1 else ""
-        )
-    positions = found.inspection.positions
-    for cart in (cart for cart in found.carts if cart > n):
-        renamed = ", or columns = { x1 = … }" if n == 1 else ""
-        yield f"{positions[cart].name!r} moves, but carts = {n}: more carts{renamed}?"
-    if n > 1 and list(positions) == [1] and not re.search(r"\d", positions[1].name):
-        yield "does it measure cart 1? If not, columns = { x2 = … }"
-
-
-def _carts_seen(looked: Sequence[Found]) -> int:
-    """Return the highest number of a cart that moves in any file.
-
-    Exports may also have columns for carts that the bench lacks.
-    """
-    carts = [
-        cart for one in looked if one.inspection for cart in one.carts or one.inspection.positions
-    ]
-    return max((cart for cart in carts if cart <= MOST_CARTS), default=1)
-
-
-def _headed_units(looked: Sequence[Found]) -> dict[str, Counter[str]]:
-    """Return for "position" and "input" how many recordings state which unit; "" for none.
-
-    Counts are a matter of each file, so they are not listed.
-    """
-    stated: dict[str, Counter[str]] = {"position": Counter(), "input": Counter()}
-    for inspection in (one.inspection for one in looked if one.inspection):
-        units = {
-            (key, column.unit or "")
-            for column in inspection.columns
-            for key, begins in (("position", "x"), ("input", "input"))
-            if (column.role or "").startswith(begins)
-        }
-        for key, unit in units:
-            if not unit.startswith("count"):
-                stated[key][unit] += 1
-    return stated
-
-
-def _state_units(document: tomlkit.TOMLDocument, looked: Sequence[Found]) -> None:
-    """Write the units stated by most headings into a new document, except counts."""
-    system: Any = document["system"]
-    for key, stated in _headed_units(looked).items():
-        units = [unit for unit, _ in stated.most_common() if unit]
-        if units:
-            system[key]["unit"] = units[0]
-
-
-def heading_doubts(found: Sequence[Found]) -> dict[str, str]:
-    """Return why units from headings are doubtful, by key of `[system]`."""
-    doubts: dict[str, str] = {}
-    for key, stated in _headed_units(found).items():
-        units = [unit for unit, _ in stated.most_common() if unit]
-        if len(units) > 1:
-            said = first_few([f"{unit} ({stated[unit]})" for unit in units], FEW_NAMED)
-            doubts[key] = f"headings state different units, {said}: is {units[0]} right?"
-        elif units and stated[""] > stated[units[0]]:
-            doubts[key] = (
-                f"only {stated[units[0]]} of {stated.total()} recordings state the unit "
-                f"{units[0]}, the others none: is it right?"
-            )
-    return doubts
+# --------------------------------------------------------------------------------------------- text
 
 
 def format_found(found: Sequence[Found]) -> str:
@@ -548,35 +488,22 @@ def format_found(found: Sequence[Found]) -> str:
         (one.file, one.state, one.kind or "?", _carts_words(one), one.experiment or "-")
         for one in found
     ]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    ]
     remarks = group_messages(
         (one.file, remark)
         for one in found
-        for remark in (
-            *one.remarks,
-            *filter(None, [one.advice]),
-            *(UNSURE + unsure for unsure in one.unsure),
-        )
+        for remark in (*one.remarks, one.advice, *(UNSURE + question for question in one.unsure))
     )
-    return "\n".join([*lines, *(f"! {remark}" for remark in remarks)])
+    return "\n".join([*align_rows(rows), *(f"! {remark}" for remark in remarks)])
+
+
+def _carts_words(found: Found) -> str:
+    if found.inspection is None or not found.carts:
+        return "all carts" if found.inspection else "-"
+    return f"cart{'s' if len(found.carts) > 1 else ''} {', '.join(map(str, found.carts))}"
 
 
 def format_passed_over(found: Iterable[Found]) -> list[str]:
     """Return a line for each reason why files are not read, with advice."""
-    return _not_looked_into([one for one in found if one.state == "not_read"])
-
-
-def _not_looked_into(found: Iterable[Found]) -> list[str]:
-    return not_read_notes((one.file, one.remarks[0], one.advice) for one in found)
-
-
-def _carts_words(found: Found) -> str:
-    if found.inspection is None:
-        return "-"
-    if not found.carts:
-        return "all carts"
-    return f"cart{'s' if len(found.carts) > 1 else ''} {', '.join(map(str, found.carts))}"
+    return not_read_notes(
+        (one.file, one.remarks[0], one.advice) for one in found if one.state == "not_read"
+    )

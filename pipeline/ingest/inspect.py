@@ -1,8 +1,10 @@
 """Inspect the content of a data file before it is used."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +17,10 @@ from pipeline.ingest.channels import (
     encoder_step,
     is_stepped,
     line_frequency,
+    little_motion,
     mirrors,
 )
-from pipeline.ingest.clock import FEWEST_SAMPLES, Clock, clock_notes, read_clock, unroll
+from pipeline.ingest.clock import Clock, clock_notes, read_clock, time_stamps
 from pipeline.ingest.columns import (
     Column,
     assign_columns,
@@ -31,7 +34,7 @@ from pipeline.ingest.files import choose_run, read_tables
 from pipeline.ingest.table import FileTable, Variable
 from pipeline.ingest.unnamed import Roles, find_roles
 from pipeline.results import ExperimentKind
-from pipeline.words.numbers import count, first_few, group_messages
+from pipeline.words.numbers import first_few, group_messages
 
 # Words in headings of signals that drive nothing.
 _NOT_INPUT = re.compile(
@@ -76,6 +79,7 @@ class Inspection:
     guessed : column numbers by role, if the file has no headings but its signals reveal the roles.
     doubts : reasons to check the guessed numbers.
     cut_short : whether the file seems to end in the middle of a recording.
+    digest : of the samples of all columns with a role; "" if none has one.
     run : which of the file's recordings this is; "" if it holds only one.
     """
 
@@ -96,6 +100,7 @@ class Inspection:
     guessed: Mapping[str, int]
     doubts: tuple[str, ...]
     cut_short: bool
+    digest: str
     run: str = ""
 
     @property
@@ -110,6 +115,23 @@ class Inspection:
         return {int(role[1:]): roles[role] for role in sorted(roles) if role[0] == "x"}
 
     @property
+    def moving(self) -> tuple[int, ...]:
+        """The carts that move; () for a table of ratios."""
+        if self.kind == "bode":
+            return ()
+        step = max((column.step or 0.0 for column in self.positions.values()), default=0.0)
+        # A free cart moves more than two encoder steps over a whole record.
+        return tuple(cart for cart, c in self.positions.items() if c.high - c.low > 2.0 * step)
+
+    @property
+    def hardly_moving(self) -> tuple[int, ...]:
+        """The carts that move so little that they may have been held."""
+        if self.kind == "sine":  # near a null, a free cart hardly moves
+            return ()
+        little = little_motion({cart: c.high - c.low for cart, c in self.positions.items()})
+        return tuple(cart for cart in little if cart in self.moving)
+
+    @property
     def ranges(self) -> str:
         """The range of each column if the columns have no names; "" if they have names."""
         if "columns" not in self.needs:
@@ -120,7 +142,7 @@ class Inspection:
     def to_dict(self) -> dict:
         """Return the inspection as plain values for JSON."""
         shown = asdict(self)
-        del shown["cut_short"]  # already listed as a problem
+        del shown["cut_short"], shown["digest"]  # the first is already listed as a problem
         return {"state": "read", **shown, "advice": ""}
 
 
@@ -159,37 +181,38 @@ def _tables(path: Path) -> list[FileTable]:
 def _inspect(table: FileTable, path: Path, *, columns: Mapping[str, str | int]) -> Inspection:
     unusable = [table.cut_short] if table.cut_short else []
     problems = [*unusable]
-    stated = {role: column for role, column in columns.items() if table.has(column)}
-    try:
+
+    @contextmanager
+    def noted(problems: list[str]) -> Iterator[None]:
+        """Note an error as a problem because of which the file cannot be used."""
+        try:
+            yield
+        except SubmissionError as error:
+            unusable.append(str(error).removeprefix(table.source).lstrip(": "))
+            problems.append(unusable[-1])
+
+    assigned: dict[str, Column] = {}
+    unused: tuple[str, ...] = ()
+    with noted(problems):
+        stated = {role: column for role, column in columns.items() if table.has(column)}
         assigned, unused = assign_columns(table, explicit=stated, free=(1,))
-    except SubmissionError as error:
-        assigned, unused = {}, ()
-        unusable.append(str(error).removeprefix(f"{table.source}: "))
-        problems.append(unusable[-1])
     unnamed = all(name.isdigit() for name in table.names)
     bare = not assigned and unnamed
     roles = find_roles(table) if bare else Roles()
-    guessed = dict(roles.columns)
     if bare:
-        assigned, _ = assign_columns(table, explicit=guessed, free=(1,))
+        assigned, _ = assign_columns(table, explicit=roles.columns, free=(1,))
         problems.append(_name_them(roles))
     elif unused and not unnamed:
         problems.append(f"not used: {', '.join(unused)}; name them in `columns` to use them")
     # If the columns have no names, the other problems follow from this.
-    further = [] if bare and not guessed else problems
-    try:
+    further = [] if bare and not roles.columns else problems
+    clock = None
+    with noted(further):
         clock = _clock(table, assigned, further) if "frequency" not in assigned else None
-    except SubmissionError as error:
-        clock = None
-        unusable.append(str(error).removeprefix(f"{table.source} "))
-        further.append(unusable[-1])
     kind, frequency = _guess(table, assigned, clock, further)
     for column in assigned.values() if kind != "bode" else ():
-        try:
+        with noted(problems):
             refuse_unknown_unit(table, column)
-        except SubmissionError as error:
-            unusable.append(str(error).removeprefix(f"{table.source}: "))
-            problems.append(unusable[-1])
     inputs = _possible_inputs(table, unused) if "input" not in assigned else []
     if kind == "decay" and inputs:  # without the input, a step looks like a decay
         kind = None
@@ -198,11 +221,12 @@ def _inspect(table: FileTable, path: Path, *, columns: Mapping[str, str | int]) 
             'kind = "decay"'
         )
     problems += table.notes
-    needs = []
-    if bare or (kind != "bode" and not any(role[0] == "x" for role in assigned)):
-        needs.append("columns")
-    if kind != "bode" and "time" not in assigned:
-        needs.append("sample_rate")
+    needs = {
+        "columns": bare or not any(role[0] == "x" for role in assigned),
+        "sample_rate": "time" not in assigned,
+    }
+    signals = {role: table.values[c.index] for role, c in sorted(assigned.items())}
+    digests = [f"{role} {sha256(values.tobytes()).hexdigest()}" for role, values in signals.items()]
     return Inspection(
         file=str(path),
         format=table.format.title,
@@ -216,11 +240,12 @@ def _inspect(table: FileTable, path: Path, *, columns: Mapping[str, str | int]) 
         frequency=frequency,
         problems=tuple(problems),
         unusable=tuple(unusable),
-        needs=tuple(needs),
+        needs=tuple(key for key, needed in needs.items() if needed and (bare or kind != "bode")),
         variables=table.variables,
-        guessed=guessed,
+        guessed=dict(roles.columns),
         doubts=roles.doubts,
         cut_short=bool(table.cut_short) or table.ends_broken,
+        digest="\n".join(digests),
     )
 
 
@@ -287,15 +312,14 @@ def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str])
     ------
     SubmissionError : there are too few samples, or time stands still or goes back.
     """
-    column, n = columns.get("time"), table.values.shape[1]
-    factor = conversion(column.unit, "s") if column else None
-    if n < FEWEST_SAMPLES:
-        few = f"only {count(n, 'sample')}; at least {FEWEST_SAMPLES} are needed"
-        raise SubmissionError(f"{table.source} {few}")
-    if column is None or factor is None:
+    column = columns.get("time")
+    if column is not None and conversion(column.unit, "s") is None:
+        column = None
+    stamps = time_stamps(table, column, sample_rate=1.0)
+    if column is None:
         problems.append(NO_CLOCK)
         return None
-    clock = read_clock(unroll(table.values[column.index] * factor))
+    clock = read_clock(stamps)
     problems += clock_notes(table, column, clock, sample_rate=None)
     # Jitter above 1 % of the interval (rms) is worth mentioning.
     if not clock.pieces and clock.jitter > 0.01 * clock.mean_interval:
@@ -318,14 +342,13 @@ def _guess(
         problems.append("no column is a cart's position: name them in `columns`")
         return None, None
     u, reference = signals.get("input"), signals.get("reference")
-    samples = np.arange(table.values.shape[1], dtype=np.float64)
-    t = clock.t if clock else samples
+    t = clock.t if clock else np.arange(table.values.shape[1], dtype=np.float64)
     problems += channel_problems(t, u, positions)
     if reference is not None and "x1" in signals and holds_counts(table, columns["reference"]):
         reference = None if mirrors(reference, signals["x1"]) else reference
-    if u is not None and u[0] != 0.0 and np.ptp(u) == 0.0 and _starts_at_rest(positions):
-        return "step", None  # the log begins at the step
     if u is None or np.ptp(u) == 0.0:
+        if u is not None and u[0] != 0.0 and _starts_at_rest(positions):
+            return "step", None  # the log begins at the step
         if (
             table.format.inputs != "count"
             or table.lines is not None
@@ -372,56 +395,54 @@ def _follows(u: Array, reference: Array) -> bool:
     return bool(blend and left < 1.0 - _COPIED**2)
 
 
-def format_inspections(inspections: Sequence[Inspection]) -> str:
-    """Return a table with one line per file, and each fault once below it."""
-    head = ("file", "format", "samples", "s", "Hz", "looks like", "columns")
-    rows: list[tuple[str, ...]] = [head]
-    for one in inspections:
-        roles = " ".join(column.role or "-" for column in one.columns)
-        duration, rate = (
-            "" if number is None else f"{number:.4g}" for number in (one.duration, one.rate)
-        )
-        rows.append(
-            (one.title, one.format, str(one.samples), duration, rate, _describe_kind(one), roles)
-        )
+def align_rows(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return a line of text for each row, with aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [
-        "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in rows
     ]
-    problems = group_messages(
-        (one.title, said)
-        for one in inspections
-        for said in (*one.problems, *filter(None, [one.ranges]))
-    )
-    return "\n".join([*lines, *(f"! {problem}" for problem in problems)])
 
 
-def _describe_kind(inspection: Inspection) -> str:
+def format_inspections(inspections: Sequence[Inspection]) -> str:
+    """Return a table with one line per file, and each fault once below it."""
+    rows = [("file", "format", "samples", "s", "Hz", "looks like", "columns")]
+    problems: list[tuple[str, str]] = []
+    for one in inspections:
+        times = ["" if number is None else f"{number:.4g}" for number in (one.duration, one.rate)]
+        roles = " ".join(column.role or "-" for column in one.columns)
+        rows.append(
+            (one.title, one.format, str(one.samples), times[0], times[1], _describe(one), roles)
+        )
+        problems += [(one.title, said) for said in (*one.problems, one.ranges)]
+    return "\n".join([*align_rows(rows), *(f"! {said}" for said in group_messages(problems))])
+
+
+def _describe(inspection: Inspection) -> str:
     at = "" if inspection.frequency is None else f" at {inspection.frequency:.4g} Hz"
     return f"{inspection.kind or 'unknown'}{at}"
 
 
 def format_inspection(inspection: Inspection) -> str:
     """Return the inspection as plain text."""
-    lines = [inspection.title, f"  format    {inspection.format}"]
-    if inspection.variables:
-        read = [str(one) for one in inspection.variables if one.read]
-        lines.append(f"  read      {first_few(read, _MOST_COLUMNS)}")
     samples = f"{inspection.samples} samples"
     if inspection.duration is not None and inspection.rate is not None:
         jitter = inspection.jitter or 0.0
         samples += f" over {inspection.duration:.4g} s, {inspection.rate:.5g} Hz, " + (
             f"jitter {1e3 * jitter:.3g} ms rms" if jitter > 1e-9 else "even"
         )
-    lines.append(f"  samples   {samples}")
-    lines.append(f"  looks like {_describe_kind(inspection)}")
     width = max(len(column.name) for column in inspection.columns)
-    for column in inspection.columns:
-        step = f", step {column.step:.4g}" if column.step else ""
-        lines.append(
-            f"  {column.name:<{width}}  {column.role or '-':<9}  "
-            f"{column.low:.6g} to {column.high:.6g}{step}"
-        )
-    lines += [f"  ! {problem}" for problem in inspection.problems]
-    return "\n".join(lines)
+    read = [str(one) for one in inspection.variables if one.read]
+    return "\n".join([
+        inspection.title,
+        f"  format    {inspection.format}",
+        *([f"  read      {first_few(read, _MOST_COLUMNS)}"] if inspection.variables else []),
+        f"  samples   {samples}",
+        f"  looks like {_describe(inspection)}",
+        *(
+            f"  {column.name:<{width}}  {column.role or '-':<9}  {column.low:.6g} to "
+            f"{column.high:.6g}{f', step {column.step:.4g}' if column.step else ''}"
+            for column in inspection.columns
+        ),
+        *(f"  ! {problem}" for problem in inspection.problems),
+    ])  # fmt: skip
