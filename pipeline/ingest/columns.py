@@ -79,6 +79,8 @@ _RUN = re.compile(
     re.IGNORECASE,
 )
 _BRACKETS = re.compile(r"\[([^\[\]]*)\]|\(([^()]*)\)")
+_RATIO = re.compile(r"(.+?)\s*/\s*\(?([^\W\d_]+/[\w^]+)\)?")  # as in "v / (m/s)"
+_WORD = re.compile(r"[^\W\d_°%][^\W\d_]{0,19}[²2]?")  # may be a unit behind a clear mark
 _NUMBER = re.compile(r"[-+]?[\d.]+[eE][-+]?\d+")
 _LABEL = re.compile(
     r"raw|filtered|measured|simulated|smoothed|left|right|top|bottom|abs|rel|relative|absolute|"
@@ -152,24 +154,19 @@ def parse_heading(text: str) -> Heading:
     for bracket in reversed(list(_BRACKETS.finditer(rest[:200]))):
         square, held = bracket[1] is not None, (bracket[1] or bracket[2] or "").strip()
         unit = unit_symbol(held)
-        if unit is None and (not held or (not square and _LABEL.fullmatch(held))):
-            continue
-        if len(held) > _LONGEST or (unit is None and held.count(" ") > 1):
+        is_label = not held or (not square and _LABEL.fullmatch(held)) or held.count(" ") > 1
+        if len(held) > _LONGEST or (unit is None and is_label):
             continue
         name = f"{rest[: bracket.start()]} {rest[bracket.end() :]}"
         return Heading(name=_tidy(name), unit=unit or held, run=run)
     for mark, any_word in ((" / ", True), ("/", True), (" in ", True), (",", False), (" ", False)):
         name, found, last = rest.rpartition(mark)
+        if mark == "/" and (ratio := _RATIO.fullmatch(rest)) and is_known_unit(ratio[2]):
+            name, last = ratio[1], ratio[2]
         unit = unit_symbol(last)
         if mark == " " and (unit is None or len(last) < 2 or last in ("in", "min", "none", "au")):
             continue
-        if mark == "/" and (ratio := re.fullmatch(r"(.+?)\s*/\s*\(?([^\W\d_]+/[\w^]+)\)?", rest)):
-            name, last = ratio[1], ratio[2]
-            unit = unit_symbol(last)
-            if unit is None and not is_known_unit(last):
-                name, _, last = rest.rpartition("/")
-                unit = unit_symbol(last)
-        word = any_word and re.fullmatch(r"[^\W\d_°%][^\W\d_]{0,19}[²2]?", last.strip())
+        word = any_word and _WORD.fullmatch(last.strip())
         if found and name.strip() and (unit or word):
             return Heading(name=_tidy(name), unit=unit or last.strip(), run=run)
     name, found, last = rest.rpartition("_")
@@ -215,7 +212,8 @@ def _tidy(name: str) -> str:
 # For each role, the words that name it. Words of the second list count only if none of the first
 # is there: a file may have the voltage and also the current, or x and also the angle.
 _ROLES = {
-    "time": (TIME, ""),
+    "frequency": (r"f|freq|frequency|omega|w|ω|frequenz|kreisfrequenz|fréquence",),
+    "time": (TIME,),
     "input": (
         r"u|inputs?|control effort|effort|duty|duty cycle|voltage|motor|motor voltage|force",
         r"f|current|i|torque|motor current|motor force|control( signal| input)?|command|pwm|"
@@ -227,7 +225,6 @@ _ROLES = {
         r"sollwert|soll|f(ü|ue)hrungsgr(ö|oe)sse|consigne|desired( position)?|"
         r"command(ed)? position",
     ),
-    "frequency": (r"f|freq|frequency|omega|w|ω|frequenz|kreisfrequenz|fréquence", ""),
 }
 _POSITION = re.compile(
     r"x ?(\d)|(?:enc|encoder) ?(\d)(?: (?:pos|position|count|counts))?|"
@@ -243,10 +240,6 @@ _ONE_POSITION = (
 # known headings of columns that have no role
 _NO_ROLE = re.compile(r"|sample|samples|index|n|no|nr|i|row|#")
 _COUNTED = re.compile(r"\benc|counts?\b|commanded pos", re.IGNORECASE)
-# Names of a time that are its unit, too.
-_NAMED_UNITS = {
-    "millis": "ms", "micros": "us", "milliseconds": "ms", "microseconds": "us",
-}  # fmt: skip
 _OF_POSITIONS = ("length", "angle")
 _OF_INPUTS = ("voltage", "current", "force", "torque")
 
@@ -316,27 +309,24 @@ def assign_columns(
     ------
     SubmissionError : a stated column does not exist, or two columns have the same role.
     """
-    columns: dict[str, Column] = {}
-    for role, wanted in (explicit or {}).items():
-        columns[role] = _column(table, table.index(wanted), role)
-    taken = {column.index for column in columns.values()}
+    stated = {role: table.index(wanted) for role, wanted in (explicit or {}).items()}
+    columns = {role: _column(table, index, role) for role, index in stated.items()}
     plain = [plain_name(name) for name in table.names]
     has_time = "time" in columns or any(re.fullmatch(TIME, name) for name in plain)
     found: dict[str, list[tuple[int, int]]] = {}  # for each role, (rank, column)
-    unused: list[str] = []
+    unused: list[int] = []
     for index, name in enumerate(plain):
-        if index in taken:
+        if index in stated.values():
             continue
         role, rank = _role(name, free=free, has_time=has_time, unit=_unit(table, index))
-        if role is None or (explicit and role in explicit):
-            if role is not None or not _NO_ROLE.fullmatch(name):
-                unused.append(table.names[index])
-        else:
+        if role and role not in stated:
             found.setdefault(role, []).append((rank, index))
+        elif role or not _NO_ROLE.fullmatch(name):
+            unused.append(index)
     seconds = [i for i in range(len(plain)) if _unit(table, i) in FACTORS["time"]]
-    if not has_time and len(seconds) == 1 and table.names[seconds[0]] in unused:
+    if not has_time and len(seconds) == 1 and seconds[0] in unused:
         found["time"] = [(0, seconds[0])]  # its unit says that it is the time
-        unused.remove(table.names[seconds[0]])
+        unused.remove(seconds[0])
     for role, candidates in found.items():
         (rank, first), *others = sorted(candidates)
         if others and others[0][0] == rank:
@@ -346,8 +336,8 @@ def assign_columns(
                 f"say which: columns = {{ {role} = {a!r} }}"
             )
         columns[role] = _column(table, first, role)
-        unused += [table.names[index] for _, index in others]
-    return columns, tuple(unused)
+        unused += [index for _, index in others]
+    return columns, tuple(table.names[index] for index in unused)
 
 
 def refuse_unknown_unit(table: FileTable, column: Column, *, stated: str = "") -> None:
@@ -376,10 +366,10 @@ def _unit(table: FileTable, index: int) -> str | None:
 
 
 def _column(table: FileTable, index: int, role: str) -> Column:
-    unit = _unit(table, index)
-    if unit is None and role == "time":  # "millis" is a name and a unit
-        unit = _NAMED_UNITS.get(plain_name(table.names[index]))
-    return Column(role=role, index=index, name=table.names[index], unit=unit)
+    unit, name = _unit(table, index), table.names[index]
+    if unit is None and role == "time" and (named := unit_symbol(plain_name(name))) in ("ms", "us"):
+        unit = named  # "millis" is a name and a unit
+    return Column(role=role, index=index, name=name, unit=unit)
 
 
 def _role(
@@ -389,20 +379,13 @@ def _role(
 
     A file with a time is no table of frequencies: there, F is a force and omega a speed.
     """
-    for role, words in _ROLES.items():
+    if plain == "i" and unit is None:  # a row's number
+        return None, 0
+    one_cart = {f"x{free[0]}": _ONE_POSITION} if len(free) == 1 else {}
+    for role, words in {**_ROLES, **one_cart}.items():
         for rank, pattern in enumerate(words):
-            if not re.fullmatch(pattern or "$^", plain):
-                continue
-            if role == "frequency" and has_time:
-                continue
-            if plain == "f" and role == "input" and not has_time:
-                continue
-            if plain == "i" and unit is None:  # a row's number
-                continue
-            return role, rank
+            if re.fullmatch(pattern, plain) and not (role == "frequency" and has_time):
+                return role, rank
     if match := _POSITION.fullmatch(plain):
         return f"x{next(number for number in match.groups() if number)}", 0
-    for rank, pattern in enumerate(_ONE_POSITION):
-        if len(free) == 1 and re.fullmatch(pattern, plain):
-            return f"x{free[0]}", rank
     return None, 0
