@@ -103,8 +103,8 @@ PROBLEMS = {
     "no time": ({"input": STEP, "x1": X}, "no time column: state `sample_rate`"),
     "no position": ({"time": T, "input": STEP}, "no column is a cart's position"),
     "two of one": ({"time": T, "input": STEP, "u": STEP, "x1": X}, "both look like input"),
-    "one": ({"time": T[:1], "x1": X[:1]}, "only 1 sample; at least 8 are needed"),
-    "few": ({"time": T[:7], "x1": X[:7]}, "only 7 samples; at least 8 are needed"),
+    "one": ({"time": T[:1], "x1": X[:1]}, "at least 8 samples, found 1"),
+    "few": ({"time": T[:7], "x1": X[:7]}, "at least 8 samples, found 7"),
 }
 
 
