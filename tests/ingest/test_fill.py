@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.errors import ConfigError, SubmissionError
-from pipeline.identify.springs import fill
+from pipeline.identify.springs import fill_folder
 from pipeline.ingest.files import files_not_read, not_read_notes
 from pipeline.ingest.fill import data_files, fill_submission
 from pipeline.ingest.read import read_data
@@ -84,7 +84,7 @@ def test_a_unit_that_few_headings_state_is_marked(heads, unit, doubtful, tmp_pat
     """`fill` writes the unit of most headings; it is unsure if few state one, or if they differ."""
     for i, head in enumerate(heads):
         put(tmp_path, f"run-{i}.csv", **{"time": T, "input": (1 + i) * STEP, head: RING / 300})
-    doubts = fill(tmp_path).doubts
+    doubts = fill_folder(tmp_path).doubts
     assert load_submission(tmp_path).system.position.unit == unit
     assert any(one.startswith("position: ") for one in doubts) == doubtful
 

@@ -13,7 +13,7 @@ import pytest
 from playwright.sync_api import expect
 
 from pipeline.desk.app import DeskServer
-from pipeline.identify.springs import fill
+from pipeline.identify.springs import fill_folder
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
 from tests.helpers.accessibility import violations
@@ -175,7 +175,7 @@ def test_the_keyboard_alone_suffices_on_a_phone(show, tmp_path):
     for file in FILES:
         if "control" not in file.name:  # for that recording the page asks which controller ran
             (folder / "data" / file.name).write_bytes(file.read_bytes())
-    fill(folder)
+    fill_folder(folder)
     with DeskServer(folder=folder) as server:
         window = show(server.url, size=PHONE)
 
@@ -274,7 +274,7 @@ def test_one_key_answers_for_several_recordings(show, tmp_path):
         rows = [f"{i / 100},0,{i % 200},{i % 6}" for i in range(n)]
         text = "\n".join(["time,input,x1,x2", *rows])
         (folder / "data" / f"{name}.csv").write_text(text, encoding="utf-8")
-    fill(folder)
+    fill_folder(folder)
     with DeskServer(folder=folder) as server:
         window = show(server.url, size=PHONE)
         assert fits(window)
