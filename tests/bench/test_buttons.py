@@ -1,8 +1,8 @@
 """A person presses Stop, Skip, Keep or Repeat, and the acquiring process decides."""
 
 import threading
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -15,7 +15,7 @@ from pipeline.bench.raw import read_raw
 from pipeline.experiments.plan import PlanLimits
 from pipeline.protocol import Reading
 from pipeline.submission import load_submission
-from tests.helpers.acquisitions import Notes, sine, write_work
+from tests.helpers.acquisitions import Notes, causes, sine, write_work
 from tests.helpers.benches import emulator
 from tests.helpers.waiting import until
 
@@ -61,13 +61,7 @@ def test_stop_ends_the_session_whatever_else_was_pressed(tmp_path, before, real)
     work = write_work(tmp_path, [sine("long", seconds=30), sine("next", seconds=1)])
     finger = Finger(*before, "stop")
     with pytest.raises(Stopped):
-        acquire(
-            work,
-            port=real.address,
-            observers=[finger],
-            only=["long", "next"],
-            buttons=finger.buttons,
-        )
+        acquire(work, port=real.address, observers=[finger], buttons=finger.buttons)
     while (ended := real.event("run"))["ended"] == "complete":
         pass
     assert ended["ended"] == "stopped"
@@ -83,10 +77,10 @@ def test_skip_goes_on_with_the_next(tmp_path, fast):
     finger = Finger("skip", "repeat")
     outcomes = record(work, fast.address, finger, "long", "next")
     assert finger.heeded == [True, False]  # one decision for each request
-    assert (outcomes[0].recording.id, outcomes[0].partial) == ("long", "skipped by hand")
+    assert (outcomes[0].recording.id, outcomes[0].wish) == ("long", "skip")
     assert [e.id for e in load_submission(work).experiments] == ["next"]
     assert (work / "data" / "long.partial.txt").exists()
-    assert not any(asked.endswith("Record long again") for asked in finger.confirmed)
+    assert not any("long" in asked for asked in finger.confirmed)
 
 
 def test_keep_saves_the_lines_so_far(tmp_path, fast):
@@ -97,7 +91,7 @@ def test_keep_saves_the_lines_so_far(tmp_path, fast):
         ("long", True), ("long", False),
     ]  # fmt: skip
     kept, _ = load_submission(work).experiments
-    assert (kept.id, kept.note) == ("long", "partial, kept by hand: ended by hand")
+    assert (kept.id, causes(kept.note)) == ("long", ["by hand"])
     lines = readings_of(read_raw(work / "raw" / "long-1.raw"))
     text = (work / kept.file).read_text(encoding="utf-8")
     assert 500 < lines[-1].ms < 300_000
@@ -108,10 +102,8 @@ def test_keep_saves_the_lines_so_far(tmp_path, fast):
 def test_repeat_begins_the_run_again(tmp_path, fast):
     """Repeat discards the first try and records the second, without a question."""
     work = write_work(tmp_path, [sine("dwell", seconds=20)])
-    finger = Finger("repeat")
-    outcomes = record(work, fast.address, finger, "dwell")
-    assert outcomes[0].partial == "ended by hand, to be repeated"
-    assert outcomes[-1].partial == ""
+    outcomes = record(work, fast.address, Finger("repeat"), "dwell")
+    assert (outcomes[0].wish, outcomes[-1].partial) == ("repeat", "")
     assert (work / "raw" / "dwell-2.raw").exists()
     assert [e.id for e in load_submission(work).experiments] == ["dwell"]
 
@@ -120,10 +112,31 @@ def test_a_run_past_a_limit_is_neither_repeated_nor_kept(tmp_path, real):
     """A run that passed a limit is neither kept nor repeated, whatever is pressed."""
     for wish in ("repeat", "keep"):
         work = write_work(tmp_path / wish, [sine("dwell", seconds=4)], limits=NEAR)
-        finger = Finger(wish, at_end=True)
-        (outcome,) = record(work, real.address, finger, "dwell")
-        assert outcome.partial.startswith("stopped: cart 1")
+        (outcome,) = record(work, real.address, Finger(wish, at_end=True), "dwell")
+        assert (causes(outcome.partial), outcome.is_unsafe) == (["travel"], True)
         assert load_submission(work).experiments == ()
+
+
+@contextmanager
+def waits_for_a_person(work: Path, port: str) -> Iterator[tuple[LiveState, list]]:
+    """Record until a person is asked; yield the shown state and a list for the outcomes.
+
+    Afterwards the session has ended.
+    """
+    state, ended = LiveState(work), []
+
+    def session() -> None:
+        try:
+            ended.extend(acquire(work, port=port, observers=[state], only=["dwell"],
+                                 buttons=state.buttons))  # fmt: skip
+        except Stopped:
+            ended.append("stopped")
+
+    thread = threading.Thread(target=session)
+    thread.start()
+    until(lambda: state.snapshot()["instruction"])
+    yield state, ended
+    thread.join()
 
 
 # ---------------------------------------------------------------- while a person is awaited
@@ -132,31 +145,15 @@ def test_a_run_past_a_limit_is_neither_repeated_nor_kept(tmp_path, real):
 def test_a_run_that_broke_off_can_be_kept(tmp_path):
     """After a fault the page offers Repeat, Keep and Skip; Keep saves the lines before it."""
     work = write_work(tmp_path, [sine("dwell", seconds=2)])
-    state, done = LiveState(work), []
     with emulator("--fault", "reset@0.6") as bench:
-
-        def session() -> None:
-            done.extend(
-                acquire(
-                    work,
-                    port=bench.address,
-                    observers=[state],
-                    only=["dwell"],
-                    buttons=state.buttons,
-                )
-            )
-
-        thread = threading.Thread(target=session)
-        thread.start()
-        until(lambda: state.snapshot()["instruction"])
-        shown = state.snapshot()
-        assert shown["offered"] == ["repeat", "keep", "skip"]
-        assert not state.press("keep", turn=shown["turn"] - 1)  # the press is for another run
-        assert state.press("keep", turn=shown["turn"])
-        thread.join()
+        with waits_for_a_person(work, bench.address) as (state, done):
+            shown = state.snapshot()
+            assert shown["offered"] == ["repeat", "keep", "skip"]
+            assert not state.press("keep", turn=shown["turn"] - 1)  # the press is for another run
+            assert state.press("keep", turn=shown["turn"])
     assert [bool(o.partial) for o in done] == [True, False]
     (kept,) = load_submission(work).experiments
-    assert "kept by hand: the bench restarted" in kept.note
+    assert causes(kept.note) == ["restart", "by hand"]
 
 
 @pytest.mark.parametrize("wish", ["stop", "skip"])
@@ -165,31 +162,9 @@ def test_a_run_that_waits_for_a_person_can_be_ended(tmp_path, wish):
     scale = 'input = { unit = "V", per_count = 0.001220703125 }\n'
     dwell = sine("dwell", seconds=2, settle=0.3)
     work = write_work(tmp_path, [dwell], scales=scale, per_count=0.00227)
-    state, ended = LiveState(work), []
     with emulator("--stock", "--speed", "5") as bench:
-
-        def session() -> None:
-            try:
-                ended.extend(
-                    acquire(
-                        work,
-                        port=bench.address,
-                        observers=[state],
-                        only=["dwell"],
-                        buttons=state.buttons,
-                    )
-                )
-            except Stopped:
-                ended.append("stopped")
-
-        thread = threading.Thread(target=session)
-        thread.start()
-        until(lambda: state.snapshot()["instruction"])
-        assert state.snapshot()["waits"] == "Waiting for you."
-        assert state.press(wish, turn=state.buttons.turn)
-        thread.join()
-    if wish == "stop":
-        assert ended == ["stopped"]
-    else:
-        assert [o.partial for o in ended] == ["skipped by hand"]
+        with waits_for_a_person(work, bench.address) as (state, ended):
+            assert "for you" in state.snapshot()["waits"]
+            assert state.press(wish, turn=state.buttons.turn)
+    assert [getattr(one, "wish", one) for one in ended] == ["stopped" if wish == "stop" else wish]
     assert not list(work.glob("raw/*.raw"))

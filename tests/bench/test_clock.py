@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.bench.acquire import acquire
 from pipeline.bench.experiments import readings_of
 from pipeline.bench.raw import read_raw
 from pipeline.bench.stamps import fit_stamps
@@ -28,17 +27,12 @@ from pipeline.protocol import (
 )
 from pipeline.simulated.controller import CommandReader
 from pipeline.submission import load_submission
-from tests.helpers.acquisitions import Notes, sine, write_work
+from tests.helpers.acquisitions import Notes, carried_out, causes, sine, write_work
 
 BENCH = Description(
-    name="odd",
-    encoders=2,
-    carts=2,
-    commands=EXTENSIONS - {"h"},
-    input_per_count=0.5 / 4096,
-    position_unit="cm",
-    position_per_count=0.002,
-)
+    name="odd", encoders=2, carts=2, commands=EXTENSIONS - {"h"}, input_per_count=0.5 / 4096,
+    position_unit="cm", position_per_count=0.002,
+)  # fmt: skip
 RUN = 4000  # ms
 NOTHING = Start(wave=Wave.DELTA, frequency=20.0, amplitude=0)
 
@@ -88,37 +82,23 @@ def _with(reading: Reading, **changes: int) -> Reading:
     return Reading(**{**vars(reading), **changes})
 
 
-def frozen(lines: list[Reading]) -> Iterator[Reading]:
-    """Freeze the clock from 0.5 s on."""
-    return (lines[min(r.ms, 500)] for r in lines)
-
-
-def never_began(lines: list[Reading]) -> Iterator[Reading]:
-    """Keep the clock at zero."""
-    return (lines[0] for _ in lines)
-
-
-def leapt(lines: list[Reading]) -> Iterator[Reading]:
-    """Advance the clock by a hundred days."""
-    return (_with(r, ms=r.ms if r.ms < 500 else r.ms + 8_640_000_000) for r in lines)
-
-
 @pytest.mark.parametrize(
-    ("lines", "said", "kept"),
+    ("stamp", "cause", "kept"),
     [
-        (frozen, "the bench's clock hardly moves: 124 ms in 500 lines", 877),
-        (never_began, "the bench's clock hardly moves: 0 ms in 500 lines", 501),
-        (leapt, "the bench's time stamps jump from 0.499 to 8640000.500 s", 500),
+        (lambda ms: min(ms, 500), "clock", 877),  # frozen from 0.5 s on
+        (lambda ms: 0, "clock", 501),
+        (lambda ms: ms if ms < 500 else ms + 8_640_000_000, "stamps", 500),  # a hundred days ahead
     ],
 )
-def test_a_clock_that_stops_or_leaps_ends_the_run(tmp_path, lines, said, kept):
+def test_a_clock_that_stops_or_leaps_ends_the_run(tmp_path, stamp, cause, kept):
     """A run whose clock stops or leaps is ended as partial; the lines received so far are saved."""
     work = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)])
+    odd = OddBench(lambda lines: (_with(r, ms=stamp(r.ms)) for r in lines))
     tracemalloc.start()
-    outcomes = acquire(work, port=OddBench(lines).address, observers=[Notes()], only=["dwell"])
+    outcomes = carried_out(work, odd.address)
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert [outcome.partial[: len(said)] for outcome in outcomes] == [said] * 3
+    assert [causes(outcome.partial) for outcome in outcomes] == [[cause]] * 3
     assert load_submission(work).experiments == ()
     rows = (work / "data" / "dwell.partial.txt").read_text(encoding="utf-8").splitlines()[1:]
     assert len(rows) == kept
@@ -136,8 +116,8 @@ def test_late_lines_of_the_previous_run_do_not_count(tmp_path):
 
     bench = OddBench(reset, late=[_with(r, ms=r.ms + 50) for r in _whole(NOTHING)])
     work = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)])
-    broken, again = acquire(work, port=bench.address, observers=[Notes()], only=["dwell"])
-    assert broken.partial.startswith("the bench restarted during the run")
+    broken, again = carried_out(work, bench.address)
+    assert causes(broken.partial) == ["restart"]
     assert (again.partial, again.lines, str(again.anomalies)) == ("", RUN, "none")
 
 
@@ -146,28 +126,13 @@ def test_a_clock_slower_than_stated_loses_nothing(tmp_path, lost):
     """A period of 1.3 ms instead of 1 ms is noted once, and only missing lines count as lost."""
 
     def slow(lines: list[Reading]) -> Iterator[Reading]:
-        for k in range(round(len(lines) / 1.3)):
-            if k not in lost:
-                yield lines[int(1.3 * k)]
+        return (lines[int(1.3 * k)] for k in range(round(len(lines) / 1.3)) if k not in lost)
 
     work, notes = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)]), Notes()
-    (outcome,) = acquire(work, port=OddBench(slow).address, observers=[notes], only=["dwell"])
+    (outcome,) = carried_out(work, OddBench(slow).address, notes=notes)
     assert outcome.partial == ""
     assert outcome.anomalies.lost == len(lost)
-    assert len([r for r in notes.remarks if "every 1 ms, but it sends one every 1.3 ms" in r]) == 1
-
-
-@pytest.mark.parametrize("factor", [25, -1])
-def test_a_motor_driven_with_another_duty_than_the_target_is_stopped(tmp_path, factor):
-    """If the duty in open loop differs from the target, the run ends and is not repeated."""
-
-    def driven(lines: list[Reading]) -> Iterator[Reading]:
-        return (_with(r, duty=factor * r.duty) for r in lines)
-
-    work = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)])
-    (outcome,) = acquire(work, port=OddBench(driven).address, observers=[Notes()], only=["dwell"])
-    assert outcome.partial.startswith("stopped: the bench drives its motor with ")
-    assert load_submission(work).experiments == ()
+    assert len([r for r in notes.remarks if "1 ms" in r and "1.3 ms" in r]) == 1
 
 
 @given(

@@ -15,7 +15,15 @@ from pipeline.cli import app
 from pipeline.errors import ConfigError
 from pipeline.protocol import EXTENSIONS, WATCHDOG, Description, Reading
 from pipeline.submission import load_submission
-from tests.helpers.acquisitions import Notes, host, sine, until_bytes, write_work
+from tests.helpers.acquisitions import (
+    Notes,
+    carried_out,
+    causes,
+    host,
+    sine,
+    until_bytes,
+    write_work,
+)
 from tests.helpers.benches import emulator
 
 
@@ -23,21 +31,18 @@ def test_a_bench_with_too_few_carts_is_refused(tmp_path):
     """A bench with one cart is refused for a submission of two carts."""
     work = write_work(tmp_path, [sine("dwell", seconds=1)])
     with emulator("--speed", "20", preset="throne-1dof") as bench:
-        with pytest.raises(
-            ConfigError, match=r"has 2 carts, but the bench 'throne-1dof' has 1: are"
-        ):
-            acquire(work, port=bench.address, observers=[Notes()])
+        with pytest.raises(ConfigError, match="'throne-1dof' has 1"):
+            carried_out(work, bench.address)
     assert not (work / "raw").exists()
 
 
 def test_a_run_in_which_nothing_moves_is_not_recorded(tmp_path):
     """A dwell in which no encoder moves is tried three times and never recorded."""
     work = write_work(tmp_path, [sine("dwell", seconds=2)])
-    notes = Notes()
     dead = ("--fault", "stuck=1@0", "--fault", "stuck=2@0")
     with emulator("--speed", "20", *dead) as bench:
-        outcomes = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
-    assert [o.partial[:27] for o in outcomes] == ["no free cart moved: is one "] * 3
+        outcomes = carried_out(work, bench.address)
+    assert [causes(o.partial) for o in outcomes] == [["still"]] * 3
     assert load_submission(work).experiments == ()
 
 
@@ -46,9 +51,8 @@ def test_a_second_session_in_a_folder_is_refused(tmp_path, real, fast):
     work = write_work(tmp_path / "work", [sine("dwell", seconds=6)])
     with host(work, real.address, "--only", "dwell", "--yes") as process:
         until_bytes(work / "raw" / "dwell-1.raw", process)
-        refused = rf"another cartlab \(process {process.pid}\) is writing"
-        with pytest.raises(ConfigError, match=refused):
-            acquire(work, port=fast.address, observers=[Notes()])
+        with pytest.raises(ConfigError, match=str(process.pid)):
+            carried_out(work, fast.address)
         process.communicate()
     assert process.returncode == 0
     assert sorted(path.name for path in (work / "data").iterdir()) == ["dwell.txt"]
@@ -67,11 +71,10 @@ class Late(Notes):
 def test_a_busy_computer_is_named_if_the_watchdog_acts(tmp_path):
     """If the computer is too busy to send a heartbeat, the message says so."""
     work = write_work(tmp_path, [sine("dwell", seconds=5)])
-    notes = Late()
     with emulator(watchdog=WATCHDOG) as bench:
-        outcome, *_ = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
-    assert "fell silent" in outcome.partial
-    late = re.search(r"too busy and sent no heartbeat for (\d+) ms", outcome.partial)
+        outcome, *_ = carried_out(work, bench.address, notes=Late())
+    assert causes(outcome.partial) == ["silent", "busy"]
+    late = re.search(r"heartbeat for (\d+) ms", outcome.partial)
     assert late is not None
     assert int(late[1]) >= 1e3 * WATCHDOG
 
@@ -104,7 +107,7 @@ def test_a_new_submission_says_what_the_bench_does_not_know(tmp_path):
     assert prepare_submission(folder, bench, stock=False).authors == ()
     path = folder / "submission.toml"
     text = path.read_text(encoding="utf-8")
-    assert "springs = [true, true, true]  # check: wall-1, 1-2, 2-wall; false for" in text
+    assert re.search(r"(?m)^springs = \[true, true, true\]  # check", text)
     path.write_text(re.sub(r"(?m)^#(?! )", "", text), encoding="utf-8")
     submission = load_submission(folder)
     assert [author.id for author in submission.authors] == ["s1024"]
@@ -116,4 +119,4 @@ def test_files_are_imported_only_into_a_submission(tmp_path):
     where = str(tmp_path / "new")
     done = CliRunner().invoke(app, ["acquire", where, "--import", str(tmp_path), "--once"])
     assert isinstance(done.exception, ConfigError)
-    assert f"run `cartlab new {where} --carts N`" in str(done.exception)
+    assert f"new {where}" in str(done.exception)

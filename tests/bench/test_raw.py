@@ -5,20 +5,17 @@ import pytest
 from pipeline.bench.experiments import log_text, readings_of, save_record
 from pipeline.bench.raw import RawHeader, RawWriter, read_raw
 from pipeline.errors import DataError
-from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.ingest.read import read_data
 from pipeline.protocol import Description, Reading, format_reading
 from pipeline.submission import load_submission
+from tests.helpers.acquisitions import LIMITS, sine
+from tests.helpers.acquisitions import LIMITS, sine
 
 HEADER = RawHeader(
-    recording=Recording(
-        id="sine-µ", kind="sine", carts=(1, 2), wave="sine", amplitude=0.1, frequency=2.0
-    ),
-    limits=PlanLimits(input=0.5, travel=2.5),
-    commands=("d;s;o;o;2;82;1;",),
+    recording=sine("sine-µ", seconds=0.5), limits=LIMITS, commands=("d;s;o;o;2;82;1;",),
     bench=Description(name="b", encoders=2, carts=2, commands=frozenset("sk")),
     begun="2026-01-01T10:00:00+01:00",
-)
+)  # fmt: skip
 LINES = [
     Reading(counts=(i, -2 * i), target=i % 50, duty=i % 50, ms=round(1.0024 * i)) for i in range(40)
 ]
@@ -71,14 +68,11 @@ def test_a_raw_file_is_never_overwritten(raw):
 @pytest.mark.parametrize(
     ("content", "why"),
     [
-        (b"", "its first line is not a header"),
-        (b'{"schema": "cartlab-raw/1"', "its first line is not a header"),
-        (b"1:2:3:4:5\n", "not a raw file of a bench"),
-        (b'{"schema": "cartlab-raw/9"}\n', "has the form 'cartlab-raw/9'"),
-        (b'{"schema": "cartlab-raw/1", "bench": 3}\n', "not a raw file of a bench"),
-        (b"[1]\n", "not a raw file of a bench"),
+        (b"", "first line"), (b'{"schema": "cartlab-raw/1"', "first line"),
+        (b"1:2:3:4:5\n", "not a"), (b'{"schema": "cartlab-raw/9"}\n', "'cartlab-raw/9'"),
+        (b'{"schema": "cartlab-raw/1", "bench": 3}\n', "not a"), (b"[1]\n", "not a"),
     ],
-)
+)  # fmt: skip
 def test_a_file_without_a_header_is_refused(tmp_path, content, why):
     """A file without a whole header gives one error that names the file."""
     path = tmp_path / "strange.raw"
@@ -88,7 +82,10 @@ def test_a_file_without_a_header_is_refused(tmp_path, content, why):
 
 
 def test_the_record_reads_as_a_bench_log(raw, tmp_path):
-    """The data file is a normal bench log, with scaled counts and even time stamps."""
+    """The data file is a normal bench log, with scaled counts and even time stamps.
+
+    Under feedback the target has its own column, which is read as the reference.
+    """
     text = """version = 1
 [system]
 carts = 2
@@ -107,12 +104,8 @@ file = "data/sine-µ.txt"
     assert record.u is not None
     assert record.u.tolist() == [0.001 * (i % 50) for i in range(40)]
     assert record.t[-1] == pytest.approx(39 * 1.0024e-3, abs=1e-3)
-
-
-def test_a_closed_loop_has_its_reference():
-    """Under feedback the target has its own column, which is read as the reference."""
     heading, first, *_ = log_text(LINES, carts=1, reference=True).splitlines()
-    assert heading == "Sample\tTime\tEncoder 1 Pos\tTarget\tControl Effort"
+    assert heading.split("\t") == ["Sample", "Time", "Encoder 1 Pos", "Target", "Control Effort"]
     assert first == "0\t0.000\t0\t0\t0"
 
 
@@ -121,5 +114,5 @@ def test_a_raw_file_of_a_few_lines_makes_no_record(tmp_path):
     path = tmp_path / "short-1.raw"
     with RawWriter(path, HEADER) as writer:
         writer.write(b"".join(map(format_reading, LINES[:7])))
-    with pytest.raises(DataError, match=r"short-1.raw: holds 7 lines, too few"):
+    with pytest.raises(DataError, match=r"short-1.raw: .*7 lines"):
         save_record(path, folder=tmp_path, carts=2)

@@ -5,29 +5,78 @@ import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
+from pipeline.bench.acquire import acquire
 from pipeline.bench.events import Anomalies, RunOutcome
+from pipeline.bench.orders import Order, make_order
+from pipeline.experiments.gains import CountScales
 from pipeline.experiments.plan import Plan, PlanLimits, Recording, save_plan
-from pipeline.protocol import Reading
-from pipeline.submission import load_submission
+from pipeline.protocol import Description, Reading
+from pipeline.submission import System, load_submission
 from pipeline.submission.load import NAME
 from tests.helpers.waiting import started, until
 
 LIMITS = PlanLimits(input=0.5, travel=2.5)  # V and cm, the scales that the virtual benches state
 
 
+# What a reason for an early end is about, and the words that only this reason has.
+CAUSES = {
+    "idle motor": "although it should rest", "duty": "counts instead", "travel": "from its zero",
+    "input": "the input was", "wave": "does not follow the wave", "end": "went on past the end",
+    "unreadable": "cannot be read", "silent": "fell silent", "busy": "this computer was too busy",
+    "line": "the line to the bench is gone", "restart": "the bench restarted",
+    "clock": "clock hardly moves", "stamps": "time stamps jump", "still": "no free cart moved",
+    "by hand": "by hand",
+}  # fmt: skip
+
+
+def causes(said: str) -> list[str]:
+    """Return what the reason of an early end is about, as keys of `CAUSES`."""
+    return [cause for cause, words in CAUSES.items() if words in said]
+
+
+def decay(
+    name: str, *, carts: Sequence[int] = (1,), seconds: float = 6.0, settle: float = 0.3
+) -> Recording:
+    """Return a decay whose first cart is released by hand."""
+    return Recording(
+        id=name, kind="decay", carts=tuple(carts), wave="delta", amplitude=0.0,
+        frequency=1 / seconds, release=carts[0], settle=settle,
+    )  # fmt: skip
+
+
+def ordered(
+    recording: Recording,
+    bench: Description,
+    *,
+    limits: PlanLimits = LIMITS,
+    per_count: float | None = None,
+    position: float = 0.00227,
+    carts: int = 2,
+    **options: Any,
+) -> Order:
+    """Return the order for a recording on a bench with all springs."""
+    scales = CountScales(input=per_count or bench.input_per_count, position=position)
+    system = System(carts=carts, springs=(True,) * (carts + 1))
+    return make_order(
+        recording, limits=limits, scales=scales, system=system, bench=bench, **options
+    )
+
+
+def carried_out(
+    work: Path, port: str, *only: str, notes: "Notes | None" = None
+) -> list[RunOutcome]:
+    """Acquire these recordings; return their outcomes."""
+    return acquire(work, port=port, observers=[notes or Notes()], only=only or ["dwell"])
+
+
 def sine(name: str, *, seconds: float, frequency: float = 2.0, settle: float = 0.0) -> Recording:
     """Return a dwell with both carts free, well within the limits."""
     return Recording(
-        id=name,
-        kind="sine",
-        carts=(1, 2),
-        wave="sine",
-        amplitude=0.01,
-        frequency=frequency,
-        cycles=round(seconds * frequency),
-        settle=settle,
-    )
+        id=name, kind="sine", carts=(1, 2), wave="sine", amplitude=0.01, frequency=frequency,
+        cycles=round(seconds * frequency), settle=settle,
+    )  # fmt: skip
 
 
 def write_work(

@@ -5,13 +5,16 @@ import json
 import re
 import shutil
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from html import unescape
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode, urlsplit
 
+from pipeline.desk.app import DeskServer
 from pipeline.desk.tasks import do
 from pipeline.processes import attempt
 from pipeline.resources import EXAMPLES
@@ -42,6 +45,18 @@ class Answer:
     def text(self) -> str:
         """The page as text."""
         return self.body.decode()
+
+    @property
+    def state(self) -> dict[str, str]:
+        """The state of the page in keys, as its first `data-state` gives it."""
+        found = re.search(r'data-state="([^"]+)"', self.text)
+        assert found, self.text
+        return dict(one.split("=", 1) for one in unescape(found[1]).split())
+
+    @property
+    def wrong_fields(self) -> set[str]:
+        """The fields beside which the page shows an error."""
+        return set(re.findall(r'id="([\w-]+)-wrong"', self.text))
 
     def value(self, name: str) -> str:
         """Return the value of a field of the page."""
@@ -144,6 +159,36 @@ def through_proxy(port: int, name: str, **given: str) -> Visitor:
     if name:
         headers["X-Remote-User"] = name
     return Visitor(port=port, host="lab.example.edu", headers=headers, **given)
+
+
+@contextmanager
+def at_desk(folder: Path | None = None, *, opened: Path | None = None) -> Iterator[Visitor]:
+    """Start a desk, perhaps on a folder; yield a visitor, who may open a further folder."""
+    with DeskServer(folder=folder) as server:
+        visitor = Visitor.of(server.url)
+        if opened:
+            assert visitor.post("/open", folder=str(opened)).status == 303
+        yield visitor
+
+
+@contextmanager
+def at_lab(folder: Path, users: str) -> Iterator[Callable[..., Visitor]]:
+    """Start a desk for these users of a lab server; yield a function from a name to a visitor."""
+    with DeskServer(users=write_users(folder, users)) as server:
+        yield partial(through_proxy, urlsplit(server.url).port or 0)
+
+
+def listed_user(name: str, role: str, **keys: str) -> str:
+    """Return a user's table in the file of users; values are TOML."""
+    lines = "".join(f"{key} = {value}\n" for key, value in keys.items())
+    return f'[[users]]\nname = "{name}"\nrole = "{role}"\n{lines}'
+
+
+def retype(folder: Path, old: str, new: str) -> None:
+    """Replace a text in the submission's file, once."""
+    text = (folder / NAME).read_text(encoding="utf-8")
+    assert old in text
+    (folder / NAME).write_text(text.replace(old, new, 1), encoding="utf-8")
 
 
 def wrongs(page: str) -> list[str]:

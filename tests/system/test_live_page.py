@@ -14,7 +14,6 @@ from contextlib import ExitStack, closing, suppress
 from urllib.parse import urlsplit
 
 import numpy as np
-import psutil
 import pytest
 from playwright.sync_api import expect
 
@@ -25,7 +24,7 @@ from pipeline.errors import ConfigError, HardwareError
 from pipeline.experiments.plan import Plan, PlanLimits, Recording, StateLoop
 from pipeline.protocol import HEARTBEAT_EVERY, Reading
 from tests.helpers.accessibility import violations
-from tests.helpers.acquisitions import sine, write_work
+from tests.helpers.acquisitions import decay, sine, write_work
 from tests.helpers.benches import emulator
 from tests.helpers.waiting import PATIENCE, started, until
 from tests.system.test_report_pages import PHONE, WIDE
@@ -39,28 +38,23 @@ carts = 2
 input = {{ unit = "V", per_count = {DUTY} }}
 position = {{ unit = "cm", per_count = {COUNT} }}
 """
-SINE = Recording(
-    id="sine-01", kind="sine", carts=(1, 2), wave="sine", amplitude=0.1, frequency=2.0, cycles=20
-)
-DECAY = Recording(
-    id="decay-1",
-    kind="decay",
-    carts=(1,),
-    wave="delta",
-    amplitude=0.0,
-    frequency=0.1,
-    release=1,
-    settle=1.0,
-)
+SINE = sine("sine-01", seconds=10, settle=3.0)
+DECAY = decay("decay-1", seconds=10, settle=1.0)
 LOOP = Recording(
-    id="control",
-    kind="closed_loop",
-    carts=(1, 2),
-    wave="square",
-    amplitude=1.0,
-    frequency=0.2,
+    id="control", kind="closed_loop", carts=(1, 2), wave="square", amplitude=1.0, frequency=0.2,
     controller=StateLoop(cart=2),
-)
+)  # fmt: skip
+
+
+@pytest.fixture
+def state(folder) -> LiveState:
+    """Return what a page keeps, while the second of three recordings runs."""
+    state = LiveState(folder)
+    state.planned(PLAN, frozenset({"decay-1"}))
+    state.started(SINE)
+    return state
+
+
 PLAN = Plan(limits=PlanLimits(input=0.4, travel=2.5), recordings=(DECAY, SINE, LOOP))
 
 
@@ -89,13 +83,12 @@ def page(folder) -> Iterator[LivePage]:
 # ------------------------------------------------------------------------ what the page keeps
 
 
-def test_points_are_thinned_in_units_and_of_this_run(folder):
-    """The page gets every fifth line, in volts and centimetres; a new run clears the old points."""
-    state = LiveState(folder)
-    state.planned(PLAN, frozenset())
-    state.started(SINE)
-    state.readings(lines(0, 1000), Anomalies(lost=2))
+def test_points_are_thinned_in_units_and_of_this_run(state):
+    """The page gets every fifth line, in volts and centimetres; a new run clears the old points.
 
+    A page that did not ask for a minute then gets only the last twelve seconds.
+    """
+    state.readings(lines(0, 1000), Anomalies(lost=2))
     found = state.points(run=0, start=0)
     assert (found["run"], found["start"], found["end"], len(found["points"])) == (1, 0, 200, 200)
     assert found["points"][10] == (0.05, round(100 * np.sin(0.63)) * DUTY, 0.01, 0.1, -0.1)
@@ -111,48 +104,39 @@ def test_points_are_thinned_in_units_and_of_this_run(folder):
     assert fresh["run"] == 2
     assert fresh["points"] == [(0.0, 0.0, 0.2, 0.0, 0.0)]  # 0.2 cm: the target of 100 counts
 
-
-def test_a_slow_page_gets_only_the_latest_points(folder):
-    """A page that did not ask for a minute then gets only the last twelve seconds."""
-    state = LiveState(folder)
-    state.planned(PLAN, frozenset())
     state.started(SINE)
     for second in range(60):
         state.readings(lines(1000 * second, 1000 * second + 1000), Anomalies())
-    found = state.points(run=1, start=10)
+    found = state.points(run=3, start=10)
     assert (found["end"], len(found["points"])) == (12_000, 2400)
     assert found["points"][0][0] == 48.0
 
 
-def test_the_plan_shows_the_state_of_each_recording(folder):
+def test_the_plan_shows_the_state_of_each_recording(state):
     """The plan shows the state of each recording, and for a partial one the reason."""
-    state = LiveState(folder)
-    state.planned(PLAN, frozenset({"decay-1"}))
-    state.started(SINE)
     assert [e["state"] for e in state.snapshot()["plan"]] == ["done", "now", "to come"]
     assert state.snapshot()["seconds_left"] == 13.0 + 8.0
-    state.finished(RunOutcome(recording=SINE, lines=5, partial="the cable was pulled"))
+    state.finished(RunOutcome(recording=SINE, lines=5, partial="cable pulled"))
     entry = state.snapshot()["plan"][1]
-    assert (entry["state"], entry["why"]) == ("partial", "the cable was pulled")
-    state.finished(RunOutcome(recording=SINE, lines=9000, remarks=("the clock is slow",)))
+    assert (entry["state"], entry["why"]) == ("partial", "cable pulled")
+    state.finished(RunOutcome(recording=SINE, lines=9000, remarks=("slow clock",)))
     assert state.snapshot()["plan"][1]["state"] == "done"
-    assert state.snapshot()["remarks"] == ["sine-01: the clock is slow"]
+    assert state.snapshot()["remarks"] == ["sine-01: slow clock"]
 
 
-def test_an_instruction_waits_for_its_own_answer(folder):
+def test_an_instruction_waits_for_its_own_answer(state):
     """An instruction waits until it is answered by its number, or until the page ends."""
-    state = LiveState(folder)
     assert not state.answer(1)
-    waiting = threading.Thread(target=state.confirm, args=("hold cart 2",))
+    waiting = threading.Thread(target=state.confirm, args=("hold",))
     waiting.start()
-    until(lambda: state.snapshot()["instruction"] == {"number": 1, "text": "hold cart 2"})
+    until(lambda: state.snapshot()["instruction"] == {"number": 1, "text": "hold"})
     assert not state.answer(7)
     assert state.answer(1)
     waiting.join()
     assert state.snapshot()["instruction"] is None
     threading.Timer(0.1, state.end).start()
-    with pytest.raises(ConfigError, match="nobody confirmed: let cart 1 go"):
-        state.confirm("let cart 1 go")
+    with pytest.raises(ConfigError, match=r"nobody .*: let go"):
+        state.confirm("let go")
 
 
 # ------------------------------------------------------------------------- who may see it
@@ -181,13 +165,17 @@ def news(page: LivePage, opened: ExitStack) -> http.client.HTTPResponse:
     return opened.enter_context(closing(connection.getresponse()))
 
 
-def test_the_page_is_served_to_this_computer_only(page):
-    """Only this computer can open the page, which loads only its own scripts and is not cached."""
+def test_the_page_is_served_to_this_computer_only(page, folder):
+    """Only this computer can open the page, which loads only its own scripts and is not cached.
+
+    A port in use is an error.
+    """
     assert urlsplit(page.url).hostname == "127.0.0.1"
     response, text = ask(page)
     assert response.status == 200
     policy = response.headers["Content-Security-Policy"]
-    assert "default-src 'none'; script-src 'self'; style-src 'self'" in policy
+    for part in ("default-src 'none'", "script-src 'self'", "style-src 'self'"):
+        assert part in policy.split("; ")
     assert "unsafe" not in policy
     assert "frame-ancestors 'none'" in policy
     assert response.headers["Referrer-Policy"] == "no-referrer"
@@ -196,6 +184,8 @@ def test_the_page_is_served_to_this_computer_only(page):
     assert "//" not in text  # nothing from another host
     for name in ("live.js", "live.css", "report.css"):
         assert ask(page, name)[0].status == 200
+    with pytest.raises(HardwareError, match="not free"):
+        LivePage(folder, port=urlsplit(page.url).port or 0)
 
 
 def test_nothing_is_shown_without_the_secret(page):
@@ -213,29 +203,22 @@ def test_requests_of_other_pages_are_refused(page):
     """A request with another host name or origin, or from another site, gets 403."""
     port = urlsplit(page.url).port
     good = f"http://127.0.0.1:{port}"
-    assert ask(page, Host=f"evil.example:{port}")[0].status == 403
-    assert ask(page, Host="127.0.0.1")[0].status == 403
-    assert ask(page, Host=f"localhost:{port}")[0].status == 200
-    assert ask(page, Origin="http://evil.example")[0].status == 403
-    assert ask(page, Origin="null")[0].status == 403
-    assert ask(page, Origin=good, Host=f"localhost:{port}")[0].status == 403
-    assert ask(page, Sec_Fetch_Site="cross-site")[0].status == 403
+    for status, headers in (
+        (403, {"Host": f"evil.example:{port}"}), (403, {"Host": "127.0.0.1"}),
+        (200, {"Host": f"localhost:{port}"}), (403, {"Origin": "http://evil.example"}),
+        (403, {"Origin": "null"}), (403, {"Origin": good, "Host": f"localhost:{port}"}),
+        (403, {"Sec_Fetch_Site": "cross-site"}),
+    ):  # fmt: skip
+        assert ask(page, **headers)[0].status == status, headers
     assert ask(page, "press", "POST", "wish=done&number=1")[0].status == 403
     assert ask(page, "press", "POST", "wish=done&number=1", Origin=good)[0].status == 409
 
 
 @pytest.mark.parametrize(
     ("body", "status"),
-    [
-        ("", 400),
-        ("[1]", 400),
-        ("wish=done", 400),
-        ("wish=done&number=x", 400),
-        ("wish=done&number=1", 409),
-        ("wish=burn&number=1", 409),
-        ("1" * 500, 413),
-    ],
-)
+    [("", 400), ("[1]", 400), ("wish=done", 400), ("wish=done&number=x", 400),
+     ("wish=done&number=1", 409), ("wish=burn&number=1", 409), ("1" * 500, 413)],
+)  # fmt: skip
 def test_nonsense_confirms_nothing(page, body, status):
     """A malformed, unknown or overlong answer is refused, and the page still works."""
     origin = page.url[: page.url.index("/", 8)]
@@ -258,12 +241,6 @@ def test_the_secret_is_new_each_time_and_never_written(folder, caplog, capfd):
     assert not any(secret in written for secret in secrets)
 
 
-def test_a_port_that_is_taken_is_one_clear_line(page, folder):
-    """If the requested port is in use, the error says that it is not free."""
-    with pytest.raises(HardwareError, match="is not free for the page"):
-        LivePage(folder, port=urlsplit(page.url).port or 0)
-
-
 def test_a_page_gets_events_and_a_ninth_page_is_refused(page):
     """A page first gets the whole state, then new points; a ninth page gets 503."""
     with ExitStack() as opened:
@@ -282,30 +259,6 @@ def test_a_page_gets_events_and_a_ninth_page_is_refused(page):
         points = json.loads(stream.readline().removeprefix(b"data: "))
         assert points["points"][0] == [0.0, 0.0, 0.01, 0.0, 0.0]
         assert ask(page, "events")[0].status == 503
-
-
-def _held(page: LivePage) -> int:
-    """Return the number of connections that the page holds open now."""
-    port = urlsplit(page.url).port
-    mine = psutil.Process().net_connections("tcp")
-    return sum(c.laddr[1:] == (port,) and c.status == psutil.CONN_ESTABLISHED for c in mine)
-
-
-def test_idle_connections_do_not_use_up_the_descriptors(page):
-    """Of 400 idle connections at most 140 are held, and the owner's page still loads."""
-    url = urlsplit(page.url)
-    with ExitStack() as opened:
-        stream = news(page, opened)
-        for number in range(400):
-            stranger = socket.create_connection((url.hostname, url.port), timeout=PATIENCE)
-            opened.enter_context(stranger)
-            if number % 2:
-                stranger.sendall(b"GET / HTTP/1.1\r\nHost: ")
-            if number % 30 == 0:  # fewer than the server accepts at once
-                until(lambda: _held(page) <= 140)
-        until(lambda: _held(page) <= 140)
-        assert ask(page)[0].status == 200
-        assert stream.readline() == b"event: state\n"
 
 
 def test_a_full_queue_does_not_keep_the_owner_out(page, monkeypatch):
@@ -333,23 +286,6 @@ def test_a_full_queue_does_not_keep_the_owner_out(page, monkeypatch):
         assert rightful.recv(12) == b"HTTP/1.1 200"
 
 
-def test_only_connections_without_the_secret_time_out(folder, monkeypatch):
-    """A connection without the secret is closed after a time; one with the secret stays."""
-    monkeypatch.setattr("pipeline.web._STRANGER_STAYS", 0.2)
-    with LivePage(folder) as page, ExitStack() as opened:
-        stream = news(page, opened)
-        assert stream.readline() == b"event: state\n"
-        url = urlsplit(page.url)
-        with socket.create_connection((url.hostname, url.port), timeout=PATIENCE) as stranger:
-            with suppress(ConnectionResetError):
-                assert stranger.recv(1) == b""
-        page.planned(PLAN, frozenset())  # sent to all pages that still listen
-        while line := stream.readline():
-            if line == b"event: state\n":
-                break
-        assert line
-
-
 def test_the_page_does_not_delay_a_run(folder):
     """With two browsers that read and one that does not, 50 lines take less than a heartbeat."""
     took = []
@@ -371,12 +307,20 @@ def test_the_page_does_not_delay_a_run(folder):
     assert np.median(took) < HEARTBEAT_EVERY
 
 
-def test_pages_get_the_end_of_the_session(folder):
-    """When the session ends, each open page gets the last state, and the port is freed."""
+def test_pages_get_the_end_of_the_session(folder, monkeypatch):
+    """When the session ends, each open page gets the last state, and the port is freed.
+
+    A connection without the secret is closed after a time before; one with the secret stays.
+    """
+    monkeypatch.setattr("pipeline.web._STRANGER_STAYS", 0.2)
     with ExitStack() as opened:
         with LivePage(folder) as page:
             page.planned(PLAN, frozenset())
             stream = news(page, opened)
+            url = urlsplit(page.url)
+            with socket.create_connection((url.hostname, url.port), timeout=PATIENCE) as stranger:
+                with suppress(ConnectionResetError):
+                    assert stranger.recv(1) == b""
         text = stream.read().decode()
     assert '"phase":"over"' in text
     with pytest.raises(ConnectionRefusedError):
@@ -433,8 +377,11 @@ BLUE, ORANGE = "0,114,178", "213,94,0"
 
 
 def test_the_page_shows_plan_progress_counters_and_curves(page, show):
-    """The page shows the plan, progress, counters, and curves in the colours of their labels."""
-    window = show()
+    """The page shows the plan, progress, counters, and curves in the colours of their labels.
+
+    If the system switches to dark mode, the curves of the open page change colour.
+    """
+    window = show(color_scheme="light")
     record(page)
 
     expect(window.locator("#status")).to_have_text("Recording sine-01.")
@@ -448,6 +395,9 @@ def test_the_page_shows_plan_progress_counters_and_curves(page, show):
     assert {BLUE, ORANGE} <= set(window.evaluate(INK, "positions"))
     assert BLUE in window.evaluate(INK, "inputs")
     assert ORANGE not in window.evaluate(INK, "inputs")
+    window.emulate_media(color_scheme="dark")
+    until(lambda: "86,180,233" in window.evaluate(INK, "positions"))
+    assert BLUE not in window.evaluate(INK, "positions")
 
     page.finished(RunOutcome(recording=SINE, lines=2000, partial="a cart passed the limit"))
     expect(window.locator("#plan .partial .why")).to_have_text("a cart passed the limit")
@@ -527,16 +477,6 @@ def test_the_live_page_is_accessible(page, show, size):
     assert violations(window) == []
     assert window.evaluate("document.documentElement.scrollWidth") <= size[0]
     page.answer(1)
-
-
-def test_by_night_the_curves_change_colour(page, show):
-    """If the system switches to dark mode, the curves of an open page change colour."""
-    window = show(color_scheme="light")
-    record(page)
-    expect(window.locator("#plots .keys").first).to_contain_text("3.99")
-    window.emulate_media(color_scheme="dark")
-    until(lambda: "86,180,233" in window.evaluate(INK, "positions"))
-    assert BLUE not in window.evaluate(INK, "positions")
 
 
 @pytest.mark.slow

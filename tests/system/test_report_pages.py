@@ -5,18 +5,13 @@ import re
 import shutil
 import subprocess
 from collections import Counter
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from unicodedata import normalize
 
 import html5lib
-import numpy as np
 import pytest
-from numpy.typing import NDArray
-from pypdf import PdfReader
-from pypdf.generic import DictionaryObject
 
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.report.effects.gallery import render_effects
@@ -180,90 +175,6 @@ def test_no_word_of_the_pdf_is_cut_or_covered(made):
         assert covered(words) == []
 
 
-# As a share of the height of a page's text. The last page may end early.
-MOST_WHITE = 1 / 3
-PRINTED = (*(pytest.param(case, marks=LONG) for case in ("one", "two")), "three", "gap", "solution")
-
-
-@pytest.mark.skipif(shutil.which("pdftoppm") is None, reason="no pdftoppm: poppler-utils")
-@pytest.mark.parametrize("case", PRINTED)
-def test_no_page_of_the_print_is_a_third_empty(case, folder, request):
-    """In print no page before the last is a third empty.
-
-    Figures shrink and tables are split so that each page is full.
-    """
-    (pdf,) = folder(case, request).glob("*.pdf")
-    pages = subprocess.run(
-        ["pdftoppm", "-gray", "-r", "36", pdf], capture_output=True, check=True
-    ).stdout
-
-    whites = [white_stretch(page) for page in pictures(pages)]
-
-    assert len(whites) == len(PdfReader(pdf).pages)
-    assert [white for white in whites[:-1] if white > MOST_WHITE] == []
-
-
-def pictures(pgm: bytes) -> Iterator[NDArray[np.uint8]]:
-    """Yield the pages written by pdftoppm, one after another."""
-    while head := re.match(rb"P5\s+(\d+)\s+(\d+)\s+255\s", pgm):
-        width, height = map(int, head.groups())
-        end = head.end() + width * height
-        yield np.frombuffer(pgm[head.end() : end], np.uint8).reshape(height, width)
-        pgm = pgm[end:]
-
-
-def white_stretch(page: NDArray[np.uint8]) -> float:
-    """Return the longest stretch of a page without ink, as a share of its text height."""
-    body = page[round(0.064 * len(page)) : round(0.929 * len(page))]  # between the margins
-    inked = np.flatnonzero((body < 200).any(axis=1))
-    edges = np.concatenate([[0], inked, [len(body)]])
-    return float(np.diff(edges).max() / len(body))
-
-
-@pytest.mark.parametrize("case", PRINTED)
-def test_no_table_begins_at_the_foot_of_a_page(case, folder, request):
-    """In print a table's caption is on the same page as its headings and first four rows."""
-    (pdf,) = folder(case, request).glob("*.pdf")
-    tables = list(rows_by_page(PdfReader(pdf)))
-    assert len(tables) > 2
-    broken = [rows for rows in tables if len(rows) > 1]
-    assert [rows for rows in broken if rows[0] < 5] == []
-
-
-def rows_by_page(pdf: PdfReader) -> Iterator[list[int]]:
-    """Yield for each table the number of its rows on each page."""
-    references = (page.indirect_reference for page in pdf.pages)
-    numbers = {at.idnum: n for n, at in enumerate(references) if at}
-    for table in elements(pdf.root_object["/StructTreeRoot"], "/Table"):
-        pages = [next(pages_of(row, numbers)) for row in elements(table, "/TR")]
-        yield [n for _, n in sorted(Counter(pages).items())]
-
-
-def elements(node: Any, kind: str) -> Iterator[Any]:
-    """Yield the elements of a kind inside a node of the structure, in order."""
-    node = node.get_object() if hasattr(node, "get_object") else node
-    if isinstance(node, list):
-        for one in node:
-            yield from elements(one, kind)
-    elif isinstance(node, dict):
-        if node.get("/S") == kind:
-            yield node
-        else:
-            yield from elements(node.get("/K", []), kind)
-
-
-def pages_of(node: Any, numbers: dict[int, int]) -> Iterator[int]:
-    """Yield the pages on which the content of a node is drawn."""
-    node = node.get_object() if hasattr(node, "get_object") else node
-    if isinstance(node, list):
-        for one in node:
-            yield from pages_of(one, numbers)
-    elif isinstance(node, DictionaryObject):
-        if "/Pg" in node:
-            yield numbers[node.raw_get("/Pg").idnum]
-        yield from pages_of(node.get("/K", []), numbers)
-
-
 class Box(NamedTuple):
     """A text and its place."""
 
@@ -323,35 +234,17 @@ BOXES = """() => {
     if (math.checkVisibility()) add(math.getBoundingClientRect(), math.textContent, math);
   return found;
 }"""
-DRAWN = """() => [...document.querySelectorAll('figure svg')].map((svg) => {
-  const box = svg.getBoundingClientRect();
-  const texts = [...svg.querySelectorAll('text')].filter((t) => t.checkVisibility());
-  return [[box.left, box.top, box.right, box.bottom], texts.map((t) => {
-    const r = t.getBoundingClientRect();
-    return [r.left, r.top, r.right, r.bottom, t.textContent];
-  })];
-})"""
-
-
-WIDER = """() => Array.from(document.querySelectorAll('.wide:has(table)'))
-    .filter((e) => e.scrollWidth > e.clientWidth).map((e) => e.innerText)"""
-BROKEN = """() => Array.from(document.querySelectorAll('td:nth-child(2):not(:last-child) > code'))
-    .filter((e) => e.getClientRects().length > 1).map((e) => e.innerText)"""
 
 
 def test_pages_are_accessible_on_every_screen(made, show):
     """On every screen the checker axe finds no serious barrier.
 
     Only parts that scroll are wider than the page, no text covers another, and figures contain
-    their texts. A laptop shows every column of a table; a phone shows the name of a check on one
-    line.
+    their texts. On a laptop letters in figures are at least ten pixels high.
     """
     page = show(page_of(made))
     page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
     assert [v for v in violations(page) if v.impact in ("serious", "critical")] == []
-    for width, height in (WIDE, LAPTOP):
-        page.set_viewport_size({"width": width, "height": height})
-        assert page.evaluate(WIDER) == []
     for width, height in (WIDE, PHONE):
         page.set_viewport_size({"width": width, "height": height})
 
@@ -366,76 +259,63 @@ def test_pages_are_accessible_on_every_screen(made, show):
             drawn = [Box(*text) for text in texts]
             assert [text for text in drawn if not text.lies_in(Box._make([*edge, ""]))] == []
             assert covered(drawn) == []
-    assert page.evaluate(BROKEN) == []
+    page.set_viewport_size({"width": LAPTOP[0], "height": LAPTOP[1]})
+    assert page.evaluate(SMALLEST) >= 10
 
 
-@pytest.mark.parametrize("case", ["class", "feedback"])
-def test_a_phone_shows_the_numbers_of_a_table(case, folder, request, show):
-    """On a phone a table's column of names stays in sight and takes at most half of the view."""
-    page = show(page_of(folder(case, request)), size=PHONE)
-    widths = page.evaluate("""() => Array.from(document.querySelectorAll('details'),
-        (fold) => fold.open = true) && Array.from(
-        document.querySelectorAll('.numbered:not(.told) :is(th, td):first-child'),
-        (cell) => cell.getBoundingClientRect().width)""")
-    assert 0 < max(widths) <= PHONE[0] / 2
+def test_a_figure_is_zoomed_by_pointer_and_by_keys(three, show):
+    """Dragging or plus zooms all panels of a figure, and the button or 0 shows all again.
+
+    Arrow keys go from point to point.
+    """
+    page = show(page_of(three))
+    figure = page.locator("figure").first
+    figure.scroll_into_view_if_needed()
+
+    def drawn() -> list[list[str | None]]:
+        own = "(all) => all.map((e) => ['d', 'x', 'y', 'transform'].map((n) => e.getAttribute(n)))"
+        return figure.locator("svg .panel *").evaluate_all(own)
+
+    def ticks() -> list[str]:
+        own = "(all) => all.filter((t) => t.checkVisibility()).map((t) => t.textContent)"
+        return figure.locator("svg .panel text").evaluate_all(own)
+
+    before, labels = drawn(), ticks()
+    box = figure.locator("svg").bounding_box()
+    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.2 * box["height"])
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 0.3 * box["height"], steps=3)
+    page.mouse.up()
+    zoomed = ticks()
+    assert zoomed != labels
+    assert len(zoomed) >= 8
+    assert all(low != high for low, high in pairwise(zoomed))
+    assert "NaN" not in figure.locator("svg").inner_html()
+    figure.get_by_role("button", name="Show all").click()
+    assert drawn() == before
+
+    figure.locator(".stage").focus()
+    told = []
+    for _ in range(3):
+        page.keyboard.press("ArrowRight")
+        told.append(numbers(figure.locator("output").inner_text())[0])
+    assert told == sorted(set(told))
+    page.keyboard.press("+")
+    assert ticks() != labels
+    page.keyboard.press("0")
+    assert ticks() == labels
 
 
-TALL = """() => Array.from(document.querySelectorAll('.numbered:not(.small) td'))
-    .map((e) => e.getBoundingClientRect().height).sort((a, b) => b - a)[0]"""
-SPLIT = """() => {
-  const found = [];
-  const walker = document.createTreeWalker(document.querySelector('main'), NodeFilter.SHOW_TEXT);
-  for (let node = walker.nextNode(); node; node = walker.nextNode()) {
-    const owner = node.parentElement;
-    if (owner.closest('math, svg, code, pre') || !owner.checkVisibility()) continue;
-    for (const match of node.textContent.matchAll(/\\d\\s(?:%|cm|V|s|Hz|rad\\/s)(?!\\w)/g)) {
-      const range = document.createRange();
-      range.setStart(node, match.index);
-      range.setEnd(node, match.index + match[0].length);
-      const [first, ...more] = range.getClientRects();
-      if (more.some((rect) => Math.abs(rect.top - first.top) > 4)) found.push(match[0]);
-    }
-  }
-  return found;
-}"""
-
-
-def test_a_phone_does_not_squeeze_columns_or_split_units(three, show):
-    """On a phone no cell of a table is higher than five lines, and a number stays with its unit."""
-    page = show(page_of(three), size=PHONE)
-    page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
-    assert 0 < page.evaluate(TALL) < 130
-    assert page.evaluate(SPLIT) == []
-
-
+DRAWN = """() => [...document.querySelectorAll('figure svg')].map((svg) => {
+  const box = svg.getBoundingClientRect();
+  const texts = [...svg.querySelectorAll('text')].filter((t) => t.checkVisibility());
+  return [[box.left, box.top, box.right, box.bottom], texts.map((t) => {
+    const r = t.getBoundingClientRect();
+    return [r.left, r.top, r.right, r.bottom, t.textContent];
+  })];
+})"""
 SMALLEST = """() => Math.min(...Array.from(document.querySelectorAll('figure svg text'), (text) =>
     text.ownerSVGElement.getScreenCTM().a * parseFloat(getComputedStyle(text).fontSize)))"""
-
-
-def test_figures_can_be_read_on_a_laptop(made, show):
-    """On a laptop letters in figures are at least ten pixels high.
-
-    No button lies below a figure.
-    """
-    page = show(page_of(made), size=LAPTOP)
-    assert page.evaluate(SMALLEST) >= 10
-    for plot in page.locator(".plot").all():
-        bounds, tools = plot.bounding_box(), plot.locator(".tools").bounding_box()
-        assert tools["x"] >= bounds["x"] + bounds["width"] / 2
-        # The buttons hang over the figure's edge by a few pixels.
-        assert tools["y"] + tools["height"] <= bounds["y"] + bounds["height"] + 10
-
-
-def test_a_class_page_begins_with_the_distribution(folder, request, show):
-    """The page of a class first shows the distribution of points, then flags, then criteria."""
-    page = show(page_of(folder("class", request)), size=LAPTOP)
-    first = page.locator("figure").first.bounding_box()
-    assert first["y"] + first["height"] < LAPTOP[1]
-    titles = page.locator("h2").all_inner_texts()
-    assert titles.index("Most common mistakes") < titles.index("Criteria")
-    drawn = page.locator("#criteria figure svg text").all_text_contents()
-    assert "static gains from the steps" in drawn
-    assert "initial-gains" not in drawn
 
 
 def test_a_class_is_searched_and_sorted(folder, request, show):
@@ -491,59 +371,6 @@ def test_a_figure_shows_the_values_under_the_pointer(three, show):
     assert magnitude == pytest.approx(decibel, abs=0.01)
 
 
-def test_dragging_zooms_a_figure_and_a_button_resets_it(three, show):
-    """Dragging zooms all panels of a figure that share an axis, and the button shows all again."""
-    page = show(page_of(three))
-    figure = page.locator("figure").first
-    figure.scroll_into_view_if_needed()
-    before = geometry(figure)
-    labels = visible_ticks(figure)
-    box = figure.locator("svg").bounding_box()
-
-    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.2 * box["height"])
-    page.mouse.down()
-    page.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 0.3 * box["height"], steps=3)
-    page.mouse.up()
-
-    zoomed = visible_ticks(figure)
-    assert zoomed != labels
-    assert len(zoomed) >= 8
-    assert all(low != high for low, high in pairwise(zoomed))
-    assert "NaN" not in figure.locator("svg").inner_html()
-    figure.get_by_role("button", name="Show all").click()
-    assert visible_ticks(figure) == labels
-    assert geometry(figure) == before
-
-
-def visible_ticks(figure) -> list[str]:
-    script = "(all) => all.filter((t) => t.checkVisibility()).map((t) => t.textContent)"
-    return figure.locator("svg .panel text").evaluate_all(script)
-
-
-def geometry(figure) -> list[list[str | None]]:
-    script = "(all) => all.map((e) => ['d', 'x', 'y', 'transform'].map((n) => e.getAttribute(n)))"
-    return figure.locator("svg .panel *").evaluate_all(script)
-
-
-def test_a_figure_answers_to_the_keyboard(three, show):
-    """Arrow keys go from point to point in a figure, plus zooms in, and 0 shows all."""
-    page = show(page_of(three))
-    figure = page.locator("figure").first
-    figure.locator(".stage").focus()
-
-    told = []
-    for _ in range(3):
-        page.keyboard.press("ArrowRight")
-        told.append(numbers(figure.locator("output").inner_text())[0])
-    labels = visible_ticks(figure)
-    page.keyboard.press("+")
-
-    assert told == sorted(set(told))
-    assert visible_ticks(figure) != labels
-    page.keyboard.press("0")
-    assert visible_ticks(figure) == labels
-
-
 def test_numbers_can_be_copied(three, show):
     """A copied table has tabs and plain numbers, with value and error in separate columns."""
     page = show(page_of(three), permissions=["clipboard-read", "clipboard-write"])
@@ -570,7 +397,7 @@ def test_without_scripts_everything_can_be_read(three, show):
     assert page.locator("figure svg").count() == page.locator("figure").count() > 5
     assert page.locator("button").count() == 0
     page.locator("#checks summary").click()
-    assert page.get_by_text("The fit converged").is_visible()
+    assert page.locator("#checks table").first.is_visible()
 
 
 @pytest.mark.slow
@@ -585,7 +412,7 @@ def test_printing_opens_folded_tables(three, show, tmp_path):
     read = subprocess.run(
         ["pdftotext", paper, "-"], capture_output=True, text=True, encoding="utf-8", check=True
     )
-    text = " ".join(normalize("NFKC", read.stdout).split())
-    assert "The fit converged" in text
-    assert "drag to zoom" not in text
-    assert "Figure 3." in text
+    words = normalize("NFKC", read.stdout).split()
+    assert "converged" in words
+    assert "zoom" not in words
+    assert "3." in words[words.index("Figure") :]

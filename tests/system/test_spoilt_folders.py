@@ -4,6 +4,7 @@ import json
 import re
 import tempfile
 import time
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from random import Random
@@ -11,10 +12,29 @@ from random import Random
 import numpy as np
 import pytest
 
+from pipeline.arrays import Array
 from pipeline.simulated.submission import write_submission
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.poison import poisoned
-from tests.system.test_any_submission import CHANNELS
+
+CHANNELS: dict[str, Callable[[Array], Array]] = {
+    "dead": lambda y: 0 * y,
+    "constant": lambda y: 0 * y + 3.3,
+    "stuck": lambda y: np.where(np.arange(y.size) < y.size // 3, y, y[y.size // 3]),
+    "jumping": lambda y: y + 1e3 * (np.arange(y.size) >= y.size // 2),
+    "spiked": lambda y: np.eye(1, y.size, y.size // 2)[0],
+    "clipped": lambda y: np.clip(y, -0.1 * np.abs(y).max(), 0.1 * np.abs(y).max()),
+    "noisy": lambda y: np.random.default_rng(y.size).standard_normal(y.size),
+    "reversed": lambda y: y[::-1],
+    "negated": lambda y: -y,
+    "offset": lambda y: y + 1e6,
+    "ramp": lambda y: np.arange(y.size, dtype=float),
+    "huge": lambda y: 1e40 * y,
+    "large": lambda y: 1e6 * y,
+    "small": lambda y: 1e-6 * y,
+    "tiny": lambda y: 1e-40 * y,
+}
+LENGTHS = (slice(None), slice(None), slice(None), slice(8), slice(40), slice(0, None, 2))
 
 # Processor time, which does not depend on other programs. `gap` also has its own limit.
 MOST_TIME = 60.0  # s
@@ -85,9 +105,10 @@ def odd(files: dict[str, bytes], rng: Random) -> None:
 
 
 def spoil_channel(files: dict[str, bytes], rng: Random, *, every: bool) -> None:
-    """Spoil one column of a table, or of all tables, as a faulty bench may do."""
+    """Spoil one column of a table, or of all tables, as a faulty bench may do; perhaps cut it."""
     tables = sorted(name for name in files if name.endswith(".csv"))
     how, column = CHANNELS[rng.choice(sorted(CHANNELS))], rng.randrange(1, 5)
+    length = rng.choice(LENGTHS)
     for name in tables if every else [rng.choice(tables)]:
         try:
             head, *rows = files[name].decode().splitlines()
@@ -96,7 +117,7 @@ def spoil_channel(files: dict[str, bytes], rng: Random, *, every: bool) -> None:
             continue
         if values.ndim == 2 and len(values) and column < values.shape[1]:
             values[:, column] = how(values[:, column])
-            lines = [head, *(",".join(f"{value:.9g}" for value in row) for row in values)]
+            lines = [head, *(",".join(f"{value:.9g}" for value in row) for row in values[length])]
             files[name] = "\n".join(lines).encode()
 
 
