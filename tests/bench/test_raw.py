@@ -9,7 +9,6 @@ from pipeline.ingest.read import read_data
 from pipeline.protocol import Description, Reading, format_reading
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import LIMITS, sine
-from tests.helpers.acquisitions import LIMITS, sine
 
 HEADER = RawHeader(
     recording=sine("sine-µ", seconds=0.5), limits=LIMITS, commands=("d;s;o;o;2;82;1;",),
