@@ -242,30 +242,6 @@ def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
     assert (added.amplitude, added.frequency_end) == (0.01, 5.0)
 
 
-@pytest.mark.slow
-@pytest.mark.sample
-def test_ports_are_listed_and_the_one_used_is_remembered(tmp_path, real):
-    """The list of ports has each virtual bench that runs on this computer.
-
-    The port used last stays in the list, marked as "not found now" if it is gone.
-    """
-    work = write_work(tmp_path / "team", [sine("long", seconds=300)])
-    with DeskServer(folder=work) as server:
-        visitor = Visitor.of(server.url)
-        assert f'<option value="{real.address}">virtual bench' in visitor.get("/bench/0/").text
-        visitor.post("/bench/0/acquire", port=real.address, other=NOBODY)  # the typed port is used
-        until(lambda: "no bench listens there" in visitor.get("/bench/0/").text)
-        page = visitor.get("/bench/0/").text
-        assert f'<option value="{NOBODY}">{NOBODY} (used last, not found now)' in page
-        begun(visitor, work, "long", port=real.address)
-        visitor.post("/bench/0/press", wish="stop", number="0", plain="1")
-        until(lambda: "Stopped. Start again" in visitor.get("/bench/0/").text)
-    with DeskServer(folder=work) as server:  # another desk that starts later
-        page = Visitor.of(server.url).get("/bench/0/").text
-    first = re.findall(r'<select name="port" id="port"><option value="([^"]+)"', page)
-    assert first == [real.address]
-
-
 def test_new_recordings_in_the_plan_are_marked(tmp_path):
     """The plan marks which runs are recorded, which is next, and which was added last."""
     work = write_work(tmp_path / "team", [sine("first", seconds=1), sine("second", seconds=1)])

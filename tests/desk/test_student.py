@@ -4,8 +4,6 @@ import io
 import json
 import os
 import re
-import subprocess
-import sys
 import time
 import zipfile
 from collections.abc import Iterator
@@ -32,7 +30,7 @@ from pipeline.submission.load import NAME
 from pipeline.words.progress import silent
 from tests.helpers.desks import Answer, Visitor, a_submission, at_desk, some_files, wrongs
 from tests.helpers.recordings import xlsx
-from tests.helpers.waiting import PATIENCE, started, until
+from tests.helpers.waiting import until
 
 HERE = "/student/0/"
 pytestmark = pytest.mark.usefixtures("work_here")
@@ -119,60 +117,6 @@ def handed_in(visitor: Visitor) -> Answer:
 def zipped(visitor: Visitor) -> zipfile.ZipFile:
     """Return the zip file's content."""
     return zipfile.ZipFile(io.BytesIO(visitor.get(HERE + "hand-in.zip").body))
-
-
-@pytest.mark.slow
-@pytest.mark.sample
-def test_from_an_empty_folder_to_the_zip(room):
-    """Without scripts, uploaded files become a submission, then a report, answers and a zip."""
-    visitor, folder = room
-    assert visitor.get(HERE).state["next"] == "files"
-    assert visitor.upload(HERE + "files", some_files()).headers["location"] == HERE + "#files"
-    assert visitor.get(HERE).text.count("<polyline") >= len(some_files())
-    files = {f"data/{name}" for name, _ in some_files()}
-    assert {e.file for e in load_submission(folder).experiments} == files
-    given = {"title": "One <cart>", "system.position.unit": "cm", "reported.final.K": "28.90",
-             "system.springs.shown": "1", "system.springs": "0"}  # fmt: skip
-    saved = save(visitor, **given)
-    assert (saved.status, saved.headers["location"]) == (303, HERE + "#details")
-    submission = load_submission(folder)
-    assert (submission.title, submission.system.springs) == ("One <cart>", (True, False))
-    assert submission.reported is not None
-    assert str(submission.reported.final["K"]) == "28.90"  # digits are kept as typed
-    assert "# Leave out" in (folder / NAME).read_text(encoding="utf-8")
-
-    assert visitor.post(HERE + "make-report").status == 303
-    until(lambda: visitor.get(HERE).state["report"] == "current")
-    assert "report/report.html" in visitor.get(HERE + "report").text
-    report = visitor.get(HERE + "report/report.html")
-    assert report.headers["content-security-policy"].split(";")[0] == "sandbox allow-scripts"
-    assert "One &lt;cart&gt;" in report.text
-    assert "28.90" in report.text  # as typed, beside the recomputed value
-    assert visitor.get(HERE + "report/report.pdf").body.startswith(b"%PDF")
-
-    told = folder / "report" / "questions.json"
-    asked = json.loads(told.read_text(encoding="utf-8"))
-    asked["questions"].append({"id": "zeta", "text": "Why?"})
-    told.write_text(json.dumps(asked), encoding="utf-8")
-    assert save(visitor, "answer", id="zeta", answer="So.\r\nAnd so.").status == 303
-    assert (folder / "notes.md").read_text(encoding="utf-8").endswith("## zeta\n\nSo.\nAnd so.\n")
-    assert "so.</textarea>" in visitor.get(HERE + "questions").text
-
-    before = visitor.get(HERE + "report/report.pdf").body
-    assert save(visitor, **{"reported.final.K": "29.13"}).status == 303
-    assert visitor.get(HERE).state["report"] == "older"
-    assert "report/report.pdf" not in zipped(visitor).namelist()  # no stale report is submitted
-    assert handed_in(visitor).state["report"] == "current"
-    assert "29.13" in visitor.get(HERE + "report/report.html").text
-    packed = visitor.get(HERE + "hand-in.zip")
-    new = zipfile.ZipFile(io.BytesIO(packed.body)).read("report/report.pdf")
-    assert new == visitor.get(HERE + "report/report.pdf").body != before
-    names = set(zipfile.ZipFile(io.BytesIO(packed.body)).namelist())
-    assert names == files | {NAME, "notes.md", "report/report.pdf"}
-    archive = folder.parent / "one.zip"
-    archive.write_bytes(packed.body)
-    (found,) = find_hand_ins([archive], scratch=folder.parent / "scratch")
-    assert found.problem == ""
 
 
 def test_an_error_is_shown_beside_its_field(filled):
@@ -346,6 +290,12 @@ def test_the_content_of_the_zip_is_shown_before_handing_in(filled):
     assert {key for key, _ in taken} >= {"system.springs", "system.position.unit",
                                          "system.input.unit", "system.input.sign"}  # fmt: skip
     assert dict(taken)["system.position.unit"].startswith(": count")
+    archive = folder.parent / "one.zip"
+    archive.write_bytes(visitor.get(HERE + "hand-in.zip").body)
+    (found,) = find_hand_ins([archive], scratch=folder.parent / "scratch")
+    assert found.problem == ""
+    policy = visitor.get(HERE + "report/report.html").headers["content-security-policy"]
+    assert policy.startswith("sandbox allow-scripts;")
     asked = json.loads((folder / "report" / "questions.json").read_bytes())["questions"]
     assert page.count(f'href="{HERE}questions#question-') == len(asked)
 
@@ -466,39 +416,6 @@ def test_only_one_of_many_simultaneous_saves_succeeds(filled):
     status = [answer.status for answer in answers]
     assert sorted(status) == [303] + 7 * [409]
     assert load_submission(folder).title == titles[status.index(303)]
-
-
-_SAVES = """
-import sys
-from pathlib import Path
-from pipeline.submission.edit import Outdated, edit_submission, submission_text, text_digest
-folder, title = Path(sys.argv[1]), sys.argv[2]
-def change(document):
-    print("changing", flush=True)
-    sys.stdin.readline()
-    document["title"] = title
-edit_submission(folder, change, version=text_digest(submission_text(folder)))
-"""
-
-
-def test_another_process_waits_its_turn(filled):
-    """If a terminal command and the desk change the file at once, the later change is refused."""
-    visitor, folder = filled
-    seen = visitor.get(HERE).value("seen")
-    command = [sys.executable, "-c", _SAVES, str(folder), "terminal"]
-    with started(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
-        assert other.stdout is not None
-        assert other.stdin is not None
-        assert other.stdout.readline().strip() == b"changing"
-        with ThreadPoolExecutor(1) as pool:
-            saved = pool.submit(visitor.post, HERE + "save", seen=seen, title="desk")
-            time.sleep(0.5)
-            assert not saved.done()
-            other.stdin.write(b"\n")
-            other.stdin.flush()
-            assert other.wait(PATIENCE) == 0
-            assert saved.result().status == 409
-    assert load_submission(folder).title == "terminal"
 
 
 def test_no_simultaneous_answer_is_lost(filled):
