@@ -1,12 +1,14 @@
 """`cartlab desk` gives an error in one line, and recognises the kind of folder it opens."""
 
-from urllib.parse import urlsplit
-
 import pytest
 
-from pipeline.desk.app import DeskServer
 from tests.helpers.commandline import cartlab_here
-from tests.helpers.desks import Visitor, a_submission, through_proxy, write_users
+from tests.helpers.desks import (
+    a_submission,
+    at_desk,
+    at_lab,
+    listed_user,
+)
 
 USERS = '[proxy]\naddress = "127.0.0.1"\nheader = "X-Name"\nsite = "http://lab"\n'
 USERS += f'secret_header = "X-Secret"\nsecret = "{"s" * 24}"\n'
@@ -29,29 +31,24 @@ def test_a_desk_that_cannot_start_is_one_line(options, why, tmp_path):
     (tmp_path / "users.toml").write_text(USERS, encoding="utf-8")
     (tmp_path / "users.toml").chmod(0o600)
     done = cartlab_here("desk", "--no-browser", *options, cwd=tmp_path)
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
     assert why in done.stderr.lower()
     assert [path.name for path in tmp_path.iterdir()] == ["users.toml"]
 
 
 def test_the_kind_of_folder_is_recognised(tmp_path):
     """A folder or file with a gradebook opens as a class, any other folder as a submission."""
-    grades = tmp_path / "grades"
+    grades, team = tmp_path / "grades", a_submission(tmp_path / "team")
     grades.mkdir()
     (grades / "gradebook.sqlite").write_bytes(b"")
-    with DeskServer(folder=grades) as server:
-        visitor = Visitor.of(server.url)
-        team = a_submission(tmp_path / "team")
-        for folder, room in (
-            (grades / "gradebook.sqlite", "grades"), (team, "student"), (team, "student"),
-        ):  # fmt: skip
+    with at_desk(grades) as visitor:
+        for folder, room in ((grades / "gradebook.sqlite", "grades"), (team, "student"),
+                             (team, "student")):  # fmt: skip
             opened = visitor.post("/open", folder=str(folder))
             assert (opened.status, opened.headers["location"]) == (303, f"/{room}/0/")
         assert visitor.post("/open", folder=str(tmp_path / "a" / "b")).status == 422
-        home = visitor.get("/").text
-        assert "/grades/0/" in home
-        assert "/student/0/" in home
+        for room in ("grades", "student"):
+            assert f"/{room}/0/" in visitor.get("/").text
 
 
 ADDRESSES = (
@@ -64,28 +61,19 @@ ADDRESSES = (
 
 
 def test_a_wrong_database_address_is_explained(tmp_path, monkeypatch):
-    """If a database address is wrong, the error shows the right form, and no file is made."""
+    """If a database address is wrong, the error shows the right form, and no file is made.
+
+    If one of a TA's gradebooks has a bad address, the others are still shown.
+    """
     monkeypatch.chdir(tmp_path)
-    with DeskServer() as server:
-        visitor = Visitor.of(server.url)
+    with at_desk() as visitor:
         for typed in ADDRESSES:
             assert visitor.post("/open", folder=typed).status == 422, typed
             assert visitor.get("/").status == 200, typed
-        page = visitor.post("/open", folder="postgresql://[::1").text
-        assert "write postgresql://NAME@HOST/DATABASE" in page
+        assert "postgresql://NAME@HOST/" in visitor.post("/open", folder=ADDRESSES[0]).text
     assert list(tmp_path.iterdir()) == []
-
-
-def test_one_bad_address_does_not_hide_the_other_gradebooks(tmp_path):
-    """If one of a TA's gradebooks has a bad address, the others are still shown.
-
-    The page of the bad gradebook says what is wrong.
-    """
     (tmp_path / "grades").mkdir()
-    books = '["postgresql://[::1", "grades"]'
-    users = f'[[users]]\nname = "ta"\nrole = "ta"\ngradebooks = {books}\n'
-    file = write_users(tmp_path, users)
-    with DeskServer(host="127.0.0.1", users=file) as server:
-        visitor = through_proxy(urlsplit(server.url).port or 0, "ta")
-        assert "/grades/1/" in visitor.get("/").text
-        assert visitor.get("/grades/0/").status == 422
+    books = f'["{ADDRESSES[0]}", "grades"]'
+    with at_lab(tmp_path, listed_user("ta", "ta", gradebooks=books)) as named:
+        assert "/grades/1/" in named("ta").get("/").text
+        assert named("ta").get("/grades/0/").status == 422

@@ -65,70 +65,6 @@ def a_desk(tmp_path: Path, *options: str) -> Iterator[tuple[subprocess.Popen, st
         yield desk, url, ended
 
 
-@pytest.mark.parametrize("name", ["SIGINT", pytest.param("SIGHUP", marks=LONG)])
-def test_a_signal_that_ends_the_desk_is_named(name, tmp_path):
-    """A signal that ends the desk is named on stderr and in the log; neither shows the secret.
-
-    The log also says when the desk started.
-    """
-    if signal.getsignal(getattr(signal, name)) is signal.SIG_IGN:
-        pytest.skip(f"the tests were started with {name} ignored, as by nohup")
-    with a_desk(tmp_path) as (desk, url, ended):
-        desk.send_signal(getattr(signal, name))
-        status, said, kept = ended()
-    assert (status, said) == (0, f"cartlab: the desk ends: {name}\n")
-    begins, ends = kept.splitlines()
-    assert f" {desk.pid} begins: cartlab " in begins
-    assert ends.endswith(f" {desk.pid} ends: {name}")
-    assert url.split("/")[3] not in kept
-
-
-@pytest.mark.parametrize(
-    ("number", "told"),
-    [
-        pytest.param(signal.SIGKILL, "was killed: by kill -9", marks=LONG),
-        (signal.SIGSEGV, "Fatal Python error: Segmentation fault"),
-    ],
-)
-def test_a_desk_killed_at_once_is_reported(number, told, tmp_path):
-    """If a signal kills the desk at once, a second process, which watches the desk, reports it.
-
-    After a crash in a library, it also reports the lines of code that were running.
-    """
-    with a_desk(tmp_path) as (desk, _, ended):
-        desk.send_signal(number)
-        status, said, kept = ended()
-    assert status == -number
-    assert told in said
-    assert told in kept
-    assert ("most recent call first" in kept) == (number != signal.SIGKILL)
-    assert f"The log: {tmp_path}" in said
-
-
-@pytest.mark.parametrize(
-    ("sent", "status", "told"),
-    [
-        pytest.param("memory MainThread", 1, "the desk ends: MemoryError", marks=LONG),
-        ("memory server", 2, "the desk's server stopped unexpectedly"),
-        pytest.param("exit0 server", 2, "the desk's server stopped unexpectedly", marks=LONG),
-        pytest.param("exit now", 3, "was killed: by kill -9", marks=LONG),
-    ],
-)
-def test_an_exception_or_exit_in_the_desk_is_reported(sent, status, told, tmp_path):
-    """If an exception or an exit ends the desk, this is reported, with a traceback in the log."""
-    with a_desk(tmp_path) as (desk, _, ended):
-        assert desk.stdin is not None
-        desk.stdin.write(f"{sent}\n")
-        desk.stdin.flush()
-        found, said, kept = ended()
-    assert found == status
-    assert told in said
-    assert told.removeprefix("the desk ") in kept
-    if sent.startswith("memory"):
-        assert "MemoryError" in said
-        assert "Traceback" in kept
-
-
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_desk_outlives_its_terminal_and_an_exception_in_another_thread(tmp_path):
@@ -183,3 +119,47 @@ def test_the_next_desk_removes_the_files_of_a_killed_one(tmp_path, monkeypatch):
             assert not theirs.exists()
         assert mine.is_dir()
     assert [path.name for path in tmp_path.iterdir()] == ["cartlab-notes"]
+
+
+@pytest.mark.parametrize(
+    ("sent", "status", "told"),
+    [
+        ("SIGINT", 0, "ends: SIGINT"),
+        pytest.param("SIGHUP", 0, "ends: SIGHUP", marks=LONG),
+        pytest.param("SIGKILL", -9, "was killed", marks=LONG),
+        ("SIGSEGV", -11, "Segmentation fault"),
+        pytest.param("memory MainThread", 1, "ends: MemoryError", marks=LONG),
+        ("memory server", 2, "server stopped"),
+        pytest.param("exit0 server", 2, "server stopped", marks=LONG),
+        pytest.param("exit now", 3, "was killed", marks=LONG),
+    ],
+)
+def test_what_ends_a_desk_is_reported(sent, status, told, tmp_path):
+    """A signal, exception or exit that ends the desk is named on stderr and in the log.
+
+    A second process, which watches the desk, reports a kill, and after a crash in a library the
+    lines of code that were running. The log says when the desk started; the secret is in neither.
+    """
+    number = getattr(signal, sent, None)
+    if number and number != signal.SIGKILL and signal.getsignal(number) is signal.SIG_IGN:
+        pytest.skip(f"the tests were started with {sent} ignored, as by nohup")
+    with a_desk(tmp_path) as (desk, url, ended):
+        if number:
+            desk.send_signal(number)
+        else:
+            assert desk.stdin is not None
+            desk.stdin.write(f"{sent}\n")
+            desk.stdin.flush()
+        found, said, kept = ended()
+    assert found == status
+    assert told in said
+    assert told in kept
+    assert f" {desk.pid} begins: cartlab " in kept.splitlines()[0]
+    assert url.split("/")[3] not in kept
+    if status == 0:
+        assert said == f"cartlab: the desk {told}\n"
+        assert kept.endswith(f" {desk.pid} {told}\n")
+    assert ("most recent call first" in kept) == (sent == "SIGSEGV")
+    assert ("Traceback" in kept) == sent.startswith("memory")
+    if status < 0:
+        assert f"The log: {tmp_path}" in said

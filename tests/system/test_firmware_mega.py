@@ -60,13 +60,6 @@ def _readings(mega: Mega) -> list[Reading]:
     return [reading for reading in readings if reading]
 
 
-def test_the_sketch_leaves_room(program):
-    """The sketch uses less than a quarter of the Mega's flash and RAM."""
-    flash, ram = memory(program)
-    assert flash < 64 * 1024
-    assert ram < 2 * 1024
-
-
 def _describe(mega: Mega) -> Description:
     mega.send(b"?;")
     mega.run(0.05)
@@ -76,11 +69,36 @@ def _describe(mega: Mega) -> Description:
     return description
 
 
-def test_the_board_describes_itself(mega):
-    """The board answers a query with a description in the form of the protocol."""
+def test_the_board_describes_itself(mega, program):
+    """The board answers a query with a description in the form of the protocol.
+
+    The sketch uses less than a quarter of the Mega's flash and RAM.
+    """
     description = _describe(mega)
     assert (description.encoders, description.period) == (2, PERIOD)
     assert description.commands == frozenset("cfks")
+    flash, ram = memory(program)
+    assert flash < 64 * 1024
+    assert ram < 2 * 1024
+
+
+def test_a_run_has_the_requested_length_and_ends_at_a_stop(mega):
+    """A run of a tenth of a second sends 25 lines, 4 ms apart, and then the motor is off.
+
+    It is also off one tick after the three bytes of a stop have arrived.
+    """
+    mega.send(encode(Start(wave=Wave.DELTA, frequency=10.0, amplitude=-4096)))
+    mega.run(0.03)
+    assert mega.duty == -4096
+    mega.run(0.17)
+    assert mega.duty == 0
+    assert [reading.ms for reading in _readings(mega)] == list(range(0, 100, 4))
+    mega.send(encode(Start(wave=Wave.SQUARE, frequency=10.0, amplitude=2000, cycles=9)))
+    mega.run(0.08)
+    assert mega.duty == 2000
+    mega.send(b";s;")
+    mega.run(3 * 87e-6 + PERIOD + 0.0005)
+    assert mega.duty == 0
 
 
 def test_every_edge_at_the_pins_counts(mega):
@@ -109,16 +127,6 @@ def test_a_third_encoder_needs_one_changed_line(tmp_path):
         mega.turn(encoder, counts)
     mega.run(2 * PERIOD)
     assert _readings(mega)[-1].counts == (30, -20, 10)
-
-
-def test_a_run_has_the_requested_length_and_period(mega):
-    """A run of a tenth of a second sends 25 lines, 4 ms apart, and then the motor is off."""
-    mega.send(encode(Start(wave=Wave.DELTA, frequency=10.0, amplitude=-4096)))
-    mega.run(0.03)
-    assert mega.duty == -4096
-    mega.run(0.17)
-    assert mega.duty == 0
-    assert [reading.ms for reading in _readings(mega)] == list(range(0, 100, 4))
 
 
 @pytest.mark.parametrize("wave", [wave for wave in Wave if wave not in "dqm"])
@@ -203,16 +211,6 @@ def test_a_storm_of_edges_does_not_keep_the_motor_on(program, tmp_path):
     mega.run(0.3)  # the wire no longer flickers: the board answers, and the motor is off
     mega.take()
     assert _describe(mega).encoders == 2
-    assert mega.duty == 0
-
-
-def test_a_stop_stops_the_motor_at_the_next_tick(mega):
-    """The motor is off one tick after the three bytes of a stop have arrived."""
-    mega.send(encode(Start(wave=Wave.SQUARE, frequency=10.0, amplitude=2000, cycles=9)))
-    mega.run(0.08)
-    assert mega.duty == 2000
-    mega.send(b";s;")
-    mega.run(3 * 87e-6 + PERIOD + 0.0005)
     assert mega.duty == 0
 
 
