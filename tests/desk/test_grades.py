@@ -188,7 +188,7 @@ def test_each_criterion_shows_its_recordings(tmp_path):
             shown[asked.id] = re.findall('figure=([^"&]*?).svg"><img', beside)
             assert "figure=other.svg" in rest
         page = who.get(at("team", criterion="final-gains")).text
-        other = re.search(r'<a class="button" href="([^"]*)"[^>]*>response-1</a>', page)
+        other = re.search(r'<a class="button" href="([^"]*figure=response-1[^"]*)"', page)
         assert other
         after = who.get(unescape(other[1]).partition("#")[0]).text
     assert {key: figures[:1] for key, figures in shown.items() if figures} == {

@@ -78,33 +78,41 @@ def test_nobody_gets_in_without_the_cookie(visitor, path):
         assert stranger.post(path).status == 403
 
 
-def test_another_cookie_of_the_same_name_locks_nobody_out(visitor):
-    """A second cookie of the same name does not lock the visitor out.
+FORM = "application/x-www-form-urlencoded"
 
-    Any page on this computer could set such a cookie.
+
+def test_other_pages_cannot_ask(visitor, lab):
+    """A request with another host, a foreign origin or a cross-site mark is refused.
+
+    A second cookie of the same name, which any page on this computer could set, does not lock the
+    visitor out. A link from another site may open a whole page of a lab server, but no part of a
+    page and no form.
     """
-    real = visitor.headers["Cookie"]
-    other = f"cartlab-{visitor.port}=guess"
-    for sent in (f"{other}; {real}", f"{real}; {other}", f"a=b; {other}; {other}x; {real}"):
-        assert Visitor(port=visitor.port, headers={"Cookie": sent}).get("/").status == 200
-    sent = f"{other}; {other}x"
-    assert Visitor(port=visitor.port, headers={"Cookie": sent}).get("/").status == 403
-
-
-def test_other_pages_cannot_ask(visitor):
-    """A request with another host, a foreign origin or a cross-site mark is refused."""
-    port = visitor.port
+    port, cookie = visitor.port, visitor.headers["Cookie"]
     for wrong in (
         {"Host": f"evil.example:{port}"}, {"Host": "127.0.0.1"}, {"Origin": "http://evil.example"},
         {"Origin": "null"}, {"Origin": f"http://127.0.0.1:{port + 1}"},
         {"Sec_Fetch_Site": "cross-site"}, {"Sec_Fetch_Site": "same-site"},
     ):  # fmt: skip
         assert visitor.get("/", **wrong).status == 403, wrong
-        form = visitor.send("/open", b"folder=/", kind="application/x-www-form-urlencoded", **wrong)
-        assert form.status == 403, wrong
+        assert visitor.send("/open", b"folder=/", kind=FORM, **wrong).status == 403, wrong
     silent = visitor.ask("POST", "/open", b"", {"Content-Type": "text/plain"})
     assert silent.status == 403  # a browser sends the form's origin
     assert visitor.get("/", Host=f"localhost:{port}").status == 200
+
+    other = f"cartlab-{port}=guess"
+    for status, sent in (
+        (200, f"{other}; {cookie}"), (200, f"{cookie}; {other}"), (403, f"{other}; {other}x"),
+        (200, f"a=b; {other}; {other}x; {cookie}"),
+    ):  # fmt: skip
+        assert Visitor(port=port, headers={"Cookie": sent}).get("/").status == status, sent
+
+    led = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"}
+    page = led | {"Sec_Fetch_Dest": "document"}
+    assert lab("s1").get("/student/0/", **page).status == 200
+    for part in (led | {"Sec_Fetch_Dest": "iframe"}, page | {"Sec_Fetch_Mode": "no-cors"}, led):
+        assert lab("s1").get("/student/0/", **part).status == 403
+    assert lab("s1").send("/student/0/fill", b"", kind=FORM, **page).status == 403
 
 
 @pytest.mark.parametrize("path", ["/", "/nowhere", "/static/desk.js", "/student/7/"])
@@ -302,17 +310,6 @@ def test_each_role_has_its_pages(lab, path):
             assert lab(name).get(path).status in (200, 303, 405), name
 
 
-def test_a_link_from_another_site_opens_only_whole_pages(lab):
-    """A link from another site may open a whole page, but no part of a page and no form."""
-    led = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"}
-    page = led | {"Sec_Fetch_Dest": "document"}
-    assert lab("s1").get("/student/0/", **page).status == 200
-    for other in (led | {"Sec_Fetch_Dest": "iframe"}, page | {"Sec_Fetch_Mode": "no-cors"}, led):
-        assert lab("s1").get("/student/0/", **other).status == 403
-    kind = "application/x-www-form-urlencoded"
-    assert lab("s1").send("/student/0/fill", b"", kind=kind, **page).status == 403
-
-
 def test_opening_a_page_writes_nothing(lab, root):
     """A GET request for any page changes no file."""
 
@@ -361,24 +358,24 @@ def test_an_instructor_writes_only_in_the_workshop(lab, root):
 
 def test_forged_names_are_refused(lab):
     """Only a request from the proxy with exactly one known name is accepted."""
-    assert lab("").get("/").status == 403
-    assert lab("root").get("/").status == 403
-    assert lab("s1", source="127.0.0.2").get("/student/0/").status == 403
-    guessed = lab("s1")
-    for secret in ("", "the-proxy-and-the-desk-know-i", "wrong"):
-        assert guessed.get("/student/0/", X_Proxy_Secret=secret).status == 403
-    del guessed.headers["X-Proxy-Secret"]  # the user who logged in at the proxy
-    assert guessed.get("/student/0/").status == 403
+    student = lab("s1")
+    for who, status in (
+        (lab(""), 403), (lab("root"), 403), (lab("s1", source="127.0.0.2"), 403), (student, 303),
+        (Visitor(port=student.port, headers={"X-Remote-User": "s1"}), 403),
+    ):  # fmt: skip
+        assert who.get("/").status == status
+    for headers in ({"X_Proxy_Secret": ""}, {"X_Proxy_Secret": "the-proxy-and-the-desk-know-i"},
+                    {"X_Proxy_Secret": "wrong"}, {"Host": "127.0.0.1"}):  # fmt: skip
+        assert student.get("/student/0/", **headers).status == 403
+    assert student.get("/", X_Forwarded_For="127.0.0.2").status == 303
     double = "GET /student/0/ HTTP/1.1\r\nHost: lab.example.edu\r\n"
     double += "X-Proxy-Secret: the-proxy-and-the-desk-know-it\r\n"
     double += "X-Remote-User: s1\r\nX-Remote-User: s2\r\n\r\n"
-    with socket.create_connection(("127.0.0.1", lab("").port), timeout=PATIENCE) as line:
+    with socket.create_connection(("127.0.0.1", student.port), timeout=PATIENCE) as line:
         line.sendall(double.encode())
         assert line.recv(12) == b"HTTP/1.1 403"
-    assert lab("s1").get("/", X_Forwarded_For="127.0.0.2").status == 303
-    assert lab("s1").get("/", Host="127.0.0.1").status == 403
-    port = lab("").port
-    assert Visitor(port=port, headers={"X-Remote-User": "s1"}).get("/").status == 403
+    del student.headers["X-Proxy-Secret"]  # the user who logged in at the proxy
+    assert student.get("/student/0/").status == 403
 
 
 @pytest.mark.parametrize(("old", "new", "why"), WRONG_LISTS)

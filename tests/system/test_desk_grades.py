@@ -1,8 +1,5 @@
 """The TA's pages in a real browser: grading a class by keys, two TAs at once, anonymous names."""
 
-import re
-from urllib.parse import quote
-
 import pytest
 from playwright.sync_api import expect
 
@@ -194,31 +191,3 @@ def test_two_tas_see_each_others_changes(show):
         with Gradebook(place) as book:
             given = book.entry("team-04").overrides["laws"]
             assert (given.points, given.by) == (1.0, "Ada")
-
-
-@pytest.mark.slow
-@pytest.mark.sample
-def test_an_anonymous_class_shows_no_name(show, tmp_path):
-    """An anonymous class shows no name on any page or in any address that the browser requests."""
-    grades = write_class(tmp_path / "g", anonymous=True)
-    with Gradebook(grades) as book:
-        real = {entry.submission for entry in book.entries()} - {"broken"}
-    asked, shown = [], []
-    with DeskServer(folder=grades) as server:
-        window = show(server.url)
-        window.on("request", lambda request: asked.append(request.url))
-        window.reload()
-        with window.expect_navigation():
-            window.get_by_role("link", name="Start with the first").click()
-        signed(window, "Ada")
-        for _ in range(3):
-            shown += [window.content(), window.title()]
-            expect(window.locator("#keys")).to_be_checked()
-            press(window, "a")
-        window.goto(server.url)
-        expect(window.locator("#teams tbody tr")).to_have_count(len(real) + 1)
-        shown.append(window.content())
-        assert fits(window)
-    for name in real:
-        pattern = re.compile("|".join(map(re.escape, {name, quote(name), quote(name, safe="")})))
-        assert not [text for text in asked + shown if pattern.search(text)], name

@@ -29,10 +29,10 @@ from tests.helpers.benches import emulator
 from tests.helpers.waiting import PATIENCE, started, until
 from tests.system.test_report_pages import PHONE, WIDE
 
-DUTY, COUNT = 1e-4, 0.002  # V, cm
+DUTY, COUNT, TITLE = 1e-4, 0.002, "Bench <9> & co"  # V, cm
 SUBMISSION = f"""
 version = 1
-title = "Bench <9> & co"
+title = "{TITLE}"
 [system]
 carts = 2
 input = {{ unit = "V", per_count = {DUTY} }}
@@ -188,44 +188,6 @@ def test_the_page_is_served_to_this_computer_only(page, folder):
         LivePage(folder, port=urlsplit(page.url).port or 0)
 
 
-def test_nothing_is_shown_without_the_secret(page):
-    """Every address with a missing, wrong or incomplete secret gets 403."""
-    path = urlsplit(page.url).path
-    for other in ("/", "/x/", path[:-2] + "/", path[:-1], "/events", "/live.js", f"/x{path}"):
-        response, text = ask(page, other)
-        assert response.status == 403, other
-        assert path.strip("/") not in text
-    assert ask(page, "../../secret")[0].status in (403, 404)
-    assert ask(page, "submission.toml")[0].status == 404
-
-
-def test_requests_of_other_pages_are_refused(page):
-    """A request with another host name or origin, or from another site, gets 403."""
-    port = urlsplit(page.url).port
-    good = f"http://127.0.0.1:{port}"
-    for status, headers in (
-        (403, {"Host": f"evil.example:{port}"}), (403, {"Host": "127.0.0.1"}),
-        (200, {"Host": f"localhost:{port}"}), (403, {"Origin": "http://evil.example"}),
-        (403, {"Origin": "null"}), (403, {"Origin": good, "Host": f"localhost:{port}"}),
-        (403, {"Sec_Fetch_Site": "cross-site"}),
-    ):  # fmt: skip
-        assert ask(page, **headers)[0].status == status, headers
-    assert ask(page, "press", "POST", "wish=done&number=1")[0].status == 403
-    assert ask(page, "press", "POST", "wish=done&number=1", Origin=good)[0].status == 409
-
-
-@pytest.mark.parametrize(
-    ("body", "status"),
-    [("", 400), ("[1]", 400), ("wish=done", 400), ("wish=done&number=x", 400),
-     ("wish=done&number=1", 409), ("wish=burn&number=1", 409), ("1" * 500, 413)],
-)  # fmt: skip
-def test_nonsense_confirms_nothing(page, body, status):
-    """A malformed, unknown or overlong answer is refused, and the page still works."""
-    origin = page.url[: page.url.index("/", 8)]
-    assert ask(page, "press", "POST", body, Origin=origin)[0].status == status
-    assert ask(page)[0].status == 200
-
-
 def test_the_secret_is_new_each_time_and_never_written(folder, caplog, capfd):
     """Each live page has a new secret, which no log line and no printed line contains."""
     caplog.set_level(logging.DEBUG)
@@ -241,6 +203,35 @@ def test_the_secret_is_new_each_time_and_never_written(folder, caplog, capfd):
     assert not any(secret in written for secret in secrets)
 
 
+def test_every_other_request_is_refused(page):
+    """Without the secret, or from another host, origin or site, every address gets 403.
+
+    A malformed, unknown or overlong answer confirms nothing, and the page still works.
+    """
+    path, port = urlsplit(page.url).path, urlsplit(page.url).port
+    good, done = f"http://127.0.0.1:{port}", "wish=done&number=1"
+    for other in ("/", "/x/", path[:-2] + "/", path[:-1], "/events", "/live.js", f"/x{path}"):
+        response, text = ask(page, other)
+        assert response.status == 403, other
+        assert path.strip("/") not in text
+    assert ask(page, "../../secret")[0].status in (403, 404)
+    assert ask(page, "submission.toml")[0].status == 404
+    for status, headers in (
+        (403, {"Host": f"evil.example:{port}"}), (403, {"Host": "127.0.0.1"}),
+        (200, {"Host": f"localhost:{port}"}), (403, {"Origin": "http://evil.example"}),
+        (403, {"Origin": "null"}), (403, {"Origin": good, "Host": f"localhost:{port}"}),
+        (403, {"Sec_Fetch_Site": "cross-site"}),
+    ):  # fmt: skip
+        assert ask(page, **headers)[0].status == status, headers
+    assert ask(page, "press", "POST", done)[0].status == 403
+    for status, body in (
+        (400, ""), (400, "[1]"), (400, "wish=done"), (400, "wish=done&number=x"), (409, done),
+        (409, "wish=burn&number=1"), (413, "1" * 500),
+    ):  # fmt: skip
+        assert ask(page, "press", "POST", body, Origin=good)[0].status == status, body
+    assert ask(page)[0].status == 200
+
+
 def test_a_page_gets_events_and_a_ninth_page_is_refused(page):
     """A page first gets the whole state, then new points; a ninth page gets 503."""
     with ExitStack() as opened:
@@ -248,14 +239,11 @@ def test_a_page_gets_events_and_a_ninth_page_is_refused(page):
         assert stream.headers["Content-Type"].startswith("text/event-stream")
         assert stream.readline() == b"event: state\n"
         state = json.loads(stream.readline().removeprefix(b"data: "))
-        assert (state["title"], state["units"]) == (
-            "Bench <9> & co", {"position": "cm", "input": "V"},
-        )  # fmt: skip
+        assert (state["title"], state["units"]) == (TITLE, {"position": "cm", "input": "V"})
         page.started(SINE)
         page.readings(lines(0, 50), Anomalies())
-        found = b""
-        while not found.startswith(b"event: points"):
-            found = stream.readline()
+        while not stream.readline().startswith(b"event: points"):
+            pass
         points = json.loads(stream.readline().removeprefix(b"data: "))
         assert points["points"][0] == [0.0, 0.0, 0.01, 0.0, 0.0]
         assert ask(page, "events")[0].status == 503
@@ -349,7 +337,7 @@ def show(browser, page):
             lambda r: None if r.url.startswith(page.url) else errors.append(r.url),
         )
         window.goto(page.url)
-        expect(window.locator("#title")).to_have_text("Bench <9> & co")
+        expect(window.locator("#title")).to_have_text(TITLE)
         return window
 
     yield opened
@@ -477,24 +465,6 @@ def test_the_live_page_is_accessible(page, show, size):
     assert violations(window) == []
     assert window.evaluate("document.documentElement.scrollWidth") <= size[0]
     page.answer(1)
-
-
-@pytest.mark.slow
-@pytest.mark.sample
-def test_the_page_says_that_the_session_is_over(folder, browser):
-    """After the session the page says that it is over, keeps its curves, and sends no requests."""
-    context = browser.new_context()
-    context.set_default_timeout(1e3 * PATIENCE)
-    window = context.new_page()
-    with LivePage(folder) as page:
-        page.planned(PLAN, frozenset())
-        window.goto(page.url)
-        record(page)
-        expect(window.locator("#status")).to_have_text("Recording sine-01.")
-        until(lambda: BLUE in window.evaluate(INK, "positions"))
-    expect(window.locator("#status")).to_have_text("The session is over.")
-    assert BLUE in window.evaluate(INK, "positions")
-    context.close()
 
 
 @pytest.mark.slow
