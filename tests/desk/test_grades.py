@@ -196,7 +196,7 @@ def test_each_criterion_shows_its_recordings(tmp_path):
         "final-gains": ["response-2"], "final-frequencies": ["response-1"],
         "final-dampings": ["response-1"],
     }  # fmt: skip
-    assert re.findall(r'<img class="drawing" src="[^"]*figure=(.*?).svg"', after) == ["response-1"]
+    assert re.findall(r'<img class="drawing" src="[^"]*figure=(.*?).svg"', after)[0] == "response-1"
 
 
 def test_pages_show_the_current_gradebook(ta, grades):
