@@ -20,7 +20,7 @@ from pipeline.experiments.plan import load_plan
 from pipeline.report.exploration.diary import NAME as DIARY
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import sine, write_work
-from tests.helpers.desks import Visitor, a_recorded_cart
+from tests.helpers.desks import Visitor, a_recorded_cart, at_desk
 from tests.helpers.waiting import PATIENCE, kill, until
 
 pytestmark = pytest.mark.usefixtures("all_work_here")
@@ -39,8 +39,7 @@ def begun(visitor: Visitor, work: Path, name: str, room: str = "acquire", **fiel
 def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
     """A ticked recording is made and can be watched, and Stop ends the session without scripts."""
     work = write_work(tmp_path / "team", [sine("short", seconds=1), sine("long", seconds=300)])
-    with DeskServer(folder=work) as server:
-        visitor = Visitor.of(server.url)
+    with at_desk(work) as visitor:
         page = visitor.get("/bench/0/")
         assert 'value="long" aria-label="long"' in page.text
         begun(visitor, work, "long", port=real.address, only="long")
@@ -150,8 +149,7 @@ def test_a_plan_is_made_and_errors_are_named(tmp_path):
     work.mkdir()
     text = 'version = 1\n[system]\ncarts = 1\nposition = { unit = "cm" }\n'
     (work / "submission.toml").write_text(text, encoding="utf-8")
-    with DeskServer(folder=work) as server:
-        visitor = Visitor.of(server.url)
+    with at_desk(work) as visitor:
         assert visitor.post("/bench/0/plan").status == 303
         until((work / "plan.toml").exists)
         assert visitor.post("/bench/0/acquire", port=" ").status == 422
@@ -176,8 +174,7 @@ def test_exploring_has_its_own_form(tmp_path):
     Numbers may have a decimal comma, and an error names its field.
     """
     work = a_recorded_cart(tmp_path / "team")
-    with DeskServer(folder=work) as server:
-        visitor = Visitor.of(server.url)
+    with at_desk(work) as visitor:
         forms = re.findall(
             r"<form[^>]*?action=[^>]*?>.*?</form>", visitor.get("/bench/0/").text, re.DOTALL
         )
@@ -211,8 +208,7 @@ def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
     work = a_recorded_cart(tmp_path / "team")
     mine = {"kind": "sweep", "amplitude": "0,01", "frequency": "0.5", "frequency_end": "5",
             "seconds": "20", "goal": "zeta"}  # fmt: skip
-    with DeskServer(folder=work) as server:
-        visitor = Visitor.of(server.url)
+    with at_desk(work) as visitor:
         answer = visitor.get(f"/bench/0/weigh?{urlencode(mine)}")
         assert answer.status == 200, answer.text
         shares = [float(share) for share in re.findall(r"<td>± ([\d.e-]+) %</td>", answer.text)]
@@ -245,8 +241,7 @@ def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
 def test_new_recordings_in_the_plan_are_marked(tmp_path):
     """The plan marks which runs are recorded, which is next, and which was added last."""
     work = write_work(tmp_path / "team", [sine("first", seconds=1), sine("second", seconds=1)])
-    with DeskServer(folder=work) as server:
-        visitor = Visitor.of(server.url)
+    with at_desk(work) as visitor:
         rows = re.findall(r"<tr.*?</tr>", visitor.get("/bench/0/").text, re.DOTALL)
         marked = [re.findall(r'class="chip \w+">(\w+)<', row) for row in rows if "checkbox" in row]
         assert marked == [["next"], []]

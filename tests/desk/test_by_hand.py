@@ -13,7 +13,7 @@ from pipeline.grading.gradebook.shared_gradebook import SharedGradebook
 from pipeline.grading.gradings import Batch
 from pipeline.grading.intake.files import digest
 from pipeline.grading.rubric import Manual
-from tests.helpers.desks import Visitor, through_proxy, write_users
+from tests.helpers.desks import at_desk, through_proxy, write_users
 from tests.helpers.grades import make_grade, make_outcome, shared_flag, two_cart_rubric
 
 pytestmark = pytest.mark.usefixtures("all_work_here")
@@ -54,9 +54,7 @@ def grades(tmp_path):
 def test_the_class_page_says_that_grades_are_not_final(grades):
     """It says so until a person has graded the criterion, which lost no points before."""
     told = "1 submission not final: a person still has to grade discussion (1)."
-    with DeskServer() as server:
-        ta = Visitor.of(server.url)
-        ta.post("/open", folder=str(grades))
+    with at_desk(opened=grades) as ta:
         page = ta.get("/grades/0/").text
         assert told in ta.get("/grades/0/class.html").text
         for card in ("Students with accounts", "Export"):
@@ -91,9 +89,7 @@ def test_a_ta_reads_grades_and_adjusts_a_team(grades):
 
     The remark about shared recordings points to the change of the total.
     """
-    with DeskServer() as server:
-        ta = Visitor.of(server.url)
-        ta.post("/open", folder=str(grades))
+    with at_desk(opened=grades) as ta:
         ta.post(TEAM, do="sign", by="Ada")
         page = ta.get(f"{TEAM}&criterion=discussion").text
         assert "Friction <strong>matters</strong>" in page

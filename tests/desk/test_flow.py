@@ -8,10 +8,9 @@ import pytest
 import tomlkit
 from starlette.exceptions import HTTPException
 
-from pipeline.desk.app import DeskServer
 from pipeline.desk.flow import AT_ONCE, limit_each_person
 from pipeline.desk.users import User
-from tests.helpers.desks import Visitor, a_submission
+from tests.helpers.desks import a_submission, at_desk
 
 
 class Requests:
@@ -84,8 +83,7 @@ def test_the_desk_itself_reads_nothing_that_a_student_wrote(tmp_path, monkeypatc
     """No page of a student makes the desk's own process parse a file of the submission."""
     folder = a_submission(tmp_path / "team")
     toml = (folder / "submission.toml").read_bytes()
-    with DeskServer(folder=folder) as server:
-        visitor = Visitor.of(server.url)
+    with at_desk(folder) as visitor:
         page = visitor.get("/student/0/")
 
         def refuse(*_: object, **__: object) -> None:

@@ -486,9 +486,7 @@ def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
         entries = list(book.entries())
     real = {entry.submission for entry in entries} - {"broken"}
     real |= {author for entry in entries for author in entry.grade.authors if len(author) > 3}
-    with DeskServer() as server:
-        who = Visitor.of(server.url)
-        who.post("/open", folder=str(grades))
+    with at_desk(opened=grades) as who:
         shown = names(who.get(ROOM))
         assert len(shown) == len(entries)
         assert shown == sorted(shown)

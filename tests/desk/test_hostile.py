@@ -5,8 +5,7 @@ import re
 
 import pytest
 
-from pipeline.desk.app import DeskServer
-from tests.helpers.desks import Visitor
+from tests.helpers.desks import at_desk
 from tests.helpers.hostile import SECRET, write_hostile
 from tests.helpers.places import ROOT
 
@@ -29,8 +28,7 @@ def visit(tmp_path, *, every: int, drawn: int, seed: int, step: int = 1) -> int:
     folders = [rooms / str(i) for i in range(len(entries))]
     for folder in folders:
         folder.mkdir(parents=True)
-    with DeskServer() as server:
-        visitor = Visitor.of(server.url)
+    with at_desk() as visitor:
         for folder in folders:
             assert visitor.post("/open", folder=str(folder)).status == 303
         for number, entry in enumerate(entries):

@@ -14,7 +14,7 @@ from pipeline.desk.app import DeskServer
 from pipeline.desk.flow import AT_ONCE
 from pipeline.desk.jobs import _SHORT_WORKERS, _WAITING, Busy, Jobs, WorkerPool
 from pipeline.processes import Failed, LineProcess
-from tests.helpers.desks import Visitor, a_submission, some_files, wrongs
+from tests.helpers.desks import Visitor, a_submission, at_desk, some_files, wrongs
 from tests.helpers.waiting import PATIENCE, until
 
 HERE = "/student/0/"
@@ -132,8 +132,7 @@ def test_a_job_survives_a_reload_and_can_be_stopped(tmp_path):
     A job that is stopped or killed leaves no half-written file and can be started again.
     """
     folder = a_submission(tmp_path / "team")
-    with DeskServer(folder=folder) as server:
-        visitor = Visitor.of(server.url)
+    with at_desk(folder) as visitor:
         visitor.get(HERE)
         before = {p.pid for p in psutil.Process().children()}
 
@@ -172,8 +171,7 @@ def test_a_file_that_ends_the_process_fails_only_its_row(tmp_path):
 
     The other files are shown, and the next task gets a new process.
     """
-    with DeskServer(folder=tmp_path) as server:
-        visitor = Visitor.of(server.url)
+    with at_desk(tmp_path) as visitor:
         visitor.upload(HERE + "files", some_files(most=2))
         before = {p: p.memory_info().rss for p in psutil.Process().children()}
         (tmp_path / "data" / "large.csv").write_bytes(b"time,x1\n" + b"0.001,0.25\n" * 4_000_000)

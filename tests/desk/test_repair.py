@@ -7,14 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.desk.app import DeskServer
 from pipeline.grading.batch.grade_class import Options
 from pipeline.grading.grade import Grade
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.intake.repairs import FOLDER, Run, read_original, read_run, save_run, text_key
 from pipeline.simulated.submission import write_submission
 from tests.helpers.commandline import cartlab_here
-from tests.helpers.desks import Visitor
+from tests.helpers.desks import at_desk
 from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.usefixtures("all_work_here")
@@ -67,9 +66,7 @@ def test_a_repaired_file_is_graded_and_stays_repaired(handed_in, tmp_path):
     assert original is not None
     assert original == right.replace("carts = 1", "carts = 1,0")
 
-    with DeskServer() as server:
-        ta = Visitor.of(server.url)
-        ta.post("/open", folder=str(out))
+    with at_desk(opened=out) as ta:
         page = unescape(ta.get(TEAM).text)
         assert "Repair submission.toml" in page
         assert "carts = 1,0" in page
@@ -117,9 +114,7 @@ def test_a_file_without_mistakes_is_not_offered_for_repair(handed_in, tmp_path):
         toml.write_text(text, "utf-8")
         pack(folder, path)
         assert grade(path, out).status == "graded"
-        with DeskServer() as server:
-            ta = Visitor.of(server.url)
-            ta.post("/open", folder=str(out))
+        with at_desk(opened=out) as ta:
             assert ("Repair submission.toml" in ta.get(TEAM).text) == offered
 
 
@@ -130,9 +125,7 @@ def test_an_anonymous_class_shows_no_file(handed_in, tmp_path):
     cartlab_here("grade", path, "--rubric", "throne-1dof", "--out", out, "--anonymous")
     document = json.loads(next((out / "feedback").glob("*/grade.json")).read_text("utf-8"))
     address = f"/grades/0/team?of={document['submission']}"
-    with DeskServer() as server:
-        ta = Visitor.of(server.url)
-        ta.post("/open", folder=str(out))
+    with at_desk(opened=out) as ta:
         assert "Repair submission.toml" not in ta.get(address).text
         sent = {"do": "repair", "by": "Ada", "why": WHY, "text": right}
         assert ta.post(address, **sent, of_text="x").status == 404
