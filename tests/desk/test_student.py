@@ -260,6 +260,7 @@ def test_handing_in_says_when_the_report_is_out_of_date(change, filled):
     expected = {"nothing": "current", "answer": "answered"}.get(change, "older")
     for page in (visitor.get(HERE), visitor.get(HERE + "hand-in")):
         assert page.state["report"] == expected
+        assert ("The report is out of date" in page.text) == (expected == "older")
     assert ("report/report.pdf" in zipped(visitor).namelist()) == (change == "nothing")
 
 

@@ -22,7 +22,7 @@ def test_short_work_prints_no_progress_to_a_pipe(tmp_path):
     """If stderr is no terminal, a short command prints only its summary, as plain text."""
     done = cartlab_here("report", EXAMPLES / "one-cart", "--out", tmp_path, "--no-pdf")
     assert done.stdout == ""
-    assert not [mark for mark in ("\x1b", " … ", "decays") if mark in done.stderr]
+    assert not [mark for mark in ("\x1b", " … ", "free decays") if mark in done.stderr]
     assert done.stderr.splitlines()[0]
 
 
