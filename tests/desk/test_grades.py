@@ -3,6 +3,7 @@
 import io
 import re
 import zipfile
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from html import unescape
 from itertools import chain
@@ -15,6 +16,7 @@ from pipeline.desk.app import DeskServer
 from pipeline.desk.grades.criteria import point_steps
 from pipeline.grading.gradebook.class_lines import GradeSummary
 from pipeline.grading.gradebook.gradebook import Gradebook
+from pipeline.grading.gradebook.override import HandPoints
 from pipeline.grading.gradebook.shared_gradebook import SharedGradebook
 from pipeline.grading.gradings import Batch
 from pipeline.grading.publish.export import export
@@ -51,7 +53,7 @@ def ta(grades):
         yield visitor
 
 
-def overrides(grades, team: str = "team-01") -> dict:
+def overrides(grades, team: str = "team-01") -> Mapping[str, HandPoints]:
     """Return what was changed by hand for a team."""
     with Gradebook(grades) as book:
         return book.entry(team).overrides

@@ -20,7 +20,7 @@ from tests.helpers.waiting import started, until
 LIMITS = PlanLimits(input=0.5, travel=2.5)  # V and cm, the scales that the virtual benches state
 
 
-# What a reason for an early end is about, and the words that only this reason has.
+# The cause of an early end, and the words that only the reason with this cause has.
 CAUSES = {
     "idle motor": "although it should rest", "duty": "counts instead", "travel": "from its zero",
     "input": "the input was", "wave": "does not follow the wave", "end": "went on past the end",
@@ -66,7 +66,7 @@ def ordered(
 
 def carried_out(
     work: Path, port: str, *only: str, notes: "Notes | None" = None
-) -> list[RunOutcome]:
+) -> tuple[RunOutcome, ...]:
     """Acquire these recordings; return their outcomes."""
     return acquire(work, port=port, observers=[notes or Notes()], only=only or ["dwell"])
 
