@@ -62,8 +62,8 @@ def test_columns_force_and_derivatives_are_generated(made):
     row = np.zeros((1, len(columns)))
     row[0, columns["CUBIC_DRAG_COEFFICIENT"]] = 2.0
 
-    force = function_of("cart_force", made["laws.py"], Cart=Cart)
-    slopes = function_of("cart_slopes", made["laws.py"], Cart=Cart)
+    force = function_of("cart_force", made["generated_forces.py"], Cart=Cart)
+    slopes = function_of("cart_slopes", made["generated_forces.py"], Cart=Cart)
 
     assert_allclose(force(row, 0, 0.3, 0.5, 0.0), -2.0 * 0.5**3)
     assert_allclose(slopes(row, 0, 0.3, 0.5, 0.0), (0.0, -6.0 * 0.5**2))
