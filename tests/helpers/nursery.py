@@ -30,10 +30,10 @@ def order(**bench: Any) -> None:
 
 def be(*, words: list[str], watchdog: float, port: int) -> None:
     """Become the bench with these options; send the pid and then stderr to that port."""
+    from pipeline import protocol
     from pipeline.cli import main
-    from pipeline.simulated import controller as core
 
-    core.WATCHDOG = watchdog
+    protocol.WATCHDOG = watchdog
     with socket.create_connection(("127.0.0.1", port)) as line:
         with line.makefile("w", buffering=1, encoding="utf-8") as stderr:
             print(os.getpid(), file=stderr)

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.identify.springs import decide_springs, fill
+from pipeline.identify.springs import decide_springs, fill_folder
 from pipeline.plant.chain import Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.resources import EXAMPLES
@@ -83,14 +83,14 @@ def test_fill_marks_what_the_files_do_not_show(tmp_path):
     assert "springs: unsure: is there a spring wall-1?" in done.stderr
     assert "position: unsure: counts are whole numbers" in done.stderr
     assert "or an encoder that is stuck" not in done.stdout  # the cart was held
-    assert fill(folder).doubts == tuple(
+    assert fill_folder(folder).doubts == tuple(
         line.removeprefix("cartlab: ") for line in done.stderr.splitlines() if "unsure: " in line
     )
     settled = text.replace(springs, "springs = [false, true, true]").replace(
         position, 'position = { unit = "cm" }'
     )
     (folder / "submission.toml").write_text(settled, encoding="utf-8")
-    assert fill(folder).doubts == ()
+    assert fill_folder(folder).doubts == ()
 
 
 @pytest.mark.parametrize(("unit", "said"), [("furlong", "is not known"), ("count", "decimals")])
@@ -99,7 +99,7 @@ def test_fill_prints_a_doubt_about_an_existing_unit(unit, said, tmp_path):
     folder = folder_of(EXAMPLES / "one-cart" / "data", tmp_path / "s")
     text = f'version = 1\n[system]\ncarts = 1\nposition = {{ unit = "{unit}" }}\n'
     (folder / "submission.toml").write_text(text, encoding="utf-8")
-    (doubt,) = fill(folder).doubts
+    (doubt,) = fill_folder(folder).doubts
     assert doubt.startswith("position: ")
     assert said in doubt
     assert "unsure" not in (folder / "submission.toml").read_text(encoding="utf-8").split("[[")[0]
@@ -112,5 +112,5 @@ def test_the_real_rig_has_no_far_spring(tmp_path):
     (folder / "data").mkdir(parents=True)
     for file in (REAL_DATA / "ecp210-ucsd").glob("DOF*_test?.csv"):
         shutil.copyfile(file, folder / "data" / file.name)
-    assert fill(folder).doubts == ()
+    assert fill_folder(folder).doubts == ()
     assert load_submission(folder).system.springs == (True, True, False)

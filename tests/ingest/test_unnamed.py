@@ -8,7 +8,7 @@ import pytest
 from pipeline.arrays import Array
 from pipeline.ingest.files import read_table
 from pipeline.ingest.read import read_data
-from pipeline.ingest.table import FileTable
+from pipeline.ingest.table import FileTable, Format
 from pipeline.ingest.unnamed import Roles, find_roles
 from pipeline.resources import EXAMPLES
 from pipeline.results import Record
@@ -23,7 +23,7 @@ def bare(*columns: Array) -> FileTable:
     """Return a matrix without headings."""
     return FileTable(
         source="f",
-        form="matrix",
+        format=Format(title="matrix", positions="unknown", inputs="unknown"),
         names=tuple(str(i) for i in range(1, len(columns) + 1)),
         values=np.array(columns),
         whole=tuple(bool((c == np.round(c)).all()) for c in columns),

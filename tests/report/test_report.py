@@ -148,7 +148,7 @@ def test_pages_are_laid_out_before_the_figures_are_drawn():
     layout = lay_out(document)
 
     assert len(document.pictures()) > 5
-    assert not any("svg" in vars(picture) for picture in document.pictures())  # none is drawn yet
+    assert not any("svg" in vars(picture) for picture in document.pictures())  # not drawn yet
     for picture in document.pictures():
         blank, drawn = map(ElementTree.fromstring, (picture.blank, picture.svg))
         for size in ("width", "height", "viewBox"):
