@@ -28,24 +28,14 @@ from tests.references.facts import Facts, read_facts
 ROOM, HERE, QUEUE = "/grades/0/", "/feedback/0/", "/grades/0/requests"
 TEAMS = ("team-01", "team-02", "team-03", "team-04", "team-05", "broken")
 PLATFORMS = ("canvas", "moodle", "gradescope")
-USERS = """
-[[users]]
-name = "s4"
-role = "student"
-grades = [{ gradebook = "grades", submission = "team-04" }]
-[[users]]
-name = "Ada"
-role = "ta"
-gradebooks = ["grades"]
-[[users]]
-name = "Bob"
-role = "ta"
-gradebooks = ["grades"]
-[[users]]
-name = "prof"
-role = "instructor"
-gradebooks = ["grades"]
-"""
+STAFF = {"Ada": "ta", "Bob": "ta", "prof": "instructor"}
+USERS = "".join(
+    f'[[users]]\nname = "{name}"\nrole = "{role}"\ngradebooks = ["grades"]\n'
+    for name, role in STAFF.items()
+) + (
+    '[[users]]\nname = "s4"\nrole = "student"\n'
+    'grades = [{ gradebook = "grades", submission = "team-04" }]\n'
+)
 _TIME = re.compile(r"\d{4}-\d\d-\d\dT[\d:.]+(?:[+-]\d\d:?\d\d|Z)?")
 _STATES = re.compile(r'data-(?:state|code)="([^"]*)"')
 
