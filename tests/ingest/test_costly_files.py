@@ -78,7 +78,7 @@ def test_a_bomb_costs_its_recording(fill, apart, tmp_path):
         files.OF_STRANGERS.reset(before)
     assert len(data.unreadable) == 1
     reason = next(iter(data.unreadable.values()))
-    assert re.search("damaged|more than .* (memory|processor time)", reason)
+    assert re.search("damaged|memory|processor", reason)
     assert time.process_time() - begin < 20  # s; it takes 2. The names alone took 400
 
 
@@ -110,7 +110,7 @@ def test_the_time_to_read_one_file_is_limited(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "MOST_SECONDS", 0.02)  # s; the long file takes ten times that
     gc.disable()  # an exception in one of its callbacks would be dropped, and be raised a second on
     try:
-        with pytest.raises(SubmissionError, match=r"long\.csv: takes more than 0\.02 s"):
+        with pytest.raises(SubmissionError, match=r"long\.csv: .* 0\.02 s"):
             read_table(tmp_path, "long.csv")
     finally:
         gc.enable()
@@ -125,7 +125,7 @@ def test_the_memory_to_read_one_file_is_limited(tmp_path, monkeypatch):
     (tmp_path / "long.csv").write_text("time,x1\n" + "0.001,12\n" * 1_000_000, encoding="utf-8")
     (tmp_path / "short.csv").write_text("time,x1\n0,1\n1,2\n", encoding="utf-8")
     monkeypatch.setattr(files, "MOST_MEMORY", 10_000_000)
-    with pytest.raises(SubmissionError, match=r"long\.csv: needs more than 0\.01 GB"):
+    with pytest.raises(SubmissionError, match=r"long\.csv: .* 0\.01 GB"):
         read_table(tmp_path, "long.csv")
     assert read_table(tmp_path, "short.csv")[0].values.shape == (2, 2)
     with limited_memory(5_000_000), pytest.raises(MemoryError):  # the limit of a whole submission
@@ -139,7 +139,7 @@ def test_a_workbook_that_inflates_is_refused_by_itself(tmp_path, monkeypatch):
     """A workbook that unpacks to much more than its size needs too much memory, whoever sent it."""
     (tmp_path / "a.xlsx").write_bytes(package("<worksheet>" + " " * 50_000_000 + "</worksheet>"))
     monkeypatch.setattr(files, "MOST_MEMORY", 20_000_000)
-    with pytest.raises(SubmissionError, match=r"a\.xlsx: needs more than 0\.02 GB"):
+    with pytest.raises(SubmissionError, match=r"a\.xlsx: .* 0\.02 GB"):
         read_table(tmp_path, "a.xlsx")
 
 
@@ -172,7 +172,7 @@ def test_patterns_take_time_in_proportion_to_the_text(name, unit):
 def test_a_line_of_commas_is_refused_at_once():
     """A text of one long line of delimiters is refused, in time proportional to its length."""
     begin = time.process_time()
-    with pytest.raises(SubmissionError, match="not a table"):
+    with pytest.raises(SubmissionError, match="line 1"):
         parse_table(b"x" + b"," * 1_000_000, source="a.csv")
     assert time.process_time() - begin < 20  # s; it takes 1. With a square it took hours
 
@@ -184,7 +184,7 @@ def test_a_key_of_many_parts_is_refused_at_once(part, between):
     text = "x = 1\n" + between.join([part] * 50_000) + " = 1\n"
     begin = time.process_time()
     assert toml.find_deep_key(text) == 2
-    with pytest.raises(toml.TomlSlip, match="nest too deeply"):
+    with pytest.raises(toml.TomlSlip, match="deeply"):
         toml.read_toml(text)
     assert time.process_time() - begin < 5  # s; it takes 0.1, parsing takes minutes
     assert not toml.find_deep_key('a.b.c = "1.2.3.4' + ".5" * 100 + '"\n')

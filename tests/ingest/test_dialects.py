@@ -153,7 +153,7 @@ def test_a_column_with_many_bad_cells_is_refused_if_it_is_asked_for():
     lines = [f"{row},{'' if i % 8 == 3 else i}" for i, row in enumerate(PLAIN.splitlines())]
     got = parse_table((HEADING.strip() + ",note\n" + "\n".join(lines)).encode(), source="f")
     assert got.names == tuple(HEADING.strip().split(","))
-    with pytest.raises(SubmissionError, match="'note' has 175 of 200 values, missing in line 5, "):
+    with pytest.raises(SubmissionError, match=r"'note' .*175 of 200.* 5, "):
         got.index("note")
 
 
@@ -173,7 +173,7 @@ def test_a_position_in_the_unit_of_another_quantity_is_asked_about(unit):
     columns, _ = assign_columns(got, explicit={"x1": 3, "input": 2}, free=(1,))
     refuse_unknown_unit(got, columns["input"])
     refuse_unknown_unit(got, columns["x1"], stated=unit)
-    with pytest.raises(SubmissionError, match="no unit of a position"):
+    with pytest.raises(SubmissionError, match=f"'{unit}'"):
         refuse_unknown_unit(got, columns["x1"])
 
 

@@ -1,7 +1,7 @@
 """Every form of data file gives the same numbers: any dialect of text, any layout of `.mat`."""
 
 import hashlib
-from collections.abc import Callable
+import re
 from io import BytesIO
 
 import h5py
@@ -11,6 +11,7 @@ import scipy.io
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.errors import SubmissionError
+from pipeline.ingest.columns import parse_heading
 from pipeline.ingest.files import OF_STRANGERS, parse_table, parse_tables, read_table
 from pipeline.ingest.table import FileTable
 
@@ -58,7 +59,7 @@ def test_an_ecp_export_is_read_in_every_dialect(content):
     got = table(content)
 
     assert got.format.positions == "count"
-    assert got.names[2:] == ("Commanded Pos", "Encoder 1 Pos", "Encoder 2 Pos", "Control Effort")
+    assert list(got.names) == re.split(r"\s{2,}", HEADING.strip())
     assert_array_equal(column(got, "Time"), TIME)
     assert_array_equal(column(got, "Encoder 1 Pos"), X1)
     assert_array_equal(column(got, "Control Effort"), U)
@@ -80,15 +81,10 @@ def test_an_ecp_export_may_hold_any_of_its_columns(keep):
 
 
 def test_lines_are_counted_as_an_editor_counts_them():
-    """A row's number is its line in an editor, whatever characters end the lines."""
-    got = table(ECP["a MATLAB script"])
-    assert (got.place(0), got.place(N - 1)) == ("line 3", f"line {N + 2}")
-
-
-def test_text_after_an_ecp_export_is_mentioned():
-    """Text after an ECP export, such as the rest of a script, is mentioned in a note."""
+    """A row's number is its line in an editor; text behind the rows is mentioned with its line."""
     got = table(ECP["a MATLAB script"] + "plot(data)\n")
-    assert got.notes == (f"text after line {N + 2} is not data and was not read",)
+    assert (got.place(0), got.place(N - 1)) == ("line 3", f"line {N + 2}")
+    assert f"line {N + 2}" in got.notes[0]
 
 
 def delimited(delimiter: str, decimal: str = ".", quote: str = "", end: str = "\n") -> str:
@@ -143,7 +139,7 @@ def test_columns_without_headings_are_numbered():
     got = table("".join(f"{t} {x}\n" for t, x in zip(TIME, X1, strict=True)))
     assert got.names == ("1", "2")
     assert got.index(2) == 1
-    with pytest.raises(SubmissionError, match="no column 3, the file has 2"):
+    with pytest.raises(SubmissionError, match="column 3"):
         got.index(3)
 
 
@@ -160,7 +156,7 @@ def test_a_row_of_units_is_joined_to_the_headings():
         "Time,Channel A\n(ms),(V)\n\n"
         + "".join(f"{t},{x}\n" for t, x in zip(TIME, X1, strict=True))
     )
-    assert got.names == ("Time [ms]", "Channel A [V]")
+    assert [parse_heading(name).unit for name in got.names] == ["ms", "V"]
     assert_array_equal(got.values[0], TIME)
 
 
@@ -225,7 +221,7 @@ def test_a_bare_matrix_has_numbered_columns():
     assert upright.names == ("1", "2", "3", "4")
     assert_array_equal(upright.values, matrix.T)
     assert_array_equal(lying.values, matrix.T)
-    assert "data is transposed" in lying.notes[0]
+    assert (len(upright.notes), len(lying.notes)) == (0, 1)
     assert upright.whole == (True, False, True, False)
 
 
@@ -233,9 +229,11 @@ def test_other_content_of_a_mat_file_is_named():
     """Structs, texts and single numbers in a .mat file are not read, and are named."""
     got = table(mat(time=TIME, x1=X1, run={"P": 1.0}, name="bench 4", rate=113.0))
     assert got.names == ("time", "x1")
-    said = "not read: run (1 × 1, struct), name (1 × 7, text), rate (1 × 1, float64)"
-    assert got.notes == (said,)
-    assert [v.read for v in got.variables] == [True, True, False, False, False]
+    unread = [(v.name, v.size, v.kind) for v in got.variables if not v.read]
+    assert unread == [
+        ("run", (1, 1), "struct"), ("name", (1, 7), "text"), ("rate", (1, 1), "float64")
+    ]  # fmt: skip
+    assert all(name in got.notes[0] for name, *_ in unread)
 
 
 def test_complex_numbers_are_not_read_as_real_ones():
@@ -245,7 +243,7 @@ def test_complex_numbers_are_not_read_as_real_ones():
         ("h", "complex"),
         ("s", "struct"),
     ]
-    with pytest.raises(SubmissionError, match="no vector or matrix"):
+    with pytest.raises(SubmissionError, match=r"s \(1 × 1, struct\)"):
         table(mat(s={"t": TIME, "h": X1 + 1j}))
 
 
@@ -266,17 +264,15 @@ def test_the_hash_is_of_the_bytes(tmp_path):
 
 def test_a_file_of_blanks_of_any_sort_is_empty():
     """A file with only blanks or line ends, of whatever sort, counts as empty."""
-    with pytest.raises(SubmissionError, match="the file is empty"):
-        table(b"\x85")
+    for blanks in (b"\x85", b"", b"\r\n", b";;\n"):
+        with pytest.raises(SubmissionError, match="empty"):
+            table(blanks)
 
 
 def test_the_matrix_of_a_mat_file_is_the_recording():
     """A matrix in a .mat file is the recording, even if the file also has settings and gains."""
     matrix = np.column_stack([TIME, X1, U])
-    stream = BytesIO()
-    settings = {f"p{i}": float(i) for i in range(12)}
-    scipy.io.savemat(stream, {**settings, "gains": [1.0, 2.0, 3.0], "log": matrix})
-    got = table(stream.getvalue())
+    got = table(mat(**{f"p{i}": float(i) for i in range(12)}, gains=[1.0, 2.0, 3.0], log=matrix))
     assert (got.format.inputs, got.names) == ("unknown", ("1", "2", "3"))
     assert_array_equal(got.values, matrix.T)
     read = [variable for variable in got.variables if variable.read]
@@ -287,17 +283,17 @@ def test_the_matrix_of_a_mat_file_is_the_recording():
 def test_a_matrix_beside_vectors_of_its_length_gives_its_columns_too():
     """If a matrix is as long as the vectors beside it, its columns are numbered and also read."""
     got = table(mat(t=TIME, y=np.column_stack([X1, U])))
-    assert set(got.names) == {"t", "y column 1", "y column 2"}
-    assert_array_equal(column(got, "y column 2"), U)
+    assert [name[0] for name in sorted(got.names)] == ["t", "y", "y"]
+    assert_array_equal(column(got, sorted(got.names)[2]), U)
 
 
 def test_a_possible_second_recording_gets_advice():
     """A note says how to read a second matrix, or a struct as large as the recording."""
     further = mat(time=TIME, x1=X1, log=np.ones((90, 70)), raw={"t": TIME, "x": X1, "u": U})
     notes = {v.name: v.advice for v in table(further).variables if not v.read}
-    assert "save('new.mat', '-struct', 'raw')" in notes["raw"]
-    assert "save('new.mat', 'log')" in notes["log"]
-    with pytest.raises(SubmissionError, match=r"holds several matrices \(a \(.* × 2, float64\), b"):
+    assert "'-struct'" in notes["raw"]
+    assert "'log'" in notes["log"]
+    with pytest.raises(SubmissionError, match=r"\ba \(.*\bb \("):
         table(mat(a=np.column_stack([TIME, X1]), b=np.column_stack([TIME, U])))
 
 
@@ -320,7 +316,7 @@ def test_a_file_that_crashes_its_reader_costs_only_itself(tmp_path):
     (tmp_path / "good.mat").write_bytes(good)
     before = OF_STRANGERS.set(True)
     try:
-        with pytest.raises(SubmissionError, match=r"bad\.mat: the \.mat file is damaged"):
+        with pytest.raises(SubmissionError, match=r"bad\.mat: .*damaged"):
             read_table(tmp_path, "bad.mat")
         apart = read_table(tmp_path, "good.mat")[0]
     finally:
@@ -338,7 +334,7 @@ def test_a_matlab_table_is_refused_with_advice():
     body += scipy_element(np.zeros((1, 6), "u4"), name="")
     kept = scipy_element(np.zeros((1, 400), "u1"), name="")
     raw = mat(rate=113.0) + np.array([14, len(body)], dtype="<u4").tobytes() + body + kept
-    with pytest.raises(SubmissionError, match=r"run7 \(object\); run7: .*writetable\(run7"):
+    with pytest.raises(SubmissionError, match=r"writetable\(run7"):
         table(raw)
 
 
@@ -401,7 +397,7 @@ def test_a_hostile_matlab_7_3_file_is_refused(spoil, tmp_path):
             file["x2"] = h5py.ExternalLink(str(tmp_path / "secret"), "/x")
     raw = stream.getvalue()
     (tmp_path / "a.mat").write_bytes(raw[: len(raw) // 2] if spoil == "cut" else raw)
-    with pytest.raises(SubmissionError, match=r"damaged or truncated|GB of memory"):
+    with pytest.raises(SubmissionError, match=r"damaged|memory"):
         read_table(tmp_path, "a.mat")
 
 
@@ -453,21 +449,12 @@ def test_a_matlab_7_3_variable_that_lies_about_its_class_is_not_read(odd):
     assert [v.name for v in table.variables if not v.read] == ["odd"]
 
 
-def mat73_with(fill: Callable[[h5py.File], object]) -> bytes:
-    """Return a version 7.3 file with a time and with what a given function adds."""
-    stream = BytesIO(mat73(time=TIME))
-    with h5py.File(stream, "r+") as file:
-        fill(file)
-    return stream.getvalue()
-
-
 def test_the_class_of_a_matlab_7_3_variable_is_one_line():
     """A version 7.3 variable is described in one line, even if its class attribute is an array."""
-
-    def fill(file: h5py.File) -> None:
+    stream = BytesIO(mat73(time=TIME))
+    with h5py.File(stream, "r+") as file:
         file["note"] = np.arange(5.0)
         file["note"].attrs["MATLAB_class"] = np.arange(60.0).reshape(6, 10)
 
-    assert [str(v) for v in table(mat73_with(fill)).variables] == [
-        "note (5 × 1, unknown)", f"time (1 × {N}, float64)",
-    ]  # fmt: skip
+    found = [(v.name, v.size, v.kind) for v in table(stream.getvalue()).variables]
+    assert found == [("note", (5, 1), "unknown"), ("time", (1, N), "float64")]

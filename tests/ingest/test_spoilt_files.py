@@ -30,34 +30,13 @@ U = np.round(0.5 * np.sign(np.sin(9 * T)), 4)
 MOST_TIME = 10.0  # s of processor time
 
 
-def _ecp() -> bytes:
-    rows = [
-        f"{i} {t:.3f} 0 {x:.0f} {u:.4f}" for i, (t, x, u) in enumerate(zip(T, X, U, strict=True))
-    ]
-    head = " Sample   Time   Commanded Pos   Encoder 1 Pos   Control Effort\r\n\n"
-    return (head + "data =[" + ";\r\n".join(rows) + "];\n").encode()
+def _text(*columns: np.ndarray, head: str, sep: str, end: str = "\n") -> bytes:
+    rows = [sep.join(f"{value:.9g}" for value in row) for row in zip(*columns, strict=True)]
+    return (head + end.join(rows)).encode()
 
 
-def _text(delimiter: str, decimal: str) -> bytes:
-    lines = [delimiter.join(("time", "input", "x1"))]
-    lines += [
-        delimiter.join(f"{v:.4f}".replace(".", decimal) for v in row)
-        for row in zip(T, U, X, strict=True)
-    ]
-    return "\n".join(lines).encode()
-
-
-def _log() -> bytes:
-    rows = [
-        f"{i}\t{t:g}\t{x:g}\t{400 * u:g}" for i, (t, x, u) in enumerate(zip(T, X, U, strict=True))
-    ]
-    return ("Sample\tTime\tEncoder 1 Pos\tControl Effort\n" + "\n".join(rows)).encode()
-
-
-def _mat(compress: bool) -> bytes:
+def _mat(*, compress: bool = False, **variables: object) -> bytes:
     stream = BytesIO()
-    variables = {"time": T, "enc1": X.astype("i2"), "duty": (400 * U).astype("i2")}
-    variables["run"] = {"P": 1.0, "wave": "Square"}  # type: ignore[assignment]
     scipy.io.savemat(stream, variables, do_compression=compress)
     return stream.getvalue()
 
@@ -70,27 +49,26 @@ def _mat73() -> bytes:
     return b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + stream.getvalue()[128:]
 
 
-def _matrix() -> bytes:
-    stream = BytesIO()
-    scipy.io.savemat(stream, {"data": np.column_stack([T, U, X])})
-    return stream.getvalue()
-
-
+INDEX = np.arange(1.0, N + 1)
+ECP = "Sample   Time   Commanded Pos   Encoder 1 Pos   Control Effort\r\n\ndata =["
+LOG = {"time": T, "enc1": X.astype("i2"), "duty": (400 * U).astype("i2"), "run": {"P": 1.0}}
+SIGNALS = {"time": T, "input": U, "x1": X}
 FILES = {
-    "ecp": _ecp(),
-    "csv": _text(",", "."),
-    "decimal commas": _text(";", ","),
-    "bench log": _log(),
-    "usb logger": b"Time [us],Displacement [mm]\n"
-    + b"".join(b"%d,%d\n" % (8840 * i, i % 7) for i in range(N)),
-    "bode": b"frequency,x1\n" + b"".join(b"%g,%g\n" % (0.5 * i, 1 / i) for i in range(1, N)),
-    "mat": _mat(compress=False),
-    "mat, compressed": _mat(compress=True),
-    "mat, matrix": _matrix(),
+    "ecp": _text(INDEX, T, 0 * T, X, U, head=ECP, sep=" ", end=";\r\n") + b"];\n",
+    "csv": _text(T, U, X, head="time,input,x1\n", sep=","),
+    "decimal commas": _text(T, U, X, head="time;input;x1\n", sep=";").replace(b".", b","),
+    "bench log": _text(
+        INDEX, T, X, 400 * U, head="Sample\tTime\tEncoder 1 Pos\tControl Effort\n", sep="\t"
+    ),
+    "usb logger": _text(8840 * INDEX, INDEX % 7, head="Time [us],Displacement [mm]\n", sep=","),
+    "bode": _text(0.5 * INDEX, 1 / INDEX, head="frequency,x1\n", sep=","),
+    "mat": _mat(**LOG),
+    "mat, compressed": _mat(compress=True, **LOG),
+    "mat, matrix": _mat(data=np.column_stack([T, U, X])),
     "mat, version 7.3": _mat73(),
-    "workbook": xlsx({"time": T, "input": U, "x1": X}),
-    "LabVIEW": lvm({"time": T, "input": U, "x1": X}),
-    "tdms": tdms_of({"time": T, "input": U, "x1": X}),
+    "workbook": xlsx(SIGNALS),
+    "LabVIEW": lvm(SIGNALS),
+    "tdms": tdms_of(SIGNALS),
 }
 
 positions = st.floats(0.0, 1.0, exclude_max=True)
