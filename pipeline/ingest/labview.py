@@ -32,7 +32,7 @@ from pipeline.ingest.table import (
     not_read,
     printable,
 )
-from pipeline.ingest.text import Block, Layout, read_block, text_lines
+from pipeline.ingest.text import Block, Layout, decode, read_block
 from pipeline.words.numbers import first_few
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def read_lvm(raw: bytes, *, source: str) -> list[FileTable]:
     ------
     SubmissionError : the file is broken; the message names the line.
     """
-    lines = text_lines(raw, source=source)
+    lines = [*enumerate(decode(raw, source=source).split("\n"), 1)]
     delimiter = "," if any(line.startswith("Separator,Comma") for _, line in lines[:40]) else "\t"
     about, segments, special = _segments(lines, delimiter, source=source)
     layout = Layout(delimiter, comma=about.get("Decimal_Separator", [""])[0].startswith(","))

@@ -7,8 +7,8 @@ Another heading with another block begins another run.
 import csv
 import datetime as dt
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 from operator import methodcaller
 
@@ -76,11 +76,6 @@ def read_text(raw: bytes, *, source: str) -> list[FileTable]:
     if layout is None:
         raise SubmissionError(_no_table(lines, source))
     return read_blocks(lines, layout, source=source, format=CSV)
-
-
-def text_lines(raw: bytes, *, source: str) -> list[tuple[int, str]]:
-    """Return the numbered lines of a text file; raises as `decode`."""
-    return [*enumerate(decode(raw, source=source).split("\n"), 1)]
 
 
 def decode(raw: bytes, *, source: str) -> str:
@@ -423,16 +418,16 @@ def read_block(
             f"{block.place(block.rows[0][0])}: expected {len(names)} columns as in the heading, "
             f"found {width}"
         )
-    lines, rows = zip(*block.rows, strict=True)
-    values = _numbers(rows, block.layout, width) if block.values is None else block.values
+    values, used, partial = block.values, [*range(width)], dict[str, str]()
+    if values is None:
+        values = _numbers([row for _, row in block.rows], block.layout, width)
+    end = block.rows[-1][0]
     if values is None or not np.isfinite(values).all():
-        mended = _mend(block, names=names, cut=cut)
-    else:
-        mended = _Mended(values=values, lines=lines, used=range(width), names=names)
-    lines, used = mended.lines, mended.used
+        block, values, used, names, partial = _mend(block, names=names, cut=cut)
+    lines = [number for number, _ in block.rows]
     place = block.place(block.head[-1][0] if block.head else lines[0])
-    names = checked_names([mended.names[i] for i in used], numbers=used, place=place)
-    values = np.ascontiguousarray(mended.values.T)
+    names = checked_names([names[i] for i in used], numbers=used, place=place)
+    values = np.ascontiguousarray(values.T)
     refuse_unusable(values, names=names, place=lambda row: block.place(lines[row]))
     whole = tuple(
         not set(typed[i]) & set(".,:") and bool((column == np.round(column)).all())
@@ -447,9 +442,9 @@ def read_block(
         lines=np.array(lines),
         lines_are=block.line,
         cut=cut,
-        ends_broken=lines[-1] != block.rows[-1][0],
-        notes=(*block.notes, *mended.notes),
-        partial=mended.partial,
+        ends_broken=lines[-1] != end,
+        notes=block.notes,
+        partial=partial,
     )
 
 
@@ -469,29 +464,10 @@ def _numbers(rows: Sequence[str], layout: Layout, width: int) -> Array | None:
         return None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Mended:
-    """The rows of a block that fit.
-
-    Attributes
-    ----------
-    values : (n, columns), for the columns in `used`.
-    lines : (n,) their numbers.
-    names : of all columns, used or not.
-    notes : what was left out.
-    partial : see `FileTable`.
-    """
-
-    values: Array
-    lines: Sequence[int]
-    used: Sequence[int]
-    names: Sequence[str]
-    notes: Sequence[str] = ()
-    partial: Mapping[str, str] = field(default_factory=dict)
-
-
-def _mend(block: Block, *, names: Sequence[str], cut: str | None) -> _Mended:
-    """Return the rows of a block that fit.
+def _mend(
+    block: Block, *, names: Sequence[str], cut: str | None
+) -> tuple[Block, Array, list[int], list[str], dict[str, str]]:
+    """Return the rows that fit, their numbers, the columns used, all names, and partial columns.
 
     Raises
     ------
@@ -575,14 +551,10 @@ def _mend(block: Block, *, names: Sequence[str], cut: str | None) -> _Mended:
             raise SubmissionError(f"{block.place(lines[first])}: {faults[first]}{more}")
         rows_are = "1 row was" if len(faults) == 1 else f"{len(faults)} rows were"
         notes.append(f"{rows_are} skipped, {block.line} {where}: {faults[first]}")
-    return _Mended(
-        values=table[np.ix_(fits, used)],
-        lines=[lines[i] for i in fits],
-        used=used,
-        names=names,
-        notes=notes,
-        partial=partial,
+    fitting = replace(
+        block, rows=[block.rows[i] for i in fits], notes=(*block.notes, *notes), values=None
     )
+    return fitting, table[np.ix_(fits, used)], used, names, partial
 
 
 def _named(names: Sequence[str], j: int) -> str:
