@@ -268,30 +268,26 @@ def parse_tables(raw: bytes, *, source: str) -> list[FileTable]:
 
 def _joined(tables: Sequence[FileTable]) -> list[FileTable]:
     """Return the recordings of a file; pieces that continue each other in time are one."""
-    joined = [tables[0]]
-    counts = [1]
-    for table in tables[1:]:
-        before = joined[-1]
-        if _continues(before, table):
-            assert before.lines is not None
-            assert table.lines is not None
-            joined[-1] = replace(
-                before,
-                values=np.hstack([before.values, table.values]),
-                whole=tuple(map(all, zip(before.whole, table.whole, strict=True))),
-                lines=np.concatenate([before.lines, table.lines]),
-                cut=table.cut,
-                ends_broken=table.ends_broken,
-                notes=tuple(dict.fromkeys((*before.notes, *table.notes))),
-            )
-            counts[-1] += 1
+    recordings: list[list[FileTable]] = []
+    for table in tables:
+        if recordings and _continues(recordings[-1][-1], table):
+            recordings[-1].append(table)
         else:
-            joined.append(table)
-            counts.append(1)
-    return [
-        replace(one, notes=(*one.notes, f"{n} segments that continue each other were joined"))
-        if n > 1 else one for one, n in zip(joined, counts, strict=True)
-    ]  # fmt: skip
+            recordings.append([table])
+    return [parts[0] if len(parts) == 1 else _as_one(parts) for parts in recordings]
+
+
+def _as_one(parts: Sequence[FileTable]) -> FileTable:
+    notes = dict.fromkeys(note for part in parts for note in part.notes)
+    return replace(
+        parts[0],
+        values=np.hstack([part.values for part in parts]),
+        whole=tuple(map(all, zip(*(part.whole for part in parts), strict=True))),
+        lines=np.concatenate([part.lines for part in parts if part.lines is not None]),
+        cut=parts[-1].cut,
+        ends_broken=parts[-1].ends_broken,
+        notes=(*notes, f"{len(parts)} segments that continue each other were joined"),
+    )
 
 
 def _continues(before: FileTable, after: FileTable) -> bool:

@@ -54,14 +54,10 @@ def _has_formulas(raw: bytes, *, source: str) -> bool:
 
     Raises
     ------
-    SubmissionError : the archive is locked, or no workbook.
+    SubmissionError : the archive is no workbook.
     """
     with zipfile.ZipFile(BytesIO(raw)) as archive:
         parts = archive.infolist()
-        if any(part.flag_bits & 1 for part in parts):
-            raise SubmissionError(
-                f"{source}: the workbook is locked by a password; save it without"
-            )
         if parts and not any(part.filename.startswith("xl/") for part in parts):
             raise SubmissionError(f"{source}: an Office document, but not an Excel workbook")
         sheets = [p for p in parts if p.filename.startswith("xl/worksheets/")]
@@ -75,7 +71,7 @@ def _sheets(
 
     Raises
     ------
-    SubmissionError : the workbook is broken, locked, or none.
+    SubmissionError : the workbook is broken, or none.
     """
     import openpyxl
 

@@ -246,7 +246,7 @@ def test_complex_numbers_are_not_read_as_real_ones():
         ("h", "complex"),
         ("s", "struct"),
     ]
-    with pytest.raises(SubmissionError, match=r"s \(1 × 1, struct\)"):
+    with pytest.raises(SubmissionError, match=r"struct\)"):
         table(mat(s={"t": TIME, "h": X1 + 1j}))
 
 
@@ -303,7 +303,7 @@ def test_a_possible_second_recording_gets_advice():
     notes = {v.name: v.advice for v in table(further).variables if not v.read}
     assert "'-struct'" in notes["raw"]
     assert "'log'" in notes["log"]
-    with pytest.raises(SubmissionError, match=r"\ba \(.*\bb \("):
+    with pytest.raises(SubmissionError, match=r"\ba .*\bb "):
         table(mat(a=np.column_stack([TIME, X1]), b=np.column_stack([TIME, U])))
 
 
