@@ -78,7 +78,7 @@ class Signal:
     ----------
     size : numbers of rows and columns.
     kind : type of the numbers, or a description of other content.
-    values : the numbers (rows, columns); None if nothing can be read.
+    values : the numbers (rows, columns); None for other content.
     bytes : memory of content other than numbers.
     group, unit : as stated; "" if not stated.
     interval, start : sample interval and first time in s, as stated; 0 if not stated.
