@@ -11,7 +11,7 @@ sections of this file:
 - Carts: `FrequencyResponse`, `Estimate` with its `Coverage`, `ChainFit`.
 - Comparisons: `ParameterRow` (initial against final), `Check`, `Finding`.
 - Control: `FeedbackDesign`, `HardwareCheck`.
-- Remarks: `Skipped`, `RecordingGroup`, `Assumption`, `LateChannel`.
+- Remarks: `Skipped`, `RecordingGroup`, `Assumption`.
 - Tables that only `results.json` has: `Submitted`, `Provenance`, `ChainWithUnits`, ….
 - All together: `Analysis`.
 
@@ -631,6 +631,7 @@ class Check:
     run, cart, parameter : what the question is about, if it is about one of these.
     part : distinguishes several questions of one kind. For example, it is "converged" for the fit,
         "in_ab" for the order of a frequency, or the number of a recording's decay.
+    code : the code of the finding that fails it, or "".
     """
 
     @computed()
@@ -643,6 +644,7 @@ class Check:
     cart: int | None = None
     parameter: str = ""
     part: str = ""
+    code: str = ""
     outcome: CheckOutcome = written()
     value: float | None = written(default=None)
     limit: float | None = written(default=None)
@@ -735,6 +737,7 @@ class Finding:
             cart=self.cart,
             parameter=self.parameter,
             part=self.part,
+            code=self.code,
             outcome="fail",
             value=self.value,
             limit=self.limit,
@@ -912,22 +915,6 @@ class Assumption:
     reason: str = written("how the data support or contradict it, or why they cannot")
 
 
-@dataclass(frozen=True, kw_only=True)
-class LateChannel:
-    """The delay between the readings of two carts, in the experiments of one kind.
-
-    `cart` is read `delay` (s) later than the cart `than`, or earlier if the delay is negative.
-    `limit` is the largest allowed delay.
-    """
-
-    cart: int
-    than: int
-    kind: str
-    delay: float
-    limit: float
-    experiments: tuple[str, ...]
-
-
 # --------------------------------------------------------------------------- tables of results.json
 
 
@@ -1072,7 +1059,7 @@ class Analysis:
     unexplained: dict[str, float] = field(default_factory=dict)
     discussion: str | None
     left_out: tuple[Finding, ...] = ()
-    late_channels: tuple[LateChannel, ...] = ()
+    late_channels: tuple[Finding, ...] = ()
     groups: tuple[RecordingGroup, ...] = ()
     reported: Mapping[str, Mapping[str, Decimal]] = field(default_factory=dict)
 

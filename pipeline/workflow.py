@@ -28,15 +28,23 @@ from pipeline.identify.model_checks import (
 )
 from pipeline.identify.recording_checks import (
     check_recordings,
+    find_late_channels,
     gain_sign_warning,
     hand_remarks,
     reading_remarks,
 )
-from pipeline.identify.recording_faults import find_late_channels
 from pipeline.identify.springs import check_springs
 from pipeline.ingest.read import Ingested, read_data
 from pipeline.plant.chain import Chain
-from pipeline.results import Analysis, ChainFit, FeedbackDesign, HardwareCheck, Intervention, Stage
+from pipeline.results import (
+    Analysis,
+    ChainFit,
+    FeedbackDesign,
+    HardwareCheck,
+    Intervention,
+    RecordingGroup,
+    Stage,
+)
 from pipeline.submission import Design, Submission
 from pipeline.words.numbers import group_messages
 from pipeline.words.phrases import phrases
@@ -66,7 +74,8 @@ def analyse(
     )
     rows = compare_estimates(found, bench=bench)
     log.add(found.log)
-    late = find_late_channels(valid_records(data.records, left_out), carts=bench.n)
+    used = valid_records(data.records, left_out)
+    late = find_late_channels(used, carts=bench.n)
     checks = (
         *check_recordings(data, left_out=left_out, sines=found.sines, late=late, bench=bench),
         *found.repeats.checks,
@@ -76,19 +85,14 @@ def analyse(
         *check_steps(found.gains, decays=found.decays, bench=bench),
         *check_carts(found.fit, decays=found.decays, bench=bench),
     )
-    used = valid_records(data.records, left_out)
     springs = check_springs(
-        found.fit,
-        responses=found.responses,
-        gains=found.gains,
-        records=used,
-        bench=bench,
+        found.fit, responses=found.responses, gains=found.gains, records=used, bench=bench
     )
-    groups = (
-        ()
-        if springs
-        else find_groups(found.fitted, decays=found.decays, records=used, rows=rows, bench=bench)
-    )
+    groups: tuple[RecordingGroup, ...] = ()
+    if not springs:
+        groups = find_groups(
+            found.fitted, decays=found.decays, records=used, rows=rows, bench=bench
+        )
     checks = (
         *springs,
         *check_groups(groups),

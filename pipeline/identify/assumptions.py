@@ -48,25 +48,20 @@ def _springs(
         name = f"k_{i}"
         value = values.get(name)
         std = fit.std.get(name) if fit and value is not None else None
-        support: Support = "open"
-        if name in contrary:
-            support, reason = "contradicted", contrary[name]
-        elif fit is None or not fit.converged:
-            reason = "no carts were identified"
+        error = f" ± {std:.1g}" if std else ""
+        number = "" if value is None else f"{name} = {value:.3g}{error} {unit}"
+        wrong, shown, misfit = contrary.get(name, ""), "", "leaves a residual above the noise"
+        if fit is None or not fit.converged:
+            unknown = "no carts were identified"
         elif not present:
-            support = "supported" if fit.explains_data else "open"
-            explains = (
-                "explains the data" if fit.explains_data else "leaves a residual above the noise"
-            )
-            reason = f"the fit without it {explains}"
-        elif name in vanishing:
-            support = "contradicted"
-            reason = f"{_number(name, value, std, unit)}: it may not exist"
-        elif fit.explains_data or std:  # a standard error includes the misfit of the carts
-            support, reason = "supported", _number(name, value, std, unit)
+            shown = "the fit without it explains the data" if fit.explains_data else ""
+            unknown = f"the fit without it {misfit}"
         else:
-            number = _number(name, value, std, unit)
-            reason = f"{number}; the fit leaves a residual above the noise"
+            wrong = wrong or (f"{number}: it may not exist" if name in vanishing else "")
+            # A standard error includes the misfit of the carts.
+            shown = number if fit.explains_data or std else ""
+            unknown = f"{number}; the fit {misfit}"
+        support, reason = _judge(wrong=wrong, shown=shown, unknown=unknown)
         yield Assumption(
             key="system.springs",
             about=about,
@@ -79,8 +74,16 @@ def _springs(
         )
 
 
-def _number(name: str, value: float | None, std: float | None, unit: str) -> str:
-    return f"{name} = {value:.3g}{f' ± {std:.1g}' if std else ''} {unit}"
+def _judge(*, wrong: str, shown: str, unknown: str) -> tuple[Support, str]:
+    """Return the support of an assumption and its reason, the first of these that there is.
+
+    Parameters
+    ----------
+    wrong, shown, unknown : what contradicts it, what supports it, and why nothing does.
+    """
+    if wrong:
+        return "contradicted", wrong
+    return ("supported", shown) if shown else ("open", unknown)
 
 
 def _units(
@@ -88,22 +91,23 @@ def _units(
 ) -> Iterator[Assumption]:
     doubts = {check.kind: check.message for check in failed}
     for role, side in (("position", system.position), ("input", system.input)):
-        headed = [
-            record.id for record in records for one in record.heading_units
-            if one.role == role and one.converts
-        ]  # fmt: skip
-        headed = list(dict.fromkeys(headed))
-        support: Support = "open"
-        if doubt := doubts.get(f"{role}_unit") or doubts.get(f"{role}_scale"):
-            support, reason = "contradicted", doubt
-        elif 2 * len(headed) >= sum(role == "position" or r.u is not None for r in records) > 0:
-            support, reason = "supported", f"the headings of {join_names(headed)} state a unit"
-        elif headed:
-            reason = f"only the headings of {join_names(headed)} state a unit"
-        elif role == "position" and is_count(side.unit) and records:
-            support, reason = "supported", "the positions are whole numbers, as counts are"
-        else:
-            reason = "no heading states a unit"
+        headed = list(
+            dict.fromkeys(
+                record.id
+                for record in records
+                for one in record.heading_units
+                if one.role == role and one.converts
+            )
+        )
+        shown, unknown = "", "no heading states a unit"
+        if headed:
+            unknown = f"only the headings of {join_names(headed)} state a unit"
+        if 2 * len(headed) >= sum(role == "position" or r.u is not None for r in records) > 0:
+            shown = f"the headings of {join_names(headed)} state a unit"
+        elif not headed and role == "position" and is_count(side.unit) and records:
+            shown = "the positions are whole numbers, as counts are"
+        wrong = doubts.get(f"{role}_unit") or doubts.get(f"{role}_scale") or ""
+        support, reason = _judge(wrong=wrong, shown=shown, unknown=unknown)
         yield Assumption(
             key=f"system.{role}.unit",
             value=side.unit,
@@ -145,14 +149,9 @@ def _sign(system: System, data: Ingested, *, failed: Sequence[Check]) -> Iterato
     shown_by = [name for name, found in data.signs.found.items() if found == sign]
     others = [name for name, found in data.signs.found.items() if found == -sign]
     wrong = next((check.message for check in failed if check.kind == "input"), "")
-    support: Support = "open"
-    if wrong:
-        support, reason = "contradicted", wrong
-    elif shown_by:
-        but = f"; the opposite sign is shown by {join_names(others)}"
-        support, reason = "supported", f"shown by {join_names(shown_by)}{but if others else ''}"
-    else:
-        reason = "no recording shows it"
+    but = f"; the opposite sign is shown by {join_names(others)}" if others else ""
+    shown = f"shown by {join_names(shown_by)}{but}" if shown_by else ""
+    support, reason = _judge(wrong=wrong, shown=shown, unknown="no recording shows it")
     yield Assumption(
         key="system.input.sign",
         value=float(sign),
@@ -175,20 +174,24 @@ def _free_carts(
         names = tuple(record.id for record in alike)
         held = [cart for cart in range(1, n + 1) if cart not in free]
         unseen = [r.id for r in alike if not set(held or free) <= set(r.carts)]
-        still = [r.id for r in alike if any(_stands_still(r, c) for c in free if c in r.carts)]
-        support: Support = "open"
-        if contrary := [name for name in names if name in wrong]:
-            support, reason = "contradicted", f"in {join_names(contrary)} another cart moves"
-        elif still:
-            reason = f"in {join_names(still)} a cart stated as free does not move"
+        still = [
+            r.id
+            for r in alike
+            if any(np.ptp(r.position(cart)) == 0 for cart in free if cart in r.carts)
+        ]
+        contrary = [name for name in names if name in wrong]
+        shown, unknown = "", ""
+        if still:
+            unknown = f"in {join_names(still)} a cart stated as free does not move"
         elif little := [record.id for record in alike if _hardly_moving(record)]:
-            reason = f"in {join_names(little)} a cart stated as free hardly moves"
+            unknown = f"in {join_names(little)} a cart stated as free hardly moves"
         elif unseen:
             what = "a held cart" if held else "a cart"
-            reason = f"in {join_names(unseen)} the position of {what} was not recorded"
+            unknown = f"in {join_names(unseen)} the position of {what} was not recorded"
         else:
-            support = "supported"
-            reason = "the held carts hardly move" if held else "all carts move"
+            shown = "the held carts hardly move" if held else "all carts move"
+        moves = f"in {join_names(contrary)} another cart moves" if contrary else ""
+        support, reason = _judge(wrong=moves, shown=shown, unknown=unknown)
         yield Assumption(
             key="experiments.carts",
             value=free,
@@ -205,7 +208,3 @@ def _hardly_moving(record: Record) -> bool:
         return False
     ranges = {cart: float(np.ptp(record.position(cart))) for cart in record.carts}
     return any(cart in record.free for cart in little_motion(ranges))
-
-
-def _stands_still(record: Record, cart: int) -> bool:
-    return float(np.ptp(record.position(cart))) == 0

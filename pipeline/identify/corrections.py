@@ -12,7 +12,8 @@ too.
 """
 
 from collections.abc import Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from itertools import chain as chained
 
 import numpy as np
 
@@ -29,7 +30,16 @@ from pipeline.estimation.record_fit import (
     most_are_consistent,
 )
 from pipeline.estimation.time_fit import FOLLOWED
-from pipeline.identify.findings import SAME, SAME_SIZE, SIGMAS, WITNESSES
+from pipeline.identify.findings import (
+    SAME,
+    SAME_SIZE,
+    SIGMAS,
+    WITNESSES,
+    by_kind,
+    explain_ratio,
+    first_by_run,
+)
+from pipeline.identify.recording_checks import span
 from pipeline.plant.chain import Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Finding, Record, StepGain
@@ -45,54 +55,29 @@ _WHITE = 0.8
 _FEWEST_CYCLES = 1.5  # cycles of a dwell; with fewer there is no steady state at any damping
 
 
-@dataclass(frozen=True, kw_only=True)
-class OtherReadings:
-    """The records that follow the chain only after a correction, by id.
-
-    Attributes
-    ----------
-    mistaken : records that do not show what happened.
-    odd : records in which the bench may have done something that no chain does.
-    """
-
-    mistaken: dict[str, Correction] = field(default_factory=dict)
-    odd: dict[str, Finding] = field(default_factory=dict)
-
-
-def find_other_readings(
+def find_corrections(
     records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, RecordFit]
-) -> OtherReadings:
-    """Find the records that follow the chain only after a correction.
+) -> dict[str, Correction]:
+    """Return, by id, the corrections with which records follow the chain.
 
     If most records of a kind need a correction, weaker evidence is enough for the other records of
     this kind.
     """
     if chain is None:
-        return OtherReadings()
+        return {}
     found: dict[str, Correction] = {}
-    held = [record for record in records if record.id in fits]
-    for alike in _by_kind(held):
+    for alike in by_kind(record for record in records if record.id in fits).values():
         sure = {r.id: m for r in alike if (m := find_correction(r, chain, fits[r.id]))}
         if 2 * len(sure) > len(alike):
-            sure |= {
-                r.id: m
-                for r in alike
-                if r.id not in sure and (m := find_correction(r, chain, fits[r.id], better=1.0))
-            }
+            rest = [r for r in alike if r.id not in sure]
+            weak = {r.id: find_correction(r, chain, fits[r.id], better=1.0) for r in rest}
+            sure |= {name: m for name, m in weak.items() if m}
         found |= sure
     legal = {name for name, misread in found.items() if misread.legal}
     if 2 * len(legal) > len(fits):  # then the bench itself has this sign
         found = {name: misread for name, misread in found.items() if name not in legal}
-    agreeing = sum(fit.is_consistent for name, fit in fits.items() if name not in found) + len(
-        found
-    )
-    if agreeing < WITNESSES:
-        return OtherReadings()
-    mistaken = without_lone_factors(found, held, fits=fits)
-    lone = {name: m for name, m in found.items() if name not in mistaken and m.scale}
-    return OtherReadings(
-        mistaken=mistaken, odd={name: _odd(name, scale=m.scale or 1.0) for name, m in lone.items()}
-    )
+    agreeing = sum(fit.is_consistent for name, fit in fits.items() if name not in found)
+    return found if agreeing + len(found) >= WITNESSES else {}
 
 
 def without_lone_factors(
@@ -108,7 +93,7 @@ def without_lone_factors(
     fits : how each record follows the chain without correction.
     """
     kept = {name: m for name, m in found.items() if m.scale is None and m.clock is None}
-    for alike in _by_kind(records):
+    for alike in by_kind(records).values():
         factors = {r.id: found[r.id] for r in alike if r.id in found and r.id not in kept}
         for words in dict.fromkeys(misread.words for misread in factors.values()):
             sharing = [r for r in alike if r.id in factors and factors[r.id].words == words]
@@ -129,11 +114,6 @@ def without_lone_factors(
     return {name: misread for name, misread in found.items() if name in kept}
 
 
-def _by_kind(records: Sequence[Record]) -> list[list[Record]]:
-    kinds = dict.fromkeys(record.kind for record in records)
-    return [[record for record in records if record.kind == kind] for kind in kinds]
-
-
 def _may_be_a_limit(
     sharing: Sequence[Record], records: Sequence[Record], fits: Mapping[str, RecordFit]
 ) -> bool:
@@ -142,14 +122,11 @@ def _may_be_a_limit(
     Their inputs must be equally large, because only then does a limit give the same factor. And no
     record with such a large input may follow the chain.
     """
-    sizes = [_size(record) for record in sharing]
-    follows = [_size(r) for r in records if r not in sharing and fits[r.id].is_consistent]
-    several = min(sizes) < (1 - SAME_SIZE) * max(sizes)
-    return not several and max(follows, default=0.0) < (1 - SAME_SIZE) * max(sizes)
-
-
-def _size(record: Record) -> float:
-    return 0.0 if record.u is None else float(np.abs(record.u).max())
+    size = {r.id: 0.0 if r.u is None else float(np.abs(r.u).max()) for r in records}
+    sizes = [size[record.id] for record in sharing]
+    follows = [size[r.id] for r in records if r not in sharing and fits[r.id].is_consistent]
+    equal = (1 - SAME_SIZE) * max(sizes)
+    return min(sizes) >= equal > max(follows, default=0.0)
 
 
 def _is_sampled_so(record: Record, records: Sequence[Record], *, factor: float) -> bool:
@@ -157,11 +134,6 @@ def _is_sampled_so(record: Record, records: Sequence[Record], *, factor: float) 
     others = [other.sample_time for other in records if other is not record]
     usual = factor * float(np.median(others)) if others else 0.0
     return abs(record.sample_time - usual) <= SAME * usual
-
-
-def _odd(name: str, *, scale: float) -> Finding:
-    code = "moves_too_little" if scale < 1 else "moves_too_far"
-    return Finding(code=code, run=name, details={"scale": f"{scale:.3g}"}, excludes="odd")
 
 
 def standing_still(records: Sequence[Record]) -> set[str]:
@@ -188,10 +160,10 @@ def find_faults(
         then only faults are found that no carts could cause.
     fits : how each record follows the chain, from `follow`.
     """
-    readings = find_other_readings(records, chain=chain, fits=fits)
-    misread = readings.mistaken
-    everywhere = len({m.words for m in misread.values()}) == 1 and misread.keys() == fits.keys()
-    copied = _copies(records)
+    held = [record for record in records if record.id in fits]
+    corrections = find_corrections(records, chain=chain, fits=fits)
+    misread = without_lone_factors(corrections, held, fits=fits)
+    legal = {name for name, correction in misread.items() if correction.legal}
     steps: dict[int, float] = {}  # the largest of all records, as a dead channel shows no step
     moving: set[int] = set()
     for record in records:
@@ -200,41 +172,28 @@ def find_faults(
             y = record.position(cart)
             if is_driven(record) and np.ptp(y) > 0 and not _is_noise(record, cart):
                 moving.add(cart)
-    allowed: dict[int, list[float]] = {}  # noise shows no friction
-    for record in (record for record in records if record.id in fits):
+    friction = _most_friction(held, fits)
+    wrong = chained(
+        _wrong_clocks(records),
+        _short_dwells(records),
+        _copies(records),
+        _misread(misread, everywhere=misread.keys() == fits.keys()),
+        _frozen(held, fits, chain, friction=friction, steps=steps),
+        _dead_channels(records, chain=chain, friction=friction, steps=steps, moving=moving),
+    )
+    odd = chained(_lone_factors(corrections, misread), _strays(held, chain=chain, fits=fits))
+    found = [replace(one, excludes="odd" if one.run in legal else "wrong") for one in wrong]
+    return first_by_run([*found, *(replace(one, excludes="odd") for one in odd)])
+
+
+def _most_friction(records: Sequence[Record], fits: Mapping[str, RecordFit]) -> dict[int, float]:
+    """Return, by cart, the largest friction that the records allow; noise shows no friction."""
+    allowed: dict[int, list[float]] = {}
+    for record in records:
         fit = fits[record.id]
         for cart in (cart for cart in fit.unexplained_share if not _is_noise(record, cart)):
             allowed.setdefault(cart, []).append(fit.friction.get(cart, np.inf))
-    friction = {cart: float(np.median(values)) for cart, values in allowed.items()}
-    # All records are compared here, because no bench samples some of them a thousand times more
-    # slowly.
-    clocks = [record.sample_time for record in records]
-    usual_clock = min((dt for dt in clocks if dt >= FASTEST), default=0.0)
-    found: dict[str, Finding] = {}
-    for record in records:
-        legal = record.id in misread and misread[record.id].legal
-        for fault in (
-            *_wrong_clock(record, usual=usual_clock),
-            *_short_dwell(record),
-            *([copied[record.id]] if record.id in copied else ()),
-            *(
-                [_correction_fault(record, misread[record.id], everywhere)]
-                if record.id in misread
-                else ()
-            ),
-            *(
-                _frozen(record, fits[record.id], chain, friction=friction, steps=steps)
-                if chain and record.id in fits
-                else ()
-            ),
-            *_dead_channels(record, chain=chain, friction=friction, steps=steps, moving=moving),
-        ):
-            found.setdefault(record.id, replace(fault, excludes="odd" if legal else "wrong"))
-    for name, one in readings.odd.items():
-        found.setdefault(name, one)
-    for stray in _strays(records, chain=chain, fits=fits):
-        found.setdefault(stray.run, stray)
-    return found
+    return {cart: float(np.median(values)) for cart, values in allowed.items()}
 
 
 def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, Finding]:
@@ -247,12 +206,10 @@ def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, Finding]:
     by_cart = {(gain.experiment, gain.cart): gain for gain in gains if gain.interval is None}
     for (run, cart), gain in by_cart.items():
         before = by_cart.get((run, cart - 1))
-        if before is None:
-            continue
         least = abs(gain.gain) - SIGMAS * gain.gain_std
         # The difference must exceed the amount by which friction may hold the carts off.
-        if least > 1.3 * (abs(before.gain) + SIGMAS * before.gain_std):
-            details = {"times": f"{abs(gain.gain / before.gain):.3g}", "before": str(cart - 1)}
+        if before and least > 1.3 * (abs(before.gain) + SIGMAS * before.gain_std):
+            details = {"times": f"{abs(gain.gain / before.gain):.3g}", "before": cart - 1}
             found[run] = Finding(
                 code="too_far", run=run, cart=cart, details=details, excludes="wrong"
             )
@@ -289,7 +246,7 @@ def _still(record: Record, cart: int) -> Iterator[slice]:
 
 
 def _dead_channels(
-    record: Record,
+    records: Sequence[Record],
     *,
     chain: Chain | None,
     friction: Mapping[int, float],
@@ -302,44 +259,31 @@ def _dead_channels(
     the records allow, and `steps` the encoder step. `moving` are the carts that any input ever
     moved.
     """
-    for cart in measured(record):
-        y = record.position(cart)
-        never = is_driven(record) and cart not in moving
+    for record, cart in ((r, cart) for r in records for cart in measured(r)):
+        y, run, driven = record.position(cart), record.id, is_driven(record)
         noise = _is_noise(record, cart)
         if noise and (record.kind == "decay" or cart not in moving):
-            yield Finding(code="only_noise", run=record.id, cart=cart, excludes="wrong")
-        elif np.ptp(y) == 0 and (record.kind == "decay" or never):
+            yield Finding(code="only_noise", run=run, cart=cart)
+        elif np.ptp(y) == 0 and (record.kind == "decay" or (driven and cart not in moving)):
             others = [free for free in record.free if free != cart]
             code = "never_changes_held" if others else "never_changes"
-            yield Finding(
-                code=code,
-                run=record.id,
-                cart=cart,
-                details={"others": str(others)},
-                excludes="wrong",
-            )
-        if chain is None or record.u is None or not is_driven(record):
+            yield Finding(code=code, run=run, cart=cart, details={"others": others})
+        if chain is None or not driven or (force := force_on(record, chain, cart=cart)) is None:
             continue
-        force = force_on(record, chain, cart=cart)
-        for still in [slice(None)] if noise else _still(record, cart):
+        for still in [slice(0, y.size)] if noise else _still(record, cart):
             # Friction holds a cart equally in both directions.
-            if force is None or 2 * friction.get(cart, np.inf) >= np.ptp(force[still]):
-                continue
-            if not _must_move(record, chain, still, cart=cart, step=steps[cart]):
-                continue
-            if noise:
-                yield Finding(code="only_noise", run=record.id, cart=cart, excludes="wrong")
-                continue
-            code = "dead" if np.ptp(y) == 0 else "froze_at_input"
-            yield Finding(
-                code=code, run=record.id, cart=cart, details=_span(record, still), excludes="wrong"
-            )
+            if 2 * friction.get(cart, np.inf) < np.ptp(force[still]) and _must_move(
+                record, chain, still, cart=cart, step=steps[cart]
+            ):
+                code = "only_noise" if noise else "dead" if np.ptp(y) == 0 else "froze_at_input"
+                details = span(record, still.start, still.stop - 1)
+                yield Finding(code=code, run=run, cart=cart, details=details)
 
 
 def _frozen(
-    record: Record,
-    fit: RecordFit,
-    chain: Chain,
+    records: Sequence[Record],
+    fits: Mapping[str, RecordFit],
+    chain: Chain | None,
     *,
     friction: Mapping[int, float],
     steps: Mapping[int, float],
@@ -350,41 +294,31 @@ def _frozen(
     a fifth of the recorded range, and the force on it exceeds any friction. At other times the
     reading follows the identified cart.
     """
-    for cart, missed in fit.residual.items():
-        y = record.position(cart)
-        far = max(_SEEN_COUNTS * steps[cart], 0.2 * float(np.ptp(y)))
-        edges = _edges(y)
-        for i in np.flatnonzero(np.diff(edges) >= 10):
-            part = slice(int(edges[i]), int(edges[i + 1]))
-            moved = float(np.ptp(missed[part]))
-            if moved < far:
-                continue
-            rest, force = np.delete(missed, part), force_on(record, chain, cart=cart)
-            if not rest.size or force is None:
-                continue
-            # A cart at rest stays there for a moment after the input steps, so only the first half
-            # counts.
-            early = force[part][: (part.stop - part.start) // 2]
-            if 2 * friction.get(cart, np.inf) >= np.ptp(early):
-                continue
-            elsewhere = float(np.mean(rest**2))
-            follows = elsewhere < FOLLOWED * float(np.var(np.delete(y, part)))
-            # The reading follows the carts if its error elsewhere is below a quarter of the missed
-            # motion.
-            if follows and np.sqrt(elsewhere) < 0.25 * moved:
-                details = _span(record, part)
-                yield Finding(
-                    code="froze_in_motion",
-                    run=record.id,
-                    cart=cart,
-                    details=details,
-                    excludes="wrong",
-                )
-
-
-def _span(record: Record, part: slice) -> dict[str, str]:
-    first, last = record.t[part.start], record.t[part.stop - 1]
-    return {"first": f"{first:.4g}", "last": f"{last:.4g}"}
+    if chain is None:
+        return
+    for record in records:
+        for cart, missed in fits[record.id].residual.items():
+            force = force_on(record, chain, cart=cart)
+            y = record.position(cart)
+            far = max(_SEEN_COUNTS * steps[cart], 0.2 * float(np.ptp(y)))
+            edges = _edges(y)
+            for i in np.flatnonzero(np.diff(edges) >= 10):
+                part = slice(int(edges[i]), int(edges[i + 1]))
+                moved, rest = float(np.ptp(missed[part])), np.delete(missed, part)
+                if moved < far or not rest.size or force is None:
+                    continue
+                # A cart at rest stays there for a moment after the input steps, so only the first
+                # half counts.
+                early = force[part][: (part.stop - part.start) // 2]
+                if 2 * friction.get(cart, np.inf) >= np.ptp(early):
+                    continue
+                elsewhere = float(np.mean(rest**2))
+                follows = elsewhere < FOLLOWED * float(np.var(np.delete(y, part)))
+                # The reading follows the carts if its error elsewhere is below a quarter of the
+                # missed motion.
+                if follows and np.sqrt(elsewhere) < 0.25 * moved:
+                    details = span(record, part.start, part.stop - 1)
+                    yield Finding(code="froze_in_motion", run=record.id, cart=cart, details=details)
 
 
 def _must_move(record: Record, chain: Chain, still: slice, *, cart: int, step: float) -> bool:
@@ -402,49 +336,60 @@ def _must_move(record: Record, chain: Chain, still: slice, *, cart: int, step: f
     return far >= max(_SEEN_COUNTS * step, 0.3 * float(np.ptp(y)))
 
 
-def _copies(records: Sequence[Record]) -> dict[str, Finding]:
-    """Return the records with exactly the samples of an earlier record of their kind."""
+def _copies(records: Sequence[Record]) -> Iterator[Finding]:
+    """Yield the records with exactly the samples of an earlier record of their kind."""
     first: dict[tuple[object, ...], str] = {}
-    copies = {}
     for record in records:
         what = (record.kind, record.free, record.t.tobytes(), record.y.tobytes())
-        if first.setdefault(what, record.id) != record.id:
-            details = {"original": first[what]}
-            copies[record.id] = Finding(
-                code="copied_samples", run=record.id, details=details, excludes="wrong"
-            )
-    return copies
+        if (original := first.setdefault(what, record.id)) != record.id:
+            yield Finding(code="copied_samples", run=record.id, details={"original": original})
 
 
-def _short_dwell(record: Record) -> Iterator[Finding]:
-    if record.kind == "sine" and record.omega is not None:
+def _short_dwells(records: Sequence[Record]) -> Iterator[Finding]:
+    for record in records:
         duration = float(record.t[-1] - record.t[0]) + record.sample_time
-        cycles = record.omega * duration / (2 * np.pi)
-        if cycles < _FEWEST_CYCLES:
+        cycles = (record.omega or np.inf) * duration / (2 * np.pi)
+        if record.kind == "sine" and cycles < _FEWEST_CYCLES:
             details = {"cycles": f"{_FEWEST_CYCLES:g}"}
-            yield Finding(code="short_dwell", run=record.id, details=details, excludes="wrong")
+            yield Finding(code="short_dwell", run=record.id, details=details)
 
 
-def _wrong_clock(record: Record, *, usual: float) -> Iterator[Finding]:
-    """Yield a fault if the time column of a record is in an unusual unit.
+def _wrong_clocks(records: Sequence[Record]) -> Iterator[Finding]:
+    """Yield the records whose time column is in an unusual unit.
 
-    That is so if its sample interval, converted from this unit, is the usual one.
+    That is so if the sample interval, converted from this unit, is the usual one. All records are
+    compared, because no bench samples some of them a thousand times more slowly.
     """
-    for factor, words in TIME_FACTORS.items():
-        # A factor of 100 or more is another unit of time; a factor of 2 may be another setting.
-        is_unit = max(factor, 1 / factor) >= 100.0
-        if is_unit and abs(record.sample_time - factor * usual) < SAME * factor * usual:
-            details = {"apart": f"{record.sample_time:.3g}", "usual": f"{usual:.3g}", "look": words}
-            yield Finding(code="other_clock", run=record.id, details=details, excludes="wrong")
+    clocks = [record.sample_time for record in records]
+    usual = min((dt for dt in clocks if dt >= FASTEST), default=np.inf)
+    # A factor of 100 or more is another unit of time; a factor of 2 may be another setting.
+    units = {f: said for f, said in TIME_FACTORS.items() if max(f, 1 / f) >= 100.0}
+    for record, apart in zip(records, clocks, strict=True):
+        if look := explain_ratio(apart / usual, units, within=SAME):
+            details = {"apart": f"{apart:.3g}", "usual": f"{usual:.3g}", "look": look}
+            yield Finding(code="other_clock", run=record.id, details=details)
 
 
 # ------------------------------------------------------- records that follow no carts
 
 
-def _correction_fault(record: Record, correction: Correction, everywhere: bool) -> Finding:
-    code = "misread_everywhere" if everywhere else "misread"
-    details = {"look": correction.words, "remedy": correction.remedy}
-    return Finding(code=code, run=record.id, details=details, excludes="wrong")
+def _misread(misread: Mapping[str, Correction], *, everywhere: bool) -> Iterator[Finding]:
+    """Yield the records that follow the chain after a correction; `everywhere` if all do."""
+    same = everywhere and len({correction.words for correction in misread.values()}) == 1
+    for name, correction in misread.items():
+        code = "misread_everywhere" if same else "misread"
+        details = {"look": correction.words, "remedy": correction.remedy}
+        yield Finding(code=code, run=name, details=details)
+
+
+def _lone_factors(
+    corrections: Mapping[str, Correction], misread: Mapping[str, Correction]
+) -> Iterator[Finding]:
+    """Yield the records with an unconfirmed factor, of which the bench may be the cause."""
+    for name, correction in corrections.items():
+        if name not in misread and correction.scale:
+            code = "moves_too_little" if correction.scale < 1 else "moves_too_far"
+            yield Finding(code=code, run=name, details={"scale": f"{correction.scale:.3g}"})
 
 
 def _strays(
@@ -458,13 +403,12 @@ def _strays(
     if chain is None or not most_are_consistent(fits):
         return
     for record in records:
-        fit = fits.get(record.id)
+        fit = fits[record.id]
         # Friction makes no cart move further, so a record whose carts all move less is not judged.
-        if fit is None or fit.is_consistent or max(fit.amplitude_ratio.values()) < 0.8:
+        if fit.is_consistent or max(fit.amplitude_ratio.values()) < 0.8:
             continue
         # More than half of the power of every cart must be unexplained.
-        if all(
-            min(near_by.unexplained_share.values()) > 0.5 for near_by in fit_detuned(record, chain)
-        ):
+        near_by = fit_detuned(record, chain)
+        if all(min(one.unexplained_share.values()) > 0.5 for one in near_by):
             details = {"percent": f"{100 * min(fit.share, 1.0):.0f}"}
-            yield Finding(code="stray", run=record.id, details=details, excludes="odd")
+            yield Finding(code="stray", run=record.id, details=details)

@@ -5,7 +5,7 @@ sticking carts and coarse encoders. `tests/grading/mistakes/test_faults.py` show
 are found.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from pipeline.results import Finding, Record
 from pipeline.words.phrases import phrases
@@ -25,7 +25,28 @@ def say(key: str, **values: object) -> str:
     return _WORDS.text(key, **values)
 
 
+def explain_ratio(ratio: float, factors: Mapping[float, str], *, within: float) -> str:
+    """Return the words for the known factor that a ratio equals, within a relative error, or ""."""
+    return next((said for factor, said in factors.items() if abs(ratio / factor - 1) < within), "")
+
+
+def first_by_run(found: Iterable[Finding]) -> dict[str, Finding]:
+    """Return the first finding of each recording, by the recording's id."""
+    first: dict[str, Finding] = {}
+    for one in found:
+        first.setdefault(one.run, one)
+    return first
+
+
+def by_kind(records: Iterable[Record]) -> dict[str, list[Record]]:
+    """Return the records of each kind of experiment, in the order of the records."""
+    kinds: dict[str, list[Record]] = {}
+    for record in records:
+        kinds.setdefault(record.kind, []).append(record)
+    return kinds
+
+
 def valid_records(records: Sequence[Record], left_out: Sequence[Finding]) -> list[Record]:
     """Return the records that show what happened, even if they differ from others."""
-    wrong = {one.experiment for one in left_out if one.is_wrong}
+    wrong = {one.run for one in left_out if one.is_wrong}
     return [record for record in records if record.id not in wrong]

@@ -31,6 +31,7 @@ from pipeline.estimation.record_fit import (
 from pipeline.estimation.sine import FEW_COUNTS
 from pipeline.estimation.time_fit import evaluate_chain, fit_records, open_window
 from pipeline.identify.corrections import without_lone_factors
+from pipeline.identify.findings import by_kind
 from pipeline.identify.log import Log
 from pipeline.names import own_zeta, read_name
 from pipeline.results import (
@@ -77,6 +78,10 @@ class Fitted:
     fits: Mapping[str, RecordFit] = field(default_factory=dict)
     by_dwells: bool = False
     conflict: Mapping[str, Finding] = field(default_factory=dict)
+
+    def compared(self, records: Sequence[Record]) -> list[Record]:
+        """Return the records that are compared with the fit."""
+        return [record for record in records if record.id in self.fits]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -166,13 +171,14 @@ def _fit_points(
     log: Log,
 ) -> Fitted | None:
     """Return the fit to the frequency response, and whether the dwells follow it."""
-    to_points = partial(
-        fit_bode,
-        responses,
-        bench=bench,
-        initial={name: estimate.value for name, estimate in initial.items()},
-        decays=_decay_dampings(initial, n=bench.n),
-    )
+    own = {cart: initial.get(own_zeta(cart, n=bench.n)) for cart in range(1, bench.n + 1)}
+    dampings = {
+        cart: zeta
+        for cart, zeta in own.items()
+        if zeta and zeta.source == "log_decrement" and zeta.value > 0 and zeta.std
+    }
+    values = {name: estimate.value for name, estimate in initial.items()}
+    to_points = partial(fit_bode, responses, bench=bench, initial=values, decays=dampings)
     bode = _held(log.attempt(Stage.BODE_FIT, to_points), runs, measured=points_measured(responses))
     return bode and replace(bode, by_dwells="sine" in _kinds_that_follow(runs.used, bode))
 
@@ -180,10 +186,8 @@ def _fit_points(
 def _fit_records(records: Sequence[Record], runs: Runs, *, bench: Setup, log: Log) -> Fitted | None:
     """Return the fit to whole records in the time domain."""
     fit = log.attempt(Stage.FINAL_ESTIMATES, partial(fit_records, records, bench=bench))
-    if fit is None:
-        return None
-    used = [record for record in records if record.id in fit.experiments]
-    return _held(fit, runs, measured=motion_measured(used))
+    used = [record for record in records if fit and record.id in fit.experiments]
+    return _held(fit, runs, measured=motion_measured(used)) if fit else None
 
 
 def _misses_transients(fitted: Fitted, runs: Runs, dwells: Sequence[Record]) -> bool:
@@ -239,8 +243,8 @@ def _kinds_that_follow(records: Sequence[Record], fitted: Fitted) -> set[str]:
     """Return the kinds of experiment of which most records follow the fit."""
     return {
         kind
-        for kind, ids in _by_kind(records, fitted).items()
-        if most_are_consistent({name: fitted.fits[name] for name in ids})
+        for kind, alike in by_kind(fitted.compared(records)).items()
+        if most_are_consistent({record.id: fitted.fits[record.id] for record in alike})
     }
 
 
@@ -255,26 +259,18 @@ def _votes(kinds: Set[str]) -> int:
 def _contrary_kinds(records: Sequence[Record], fitted: Fitted) -> set[str]:
     """Return the kinds of record of which most follow no chain similar to the fitted one."""
     assert fitted.fit is not None
-    chain, by_id = fitted.fit.chain, {record.id: record for record in records}
+    chain = fitted.fit.chain
 
-    def contrary(name: str) -> bool:
+    def contrary(record: Record) -> bool:
         # With inches in place of centimetres, this share is 0.37.
-        return all(fit.share > 0.3 for fit in fit_detuned(by_id[name], chain))
+        return all(fit.share > 0.3 for fit in fit_detuned(record, chain))
 
     return {
         kind
-        for kind, ids in _by_kind(records, fitted).items()
-        if 2 * sum(not fitted.fits[name].is_consistent for name in ids) > len(ids)
-        and 2 * sum(map(contrary, ids)) > len(ids)
+        for kind, alike in by_kind(fitted.compared(records)).items()
+        if 2 * sum(not fitted.fits[record.id].is_consistent for record in alike) > len(alike)
+        and 2 * sum(map(contrary, alike)) > len(alike)
     }
-
-
-def _by_kind(records: Sequence[Record], fitted: Fitted) -> dict[str, list[str]]:
-    kinds: dict[str, list[str]] = {}
-    for record in records:
-        if record.id in fitted.fits:
-            kinds.setdefault(record.kind, []).append(record.id)
-    return kinds
 
 
 def _conflict(
@@ -286,30 +282,19 @@ def _conflict(
     carts may really behave in both ways.
     """
     assert fitted.fit is not None
-    chain, ids = fitted.fit.chain, _by_kind(records, fitted)
-    others = [r for r in records if r.id in fitted.fits and r.kind in theirs - mine]
-    misread = {r.id: m for r in others if (m := find_correction(r, chain, fitted.fits[r.id]))}
-    held = [record for record in records if record.id in fitted.fits]
-    found = without_lone_factors(misread, held, fits=fitted.fits)
+    chain, fits, held = fitted.fit.chain, fitted.fits, fitted.compared(records)
+    others = [record for record in held if record.kind in theirs - mine]
+    misread = {r.id: m for r in others if (m := find_correction(r, chain, fits[r.id]))}
+    found = without_lone_factors(misread, held, fits=fits)
     if 2 * len(found) <= len(others):
         return {}
-    example, misread = next(iter(found.items()))
+    example, correction = next(iter(found.items()))
     of_mine, of_theirs = (" and ".join(sorted(kinds)) for kinds in (mine - theirs, theirs - mine))
-    details = {"mine": of_mine, "theirs": of_theirs, "example": example, "look": misread.words}
+    details = {"mine": of_mine, "theirs": of_theirs, "example": example, "look": correction.words}
     return {
-        name: Finding(code="contradicting_kinds", run=name, details=details, excludes="wrong")
-        for kind in mine ^ theirs
-        for name in ids[kind]
-    }
-
-
-def _decay_dampings(initial: Mapping[str, Estimate], *, n: int) -> dict[int, Estimate]:
-    """Return each cart's own damping ratio, by cart, if decays give it."""
-    own = {cart: initial.get(own_zeta(cart, n=n)) for cart in range(1, n + 1)}
-    return {
-        cart: zeta
-        for cart, zeta in own.items()
-        if zeta and zeta.source == "log_decrement" and zeta.value > 0 and zeta.std
+        r.id: Finding(code="contradicting_kinds", run=r.id, details=details, excludes="wrong")
+        for r in held
+        if r.kind in mine ^ theirs
     }
 
 
@@ -360,12 +345,10 @@ def check_groups(groups: Sequence[RecordingGroup]) -> list[Check]:
     """Return a failed check if groups of recordings want different carts."""
     if not groups:
         return []
-    told = [
-        join_names(list(group.experiments))
-        + ": "
-        + listing([f"{k} = {with_error(v, group.std.get(k))}" for k, v in group.values.items()])
-        for group in groups
-    ]
+    told = []
+    for group in groups:
+        values = [f"{k} = {with_error(v, group.std.get(k))}" for k, v in group.values.items()]
+        told.append(f"{join_names(list(group.experiments))}: {listing(values)}")
     details = {"groups": "; ".join(told)}
     finding = Finding(code="groups", kind="groups", details=details, value=len(groups), limit=1)
     return [finding.check]
@@ -384,7 +367,9 @@ def _against_decays(
     pairs = {
         row.name: (row.initial, row.final)
         for row in rows
-        if read_name(row.name).is_frequency and _differs(row)
+        if read_name(row.name).is_frequency
+        if abs(row.change_percent or 0.0) > 100 * _DETUNED
+        if row.change_sigmas is not None and row.change_sigmas > SIGMA_LIMIT
         if row.initial and row.initial.source == "log_decrement" and row.final
         if not bent & set(row.initial.experiments)
     }
@@ -398,15 +383,6 @@ def _against_decays(
             std={name: std for name, pair in pairs.items() if (std := pair[i].std) is not None},
         )
         for i, runs in ((1, fit.experiments), (0, tuple(swings)))
-    )
-
-
-def _differs(row: ParameterRow) -> bool:
-    """Return whether initial and final frequency differ by more than chance and by enough."""
-    return (
-        abs(row.change_percent or 0.0) > 100 * _DETUNED
-        and row.change_sigmas is not None
-        and row.change_sigmas > SIGMA_LIMIT
     )
 
 
@@ -492,24 +468,15 @@ def _described(groups: Sequence[tuple[Sequence[Record], ChainFit]]) -> tuple[Rec
         return ()
     fits = [fit for _, fit in groups]
     values = [_physical(fit) for fit in fits]
-    names = [
+    first, std = values[0], fits[0].std
+    known = [name for name in first if all(name in one for one in values)]
+    different = dict.fromkeys(
         name
-        for name in values[0]
-        if all(name in one and name in fit.std for one, fit in zip(values, fits, strict=True))
-        and read_name(name).symbol != "c"
-    ]
-    different = [
-        name
-        for name in names
-        if any(
-            abs(one[name] - values[0][name])
-            > max(
-                SIGMA_LIMIT * np.hypot(fit.std[name], fits[0].std[name]),
-                _DIFFERENT * abs(values[0][name]),
-            )
-            for one, fit in zip(values[1:], fits[1:], strict=True)
-        )
-    ]
+        for name in known
+        for one, fit in zip(values[1:], fits[1:], strict=True)
+        if abs(one[name] - first[name])
+        > max(SIGMA_LIMIT * np.hypot(fit.std[name], std[name]), _DIFFERENT * abs(first[name]))
+    )
     if not different:
         return ()
     return tuple(
@@ -523,5 +490,7 @@ def _described(groups: Sequence[tuple[Sequence[Record], ChainFit]]) -> tuple[Rec
 
 
 def _physical(fit: ChainFit) -> dict[str, float]:
+    """Return the masses and springs of a fit that have a standard error."""
     rows = {"m": fit.chain.m, "k": fit.chain.k}
-    return {f"{s}_{i}": float(v) for s, row in rows.items() for i, v in enumerate(row, start=1)}
+    values = {f"{s}_{i}": float(v) for s, row in rows.items() for i, v in enumerate(row, start=1)}
+    return {name: value for name, value in values.items() if name in fit.std}

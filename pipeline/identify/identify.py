@@ -30,7 +30,7 @@ from pipeline.identify.corrections import (
 )
 from pipeline.identify.fit import Fitted, Runs, fit_carts
 from pipeline.identify.log import Log, Measured
-from pipeline.identify.recording_faults import find_other_kinds, find_other_units, find_stuck
+from pipeline.identify.recording_checks import find_shown
 from pipeline.identify.repeats import Repeats, compare_repeats, find_outlier_repeats
 from pipeline.ingest.read import Ingested
 from pipeline.names import parameter_names
@@ -161,10 +161,6 @@ def compare_estimates(found: Identified, *, bench: Setup) -> tuple[ParameterRow,
     )
 
 
-def _counted(carts: Sequence[int]) -> str:
-    return ("cart " if len(carts) == 1 else "carts ") + ", ".join(map(str, carts))
-
-
 def _driven(records: Sequence[Record], *, n: int, log: Log) -> list[Record]:
     """Return the steps and sweeps in which all carts are free.
 
@@ -173,13 +169,11 @@ def _driven(records: Sequence[Record], *, n: int, log: Log) -> list[Record]:
     """
     runs = [r for r in records if r.kind in ("step", "sweep") and r.u is not None]
     runs = [r for r in runs if len(r.free) == n]
-    log.warn(
-        group_messages(
-            (run.id, _WORDS.text("carts_unseen", all=n, carts=_counted(run.carts)))
-            for run in runs
-            if len(run.carts) < n
-        )
-    )
+    notes = []
+    for run in (run for run in runs if len(run.carts) < n):
+        seen = f"cart{'s' * (len(run.carts) != 1)} {', '.join(map(str, run.carts))}"
+        notes.append((run.id, _WORDS.text("carts_unseen", all=n, carts=seen)))
+    log.warn(group_messages(notes))
     return runs
 
 
@@ -190,19 +184,14 @@ def _log_decrements(
     decays: list[LogDecrement] = []
     for cart, (before, after) in enumerate(pairwise(bench.springs), start=1):
         if not (before or after):
-            reason = _WORDS.text("no_spring_at_cart", cart=cart)
-            log.skip(Stage.LOG_DECREMENT, reason, cart=cart)
+            log.skip(Stage.LOG_DECREMENT, _WORDS.text("no_spring_at_cart", cart=cart), cart=cart)
             continue
         alone = [r for r in runs.used if r.free == (cart,) and cart in r.carts]
         swinging = [r for r in alone if r.kind == "decay"] or [r for r in alone if r.kind == "step"]
         if not swinging:
-            _skip_without(
-                log,
-                Stage.LOG_DECREMENT,
-                f"decay in which cart {cart} alone is free" if bench.n > 1 else "decay",
-                out=[r for r in runs.left_out if r.free == (cart,) and r.kind in ("decay", "step")],
-                cart=cart,
-            )
+            what = f"decay in which cart {cart} alone is free" if bench.n > 1 else "decay"
+            out = [r for r in runs.left_out if r.free == (cart,) and r.kind in ("decay", "step")]
+            _skip_without(log, Stage.LOG_DECREMENT, what, out=out, cart=cart)
         for run in swinging:
             find = partial(_decays_between, between(run, interventions), cart=cart)
             known = log.measured.decays
@@ -218,16 +207,14 @@ def _decays_between(pieces: Sequence[Record], *, cart: int) -> list[LogDecrement
     ------
     DataError : no piece shows a decay.
     """
-    if not pieces:
-        raise DataError("a force that was not measured acts on a cart throughout")
     decays: list[LogDecrement] = []
-    fault: DataError | None = None
+    fault = DataError("a force that was not measured acts on a cart throughout")
     for piece in pieces:
         try:
             decays.append(fit_log_decrement(piece, cart=cart))
         except DataError as error:
             fault = error
-    if fault and not decays:
+    if not decays:
         raise fault
     if len(decays) == 1:
         return decays
@@ -238,12 +225,10 @@ def _skip_without(
     log: Log, stage: Stage, what: str, *, out: Sequence[Record], cart: int | None = None
 ) -> None:
     """Note that records of some kind are missing, or that all of them were left out."""
+    reason = _WORDS.text("none_recorded", what=what)
     if out:
         reason = _WORDS.text("all_left_out", what=what, runs=join_names([r.id for r in out]))
-        log.skip(stage, reason, cart=cart)
-    else:
-        reason = _WORDS.text("none_recorded", what=what)
-        log.skip(stage, reason, cart=cart, missing=f"a {what}")
+    log.skip(stage, reason, cart=cart, missing="" if out else f"a {what}")
 
 
 def _step_gains(runs: Runs, *, bench: Setup, log: Log) -> list[StepGain]:
@@ -331,24 +316,14 @@ def identify_with_rejection(
     driven = [r for r in data.records if r.kind in ("step", "sweep")]
     # Faults that input or encoder show by themselves are kept, because later rounds do not see
     # their records.
-    shown = {
-        **find_other_units(data.records),
-        **find_stuck(data.records),
-        **find_other_kinds(data.records, files=data.files),
-    }
+    shown = find_shown(data.records, files=data.files)
     contradicted = []
     chain: Chain | None = None
     fits: Mapping[str, RecordFit] = {}
     left_out = find_outlier_repeats(driven, unit=bench.units.position) | shown
     without = left_out.keys() | standing_still(data.records)
-    again = partial(
-        identify,
-        data,
-        interventions=interventions,
-        bench=bench,
-        progress=progress,
-        measured=Measured(),
-    )
+    again = partial(identify, data, interventions=interventions, bench=bench, progress=progress)
+    again = partial(again, measured=Measured())
     found = again(without=without)
     for _ in range(_ROUNDS):
         # If too few records remain to identify the carts, the earlier result is kept.
@@ -358,12 +333,11 @@ def identify_with_rejection(
         shown |= {**found.repeats.odd, **found.fitted.conflict}
         # Search for odd repeats only among good records, because otherwise most repeats may be
         # wrong.
-        sound = [record for record in driven if record.id not in faults]
-        odd = find_outlier_repeats(sound, unit=bench.units.position)
+        valid = [record for record in driven if record.id not in faults]
+        odd = find_outlier_repeats(valid, unit=bench.units.position)
         # A fault that says how a record is wrong has priority over a fault that only calls it odd.
-        doubted = {name: one for name, one in faults.items() if one.excludes == "odd"}
-        sure = {name: one for name, one in faults.items() if one.excludes == "wrong"}
-        left_out = {**odd, **doubted, **shown, **sure}
+        sure = {name: one for name, one in faults.items() if one.is_wrong}
+        left_out = odd | faults | shown | sure
         if left_out.keys() == without:
             break
         without = left_out.keys()
@@ -375,10 +349,8 @@ def identify_with_rejection(
         found = again(without=without)
     checks = {check.id: check for check in (*found.repeats.checks, *contradicted)}
     repeats = replace(found.repeats, checks=tuple(checks.values()))
-    return (
-        replace(found, repeats=repeats),
-        [left_out[record.id] for record in data.records if record.id in left_out],
-    )
+    ordered = [left_out[record.id] for record in data.records if record.id in left_out]
+    return replace(found, repeats=repeats), ordered
 
 
 def _reference_chain(
@@ -388,8 +360,11 @@ def _reference_chain(
 
     If a chain explains the data only after two columns are swapped, it is returned.
     """
-    if found.fit and found.fit.converged and most_are_consistent(found.fitted.fits):
-        return found.fit.chain, found.fitted.fits
+    fitted = None
+    if found.fit and found.fit.converged:
+        fitted = found.fit.chain, found.fitted.fits
+    if fitted and most_are_consistent(found.fitted.fits):
+        return fitted
     for i, j in combinations(sorted(response.cart for response in found.responses), 2):
         turned = [replace(r, cart={i: j, j: i}.get(r.cart, r.cart)) for r in found.responses]
         try:
@@ -398,6 +373,4 @@ def _reference_chain(
             continue
         if fit.explains_data:
             return fit.chain, record_fits(data.records, fit.chain)
-    if found.fit is None or not found.fit.converged:
-        return None
-    return found.fit.chain, found.fitted.fits
+    return fitted

@@ -76,15 +76,14 @@ def check_carts(
 
 
 def _fit_checks(fit: ChainFit) -> list[Check]:
+    found = (
+        "the linear carts leave a residual above the noise; look where model and measurement "
+        "differ."
+    )
     if not fit.converged:
         found = "not judged, because the fit failed."
     elif fit.explains_data:
         found = "the linear carts and the noise explain the data."
-    else:
-        found = (
-            "the linear carts leave a residual above the noise; look where model and measurement "
-            "differ."
-        )
     return [
         Check(
             kind="fit",
@@ -105,19 +104,13 @@ def _fit_checks(fit: ChainFit) -> list[Check]:
 
 def _sign_check(fit: ChainFit, *, bench: Setup) -> Check:
     """Check that no mass, damping or spring is negative by more than its standard error allows."""
-    values, std = physical_values(fit.chain, bench=bench), fit.std
-    below = {
-        name: -value / std[name] if std.get(name) else np.inf
-        for name, value in values.items()
-        if value < 0
-    }
-    worst = float(max(below.values(), default=0.0))
-    names = ", ".join(f"{name} = {values[name]:.3g}" for name in below)
-    message = (
-        f"Not positive: {names}; up to {worst:.1f} standard errors below zero."
-        if below
-        else "No mass, damping or spring is below zero."
-    )
+    std = fit.std
+    below = {k: v for k, v in physical_values(fit.chain, bench=bench).items() if v < 0}
+    sigmas = [-value / std[name] if std.get(name) else np.inf for name, value in below.items()]
+    worst, message = float(max(sigmas, default=0.0)), "No mass, damping or spring is below zero."
+    if below:
+        names = ", ".join(f"{name} = {value:.3g}" for name, value in below.items())
+        message = f"Not positive: {names}; up to {worst:.1f} standard errors below zero."
     return Check(
         kind="physical",
         part="signs",
@@ -168,15 +161,9 @@ def check_vanishing(
             beside=beside,
         )
         code, details = _ask_if_there(name, decays=decays, bench=bench)
-        finding = Finding(
-            code=code,
-            kind="vanishing",
-            parameter=name,
-            details={"found": found, **details},
-            value=measured or 0.0,
-            limit=limit,
-        )
-        checks.append(finding.check)
+        finding = Finding(code=code, kind="vanishing", parameter=name, limit=limit)
+        details |= {"found": found}
+        checks.append(replace(finding, details=details, value=measured or 0.0).check)
     return checks
 
 
@@ -239,13 +226,14 @@ def _gain_order_check(values: Mapping[str, float], *, chain: Chain) -> Check:
     # larger.
     rise = max(later / earlier - 1 for earlier, later in pairwise(gains))
     good = rise <= _REDUNDANCY and min(gains) >= 0
+    said = "yes" if good else "no"
     return Check(
         kind="order",
         part="gains",
         outcome=passed(good),
         value=max(float(rise), 0.0),
         limit=_REDUNDANCY,
-        message=f"Static gains fall along the chain ({' ≥ '.join(names)} > 0): {_yes(good)}.",
+        message=f"Static gains fall along the chain ({' ≥ '.join(names)} > 0): {said}.",
     )
 
 
@@ -255,29 +243,23 @@ def _frequency_order_checks(values: Mapping[str, float], *, n: int) -> list[Chec
     With heavy damping, a wrong order is no failure, because damping may change the order.
     """
     damped = any(v > HEAVY_DAMPING for name, v in values.items() if read_name(name).is_ratio)
+    wrong = "no (not exact where a damping ratio is above 0.3)" if damped else "no"
     checks = []
     for low, middle, high, _ in interlacing_brackets(n):
         # Distance of the frequency from its allowed range, in percent of the frequency.
         excess = max(values[low] / values[middle], values[middle] / values[high]) - 1
         good = excess <= _REDUNDANCY
-        reason = " (not exact where a damping ratio is above 0.3)" if damped and not good else ""
-        ends = f"in_{read_name(low).suffix}{read_name(high).suffix}" if n == 3 else ""
-        checks.append(
-            Check(
-                kind="order",
-                parameter=middle,
-                part=ends,
-                outcome="pass" if good else ("skip" if damped else "fail"),
-                value=100 * max(float(excess), 0.0),
-                limit=0.0,
-                message=f"{low} < {middle} < {high}: {_yes(good)}{reason}.",
-            )
+        check = Check(
+            kind="order",
+            parameter=middle,
+            part=f"in_{read_name(low).suffix}{read_name(high).suffix}" if n == 3 else "",
+            outcome="pass" if good else ("skip" if damped else "fail"),
+            value=100 * max(float(excess), 0.0),
+            limit=0.0,
+            message=f"{low} < {middle} < {high}: {'yes' if good else wrong}.",
         )
+        checks.append(check)
     return checks
-
-
-def _yes(good: bool) -> str:
-    return "yes" if good else "no"
 
 
 def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
@@ -294,24 +276,23 @@ def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
     for row in rows:
         if row.change_percent is None or (row.consistent is None and row.change_sigmas is None):
             continue
-        limit = change_limit(row.name)
+        limit, change = change_limit(row.name), row.change_percent
         outcome, verdict = verdicts[row.consistent]
-        sigmas = (
-            "" if row.change_sigmas is None else f", or {row.change_sigmas:.1f} standard errors"
+        parts = [f"Initial and final {row.name} {verdict} (limit {limit:.0f} %): "]
+        parts.append(f"the difference is {change:+.1f} %")
+        if row.change_sigmas is not None:
+            parts.append(f", or {row.change_sigmas:.1f} standard errors")
+        parts.append("." if row.independent is not False else ". Both use the same recordings.")
+        message = "".join(parts) + (_advice(row) if outcome == "fail" else "")
+        check = Check(
+            kind="initial_final",
+            parameter=row.name,
+            outcome=outcome,
+            value=abs(change),
+            limit=limit,
+            message=message,
         )
-        advice = _advice(row) if outcome == "fail" else ""
-        same = "" if row.independent is not False else " Both use the same recordings."
-        checks.append(
-            Check(
-                kind="initial_final",
-                parameter=row.name,
-                outcome=outcome,
-                value=abs(row.change_percent),
-                limit=limit,
-                message=f"Initial and final {row.name} {verdict} (limit {limit:.0f} %): the "
-                f"difference is {row.change_percent:+.1f} %{sigmas}.{same}{advice}",
-            )
-        )
+        checks.append(check)
     return checks
 
 
@@ -368,54 +349,42 @@ def _advice(row: ParameterRow) -> str:
         return " Their signs differ: is the sign of the input in submission.toml right?"
     response = after.source == "bode_fit"
     if name.is_ratio:
-        seen = (
-            "a steady sine of amplitude A gives ζ + 2d/(πA)"
-            if response
-            else "it raises them more for small swings"
-        )
-        return (
-            f" Dry friction makes damping ratios differ: {seen}. Check which of the two methods "
-            "used the larger amplitude."
-        )
+        return say("dampings_of_points" if response else "dampings_of_records")
     looks = {
         "step": "the rest and settled levels of {runs}",
         "log_decrement": "the peaks of {runs}",
-        "frequency_response": "the points near this frequency",
+        "frequency_response": "the points at the lowest frequencies"
+        if name.is_gain
+        else "the points near this frequency",
     }
-    if name.is_gain:
-        looks["frequency_response"] = "the points at the lowest frequencies"
     look = looks.get(before.source, "{runs}").format(runs=join_names(before.experiments))
-    beside = (
-        ", and at the points of the response near this frequency"
-        if response and name.is_frequency
-        else ""
-    )
-    lowest = ", and at the lowest frequencies" if response and before.source == "step" else ""
-    return f" Look at {look}{beside}{lowest}."
+    if response and name.is_frequency:
+        look += ", and at the points of the response near this frequency"
+    if response and before.source == "step":
+        look += ", and at the lowest frequencies"
+    return f" Look at {look}."
 
 
 def check_decays(
     decays: Sequence[LogDecrement], *, records: Sequence[Record] = (), bench: Setup
 ) -> list[Check]:
     """Check for every decay whether it is exponential within the noise."""
-    checks, kinds = [], {record.id: record.kind for record in records}
+    checks, steps = [], {record.id for record in records if record.kind == "step"}
     for decay in decays:
-        what = f"the decay of cart {decay.cart}"
-        if kinds.get(decay.experiment) == "step":
-            what = f"the ringing of cart {decay.cart} after the step"
-        said = say_law(decay, unit=bench.units.position)
-        checks.append(
-            Check(
-                kind="decay",
-                run=decay.experiment,
-                cart=decay.cart,
-                part=str(decay.number or ""),
-                outcome="skip" if decay.law.is_untested else passed(decay.law.is_exponential),
-                value=decay.law.statistic,
-                limit=decay.law.limit,
-                message=f"{decay.name}: {what} {said}",
-            )
+        cart, law = decay.cart, decay.law
+        rings = f"the ringing of cart {cart} after the step"
+        what = rings if decay.experiment in steps else f"the decay of cart {cart}"
+        check = Check(
+            kind="decay",
+            run=decay.experiment,
+            cart=cart,
+            part=str(decay.number or ""),
+            outcome="skip" if law.is_untested else passed(law.is_exponential),
+            value=law.statistic,
+            limit=law.limit,
+            message=f"{decay.name}: {what} {say_law(decay, unit=bench.units.position)}",
         )
+        checks.append(check)
     return checks
 
 
@@ -463,9 +432,9 @@ def _step_check(step: StepGain, *, shown: Sequence[str], bench: Setup) -> Check:
 
 def say_law(decay: LogDecrement, *, unit: str) -> str:
     """Return the law with its numbers, as the end of a sentence about the decay."""
-    law, said = decay.law, _numbers(decay, unit=unit)
+    said = _numbers(decay, unit=unit)
     numbers = _LAWS.text("numbers", zeta=said["zeta"], omega_n=said["omega_n"])
-    return _LAWS.text(_key(law), numbers=numbers, **said)
+    return _LAWS.text(_key(decay.law), numbers=numbers, **said)
 
 
 def name_law(decay: LogDecrement, *, unit: str) -> str:
@@ -522,8 +491,8 @@ def design_margins(chain: Chain, design: FeedbackDesign, *, on_bench: bool = Fal
     except np.linalg.LinAlgError:
         raise DataError("no margins: the numbers of this loop differ too much in size") from None
     if found is None:
-        where = "on cartlab's bench, whose observer has no model," if on_bench else ""
-        raise DataError(f"no margins: {'the loop ' + where if where else 'the loop'} is unstable")
+        where = " on cartlab's bench, whose observer has no model," if on_bench else ""
+        raise DataError(f"no margins: the loop{where} is unstable")
     return found
 
 
@@ -546,17 +515,17 @@ def verify_design(chain: Chain, design: FeedbackDesign) -> Check:
         message = "not verified: the plant's numbers differ too much in size"
         return replace(verified, outcome="skip", message=message)
     value = float(np.max(np.append(np.abs(ours - wanted), abs(level - 1))).round(_LAST_DIGIT))
-    if not value <= _SAME_LOOP:
-        finite = bool(np.isfinite(value))
-        return Finding(
-            code="other_loop" if finite else "no_polynomial",
-            kind="feedback",
-            part="gains",
-            details={"asked": asked},
-            value=value if finite else None,
-            limit=_SAME_LOOP,
-        ).check
-    return replace(verified, value=value)
+    if value <= _SAME_LOOP:
+        return replace(verified, value=value)
+    finite = bool(np.isfinite(value))
+    return Finding(
+        code="other_loop" if finite else "no_polynomial",
+        kind="feedback",
+        part="gains",
+        details={"asked": asked},
+        value=value if finite else None,
+        limit=_SAME_LOOP,
+    ).check
 
 
 def _loops(chain: Chain, design: FeedbackDesign) -> tuple[Array, Array, float]:

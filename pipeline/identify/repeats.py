@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 from pipeline.estimation.record_fit import TIME_FACTORS
-from pipeline.identify.findings import SAME_SIZE, SIGMAS, say
+from pipeline.identify.findings import SAME_SIZE, SIGMAS, explain_ratio, say
 from pipeline.names import gain_name, own_omega, own_zeta, read_name
 from pipeline.results import Check, Estimate, Finding, LogDecrement, Record, StepGain
 
@@ -26,6 +26,7 @@ _MATERIAL = 0.05  # share of the response; a smaller difference does not matter
 _SPREADS, _SPREADS_OF_MANY = {3: 30.0, 4: 8.0}, 5.0
 _AMPLIFICATION = 2.0  # factor by which a lightly damped chain amplifies a difference of the inputs
 _START_SAMPLES = 3  # samples whose median is the start, so that a spike is ignored
+_SAME_RUN = 0.05  # relative; two runs may differ by this even if a known mistake is corrected
 _LIKE_THE_FIT = 0.15  # relative; the usual difference of initial and final estimates (Throne 2005)
 # Factors by which friction, play or a soft hold may change a gain or a frequency.
 _BY_THE_BENCH = {"K": 1.6, "omega": 1.3}
@@ -206,27 +207,21 @@ def compare_repeats(
             if clock_error or name not in by_size:
                 wrong = clock_error or (not right[name] and _differ_in_size(readings[name]))
                 is_wrong = bool(wrong) and not _is_reversed(of_run[run], usual)
+                details = {"parameter": name, "found": f"{of_run[run][name]:.3g}"}
+                details |= {"usual": f"{value:.3g}", "look": clock_error and f": {clock_error}"}
                 odd[run] = Finding(
                     code="odd_number" if right[name] else "odd_beside_dwells",
                     run=run,
-                    details={
-                        "parameter": name,
-                        "found": f"{of_run[run][name]:.3g}",
-                        "usual": f"{value:.3g}",
-                        "look": f": {clock_error}" if clock_error else "",
-                    },
+                    details=details,
                     excludes="wrong" if is_wrong else "odd",
                 )
     undecided = tuple(name for name in readings if name not in usual and name not in by_size)
-    return Repeats(
-        checks=tuple(
-            _check(name, all_, right=right[name], odd=odd, undecided=name in undecided)
-            for name, all_ in readings.items()
-            if len(all_) > 1 and (right[name] or name not in usual)
-        ),
-        odd=odd,
-        undecided=undecided,
+    checks = tuple(
+        _check(name, all_, right=right[name], odd=odd, undecided=name in undecided)
+        for name, all_ in readings.items()
+        if len(all_) > 1 and (right[name] or name not in usual)
     )
+    return Repeats(checks=checks, odd=odd, undecided=undecided)
 
 
 def _readings(
@@ -234,42 +229,23 @@ def _readings(
 ) -> dict[str, list[_Reading]]:
     found: dict[str, list[_Reading]] = {}
     for decay in decays:
-        name = own_omega(decay.cart, n=carts)
-        slack = SIGMAS * decay.omega_n_std
-        found.setdefault(name, []).append(
-            _Reading(
-                run=decay.experiment,
-                value=decay.omega_n,
-                low=decay.omega_n - slack,
-                high=decay.omega_n + slack,
-            )
-        )
-        slack = SIGMAS * decay.zeta_std
+        run, omega, slack = decay.experiment, decay.omega_n, SIGMAS * decay.omega_n_std
+        frequency = _Reading(run=run, value=omega, low=omega - slack, high=omega + slack)
         # If the damping depends on the swing, the interval covers all amplitudes.
         seen = () if decay.law.is_exponential else decay.zeta_at_amplitude[1].tolist()
-        ratios = [decay.zeta, *seen]
-        found.setdefault(own_zeta(decay.cart, n=carts), []).append(
-            _Reading(
-                run=decay.experiment,
-                value=decay.zeta,
-                low=min(ratios) - slack,
-                high=max(ratios) + slack,
-                # Dirt in a bearing changes a damping by half.
-                tolerance=50.0,
-            )
-        )
+        ratios, slack = [decay.zeta, *seen], SIGMAS * decay.zeta_std
+        low, high = min(ratios) - slack, max(ratios) + slack
+        # Dirt in a bearing changes a damping by half.
+        damping = _Reading(run=run, value=decay.zeta, low=low, high=high, tolerance=50.0)
+        found.setdefault(own_omega(decay.cart, n=carts), []).append(frequency)
+        found.setdefault(own_zeta(decay.cart, n=carts), []).append(damping)
     for step in steps:
-        name, slack = gain_name(step.cart, n=carts), SIGMAS * step.gain_std
-        low, high = step.interval or (step.gain, step.gain)  # the cart may stick
-        found.setdefault(name, []).append(
-            _Reading(
-                run=step.experiment,
-                value=step.gain,
-                low=min(low, step.gain - slack),
-                high=max(high, step.gain + slack),
-                size=max(abs(edge.u_after - edge.u_before) for edge in step.edges),
-            )
-        )
+        gain, slack = step.gain, SIGMAS * step.gain_std
+        low, high = step.interval or (gain, gain)  # the cart may stick
+        low, high = min(low, gain - slack), max(high, gain + slack)
+        size = max(abs(edge.u_after - edge.u_before) for edge in step.edges)
+        reading = _Reading(run=step.experiment, value=gain, low=low, high=high, size=size)
+        found.setdefault(gain_name(step.cart, n=carts), []).append(reading)
     return found
 
 
@@ -328,28 +304,15 @@ def _is_far(reading: _Reading, estimate: Estimate, *, name: str) -> bool:
 
 def _wrong_clock(values: Mapping[str, float], usual: Mapping[str, float]) -> str:
     """Return the clock error that would explain a decay's frequencies, or ""."""
-    ratios = [
-        usual[name] / value
-        for name, value in values.items()
-        if read_name(name).is_frequency and usual.get(name)
-    ]
-    explanations = (
-        words
-        for factor, words in TIME_FACTORS.items()
-        if ratios and all(_near(ratio, factor) for ratio in ratios)
-    )
-    return next(explanations, "")
+    known = [n for n in values if read_name(n).is_frequency and usual.get(n)]
+    looks = {explain_ratio(usual[n] / values[n], TIME_FACTORS, within=_SAME_RUN) for n in known}
+    return looks.pop() if len(looks) == 1 else ""
 
 
 def _is_reversed(values: Mapping[str, float], usual: Mapping[str, float]) -> bool:
     """Whether all gains have the opposite sign, perhaps because the logged input has."""
     known = [name for name in values if read_name(name).is_gain and usual.get(name)]
-    return bool(known) and all(_near(values[name], -usual[name]) for name in known)
-
-
-def _near(value: float, other: float) -> bool:
-    # Two runs may differ by 5 % even when a known mistake is corrected.
-    return abs(value - other) <= 0.05 * abs(other)
+    return bool(known) and all(abs(values[n] / usual[n] + 1) <= _SAME_RUN for n in known)
 
 
 def _check(
@@ -380,10 +343,11 @@ def _check(
         code = "odd_repeats"
     elif np.any(_contradictions(readings)):
         code = "sticking_repeats"
+    finding = Finding(
+        code=code, kind="repeats", parameter=name, details=details, value=spread, limit=limit
+    )
     if code:
-        return Finding(
-            code=code, kind="repeats", parameter=name, details=details, value=spread, limit=limit
-        ).check
+        return finding.check
     agree = spread <= limit
     return Check(
         kind="repeats",

@@ -5,7 +5,7 @@ stiffnesses: k_(n+1) / k_n = K_(n-1) / K_n - 1. Without a spring at the far wall
 equally, and only the spring wall-1 can hold them.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -84,11 +84,6 @@ class _BetterSprings:
     before: float | None
     after: float
 
-    @property
-    def limit(self) -> float:
-        """χ² per degree of freedom that the stated springs exceed by far."""
-        return max(self.after, EXPLAINED)
-
 
 def fill_folder(folder: Path) -> Filled:
     """Write the tables of the files in `data/`, and the springs if `submission.toml` is new.
@@ -146,22 +141,21 @@ def decide_springs(records: Sequence[Record], *, n: int) -> Springs:
         inside = (False, *every[1:-1], False)
         return Springs(present=inside, why="no cart comes back after a step", open=())
     gains = [_gains(step) for step in steps]
+    present, uncertain = every, (1, n + 1)
     if not any(gains):
-        return Springs(present=every, why="no cart settles after a step", open=(1, n + 1))
-    if n == 1:
-        return Springs(
-            present=every,
-            why="the cart stays displaced under a step; only the sum of the springs can be known",
-            open=(),
-        )
-    ratios = [_ratio(*one[-2:]) for one in gains if one]
-    low, high = np.median(ratios, axis=0)
-    if low > NEGLIGIBLE:
-        return Springs(present=every, why="static gains do not show it", open=(1,))
-    if high < _NO_SPRING:
-        why = "static gains are equal, so no spring ties the last cart to the wall"
-        return Springs(present=(*every[:-1], False), why=why, open=())
-    return Springs(present=every, why="static gains are too uncertain", open=(1, n + 1))
+        why = "no cart settles after a step"
+    elif n == 1:
+        uncertain = ()
+        why = "the cart stays displaced under a step; only the sum of the springs can be known"
+    else:
+        low, high = np.median([_ratio(*one[-2:]) for one in gains if one], axis=0)
+        why = "static gains are too uncertain"
+        if low > NEGLIGIBLE:
+            why, uncertain = "static gains do not show it", (1,)
+        elif high < _NO_SPRING:
+            why = "static gains are equal, so no spring ties the last cart to the wall"
+            present, uncertain = (*every[:-1], False), ()
+    return Springs(present=present, why=why, open=uncertain)
 
 
 def check_springs(
@@ -185,11 +179,12 @@ def check_springs(
     if last and right[-1] is stated[-1]:
         right = (*right[:-1], not right[-1])
     names, wrong = spring_names(n), [j for j in range(n + 1) if right[j] is not stated[j]]
-    checks = []
+    findings = []
     for j in wrong[:1] if n == 1 else wrong:  # of one cart, only the sum of the springs is known
         if better and better.springs[j] is not stated[j]:
             code = "better_springs" if better.before is not None else "better_springs_alone"
-            value, limit = better.before, better.limit
+            # χ² per degree of freedom that the stated springs exceed by far.
+            value, limit = better.before, max(better.after, EXPLAINED)
         else:
             assert last is not None
             code, value, limit = "no_spring" if stated[j] else "spring", last, _NO_SPRING
@@ -204,40 +199,30 @@ def check_springs(
             "after": significant(better.after if better else 0.0, digits=3),
             "springs": toml_flags(right),
         }
-        checks.append(_spring_check(code, spring=j, details=details, value=value, limit=limit))
-    if checks or bench.tied or (fit and fit.converged):
-        return checks
-    by_steps = decide_springs(records, n=n)
-    if by_steps.is_certain and (by_steps.present[0] or by_steps.present[-1]):
-        checks = [_spring_check("tied", spring=n, details={"last": names[-1]})]
-    return checks
-
-
-def _spring_check(
-    code: str,
-    *,
-    spring: int,
-    details: Mapping[str, object],
-    value: float | None = None,
-    limit: float | None = None,
-) -> Check:
-    """Return the failed check of a spring, which is counted from 0."""
-    return Finding(
-        code=code,
-        kind="springs",
-        parameter=f"k_{spring + 1}",
-        details=details,
-        value=value,
-        limit=limit,
-    ).check
+        findings.append(
+            Finding(
+                code=code,
+                kind="springs",
+                parameter=f"k_{j + 1}",
+                details=details,
+                value=value,
+                limit=limit,
+            )
+        )
+    if not (findings or bench.tied or (fit and fit.converged)):
+        by_steps = decide_springs(records, n=n)
+        if by_steps.is_certain and (by_steps.present[0] or by_steps.present[-1]):
+            details, parameter = {"last": names[-1]}, f"k_{n + 1}"
+            tied = Finding(code="tied", kind="springs", parameter=parameter, details=details)
+            findings.append(tied)
+    return [finding.check for finding in findings]
 
 
 def _named(right: Sequence[bool], *, bench: Setup) -> str:
     """Return the change from the stated springs to the right ones, in words."""
-    names = spring_names(bench.n)
-    pairs = list(zip(names, right, bench.springs, strict=True))
     if bench.n == 1:
         return "a spring"
+    pairs = list(zip(spring_names(bench.n), right, bench.springs, strict=True))
     more = [name for name, is_there, stated in pairs if is_there and not stated]
     fewer = [name for name, is_there, stated in pairs if stated and not is_there]
     said = f"{'a spring' if len(more) == 1 else 'springs'} {listing(more)}"

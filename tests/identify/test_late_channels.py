@@ -10,8 +10,11 @@ import pytest
 from pipeline.arrays import Array
 from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.identify.recording_checks import check_channels, find_bad_recordings
-from pipeline.identify.recording_faults import find_late_channels, late_experiments
+from pipeline.identify.recording_checks import (
+    check_channels,
+    find_bad_recordings,
+    find_late_channels,
+)
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import propagate, simulate_linear
@@ -65,12 +68,12 @@ def test_a_late_channel_is_reported_with_its_delay(tmp_path):
 def test_a_late_channel_is_found_without_dwells(kinds, cart):
     """Steps, a sweep or a decay show a late channel and its delay to within half a sample."""
     late = find_late_channels(motions(kinds, late=cart), carts=3)
-    told = {one.cart: one.delay / SAMPLE for one in late}
+    told = {one.cart: (one.value or 0.0) / SAMPLE for one in late}
     assert told == pytest.approx(
         {2: -LATE, 3: -LATE} if cart == 1 else {cart: LATE},
         abs=0.5,
     )
-    assert {one.kind for one in late} == set(kinds)
+    assert {one.details["kind"] for one in late} == set(kinds)
 
 
 def test_a_channel_late_only_in_the_sweep_is_reported_only_for_it():
@@ -78,10 +81,10 @@ def test_a_channel_late_only_in_the_sweep_is_reported_only_for_it():
     sound, late = motions(("step", "sweep")), motions(("sweep",), late=2)
     records = [record for record in sound if record.kind != "sweep"] + late
     (one,) = find_late_channels(records, carts=3)
-    assert (one.cart, one.than, one.kind) == (2, 1, "sweep")
-    assert late_experiments([one]).keys() == {"sweep"}
+    assert (one.run, one.cart, one.details["than"], one.code) == ("sweep", 2, 1, "late_channel")
     (check,) = check_channels([one])
-    assert "in the sweeps" in check.message
+    assert (check.id, check.code) == ("late_channel.cart-2", "late_channel_in")
+    assert "sweeps" in check.message
 
 
 @pytest.mark.parametrize(("late", "told"), [(0, []), (LATE, [2])])
@@ -95,8 +98,7 @@ def test_the_channels_of_a_real_bench_are_not_late(late, told, real_data, tmp_pa
         for record in read_data(load_submission(folder)).records
     ]
     found = find_late_channels(records, carts=2)
-    assert [one.cart for one in found] == told
-    assert all(one.kind == "step" for one in found)
+    assert {(one.cart, one.details["kind"]) for one in found} == {(cart, "step") for cart in told}
 
 
 def delayed(x: Array, samples: int) -> Array:

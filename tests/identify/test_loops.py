@@ -122,7 +122,7 @@ def test_an_unstable_loop_has_no_margins():
     design, controller = designed(chain, "lqr")
     wild = StateFeedback(gains=50 * controller.gains, prefilter=1.0, model=chain)
     assert stability_margins(chain, wild, sample_time=design.sample_time) is None
-    with pytest.raises(DataError, match="no margins: the loop is unstable"):
+    with pytest.raises(DataError, match="is unstable"):
         design_margins(chain, replace(design, gains=wild.gains))
 
 
@@ -132,7 +132,7 @@ def test_undamped_carts_have_no_margins():
     The largest stable gain of the undamped model would say nothing about the bench.
     """
     design, _ = designed(UNDAMPED, "lqr")
-    with pytest.raises(DataError, match="a mode of the carts has no damping"):
+    with pytest.raises(DataError, match="no damping"):
         design_margins(UNDAMPED, design)
 
 
