@@ -125,7 +125,7 @@ def test_a_held_cart_that_was_not_measured_is_open(tmp_path):
     folder = write_two_cart_submission(tmp_path / "s", REAL_DATA, steps=(1, 2, 3, 4, 5))
     found = by_key(analyse(load_submission(folder), design=False))
     assert found["carts", (1,)].support == "open"
-    assert found["unit", "cm"].support == "supported"
+    assert found["unit", "count"].support == "supported"
     sign = found["sign", -1.0]
     assert (sign.origin, sign.support) == ("data", "supported")
     assert "pid" not in sign.experiments  # the logged input has the opposite sign
