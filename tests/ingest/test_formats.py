@@ -3,6 +3,7 @@
 import hashlib
 import re
 from io import BytesIO
+from typing import Any
 
 import h5py
 import numpy as np
@@ -282,7 +283,8 @@ def test_a_file_of_blanks_of_any_sort_is_empty():
 def test_the_matrix_of_a_mat_file_is_the_recording():
     """A matrix in a .mat file is the recording, even if the file also has settings and gains."""
     matrix = np.column_stack([TIME, X1, U])
-    got = table(mat(**{f"p{i}": float(i) for i in range(12)}, gains=[1.0, 2.0, 3.0], log=matrix))
+    settings: dict[str, Any] = {f"p{i}": float(i) for i in range(12)}
+    got = table(mat(**settings, gains=[1.0, 2.0, 3.0], log=matrix))
     assert (got.format.inputs, got.names) == ("unknown", ("1", "2", "3"))
     assert_array_equal(got.values, matrix.T)
     read = [variable for variable in got.variables if variable.read]
