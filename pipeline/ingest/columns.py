@@ -79,7 +79,6 @@ _RUN = re.compile(
     re.IGNORECASE,
 )
 _BRACKETS = re.compile(r"\[([^\[\]]*)\]|\(([^()]*)\)")
-_RATIO = re.compile(r"(.+?)\s*/\s*\(?([^\W\d_]+/[\w^]+)\)?")  # as in "v / (m/s)"
 _WORD = re.compile(r"[^\W\d_°%][^\W\d_]{0,19}[²2]?")  # may be a unit behind a clear mark
 _NUMBER = re.compile(r"[-+]?[\d.]+[eE][-+]?\d+")
 _LABEL = re.compile(
@@ -161,8 +160,10 @@ def parse_heading(text: str) -> Heading:
         return Heading(name=_tidy(name), unit=unit or held, run=run)
     for mark, any_word in ((" / ", True), ("/", True), (" in ", True), (",", False), (" ", False)):
         name, found, last = rest.rpartition(mark)
-        if mark == "/" and (ratio := _RATIO.fullmatch(rest)) and is_known_unit(ratio[2]):
-            name, last = ratio[1], ratio[2]
+        before, _, top = name.rpartition("/")
+        ratio = f"{top.strip().lstrip('(')}/{last.strip().rstrip(')')}"  # as in "v / (m/s)"
+        if mark == "/" and before.strip() and is_known_unit(ratio):
+            name, last = before.strip(), ratio
         unit = unit_symbol(last)
         if mark == " " and (unit is None or len(last) < 2 or last in ("in", "min", "none", "au")):
             continue

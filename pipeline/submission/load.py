@@ -34,6 +34,7 @@ from pipeline.submission.toml import (
     dotted,
     explain,
     list_faults,
+    list_keys,
     mend_number,
     nearest,
     parse_toml,
@@ -231,6 +232,9 @@ def _validate(document: dict, *, where: str) -> Submission:
     except RecursionError:
         raise SubmissionError(f"{where}: lists or tables nest too deeply") from None
     _refuse(refused, document, where=where)
+    keys = list_keys(Submission)  # without the fields that no file may state
+    stated = [key for key in document if key in Submission.model_fields and key not in keys]
+    _refuse([((key,), f"unknown key{nearest(key, keys)}") for key in stated], document, where=where)
     try:
         return Submission.model_validate(plain, strict=True)
     except ValidationError as error:

@@ -185,13 +185,13 @@ def test_diverging_model_is_reported_as_nan():
 
 _NOTHING_LEFT = """
 import numpy as np
-from pipeline.plant.simulator import kernel, laws, sensitivity
+from pipeline.plant.simulator import kernel, generated_forces, sensitivity
 from pipeline.plant.augmented import SteppedBench, compile_simulator
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain
 from pipeline.plant.simulator.tables import linear_tables
 
-files = [vars(module) for module in (kernel, laws, sensitivity)]
+files = [vars(module) for module in (kernel, generated_forces, sensitivity)]
 stats = [one.stats for file in files for one in file.values() if hasattr(one, "stats")]
 compile_simulator()
 before = [dict(one.cache_misses) for one in stats]

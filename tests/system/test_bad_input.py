@@ -101,6 +101,7 @@ BAD_TOML = [
     ("", 'controller = { type = "pidd", kp = 1 }\n', r"found 'pidd'; .*'pid'"),
     ("", '"a\\nb" = 1\n', r"unknown key"),
     ("version = 1", 'folder = "/etc"\nversion = 1', r"folder: unknown key"),
+    ("version = 1", 'discussion = "well done"\nversion = 1', r"discussion: unknown key"),
     ("carts = 2", 'carts = "2"', r"system\.carts: .*, found '2'"),
     ("carts = 2", "carts = 2.0", r"carts: expected a whole"),
     ('"step-a"', "7", r"experiments\[1\]\.id: expected text"),
