@@ -88,6 +88,7 @@ DIALECTS = {
     + "".join(f"{line.replace(',', ',OK,', 1)}\n" for line in PLAIN.splitlines()),
     "first row cut": "time [s],input [V],x1 [cm]\n05,0.1\n" + PLAIN,
     "line below": "time [s],input [V],x1 [cm]\n" + PLAIN + "End of data\n",
+    "numbered rows": "#,time [s],input [V],x1 [cm]\n" + rows(np.arange(N), T, U, X),
     "F and omega": "t,F [V],x [cm],omega\n" + rows(T, U, X, X),
 }  # fmt: skip
 
@@ -100,6 +101,14 @@ def test_every_dialect_gives_the_same_signals(content):
     assert_allclose(got["time"], T, rtol=0, atol=2e-6)
     assert_allclose(got["input"], U, rtol=0, atol=2e-6)
     assert_allclose(got["x1"], X, rtol=0, atol=6e-5)
+
+
+@pytest.mark.parametrize("name", ["msec", "ms", "millis"])
+def test_a_stated_time_column_that_is_named_by_its_unit_has_this_unit(name):
+    """A heading that is only a unit of time gives the unit, and no factor of a thousand is lost."""
+    table = parse_table(f"{name},input [V],x1 [cm]\n{rows(1e3 * T, U, X)}".encode(), source="f")
+    columns, _ = assign_columns(table, explicit={"time": name}, free=(1,))
+    assert conversion(columns["time"].unit, "s") == 1e-3
 
 
 HEADING = "time [s],input [V],x1 [cm]\n"
