@@ -14,12 +14,16 @@ _MOST_BYTES = 20_000_000
 _MOST_ROWS, _MOST_COLUMNS = 100_000, 2_000  # more than any class or questionnaire has
 
 
-def read_table(path: Path) -> "pd.DataFrame":
+def read_table(path: Path, *, exact: bool = False) -> "pd.DataFrame":
     """Return the cells of a CSV file as text, one row per record.
 
     The index of a row is the line of the file on which the row ends. Separators are commas,
     semicolons or tabs. Empty rows are left out, short rows are padded with empty cells, and cells
     beyond the heading are dropped.
+
+    Parameters
+    ----------
+    exact : whether to refuse rows with more cells than the heading, as "0,5" gives them.
 
     Raises
     ------
@@ -47,6 +51,11 @@ def read_table(path: Path) -> "pd.DataFrame":
             if not head:
                 head = [name.strip() for name in row]
             else:
+                if exact and any(cell.strip() for cell in row[len(head) :]):
+                    raise ConfigError(
+                        f"{path.name} line {reader.line_num}: expected {len(head)} cells, found "
+                        f"{len(row)}; write numbers with a point, or separate cells by semicolons"
+                    )
                 rows[reader.line_num] = [*row, *[""] * (len(head) - len(row))][: len(head)]
             if len(head) > _MOST_COLUMNS or len(rows) > _MOST_ROWS:
                 raise ConfigError(

@@ -350,7 +350,7 @@ def refuse_unknown_unit(table: FileTable, column: Column, *, stated: str = "") -
         that the submission states is accepted.
     """
     unit = column.unit
-    if unit is None or unit == stated:
+    if unit is None or unit == (unit_symbol(stated) or stated):
         return
     why = "which is not known" if not is_known_unit(unit) else ""
     if column.role[:1] == "x" and not why and not is_known(unit, position_units()):

@@ -26,6 +26,7 @@ from pipeline.ingest.columns import (
     assign_columns,
     conversion,
     holds_counts,
+    is_known_unit,
     parse_heading,
     plain_name,
     refuse_unknown_unit,
@@ -183,13 +184,13 @@ def _inspect(table: FileTable, path: Path, *, columns: Mapping[str, str | int]) 
     problems = [*unusable]
 
     @contextmanager
-    def noted(problems: list[str]) -> Iterator[None]:
-        """Note an error as a problem because of which the file cannot be used."""
+    def noted(problems: list[str], *, excludes: bool = True) -> Iterator[None]:
+        """Note an error as a problem, because of which the file cannot be used if it `excludes`."""
         try:
             yield
         except SubmissionError as error:
-            unusable.append(str(error).removeprefix(table.source).lstrip(": "))
-            problems.append(unusable[-1])
+            problems.append(str(error).removeprefix(table.source).lstrip(": "))
+            unusable.extend(problems[-1:] if excludes else ())
 
     assigned: dict[str, Column] = {}
     unused: tuple[str, ...] = ()
@@ -211,7 +212,8 @@ def _inspect(table: FileTable, path: Path, *, columns: Mapping[str, str | int]) 
         clock = _clock(table, assigned, further) if "frequency" not in assigned else None
     kind, frequency = _guess(table, assigned, clock, further)
     for column in assigned.values() if kind != "bode" else ():
-        with noted(problems):
+        # A submission may state another unit of a position, such as the V of a potentiometer.
+        with noted(problems, excludes=not is_known_unit(column.unit or "")):
             refuse_unknown_unit(table, column)
     inputs = _possible_inputs(table, unused) if "input" not in assigned else []
     if kind == "decay" and inputs:  # without the input, a step looks like a decay

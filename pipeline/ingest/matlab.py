@@ -76,6 +76,10 @@ def read_mat(raw: bytes, *, source: str) -> list[FileTable]:
         for v in variables
     ]
     notes += not_read(entries)
+    for name, column in columns.items():
+        columns[name] = _unwrap(column)
+        if columns[name] is not column:
+            notes.append(f"{name}: a {column.dtype} counter that overflowed was made continuous")
     return [
         binary_table(
             [*columns.values()],
@@ -199,6 +203,14 @@ def _advice(variable: Signal, *, longest: int) -> str:
     else:  # a smaller one cannot hold even the times
         advice = _ADVICE.get(variable.kind, "") if variable.bytes >= 8 * longest else ""
     return advice.format(name=variable.name)
+
+
+def _unwrap(values: np.ndarray) -> np.ndarray:
+    """Undo the overflow of a 16-bit encoder counter: a jump of more than half its range."""
+    if values.dtype.kind not in "iu" or values.dtype.itemsize != 2:
+        return values
+    wide = values.astype(np.float64)
+    return np.unwrap(wide, period=2**16) if np.abs(np.diff(wide)).max() > 2**15 else values
 
 
 # ------------------------------------------------------------------------------- variables

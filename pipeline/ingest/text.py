@@ -42,7 +42,9 @@ _HEADING_WORDS = re.compile(
     re.IGNORECASE,
 )
 # A bracket before numbers; one before a unit begins a row of units.
-_OPENING = re.compile(r"^[^\S\n]*(?:[A-Za-z]\w*\s*=\s*)?\[(?=\s*(?:[-+.\d%\]]|\Z))", re.MULTILINE)
+_OPENING = re.compile(
+    r"^[^\S\n]*(?:[A-Za-z]\w*\s*=\s*)?\[(?!\s*(?!(?i:nan|inf))[A-Za-zµ°]\S*\s*\])", re.MULTILINE
+)
 _MISSING = frozenset({"", "-", "--", "nan", "na", "n/a", "null", "none", "#n/a", "inf", "-inf"})
 _TIME_OF_DAY = re.compile(
     r"(?:(\d{4}[-/.]\d\d?[-/.]\d\d?|\d\d?[./-]\d\d?[./-]\d{4})[T ,]+)?"
@@ -254,7 +256,7 @@ def _sniff(sample: Sequence[str], *, least: int = 1) -> Layout | None:
             share = plain / max(sum(map(len, found)), 1)
             # A single column counts only if nothing else fits.
             wide = 1.0 if length and len(found[0]) > 1 else 0.3
-            numbers = sum(s.count("n") / len(s) for s in found)
+            numbers = sum(s.count("n") / len(s) for s in found if s)
             score = wide * numbers * (0.5 + share)
             if length >= least and score > 1.001 * most:
                 best, most = layout, score
@@ -329,7 +331,8 @@ def _find_blocks(
     signatures: list[str] = []
     if values is None:
         signatures = [layout.signature(row) for _, row in lines]
-        again = (i for i in range(start + 1, len(lines) - _LONG) if _begins(signatures, i))
+        below = signatures[start:]  # not the heading above the first table
+        again = (start + i for i in range(1, len(below) - _LONG) if _begins(below, i))
         starts = [start, *again, len(lines)]
     end = 0
     for first, following in pairwise(starts):

@@ -449,10 +449,11 @@ def split_statements(text: str) -> Iterator[Statement]:
     one, depth = Statement(1, (), (), is_heading=False, lines=[]), 0  # of open lists
     counts: dict[Location, int] = {}
     for number, line in enumerate(text.split("\n"), start=1):
-        code, name = line.partition("#")[0], _NAME.match(line[:_LONGEST_LINE])
+        unquoted = _QUOTED.sub(lambda found: "x" * len(found[0]), line).partition("#")[0]
+        code, name = line[: len(unquoted)], _NAME.match(line[:_LONGEST_LINE])
         heading: Location = ()
         if (depth <= 0 or code.lstrip()[:1] == "[") and len(code) <= _LONGEST_LINE:
-            typed = _HEADING.match(code)
+            typed = _HEADING.match(code) if code.lstrip()[:1] == "[" or "=" not in line else None
             heading = _keys(typed[1]) if typed else ()
             if heading and "[[" in code:
                 counts[heading] = counts.get(heading, -1) + 1
@@ -463,7 +464,7 @@ def split_statements(text: str) -> Iterator[Statement]:
             at = (*table, *_keys(name[1])) if name and not heading else table
             one, depth = Statement(number, table, at, is_heading=bool(heading), lines=[]), 0
         one.lines.append(line)
-        depth += code.count("[") - code.count("]")
+        depth += unquoted.count("[") - unquoted.count("]")
     yield one
 
 

@@ -88,6 +88,10 @@ DIALECTS = {
     + "".join(f"{line.replace(',', ',OK,', 1)}\n" for line in PLAIN.splitlines()),
     "first row cut": "time [s],input [V],x1 [cm]\n05,0.1\n" + PLAIN,
     "line below": "time [s],input [V],x1 [cm]\n" + PLAIN + "End of data\n",
+    "comment between the first rows": "time [s],input [V],x1 [cm]\n"
+    + PLAIN.replace("\n", "\n# motor on\n", 1),
+    "line after the first row": "time [s],input [V],x1 [cm]\n"
+    + PLAIN.replace("\n", "\nmotor on\n", 1),
     "numbered rows": "#,time [s],input [V],x1 [cm]\n" + rows(np.arange(N), T, U, X),
     "F and omega": "t,F [V],x [cm],omega\n" + rows(T, U, X, X),
 }  # fmt: skip

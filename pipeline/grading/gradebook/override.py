@@ -127,7 +127,7 @@ def read_wishes(path: Path, *, why: str = "") -> list[WantedPoints]:
     ------
     ConfigError : the table is not valid; the message names the line.
     """
-    table = read_table(path)
+    table = read_table(path, exact=True)
     by_row = {"criterion", "points"} <= set(table.columns)
     needed = [name for name in (_HEADS if by_row else ("submission", "why"))
               if name != "why" or not why]  # fmt: skip

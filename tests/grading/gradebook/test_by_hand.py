@@ -178,6 +178,14 @@ def test_the_desk_refuses_an_adjustment_sent_twice(tmp_path):
         assert book.entry("team-1").grade.points == 18
 
 
+def test_a_row_with_a_decimal_comma_too_many_changes_nothing(tmp_path):
+    """A cell beyond the headings is refused with its line, since "0,5" would give 0 points."""
+    table = tmp_path / "points.csv"
+    table.write_text("submission,laws\nteam-1,0.5\nteam-2,0,5\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"line 3: expected 2 cells, found 3"):
+        read_wishes(table, why="x")
+
+
 def test_points_come_from_a_table(tmp_path):
     """The commands read one change, a table with a column per criterion, and an adjustment."""
     table = tmp_path / "points.csv"
