@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from pipeline.cli.common import app as app
 
 INTERRUPTED = 130  # exit status, as usual after Ctrl-C
+STOPPED = "stopped; repeat the command to start again"
 
 
 def __getattr__(name: str) -> object:
@@ -32,5 +33,6 @@ def main() -> None:
         from pipeline.cli.commands import run
 
         run()
-    except KeyboardInterrupt:  # either nothing has started yet, or the message is already printed
+    except KeyboardInterrupt:  # the commands were not loaded yet
+        sys.stderr.write(STOPPED + "\n")
         sys.exit(INTERRUPTED)

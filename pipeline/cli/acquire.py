@@ -1,5 +1,6 @@
 """The command `acquire`: fill a submission from a bench, or from files as they appear."""
 
+import sys
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -106,7 +107,7 @@ def _record(
         outcomes = carry_out(folder, port=port, observers=observers, only=only, buttons=buttons)
     except KeyboardInterrupt:
         terminal.remark("stopped; repeat the command to continue")
-        raise typer.Exit(INTERRUPTED) from None
+        sys.exit(INTERRUPTED)
     whole = {outcome.recording.id for outcome in outcomes if not outcome.partial}
     failed = {outcome.recording.id for outcome in outcomes} - whole
     report = f": try `cartlab report {folder}`" if whole or not failed else ""

@@ -19,6 +19,7 @@ import typer
 from typer.exceptions import TyperException
 
 from pipeline import __version__
+from pipeline.cli import INTERRUPTED, STOPPED
 from pipeline.cli.stopping import ctrl_c_says
 from pipeline.errors import PipelineError, is_disk_full, is_file_fault
 from pipeline.words.progress import Progress
@@ -58,16 +59,27 @@ def run() -> None:
         if isinstance(stream, TextIOWrapper):  # a console that lacks a character shows it as \u…
             stream.reconfigure(errors="backslashreplace")
     try:
-        sys.exit(app(sys.argv[1:] or ["--help"], standalone_mode=False))
+        status = app(sys.argv[1:] or ["--help"], standalone_mode=False)
+        # Typer turns Ctrl-C into this status; a command that has said so raises SystemExit.
+        if status == INTERRUPTED:
+            say(STOPPED)
+        sys.exit(status)
     except TyperException as error:  # a wrong option or argument
         _fail(_misuse(error))
     except PipelineError as error:
         _fail(str(error))
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        elsewhere = is_disk_full(error) or is_file_fault(error) or error.errno == errno.EROFS
-        hint = ": choose another place, for example with --out" if elsewhere else ""
-        _fail(f"{where}{error.strerror or error}{hint}")
+        _fail(f"{where}{error.strerror or error}{_hint(error)}")
+
+
+def _hint(error: OSError) -> str:
+    """Return what to do about a file that cannot be read or written."""
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return "; can you read and write it? Commands with --out can write to another place"
+    if is_disk_full(error) or is_file_fault(error) or error.errno == errno.EROFS:
+        return ": choose another place, for example with --out"
+    return ""
 
 
 def _misuse(error: TyperException) -> str:
@@ -96,7 +108,7 @@ def say(text: str) -> None:
 @contextmanager
 def progress_line() -> Iterator[Progress]:
     """Show progress; print a message if Ctrl-C ends the work."""
-    with ctrl_c_says(lambda: say("stopped; repeat the command to start again")) as check_stop:
+    with ctrl_c_says(lambda: say(STOPPED)) as check_stop:
         with _shown_line() as show:
 
             def check_and_show(text: str) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import app, say
+from pipeline.cli.common import app, progress_line, say
 from pipeline.errors import ConfigError
 
 
@@ -33,16 +33,18 @@ def desk(
     ] = None,
 ) -> None:
     """Open the desk: all tasks of the other commands in a browser on this computer."""
-    from pipeline.desk.app import DeskServer
-    from pipeline.desk.crash_log import CrashLog
-    from pipeline.startup import collect_for_hours
-
     if (host is None) != (users is None):
         raise ConfigError("--host and --users need each other: others may only enter by name")
     if folder is not None and users is not None:
         raise ConfigError("with --users, the file lists the folders: do not give one here")
-    collect_for_hours()
-    server = DeskServer(folder=folder, port=port, host=host or "127.0.0.1", users=users)
+    with progress_line() as progress:
+        progress("starting the desk")
+        from pipeline.desk.app import DeskServer
+        from pipeline.desk.crash_log import CrashLog
+        from pipeline.startup import collect_for_hours
+
+        collect_for_hours()
+        server = DeskServer(folder=folder, port=port, host=host or "127.0.0.1", users=users)
     with CrashLog(say=say) as ending, server:
         say(f"ready: {server.url}")
         if browser and host is None:

@@ -61,7 +61,7 @@ def explore(
             )
         except KeyboardInterrupt:
             terminal.remark("stopped; finished recordings are in the submission")
-            raise typer.Exit(INTERRUPTED) from None
+            sys.exit(INTERRUPTED)
         terminal.remark(f"{len(turns)} turns; wrote {folder / NAME}")
     if not turns[-1].reached:
         raise typer.Exit(1)

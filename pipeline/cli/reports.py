@@ -75,7 +75,7 @@ def inspect(
     not_read: list[tuple[str, str, str]] = []
     for folder in folders:
         for one in files_not_read(folder, root=folder):
-            not_read.append((f"{folder.name}/{one.file}", one.reason, one.advice))
+            not_read.append(((Path(folder.name) / one.file).as_posix(), one.reason, one.advice))
             entries.append(
                 unread_entry(folder / one.file, "not_read", one.reason, advice=one.advice)
             )

@@ -1,10 +1,9 @@
 """Make Ctrl-C end a command, even if a library does not pass it on."""
 
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-
-import typer
 
 from pipeline.cli import INTERRUPTED
 
@@ -38,6 +37,6 @@ def ctrl_c_says(say: Callable[[], None]) -> Iterator[Callable[[], None]]:
         if not pressed:
             raise
         say()
-        raise typer.Exit(INTERRUPTED) from None
+        sys.exit(INTERRUPTED)
     finally:
         signal.signal(signal.SIGINT, before)

@@ -1,6 +1,7 @@
 """Data files: the recordings in each, in any format, and the files of a folder that have some."""
 
 import hashlib
+import os
 import re
 import signal
 import sys
@@ -339,8 +340,8 @@ def data_files_in(folder: Path) -> list[Path]:
 def files_not_read(folder: Path, *, root: Path) -> list[NotRead]:
     """Return the files of a folder and its subfolders that are no data files, with advice.
 
-    Names are relative to `root`; links that lead out of `root` are not followed. Hidden files are
-    skipped.
+    Folders that may not be opened are listed too. Names are relative to `root`; links that lead out
+    of `root` are not followed. Hidden files are skipped.
     """
     names = [p.relative_to(root).as_posix() for p in _entries(folder) if not _has_data_ending(p)]
     return [refused(root, name) or _not_read(root, name) for name in names]
@@ -352,6 +353,8 @@ def refused(root: Path, name: str) -> NotRead | None:
     if problem is None:
         return None
     link = (root / name).is_symlink()
+    if not link and _closed(root / name):
+        problem = "this folder cannot be opened (Permission denied)"
     advice = "replace the link with the file itself" if link else ""
     shown = name if name.isprintable() else name.encode("unicode_escape").decode("ascii")
     return NotRead(file=shown, reason=problem, advice=advice)
@@ -413,16 +416,30 @@ def _has_data_ending(path: Path) -> bool:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """Return all files in a folder and its subfolders; links are not followed."""
+    """Return all files in a folder and its subfolders, and the folders that may not be read.
+
+    Links are not followed.
+    """
     return sorted(_walk(folder), key=_natural)
 
 
 def _walk(folder: Path) -> Iterator[Path]:
+    if _closed(folder):
+        yield folder
     for path in folder.rglob("*"):
         if any(map(_is_hidden, path.relative_to(folder).parts)):
             continue
-        if path.is_symlink() or not path.is_dir():
+        if path.is_symlink() or not path.is_dir() or _closed(path):
             yield path
+
+
+def _closed(folder: Path) -> bool:
+    """Return whether a folder exists, but its files may not be listed."""
+    try:
+        with os.scandir(folder):
+            return False
+    except OSError as error:  # of others, such as a missing folder, the caller knows already
+        return isinstance(error, PermissionError)
 
 
 def _is_hidden(name: str) -> bool:

@@ -17,9 +17,11 @@ from urllib.parse import urlsplit
 import html5lib
 import pytest
 
+from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.intake.files import digest, open_submission
 from pipeline.grading.intake.find import find_hand_ins
+from pipeline.ingest.fill import fill_submission, passed_over
 from pipeline.simulated.submission import Students, write_submission
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.hostile import SECRET, write_hostile
@@ -265,6 +267,28 @@ def test_an_unreadable_folder_affects_only_its_row(tmp_path_factory):
             with pytest.raises(PermissionError):
                 open_submission(found[name].sources, base / "scratch" / name)
         assert open_submission(found["good"].sources, base / "scratch" / "good")
+    finally:
+        os.seteuid(0)
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root changes user"
+)
+@pytest.mark.parametrize("closed", ["data", "data/more"])
+def test_a_folder_that_may_not_be_opened_is_named(tmp_path_factory, closed):
+    """Recordings in a folder that may not be opened are reported, not taken for missing."""
+    folder = tmp_path_factory.mktemp("closed") / "team"
+    (folder / closed).mkdir(parents=True)
+    (folder / closed / "step.csv").write_text("t,u,x1\n0,1,0\n", encoding="utf-8")
+    (folder / closed).chmod(0)
+    for path in (folder, *folder.parents):
+        if path.stat().st_mode & 0o005 != 0o005:
+            path.chmod(0o755)
+    os.seteuid(NOBODY)
+    try:
+        assert [one.file for one in passed_over(folder)] == [closed]
+        with pytest.raises(ConfigError, match=rf"not read: {closed} \(.*Permission denied"):
+            fill_submission(folder)
     finally:
         os.seteuid(0)
 
