@@ -22,9 +22,11 @@ from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 from numpy.testing import assert_allclose, assert_array_equal
 
+from pipeline.gap.residual import ResidualForce
 from pipeline.plant.chain import Chain
 from pipeline.report.figures.bode import bode_figure, overview_figure, plot_phase
 from pipeline.report.figures.colours import CARTS, MEASURED, QUIET
+from pipeline.report.figures.gap import force_figure, force_left_figure, timing_figure
 from pipeline.report.figures.grading import distribution_figure
 from pipeline.report.figures.style import (
     drawing,
@@ -45,13 +47,14 @@ from pipeline.report.figures.time import (
     sine_figure,
     step_figure,
 )
-from pipeline.report.sections.measurements import response_blocks, step_blocks
+from pipeline.report.sections.measurements import dwell_blocks, response_blocks, step_blocks
 from pipeline.report.sections.page import Page
 from pipeline.results import FrequencyResponse
 from pipeline.setup import PAPER_UNITS, Units
 from pipeline.words.numbers import significant
 from pipeline.words.text import plain
 from tests.helpers.analysis_factory import make_analysis
+from tests.helpers.gaps import RESIDUAL, make_gap
 from tests.helpers.pages import pictures
 
 COUNTS = Units(position="count", input="V")
@@ -227,6 +230,14 @@ def test_residuals_without_a_far_point_are_all_shown(carts, cart):
     assert_allclose(data(marked(gain, "D")[0], "y"), 20 * np.log10(response.magnitude), atol=1e-9)
 
 
+def test_a_dwell_is_steady_once_every_cart_is():
+    """The caption of a dwell says from when every cart is steady, not only the first."""
+    analysis = make_analysis(2)
+    points = tuple(replace(p, steady_from=p.steady_from + p.cart) for p in analysis.sine_points)
+    found = pictures(dwell_blocks(Page(replace(analysis, sine_points=points))))
+    assert "from 6.00 s on, every cart" in plain(found["sine"].caption)
+
+
 def test_a_dwell_shades_the_transient():
     """The figure of a dwell shades the transient up to the start of the steady part."""
     analysis = make_analysis(2)
@@ -301,6 +312,19 @@ def test_the_report_imports_only_what_it_needs():
 _TOUCH = 2.0  # points by which two boxes may overlap, since letters do not fill their boxes
 
 
+def small_force(cart: int) -> ResidualForce:
+    """Return a force of a few millivolt that changes its sign with the velocity."""
+    t = np.linspace(0.0, 6.0, 601)
+    v, none = np.sin(2 * np.pi * t), np.zeros(t.size)
+    force = -2.4e-3 * np.sign(v)
+    beside = np.zeros((2, t.size))
+    return ResidualForce(
+        experiment="step-1", cart=cart, held_out=True, t=t, measured=force, model=force,
+        u=np.where(t > 3.0, 2.4e-3, 0.0), shaped_input=none, velocity=v, position=none,
+        neighbours=beside, neighbours_velocity=beside,
+    )  # fmt: skip
+
+
 def figures_of(carts: int) -> dict[str, Figure]:
     """Return a figure of each kind in a report; the names of the recordings are long."""
     analysis = make_analysis(carts)
@@ -312,7 +336,18 @@ def figures_of(carts: int) -> dict[str, Figure]:
     dwell = analysis.sine_points[-1].experiment
     checks = [[c for c in analysis.hardware if c.cart == cart] for cart in range(1, carts + 1)]
     assert analysis.feedback is not None
+    # A force in volt is small, so its numbers are long.
+    small = replace(RESIDUAL.against[0], force=(2.4e-3, -2.4e-3), spread=(1e-4, None), formula=None)
+    forces = [small_force(cart) for cart in (1, 2)]
+    (friction,) = make_gap("named", ("coulomb_friction",)).effects
+    force = force_figure(friction, forces, units=("cm", "V"))
+    timing = timing_figure(forces, drive="V")
+    assert force is not None
+    assert timing is not None
     return {
+        "force": force,
+        "timing": timing,
+        "force left": force_left_figure(replace(RESIDUAL, against=(small,))),
         "bode": bode_figure(
             analysis.frequency_responses[0], chain=analysis.chain, units=COUNTS,
         ),

@@ -28,6 +28,7 @@ from pipeline.words.text import clean
 # Name of the model that has effects besides masses, dampings and springs.
 ADDED = "with the effects"
 _RESIDUALS = 1.0  # height of the panel of residuals in inches
+_LEFT = 0.76  # inches left of a force; "−0.00005" is wider than most numbers
 _SEEN = 3.0  # points; a narrower band is hidden by the lines of the residuals
 
 
@@ -157,7 +158,7 @@ def force_figure(
     axis = found.effect.axis
     cart, spring = found.where.get("cart", 1), found.where.get("spring")
     position, drive = units
-    figure, (ax,) = panels(2.1)
+    figure, (ax,) = panels(2.1, left=_LEFT)
     shown: list[tuple[Array, Array, Array]] = []
     if spring is not None:
         own = [f for f in forces if f.cart in (spring, spring - 1)]
@@ -217,7 +218,7 @@ def plot_force(
 
 def force_left_figure(residual: Residual) -> Figure:
     """Plot the unexplained force on a cart over each quantity, with the fitted formula."""
-    figure, axes = panels(*(1.6 for _ in residual.against), share_x=False)
+    figure, axes = panels(*(1.6 for _ in residual.against), share_x=False, left=_LEFT)
     for ax, shown in zip(axes, residual.against, strict=True):
         bars = [0.0 if spread is None else spread for spread in shown.spread]
         ax.axhline(0.0, color=QUIET, lw=0.6)
@@ -242,7 +243,7 @@ def timing_figure(
     force = own[int(np.argmax(steep))]
     at = float(force.t[int(np.argmax(np.abs(np.diff(force.u))))])
     kept = (force.t > at - 0.15) & (force.t < at + 0.5)
-    figure, (ax,) = panels(1.8)
+    figure, (ax,) = panels(1.8, left=_LEFT)
     measured = (force.measured + force.shaped_input)[kept]
     ax.plot(force.t[kept], measured, ".", color=MEASURED, ms=4.0, mew=0, label="measured")
     ax.plot(force.t[kept], force.u[kept], color=SECOND, ls="--", lw=1.1, label="logged input")

@@ -63,13 +63,18 @@ def panels(
     share_x: bool = True,
     share_y: bool = False,
     titled: bool = False,
+    left: float = 0.62,
 ) -> tuple[Figure, list[Axes]]:
     """Return a figure with rows of the given heights (inches), and its axes row by row.
 
     Margins are set in inches; if matplotlib computed them, it would draw every figure twice. Panels
     with separate time axes each get room for tick labels and a title.
+
+    Parameters
+    ----------
+    left : inches for the label and the tick labels of the vertical axis.
     """
-    left, right, bottom = 0.62, 0.12, 0.47  # inches for tick labels and axis titles
+    right, bottom = 0.12, 0.47  # inches for tick labels and axis titles
     top = 0.26 + (_LIFT if titled else 0.0)  # for a legend
     gap = 0.24 if titled else 0.13 if share_x else 0.53
     column_gap = 0.13 if share_y else 0.5
@@ -99,7 +104,7 @@ def panels(
             )
             # Axis labels at fixed positions are aligned, and matplotlib need not measure the tick
             # labels.
-            ax.yaxis.set_label_coords(-0.46 / width, 0.5)
+            ax.yaxis.set_label_coords((0.16 - left) / width, 0.5)
             ax.xaxis.set_label_coords(0.5, -0.31 / heights[row])
             axes.append(ax)
     return figure, axes

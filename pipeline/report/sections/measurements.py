@@ -208,7 +208,7 @@ def dwell_blocks(page: Page) -> list[Block]:
     amplitudes = [f"{significant(p.amplitude, digits=3)} {page.position}" for p in shown]
     said = {
         "hertz": significant(chosen.omega / (2 * np.pi), digits=3),
-        "seconds": significant(chosen.steady_from, digits=3),
+        "seconds": significant(max(p.steady_from for p in shown), digits=3),
         "carts": "every cart" if len(shown) > 1 else "the cart",
         "run": clean(chosen.experiment),
         "amplitudes": listing(amplitudes),
