@@ -35,7 +35,7 @@ from pipeline.ingest.files import choose_run, read_tables
 from pipeline.ingest.table import FileTable, Variable
 from pipeline.ingest.unnamed import Roles, find_roles
 from pipeline.results import ExperimentKind
-from pipeline.words.numbers import first_few, group_messages
+from pipeline.words.numbers import count, first_few, group_messages
 
 # Words in headings of signals that drive nothing.
 _NOT_INPUT = re.compile(
@@ -427,7 +427,7 @@ def _describe(inspection: Inspection) -> str:
 
 def format_inspection(inspection: Inspection) -> str:
     """Return the inspection as plain text."""
-    samples = f"{inspection.samples} samples"
+    samples = count(inspection.samples, "sample")
     if inspection.duration is not None and inspection.rate is not None:
         jitter = inspection.jitter or 0.0
         samples += f" over {inspection.duration:.4g} s, {inspection.rate:.5g} Hz, " + (
