@@ -128,15 +128,15 @@ def _without_unread(text: str, *, folder: Path, where: str) -> Submission:
     unread: dict[Location, Unread] = {}
 
     def leave_out(at: Location, line: int, what: str) -> None:
-        """Leave out a number or table of `[reported]`."""
-        part = tuple(map(str, at[: 3 if len(at) > 2 else 2]))
+        """Leave out a number or table of `[reported]`; other tables stay."""
+        part = tuple(key for key in at[:3] if isinstance(key, str))  # not the number of a [[table]]
         unread.setdefault(part, Unread(at=part, message=at_line(NAME, line, what)))
         if len(unread) > MOST_SPOILT:
             raise SubmissionError(f"{where}: [reported] has more than {MOST_SPOILT} mistakes")
         table: Any = document
         for key in part[:-1]:
             table = table.get(key) if isinstance(table, dict) else None
-        if isinstance(table, dict) and len(part) > 1:  # nothing was read below a spoilt heading
+        if isinstance(table, dict) and (len(part) > 1 or not isinstance(table.get(part[0]), dict)):
             table.pop(part[-1], None)
 
     for one in statements:

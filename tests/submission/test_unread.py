@@ -182,6 +182,35 @@ def test_a_table_that_cannot_be_read_costs_this_table(tmp_path, heading):
     assert line_of(part.message) == 7
 
 
+@pytest.mark.parametrize(
+    ("heading", "part"),
+    [("[[reported.final]]", ("reported", "final")), ("[[reported]]", ("reported",))],
+)
+def test_a_table_in_double_brackets_costs_this_table(tmp_path, heading, part):
+    """A list of tables is no table of numbers; the message tells how a table starts."""
+    whole = numbers(read(tmp_path, TEXT).reported)
+    found = read(tmp_path, TEXT.replace("[reported.final]", heading))
+    assert whole - numbers(found.reported) == {"final.K_1", "final.omega_a", "final.zeta_a"}
+    (lost,) = found.unread
+    assert lost.at == part
+    assert line_of(lost.message) == 7
+    assert "[name]" in lost.message
+
+
+def test_a_number_in_place_of_all_tables_costs_the_tables(tmp_path):
+    """With `reported = 5`, the rest of the submission is read."""
+    found = read(tmp_path, TEXT.replace("version = 1", "version = 1\nreported = 5"))
+    assert numbers(found.reported) == set()
+    assert found.unread[-1].at == ("reported",)
+
+
+def test_a_table_typed_twice_with_a_wrong_name_names_its_first_line(tmp_path):
+    """The message leads to the first of two headings with the same mistake."""
+    text = TEXT.replace("[reported.final]", "[reported.finl]")
+    found = read(tmp_path, f"{text}[reported.finl]\nK_2 = 1.0\n")
+    assert [line_of(part.message) for part in found.unread] == [7]
+
+
 def test_all_numbers_may_be_unreadable(tmp_path):
     """A table full of nan, and four kinds of mistakes, cost the numbers that have them."""
     every = TEXT.replace("25.6", "nan").replace("10.0", "nan").replace("24.3", "nan")
