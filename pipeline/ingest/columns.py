@@ -158,12 +158,12 @@ def parse_heading(text: str) -> Heading:
             continue
         name = f"{rest[: bracket.start()]} {rest[bracket.end() :]}"
         return Heading(name=_tidy(name), unit=unit or held, run=run)
+    name, *ratio = rest.rsplit("/", 2)  # as in "v / (m/s)"
+    unit = "/".join(part.strip(" ()") for part in ratio)
+    if name.strip() and len(ratio) == 2 and is_known_unit(unit):
+        return Heading(name=_tidy(name), unit=unit_symbol(unit) or unit, run=run)
     for mark, any_word in ((" / ", True), ("/", True), (" in ", True), (",", False), (" ", False)):
         name, found, last = rest.rpartition(mark)
-        before, _, top = name.rpartition("/")
-        ratio = f"{top.strip().lstrip('(')}/{last.strip().rstrip(')')}"  # as in "v / (m/s)"
-        if mark == "/" and before.strip() and is_known_unit(ratio):
-            name, last = before.strip(), ratio
         unit = unit_symbol(last)
         if mark == " " and (unit is None or len(last) < 2 or last in ("in", "min", "none", "au")):
             continue

@@ -58,6 +58,11 @@ DIALECTS = {
     "German": "Zeit in ms;Spannung in V;Weg in mm\n" + GERMAN,
     "row of units in brackets": "time;voltage;x1\n[ms];[mV];[mm]\n"
     + rows(1e3 * T, 1e3 * U, 10 * X, sep=";"),
+    "row of units in brackets, the first a sign": "load;time;voltage;x1\n[%];[ms];[mV];[mm]\n"
+    + rows(50 * U, 1e3 * T, 1e3 * U, 10 * X, sep=";"),
+    "remarks in brackets": "[2024-05-01 12:00] start\n[note: cart 2 is held]\nt,u,x1\n" + PLAIN,
+    "matrix below an empty one": "% time (s)  u (V)  x1 (cm)\nlog = [];\ndata = [\n"
+    + PLAIN + "];\n",
     "row of units": "Time\tVoltage\tPosition\n(ms)\t(mV)\t(mm)\n\n"
     + rows(1e3 * T, 1e3 * U, 10 * X, sep="\t"),
     "three rows": "Run #1,Run #1,Run #1\nTime,Voltage,Position\ns,V,mm\n" + rows(T, U, 10 * X),
@@ -188,6 +193,14 @@ def test_a_position_in_the_unit_of_another_quantity_is_asked_about(unit):
     refuse_unknown_unit(got, columns["x1"], stated=unit)
     with pytest.raises(SubmissionError, match=f"'{unit}'"):
         refuse_unknown_unit(got, columns["x1"])
+
+
+@pytest.mark.parametrize("ratio", ["m/s", "rad/s", "m/s^2", "V/s", "rev/min"])
+@pytest.mark.parametrize("form", ["v [{}]", "v ({})", "v/({})", "v / ({})", "v/{}", "v / {}"])
+def test_a_ratio_of_units_is_read_in_every_form(ratio, form):
+    """A ratio of known units is the unit of a heading, with and without its own symbol."""
+    got = parse_heading(form.format(ratio))
+    assert (got.name, (got.unit or "").replace("^", "")) == ("v", ratio.replace("^", ""))
 
 
 @pytest.mark.parametrize("name", ["x1 (left)", "u_in", "Encoder 1 Pos", "Position (cart 1)"])
