@@ -80,7 +80,7 @@ class Inspection:
     guessed : column numbers by role, if the file has no headings but its signals reveal the roles.
     doubts : reasons to check the guessed numbers.
     cut_short : whether the file seems to end in the middle of a recording.
-    digest : of the samples of all columns with a role; "" if none has one.
+    digest : of the samples of all columns with a role, except the reference; "" if none has one.
     run : which of the file's recordings this is; "" if it holds only one.
     """
 
@@ -184,17 +184,18 @@ def _inspect(table: FileTable, path: Path, *, columns: Mapping[str, str | int]) 
     problems = [*unusable]
 
     @contextmanager
-    def noted(problems: list[str], *, excludes: bool = True) -> Iterator[None]:
-        """Note an error as a problem, because of which the file cannot be used if it `excludes`."""
+    def noted(*lists: list[str]) -> Iterator[None]:
+        """Add the message of an error to each of the lists."""
         try:
             yield
         except SubmissionError as error:
-            problems.append(str(error).removeprefix(table.source).lstrip(": "))
-            unusable.extend(problems[-1:] if excludes else ())
+            message = str(error).removeprefix(table.source).lstrip(": ")
+            for one in lists:
+                one.append(message)
 
     assigned: dict[str, Column] = {}
     unused: tuple[str, ...] = ()
-    with noted(problems):
+    with noted(problems, unusable):
         stated = {role: column for role, column in columns.items() if table.has(column)}
         assigned, unused = assign_columns(table, explicit=stated, free=(1,))
     unnamed = all(name.isdigit() for name in table.names)
@@ -208,12 +209,12 @@ def _inspect(table: FileTable, path: Path, *, columns: Mapping[str, str | int]) 
     # If the columns have no names, the other problems follow from this.
     further = [] if bare and not roles.columns else problems
     clock = None
-    with noted(further):
+    with noted(further, unusable):
         clock = _clock(table, assigned, further) if "frequency" not in assigned else None
     kind, frequency = _guess(table, assigned, clock, further)
     for column in assigned.values() if kind != "bode" else ():
-        # A submission may state another unit of a position, such as the V of a potentiometer.
-        with noted(problems, excludes=not is_known_unit(column.unit or "")):
+        # A submission may state another known unit, such as the V of a potentiometer.
+        with noted(problems) if is_known_unit(column.unit or "") else noted(problems, unusable):
             refuse_unknown_unit(table, column)
     inputs = _possible_inputs(table, unused) if "input" not in assigned else []
     if kind == "decay" and inputs:  # without the input, a step looks like a decay
@@ -227,7 +228,8 @@ def _inspect(table: FileTable, path: Path, *, columns: Mapping[str, str | int]) 
         "columns": bare or not any(role[0] == "x" for role in assigned),
         "sample_rate": "time" not in assigned,
     }
-    signals = {role: table.values[c.index] for role, c in sorted(assigned.items())}
+    # A matrix without headings does not show which column is the reference.
+    signals = {r: table.values[c.index] for r, c in sorted(assigned.items()) if r != "reference"}
     digests = [f"{role} {sha256(values.tobytes()).hexdigest()}" for role, values in signals.items()]
     return Inspection(
         file=str(path),

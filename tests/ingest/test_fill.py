@@ -213,6 +213,15 @@ def test_the_same_samples_in_two_formats_get_one_table(tmp_path):
     assert [state for state, *_ in states(tmp_path).values()] == ["new", "copy", "new"]
 
 
+def test_a_matrix_without_headings_is_a_copy_of_the_recording_that_has_them(tmp_path):
+    """The commanded position in an ECP export does not make its .mat file another recording."""
+    (tmp_path / "data").mkdir()
+    put(tmp_path, "a.csv", time=T, commanded_pos=RING, encoder_1_pos=RING, control_effort=STEP)
+    table = np.loadtxt(tmp_path / "data" / "a.csv", delimiter=",", skiprows=1)
+    scipy.io.savemat(tmp_path / "data" / "a.mat", {"log": table})
+    assert [state for state, *_ in states(tmp_path).values()] == ["new", "copy"]
+
+
 def test_a_bare_matrix_gets_its_columns(tmp_path):
     """For a matrix without headings, `fill` writes the columns that the signals reveal."""
     (tmp_path / "data").mkdir()

@@ -145,6 +145,14 @@ def test_a_file_with_a_remark_can_be_used(tmp_path):
     assert got.unusable == ()
 
 
+@pytest.mark.parametrize(("unit", "refused"), [("V", False), ("furlong", True), ("cm", False)])
+def test_a_position_in_a_unit_that_is_not_known_cannot_be_used(unit, refused, tmp_path):
+    """A submission may state that a position is in V, but not what an unknown unit means."""
+    got = inspect(tmp_path, **{"time": T, "input": STEP, f"x1 [{unit}]": X})
+    assert any(unit in said for said in got.problems) == (unit != "cm")
+    assert any(unit in said for said in got.unusable) == refused
+
+
 def test_a_file_whose_clock_goes_back_cannot_be_used(tmp_path):
     """A file whose time goes back, as in two records pasted together, cannot be used."""
     got = inspect(tmp_path, time=np.r_[T, T], x1=np.r_[X, X])
