@@ -282,6 +282,20 @@ def test_the_matrix_of_a_mat_file_is_the_recording():
     assert len(got.variables) == 14
 
 
+def test_short_vectors_beside_those_of_a_recording_are_settings():
+    """A short vector neither joins the recording nor makes its vectors differ in length."""
+    got = table(mat(time=TIME, x1=X1, gains=[1.0, 2.0, 3.0]))
+    assert got.names == ("time", "x1")
+    assert [(one.name, one.read) for one in got.variables][2] == ("gains", False)
+
+
+def test_short_vectors_neither_hide_nor_make_a_recording_in_a_struct():
+    """Gains beside a struct of signals, and a struct of gains, are settings."""
+    run, gains = {"time": TIME, "x1": X1}, [1.0, 2.0, 3.0]
+    got = table(mat(run=run, gains=gains, limits=[0.0, 1.0], law={"K": gains, "L": gains}))
+    assert got.names == ("time", "x1")
+
+
 def test_a_matrix_beside_vectors_of_its_length_gives_its_columns_too():
     """If a matrix is as long as the vectors beside it, its columns are numbered and also read."""
     got = table(mat(t=TIME, y=np.column_stack([X1, U])))

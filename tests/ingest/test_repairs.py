@@ -69,14 +69,32 @@ def test_wrong_readings_are_left_out(value, tmp_path):
     assert kept.t.size == N
 
 
-def test_a_new_zero_is_taken_back(tmp_path):
-    """A position that is zeroed during the run continues where it was."""
+@pytest.mark.parametrize("i", [116, 700])
+def test_a_new_zero_is_taken_back(i, tmp_path):
+    """A position that is zeroed during the run, in motion or at rest, continues where it was."""
     x = X.copy()
-    x[700:] -= x[700]
+    x[i:] -= x[i]
     got = record(tmp_path, x)
-    # The cart moves by the mean of the steps beside the jump, which the noise of 0.002 blurs.
+    # The cart moves by the mean of the steps beside the jump, which the noise of 0.002 blurs. At
+    # sample 116 it moves fastest, by 0.16 a sample.
     assert_allclose(got.y[0], X, atol=0.02)
     assert any("jumps = false" in note for note in got.notes)
+
+
+def test_a_jump_with_the_input_is_no_new_zero(tmp_path):
+    """A position that jumps when the input does is left as it is."""
+    x = X + 3 * U
+    assert_allclose(record(tmp_path, x).y[0], x, atol=1e-6)
+
+
+def test_a_new_zero_of_a_fast_cart_is_no_wrapped_counter(tmp_path):
+    """If a cart moves by a fifth of a counter's range in a sample, no jump shows that range."""
+    since = np.maximum(T - 0.5, 0.0)
+    x = np.round(120 * np.exp(-12 * since) * np.sin(100 * since))  # up to 54 counts a sample
+    zeroed = np.where(np.arange(N) < 900, x, x + 180)
+    assert_allclose(record(tmp_path, zeroed, unit="count").y[0], x)
+    kept = record(tmp_path, zeroed, unit="count", more="repair = { jumps = false }")
+    assert_allclose(kept.y[0], zeroed)
 
 
 @pytest.mark.parametrize("n", [8, 20])
