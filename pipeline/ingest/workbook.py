@@ -79,12 +79,12 @@ def _sheets(
         return openpyxl.load_workbook(BytesIO(raw), read_only=True, data_only=data_only)
 
     try:
-        has_formulas = _has_formulas(raw, source=source)
+        formulas = load(data_only=False) if _has_formulas(raw, source=source) else None
         for sheet in load(data_only=True).worksheets:
             sheet.reset_dimensions()  # the stated size need not be true
             rows = list(sheet.iter_rows(values_only=True))
-            if has_formulas:
-                other = load(data_only=False)[sheet.title]
+            if formulas is not None:
+                other = formulas[sheet.title]
                 other.reset_dimensions()
                 for i, row in enumerate(other.iter_rows(values_only=True)):
                     if any(isinstance(value, str) and value[:1] == "=" for value in row):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 from nptdms import ChannelObject
 from numpy.testing import assert_allclose, assert_array_equal
@@ -129,9 +129,13 @@ def test_a_broken_lvm_names_its_line(content, said):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(("end", "n"), [(GOOD.index("0.300000"), 30), (len(GOOD) - 12, N - 1)])
+def test_an_lvm_cut_between_two_rows_is_recognised(end, n):
+    """A cut .lvm file is recognised from the number of samples in its header."""
+    assert f"{n} of {N}" in (table(GOOD[:end]).cut or "")
+
+
 @given(st.integers(0, len(GOOD) - 1))
-@example(GOOD.index("0.300000"))
-@example(len(GOOD) - 12)
 def test_any_piece_of_an_lvm_is_cut_or_refused(end):
     """An .lvm file cut anywhere is refused, reported as cut, or still has all its samples."""
     with suppress(SubmissionError):
