@@ -133,11 +133,12 @@ def _without_unread(text: str, *, folder: Path, where: str) -> Submission:
         unread.setdefault(part, Unread(at=part, message=at_line(NAME, line, what)))
         if len(unread) > MOST_SPOILT:
             raise SubmissionError(f"{where}: [reported] has more than {MOST_SPOILT} mistakes")
+        *above, key = part
         table: Any = document
-        for key in part[:-1]:
-            table = table.get(key) if isinstance(table, dict) else None
-        if isinstance(table, dict) and (len(part) > 1 or not isinstance(table.get(part[0]), dict)):
-            table.pop(part[-1], None)
+        for name in above:
+            table = table.get(name) if isinstance(table, dict) else None
+        if isinstance(table, dict) and (above or not isinstance(table.get(key), dict)):
+            table.pop(key, None)
 
     for one in statements:
         if one.fault:
