@@ -2,21 +2,24 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pipeline.identify.assumptions import list_assumptions
 from pipeline.ingest.fill import fill_submission
+from pipeline.ingest.read import read_data
 from pipeline.json_files import file_model, json_text
 from pipeline.report.document import Table
 from pipeline.report.lab_report.content import build_document
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.resources import EXAMPLES
-from pipeline.results import Analysis, Assumption
+from pipeline.results import Analysis, Assumption, HeadingUnit
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
-from tests.helpers.examples import analysed
+from tests.helpers.examples import analysed, recorded
 from tests.helpers.places import REAL_DATA
 from tests.helpers.ucsd import write_two_cart_submission
 
@@ -100,6 +103,22 @@ def test_headings_support_a_unit(tmp_path):
     found = by_key(analysis)
     assert [found["unit", unit].support for unit in ("cm", "V")] == ["supported", "supported"]
     assert len(found["unit", "cm"].experiments) == len(analysis.records)
+
+
+@pytest.mark.parametrize(("headed", "support"), [(0, "open"), (3, "open"), (4, "supported")])
+def test_half_of_the_headings_support_a_unit(headed, support):
+    """A unit in the headings of fewer than half of the recordings leaves the others open."""
+    submission = recorded("two-cart", "step", "sine")
+    data = read_data(submission)
+    unit = HeadingUnit(role="position", heading="x1 [mm]", unit="mm", converts=True)
+    records = tuple(
+        replace(record, heading_units=(unit,) if i < headed else ())
+        for i, record in enumerate(data.records[:8])
+    )
+    data = replace(data, records=records)
+    found = list_assumptions(submission, data=data, fit=None, checks=())
+    (position,) = (one for one in found if one.key == "system.position.unit")
+    assert (position.support, len(position.experiments)) == (support, headed)
 
 
 def test_the_report_and_results_json_list_the_assumptions():

@@ -1,15 +1,23 @@
-"""A wrong factor is reported as a wrong unit only if all records of a kind share it."""
+"""Records with a known mistake are left out, each with the reason that says most."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pipeline.estimation.record_fit import Correction, RecordFit
-from pipeline.identify.corrections import without_lone_factors
+from pipeline.estimation.record_fit import Correction, RecordFit, record_fits
+from pipeline.identify.corrections import find_faults, without_lone_factors
+from pipeline.identify.identify import identify_with_rejection
+from pipeline.ingest.read import Ingested
+from pipeline.ingest.sign import Signs
+from pipeline.plant.chain import PRESETS
 from pipeline.results import Record
+from pipeline.setup import Setup
+from pipeline.words.progress import silent
+from tests.helpers.time_records import decay_record, step_record
 
+CHAIN = PRESETS["throne-2dof"]
 TENTH = Correction(words="a tenth as far", scale=0.1)
 TENFOLD = Correction(words="ten times as far", scale=10.0)
 SLOW = Correction(words="half its speed", clock=2.0)
@@ -33,18 +41,21 @@ def record(name: str, *, size: float = 1.0, step: float = 0.01) -> Record:
 def kept(found: Mapping[str, Correction], *others: Record, sizes: Mapping[str, float]) -> set[str]:
     """Return the suspected mistakes that remain if all other records fit as they are."""
     records = [*(record(name, size=size) for name, size in sizes.items()), *others]
-    follows = {r.id: 1.0 if r.id in found else 0.0 for r in records}
-    fits = {
-        name: RecordFit(
-            unexplained_share={1: lost},
+    return set(without_lone_factors(found, records, fits=fits_of(records, found)))
+
+
+def fits_of(records: Sequence[Record], found: Mapping[str, Correction]) -> dict[str, RecordFit]:
+    """Return fits that nothing explains for the records in `found`, and exact ones for others."""
+    return {
+        record.id: RecordFit(
+            unexplained_share={1: float(record.id in found)},
             residual={},
             chi_square=1.0,
             amplitude_ratio={1: 1.0},
             friction={},
         )
-        for name, lost in follows.items()
+        for record in records
     }
-    return set(without_lone_factors(found, records, fits=fits))
 
 
 @pytest.mark.parametrize(
@@ -70,20 +81,68 @@ def test_another_clock_needs_another_sampling_rate():
     """The clock of a single dwell is called wrong only if the dwell's sampling rate differs too."""
     others = [record("sine-2"), record("sine-3")]
     assert kept({"sine-1": SLOW}, *others, sizes={"sine-1": 1.0}) == set()
-    slow = replace(record("sine-1"), t=np.linspace(0.0, 1.98, 100))
-    fits = {
-        name: RecordFit(
-            unexplained_share={1: lost},
-            residual={},
-            chi_square=1.0,
-            amplitude_ratio={1: 1.0},
-            friction={},
-        )
-        for name, lost in (("sine-1", 1.0), ("sine-2", 0.0), ("sine-3", 0.0))
-    }
-    assert without_lone_factors({"sine-1": SLOW}, [slow, *others], fits=fits) == {"sine-1": SLOW}
+    records = [replace(record("sine-1"), t=np.linspace(0.0, 1.98, 100)), *others]
+    found = {"sine-1": SLOW}
+    assert without_lone_factors(found, records, fits=fits_of(records, found)) == found
 
 
 def test_an_inverted_channel_counts_even_in_one_record():
     """An inverted channel counts even in one record, as no limit or friction inverts a channel."""
     assert kept({"step-1": TURNED}, record("step-2"), sizes={"step-1": 1.0}) == {"step-1"}
+
+
+def steps(*durations: float) -> list[Record]:
+    """Return honest steps of two carts, "step-1" and so on, that last so many seconds."""
+    rng = np.random.default_rng(0)
+    return [
+        step_record(CHAIN, rng=rng, id=f"step-{i}", duration=duration)
+        for i, duration in enumerate(durations, start=1)
+    ]
+
+
+def turned(record: Record) -> Record:
+    """Return a record whose cart 2 has the opposite sign."""
+    return replace(record, y=record.y * [[1], [-1]])
+
+
+def test_an_input_may_have_the_opposite_sign_but_a_channel_may_not():
+    """A reversed input is only odd, because it may be logged so; a reversed channel is wrong."""
+    first, second, third, fourth = steps(*[6.0] * 4)
+    assert second.u is not None
+    records = [first, replace(second, u=-second.u), turned(third), fourth]
+    found = find_faults(records, chain=CHAIN, fits=record_fits(records, CHAIN))
+    assert {run: (one.code, one.excludes) for run, one in found.items()} == {
+        "step-2": ("misread", "odd"),
+        "step-3": ("misread", "wrong"),
+    }
+
+
+def left_out(*records: Record) -> list[tuple[str, str, str]]:
+    """Return which records are left out, with the code of the finding and what it excludes."""
+    data = Ingested(
+        records=records,
+        tables=(),
+        files={},
+        unreadable={},
+        signs=Signs(stated={}, found={}),
+        warnings=(),
+    )
+    bench = Setup(springs=tuple(bool(k) for k in CHAIN.k))
+    _, found = identify_with_rejection(data, interventions=(), bench=bench, progress=silent)
+    return [(one.run, one.code, one.excludes) for one in found]
+
+
+def test_a_record_in_another_unit_is_wrong_and_not_only_odd():
+    """An encoder step in mm says why a step moves ten times too far, so this reason is given."""
+    first, second, third, fourth = steps(*[6.0] * 4)
+    in_mm = replace(second, y=10 * second.y, resolution=10 * second.resolution)
+    decay = decay_record(CHAIN, free=(1, 2), rng=np.random.default_rng(1))
+    found = left_out(first, in_mm, third, fourth, decay)
+    assert found == [("step-2", "other_unit", "wrong")]
+
+
+def test_a_reversed_channel_is_wrong_and_its_gain_not_only_odd():
+    """A reversed channel says why one static gain is odd, so this reason is given."""
+    first, second, third, fourth = steps(3.0, 4.0, 5.2, 6.8)  # too different to be repeats
+    found = left_out(first, second, turned(third), fourth)
+    assert found == [("step-3", "misread", "wrong")]

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import pytest
+
 from pipeline.identify.repeats import Repeats, compare_repeats
 from pipeline.results import Estimate, LogDecrement, StepEdge, StepGain
 from tests.helpers.analysis_factory import make_analysis
@@ -36,9 +38,11 @@ def step(run: str, gain: float, *, cart: int = 1, std: float = 0.01, size: float
     )
 
 
-def compared(decays=(), steps=(), *, carts: int = 2, **fitted: float) -> Repeats:
+def compared(decays=(), steps=(), *, dwells: bool = False, **fitted: float) -> Repeats:
+    """Return the comparison with a fit of these parameters, to dwells if `dwells` is true."""
     estimates = {k: Estimate(value=v, std=0.01, source="bode_fit") for k, v in fitted.items()}
-    return compare_repeats(decays, steps, carts=carts, fitted=estimates, dwells={})
+    by_dwells = estimates if dwells else {}
+    return compare_repeats(decays, steps, carts=2, fitted=estimates, dwells=by_dwells)
 
 
 def test_repeats_that_agree_pass():
@@ -127,3 +131,13 @@ def test_gains_that_depend_on_the_step_size_are_not_odd():
     assert [check.outcome for check in found.checks] == ["fail"]
     assert found.odd == {}
     assert found.undecided == ()
+
+
+@pytest.mark.parametrize(("gain", "excludes"), [(20.0, "wrong"), (-2.06, "odd"), (-20.0, "wrong")])
+def test_steps_with_the_opposite_sign_of_the_dwells_may_be_right(gain, excludes):
+    """Steps that agree on a gain ten times that of the dwells are wrong; a logged sign is legal."""
+    found = compared(steps=[step("a", gain), step("b", gain, size=2.0)], dwells=True, K_1=2.0)
+    assert {run: (one.code, one.excludes) for run, one in found.odd.items()} == {
+        "a": ("odd_beside_dwells", excludes),
+        "b": ("odd_beside_dwells", excludes),
+    }
