@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 
 from pipeline.estimation.record_fit import Correction, RecordFit, record_fits
-from pipeline.identify.corrections import find_faults, without_lone_factors
+from pipeline.identify.corrections import (
+    find_faults,
+    find_impossible_gains,
+    without_lone_factors,
+)
 from pipeline.identify.identify import identify_with_rejection
 from pipeline.ingest.read import Ingested
 from pipeline.ingest.sign import Signs
@@ -15,6 +19,7 @@ from pipeline.plant.chain import PRESETS
 from pipeline.results import Record
 from pipeline.setup import Setup
 from pipeline.words.progress import silent
+from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.time_records import decay_record, step_record
 
 CHAIN = PRESETS["throne-2dof"]
@@ -146,3 +151,16 @@ def test_a_reversed_channel_is_wrong_and_its_gain_not_only_odd():
     first, second, third, fourth = steps(3.0, 4.0, 5.2, 6.8)  # too different to be repeats
     found = left_out(first, second, turned(third), fourth)
     assert found == [("step-3", "misread", "wrong")]
+
+
+@pytest.mark.parametrize(("gain", "wrong"), [(0.5, False), (1.25, False), (1.45, True)])
+def test_no_cart_moves_much_further_than_the_cart_that_pulls_it(gain, wrong):
+    """A static gain of cart 2 above 1.3 times that of cart 1 is impossible, friction included."""
+    one = make_analysis(2).step_gains[0]
+    gains = [
+        replace(one, experiment="step-1", cart=cart, gain=K, gain_std=0.01, interval=None)
+        for cart, K in ((1, 1.0), (2, gain))
+    ]
+    found = find_impossible_gains(gains)
+    expected = [("step-1", 2, "too_far", "wrong")] if wrong else []
+    assert [(one.run, one.cart, one.code, one.excludes) for one in found.values()] == expected

@@ -74,6 +74,7 @@ def test_a_late_channel_is_found_without_dwells(kinds, cart):
         abs=0.5,
     )
     assert {one.details["kind"] for one in late} == set(kinds)
+    assert {one.details["when"] for one in late} == {"earlier" if cart == 1 else "later"}
 
 
 def test_a_channel_late_only_in_the_sweep_is_reported_only_for_it():
