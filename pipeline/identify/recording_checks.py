@@ -77,7 +77,7 @@ _WORDS = phrases("skipped")
 # ------------------------------------------------------------------------- search
 
 
-def swings(record: Record) -> tuple[float, dict[int, float]]:
+def _swings(record: Record) -> tuple[float, dict[int, float]]:
     """Return the largest swing of the free carts, and the swing of each held cart.
 
     If no free cart was measured, the held ones are left out.
@@ -87,9 +87,9 @@ def swings(record: Record) -> tuple[float, dict[int, float]]:
     return (max(free), swing) if free else (0.0, {})
 
 
-def wrong_setup(record: Record) -> Finding | None:
+def _wrong_setup(record: Record) -> Finding | None:
     """Return what is wrong if a cart that should be held moves, but the free carts do not."""
-    free, held = swings(record)
+    free, held = _swings(record)
     mover = max(held, key=lambda cart: held[cart], default=0)
     if not mover or free >= _LEAST_SHARE * held[mover]:
         return None
@@ -103,9 +103,9 @@ def wrong_setup(record: Record) -> Finding | None:
     )
 
 
-def loose_holds(record: Record) -> Iterator[Finding]:
+def _loose_holds(record: Record) -> Iterator[Finding]:
     """Yield the carts that should be held but move much compared with the free ones."""
-    free, held = swings(record)
+    free, held = _swings(record)
     for cart, swing in held.items():
         if _HELD_FIRMLY * free < swing <= free:
             yield Finding(
@@ -119,7 +119,7 @@ def loose_holds(record: Record) -> Iterator[Finding]:
             )
 
 
-def find_other_scales(records: Sequence[Record], *, bench: Setup) -> list[Finding]:
+def _find_other_scales(records: Sequence[Record], *, bench: Setup) -> list[Finding]:
     """Find positions or inputs of a size that no bench has, and so must be in another unit.
 
     Examples are counts in place of a length, and millivolts in place of volts. A fit to such
@@ -166,7 +166,7 @@ def _scale(
     return Finding(code=code, kind=code, run=run, details=details, value=value, limit=limit)
 
 
-def find_other_steps(records: Sequence[Record], *, bench: Setup) -> Finding | None:
+def _find_other_steps(records: Sequence[Record], *, bench: Setup) -> Finding | None:
     """Find positions whose encoder step is a power of ten times the known one of an ECP bench."""
     if any(one.role == "position" for record in records for one in record.heading_units):
         return None
@@ -218,20 +218,7 @@ def _reached(reaches: Iterable[tuple[Record, float]]) -> tuple[float, str]:
     return sorted(by_kind.values())[-2:][0] if by_kind else (0.0, "")
 
 
-def why_other_frequency(ratio: float) -> str:
-    """Return why the stated frequency may be `ratio` times the true one; "" if unknown."""
-    reasons = {
-        2 * np.pi: say("frequency_in_radians"),
-        1 / (2 * np.pi): say("frequency_divided"),
-        **{
-            f: say("frequency_by_clock", unit=u, short=short)
-            for f, (u, short) in TIME_UNITS.items()
-        },
-    }
-    return explain_ratio(ratio, reasons, within=_OTHER_DWELL)
-
-
-def find_other_units(records: Sequence[Record], *, decays: bool = False) -> Iterator[Finding]:
+def _find_other_units(records: Sequence[Record], *, decays: bool = False) -> Iterator[Finding]:
     """Yield the records whose encoder step is the usual one converted to another unit.
 
     The usual step is that of most kinds of experiment, not of most records. A dozen dwells may have
@@ -273,7 +260,7 @@ def find_shown(records: Sequence[Record], *, files: Mapping[str, str]) -> dict[s
     They are in another unit, or an encoder was stuck, or they are no complete recording of their
     kind. `files` has the digest of each data file.
     """
-    faults = chain(_other_kinds(records, files=files), _stuck(records), find_other_units(records))
+    faults = chain(_other_kinds(records, files=files), _stuck(records), _find_other_units(records))
     return {name: replace(one, excludes="wrong") for name, one in first_by_run(faults).items()}
 
 
@@ -398,6 +385,64 @@ def _late_in(records: Sequence[Record], *, kind: str, carts: int) -> Iterator[Fi
                 )
 
 
+def find_bad_recordings(analysis: Analysis) -> dict[str, Finding]:
+    """Return the recordings with a fault, each with its first one."""
+    valid = valid_records(analysis.records, analysis.left_out)
+    # A cart that sticks rests at its turning points, which looks like a clipped reading.
+    sticky = analysis.fit is not None and not analysis.fit.explains_data
+    faults = [
+        *filter(None, map(_wrong_setup, analysis.records)),
+        *reversed(_find_other_scales(valid, bench=analysis.bench)),
+        *(
+            Finding(code="unreadable", run=name, details={"reason": why}, excludes="wrong")
+            for name, why in analysis.unreadable.items()
+        ),
+        *(one for one in analysis.left_out if one.is_wrong),
+        *(one for r in analysis.records for one in _channels_at_fault(r, sticky=sticky)),
+        *analysis.late_channels,
+    ]
+    found = first_by_run(faults)
+    order = [*analysis.unreadable, *(one.run for one in analysis.left_out if one.is_wrong)]
+    order += [record.id for record in analysis.records]
+    return {name: found[name] for name in dict.fromkeys(order) if name in found}
+
+
+def _channels_at_fault(record: Record, *, sticky: bool) -> Iterator[Finding]:
+    """Yield a fault for each clipped channel, and for an input with a wrong frequency."""
+    for cart in record.carts:
+        if cart not in record.free or sticky or record.kind not in ("sine", "sweep"):
+            continue
+        if (limit := saturation(record.position(cart))) is not None:
+            details = {"limit": f"{limit:.4g}"}
+            yield Finding(code="clipped_position", run=record.id, cart=cart, details=details)
+    u = record.u
+    if u is None or record.kind == "closed_loop":
+        return
+    if (limit := saturation(u)) is not None:
+        details = {"limit": f"{limit:.4g}"}
+        yield Finding(code="clipped_input", run=record.id, details=details)
+    if record.kind == "sine" and record.omega is not None and np.ptp(u) > 0:
+        hertz, stated = line_frequency(record.t, u), record.omega / (2 * np.pi)
+        resolution = 1.0 / float(record.t[-1] - record.t[0])
+        if hertz is not None and abs(hertz - stated) > max(_OTHER_RUN * stated, resolution):
+            look = _why_other_frequency(stated / hertz) or say("frequency_of_another")
+            details = {"found": f"{hertz:.3g}", "stated": f"{stated:.3g}", "look": look}
+            yield Finding(code="other_frequency", run=record.id, details=details)
+
+
+def _why_other_frequency(ratio: float) -> str:
+    """Return why the stated frequency may be `ratio` times the true one; "" if unknown."""
+    reasons = {
+        2 * np.pi: say("frequency_in_radians"),
+        1 / (2 * np.pi): say("frequency_divided"),
+        **{
+            f: say("frequency_by_clock", unit=u, short=short)
+            for f, (u, short) in TIME_UNITS.items()
+        },
+    }
+    return explain_ratio(ratio, reasons, within=_OTHER_DWELL)
+
+
 # ------------------------------------------------------------------------- checks
 
 
@@ -410,15 +455,15 @@ def check_recordings(
     bench: Setup,
 ) -> list[Check]:
     """Return all checks of the recordings, those whose failure affects most numbers first."""
-    sound = valid_records(data.records, left_out)
+    valid = valid_records(data.records, left_out)
     return [
         *check_signs(data.signs, without={one.run for one in left_out if one.is_wrong}),
         *check_files(data.unreadable),
         *check_units(data.records, bench=bench),
-        *(one.check for one in find_other_scales(sound, bench=bench)),
+        *(one.check for one in _find_other_scales(valid, bench=bench)),
         *check_left_out(left_out, records=data.records),
         *check_setup(data.records),
-        *check_dwells(data.records, sines),
+        *_check_dwells(data.records, sines),
         *check_channels(late),
     ]
 
@@ -457,7 +502,7 @@ def check_units(records: Sequence[Record], *, bench: Setup) -> list[Check]:
             details |= {"heading": repr(other.heading), "unit": unit}
             details |= {"other": other.unit, "role": role}
             finding = Finding(code="other_heading", kind=kind, details=details)
-        elif role == "position" and (other_step := find_other_steps(records, bench=bench)):
+        elif role == "position" and (other_step := _find_other_steps(records, bench=bench)):
             checks.append(other_step.check)
         elif role == "position" and fractions:
             details |= {"gain_unit": bench.units.gain}
@@ -540,8 +585,8 @@ def check_setup(records: Sequence[Record]) -> list[Check]:
     """Check that the carts that move are the free ones, if all carts were measured."""
     checks = []
     for record in records:
-        free, held = swings(record)
-        if wrong := wrong_setup(record):
+        free, held = _swings(record)
+        if wrong := _wrong_setup(record):
             checks.append(wrong.check)
         elif held:
             named = ", ".join(map(str, record.free))
@@ -554,7 +599,7 @@ def check_setup(records: Sequence[Record]) -> list[Check]:
                 message=say("setup_right", run=record.id, free=named),
             )
             checks.append(check)
-    return checks + [one.check for record in records for one in loose_holds(record)]
+    return checks + [one.check for record in records for one in _loose_holds(record)]
 
 
 def check_channels(late: Sequence[Finding]) -> list[Check]:
@@ -570,7 +615,7 @@ def check_channels(late: Sequence[Finding]) -> list[Check]:
     return checks
 
 
-def check_dwells(records: Sequence[Record], points: Sequence[SinePoint]) -> list[Check]:
+def _check_dwells(records: Sequence[Record], points: Sequence[SinePoint]) -> list[Check]:
     """Check that the dwells have their stated frequencies, all together or one by one."""
     stated = {record.id: record.omega for record in records if record.omega}
     ratios = {
@@ -580,7 +625,7 @@ def check_dwells(records: Sequence[Record], points: Sequence[SinePoint]) -> list
     if not off:
         return []
     ratio = float(np.median(list(off.values())))
-    look = why_other_frequency(ratio)
+    look = _why_other_frequency(ratio)
     alike = all(abs(r / ratio - 1) < _OTHER_DWELL for r in off.values())
     details = {
         "off": len(off),
@@ -594,51 +639,6 @@ def check_dwells(records: Sequence[Record], points: Sequence[SinePoint]) -> list
     return [finding.check]
 
 
-def find_bad_recordings(analysis: Analysis) -> dict[str, Finding]:
-    """Return the recordings with a fault, each with its first one."""
-    valid = valid_records(analysis.records, analysis.left_out)
-    # A cart that sticks rests at its turning points, which looks like a clipped reading.
-    sticky = analysis.fit is not None and not analysis.fit.explains_data
-    faults = [
-        *filter(None, map(wrong_setup, analysis.records)),
-        *reversed(find_other_scales(valid, bench=analysis.bench)),
-        *(
-            Finding(code="unreadable", run=name, details={"reason": why}, excludes="wrong")
-            for name, why in analysis.unreadable.items()
-        ),
-        *(one for one in analysis.left_out if one.is_wrong),
-        *(one for r in analysis.records for one in _channels_at_fault(r, sticky=sticky)),
-        *analysis.late_channels,
-    ]
-    found = first_by_run(faults)
-    order = [*analysis.unreadable, *(one.run for one in analysis.left_out if one.is_wrong)]
-    order += [record.id for record in analysis.records]
-    return {name: found[name] for name in dict.fromkeys(order) if name in found}
-
-
-def _channels_at_fault(record: Record, *, sticky: bool) -> Iterator[Finding]:
-    """Yield a fault for each clipped channel, and for an input with a wrong frequency."""
-    for cart in record.carts:
-        if cart not in record.free or sticky or record.kind not in ("sine", "sweep"):
-            continue
-        if (limit := saturation(record.position(cart))) is not None:
-            details = {"limit": f"{limit:.4g}"}
-            yield Finding(code="clipped_position", run=record.id, cart=cart, details=details)
-    u = record.u
-    if u is None or record.kind == "closed_loop":
-        return
-    if (limit := saturation(u)) is not None:
-        details = {"limit": f"{limit:.4g}"}
-        yield Finding(code="clipped_input", run=record.id, details=details)
-    if record.kind == "sine" and record.omega is not None and np.ptp(u) > 0:
-        hertz, stated = line_frequency(record.t, u), record.omega / (2 * np.pi)
-        resolution = 1.0 / float(record.t[-1] - record.t[0])
-        if hertz is not None and abs(hertz - stated) > max(_OTHER_RUN * stated, resolution):
-            look = why_other_frequency(stated / hertz) or say("frequency_of_another")
-            details = {"found": f"{hertz:.3g}", "stated": f"{stated:.3g}", "look": look}
-            yield Finding(code="other_frequency", run=record.id, details=details)
-
-
 # ---------------------------------------------------------------------- remarks
 
 
@@ -648,7 +648,7 @@ def reading_remarks(data: Ingested, *, unit: str) -> list[str]:
     There is one if `unit` seems wrong, and one for decays in other units. Their unit does not
     affect their results.
     """
-    units = first_by_run(find_other_units(data.records, decays=True)).items()
+    units = first_by_run(_find_other_units(data.records, decays=True)).items()
     notes = ((record.id, note) for record in data.records for note in record.notes)
     other = ((run, _WORDS.text("decay_in_other_unit", reason=one.reason)) for run, one in units)
     too_fast = _too_fast(data.records, unit=unit)

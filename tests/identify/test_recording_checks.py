@@ -17,7 +17,7 @@ from tests.helpers.time_records import record_of
 
 T = np.arange(0.0, 10.0, 0.01)
 OMEGA = 5.0  # rad/s; no whole number of samples is a period
-WAVE = np.round(np.sin(OMEGA * T), 3)
+WAVE = np.sin(OMEGA * T).round(3)
 
 
 def dwell(y: Array, *, free: tuple[int, ...] = (1, 2), limit: float = np.inf) -> Record:
