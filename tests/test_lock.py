@@ -3,13 +3,18 @@
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor, TimeoutError
 
 import pytest
 
 from pipeline.errors import ConfigError
 from pipeline.grading.batch.grade_class import scratch_in
 from pipeline.lock import lock_or_refuse
+from pipeline.submission import load_submission
+from pipeline.submission.edit import Outdated, edit_submission, submission_text, text_digest
 from tests.helpers.commandline import cartlab_here
+from tests.helpers.desks import a_submission
+from tests.helpers.waiting import PATIENCE
 
 _HOLDER = """
 import sys
@@ -56,6 +61,40 @@ def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
     with lock_or_refuse(tmp_path), scratch_in(tmp_path) as scratch:
         assert [path.name for path in tmp_path.glob(".scratch*")] == [scratch.name]
     assert [path.name for path in tmp_path.iterdir()] == [".lock"]
+
+
+_EDITOR = """
+import sys
+from pathlib import Path
+from pipeline.submission.edit import edit_submission
+def change(document):
+    print("changing", flush=True)
+    sys.stdin.read()
+    document["title"] = "other"
+edit_submission(Path(sys.argv[1]), change)
+"""
+
+
+def test_an_edit_waits_for_that_of_another_process(tmp_path):
+    """While another process changes `submission.toml`, an edit waits; then it is outdated."""
+    folder = a_submission(tmp_path / "team")
+    seen = text_digest(submission_text(folder))
+    command = [sys.executable, "-c", _EDITOR, str(folder)]
+    with (
+        ThreadPoolExecutor(1) as pool,
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other,
+    ):
+        assert other.stdout is not None
+        assert other.stdout.readline().strip() == b"changing"
+        mine = pool.submit(
+            edit_submission, folder, lambda document: document.update(title="mine"), version=seen
+        )
+        with pytest.raises(TimeoutError):
+            mine.result(timeout=0.5)
+        other.communicate(timeout=PATIENCE)
+        with pytest.raises(Outdated):
+            mine.result(timeout=PATIENCE)
+    assert load_submission(folder).title == "other"
 
 
 def test_a_foreign_file_with_the_locks_name_is_refused(tmp_path):

@@ -2,6 +2,7 @@
 
 import io
 import re
+import shutil
 import zipfile
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +21,7 @@ from pipeline.grading.gradebook.override import HandPoints
 from pipeline.grading.gradebook.shared_gradebook import SharedGradebook
 from pipeline.grading.gradings import Batch
 from pipeline.grading.publish.export import export
+from pipeline.grading.rubric_file import load_rubric
 from pipeline.resources import RUBRICS
 from pipeline.words.text import capital
 from tests.helpers.commandline import cartlab_here
@@ -32,7 +34,15 @@ from tests.helpers.desks import (
     through_proxy,
     write_users,
 )
-from tests.helpers.grades import fill_book, make_grade, make_outcome, two_cart_rubric, write_class
+from tests.helpers.grades import (
+    book_of,
+    fill_book,
+    make_grade,
+    make_outcome,
+    two_cart_rubric,
+    write_class,
+)
+from tests.helpers.grading_students import criterion, write_team
 from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.usefixtures("all_work_here")
@@ -268,9 +278,9 @@ def test_criteria_that_lost_points_come_first(ta):
     chosen = re.search(r'id="chosen-title">(.*): ', page)
     assert chosen
     assert chosen[1].lower() == titles[order[0]].lower()
-    for criterion in order:
-        own = ta.get(at("team-06", criterion=criterion)).text
-        assert f'name="criterion" value="{criterion}"' in own
+    for asked in order:
+        own = ta.get(at("team-06", criterion=asked)).text
+        assert f'name="criterion" value="{asked}"' in own
         assert own.count('aria-current="true"') == 1
 
 
@@ -481,6 +491,36 @@ def test_the_export_equals_that_of_the_command(ta, grades, tmp_path, platform):
 
 @pytest.mark.slow
 @pytest.mark.sample
+@pytest.mark.slow
+@pytest.mark.sample
+@pytest.mark.parametrize("anonymous", [False, True])
+def test_a_class_is_graded_again_from_the_desk(tmp_path, anonymous):
+    """A late submission is graded into the open class; earlier grades and hidden names stay."""
+    team, late, lab = (tmp_path / name for name in ("team-05", "late.csv", "lab.toml"))
+    write_team(team, 5)
+    late.write_text("submission,days_late\nteam-05,2\n", encoding="utf-8")
+    shutil.copy(RUBRICS / "throne-1dof.toml", lab)
+    rubric = load_rubric(lab).model_copy(update={"anonymous": anonymous})
+    old = make_outcome(make_grade("team-04"), fingerprints=b"")
+    grades = tmp_path / "grades"
+    grades.mkdir()
+    with book_of(grades, old, rubric=rubric) as book:
+        book.override("team-04", "pieces", 0.5, why="as told", by="Ada")
+    with at_desk(opened=grades) as who:
+        sent = {"paths": str(team), "rubric": str(lab), "lateness": str(late)}
+        assert who.post(ROOM + "regrade", **sent).status == 303
+        until(lambda: "data-events" not in who.get(ROOM).text)
+        shown = names(who.get(ROOM))
+    with Gradebook(grades) as book:
+        entry = {one.submission: one for one in book.entries()}
+        assert entry["team-04"].overrides["pieces"].why == "as told"
+        assert (entry["team-05"].grade.status, entry["team-05"].grade.days_late) == ("graded", 2)
+        assert book.rubric.anonymous == anonymous
+    made = sorted(path.name for path in (grades / "feedback").iterdir() if path.is_dir())
+    assert made == sorted(shown)
+    assert (set(shown) == entry.keys()) is not anonymous
+
+
 def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
     """In an anonymous class no page, address or refusal shows a name; exports use pseudonyms."""
     grades = write_class(tmp_path / "g", anonymous=True)
@@ -563,7 +603,7 @@ def apply(who: Visitor, address: str, form: str) -> Answer:
 def test_one_decision_for_several_teams_is_previewed(ta, grades):
     """One decision for several teams shows points before and after, and changes only ticked teams.
 
-    The decision carries the TA's name and can be undone as a whole.
+    The decision carries the TA's name and can be undone as a whole. A comment changes no points.
     """
     with Gradebook(grades) as book:
         before = {entry.submission: entry.grade for entry in book.entries()}
@@ -590,6 +630,13 @@ def test_one_decision_for_several_teams_is_previewed(ta, grades):
     ta.post(answer.headers["location"], do="undo", set=done.value("set"))
     with Gradebook(grades) as book:
         assert {entry.submission: entry.grade for entry in book.entries()} == before
+    form = sent(ta.get(together()), *ticked, do="apply", points="same", why="Mind the unit.")
+    assert apply(ta, together(), form).status == 303
+    with Gradebook(grades) as book:
+        for name in ticked:
+            entry, said = book.entry(name), criterion(before[name], "laws").message
+            assert (entry.overrides, entry.grade.points) == ({}, before[name].points)
+            assert criterion(entry.grade, "laws").message == f"{said} Mind the unit."
 
 
 def test_a_decision_applies_to_all_teams_or_none(ta, grades):

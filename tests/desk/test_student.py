@@ -261,6 +261,9 @@ def test_handing_in_says_when_the_report_is_out_of_date(change, filled):
     for page in (visitor.get(HERE), visitor.get(HERE + "hand-in")):
         assert page.state["report"] == expected
         assert ("The report is out of date" in page.text) == (expected == "older")
+    top = visitor.get(HERE).text.partition('class="now')[2].partition('class="next')[0]
+    said = {"older": "out of date", "current": "up to date", "answered": "answers are newer"}
+    assert [state for state, words in said.items() if words in top] == [expected]
     assert ("report/report.pdf" in zipped(visitor).namelist()) == (change == "nothing")
 
 

@@ -89,7 +89,7 @@ def test_independent_initial_estimates_are_named():
 
 @pytest.mark.parametrize("judged", [*product([True, False], repeat=2), (True,), (False,)])
 def test_one_parameter_is_singular(judged):
-    """The number of parameters that agree has the right singular or plural."""
+    """The number of parameters that agree is true, and has the right singular or plural."""
     analysis = make_analysis(2)
     flags = [*judged, *[None] * (len(analysis.rows) - len(judged))]
     rows = tuple(
@@ -100,6 +100,8 @@ def test_one_parameter_is_singular(judged):
     said = re.findall(r"[^.]*estimated in two ways[^.]*", text)
     assert len(said) == 1
     assert not re.findall(r"\b1 parameters|one parameters|[2-9] parameter ", said[0])
+    assert bool(re.search(r"\bNo(ne)?\b", said[0])) == (not any(judged))
+    assert ("other" in said[0]) == (judged.count(False) == 1)
 
 
 def test_the_table_mentions_only_existing_sources():

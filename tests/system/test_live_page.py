@@ -249,6 +249,23 @@ def test_a_page_gets_events_and_a_ninth_page_is_refused(page):
         assert ask(page, "events")[0].status == 503
 
 
+def test_idle_connections_share_a_fixed_number_of_places(page, monkeypatch):
+    """One more connection without the secret ends the oldest; those with the secret stay."""
+    monkeypatch.setattr("pipeline.web._MOST_STRANGERS", 4)
+    monkeypatch.setattr("pipeline.web._STRANGER_STAYS", 10 * PATIENCE)
+    url = urlsplit(page.url)
+    with ExitStack() as opened:
+        stream = news(page, opened)
+        strangers = [
+            opened.enter_context(socket.create_connection((url.hostname, url.port), PATIENCE))
+            for _ in range(5)
+        ]
+        with suppress(ConnectionResetError):
+            assert strangers[0].recv(1) == b""
+        assert ask(page)[0].status == 200
+        assert stream.readline() == b"event: state\n"
+
+
 def test_a_full_queue_does_not_keep_the_owner_out(page, monkeypatch):
     """An owner who waits in a queue full of idle connections is still served."""
     url, held, go_on = urlsplit(page.url), threading.Event(), threading.Event()
