@@ -110,15 +110,27 @@ def spoil_channel(files: dict[str, bytes], rng: Random, *, every: bool) -> None:
     how, column = CHANNELS[rng.choice(sorted(CHANNELS))], rng.randrange(1, 5)
     length = rng.choice(LENGTHS)
     for name in tables if every else [rng.choice(tables)]:
-        try:
-            head, *rows = files[name].decode().splitlines()
-            values = np.array([row.split(",") for row in rows], dtype=float)
-        except ValueError:  # spoilt already
-            continue
-        if values.ndim == 2 and len(values) and column < values.shape[1]:
-            values[:, column] = how(values[:, column])
-            lines = [head, *(",".join(f"{value:.9g}" for value in row) for row in values[length])]
-            files[name] = "\n".join(lines).encode()
+        spoil_table(files, name, how, column=column, length=length)
+
+
+def spoil_table(
+    files: dict[str, bytes],
+    name: str,
+    how: Callable[[Array], Array],
+    *,
+    column: int,
+    length: slice = LENGTHS[0],
+) -> None:
+    """Spoil one column of a table, if it has so many, and keep a part of the rows."""
+    try:
+        head, *rows = files[name].decode().splitlines()
+        values = np.array([row.split(",") for row in rows], dtype=float)
+    except ValueError:  # spoilt already
+        return
+    if values.ndim == 2 and len(values) and column < values.shape[1]:
+        values[:, column] = how(values[:, column])
+        lines = [head, *(",".join(f"{value:.9g}" for value in row) for row in values[length])]
+        files[name] = "\n".join(lines).encode()
 
 
 def spoilt(carts: int, rng: Random) -> dict[str, bytes]:
@@ -157,16 +169,20 @@ def _refuse(constant: str) -> None:
     raise AssertionError(f"{constant} is not JSON")
 
 
+def run_on(command: str, files: dict[str, bytes]) -> None:
+    """Run a command on a submission with these files."""
+    with tempfile.TemporaryDirectory() as base:
+        for name, raw in files.items():
+            path = Path(base) / "work" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(raw)
+        run(command, Path(base) / "work")
+
+
 def try_seed(command: str, seed: int) -> None:
     """Spoil a submission at random, and run a command on it."""
     rng = Random(f"{command} {seed}")
-    with tempfile.TemporaryDirectory() as base:
-        folder = Path(base) / "work"
-        for name, raw in spoilt(1 + seed % (2 if command == "gap" else 3), rng).items():
-            path = folder / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(raw)
-        run(command, folder)
+    run_on(command, spoilt(1 + seed % (2 if command == "gap" else 3), rng))
 
 
 @pytest.mark.parametrize("command", ["report", "import"])
@@ -174,6 +190,32 @@ def test_a_spoilt_submission_gives_a_result_or_one_line(command):
     """For two spoilt submissions, `report` and `import` give a result or one line of error."""
     for seed in (0, 3):
         try_seed(command, seed)
+
+
+LONG = [pytest.mark.slow, pytest.mark.sample]
+
+
+@pytest.mark.parametrize(
+    ("carts", "every"),
+    [(1, 1), (1, 2), *(pytest.param(*case, marks=LONG) for case in ((2, 1), (2, 2), (3, 2)))],
+)
+def test_spoilt_channels_of_every_kind_give_a_result_or_one_line(carts, every):
+    """Each recording has another fault in one of its columns; or only every second has.
+
+    If all have one, a third of them is also stated to be of another kind.
+    """
+    files = dict(good(carts))
+    runs = files["submission.toml"].decode().split("\nkind = ")
+    faults = sorted(CHANNELS)
+    for i, name in enumerate(sorted(name for name in files if name.endswith(".csv"))):
+        if i % every == 0:
+            how = CHANNELS[faults[(i // every + 5 * carts) % len(faults)]]
+            columns = files[name].partition(b"\n")[0].count(b",")
+            spoil_table(files, name, how, column=1 + i // every % columns)
+    if every == 1:
+        for i in range(1, len(runs), 3):
+            runs[i] = f'"{KINDS[i % len(KINDS)]}"\n' + runs[i].partition("\n")[2]
+    run_on("report", files | {"submission.toml": "\nkind = ".join(runs).encode()})
 
 
 @pytest.mark.slow
