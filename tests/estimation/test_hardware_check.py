@@ -140,7 +140,7 @@ def test_a_true_model_leaves_the_noise(name, cart):
 
 @pytest.mark.parametrize(
     ("name", "cart", "factor"),
-    [(name, cart, factor) for name, cart in LAST_CART for factor in (-0.5, 3.0)],
+    [(name, cart, factor) for name, cart in LAST_CART for factor in (-1.0, -0.5, 3.0)],
 )
 def test_a_logged_input_of_another_sign_or_scale_is_corrected(name, cart, factor):
     """If the logged input has another sign or scale, its factor is found, reported and used."""
