@@ -160,6 +160,26 @@ def test_the_motor_is_cut_if_the_host(fast_bench, way):
     assert fast_bench.event("run")["ended"] == "watchdog"
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
+def test_a_closed_pseudo_terminal_stops_the_motor():
+    """If a host closes a pseudo-terminal, its run ends, and the next host finds the motor off."""
+    # Between the start and the closing, the host has 2 s before the watchdog acts.
+    with emulator("--port", "pty", "--speed", "5", watchdog=2.0) as bench:
+        with host(bench) as line:
+            start = Start(wave=Wave.SINE, frequency=0.01, amplitude=300, cycles=1)
+            line.write(encode(Signal.HEARTBEAT) + encode(start))
+            assert line.read(1000)
+        assert [bench.event("client")["connected"] for _ in range(2)] == [True, False]
+        assert 1999 <= bench.event("motor off")["ms_after_heartbeat"] <= 2000 + MOTOR_OFF
+        ended = bench.event("run")
+        assert ended["ended"] == "watchdog"
+        assert ended["lines"] < start.duration / TRUE_PERIOD
+        with host(bench) as line:
+            assert line.read(1) == b""
+            readings = stream(bench, line, Start(wave=Wave.DELTA, frequency=1.0, amplitude=0))
+        assert {reading.duty for reading in readings} == {0}
+
+
 def test_a_host_that_leaves_an_unguarded_bench_stops_nothing(fast_bench):
     """Without any heartbeat a run goes on to its end after the host has left."""
     with host(fast_bench) as line:
