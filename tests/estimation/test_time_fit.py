@@ -267,6 +267,13 @@ def test_a_decay_is_used_from_its_release_on():
 # ------------------------------------------------------------- standard errors
 
 
+def test_readings_at_rest_share_the_rounding_of_the_encoder():
+    """While nothing moves, all readings share a rounding error, whose variance is step²/12."""
+    window = open_window(step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(1)))
+    got = window.informed(np.zeros_like(window.y), at_rest=True)  # no noise dithers the rounding
+    assert_allclose(got.shared * got.sigma**2, window.step**2 / 12, rtol=1e-12)
+
+
 def test_correlated_residuals_widen_the_error():
     """The variance of a sum of correlated residuals is found from their spectrum."""
     rng = np.random.default_rng(14)
