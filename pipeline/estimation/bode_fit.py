@@ -359,6 +359,7 @@ def fit_bode(
 
     Parameters
     ----------
+    responses : measured responses of the carts, with or without phases.
     bench : the carts and springs of the bench.
     initial : named parameters to start from, if known.
     decays : each cart's own damping ratio, used only if the responses put it at zero.

@@ -64,12 +64,12 @@ class FreeDecay:
         return law.model if law else self.fit
 
     def residual(self, t: Array, y: Array) -> Array:
-        """Return what the model leaves of the decay; `t` and `y` cover the record."""
+        """Return what the model leaves of the decay; `t` and `y` (n,) cover the record."""
         window = slice(self.first, self.stop)
         return y[window] - self.model(t[window])
 
     def rms(self, t: Array, y: Array) -> float:
-        """Return the root-mean-square residual over the decay; `t` and `y` cover the record."""
+        """Return the root-mean-square residual over the decay; `t`, `y` (n,) cover the record."""
         return float(np.sqrt(np.mean(self.residual(t, y) ** 2)))
 
 

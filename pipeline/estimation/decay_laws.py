@@ -34,10 +34,12 @@ UNKNOWNS = 6  # of an exponential decay with a drift
 
 
 class Departure:
-    """Whether the residual of an exponential fit to the decay `y` exceeds the noise.
+    """Whether the residual of an exponential fit to a decay exceeds the noise.
 
     Parameters
     ----------
+    t, y : times and readings (n,) of the decay.
+    fit : the exponential fit to them.
     step : the encoder step.
     floor : the noise between neighbouring samples (root mean square).
     friction : what a little dry friction adds to the decay, shape (n,). This one column shows less
@@ -156,15 +158,20 @@ def thinned(t: Array, y: Array, *, omega: float) -> tuple[Array, Array]:
 
 
 class Swings:
-    """A decay, sampled at `t`, cut into half cycles at its turning points.
+    """A decay cut into half cycles at its turning points.
 
     In each half cycle, y = rest + drift + (amplitude kept + friction pushed) swing - friction side.
-    Here friction means the friction band d. After the turning point the cart moves in `direction`
-    (1 or -1), for so many half `cycles`.
+    Here friction means the friction band d.
+
+    Parameters
+    ----------
+    t : times (n,) of the samples, s.
+    p : turning point in s, decay rate and damped frequency in rad/s, shape (3,).
+    direction : 1 or -1, in which the cart moves after the turning point.
+    cycles : number of half cycles after which friction stops the cart.
 
     Attributes
     ----------
-    p : turning point in s, decay rate and damped frequency in rad/s.
     since : time (n,) since the turning point, s.
     tau : time (n,) since the half cycle began, s.
     swing : cosine (n,) from 1 at the start of the half cycle to -1 at its end.
@@ -258,15 +265,21 @@ class Modulated:
     Because a stiffer spring stores more energy, R = 1 - (1 - e^{-2 gamma tau}) shift / omega.
     Further, phi' = omega + shift E² - (5/12 shift² E⁴ + b gamma E / 2 + 0.092 b² E²) / omega.
 
-    Attributes
+    Parameters
     ----------
-    tau : time (n_lead + n,) since the start, s. The first times lead from the start to the samples.
-    p : gamma, omega, b and shift, 1/s; those in `free` are given, the others are zero.
-    grown, below, bent : (1 - e^{-gamma tau}) / gamma, B and R (n_lead + n,).
-    envelope, phase : E and phi (n_lead + n,).
+    tau : times (n,) of the samples since the start, s.
+    p : the unknowns (n_free,), 1/s: those of gamma, omega, b and shift that are in `free`.
+    free : numbers (n_free,) of the unknowns; the others are zero.
     power : if positive, there is a third harmonic that follows E^power.
     bends : highest power of time in the drift.
     length : unit of time of these powers, s.
+
+    Attributes
+    ----------
+    tau : time (n_lead + n,) since the start, s. The first times lead from the start to the samples.
+    p : gamma, omega, b and shift (4,), 1/s.
+    grown, below, bent : (1 - e^{-gamma tau}) / gamma, B and R (n_lead + n,).
+    envelope, phase : E and phi (n_lead + n,).
     """
 
     def __init__(

@@ -92,7 +92,8 @@ _BULK = 2.0  # standard deviations of the residual; data beyond have little weig
 class RecordResidualForce:
     """The force on one cart in one record that a law leaves unexplained, over windows at `t` (n,).
 
-    `columns` (n, unknowns) are the law's, and `size` is the usual residual.
+    The `columns` (n, unknowns) times the `law` (unknowns,) are the acceleration that it explains.
+    `size` is the usual residual.
 
     Attributes
     ----------

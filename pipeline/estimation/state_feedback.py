@@ -131,6 +131,10 @@ class SampledPlant:
 
     It is in scaled units: v is divided by `rate` (rad/s), and u by `stiffness` (input unit per
     position unit). `phi` is (2n, 2n), `gamma` (2n,).
+
+    Raises
+    ------
+    LinAlgError : the poles are so fast that the sampled plant is not finite.
     """
 
     def __init__(
@@ -362,9 +366,11 @@ class _Candidates:
 
     Attributes
     ----------
-    overshoot, level_error : percent of the step; the latter is due to errors in the model.
-    settling : s; estimated from the slowest pole if the simulated step ends earlier.
-    peak : input units.
+    overshoot, level_error : percent of the step (n_candidates,); the latter is due to errors in the
+        model.
+    settling : s (n_candidates,); estimated from the slowest pole if the simulated step ends
+        earlier.
+    peak : input units (n_candidates,).
     """
 
     def __init__(self, plant: SampledPlant, gains: Array, task: Design) -> None:
