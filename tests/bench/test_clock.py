@@ -135,6 +135,15 @@ def test_a_clock_slower_than_stated_loses_nothing(tmp_path, lost):
     assert len([r for r in notes.remarks if "1 ms" in r and "1.3 ms" in r]) == 1
 
 
+def test_a_motor_that_is_driven_the_other_way_is_stopped(tmp_path):
+    """If the duty in open loop has the opposite sign of the target, the run is not repeated."""
+    reversed_ = OddBench(lambda lines: (_with(r, duty=-r.duty) for r in lines))
+    work = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)])
+    (outcome,) = carried_out(work, reversed_.address)
+    assert (causes(outcome.partial), outcome.is_unsafe) == (["duty"], True)
+    assert load_submission(work).experiments == ()
+
+
 @given(
     steps=st.lists(st.sampled_from([0, 0, 1, 1, 1, 2, 3, 7, 1000, 10**9]), max_size=60),
     still=st.sampled_from([0, 1]),
