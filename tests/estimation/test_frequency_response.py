@@ -16,7 +16,7 @@ from pipeline.estimation.frequency_response import (
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import ExperimentKind, FrequencyResponse, Hold, Record, SinePoint
-from tests.helpers.time_records import record_of
+from tests.helpers.time_records import COUNT, record_of
 
 COUNT_NOISE = 0.00115  # cm, half an encoder count
 
@@ -161,6 +161,17 @@ def test_stated_errors_of_a_response_are_right(preset, drive):
         assert response.omega.size > 50
 
 
+@pytest.mark.parametrize("preset", PRESETS)
+def test_rounding_alone_gives_the_stated_errors(preset):
+    """Without noise, the errors of a response are those of the encoder's rounding, step/√12."""
+    chain, (t, u, kind) = PRESETS[preset], DRIVES["pulse"]
+    y = simulate_linear(chain, t, u(t))
+    for response in response_from_records([record_of(t, u(t), y, kind=kind, count=COUNT)]):
+        # The rms of 160 or more standardised errors is within 1 ± 0.17 (three sigma). Rounding is
+        # not quite white where the carts rest.
+        assert 0.7 < np.sqrt(np.mean(errors(chain, response) ** 2)) < 1.4
+
+
 def test_a_band_limited_input_causes_no_false_phase():
     """A smooth sweep shows no false phase lag if its input is declared band-limited."""
     chain = PRESETS["throne-2dof"]
@@ -228,6 +239,11 @@ def test_peaks_and_nulls_are_found(preset):
     for name in expected:
         # The grid's ratio is 1.08, and a peak is low by sqrt(1 - 2 zeta²), or 6 % at zeta 0.25.
         assert_allclose(got[name].value, truth[name], rtol=0.08)
+        if name.startswith("omega"):
+            # An extremum lies anywhere within the distance of two points, and half of this from
+            # the point that the distance is taken at.
+            distance = got[name].value * np.log(omega[1] / omega[0])
+            assert_allclose(got[name].std, distance / np.sqrt(12), rtol=0.05)
     assert all(e.value == 0.1 for e in got.values() if e.source == "assumed")
 
 

@@ -162,6 +162,8 @@ def test_an_unusual_step_gives_the_gain(name, preset):
     # Rounding moves each of the two levels by up to half a count.
     assert_allclose(got.gain, chain.static_gains()[0], atol=COUNT / 0.03)
     assert abs(got.gain - chain.static_gains()[0]) < 3 * got.gain_std
+    # The variance of each level's rounding is at most step²/12.
+    assert got.gain_std <= np.sqrt(2 / 12) * COUNT / 0.03
     assert note in got.note
     assert got.interval is None
 
