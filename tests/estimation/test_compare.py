@@ -7,11 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.estimation.estimates import DAMPING_LIMIT, GAIN_AND_FREQUENCY_LIMIT, compare
+from pipeline.estimation.estimates import (
+    DAMPING_LIMIT,
+    GAIN_AND_FREQUENCY_LIMIT,
+    compare,
+    motion_measured,
+)
 from pipeline.identify.model_checks import check_carts, check_rows
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.results import ChainFit, Estimate
 from pipeline.setup import Setup
+from tests.helpers.time_records import record_of
 
 
 def _estimate(value, std=None, source="step"):
@@ -155,3 +161,13 @@ def test_the_papers_third_table_breaks_two_redundancies():
     value = {c.id: c.value for c in checks if c.value is not None}
     assert value["redundancy.R4"] > 0.1
     assert value["redundancy.R5"] > 0.02
+
+
+def test_a_drift_and_a_sine_are_measured_where_they_are():
+    """A motion counts at its own frequency, but not below two periods of the record."""
+    t = np.arange(2000) / 113.0
+    lowest = 2 * 2 * np.pi / (t.size / 113.0)
+    for motion in (0.3 * t, np.sin(20 * t)):
+        assert motion_measured([record_of(t, None, motion[None], kind="decay")]).min() > lowest
+    exact = motion_measured([record_of(t, None, np.sin(20 * t)[None], kind="decay", count=0.0)])
+    assert np.abs(exact - 20.0).min() < lowest / 4

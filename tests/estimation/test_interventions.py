@@ -5,8 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.estimation.force_balance import between, find_interventions
+from pipeline.estimation.force_balance import (
+    WindowMeans,
+    between,
+    find_interventions,
+    record_residual_forces,
+)
+from pipeline.plant.chain import PRESETS
 from pipeline.results import Intervention
+from tests.helpers.time_records import COUNT, record_of, step_record
 from tests.truth.bench import Hand
 from tests.truth.cases import EFFECTS, Case, make_case
 
@@ -34,6 +41,25 @@ def unmatched(case: Case) -> tuple[list[tuple[str, Hand]], list[Intervention]]:
             missed.append((name, hand))
         found = [one for one in found if one not in own]
     return missed, found
+
+
+def test_the_usual_residual_of_a_linear_cart_is_its_rounding():
+    """A record without noise leaves twice the acceleration that rounding causes, of step/√12."""
+    run = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(1), noise=0.0)
+    means = WindowMeans(run)
+    for cart in run.carts:
+        _, size = record_residual_forces(cart, [means])
+        # A rounded cart at rest leaves less, and the limit is that of white rounding errors.
+        assert size == pytest.approx(2 * means.gain * COUNT / np.sqrt(12), rel=0.1)
+
+
+def test_the_acceleration_of_noise_is_known():
+    """White noise of size 1 causes accelerations whose standard deviation is the stated gain."""
+    t = np.arange(20_000) / 113.0
+    noise = np.random.default_rng(2).standard_normal((1, t.size))
+    means = WindowMeans(record_of(t, None, noise, kind="decay", count=0.0))
+    # The mean of some thousand independent windows errs by 2 %.
+    assert np.std(means.acceleration) == pytest.approx(means.gain, rel=0.06)
 
 
 @pytest.mark.parametrize(
