@@ -45,7 +45,7 @@ def test_the_errors_of_an_exponential_are_those_of_its_pole():
     """The errors of ζ and ω_n follow from the covariance of decay rate and damped frequency."""
     pole = complex(-0.4, np.sqrt(1 - 0.4**2)) * 20.0  # a larger ζ correlates the two more
     t = np.arange(90) / 113.1
-    run = record_of(t, None, np.exp(pole * t).real[None], kind="decay")
+    run = record_of(t, None, np.real(np.exp(pole * t))[None], kind="decay")
     got = fit_log_decrement(run, cart=1)
     stretch, turning = find_decay(run, cart=1, size=COUNT)
     decay = fit_decay(

@@ -243,7 +243,7 @@ def test_peaks_and_nulls_are_found(preset):
             # An extremum lies anywhere within the distance of two points, and half of this from
             # the point that the distance is taken at.
             distance = got[name].value * np.log(omega[1] / omega[0])
-            assert_allclose(got[name].std, distance / np.sqrt(12), rtol=0.05)
+            assert got[name].std == pytest.approx(distance / np.sqrt(12), rel=0.05)
     assert all(e.value == 0.1 for e in got.values() if e.source == "assumed")
 
 

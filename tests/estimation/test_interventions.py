@@ -49,7 +49,7 @@ def test_the_usual_residual_of_a_linear_cart_is_its_rounding():
     means = WindowMeans(run)
     for cart in run.carts:
         _, size = record_residual_forces(cart, [means])
-        # A rounded cart at rest leaves less, and the limit is that of white rounding errors.
+        # A cart at rest has smaller errors, but no size below that of white errors is used.
         assert size == pytest.approx(2 * means.gain * COUNT / np.sqrt(12), rel=0.1)
 
 
