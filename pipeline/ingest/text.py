@@ -41,8 +41,8 @@ _HEADING_WORDS = re.compile(
     r"[^\s,;\[(]+(?: ?[\[(][^\[\]()]{0,20}[\])])?",
     re.IGNORECASE,
 )
-# The bracket before the rows of a matrix; one closed in its line holds a remark or a unit.
-_OPENING = re.compile(r"^[^\S\n]*(?:[A-Za-z]\w*\s*=\s*)?\[(?![^\n;\]]*\])", re.MULTILINE)
+# The bracket before the rows of a matrix; text in brackets in one line is a remark or a unit.
+_OPENING = re.compile(r"^[^\S\n]*(?:[A-Za-z]\w*\s*=\s*)?\[(?![^\n;\]]+\])", re.MULTILINE)
 _MISSING = frozenset({"", "-", "--", "nan", "na", "n/a", "null", "none", "#n/a", "inf", "-inf"})
 _TIME_OF_DAY = re.compile(
     r"(?:(\d{4}[-/.]\d\d?[-/.]\d\d?|\d\d?[./-]\d\d?[./-]\d{4})[T ,]+)?"

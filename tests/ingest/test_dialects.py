@@ -61,7 +61,7 @@ DIALECTS = {
     "row of units in brackets, the first a sign": "load;time;voltage;x1\n[%];[ms];[mV];[mm]\n"
     + rows(50 * U, 1e3 * T, 1e3 * U, 10 * X, sep=";"),
     "remarks in brackets": "[2024-05-01 12:00] start\n[note: cart 2 is held]\nt,u,x1\n" + PLAIN,
-    "matrix below an empty one": "% time (s)  u (V)  x1 (cm)\nlog = [];\ndata = [\n"
+    "matrix below a short one": "% time (s)  u (V)  x1 (cm)\ncarts = [1 2];\ndata = [\n"
     + PLAIN + "];\n",
     "row of units": "Time\tVoltage\tPosition\n(ms)\t(mV)\t(mm)\n\n"
     + rows(1e3 * T, 1e3 * U, 10 * X, sep="\t"),
