@@ -153,6 +153,16 @@ def test_a_reversed_channel_is_wrong_and_its_gain_not_only_odd():
     assert found == [("step-3", "misread", "wrong")]
 
 
+@pytest.mark.parametrize(("factor", "wrong"), [(1e3, True), (60.0, False), (2.0, False)])
+def test_a_clock_in_another_unit_is_found_without_carts(factor, wrong):
+    """Samples 1000 times as far apart show milliseconds; other settings of a clock are possible."""
+    first, second, third = steps(*[6.0] * 3)
+    records = [first, replace(second, t=factor * second.t), third]
+    found = find_faults(records, chain=None, fits={})
+    expected = [("step-2", "other_clock", "wrong")] if wrong else []
+    assert [(one.run, one.code, one.excludes) for one in found.values()] == expected
+
+
 @pytest.mark.parametrize(("gain", "wrong"), [(0.5, False), (1.25, False), (1.45, True)])
 def test_no_cart_moves_much_further_than_the_cart_that_pulls_it(gain, wrong):
     """A static gain of cart 2 above 1.3 times that of cart 1 is impossible, friction included."""
