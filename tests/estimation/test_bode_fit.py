@@ -250,6 +250,27 @@ def test_a_table_is_judged_by_its_own_scatter():
     assert abs(gain.value - chain.parameters()["K_1"]) < 4 * gain.std
 
 
+def test_the_errors_of_a_table_grow_with_its_scatter():
+    """If the points of a table scatter twice as far, the standard errors are twice as large."""
+    rng = np.random.default_rng(5)
+    scatter = [(r, rng.standard_normal(r.omega.size)) for r in exact(PRESETS["throne-2dof"])]
+    small, large = (
+        fit_bode(
+            [
+                replace(r, magnitude=r.magnitude * (1 + share * z), source="table")
+                for r, z in scatter
+            ],
+            bench=WALLS[2],
+        ).parameters
+        for share in (0.01, 0.02)
+    )
+    for name in ("K_1", "K_2", "omega_a", "omega_b"):
+        first, second = small[name].std, large[name].std
+        assert first is not None
+        # The derivatives change with the parameters, which move by less than 2 %.
+        assert second == pytest.approx(2 * first, rel=0.05)
+
+
 def test_one_measured_cart_may_be_enough():
     """If the near spring is missing, the response of cart 1 alone determines both carts."""
     got = fit_bode(

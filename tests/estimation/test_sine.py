@@ -157,6 +157,16 @@ def test_an_amplitude_of_few_counts_is_noted():
     assert_allclose(got.amplitude, 10 * COUNT, rtol=0.02)
 
 
+def test_a_phase_in_noise_has_the_error_of_a_random_angle():
+    """If a cart does not follow the input, its phase has at most the error of a random angle."""
+    t, omega = sampled(4.0), 2 * np.pi * 3.0
+    noise = np.random.default_rng(1).standard_normal((1, t.size))
+    run = record_of(t, np.sin(omega * t), noise, kind="sine", omega=omega, count=0.0)
+    got = Dwell(run).fit(cart=1)
+    assert got.amplitude < got.amplitude_std
+    assert_allclose(got.phase_std, np.pi / np.sqrt(3), rtol=1e-12)
+
+
 def test_a_third_harmonic_is_noted():
     """If friction adds a third harmonic, a note gives its size."""
     t, omega = sampled(6.0), 2 * np.pi * 3.0
