@@ -423,3 +423,12 @@ def test_pages_are_whole_wherever_the_data_lie(top):
     for address in ("/student/0/", "/student/1/", "/static/desk.css"):
         assert f'="{address}' in page
     assert f'"{top}"' not in page or top == "/"
+
+
+@pytest.mark.parametrize("role", ["ta", "instructor"])
+def test_a_message_names_places_only_by_their_names(role, tmp_path):
+    """A message for students and TAs holds no path of their folders; an instructor sees it."""
+    user = User(name="x", role=role, gradebooks=[tmp_path / "grades"])
+    shown = user.name_places(f"{tmp_path}/grades/gradebook.sqlite: is a link")
+    assert "grades/gradebook.sqlite" in shown
+    assert (str(tmp_path) in shown) == (role == "instructor")
