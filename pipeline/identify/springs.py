@@ -242,7 +242,7 @@ def _last_by_gains(gains: Sequence[StepGain], *, bench: Setup) -> float | None:
         return None
     low, high = np.median(ratios, axis=0)
     stated = bench.springs[-1]
-    if low <= _NO_SPRING < high or (high <= _NO_SPRING) is not stated:
+    if low <= _NO_SPRING < high or bool(high <= _NO_SPRING) is not stated:
         return None
     if stated and low < -_NO_SPRING:
         return None

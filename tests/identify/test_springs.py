@@ -1,6 +1,7 @@
 """`fill` finds from steps which springs exist, and marks the others as unsure."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +9,14 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.identify.springs import decide_springs, fill_folder
+from pipeline.identify.springs import check_springs, decide_springs, fill_folder
 from pipeline.plant.chain import Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.resources import EXAMPLES
 from pipeline.results import Record
+from pipeline.setup import Setup
 from pipeline.submission import load_submission
+from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.places import REAL_DATA
 
 STEP = 0.00227  # cm, one encoder step
@@ -61,6 +64,27 @@ def test_without_a_step_of_all_carts_both_walls_are_open():
     assert decide_springs([], n=2).open == (1, 3)
     short = step([0.0, SPRING, SPRING], seconds=0.7)
     assert decide_springs([short], n=2).open == (1, 3)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "stated", "code"),  # stiffness of the far spring, relative to the one before it
+    [
+        (0.03, True, "no_spring"),
+        (0.2, True, ""),
+        (0.03, False, ""),
+        (0.2, False, "spring"),
+    ],
+)
+def test_static_gains_show_whether_there_is_a_far_spring(ratio, stated, code):
+    """K_1 / K_2 - 1 is k_3 / k_2, which contradicts a stated spring only if it is almost zero."""
+    one = make_analysis(2).step_gains[0]
+    gains = [
+        replace(one, cart=cart, gain=K, gain_std=1e-3, interval=None)
+        for cart, K in ((1, 1.0 + ratio), (2, 1.0))
+    ]
+    bench = Setup(springs=(True, True, stated))
+    checks = check_springs(None, responses=(), gains=gains, records=(), bench=bench)
+    assert [(check.code, check.parameter) for check in checks] == [(code, "k_3")] * bool(code)
 
 
 def folder_of(data: Path, folder: Path) -> Path:
