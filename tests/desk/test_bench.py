@@ -21,7 +21,7 @@ from pipeline.report.exploration.diary import NAME as DIARY
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import sine, write_work
 from tests.helpers.desks import Visitor, a_recorded_cart, at_desk
-from tests.helpers.waiting import PATIENCE, kill, until
+from tests.helpers.waiting import PATIENCE, address, kill, until
 
 pytestmark = pytest.mark.usefixtures("all_work_here")
 NOBODY = "socket://127.0.0.1:1"
@@ -118,11 +118,9 @@ def test_the_bench_is_stopped_when_the_desk_is_gone(tmp_path, real, name, room, 
     command = [sys.executable, "-m", "pipeline", "desk", str(work), "--no-browser"]
     desk = subprocess.Popen(command, stderr=subprocess.PIPE, encoding="utf-8")
     try:
-        assert desk.stderr is not None
-        url = re.search(r"http://\S+", desk.stderr.readline())
-        assert url is not None
+        url = address(desk)
         (work / DIARY).write_text("of an older exploration", encoding="utf-8")
-        visitor = Visitor.of(url[0])
+        visitor = Visitor.of(url)
         begun(visitor, work, name, room, port=real.address, **fields)
         # The diary of an older exploration stays hidden until this one has written its own.
         shown = re.findall(r'aria-labelledby="diary-title"(.*)>', visitor.get("/bench/0/").text)

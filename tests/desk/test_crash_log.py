@@ -14,7 +14,7 @@ import pytest
 from pipeline.desk.app import DeskServer
 from pipeline.desk.scratch import clear_scratch, scratch_folder
 from tests.helpers.desks import Visitor
-from tests.helpers.waiting import PATIENCE, started
+from tests.helpers.waiting import PATIENCE, address, started
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no such signals")
 
@@ -53,14 +53,14 @@ def a_desk(tmp_path: Path, *options: str) -> Iterator[tuple[subprocess.Popen, st
     command = [sys.executable, "-c", DESK, *options]
     pipes = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE, "encoding": "utf-8"}
     with started(command, env=environment, **pipes) as desk:
-        assert desk.stderr is not None
-        url = desk.stderr.readline().split()[-1]
+        url = address(desk)
 
         def ended() -> tuple[int, str, str]:
             assert desk.stderr is not None
+            status = desk.wait(PATIENCE)
             said = desk.stderr.read()  # ends when the watching process has ended too
             kept = log.read_text(encoding="utf-8") if log.exists() else ""
-            return desk.wait(PATIENCE), said, kept
+            return status, said, kept
 
         yield desk, url, ended
 

@@ -1,5 +1,6 @@
 """Wait for events on a machine of any load; the deadline only ends a hang."""
 
+import re
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -36,6 +37,16 @@ def started(command: Sequence[object], **options: Any) -> Iterator[subprocess.Po
             yield process
         finally:
             kill(process)
+
+
+def address(program: subprocess.Popen[str]) -> str:
+    """Return the address that a program prints on stderr when it is ready.
+
+    On a busy machine, lines of progress come first.
+    """
+    assert program.stderr is not None
+    found = (re.search(r"http://\S+", line) for line in program.stderr)
+    return next(one[0] for one in found if one)
 
 
 def kill(process: subprocess.Popen[Any]) -> None:

@@ -28,7 +28,7 @@ from pipeline.submission import load_submission
 from pipeline.submission.edit import edit_submission
 from tests.helpers.desks import Visitor, a_submission, some_files
 from tests.helpers.grades import make_grade, make_outcome, two_cart_rubric, write_class
-from tests.helpers.waiting import PATIENCE, started, until
+from tests.helpers.waiting import PATIENCE, address, started, until
 
 _RECORD = some_files(most=1)[0][1]
 
@@ -183,8 +183,7 @@ def _act_until_killed(work: _Save, desk: subprocess.Popen, *, after: float) -> N
 
     The processes that the desk started must end too.
     """
-    assert desk.stderr is not None
-    who, started_by_it = Visitor.of(desk.stderr.readline().split()[1]), []
+    who, started_by_it = Visitor.of(address(desk)), []
     assert who.get(work.page).status == 200  # the processes that the page needs are running
 
     def end() -> None:

@@ -3,7 +3,6 @@
 import http.client
 import json
 import logging
-import re
 import socket
 import subprocess
 import sys
@@ -26,7 +25,7 @@ from pipeline.protocol import HEARTBEAT_EVERY, Reading
 from tests.helpers.accessibility import violations
 from tests.helpers.acquisitions import decay, sine, write_work
 from tests.helpers.benches import emulator
-from tests.helpers.waiting import PATIENCE, started, until
+from tests.helpers.waiting import PATIENCE, address, started, until
 from tests.system.test_report_pages import PHONE, WIDE
 
 DUTY, COUNT, TITLE = 1e-4, 0.002, "Bench <9> & co"  # V, cm
@@ -498,18 +497,16 @@ def test_a_session_is_watched_and_confirmed_in_the_browser(tmp_path, browser):
     with emulator("--stock", "--speed", "5") as bench:
         command += ["--port", bench.address, "--only", "dwell"]
         with started(command, stderr=subprocess.PIPE, encoding="utf-8") as host:
-            assert host.stderr is not None
-            url = re.search(r"http://\S+", host.stderr.readline())
-            assert url is not None
+            url = address(host)
             window = context.new_page()
-            window.goto(url[0])
+            window.goto(url)
             expect(window.get_by_role("alert")).to_have_text("All carts free")
             window.get_by_role("button", name="Done").click()
             expect(window.locator("#status")).to_have_text("The session is over.")
             expect(window.locator("#plan .done b")).to_have_text("dwell")
-            host.stderr.read()
+            host.wait(PATIENCE)
     assert host.returncode == 0
-    secret = urlsplit(url[0]).path.strip("/").encode()
+    secret = urlsplit(url).path.strip("/").encode()
     files = [path.read_bytes() for path in work.rglob("*") if path.is_file()]
     assert len(files) >= 4
     assert not any(secret in file for file in files)
