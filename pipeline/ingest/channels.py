@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.arrays import Array
+from pipeline.ingest.table import Note
 
 _MOST_LEVELS = 20_000  # an encoder on a lab cart has a few thousand counts over its travel
 
@@ -155,12 +156,13 @@ def line_frequency(t: Array, u: Array) -> float | None:
     return centre / float(t[-1] - t[0]) * (t.size - 1) / t.size
 
 
-def never_changes(name: str) -> str:
+def never_changes(name: str) -> Note:
     """Return the sentence for a position that stays constant while another signal changes."""
-    return f"{name!r} never changes: a held cart, or an encoder that is stuck"
+    said = f"{name!r} never changes: a held cart, or an encoder that is stuck"
+    return Note(said, "never_changes", about=name)
 
 
-def channel_problems(t: Array, u: Array | None, positions: dict[str, Array]) -> list[str]:
+def channel_problems(t: Array, u: Array | None, positions: dict[str, Array]) -> list[Note]:
     """Return the faults of the input and of the positions in words.
 
     The positions are given by heading.
@@ -171,11 +173,16 @@ def channel_problems(t: Array, u: Array | None, positions: dict[str, Array]) -> 
         if np.ptp(x) == 0.0 and (moving or (u is not None and np.ptp(u) > 0)):
             problems.append(never_changes(name))
         problems += [
-            f"{name!r} stands still while the cart moves fast, from {t[first]:.4g} s to "
-            f"{t[last]:.4g} s: "
-            "the encoder was stuck"
+            Note(
+                f"{name!r} stands still while the cart moves fast, from {t[first]:.4g} s to "
+                f"{t[last]:.4g} s: the encoder was stuck",
+                "stuck",
+                about=name,
+                at=(first, last),
+            )
             for first, last in stuck_spans(x)[:3]
         ]
     if u is not None and (limit := saturation(u)) is not None:
-        problems.append(f"the input is clipped at {limit:g}")
+        at = np.flatnonzero(np.abs(u) == limit)
+        problems.append(Note(f"the input is clipped at {limit:g}", "clipped", at=at))
     return problems

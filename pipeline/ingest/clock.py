@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.columns import Column, conversion
-from pipeline.ingest.table import FileTable
+from pipeline.ingest.table import FileTable, Note
 
 SLOW = 0.5  # s between samples; no bench records more slowly
 FEWEST_SAMPLES = 8  # fewest samples for any estimate
@@ -103,7 +103,7 @@ def time_stamps(table: FileTable, column: Column | None, *, sample_rate: float |
 
 def clock_notes(
     table: FileTable, column: Column, clock: Clock, *, sample_rate: float | None
-) -> list[str]:
+) -> list[Note]:
     """Return notes on the clock that wrote a time column.
 
     Raises
@@ -117,27 +117,34 @@ def clock_notes(
         raise SubmissionError(
             f"{table.source} {table.place(i)}: time {what}, from {before:g} s to {after:g} s{hint}"
         )
-    notes, interval, gaps = [], clock.mean_interval, clock.gaps
+    notes, interval, gaps = list[Note](), clock.mean_interval, clock.gaps
     if interval > SLOW:
-        notes.append(f"samples are {interval:.4g} s apart: is {column.name!r} in other units?")
+        said = f"samples are {interval:.4g} s apart: is {column.name!r} in other units?"
+        notes.append(Note(said, "slow", about=column.name))
     if clock.pieces:
         even = "" if clock.pieces == 1 else f", in {clock.pieces} pieces"
-        notes.append(
+        said = (
             f"time stamps rounded to {clock.rounding:g} s were replaced by even ones: "
             f"one sample every {1e3 * (clock.period or interval):.6g} ms{even}"
         )
+        notes.append(Note(said, "rounded", about=column.name))
     notes += [
-        f"there is a gap in time between {clock.t[i - 1]:.4g} s and {clock.t[i]:.4g} s"
+        Note(
+            f"there is a gap in time between {clock.t[i - 1]:.4g} s and {clock.t[i]:.4g} s",
+            "gap",
+            at=[i],
+        )
         for i in gaps[:3]
     ]
     if len(gaps) > 3:
-        notes.append(f"and {len(gaps) - 3} more gaps in time")
+        notes.append(Note(f"and {len(gaps) - 3} more gaps in time", "gap", at=gaps[3:]))
     # A stated rate may differ by 1 % from the time column.
     if sample_rate is not None and abs(sample_rate * interval - 1) > 0.01:
-        notes.append(
+        said = (
             f"sample_rate = {sample_rate:g} Hz is not used: the time column says "
             f"{1 / interval:.5g} Hz"
         )
+        notes.append(Note(said, "rate_unused", about=column.name))
     return notes
 
 

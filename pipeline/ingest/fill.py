@@ -28,7 +28,7 @@ from pipeline.ingest.files import (
     refused,
 )
 from pipeline.ingest.inspect import NO_CLOCK, Inspection, align_rows, inspect_runs
-from pipeline.ingest.table import FEW_NAMED
+from pipeline.ingest.table import FEW_NAMED, Note
 from pipeline.results import ExperimentKind
 from pipeline.submission.edit import (
     append_experiment,
@@ -284,7 +284,11 @@ class _Filling:
         append_experiment(self._document, entry, remarks=[UNSURE + one for one in unsure])
         carts = found.carts or range(1, n + 1)
         held = [
-            f"{column.name!r} never changes, so cart {cart} is written as held"
+            Note(
+                f"{column.name!r} never changes, so cart {cart} is written as held",
+                "written_as_held",
+                about=column.name,
+            )
             for cart, column in inspection.positions.items()
             if cart <= n and cart not in carts and column.low == column.high
         ]

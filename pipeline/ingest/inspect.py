@@ -32,7 +32,7 @@ from pipeline.ingest.columns import (
     refuse_unknown_unit,
 )
 from pipeline.ingest.files import choose_run, read_tables
-from pipeline.ingest.table import FileTable, Variable
+from pipeline.ingest.table import FileTable, Note, Variable
 from pipeline.ingest.unnamed import Roles, find_roles
 from pipeline.results import ExperimentKind
 from pipeline.words.numbers import count, first_few, group_messages
@@ -42,7 +42,7 @@ _NOT_INPUT = re.compile(
     r"^v ?\d?$|^w$|vel|speed|omega|acc|geschw|temp|^y\d?$|^z\d?$|angle|theta|phi|pos|^x|^a ?\d?$|"
     r"time|frame|index|count|enc|remark|comment|note|status"
 )
-NO_CLOCK = "no time column: state `sample_rate`"
+NO_CLOCK = Note("no time column: state `sample_rate`", "no_clock")
 _MOST_COLUMNS = 16  # most columns listed in a sentence
 _COPIED = 0.999  # correlation above which a reference is the input itself
 
@@ -205,7 +205,9 @@ def _inspect(table: FileTable, path: Path, *, columns: Mapping[str, str | int]) 
         assigned, _ = assign_columns(table, explicit=roles.columns, free=(1,))
         problems.append(_name_them(roles))
     elif unused and not unnamed:
-        problems.append(f"not used: {', '.join(unused)}; name them in `columns` to use them")
+        names = ", ".join(unused)
+        said = f"not used: {names}; name them in `columns` to use them"
+        problems.append(Note(said, "unused", about=names))
     # If the columns have no names, the other problems follow from this.
     further = [] if bare and not roles.columns else problems
     clock = None
@@ -219,10 +221,11 @@ def _inspect(table: FileTable, path: Path, *, columns: Mapping[str, str | int]) 
     inputs = _possible_inputs(table, unused) if "input" not in assigned else []
     if kind == "decay" and inputs:  # without the input, a step looks like a decay
         kind = None
-        problems.append(
-            f"is {first_few(inputs, 4)} the input? Say so in columns = {{ input = … }}, or state "
-            'kind = "decay"'
+        said = (
+            f"is {first_few([*map(repr, inputs)], 4)} the input? Say so in columns = {{ input = … "
+            '}, or state kind = "decay"'
         )
+        problems.append(Note(said, "perhaps_input", about=inputs[0]))
     problems += table.notes
     needs = {
         "columns": bare or not any(role[0] == "x" for role in assigned),
@@ -261,7 +264,7 @@ def _possible_inputs(table: FileTable, unused: Sequence[str]) -> list[str]:
         is_other = heading.unit is not None and conversion(heading.unit, "V") is None
         is_speed = _NOT_INPUT.search(plain_name(name)) or re.fullmatch(r"\d+", name)
         if np.ptp(values) > 0 and not is_speed and not (is_other and heading.unit not in ("%",)):
-            names.append(repr(name))
+            names.append(name)
     return names
 
 
@@ -294,19 +297,20 @@ def unread_entry(file: Path, state: str, problem: str, *, advice: str = "") -> d
     return {"state": state, **nothing, **lists, "samples": 0, "guessed": {}, **entry}
 
 
-def _name_them(roles: Roles) -> str:
+def _name_them(roles: Roles) -> Note:
     """Return advice on naming columns without headings, with the roles that signals suggest."""
     text = "the columns have no names: state their roles in submission.toml"
     line = ", ".join(f"{role} = {number}" for role, number in roles.columns.items())
-    if line and not roles.doubts:
-        return f"the columns have no names; their signals suggest columns = {{ {line} }}"
-    if line:
-        return f"{text}, perhaps columns = {{ {line} }}: {'; '.join(roles.doubts)}"
-    return (
+    said = (
         f"{text}, by their numbers from 1: columns = {{ time = …, input = …, x1 = … }}; none looks "
         "like time: if there is none, state sample_rate = … (Hz) instead"
         + "".join(f"; {doubt}" for doubt in roles.doubts)
     )
+    if line:
+        said = f"{text}, perhaps columns = {{ {line} }}: {'; '.join(roles.doubts)}"
+    if line and not roles.doubts:
+        said = f"the columns have no names; their signals suggest columns = {{ {line} }}"
+    return Note(said, "no_names")
 
 
 def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str]) -> Clock | None:
@@ -327,10 +331,11 @@ def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str])
     problems += clock_notes(table, column, clock, sample_rate=None)
     # Jitter above 1 % of the interval (rms) is worth mentioning.
     if not clock.pieces and clock.jitter > 0.01 * clock.mean_interval:
-        problems.append(
+        said = (
             f"the sample interval varies by {clock.jitter / clock.mean_interval:.1%} (rms); "
             "times are used as they are"
         )
+        problems.append(Note(said, "uneven", about=column.name))
     return clock
 
 
@@ -343,7 +348,8 @@ def _guess(
     signals = {role: table.values[column.index] for role, column in columns.items()}
     positions = {c.name: signals[role] for role, c in columns.items() if role[0] == "x"}
     if not positions:
-        problems.append("no column is a cart's position: name them in `columns`")
+        said = "no column is a cart's position: name them in `columns`"
+        problems.append(Note(said, "no_position"))
         return None, None
     u, reference = signals.get("input"), signals.get("reference")
     t = clock.t if clock else np.arange(table.values.shape[1], dtype=np.float64)
@@ -360,10 +366,11 @@ def _guess(
             or np.ptp(reference) == 0.0
         ):
             return "decay", None
-        problems.append(
+        said = (
             f"the input never changes, yet {columns['reference'].name!r} does: was it saved as "
             "an unsigned integer, which cannot be negative?"
         )
+        problems.append(Note(said, "unsigned", about=columns["input"].name))
         return "step", None
     if reference is not None and np.any(reference != 0) and not _follows(u, reference):
         return "closed_loop", None

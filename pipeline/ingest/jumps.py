@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline.arrays import Array
 from pipeline.ingest.channels import encoder_step, find_edges, stuck_spans
 from pipeline.ingest.columns import unit_symbol
-from pipeline.ingest.table import FEW_NAMED
+from pipeline.ingest.table import FEW_NAMED, Note
 from pipeline.words.numbers import first_few
 
 _SIDE = 8  # samples on each side of a step
@@ -39,8 +39,10 @@ def repair_positions(
     unit: str,
     scales: Mapping[str, float],
     wanted: Mapping[str, bool],
-) -> tuple[dict[str, Array], _Mask, list[str]]:
-    """Return the positions by heading, which samples remain, and notes.
+) -> tuple[dict[str, Array], _Mask, list[Note]]:
+    """Return the positions by heading, which samples remain, and a note on each repair.
+
+    The code of a note is the key of its repair in `submission.toml`.
 
     Parameters
     ----------
@@ -58,7 +60,8 @@ def repair_positions(
         keep &= kept
         for key, at, message in said:
             where = first_few([f"{t[i]:.4g} s" for i in at], FEW_NAMED)
-            notes.append(f"{name!r}: {message} ({where}); to undo: repair = {{ {key} = false }}")
+            told = f"{name!r}: {message} ({where}); to undo: repair = {{ {key} = false }}"
+            notes.append(Note(told, key, about=name, at=at))
     return done, keep, notes
 
 

@@ -24,7 +24,7 @@ from pipeline.ingest.columns import (
 from pipeline.ingest.files import choose_run, read_tables
 from pipeline.ingest.jumps import repair_positions
 from pipeline.ingest.sign import Signs, with_signs
-from pipeline.ingest.table import FileTable, refuse_extreme
+from pipeline.ingest.table import FileTable, Note, refuse_extreme
 from pipeline.results import FrequencyResponse, HeadingUnit, Record
 from pipeline.submission import Experiment, Submission, System
 
@@ -85,10 +85,11 @@ def read_data(submission: Submission) -> Ingested:
                 )
             table = choose_run(tables[experiment.file][0], experiment.run)
             if experiment.kind == "bode" and len(experiment.carts) < system.carts:
-                warnings.append(
+                said = (
                     f"{experiment.id}: not used: a bode table needs all carts free, here only "
                     f"{list(experiment.carts)} are"
                 )
+                warnings.append(Note(said, "held", about=experiment.id))
                 continue
             if table.cut_short:
                 raise SubmissionError(f"{table.source} {table.cut_short}")
@@ -108,13 +109,18 @@ def read_data(submission: Submission) -> Ingested:
     per_count = system.input.per_count
     driven = [record for record in records if record.u is not None and np.any(record.u)]
     if per_count is not None and driven and all(r.input_scale != per_count for r in driven):
-        warnings.append(
+        said = (
             f"system.input.per_count = {per_count:g} is not used: no input holds counts (whole "
             f"numbers beyond ±{_FEW_COUNTS:g}); every input is read in {system.input.unit}"
         )
+        warnings.append(Note(said, "per_count_unused"))
     first: dict[str, str] = {}
     warnings += [
-        f"{name} is a copy of {original}; a repeat must be recorded separately"
+        Note(
+            f"{name} is a copy of {original}; a repeat must be recorded separately",
+            "copy",
+            about=name,
+        )
         for name, (_, digest) in tables.items()
         if (original := first.setdefault(digest, name)) != name
     ]
@@ -195,7 +201,8 @@ def _open(table: FileTable, experiment: Experiment, system: System) -> _Opened:
         )
     notes, extra = list(table.notes), [c.name for c in measured.values() if c not in positions]
     if unused or extra:
-        notes.append(f"columns not used: {', '.join([*unused, *extra])}")
+        names = ", ".join([*unused, *extra])
+        notes.append(Note(f"columns not used: {names}", "unused", about=names))
     return _Opened(
         system=system,
         table=table,
@@ -312,7 +319,8 @@ def _unit_scale(
             HeadingUnit(role=role, heading=column.name, unit=column.unit, converts=converts)
         )
     if factor not in (None, 1.0):
-        opened.notes.append(f"{column.name!r} was converted from {column.unit} to {unit}")
+        said = f"{column.name!r} was converted from {column.unit} to {unit}"
+        opened.notes.append(Note(said, "converted", about=column.name))
     return 1.0 if factor is None else factor
 
 
@@ -343,7 +351,8 @@ def _input(opened: _Opened) -> tuple[Array | None, float]:
     elif in_counts:
         scale = per_count or DUTY_COUNT
         if per_count is None:
-            opened.notes.append(f"{column.name!r} is taken as duty counts of 5/4096 {stated.unit}")
+            said = f"{column.name!r} is taken as duty counts of 5/4096 {stated.unit}"
+            opened.notes.append(Note(said, "duty", about=column.name))
     else:
         scale = _unit_scale(opened, column, stated.unit, "input")
     return values * scale, scale
@@ -360,6 +369,7 @@ def _reference(opened: _Opened, keep: NDArray[np.intp]) -> Array | None:
         return None
     values, first = table.values[column.index], columns.get("x1")
     if first and holds_counts(table, column) and mirrors(values, table.values[first.index]):
-        opened.notes.append(f"{column.name!r} only copies {first.name!r}, so it is not a reference")
+        said = f"{column.name!r} only copies {first.name!r}, so it is not a reference"
+        opened.notes.append(Note(said, "copied", about=column.name))
         return None
     return values[keep] * _position_scale(opened, column)

@@ -27,6 +27,30 @@ _SMALLEST_MEASURED, _LARGEST_MEASURED = 1e-12, 1e12
 UnitFrom = Literal["heading", "count", "unknown"]
 
 
+class Note(str):
+    """A sentence about a file, with the facts that it states.
+
+    Attributes
+    ----------
+    code : what it says, such as "gap".
+    about : the column concerned; "" for the whole file.
+    at : the samples concerned, from 0, or for a text their lines in the file.
+    """
+
+    code: str
+    about: str
+    at: tuple[int, ...]
+
+    def __new__(cls, text: str, code: str, *, about: str = "", at: Iterable[int] = ()) -> "Note":
+        """Make a note; see the class."""
+        note = super().__new__(cls, text)
+        note.code, note.about, note.at = code, about, tuple(map(int, at))
+        return note
+
+    def __getnewargs__(self) -> tuple[str, str]:  # for copies
+        return str(self), self.code
+
+
 @dataclass(frozen=True, kw_only=True)
 class Format:
     """What the format of a file says about its numbers.

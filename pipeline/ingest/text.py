@@ -22,6 +22,7 @@ from pipeline.ingest.table import (
     FEW_NAMED,
     FileTable,
     Format,
+    Note,
     checked_names,
     refuse_unusable,
 )
@@ -346,7 +347,8 @@ def _find_blocks(
             where = first_few([str(number) for number, _ in head[below:]], FEW_NAMED)
             what = head[below][1].strip()[:30]
             rows_are = "1 row was" if below == len(head) - 1 else f"{len(head) - below} rows were"
-            said = (f"{rows_are} skipped, {line} {where}: expected numbers, found {what!r}",)
+            text = f"{rows_are} skipped, {line} {where}: expected numbers, found {what!r}"
+            said = (Note(text, "skipped", at=(number for number, _ in head[below:])),)
             head = head[:below]
         yield Block(
             head=head, rows=lines[first:end], layout=layout, source=source, line=line,
@@ -481,8 +483,9 @@ def _mend(
         end -= 1  # text below the table
     comments = {i for i, row in enumerate(rows) if i >= end or row.lstrip()[:1] in ("#", "%")}
     if comments:
-        where = first_few([str(lines[i]) for i in sorted(comments)], FEW_NAMED)
-        notes.append(f"not read: text in {block.line} {where}")
+        at = [lines[i] for i in sorted(comments)]
+        where = first_few([*map(str, at)], FEW_NAMED)
+        notes.append(Note(f"not read: text in {block.line} {where}", "text", at=at))
     table = np.full((len(rows), width), np.nan)
     texts, times = np.zeros((2, len(rows), width), dtype=np.bool_)
     faults: dict[int, str] = {}
@@ -541,7 +544,8 @@ def _mend(
     if faults.get(last, "").startswith("expected") and fits:
         what = faults.pop(last)
         if cut is None:
-            notes.append(f"the last row, {block.line} {lines[last]}, is cut off: {what}")
+            said = f"the last row, {block.line} {lines[last]}, is cut off: {what}"
+            notes.append(Note(said, "cut_row", at=[lines[last]]))
     if faults:
         first, *_ = bad_rows = sorted(faults)
         where, others = (
@@ -551,7 +555,8 @@ def _mend(
             more = f" (and {len(faults) - 1} more: {others})" if others else ""
             raise SubmissionError(f"{block.place(lines[first])}: {faults[first]}{more}")
         rows_are = "1 row was" if len(faults) == 1 else f"{len(faults)} rows were"
-        notes.append(f"{rows_are} skipped, {block.line} {where}: {faults[first]}")
+        said = f"{rows_are} skipped, {block.line} {where}: {faults[first]}"
+        notes.append(Note(said, "skipped", at=[lines[i] for i in bad_rows]))
     fitting = replace(
         block, rows=[block.rows[i] for i in fits], notes=(*block.notes, *notes), values=None
     )

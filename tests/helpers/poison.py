@@ -6,11 +6,18 @@ All randomness comes from a `random.Random`, so a seed always gives the same cas
 import io
 import json
 import re
+import time
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from random import Random
 from typing import Any
+
+from pipeline.errors import PipelineError
+
+# A damaged file may take no longer than this, even on a busy machine. A good one takes 2 ms.
+MOST_TIME = 10.0  # s of processor time
 
 Files = Mapping[str, bytes]
 
@@ -25,11 +32,14 @@ _SCALES = (1e-300, 1e-40, 1e-13, 1e-11, 1e11, 1e13, 1e40, 1e300)
 _OTHER = ("true", "[]", "{}", "[[]]", "[1, 2, 3]", "2024-01-01", "''", "[" * 500, "{a = 1}")
 
 
-def damaged(raw: bytes, rng: Random, *, hits: int = 3) -> bytes:
-    """Cut, flip, insert, remove or repeat bytes of a file up to this many times."""
+def damaged(raw: bytes, rng: Random, *, hits: int = 3, more: Sequence[bytes] = ()) -> bytes:
+    """Cut, flip, insert, remove or repeat bytes of a file up to this many times.
+
+    `more` are further bytes to insert.
+    """
     for _ in range(rng.randint(1, hits)):
         at, n = rng.randrange(len(raw) + 1), rng.randint(1, 60)
-        junk = rng.choice([*map(str.encode, (*_MARKS, *_NUMBERS[:20])), rng.randbytes(n)])
+        junk = rng.choice([*map(str.encode, (*_MARKS, *_NUMBERS[:20])), *more, rng.randbytes(n)])
         raw = rng.choice([
             raw[:at],
             raw[:at] + junk + raw[at:],
@@ -162,3 +172,18 @@ def zipped(files: Files, rng: Random) -> bytes:
             )
     raw = buffer.getvalue()
     return damaged(raw, rng) if rng.random() < 0.5 else raw
+
+
+@contextmanager
+def few_lines_at_most(most: int = 1) -> Iterator[None]:
+    """Accept an error of few lines, and fail on any other exception."""
+    message = ""
+    began = time.process_time()
+    try:
+        yield
+    except PipelineError as error:
+        message = str(error)
+    lines = message.splitlines()
+    assert len(lines) <= most
+    assert all(len(line) < 1_000 for line in lines)
+    assert time.process_time() - began < MOST_TIME

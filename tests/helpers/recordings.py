@@ -1,12 +1,14 @@
 """Write one recording as other programs save it: Excel, LabVIEW, National Instruments."""
 
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from io import BytesIO
 
 import numpy as np
 import openpyxl
 from nptdms import ChannelObject, TdmsWriter
+
+from pipeline.ingest.table import Note
 
 _SPREADSHEET = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
 _OFFICE = "http://schemas.openxmlformats.org/officeDocument/2006/relationships"
@@ -26,6 +28,11 @@ _SHARED = (
     '<Override PartName="/xl/texts.xml" ContentType="application/vnd.openxmlformats-'
     'officedocument.spreadsheetml.sharedStrings+xml"/>'
 )
+
+
+def facts(notes: Iterable[str]) -> dict[str, Note]:
+    """Return the notes that state a fact, by its code."""
+    return {note.code: note for note in notes if isinstance(note, Note)}
 
 
 def xlsx(columns: Mapping[str, np.ndarray]) -> bytes:

@@ -7,6 +7,7 @@ import sys
 import time
 import zlib
 from io import BytesIO
+from itertools import product
 
 import h5py
 import numpy as np
@@ -31,16 +32,11 @@ def in_matlab(fill) -> bytes:
     return b"MATLAB 7.3".ljust(512, b"\0") + buffer.getvalue()[512:]
 
 
-def a_signal(file: h5py.File, name: str, values: np.ndarray, **options: object) -> h5py.Dataset:
-    """Add a vector to a `.mat` file, as MATLAB writes it."""
-    signal = file.create_dataset(name, data=values[None, :], **options)
-    signal.attrs["MATLAB_class"] = np.bytes_("double")
-    return signal
-
-
 def inflating(file: h5py.File) -> None:
     """Write one chunk that unpacks to 4 GB."""
-    signal = a_signal(file, "x1", np.zeros(100_000), chunks=(1, 100_000), compression="gzip")
+    zeros = np.zeros((1, 100_000))
+    signal = file.create_dataset("x1", data=zeros, chunks=zeros.shape, compression="gzip")
+    signal.attrs["MATLAB_class"] = np.bytes_("double")
     packer = zlib.compressobj(9)
     first, again = (
         packer.compress(bytes(1 << 20)) + packer.flush(zlib.Z_FULL_FLUSH) for _ in range(2)
@@ -82,27 +78,6 @@ def test_a_bomb_costs_its_recording(fill, apart, tmp_path):
     assert time.process_time() - begin < 20  # s; it takes 2. The names alone took 400
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"compression": "gzip"},
-        {"compression": "gzip", "shuffle": True, "fletcher32": True},
-        {"compression": "lzf"},
-        {},
-    ],
-)
-def test_honest_chunks_are_read(options):
-    """Signals in chunks are read, however they are compressed."""
-    values = np.random.default_rng(1).normal(size=(2, 12_345))
-    chunks = {"chunks": (1, 1000)} if options else {}
-
-    def fill(file: h5py.File) -> None:
-        for name, signal in zip(("t", "x1"), values, strict=True):
-            a_signal(file, name, signal, **options, **chunks)
-
-    assert np.array_equal(parse_table(in_matlab(fill), source="a.mat").values, values)
-
-
 def test_the_time_to_read_one_file_is_limited(tmp_path, monkeypatch):
     """A file that takes too long is refused by itself, and the next one is read."""
     (tmp_path / "long.csv").write_text("time,x1\n" + "0.001,12\n" * 400_000, encoding="utf-8")
@@ -110,7 +85,7 @@ def test_the_time_to_read_one_file_is_limited(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "MOST_SECONDS", 0.02)  # s; the long file takes ten times that
     gc.disable()  # an exception in one of its callbacks would be dropped, and be raised a second on
     try:
-        with pytest.raises(SubmissionError, match=r"long\.csv: .* 0\.02 s"):
+        with pytest.raises(SubmissionError, match=r"^long\.csv:.*\b0\.02\b"):
             read_table(tmp_path, "long.csv")
     finally:
         gc.enable()
@@ -125,7 +100,7 @@ def test_the_memory_to_read_one_file_is_limited(tmp_path, monkeypatch):
     (tmp_path / "long.csv").write_text("time,x1\n" + "0.001,12\n" * 1_000_000, encoding="utf-8")
     (tmp_path / "short.csv").write_text("time,x1\n0,1\n1,2\n", encoding="utf-8")
     monkeypatch.setattr(files, "MOST_MEMORY", 10_000_000)
-    with pytest.raises(SubmissionError, match=r"long\.csv: .* 0\.01 GB"):
+    with pytest.raises(SubmissionError, match=r"^long\.csv:.*\b0\.01\b"):
         read_table(tmp_path, "long.csv")
     assert read_table(tmp_path, "short.csv")[0].values.shape == (2, 2)
     with limited_memory(5_000_000), pytest.raises(MemoryError):  # the limit of a whole submission
@@ -139,7 +114,7 @@ def test_a_workbook_that_inflates_is_refused_by_itself(tmp_path, monkeypatch):
     """A workbook that unpacks to much more than its size needs too much memory, whoever sent it."""
     (tmp_path / "a.xlsx").write_bytes(package("<worksheet>" + " " * 50_000_000 + "</worksheet>"))
     monkeypatch.setattr(files, "MOST_MEMORY", 20_000_000)
-    with pytest.raises(SubmissionError, match=r"a\.xlsx: .* 0\.02 GB"):
+    with pytest.raises(SubmissionError, match=r"^a\.xlsx:.*\b0\.02\b"):
         read_table(tmp_path, "a.xlsx")
 
 
@@ -155,18 +130,16 @@ PATTERNS = {
 LONG = 50_000  # characters; a pattern that takes time with their square needs minutes
 
 
-@pytest.mark.parametrize("unit", [",", " ", "[", "(", "x", "1", "\n", "a=", "[ ", "t", "] #", ";"])
 @pytest.mark.parametrize("name", PATTERNS)
-def test_patterns_take_time_in_proportion_to_the_text(name, unit):
+def test_patterns_take_time_in_proportion_to_the_text(name):
     """No pattern that reads a student's text takes much longer for long repetitions."""
-    pattern, begin = PATTERNS[name], time.process_time()
-    searched = name.endswith(("HEADING", "OPENING", "_UNIT", "_FORMULA"))
-    find = pattern.search if searched else pattern.match
-    for start in ("", "x", "[", "a = "):
-        for end in ("", "!"):
-            long = start + unit * (LONG // len(unit)) + end
-            find(long.encode() if isinstance(pattern.pattern, bytes) else long)
-    assert time.process_time() - begin < 5  # s; each takes a few ms
+    pattern = PATTERNS[name]
+    find = pattern.search if name.endswith("OPENING") else pattern.match
+    for unit in (",", " ", "[", "(", "x", "1", "\n", "a=", "[ ", "t", "] #", ";"):
+        begin = time.process_time()
+        for start, end in product(("", "x", "[", "a = "), ("", "!")):
+            find(start + unit * (LONG // len(unit)) + end)
+        assert time.process_time() - begin < 5, unit  # s; each takes a few ms
 
 
 def test_a_line_of_commas_is_refused_at_once():
@@ -187,4 +160,5 @@ def test_a_key_of_many_parts_is_refused_at_once(part, between):
     with pytest.raises(toml.TomlSlip, match="deeply"):
         toml.read_toml(text)
     assert time.process_time() - begin < 5  # s; it takes 0.1, parsing takes minutes
-    assert not toml.find_deep_key('a.b.c = "1.2.3.4' + ".5" * 100 + '"\n')
+    value = f'"1{".5" * 100}"'
+    assert not toml.find_deep_key(f"a.b.c = {value}\n")

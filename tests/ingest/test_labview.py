@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from nptdms import ChannelObject
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.files import parse_table
@@ -76,6 +76,12 @@ def test_every_dialect_of_lvm_gives_the_same_numbers(content):
     assert got.cut is None
 
 
+def test_the_first_time_of_the_header_is_used():
+    """Without an X column, the times begin at the X0 of the header."""
+    got = table(no_times(Delta_X=["1.0E-2", "1.0E-2"], X0=["5.0E-1", "5.0E-1"]))
+    assert_allclose(got.values[0], 0.5 + TIME, rtol=0, atol=1e-12)
+
+
 def test_units_of_the_header_are_joined_to_the_headings():
     """Units in the header, which LabVIEW writes in words, are added to the headings."""
     segment = lvm_segment(COLUMNS, tags={"Y_Unit_Label": ["Volts", "Millimeters"]})
@@ -84,12 +90,16 @@ def test_units_of_the_header_are_joined_to_the_headings():
 
 def test_segments_that_continue_each_other_are_one_recording():
     """Segments that follow each other in time become one recording."""
+    last = {**LATER, "time": TIME + 0.8}
     for text in (
-        GOOD + "\r\n" + lvm_segment(LATER),
-        GOOD + "\r\n" + lvm_segment(LATER).partition("Comment\r\n")[2],
+        "\r\n".join([GOOD, lvm_segment(LATER), lvm_segment(last)]),
+        "\r\n".join(
+            [GOOD, *(lvm_segment(one).partition("Comment\r\n")[2] for one in (LATER, last))]
+        ),
     ):
         got = table(text)
-        assert_allclose(got.values[0], np.r_[TIME, LATER["time"]], rtol=0, atol=1e-12)
+        stamps = np.r_[TIME, LATER["time"], last["time"]]
+        assert_allclose(got.values[0], stamps, rtol=0, atol=1e-12)
         assert got.lines is not None
         assert got.lines[-1] == len(text.splitlines())
 
@@ -196,22 +206,6 @@ GOOD_TDMS = tdms_of(COLUMNS)
 COUNT = struct.pack("<Q", N)
 
 
-def lead_in(flags: int, length: int, data: int) -> bytes:
-    """Return the bytes at the start of a segment."""
-    return b"TDSm" + struct.pack("<IIQQ", flags, 4712, length, data)
-
-
-def objects(*named: tuple[str, int]) -> bytes:
-    """Return the metadata of objects, given each one's path and number of doubles per chunk."""
-    body = struct.pack("<I", len(named))
-    for path, count in named:
-        body += struct.pack("<I", len(path)) + path.encode()
-        body += struct.pack("<IIIQ", 20, 10, 1, count) if count else b"\xff" * 4
-        body += bytes(4)
-    return body
-
-
-TINY = objects(("/'g'/'t'", 1), ("/'g'/'x1'", 1))
 BAD_TDMS = {
     "cut": (GOOD_TDMS[:-1], r"the segment at byte 0 is not whole: the file was cut short"),
     "never closed": (
@@ -240,13 +234,6 @@ def test_a_broken_tdms_is_one_line(raw, said, capfd):
         table(raw)
     assert "\n" not in str(caught.value)
     assert capfd.readouterr() == ("", "")
-
-
-def test_a_tdms_in_tiny_pieces_is_read():
-    """A .tdms file whose channels alternate sample by sample is read."""
-    data = np.arange(200.0).tobytes()
-    raw = lead_in(14, len(TINY) + len(data), len(TINY)) + TINY + data
-    assert_array_equal(table(raw).values, np.arange(200.0).reshape(100, 2).T)
 
 
 def test_other_forms_do_not_load_the_readers():

@@ -6,6 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.ingest.read import read_data
 from pipeline.submission import load_submission
+from tests.helpers.recordings import facts
 
 N = 1200
 T = 0.005 * np.arange(N)
@@ -40,6 +41,7 @@ OFF = "unwrap = false, spikes = false, jumps = false"
 WRAPS = {
     "16 bits": (np.round(wrapped(65536, 64_000, 1000)), "count", 1000.0),
     "12 bits": (np.round(wrapped(4096, 3_000, 500)), "count", 500.0),
+    "20 bits": (np.round(wrapped(2**20, 2**20 - 1_500, 1000)), "count", 1000.0),
     "rad": (wrapped(2 * np.pi, 5.0, 1.0), "rad", 1.0),
     "deg": (wrapped(360.0, 300.0, 60.0), "deg", 60.0),
 }
@@ -51,7 +53,9 @@ def test_a_counter_that_wraps_is_unwrapped(x, unit, scale, tmp_path):
     got = record(tmp_path, x, unit=unit)
     # Counts are rounded, and the file has six decimals.
     assert_allclose(got.y[0] - got.y[0, 0], scale * (X - X[0]), atol=1.1)
-    assert any("unwrap = false" in note for note in got.notes)
+    jumps = np.flatnonzero(np.abs(np.diff(x)) > np.ptp(x) / 2) + 1
+    told = facts(got.notes)["unwrap"]
+    assert (told.about, told.at) == ("x1", tuple(jumps))
     kept = record(tmp_path, x, unit=unit, more=f"repair = {{ {OFF} }}")
     assert_allclose(kept.y[0], x, atol=1e-6)
 
@@ -63,6 +67,7 @@ def test_wrong_readings_are_left_out(value, tmp_path):
     x[SPIKES] = value
     got = record(tmp_path, x)
     right = np.delete(np.arange(N), SPIKES)
+    assert facts(got.notes)["spikes"].at == tuple(SPIKES)
     assert_array_equal(got.t, T[right].round(6))
     assert_allclose(got.y[0], x[right], atol=1e-6)
     kept = record(tmp_path, x, more="repair = { spikes = false, jumps = false }")
@@ -78,7 +83,7 @@ def test_a_new_zero_is_taken_back(i, tmp_path):
     # The cart moves by the mean of the steps beside the jump, which the noise of 0.002 blurs. At
     # sample 116 it moves fastest, by 0.16 a sample.
     assert_allclose(got.y[0], X, atol=0.02)
-    assert any("jumps = false" in note for note in got.notes)
+    assert facts(got.notes)["jumps"].at == (i,)
 
 
 def test_a_jump_with_the_input_is_no_new_zero(tmp_path):
@@ -104,7 +109,7 @@ def test_repeated_readings_are_used_once(n, tmp_path):
     got = record(tmp_path, x)
     assert_array_equal(got.t, T[::n].round(6))
     assert_allclose(got.y[0], X[::n], atol=1e-6)
-    assert not any("stuck" in note for note in got.notes)
+    assert [*facts(got.notes)] == ["repeats"]
 
 
 @pytest.mark.parametrize("x", [X, X + 5.0, np.round(X, 1), np.round(X, 2), 0.01 * X])
@@ -112,4 +117,5 @@ def test_an_honest_position_is_left_alone(x, tmp_path):
     """Noise, a coarse encoder and a fast start are no reason for a repair."""
     got = record(tmp_path, x)
     assert got.t.size == N
+    assert got.notes == ()
     assert_allclose(got.y[0], x, atol=1e-6)

@@ -12,12 +12,12 @@ import openpyxl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.files import parse_table, parse_tables
 from pipeline.ingest.table import FileTable
-from tests.helpers.recordings import package, saved, sheet_xml, xlsx
+from tests.helpers.recordings import facts, package, saved, sheet_xml, xlsx
 
 N = 40
 TIME = np.round(0.01 * np.arange(N), 2)
@@ -131,7 +131,7 @@ def test_unread_rows_and_columns_are_reported():
     got = table(sheet(titled))
     assert got.names == ("time [s]", "input [V]", "x1 [cm]")
     assert len(got.notes) == 1
-    assert "row 60" in got.notes[0]
+    assert facts(got.notes)["text"].at == (60,)
     assert got.place(0) == "row 8"
     (said,) = table(sheet(typed)).notes
     assert "'0,00'" in said
@@ -171,10 +171,17 @@ def test_dates_and_times_of_day_become_seconds():
         for t, _, x in ROWS:
             ws.append([(begin + dt.timedelta(seconds=t)).time(), x])
 
+    def durations(ws) -> None:
+        ws.append(["Time (s)", "x1"])
+        for t, _, x in ROWS:
+            ws.append([dt.timedelta(days=1, seconds=t), x])
+
     got = table(sheet(dates))
     assert got.names[0] == "Time [s]"
     assert_array_equal(got.values[0], TIME)
     assert_array_equal(table(sheet(times)).values[0], 43_200 + TIME)
+    # a day has 11 digits of a double above the microsecond
+    assert_allclose(table(sheet(durations)).values[0], 86_400 + TIME, rtol=0, atol=1e-6)
 
 
 def test_percent_is_read_and_reported():
@@ -189,21 +196,6 @@ def test_percent_is_read_and_reported():
     assert_array_equal(got.values[1], U)
     assert len(got.notes) == 1
     assert "column B" in got.notes[0]
-
-
-@pytest.mark.parametrize(
-    "code",
-    ["General", "0.000", '0.0" s"', "[Red]0.0", r"0.0\ \d", "#,##0.00 [$€-407]", "0.00E+00", "@"],
-)
-def test_a_number_format_is_not_taken_for_a_date(code):
-    """A number format with quoted letters, colours or a currency is not taken for a date."""
-
-    def fill(ws) -> None:
-        plain(ws)
-        for row in range(2, N + 2):
-            ws.cell(row, 3).number_format = code
-
-    assert_array_equal(table(sheet(fill)).values[2], X1)
 
 
 BAD = {
@@ -227,7 +219,7 @@ BAD = {
 @pytest.mark.parametrize(("raw", "row", "what"), BAD.values(), ids=BAD.keys())
 def test_a_cell_that_is_not_a_number_is_named(raw, row, what):
     """A cell that is not a number gives one line of error with sheet, row and column."""
-    with pytest.raises(SubmissionError, match=rf"sheet 'Sheet' row {row}: .*{what}") as caught:
+    with pytest.raises(SubmissionError, match=rf"'Sheet' row {row}:.*{what}") as caught:
         table(raw)
     assert "\n" not in str(caught.value)
 
@@ -254,13 +246,6 @@ HOSTILE = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("xml", HOSTILE.values(), ids=HOSTILE.keys())
-def test_a_hostile_workbook_is_refused(xml):
-    """A sheet that spans everything, grows by its entities or names another file is refused."""
-    with pytest.raises(SubmissionError):
-        table(package(xml))
-
-
 def test_the_stated_size_of_a_sheet_need_not_be_true():
     """A sheet that states a size of sixteen billion cells is read like any other."""
     raw = package(BOOK.replace("<sheetData>", '<dimension ref="A1:XFD1048576"/><sheetData>'))
@@ -273,12 +258,16 @@ REFUSED = {
     "no headings": (sheet(lambda ws: [ws.append(r) for r in ROWS]), "'Sheet'"),
     "nothing": (sheet(lambda ws: None), "'Sheet'"),
     "two tables": (sheet(lambda ws: [plain(ws), plain(ws)]), "several"),
+    **{name: (package(xml), r"f\.xlsx") for name, xml in HOSTILE.items()},
 }
 
 
 @pytest.mark.parametrize(("raw", "what"), REFUSED.values(), ids=REFUSED.keys())
 def test_what_is_no_sheet_with_one_table_is_refused(raw, what):
-    """Another document, a part of a workbook, and no table or two tables are refused."""
+    """Another document, a part of a workbook, and no table or two tables are refused.
+
+    So is a sheet that spans everything, grows by its entities or names another file.
+    """
     with pytest.raises(SubmissionError, match=what):
         table(raw)
 
@@ -298,13 +287,3 @@ def test_any_sheet_is_a_table_or_one_line(rows):
         return
     written = {value for row in rows for value in row if isinstance(value, float)} | {0.5}
     assert set(got.values.ravel().tolist()) <= written
-
-
-def test_openpyxl_reads_the_same_numbers():
-    """Each value of a workbook with long decimals is the double that openpyxl reads."""
-    values = np.random.default_rng(1).normal(size=(3, 200)) * 10.0 ** np.arange(-9, 9, 6)[:, None]
-    raw = xlsx(dict(zip(HEADINGS, values, strict=True)))
-    book = openpyxl.load_workbook(BytesIO(raw))
-    assert book.active is not None
-    _, *rows = book.active.iter_rows(values_only=True)
-    assert_array_equal(table(raw).values.T, np.array(rows, dtype=np.float64))

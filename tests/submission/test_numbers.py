@@ -4,9 +4,10 @@ import re
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
+from random import Random
 
 import pytest
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pipeline.desk.student.folder_tasks import read_document
@@ -22,7 +23,8 @@ from pipeline.resources import EXAMPLES, RUBRICS
 from pipeline.submission import load_submission
 from pipeline.submission.edit import edit_submission
 from pipeline.submission.load import NAME, parse_submission
-from pipeline.submission.toml import parse_toml
+from pipeline.submission.toml import MOST_LISTED, parse_toml
+from tests.helpers.poison import damaged, few_lines_at_most, poisoned_toml
 
 EXAMPLE = EXAMPLES / "two-cart"
 SUBMISSION = (EXAMPLE / NAME).read_text(encoding="utf-8")
@@ -99,6 +101,18 @@ def test_any_number_of_a_submission(number, at):
     for index in range(len(document.get("experiments", []))):
         shown += [field.value for field in fill_experiment(document, index)]
     assert all(isinstance(value, str) for value in shown)
+
+
+@settings(max_examples=100)
+@given(seed=st.integers(0, 2**32 - 1), by_values=st.booleans())
+def test_any_damage_of_a_submission(tmp_path_factory, seed, by_values):
+    """A `submission.toml` with cuts, junk or absurd values is read, or gives few lines of error."""
+    rng, raw = Random(seed), SUBMISSION[:3000].encode()
+    spoilt = poisoned_toml(raw.decode(), rng).encode() if by_values else damaged(raw, rng, hits=4)
+    folder = tmp_path_factory.mktemp("toml")
+    (folder / NAME).write_bytes(spoilt)
+    with few_lines_at_most(MOST_LISTED):
+        load_submission(folder)
 
 
 @given(numbers, where)

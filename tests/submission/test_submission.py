@@ -18,6 +18,7 @@ from pipeline.submission import (
     load_submission,
     new_submission,
 )
+from pipeline.submission.edit import edit_submission
 from pipeline.submission.load import InvalidSubmission
 from pipeline.submission.toml import nearest
 
@@ -57,6 +58,7 @@ columns = { time = 1, x1 = "Encoder 1 Pos" }
 [[experiments]]
 id = "pid"
 kind = "closed_loop"
+carts = [2, 1]
 controller = { type = "pid", kp = 0.05 }
 file = "./data/a.csv"
 [reported.initial]
@@ -92,7 +94,7 @@ def test_every_table_of_the_format_is_read(folder):
     assert submission.system.input.sign == -1
     assert submission.design is not None
     assert submission.design.input_limit == 5.0
-    assert (decay.carts, control.carts) == ((1,), (1, 2))
+    assert (decay.carts, control.carts, pid.carts) == ((1,), (1, 2), (1, 2))
     assert {e.file for e in submission.experiments} == {"data/a.csv"}
     assert isinstance(control.controller, StateFeedbackController)
     assert control.controller.gains == (1.0, 2.0, 3.0, 4.5)
@@ -180,6 +182,70 @@ def test_notes_are_the_discussion(folder):
     assert load_submission(folder).discussion is None
     (folder / "notes.md").write_text("Friction *matters*.\n", encoding="utf-8")
     assert load_submission(folder).discussion == "Friction *matters*.\n"
+
+
+@pytest.mark.parametrize(("lines", "kept"), [(2_900, 2_900), (4_000, 3_000)])
+def test_long_notes_are_cut_at_a_line(lines, kept, folder):
+    """Of notes with more than 30,000 characters, the first are shown, up to the end of a line."""
+    (folder / "notes.md").write_text("ten chars\n" * lines, encoding="utf-8")
+    shown = load_submission(folder).discussion or ""
+    assert shown.count("ten chars\n") == kept
+    assert (f"{10 * lines:,}" in shown) == (kept < lines)
+
+
+# In the full file the first text is replaced by the second; the mistake is at the third.
+MISTAKES = [
+    ("window = [0, 2.5]", "window = [2.5, 2.5]", ("experiments", 1, "window")),
+    ("window = [0, 2.5]", "window = [2.5, 2.4]", ("experiments", 1, "window")),
+    ("{ time = 1,", "{ time = 0,", ("experiments", 1, "columns", "time")),
+    ("{ time = 1,", "{ tine = 1,", ("experiments", 1, "columns", "tine")),
+    ("carts = [1]", "carts = [1, 3]", ("experiments", 0, "carts", 1)),
+    ("carts = [1]", "carts = [1, 1]", ("experiments", 0, "carts")),
+    ('id = "pid"', 'id = "control"', ("experiments", 2, "id")),
+    ("1, 2, 3, 4.5]", "1, 2, 3]", ("experiments", 1, "controller", "gains")),
+    ("kp = 0.05", "kp = 0.05, cart = 3", ("experiments", 2, "controller", "cart")),
+    ("settling_time = 1.0\n", "settling_time = 1000.1\n", ("design", "settling_time")),
+    ("settling_time = 1.0\n", "settling_time = 0\n", ("design", "settling_time")),
+    ("overshoot_percent = 10.0", "overshoot_percent = 100", ("design", "overshoot_percent")),
+    ("sample_time = 0.00884", "sample_time = 1.1", ("design", "sample_time")),
+    ("per_count = 0.00227", "per_count = 0", ("system", "position", "per_count")),
+    ("sign = -1", "sign = 2", ("system", "input", "sign")),
+    ("[false, true, true]", "[false, true]", ("system", "springs")),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "at"), MISTAKES, ids=range(len(MISTAKES)))
+def test_a_mistake_has_its_place(old, new, at, folder):
+    """A value that is not allowed is refused with its key; lists count from 1 in the message."""
+    assert FULL.count(old) == 1
+    (folder / "submission.toml").write_text(FULL.replace(old, new), encoding="utf-8")
+    with pytest.raises(InvalidSubmission) as told:
+        load_submission(folder)
+    ((where, _),) = told.value.problems
+    assert tuple(where) == at
+    shown = "".join(f"[{key + 1}]" if isinstance(key, int) else f".{key}" for key in at)
+    assert shown.lstrip(".") in str(told.value)
+
+
+def test_values_at_the_limits_are_read(folder):
+    """The largest allowed values are read."""
+    text = FULL.replace("settling_time = 1.0\n", "settling_time = 1000\n")
+    text = text.replace("overshoot_percent = 10.0", "overshoot_percent = 99.9")
+    (folder / "submission.toml").write_text(text.replace("0.00884", "1"), encoding="utf-8")
+    design = load_submission(folder).design
+    assert design is not None
+    assert (design.settling_time, design.overshoot_percent, design.sample_time) == (1000, 99.9, 1)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_an_edit_keeps_line_ends_and_other_text(end, folder):
+    """An edit changes one value, and keeps all other bytes of the file."""
+    toml = folder / "submission.toml"
+    toml.write_bytes(FULL.replace("\n", end).encode())
+    edit_submission(folder, lambda document: None)
+    assert toml.read_bytes() == FULL.replace("\n", end).encode()
+    edit_submission(folder, lambda document: document.update(title="new"))
+    assert toml.read_bytes() == FULL.replace("Two carts · 弹簧", "new").replace("\n", end).encode()
 
 
 def test_every_problem_is_listed(folder):

@@ -163,6 +163,13 @@ def test_a_list_that_cannot_be_read_costs_this_list(tmp_path, text, lost, says):
     assert says in part.message
 
 
+def test_a_mistake_in_a_row_of_a_matrix_names_its_line(tmp_path):
+    """In a matrix over several lines, the message names the line with the mistake."""
+    (part,) = read(tmp_path, ROWS.replace("[4, 0", "[n/a, 0")).unread
+    line = ROWS[: ROWS.index("[4, 0")].count("\n") + 1
+    assert line_of(part.message) == line == 16
+
+
 @pytest.mark.parametrize(
     "heading",
     [

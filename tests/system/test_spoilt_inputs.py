@@ -31,8 +31,14 @@ from tests.grading.publish.test_survey import write_paper
 from tests.helpers.acquisitions import Notes, write_work
 from tests.helpers.gaps import make_gap, two_cart_analysis
 from tests.helpers.grades import make_grade
-from tests.helpers.poison import damaged, poisoned_json, poisoned_table, poisoned_toml
-from tests.ingest.test_spoilt_files import FILES, few_lines_at_most
+from tests.helpers.poison import (
+    damaged,
+    few_lines_at_most,
+    poisoned_json,
+    poisoned_table,
+    poisoned_toml,
+)
+from tests.ingest.test_spoilt_files import FILES
 
 ROSTERS: dict[Platform, str] = {
     "canvas": "Student,ID,SIS User ID,Section,Lab 3 (77)\nJane Doe,7,s1,A,\nBob,8,s2,A,4\n",
