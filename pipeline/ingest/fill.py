@@ -308,7 +308,8 @@ class _Filling:
             if key not in table and value:
                 table[key] = toml_item(value)
         carts = tuple(table.get("carts", range(1, self._n + 1)))
-        known = {NO_CLOCK} if "sample_rate" in table else set()  # already stated in the table
+        # what the table states already
+        known: set[str] = {NO_CLOCK} if "sample_rate" in table else set()
         if "columns" in table and not inspection.guessed:
             known.add(inspection.ranges)
         remarks = _beside_held(found, inspection, carts)

@@ -41,14 +41,13 @@ class Note(str):
     about: str
     at: tuple[int, ...]
 
-    def __new__(cls, text: str, code: str, *, about: str = "", at: Iterable[int] = ()) -> "Note":
+    def __new__(
+        cls, text: str, code: str = "", *, about: str = "", at: Iterable[int] = ()
+    ) -> "Note":
         """Make a note; see the class."""
         note = super().__new__(cls, text)
         note.code, note.about, note.at = code, about, tuple(map(int, at))
         return note
-
-    def __getnewargs__(self) -> tuple[str, str]:  # for copies
-        return str(self), self.code
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,9 +6,16 @@ from numpy.testing import assert_allclose
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.clock import unroll
-from pipeline.ingest.columns import assign_columns, conversion, parse_heading, refuse_unknown_unit
+from pipeline.ingest.columns import (
+    FACTORS,
+    assign_columns,
+    conversion,
+    parse_heading,
+    refuse_unknown_unit,
+)
 from pipeline.ingest.files import parse_table, parse_tables
 from pipeline.ingest.table import FileTable
+from pipeline.ingest.text import Layout
 from tests.helpers.recordings import facts
 
 N = 200
@@ -211,3 +218,49 @@ def test_a_ratio_of_units_is_read_in_every_form(ratio, form):
 def test_labels_are_no_units(name):
     """A label in a heading is a part of the name."""
     assert parse_heading(name).unit is None
+
+
+# The sizes of all units, in the first unit of their quantity, from their definitions.
+SIZES = {
+    "s": {"ms": 1 / 1000, "us": 1 / 1e6, "ns": 1 / 1e9, "min": 60, "h": 3600},
+    "m": {"dm": 1 / 10, "cm": 1 / 100, "mm": 1 / 1000, "um": 1 / 1e6, "in": 25.4 / 1000,
+          "ft": 12 * 25.4 / 1000},
+    "V": {"mV": 1 / 1000, "kV": 1000, "uV": 1 / 1e6},
+    "N": {"mN": 1 / 1000, "kN": 1000},
+    "A": {"mA": 1 / 1000},
+    "Nm": {"mNm": 1 / 1000},
+    "rad": {"mrad": 1 / 1000, "deg": np.pi / 180, "rev": 2 * np.pi},
+    "Hz": {"kHz": 1000, "rad/s": 1 / (2 * np.pi)},
+}  # fmt: skip
+
+
+def test_every_unit_has_its_size():
+    """Each known unit is converted by its definition, and no unit is left out here."""
+    assert [{*units} for units in FACTORS.values()] == [{of, *sizes} for of, sizes in SIZES.items()]
+    for of, sizes in SIZES.items():
+        for unit, size in sizes.items():
+            assert conversion(unit, of) == pytest.approx(size, rel=1e-14)
+            assert conversion(of, unit) == pytest.approx(1 / size, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("typed", "comma", "number"),
+    [
+        ("1,5", True, 1.5),
+        ("-1.234,5", True, -1234.5),
+        ("1 234,5", True, 1234.5),
+        ("1.234.567", True, 1_234_567.0),
+        ("\u22120,5", True, -0.5),
+        ("1,5D+03", True, 1500.0),
+        (" '0,5' ", True, 0.5),
+        ("1,234.5", False, 1234.5),
+        ("1'234'567.5", False, 1_234_567.5),
+        ("1.5d-3", False, 0.0015),
+        ("\u22120.5", False, -0.5),
+        ("12:30:15", False, 45_015.0),
+        ("0:00:01.25 PM", False, 43_201.25),
+    ],
+)
+def test_a_cell_is_read_as_typed(typed, comma, number):
+    """Decimal commas, thousands, D exponents, long minus signs and times of day are read."""
+    assert Layout(";", comma=comma).value(typed) == pytest.approx(number, rel=1e-15)
