@@ -37,7 +37,7 @@ from benchmarks.endurance_checks import Found, check_book, check_folders
 from benchmarks.endurance_people import Assistant, Files, Journal, Lab, Person, Student
 from benchmarks.page import machine
 from pipeline.experiments.plan import load_plan, session_time
-from pipeline.grading.gradebook.request_gradebook import RequestGradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Batch
 from pipeline.grading.judge.recompute import findings_text
 from pipeline.grading.judge.run import under_rubric
@@ -93,7 +93,7 @@ def graded_class(place: str, size: Size, *, folder: Path, seed: int) -> list[Fil
     rubric, draw = load_rubric(Path(PRESET)), random.Random(f"{seed} class")
     bases = [_base(folder / f"base-{n}", rubric, seed=seed + n) for n in range(size.bases)]
     keys = []
-    with RequestGradebook(place, assignment=ASSIGNMENT, create=True) as book:
+    with Gradebook(place, assignment=ASSIGNMENT, create=True) as book:
         for number, name in enumerate(team_names(size.teams)):
             base, figures, prints = bases[number % size.bases]
             graded = _with_slips(base, draw).graded(days_late=draw.choice([0, 0, 0, 1.5]))

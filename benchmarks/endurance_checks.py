@@ -8,7 +8,7 @@ from typing import Any
 
 from benchmarks.endurance_people import Change, Journal, digest
 from pipeline.errors import PipelineError
-from pipeline.grading.gradebook.request_gradebook import RequestGradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.submission import load_submission
 
 
@@ -34,10 +34,10 @@ def _say(change: Change) -> str:
 
 def check_book(place: str, journal: Journal, *, teams: Sequence[str], found: Found) -> None:
     """Check that each confirmed change is stored once, and any other at most once."""
-    with RequestGradebook(place) as book:
+    with Gradebook(place) as book:
         given: dict[tuple[str, str, str], list[Any]] = defaultdict(list)
         for team, one in book.changes_since(0):
-            given[team, one.criterion, one.why].append(one)
+            given[team, one.criterion, one.text].append(one)
         listed = [one.submission for one in book.class_now().rows]
         if sorted(listed) != sorted(teams):
             found.lost.append(f"the class list has {len(listed)} of {len(teams)} teams")
@@ -78,7 +78,7 @@ def check_book(place: str, journal: Journal, *, teams: Sequence[str], found: Fou
                 found.spoilt.append(f"{_say(change)}: its points without it")
         if change.kind in ("points", "together"):
             for one in given[team, criterion, change.token]:
-                if one.points != change.points and not one.comment:
+                if one.points != change.points and one.what != "comment":
                     found.spoilt.append(f"{_say(change)}: {one.points} points")
     sent = {change.token for change in journal.sent}
     found.spoilt += [f"nobody sent {key}" for key in given if key[2] not in sent and given[key]]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
 
     from pipeline.grading.batch.grade_class import Summary
-    from pipeline.grading.gradebook.shared_gradebook import SharedGradebook
+    from pipeline.grading.gradebook.gradebook import Gradebook
 
 
 @app.command()
@@ -229,7 +229,7 @@ def _change(
     grades: str,
     team: str,
     assignment: str | None,
-    change: "Callable[[SharedGradebook, str], object]",
+    change: "Callable[[Gradebook, str], object]",
 ) -> None:
     """Change the points of a team, which may be a pseudonym, and say its new total."""
     from pipeline.grading.publish.anonymous import resolve_pseudonym
@@ -293,7 +293,7 @@ def remove(
         say(f"their points given by hand no longer count: {', '.join(by_hand)}")
 
 
-def _by_hand(book: "SharedGradebook", name: str) -> bool:
+def _by_hand(book: "Gradebook", name: str) -> bool:
     entry = book.entry(name)
     return bool(entry.overrides or entry.adjustments)
 
@@ -319,14 +319,14 @@ def _erase(grades: str, teams: list[str], assignment: str | None) -> None:
 
 
 @contextmanager
-def _changing(grades: str, assignment: str | None) -> Iterator["SharedGradebook"]:
+def _changing(grades: str, assignment: str | None) -> Iterator["Gradebook"]:
     """Open a gradebook to change it; if it is in a folder, update the pages there afterwards."""
-    from pipeline.grading.gradebook.shared_gradebook import SharedGradebook
+    from pipeline.grading.gradebook.gradebook import Gradebook
     from pipeline.grading.publish.outputs import write_outputs
     from pipeline.lock import lock_or_refuse
 
     folder = Path(grades)
-    with SharedGradebook(grades, assignment=assignment) as book:
+    with Gradebook(grades, assignment=assignment) as book:
         if not folder.is_dir():
             yield book
             return

@@ -8,7 +8,7 @@ from typing import Literal
 
 from pipeline.desk.form_input import read_path
 from pipeline.errors import ConfigError
-from pipeline.grading.gradebook.schema import FILE
+from pipeline.grading.gradebook.database import FILE
 from pipeline.submission.load import NAME
 
 MOST = 200  # folders shown in a list

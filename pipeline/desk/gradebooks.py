@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ConfigError
-from pipeline.grading.gradebook.request_gradebook import RequestGradebook
-from pipeline.grading.gradebook.shared_gradebook import ClassNow, ClassRow, State
+from pipeline.grading.gradebook.class_lines import ClassNow, ClassRow
+from pipeline.grading.gradebook.gradebook import Gradebook, State
 from pipeline.grading.publish.anonymous import anonymous_line, pseudonyms
 from pipeline.grading.rubric import Rubric
 
@@ -80,12 +80,12 @@ class Gradebooks:
         self.signed = _find_user()
         # By gradebook: submissions and options of the last regrading.
         self.asked: dict[Path | str, dict[str, str]] = {}
-        self._books: dict[Path | str, RequestGradebook] = {}
+        self._books: dict[Path | str, Gradebook] = {}
         self._classes: dict[Path | str, ClassView] = {}
         self._drawn: dict[tuple[Path | str, str], tuple[State, Any]] = {}
         self._lock, self._drawing = threading.Lock(), threading.Lock()
 
-    def gradebook(self, place: Path | str) -> RequestGradebook:
+    def gradebook(self, place: Path | str) -> Gradebook:
         """Return an open gradebook.
 
         Raises
@@ -96,7 +96,7 @@ class Gradebooks:
             if isinstance(place, Path) and not place.is_dir():
                 raise ConfigError(f"{place.name}: this folder no longer exists")
             if place not in self._books:
-                self._books[place] = RequestGradebook(place)
+                self._books[place] = Gradebook(place)
             return self._books[place]
 
     def n_waiting(self, place: Path | str) -> int:

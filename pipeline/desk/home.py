@@ -14,7 +14,7 @@ from pipeline.desk.page_request import PageRequest
 from pipeline.desk.users import Place, User, name_place
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.experiments.plan import NAME as PLAN
-from pipeline.grading.gradebook.schema import FILE
+from pipeline.grading.gradebook.database import FILE
 from pipeline.submission.load import file_problem
 
 _MADE = 3  # exercises listed on the first page

@@ -3,8 +3,8 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from pipeline.grading.gradebook.events import Event, hide_people
 from pipeline.grading.gradebook.history import to_the_second
-from pipeline.grading.gradebook.requests import RequestEvent, hide_people
 from pipeline.grading.words import points_text
 
 _HEADS = {
@@ -24,7 +24,7 @@ class ShownStep:
 
 
 def describe_steps(
-    events: Iterable[RequestEvent], *, team: str = "", submission: str = ""
+    events: Iterable[Event], *, team: str = "", submission: str = ""
 ) -> list[ShownStep]:
     """Return the events of a request, oldest first.
 

@@ -9,11 +9,11 @@ from numpy.testing import assert_allclose
 from benchmarks.endurance import SETTLING, Memory
 from benchmarks.endurance_checks import Found, check_book, check_folders
 from benchmarks.endurance_people import Change, Journal, digest
-from pipeline.grading.gradebook.request_gradebook import RequestGradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.submission import load_submission
 from tests.helpers import postgres
 from tests.helpers.desks import a_submission
-from tests.helpers.grades import fill_book
+from tests.helpers.grades import fill_book, seen
 from tests.helpers.places import ROOT
 
 
@@ -27,13 +27,13 @@ def book(tmp_path_factory):
     """Return a class with manual points, some of them changed twice, and one answered request."""
     place = str(tmp_path_factory.mktemp("book"))
     fill_book(place)
-    with RequestGradebook(place) as book:
+    with Gradebook(place) as book:
         for why, points in (("once", 0.5), ("twice", 0.5), ("x", 0.0), ("twice", 0.5)):
             book.override("team-02", "laws", points, why=why, by="Ada")
         book.release(True, by="prof")
         book.ask("team-04", "laws", why="see page 3", by="s4")
         (asked,) = book.queue().waiting
-        book.answer("team-04", "laws", 0.5, text="right", by="Ada", version=asked.version)
+        book.answer("team-04", "laws", 0.5, text="right", by="Ada", version=seen(asked))
     return place
 
 
@@ -60,7 +60,7 @@ def book(tmp_path_factory):
 def test_a_change_of_points_is_stored_exactly_once(book, change, wrong):
     """A confirmed change must be stored exactly once; any other change at most once."""
     found = Found()
-    with RequestGradebook(book) as opened:
+    with Gradebook(book) as opened:
         teams = [one.submission for one in opened.class_now().rows]
 
     check_book(book, Journal(sent=[change]), teams=teams, found=found)

@@ -8,8 +8,6 @@ import pytest
 
 from pipeline.desk.app import DeskServer
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradebook.request_gradebook import RequestGradebook
-from pipeline.grading.gradebook.shared_gradebook import SharedGradebook
 from pipeline.grading.gradings import Batch
 from pipeline.grading.intake.files import digest
 from pipeline.grading.rubric import Manual
@@ -61,7 +59,7 @@ def test_the_class_page_says_that_grades_are_not_final(grades):
             assert told in page.split(f"<h3>{card}</h3>")[1].split("</article>")[0]
         assert "Nobody lost points." in page
         assert "1 of 1." in ta.get("/grades/0/?state=open").text
-        with SharedGradebook(grades) as book:
+        with Gradebook(grades) as book:
             book.override("team-1", "discussion", 1, why="too short", by="Ada")
         page = ta.get("/grades/0/").text
         assert "not final:" not in page
@@ -71,7 +69,7 @@ def test_the_class_page_says_that_grades_are_not_final(grades):
 
 def test_a_student_reads_that_a_grade_is_not_final(grades, tmp_path):
     """An open criterion lost no points yet, so there is nothing to ask about."""
-    with RequestGradebook(grades) as book:
+    with Gradebook(grades) as book:
         book.release(by="Ada", released=True)
     with DeskServer(users=write_users(tmp_path, STUDENT)) as server:
         student = through_proxy(urlsplit(server.url).port or 0, "s1")

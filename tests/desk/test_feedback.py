@@ -9,8 +9,8 @@ import pytest
 
 from pipeline.desk.users import read_users
 from pipeline.errors import ConfigError
-from pipeline.grading.gradebook.request_gradebook import RequestGradebook
-from pipeline.grading.gradebook.requests import MOST_LETTERS, MOST_OPEN
+from pipeline.grading.gradebook.decisions import MOST_LETTERS, MOST_OPEN
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Batch
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.resources import RUBRICS
@@ -81,7 +81,7 @@ def released(lab):
 @pytest.fixture
 def book(tmp_path, lab):
     """Return the class's gradebook."""
-    with RequestGradebook(tmp_path / "grades") as book:
+    with Gradebook(tmp_path / "grades") as book:
         yield book
 
 
@@ -323,7 +323,7 @@ def test_students_who_must_find_the_numbers_see_none(tmp_path, by_class):
     users = USERS.replace("[[users]]", '[[users]]\nrubric = "lab.toml"', 1)
     if by_class:
         users = USERS
-        with RequestGradebook(tmp_path / "grades", assignment="lab") as book:
+        with Gradebook(tmp_path / "grades", assignment="lab") as book:
             keys = tuple(entry.key for entry in book.entries())
             book.finish(Batch(keys=keys, shared={}), rubric=load_rubric(rubric))
     with at_lab(tmp_path, users) as lab:
@@ -342,7 +342,7 @@ def test_a_student_reads_that_a_stopped_submission_is_not_graded_yet(lab, tmp_pa
     """If a limit ended the grading, the student sees no points and no lost criteria."""
     stopped = failed_grade("team-04", "stopped").model_copy(update={"unsettled": True})
     outcome = make_outcome(stopped, key="stopped", authors=("s4",), settled=False)
-    with RequestGradebook(tmp_path / "grades", assignment="lab") as book:
+    with Gradebook(tmp_path / "grades", assignment="lab") as book:
         book.put(outcome)
         others = (entry.key for entry in book.entries() if entry.submission != "team-04")
         book.finish(Batch(keys=(*others, "stopped"), shared={}), rubric=two_cart_rubric())

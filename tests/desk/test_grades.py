@@ -16,9 +16,8 @@ import pytest
 from pipeline.desk.app import DeskServer
 from pipeline.desk.grades.criteria import point_steps
 from pipeline.grading.gradebook.class_lines import GradeSummary
+from pipeline.grading.gradebook.events import Event
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradebook.override import HandPoints
-from pipeline.grading.gradebook.shared_gradebook import SharedGradebook
 from pipeline.grading.gradings import Batch
 from pipeline.grading.publish.export import export
 from pipeline.grading.rubric_file import load_rubric
@@ -63,7 +62,7 @@ def ta(grades):
         yield visitor
 
 
-def overrides(grades, team: str = "team-01") -> Mapping[str, HandPoints]:
+def overrides(grades, team: str = "team-01") -> Mapping[str, Event]:
     """Return what was changed by hand for a team."""
     with Gradebook(grades) as book:
         return book.entry(team).overrides
@@ -150,7 +149,7 @@ def test_a_class_is_filtered_and_its_lines_are_its_grades(ta, grades):
         entry.grade.points for entry in entries.values()
     )
 
-    with SharedGradebook(grades) as book:
+    with Gradebook(grades) as book:
         first = book.class_now()
         assert [one.line for one in first.rows] == [
             GradeSummary.of(e.grade) for e in book.entries()
@@ -301,8 +300,8 @@ def test_points_are_changed_as_by_the_command(ta, grades):
     """Points can be changed with a reason and undone, and the history lists every change."""
     assert change(ta, "team-01", points="0,5", why="a clear plot").status == 303
     given = overrides(grades)["laws"]
-    assert (given.points, given.why, given.by) == (0.5, "a clear plot", "Ada")
-    assert given.why in ta.get(at("team-01")).text
+    assert (given.points, given.text, given.by) == (0.5, "a clear plot", "Ada")
+    assert given.text in ta.get(at("team-01")).text
     for expected in ({}, {"laws": 0.5}):  # undo the change, then undo that
         seen = version(ta.get(at("team-01", criterion="laws")), "laws")
         ta.post(at("team-01"), do="undo", criterion="laws", seen=seen)
@@ -440,7 +439,7 @@ def test_only_one_of_two_simultaneous_changes_counts(two_desks, database):
             one = pool.submit(give, ada, f"a{number}")
             other = pool.submit(give, bob, f"b{number}")
             assert sorted([one.result(), other.result()]) == [303, 409]
-    with SharedGradebook(database) as book:
+    with Gradebook(database) as book:
         assert len([o for _, o in book.changes_since(0) if o.criterion == "pieces"]) == 20
 
 
@@ -463,7 +462,7 @@ def test_a_table_is_imported_whole_or_not_at_all(ta, grades):
     for changes in ("2 changes", "0 changes"):
         assert upload(ta, ROOM + "import", "table", head + good).status == 303
         assert changes in ta.get(ROOM).text
-    assert overrides(grades)["laws"].why == "clear, at last"
+    assert overrides(grades)["laws"].text == "clear, at last"
     assert overrides(grades, "Ünal 学生 & co")["pieces"].by == "Ada"
 
 
@@ -513,7 +512,7 @@ def test_a_class_is_graded_again_from_the_desk(tmp_path, anonymous):
         shown = names(who.get(ROOM))
     with Gradebook(grades) as book:
         entry = {one.submission: one for one in book.entries()}
-        assert entry["team-04"].overrides["pieces"].why == "as told"
+        assert entry["team-04"].overrides["pieces"].text == "as told"
         assert (entry["team-05"].grade.status, entry["team-05"].grade.days_late) == ("graded", 2)
         assert book.rubric.anonymous == anonymous
     made = sorted(path.name for path in (grades / "feedback").iterdir() if path.is_dir())
@@ -621,7 +620,7 @@ def test_one_decision_for_several_teams_is_previewed(ta, grades):
         after = {entry.submission: entry for entry in book.entries()}
         for name in ticked:
             given = after[name].overrides["laws"]
-            assert (given.points, given.why, given.by) == (0.5, "one unit", "Ada")
+            assert (given.points, given.text, given.by) == (0.5, "one unit", "Ada")
             assert rows[name][1:4:2] == ["0.5", f"{after[name].grade.points:g}"]
             assert book.history(name)[1][-1].text == "one unit"
         assert after[left].grade == before[left]
@@ -652,7 +651,7 @@ def test_a_decision_applies_to_all_teams_or_none(ta, grades):
     assert answer.status == 409
     assert listed(answer)[names[1]][0] == "0"  # the current version
     given = {name: overrides(grades, name) for name in names}
-    assert {name: own["laws"].why for name, own in given.items() if own} == {names[1]: "mine"}
+    assert {name: own["laws"].text for name, own in given.items() if own} == {names[1]: "mine"}
     again = apply(ta, together(), sent(answer, *names, do="apply", points="0.5", why="one unit"))
     assert again.status == 303  # with the versions shown by the refusal
 
@@ -702,5 +701,5 @@ def test_undoing_a_decision_keeps_later_changes(ta, grades):
     said = " ".join(re.findall(r'class="said">(.*?)<', ta.get(ROOM).text))
     assert (str(len(names) - 1) in said, names[0] in said) == (True, True)
     given = {name: overrides(grades, name) for name in names}
-    reasons = {name: own["laws"].why for name, own in given.items() if own}
+    reasons = {name: own["laws"].text for name, own in given.items() if own}
     assert reasons == {names[0]: "right after all"}

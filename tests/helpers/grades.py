@@ -13,9 +13,10 @@ import numpy as np
 from pipeline.grading.batch.task import Setup, Task
 from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.grade import Criterion, Flag, Grade, grade_text
+from pipeline.grading.gradebook.database import FILE
+from pipeline.grading.gradebook.entry import Entry
+from pipeline.grading.gradebook.events import Request
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradebook.request_gradebook import RequestGradebook
-from pipeline.grading.gradebook.schema import FILE
 from pipeline.grading.gradings import Batch, Grading
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
@@ -148,11 +149,17 @@ def book_of(
     *class_: Grade | Grading,
     rubric: Rubric | None = None,
     shared: Mapping[str, Flag] | None = None,
-) -> Iterator[RequestGradebook]:
+) -> Iterator[Gradebook]:
     """Open a new gradebook of an assignment called `lab` with this class list."""
-    with RequestGradebook(place, assignment="lab", create=True) as book:
+    with Gradebook(place, assignment="lab", create=True) as book:
         finish(book, *class_, rubric=rubric, shared=shared)
         yield book
+
+
+def seen(queued: tuple[Entry, Request]) -> str:
+    """Return the version of a request in the queue, which an answer must name."""
+    entry, request = queued
+    return entry.request_version(request.criterion)
 
 
 def write_class(folder: Path, *, anonymous: bool = False) -> Path:

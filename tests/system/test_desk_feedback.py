@@ -7,7 +7,7 @@ import pytest
 from playwright.sync_api import expect
 
 from pipeline.desk.app import DeskServer
-from pipeline.grading.gradebook.request_gradebook import RequestGradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from tests.helpers.desks import PROXY, through_proxy
 from tests.helpers.grades import write_class
 from tests.system import test_desk
@@ -109,6 +109,6 @@ def test_from_the_request_to_the_answer_by_keyboard(show, lab, tmp_path: Path):
     assert fits(student)
     press(student, student.get_by_role("link", name="The whole feedback"))
     expect(student.locator("body")).to_contain_text("You are right.")
-    with RequestGradebook(tmp_path / "grades") as book:
+    with Gradebook(tmp_path / "grades") as book:
         given = book.entry("team-04").overrides["laws"]
-        assert (given.points, given.why, given.by) == (1.0, "You are right.", "Ada")
+        assert (given.points, given.text, given.by) == (1.0, "You are right.", "Ada")

@@ -5,7 +5,6 @@ from playwright.sync_api import expect
 
 from pipeline.desk.app import DeskServer
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradebook.shared_gradebook import SharedGradebook
 from tests.helpers import postgres
 from tests.helpers.grades import fill_book, write_class
 from tests.system import test_desk
@@ -113,9 +112,9 @@ def test_a_class_is_graded_by_keys(show, tmp_path):
         press(window, "Enter")
         expect(window.get_by_text("3 teams changed")).to_be_visible()
         assert fits(window)
-        with SharedGradebook(grades) as book:
+        with Gradebook(grades) as book:
             given = [book.entry(one).overrides.get("data") for one in teams]
-        assert [one.points for one in given if one and one.why == REASON].count(0.75) == 3
+        assert [one.points for one in given if one and one.text == REASON].count(0.75) == 3
         press(window, "u")
         expect(window.get_by_text("3 teams undone")).to_be_visible()
         press(window, "a")
@@ -143,12 +142,12 @@ def test_a_class_is_graded_by_keys(show, tmp_path):
         expect(heading).to_have_text(teams[1])
         window.get_by_text("Keys", exact=True).click()
         window.get_by_label("Keys are on").check()
-    with SharedGradebook(grades) as book:
+    with Gradebook(grades) as book:
         seen = [one.reviewed_by for one in book.class_now().rows if one.reviewed_by]
         assert seen == ["Ada"]
         given = {one: book.entry(one).overrides.get("data") for one in teams}
     (own,) = [one for one in given.values() if one]
-    assert (own.points, own.why, own.by) == (0.5, REASON, "Ada")
+    assert (own.points, own.text, own.by) == (0.5, REASON, "Ada")
 
 
 @pytest.mark.slow

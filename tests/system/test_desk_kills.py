@@ -19,9 +19,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+from pipeline.grading.gradebook.database import FILE
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradebook.schema import FILE
-from pipeline.grading.gradebook.shared_gradebook import SharedGradebook
 from pipeline.grading.gradings import Batch
 from pipeline.resources import RUBRICS
 from pipeline.submission import load_submission
@@ -106,11 +105,11 @@ class _Override(_Save):
         assert answer.status == 303
 
     def check(self) -> None:
-        with SharedGradebook(self.folder) as book:
+        with Gradebook(self.folder) as book:
             given = {
-                int(one.why.removeprefix("change ")): one.points
+                int(one.text.removeprefix("change ")): one.points
                 for _, one in book.changes_since(0)
-                if one.why.startswith("change")
+                if one.text.startswith("change")
             }
             assert list(given) == sorted(given)
             assert all(points == number % 3 / 2 for number, points in given.items())
@@ -152,7 +151,7 @@ class _Regrade(_Save):
         _whole(self.folder)
         with Gradebook(self.folder) as book:
             teams = {entry.submission: entry for entry in book.entries()}
-            assert teams["team-04"].overrides["laws"].why == "as told"
+            assert teams["team-04"].overrides["laws"].text == "as told"
             assert set(teams) <= {"team-04", "team-x"}
             assert not self.confirmed or "team-x" in teams
 

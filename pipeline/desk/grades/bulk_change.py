@@ -14,8 +14,9 @@ from pipeline.desk.grades.filters import Filter
 from pipeline.desk.grades.team_page import sign, write_address
 from pipeline.desk.page_request import PageRequest
 from pipeline.errors import ConfigError
+from pipeline.grading.gradebook.decisions import Conflict
+from pipeline.grading.gradebook.entry import Entry
 from pipeline.grading.gradebook.override import WantedPoints, read_points
-from pipeline.grading.gradebook.shared_gradebook import Conflict, Preview
 from pipeline.grading.publish.anonymous import STRANGER
 from pipeline.grading.publish.feedback import sentence
 from pipeline.grading.rubric import Criterion
@@ -89,14 +90,14 @@ def _undo(ask: PageRequest) -> Response:
     if ask.text("set") not in [one.at for one in book.changed_together(least=1)]:
         raise HTTPException(404, "there is no such change in this class")
     undone = book.undo_all(ask.text("set"), by=sign(ask))
-    message = f"{count(undone.back, 'team')} undone."
+    message = f"{count(undone.teams, 'team')} undone."
     if undone.kept:
         names = {team.submission: name for name, team in shown.teams.items()}
         kept = ", ".join(sorted(names.get(one, STRANGER) for one in undone.kept))
         message += f" Kept, because they changed since: {kept}."
     if not ask.query("criterion"):  # the button was in the list on the class page
         return ask.back(f"{ask.here}#sets", message, place=_DONE)
-    return ask.back(_address(ask, done=undone.at if undone.back else ""), message, place=_DONE)
+    return ask.back(_address(ask, done=undone.at if undone.teams else ""), message, place=_DONE)
 
 
 def _address(ask: PageRequest, *, done: str) -> str:
@@ -224,33 +225,34 @@ def _list_rows(
     if typed == _SAME:  # a criterion that was never judged has no points to keep
         names = [name for name in names if asked.id in shown.teams[name].line.judged]
     wishes = [_wish(ask, shown, asked, name, typed=typed) for name in names]
-    tried = {one.submission: one for one in open_gradebook(ask).try_all(wishes)}
+    tried = {both[0].submission: both for both in open_gradebook(ask).preview_all(wishes)}
     began = ask.text("listed") == "1"
     rows = []
     for name in names:
-        one = tried.get(shown.teams[name].submission)
-        if one is not None:
+        if both := tried.get(shown.teams[name].submission):
             ticked = name in sent if began else True
-            rows.append(_row(ask, name, one, asked=asked, ticked=ticked))
+            rows.append(_row(ask, name, *both, asked=asked, ticked=ticked))
     return rows
 
 
-def _row(ask: PageRequest, name: str, one: Preview, *, asked: Criterion, ticked: bool) -> TeamRow:
+def _row(
+    ask: PageRequest, name: str, now: Entry, after: Entry, *, asked: Criterion, ticked: bool
+) -> TeamRow:
     def own(grade: Any) -> str:
         found = (points_text(c.points) for c in grade.criteria if c.id == asked.id)
         return next(found, "not judged")
 
-    sent = ask.text(f"seen.{name}")
-    messages = (sentence(c.message) for c in one.now.criteria if c.id == asked.id)
+    sent, version = ask.text(f"seen.{name}"), now.version(asked.id)
+    messages = (sentence(c.message) for c in now.grade.criteria if c.id == asked.id)
     return TeamRow(
         name=name,
         address=write_address(ask, name, criterion=asked.id),
         ticked=ticked,
-        version=one.version,
-        moved=ask.request.method == "POST" and bool(sent) and sent != one.version,
-        now=own(one.now),
-        after=own(one.after),
-        total_now=points_text(one.now.points),
-        total_after=points_text(one.after.points),
+        version=version,
+        moved=ask.request.method == "POST" and bool(sent) and sent != version,
+        now=own(now.grade),
+        after=own(after.grade),
+        total_now=points_text(now.grade.points),
+        total_after=points_text(after.grade.points),
         message=with_symbols(next(messages, "")),
     )

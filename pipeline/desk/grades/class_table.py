@@ -15,10 +15,10 @@ from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing, show_own_page
 from pipeline.desk.users import name_place
 from pipeline.grading.grade import CODES
+from pipeline.grading.gradebook.class_lines import ClassRow
+from pipeline.grading.gradebook.events import TOTAL
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.history import to_the_second
-from pipeline.grading.gradebook.override import TOTAL
-from pipeline.grading.gradebook.request_gradebook import RequestGradebook
-from pipeline.grading.gradebook.shared_gradebook import ClassRow
 from pipeline.grading.publish.anonymous import STRANGER, anonymise
 from pipeline.grading.publish.class_page import class_page, not_final
 from pipeline.grading.publish.feedback import feedback_page
@@ -51,7 +51,7 @@ def read_class(ask: PageRequest) -> ClassView:
     return ask.desk.gradebooks.of(ask.place_or_404())
 
 
-def open_gradebook(ask: PageRequest) -> RequestGradebook:
+def open_gradebook(ask: PageRequest) -> Gradebook:
     """Return the gradebook that the URL names."""
     return ask.desk.gradebooks.gradebook(ask.place_or_404())
 
@@ -155,12 +155,12 @@ def list_news(ask: PageRequest, shown: ClassView, *, since: int) -> dict[str, An
         for submission, override in open_gradebook(ask).changes_since(since):
             name = of_name.get(submission, STRANGER)
             points = "as graded" if override.points is None else points_text(override.points)
-            points = "a comment" if override.comment else points
+            points = "a comment" if override.what == "comment" else points
             what = titles.get(override.criterion) or override.criterion
             if override.criterion == TOTAL:
                 what, points = "total", signed_points(override.points or 0.0)
             at = to_the_second(override.at)
-            text = f"{what}: {points}, by {override.by}: {override.why} ({at})"
+            text = f"{what}: {points}, by {override.by}: {override.text} ({at})"
             changes.append({"name": name, "text": text, "mine": name == about})
     more = len(changes) - _MOST_NEWS
     return {"since": since, "told": latest, "changes": changes[::-1][:_MOST_NEWS],

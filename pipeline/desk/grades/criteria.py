@@ -7,8 +7,8 @@ from typing import Any
 
 from pipeline.desk.evidence import show_message, show_numbers
 from pipeline.grading.grade import Criterion, Flag, Grade
-from pipeline.grading.gradebook.override import HandPoints
-from pipeline.grading.gradebook.shared_gradebook import TeamNow
+from pipeline.grading.gradebook.entry import Entry
+from pipeline.grading.gradebook.events import Event
 from pipeline.grading.judge.costs import is_about
 from pipeline.grading.publish.feedback import TONES, alternative, evidence_table, sentence
 from pipeline.grading.publish.feedback_figures import is_response, numbers_in
@@ -50,7 +50,7 @@ class Item:
     by_hand: bool = False
 
 
-def list_items(grade: Grade, now: TeamNow) -> list[Item]:
+def list_items(grade: Grade, now: Entry) -> list[Item]:
     """Return the rows: those in doubt first, flags before criteria, then by points lost."""
     judged = {criterion.id: criterion for criterion in grade.criteria}
     items = [
@@ -62,7 +62,7 @@ def list_items(grade: Grade, now: TeamNow) -> list[Item]:
         own = judged.get(asked.id)
         flagged = any(is_about(flag, asked, now.rubric) for flag in grade.flags)
         earned = points_text(own.points) if own and own.id not in grade.open else NOTHING
-        by_hand = asked.id in now.entry.overrides
+        by_hand = asked.id in now.overrides
         items.append(
             Item(
                 id=asked.id,
@@ -70,7 +70,7 @@ def list_items(grade: Grade, now: TeamNow) -> list[Item]:
                 points=f"{earned} / {points_text(asked.points)}",
                 outcome=WORDS.text(f"outcome_{own.outcome}") if own else "not judged",
                 tone=TONES[own.outcome] if own else "quiet",
-                lost=asked.points - now.entry.automatic.get(asked.id, asked.points),
+                lost=asked.points - now.automatic.get(asked.id, asked.points),
                 doubt=own is None or own.outcome != "pass" or flagged or by_hand,
                 by_hand=by_hand,
             )
@@ -97,7 +97,7 @@ def list_steps(out_of: float, rubric: Rubric) -> list[str]:
 
 
 def describe_criterion(
-    asked: Asked, grade: Grade, now: TeamNow, *, typed: Mapping[str, str]
+    asked: Asked, grade: Grade, now: Entry, *, typed: Mapping[str, str]
 ) -> dict[str, Any]:
     """Return what the page shows of a criterion, even if it was never judged.
 
@@ -106,7 +106,7 @@ def describe_criterion(
     typed : fields of a refused form (points, other, why), and why it was refused (wrong).
     """
     own = next((c for c in grade.criteria if c.id == asked.id), None)
-    by_hand = now.entry.overrides.get(asked.id) or now.entry.comments.get(asked.id)
+    by_hand = now.overrides.get(asked.id) or now.comments.get(asked.id)
     points = points_text(own.points) if own and own.id not in grade.open else ""
     steps = list_steps(asked.points, now.rubric)
     chosen = typed.get("points") or points
@@ -127,17 +127,17 @@ def describe_criterion(
         "other": other,
         "why": typed.get("why", ""),
         "wrong": typed.get("wrong", ""),
-        "version": now.versions[asked.id],
-        "changed": asked.id in now.changed,
+        "version": now.version(asked.id),
+        "changed": asked.id in now.given,
         "by_hand": _describe_by_hand(by_hand) if by_hand else "",
-        "is_comment": by_hand is not None and by_hand.comment,
-        "own_reason": by_hand.why if by_hand else "",
+        "is_comment": by_hand is not None and by_hand.what == "comment",
+        "own_reason": by_hand.text if by_hand else "",
     }
 
 
-def _describe_by_hand(by_hand: HandPoints) -> str:
-    what = "Comment by" if by_hand.comment else "Points by hand,"
-    return f"{what} {by_hand.by}: {by_hand.why}"
+def _describe_by_hand(by_hand: Event) -> str:
+    what = "Comment by" if by_hand.what == "comment" else "Points by hand,"
+    return f"{what} {by_hand.by}: {by_hand.text}"
 
 
 def describe_flag(flag: Flag, units: Units | None) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from urllib.parse import urlencode
 
 from pipeline.desk.gradebooks import ClassView
 from pipeline.grading.grade import CODES
-from pipeline.grading.gradebook.shared_gradebook import ClassRow
+from pipeline.grading.gradebook.class_lines import ClassRow
 from pipeline.grading.words import WORDS
 
 _STATES: Mapping[str, tuple[str, Callable[[ClassRow], bool]]] = {

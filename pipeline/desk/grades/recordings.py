@@ -12,7 +12,7 @@ from markupsafe import Markup
 from pipeline.desk.gradebooks import ClassView
 from pipeline.desk.last_report import PLOTS, PLOTS_OF
 from pipeline.desk.page_request import PageRequest
-from pipeline.grading.gradebook.rows import Entry
+from pipeline.grading.gradebook.entry import Entry
 from pipeline.grading.intake.files import digest
 from pipeline.output import LOCK
 from pipeline.submission.load import NAME, file_problem

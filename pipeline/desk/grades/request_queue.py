@@ -13,10 +13,10 @@ from pipeline.desk.grades.team_page import sign
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.request_steps import describe_steps
 from pipeline.errors import ConfigError
+from pipeline.grading.gradebook.decisions import MOST_LETTERS, Conflict, RequestRefused
+from pipeline.grading.gradebook.entry import Entry
+from pipeline.grading.gradebook.events import Request
 from pipeline.grading.gradebook.override import read_points
-from pipeline.grading.gradebook.request_gradebook import Queued
-from pipeline.grading.gradebook.requests import MOST_LETTERS, RequestRefused
-from pipeline.grading.gradebook.shared_gradebook import Conflict
 from pipeline.grading.publish.feedback import sentence
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import points_text
@@ -68,7 +68,10 @@ def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Respo
     queue = book.queue(find_team(shown, of).submission if of else "")
     called = {team.submission: name for name, team in shown.teams.items()}
     waiting, settled = (
-        [_describe(ask, one, shown, called[one.entry.submission], wrong=wrong) for one in listed]
+        [
+            _describe(ask, entry, request, shown, called[entry.submission], wrong=wrong)
+            for entry, request in listed
+        ]
         for listed in (queue.waiting, queue.settled)
     )
     return ask.page(
@@ -88,7 +91,7 @@ def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Respo
 
 
 def _describe(
-    ask: PageRequest, queued: Queued, shown: ClassView, name: str, *, wrong: str
+    ask: PageRequest, entry: Entry, request: Request, shown: ClassView, name: str, *, wrong: str
 ) -> dict[str, Any]:
     """Return a request as the page shows it.
 
@@ -96,10 +99,10 @@ def _describe(
     ----------
     wrong : why the answer was refused, or "".
     """
-    rubric, request = shown.rubric, queued.request
+    rubric = shown.rubric
     asked = next((c for c in rubric.criteria if c.id == request.criterion), None)
-    own = next((c for c in queued.entry.grade.criteria if c.id == request.criterion), None)
-    hidden = {} if shown.names is None else {"team": name, "submission": queued.entry.submission}
+    own = next((c for c in entry.grade.criteria if c.id == request.criterion), None)
+    hidden = {} if shown.names is None else {"team": name, "submission": entry.submission}
     place = {"of": name, "criterion": request.criterion}
     failed = wrong and (ask.text("team"), ask.text("criterion")) == (name, request.criterion)
     return {
@@ -112,7 +115,7 @@ def _describe(
         "address": f"{ask.here}team?{urlencode(place)}#chosen",
         "steps": describe_steps(request.events, **hidden),
         "state": request.state,
-        "version": queued.version,
+        "version": entry.request_version(request.criterion),
         "choices": list_steps(asked.points, rubric) if asked else None,
         "typed": ask.text("points") if failed else "",
         "text": ask.text("text") if failed else "",
@@ -129,17 +132,12 @@ def _find_title(rubric: Rubric, criterion: str) -> str:
 def _show_conflict(ask: PageRequest, shown: ClassView, conflict: Conflict) -> Response:
     """Show the typed answer next to the current state; nothing was changed."""
     name, criterion = ask.text("team"), ask.text("criterion")
-    queue = open_gradebook(ask).queue(shown.teams[name].submission)
-    queued = next(
-        (q for q in (*queue.waiting, *queue.settled) if q.request.criterion == criterion), None
-    )
-    points, last = NOTHING, conflict.now
-    if queued is not None:
-        own = next((c for c in queued.entry.grade.criteria if c.id == criterion), None)
-        points = points_text(own.points) if own else NOTHING
-    answer = queued.request.events[-1] if queued and queued.request.state == "answered" else None
-    why = answer.text if answer else last.why if last else "as graded"
-    by = answer.by if answer else last.by if last else "cartlab"
+    entry = open_gradebook(ask).entry(shown.teams[name].submission)
+    own = next((c for c in entry.grade.criteria if c.id == criterion), None)
+    points, request = points_text(own.points) if own else NOTHING, entry.requests.get(criterion)
+    answered = request is not None and request.state == "answered"
+    last = request.events[-1] if request and answered else conflict.now
+    why, by = (last.text, last.by) if last else ("as graded", "cartlab")
     typed = ask.text("points") or "unchanged"
     return ask.page(
         "conflict",

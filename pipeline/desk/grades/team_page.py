@@ -33,9 +33,12 @@ from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, Grade
+from pipeline.grading.gradebook.class_lines import ClassRow
+from pipeline.grading.gradebook.decisions import Conflict
+from pipeline.grading.gradebook.entry import Entry
+from pipeline.grading.gradebook.events import TOTAL
 from pipeline.grading.gradebook.history import event_words, to_the_second
-from pipeline.grading.gradebook.override import TOTAL, read_points
-from pipeline.grading.gradebook.shared_gradebook import ClassRow, Conflict, TeamNow
+from pipeline.grading.gradebook.override import read_points
 from pipeline.grading.intake.repairs import (
     Repair,
     read_original,
@@ -175,16 +178,16 @@ def _show_page(
     shown = read_class(ask)
     team = find_team(shown, ask.query("of"))
     book, name = open_gradebook(ask), team.line.submission
-    now = book.team(team.submission)
-    grade = now.entry.grade if shown.names is None else anonymise(now.entry.grade, shown.names)
-    events = now.events
+    now = book.entry(team.submission)
+    grade = now.grade if shown.names is None else anonymise(now.grade, shown.names)
+    _, events = book.history(team.submission, named=not now.rubric.anonymous)
     if shown.names is not None:
         events = renamed_events(events, team.submission, name)
     wanted = Filter.read(ask.request.query_params)
     before, after = wanted.beside(shown, name)
     items = list_items(grade, now)
     chosen = _find_chosen(ask, items, now.rubric)
-    folder = find_recordings(ask, shown, now.entry)
+    folder = find_recordings(ask, shown, now)
     return ask.page(
         "team",
         status=status,
@@ -205,7 +208,7 @@ def _show_page(
         news=list_news(ask, shown, since=shown.state[1]),
         signature=find_signature(ask),
         repair=_show_repair(ask, shown, team, wrong=wrong_repair),
-        requests=book.request_states(team.submission),
+        requests={criterion: request.state for criterion, request in now.requests.items()},
         recordings=folder,
         notes=show_notes(ask, folder) if folder else "",
         papers=[
@@ -217,11 +220,11 @@ def _show_page(
     )
 
 
-def _describe_total(ask: PageRequest, now: TeamNow, *, wrong: str) -> dict[str, str]:
+def _describe_total(ask: PageRequest, now: Entry, *, wrong: str) -> dict[str, str]:
     """Return what the form for an adjustment shows; a refused one is shown as it was typed."""
     refused = bool(wrong) and ask.text("do") == "adjust"
     return {
-        "version": now.versions[TOTAL],
+        "version": now.version(TOTAL),
         "points": ask.text("points") if refused else "",
         "why": ask.text("why") if refused else "",
         "wrong": wrong if refused else "",
@@ -257,10 +260,10 @@ def _link_items(
 
 
 def _show_chosen(
-    ask: PageRequest, shown: ClassView, grade: Grade, now: TeamNow, *, chosen: Item, wrong: str
+    ask: PageRequest, shown: ClassView, grade: Grade, now: Entry, *, chosen: Item, wrong: str
 ) -> dict[str, Any]:
     """Return what is shown next to the list: the chosen criterion or flag, with its evidence."""
-    name, drawn = grade.submission, open_gradebook(ask).figures(now.entry)
+    name, drawn = grade.submission, open_gradebook(ask).figures(now)
     asked = next((c for c in now.rubric.criteria if c.id == chosen.id), None)
     if chosen.is_remark or asked is None:
         asked, one, flags = None, None, [flag for flag in grade.flags if flag.code == chosen.id]
@@ -332,10 +335,10 @@ def _show_conflict(
     ask: PageRequest, shown: ClassView, team: ClassRow, conflict: Conflict
 ) -> Response:
     """Show what a person typed next to the current state; nothing was changed."""
-    now = open_gradebook(ask).team(team.submission)
+    now = open_gradebook(ask).entry(team.submission)
     criterion = ask.text("criterion")
     titles = {asked.id: asked.title for asked in now.rubric.criteria}
-    own = next((c for c in now.entry.grade.criteria if c.id == criterion), None)
+    own = next((c for c in now.grade.criteria if c.id == criterion), None)
     undoing = ask.text("do") == "undo"
     return ask.page(
         "conflict",
@@ -348,7 +351,7 @@ def _show_conflict(
         },
         now={
             "points": points_text(own.points) if own else "not judged",
-            "why": conflict.now.why if conflict.now else "as graded",
+            "why": conflict.now.text if conflict.now else "as graded",
             "by": conflict.now.by if conflict.now else "cartlab",
         },
         # With a fragment, the browser would stay on this page without loading it again.

@@ -13,8 +13,9 @@ from pipeline.desk.users import OwnGrade
 from pipeline.desk.visibility import REFUSED, hides_values
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Criterion, Grade
-from pipeline.grading.gradebook.request_gradebook import OwnFeedback, RequestGradebook, points_lost
-from pipeline.grading.gradebook.requests import MOST_LETTERS, RequestRefused
+from pipeline.grading.gradebook.decisions import MOST_LETTERS, RequestRefused, points_lost
+from pipeline.grading.gradebook.entry import Entry
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.judge.costs import find_remarks
 from pipeline.grading.publish.anonymous import anonymise
 from pipeline.grading.publish.feedback import TONES, feedback_page, sentence
@@ -51,7 +52,7 @@ def show_whole(ask: PageRequest) -> Response:
         raise HTTPException(404, "your feedback is not published yet")
     if hides_values(ask.user, found.rubric):
         raise HTTPException(403, REFUSED)
-    figures = _open_book(ask).figures(found.entry)
+    figures = _open_book(ask).figures(found)
     grade = _hide_others(found, own)
     page = feedback_page(grade, rubric=found.rubric, figures=figures, name=own.submission)
     return show_own_page(page)
@@ -68,11 +69,11 @@ def _find_own(ask: PageRequest) -> OwnGrade:
     return ask.user.grades[number]
 
 
-def _open_book(ask: PageRequest) -> RequestGradebook:
+def _open_book(ask: PageRequest) -> Gradebook:
     return ask.desk.gradebooks.gradebook(_find_own(ask).gradebook)
 
 
-def _read(ask: PageRequest) -> OwnFeedback | None:
+def _read(ask: PageRequest) -> Entry | None:
     """Return the feedback; None before it is released.
 
     Raises
@@ -87,9 +88,9 @@ def _read(ask: PageRequest) -> OwnFeedback | None:
         raise ConfigError(_UNREADABLE) from None
 
 
-def _hide_others(found: OwnFeedback, own: OwnGrade) -> Grade:
+def _hide_others(found: Entry, own: OwnGrade) -> Grade:
     """Return the grade; in an anonymous class it names no other submission."""
-    grade = found.entry.grade
+    grade = found.grade
     return anonymise(grade, {own.submission: own.submission}) if found.rubric.anonymous else grade
 
 
@@ -127,7 +128,7 @@ def _show_page(
 
 
 def _describe_criteria(
-    found: OwnFeedback, grade: Grade, *, refused: dict[str, tuple[str, str]], hidden: bool
+    found: Entry, grade: Grade, *, refused: dict[str, tuple[str, str]], hidden: bool
 ) -> list[dict[str, Any]]:
     """Return every criterion of the rubric, including those that were never judged.
 
@@ -170,7 +171,7 @@ def _describe_judged(own: Criterion | None) -> dict[str, Any]:
     }
 
 
-def _show_why(asked: Asked, grade: Grade, found: OwnFeedback, *, hidden: bool) -> str:
+def _show_why(asked: Asked, grade: Grade, found: Entry, *, hidden: bool) -> str:
     """Return the evidence for a criterion as HTML.
 
     Parameters
@@ -182,6 +183,6 @@ def _show_why(asked: Asked, grade: Grade, found: OwnFeedback, *, hidden: bool) -
         return show_evidence(own, asked.check, grade.units) if own else ""
     remarks = find_remarks(grade, asked, found.rubric)
     sentences = [capital(WORDS.text(f"title_{flag.code}")) for flag in remarks]
-    by_hand = found.entry.overrides.get(asked.id) or found.entry.comments.get(asked.id)
-    sentences += [by_hand.why] if by_hand else []
+    by_hand = found.overrides.get(asked.id) or found.comments.get(asked.id)
+    sentences += [by_hand.text] if by_hand else []
     return render_blocks([paragraph(rich(sentence(one))) for one in dict.fromkeys(sentences)])

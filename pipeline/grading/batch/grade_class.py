@@ -14,8 +14,8 @@ from pipeline.errors import ConfigError, PipelineError
 from pipeline.grading.batch.runner import Executor, Progress, grade_batch, run_here, silent
 from pipeline.grading.batch.task import Setup
 from pipeline.grading.gradebook.class_lines import wrong_springs
+from pipeline.grading.gradebook.database import Lost
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradebook.schema import Lost
 from pipeline.grading.gradings import Batch, Example
 from pipeline.grading.intake.find import HandIn, find_hand_ins
 from pipeline.grading.intake.late_table import read_late_table, settle_lateness

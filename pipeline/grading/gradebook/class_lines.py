@@ -1,9 +1,10 @@
 """The data of a class list that pages and tables show."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import cached_property
 from math import nan
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from typing_extensions import TypedDict  # pydantic needs this version before Python 3.12
 
@@ -11,6 +12,7 @@ from pipeline.grading.grade import (
     CODES,
     Adjustment,
     Code,
+    Flag,
     Grade,
     GradeOverride,
     GradeTable,
@@ -93,6 +95,38 @@ class GradeSummary(GradeTable):
         """The ids of the criteria with points given by hand, and `total` if that was adjusted."""
         total = ("total",) if self.adjustments else ()
         return (*(given.criterion for given in self.overrides), *total)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClassRow:
+    """A line of the class list with its current grade.
+
+    Attributes
+    ----------
+    line : parts of the grade; on an anonymous page, its `submission` is a pseudonym.
+    submission : name of the submission in the gradebook.
+    grading : number of the grading in the gradebook.
+    reviewed_by : name of the person who marked the grading as reviewed, or "".
+    shared : the flag for recordings that other submissions also contain.
+    first_key : key of the first version that was submitted under this name.
+    made_of : data from which the line was computed; the line is valid until they change.
+    """
+
+    line: GradeSummary
+    submission: str
+    grading: int
+    reviewed_by: str
+    shared: Flag | None
+    first_key: str
+    made_of: tuple[Any, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClassNow:
+    """The class list with current grades."""
+
+    rubric: Rubric
+    rows: tuple[ClassRow, ...]
 
 
 def wrong_springs(graded: Iterable[tuple[str, ...]]) -> str:

@@ -7,13 +7,12 @@ from collections.abc import Mapping
 from sqlalchemy import Connection, delete, select, update
 
 from pipeline.grading.gradebook.schema import (
+    drop_copied,
     entries,
+    events,
     figures,
     findings,
     gradings,
-    overrides,
-    request_events,
-    reviews,
     submissions,
 )
 
@@ -27,9 +26,10 @@ def erase_rows(connection: Connection, gone: Mapping[int, str]) -> None:
     """
     numbers = list(gone)
     graded = select(gradings.c.id).where(gradings.c.submission_id.in_(numbers))
-    for table in (reviews, figures, findings):
+    drop_copied(connection)
+    for table in (figures, findings):
         connection.execute(delete(table).where(table.c.grading_id.in_(graded)))
-    for table in (entries, overrides, request_events, gradings):
+    for table in (entries, events, gradings):
         connection.execute(delete(table).where(table.c.submission_id.in_(numbers)))
     connection.execute(delete(submissions).where(submissions.c.id.in_(numbers)))
     flagged = select(entries.c.batch_id, entries.c.position, entries.c.shared)

@@ -5,38 +5,54 @@ class list. Grades contain no dates, but the gradebook does, and `cartlab histor
 """
 
 import json
-import math
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from sqlalchemy import Connection, Row, select
+from sqlalchemy import Connection, Row, func, select
 
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Grade, read_grade
+from pipeline.grading.gradebook import decisions
 from pipeline.grading.gradebook.changes import points_changes, rubric_changes
-from pipeline.grading.gradebook.class_lines import GradeSummary, class_frame
+from pipeline.grading.gradebook.class_lines import ClassNow, ClassRow, GradeSummary, class_frame
+from pipeline.grading.gradebook.database import Database
+from pipeline.grading.gradebook.decisions import Conflict, RequestRefused
+from pipeline.grading.gradebook.entry import Entry
 from pipeline.grading.gradebook.erase import erase_rows
-from pipeline.grading.gradebook.history import Event, read_events
-from pipeline.grading.gradebook.override import TOTAL, HandPoints, WantedPoints, check_step
+from pipeline.grading.gradebook.events import (
+    POINTS,
+    TOTAL,
+    Event,
+    Request,
+    newest_points,
+    reviewer,
+)
+from pipeline.grading.gradebook.history import read_history
+from pipeline.grading.gradebook.override import WantedPoints
 from pipeline.grading.gradebook.rows import (
     GRADING,
-    Entry,
     add_list,
     add_row,
     by_other_rubrics,
     carry_over,
     class_list,
-    final_entries,
-    final_entry,
+    find_requests,
+    first_keys,
+    in_class,
+    is_released,
     known_grading,
     last_named,
     lines_of,
     newest_of,
     pages,
     points_of,
+    read_entries,
+    read_entry,
+    read_events,
     read_figures,
     read_flag,
     read_members,
@@ -44,13 +60,12 @@ from pipeline.grading.gradebook.rows import (
     read_rubric,
 )
 from pipeline.grading.gradebook.schema import (
-    Database,
     batches,
     entries,
+    events,
     figures,
     findings,
     gradings,
-    overrides,
     submissions,
 )
 from pipeline.grading.gradings import Batch, Grading, Member, person
@@ -61,11 +76,52 @@ from pipeline.words.progress import silent
 if TYPE_CHECKING:
     import pandas as pd
 
+State = tuple[int, int]
+
 _SUGGESTED = 4  # names of submissions in one suggestion
+_MOST_SHOWN = 50  # requests of each kind on one page
+
+
+@dataclass(frozen=True, kw_only=True)
+class BulkChange:
+    """Changes that a person made to several submissions at once.
+
+    Attributes
+    ----------
+    at : time of all these changes, in ISO 8601, UTC, to the microsecond; it identifies them.
+    criterion, why : a criterion and a reason from these changes, as examples.
+    teams : number of submissions changed.
+    kept : submissions that `undo_all` left unchanged, because somebody has changed them since.
+    """
+
+    at: str
+    by: str
+    criterion: str = ""
+    why: str = ""
+    teams: int
+    kept: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Queue:
+    """The requests of a class: waiting ones oldest first, settled ones newest first.
+
+    Attributes
+    ----------
+    n_waiting, n_settled : total numbers of requests; `waiting` and `settled` hold only one page.
+    """
+
+    waiting: Sequence[tuple[Entry, Request]]
+    settled: Sequence[tuple[Entry, Request]]
+    n_waiting: int
+    n_settled: int
 
 
 class Gradebook:
-    """A database of all gradings and of the class lists made from them.
+    """A database of all gradings, of the class lists made from them, and of what people do.
+
+    Several processes may share it. A person's change names the version of the data that the person
+    saw, and is refused if the data have changed since.
 
     Parameters
     ----------
@@ -212,12 +268,12 @@ class Gradebook:
 
     def _finish(self, batch: Batch, *, rubric: Rubric, shown: Callable[[str], str]) -> list[str]:
         listed, points, by_hand = [], {}, set()
-        with self._database.writing() as connection:
+        with self._database.changing() as connection:
             carry_over(connection, batch.moved, assignment=self._assignment or "")
             for position, key in enumerate(batch.keys):
                 row = newest_of(connection, key, assignment=self._assignment or "")
                 shared = batch.shared.get(row.name)
-                entry = final_entry(connection, row, shared=shared, rubric=rubric)
+                (entry,) = read_entries(connection, [(row, shared)], rubric=rubric)
                 points[row.name] = entry.grade.points
                 by_hand |= {row.name} if entry.overrides or entry.adjustments else set()
                 listed.append(
@@ -280,7 +336,7 @@ class Gradebook:
             with self._database.reading() as connection:
                 rows = connection.execute(lines.where(entries.c.position.in_(page))).all()
                 read = [(row, read_flag(row.shared)) for row in rows]
-                found = final_entries(connection, read, rubric=rubric)
+                found = read_entries(connection, read, rubric=rubric)
             yield from found
 
     def entry(self, team: str) -> Entry:
@@ -291,10 +347,7 @@ class Gradebook:
         ConfigError : no submission matches, or several do.
         """
         with self._database.reading() as connection:
-            last, row = self._find(connection, team)
-            return final_entry(
-                connection, row, shared=read_flag(row.shared), rubric=read_rubric(last)
-            )
+            return self._entry(connection, team)
 
     def to_frame(self) -> "pd.DataFrame":
         """Return the class list, one row per submission and criterion; see `class_frame`."""
@@ -318,7 +371,7 @@ class Gradebook:
             return connection.scalar(mine) or ""
 
     def history(self, team: str, *, named: bool = True) -> tuple[str, list[Event]]:
-        """Return the id of a submission and all its events; see `read_events`.
+        """Return the id of a submission and all its events; see `read_history`.
 
         Raises
         ------
@@ -326,7 +379,7 @@ class Gradebook:
         """
         with self._database.reading() as connection:
             row = self._find_ever(connection, team)
-            return row.name, read_events(connection, row.submission_id, named=named)
+            return row.name, read_history(connection, row.submission_id, named=named)
 
     def remove(self, teams: Sequence[str]) -> list[str]:
         """Remove submissions from the class list; return their names.
@@ -337,7 +390,7 @@ class Gradebook:
         ------
         ConfigError : a name matches no submission on the class list, or more than one.
         """
-        with self._database.writing() as connection:
+        with self._database.changing() as connection:
             found = [self._find(connection, team) for team in teams]
             gone = {row.submission_id: row.name for _, row in found}
             last = self._last(connection)
@@ -365,9 +418,60 @@ class Gradebook:
             erase_rows(connection, gone)
         return list(gone.values())
 
+    def state(self) -> State:
+        """Return numbers that change whenever the content of the gradebook changes."""
+        with self._database.reading() as connection:
+            last = self._last(connection).id
+            return last, connection.scalar(select(func.max(events.c.id))) or 0
+
+    def class_now(self, before: ClassNow | None = None) -> ClassNow:
+        """Return the class with current grades.
+
+        Parameters
+        ----------
+        before : an earlier result, whose unchanged lines are reused.
+        """
+        with self._database.reading() as connection:
+            last = self._last(connection)
+            rubric, members = read_rubric(last), in_class(last)
+            done = read_events(connection, events.c.submission_id.in_(members))
+            keys = first_keys(connection, members)
+            known = before.rows if before and before.rubric == rubric else ()
+            made = {row.made_of: row for row in known}
+            columns = gradings.c.id, gradings.c.submission_id
+            made_of = {
+                row.position: (row.id, row.shared, *(e.id for e in done.get(row.submission_id, ())))
+                for row in connection.execute(class_list(last, *columns))
+            }
+            listed = {at: made[of] for at, of in made_of.items() if of in made}
+            rows = class_list(last)
+            if listed:
+                new = [at for at in made_of if at not in listed]
+                rows = rows.where(entries.c.position.in_(new))
+            for row in connection.execute(rows):
+                shared, own = read_flag(row.shared), done.get(row.submission_id, ())
+                if newest_points(own):  # only then the whole grade is needed
+                    grade = read_entry(row, own, shared=shared, rubric=rubric).grade
+                    line = GradeSummary.of(grade)
+                else:
+                    line = GradeSummary.model_validate_json(row.grade)
+                    line = line.sharing() if shared else line
+                listed[row.position] = ClassRow(
+                    line=line,
+                    submission=row.name,
+                    grading=row.id,
+                    reviewed_by=reviewer(own, row.id),
+                    shared=shared,
+                    first_key=keys[row.submission_id],
+                    made_of=made_of[row.position],
+                )
+            return ClassNow(rubric=rubric, rows=tuple(listed[at] for at in made_of))
+
+    # ------------------------------------------------------------------ what people do
+
     def override(
         self, team: str, criterion: str, points: float | None, *, why: str, by: str
-    ) -> HandPoints:
+    ) -> Event:
         """Set a criterion's points by hand, also for later gradings; None: the automatic points.
 
         Raises
@@ -375,12 +479,10 @@ class Gradebook:
         ConfigError : the submission or criterion does not exist, the points are out of range, or
             `why` or `by` is empty.
         """
-        with self._database.writing() as connection:
-            last, row = self._find(connection, team)
-            asked = WantedPoints(submission=team, criterion=criterion, points=points, why=why)
-            return self._give(connection, row, asked, by=by, rubric=read_rubric(last))
+        wanted = WantedPoints(submission=team, criterion=criterion, points=points, why=why)
+        return self._decide(team, lambda entry: [decisions.give(entry, wanted)], by=by)[0]
 
-    def adjust(self, team: str, points: float, *, why: str, by: str) -> HandPoints:
+    def adjust(self, team: str, points: float, *, why: str, by: str) -> Event:
         """Add points to a submission's total, also for later gradings; negative points deduct.
 
         All adjustments of a submission are added up. The total never falls below 0.
@@ -392,46 +494,376 @@ class Gradebook:
         """
         return self.override(team, TOTAL, points, why=why, by=by)
 
+    def change(
+        self, team: str, criterion: str, points: float | None, *, why: str, by: str, version: str
+    ) -> Event:
+        """Set the points of a criterion by hand, unless they have changed in the meantime.
+
+        If the criterion already has these points, exactly or as `points_text` shows them, `why` is
+        only added as a comment.
+
+        Parameters
+        ----------
+        version : version of the points that the person saw, from `Entry.version`.
+
+        Raises
+        ------
+        Conflict : somebody else changed the points, or the submission was graded again.
+        """
+        wanted = WantedPoints(
+            submission=team, criterion=criterion, points=points, why=why, version=version
+        )
+
+        def decide(entry: Entry) -> list[Event]:
+            _check_version(entry, wanted)
+            return [decisions.change(entry, wanted)]
+
+        return self._decide(team, decide, by=by)[0]
+
+    def undo(self, team: str, criterion: str, *, by: str, version: str) -> Event:
+        """Undo the last change of a criterion; a second call redoes it.
+
+        Raises
+        ------
+        Conflict : see `change`.
+        """
+        wanted = WantedPoints(
+            submission=team, criterion=criterion, points=None, why="", version=version
+        )
+
+        def decide(entry: Entry) -> list[Event]:
+            _check_version(entry, wanted)
+            return [decisions.undo(entry, criterion)]
+
+        return self._decide(team, decide, by=by)[0]
+
+    def change_all(self, wishes: Sequence[WantedPoints], *, by: str) -> BulkChange:
+        """Give points by hand to several submissions; if one change is refused, all are.
+
+        Raises
+        ------
+        ConfigError : a change is not valid; the message names its line in the table, if any.
+        Conflict : a change is based on an outdated version.
+        """
+        at, new = self._at(), 0
+        with self._database.changing() as connection:
+            known = self._named(connection, [wish.submission for wish in wishes])
+            for wish in wishes:
+                where = f"line {wish.line}: " if wish.line else ""
+                if wish.submission not in known:
+                    raise ConfigError(f"{where}no such submission is in the class")
+                row, entry = known[wish.submission]
+                if wish.version:
+                    _check_version(entry, wish)
+                try:
+                    event = decisions.give(entry, decisions.beside(entry, wish))
+                    if decisions.is_repeated(entry, event):
+                        continue
+                    stored = self._store(connection, row, [event], by=by, at=at)
+                except ConfigError as error:
+                    raise ConfigError(f"{where}{error}") from None
+                known[wish.submission] = row, entry.after(*stored)
+                new += 1
+        return BulkChange(at=at, by=by, teams=new)
+
+    def preview_all(self, wishes: Sequence[WantedPoints]) -> list[tuple[Entry, Entry]]:
+        """Return each submission without and with the requested points; store nothing.
+
+        Submissions that are not in the class are left out.
+        """
+        with self._database.reading() as connection:
+            known = self._named(connection, [wish.submission for wish in wishes])
+        found = []
+        for wish in wishes:
+            if wish.submission in known:
+                entry = known[wish.submission][1]
+                asked = decisions.beside(entry, wish)
+                what = "comment" if asked.comment else "override"
+                event = Event(
+                    what=what, criterion=asked.criterion, points=asked.points, text=asked.why
+                )
+                found.append((entry, entry.after(event)))
+        return found
+
+    def undo_all(self, at: str, *, by: str) -> BulkChange:
+        """Undo all changes that a person made at the same time.
+
+        A criterion that has been changed since stays as it is. `undo_all` with the time of the
+        result restores the changes.
+
+        Parameters
+        ----------
+        at : time of the changes, from `BulkChange.at`.
+        """
+        now, back, kept = self._at(), 0, []
+        with self._database.changing() as connection:
+            members = in_class(self._last(connection))
+            mine = events.c.at == at, events.c.submission_id.in_(members), events.c.what.in_(POINTS)
+            chosen = (
+                select(submissions.c.name, events.c.id, events.c.criterion)
+                .join(submissions, submissions.c.id == events.c.submission_id)
+                .where(*mine)
+                .order_by(events.c.id)
+            )
+            made = connection.execute(chosen).all()
+            known = self._named(connection, [row.name for row in made])
+            for name, number, criterion in made:
+                row, entry = known[name]
+                last = entry.given.get(criterion)
+                if last is None or last.id != number:
+                    kept.append(name)
+                    continue
+                self._store(connection, row, [decisions.undo(entry, criterion)], by=by, at=now)
+                back += 1
+        return BulkChange(at=now, by=by, teams=back, kept=tuple(kept))
+
+    def changed_together(self, *, least: int = 2) -> list[BulkChange]:
+        """Return the changes that were made to several submissions at once, newest first.
+
+        Parameters
+        ----------
+        least : smallest number of submissions that counts as several.
+        """
+        with self._database.reading() as connection:
+            members = in_class(self._last(connection))
+            columns = events.c.at, events.c.by
+            teams = func.count(events.c.submission_id.distinct())
+            mine = (
+                select(
+                    *columns,
+                    func.min(events.c.criterion).label("criterion"),
+                    func.max(events.c.text).label("why"),
+                    teams.label("teams"),
+                )
+                .where(events.c.submission_id.in_(members), events.c.what.in_(POINTS))
+                .group_by(*columns)
+                .having(teams >= least)
+                .order_by(func.max(events.c.id).desc())
+            )
+            return [BulkChange(**row) for row in connection.execute(mine).mappings()]
+
+    def set_reviewed(self, team: str, *, by: str, reviewed: bool) -> None:
+        """Mark the current grading of a submission as reviewed, or as not reviewed."""
+        what = "reviewed" if reviewed else "unreviewed"
+        self._decide(team, lambda entry: [Event(what=what, grading=entry.grading)], by=by)
+
+    def changes_since(self, number: int) -> list[tuple[str, Event]]:
+        """Return the points given by hand after the event `number`, with their submissions."""
+        with self._database.reading() as connection:
+            mine = self._last(connection).assignment
+            found = read_events(
+                connection,
+                events.c.id > number,
+                events.c.assignment == mine,
+                events.c.what.in_(POINTS),
+            )
+            named = select(submissions.c.id, submissions.c.name).where(submissions.c.id.in_(found))
+            names = {row.id: row.name for row in connection.execute(named)}
+        new = [(names[key], event) for key, own in found.items() for event in own]
+        return sorted(new, key=lambda one: one[1].id)
+
+    def reasons(self) -> dict[str, list[str]]:
+        """Return the reasons for points and comments by criterion, the most common first."""
+        with self._database.reading() as connection:
+            mine = (
+                select(events.c.criterion, events.c.text)
+                .where(
+                    events.c.assignment == self._last(connection).assignment,
+                    events.c.what.in_(POINTS),
+                    events.c.points.is_not(None) | (events.c.what == "comment"),
+                )
+                .group_by(events.c.criterion, events.c.text)
+                .order_by(func.count().desc(), events.c.text)
+            )
+            found: dict[str, list[str]] = defaultdict(list)
+            for criterion, why in connection.execute(mine):
+                found[criterion].append(why)
+        return dict(found)
+
+    # ------------------------------------------------------- release and requests
+
+    @property
+    def released(self) -> bool:
+        """Whether students may read the feedback of the class."""
+        with self._database.reading() as connection:
+            return is_released(connection, self._last(connection).assignment)
+
+    def release(self, released: bool, *, by: str) -> None:
+        """Let students read the feedback of the class, or hide it again."""
+        with self._database.changing() as connection:
+            event = Event(what="released" if released else "hidden", by=by, at=self._at())
+            _add_event(connection, event, assignment=self._last(connection).assignment)
+
+    def n_waiting(self) -> int:
+        """Return the number of requests of the class that wait for an answer."""
+        with self._database.reading() as connection:
+            last = self._newest(connection)
+            return 0 if last is None else len(find_requests(connection, last)[0])
+
+    def queue(self, of: str = "") -> Queue:
+        """Return the requests of the class, or only those of the submission `of`."""
+        with self._database.reading() as connection:
+            waiting, settled = (
+                [(row.name, row.criterion) for row in rows if not of or row.name == of]
+                for rows in find_requests(connection, self._last(connection))
+            )
+            shown = [*waiting[:_MOST_SHOWN], *settled[:_MOST_SHOWN]]
+            known = self._named(connection, [name for name, _ in shown])
+        queued = [(known[name][1], known[name][1].requests[criterion]) for name, criterion in shown]
+        n_first = len(waiting[:_MOST_SHOWN])
+        return Queue(
+            waiting=queued[:n_first],
+            settled=queued[n_first:],
+            n_waiting=len(waiting),
+            n_settled=len(settled),
+        )
+
+    def own_feedback(self, submission: str, *, assignment: str = "") -> Entry | None:
+        """Return what the authors of a submission may read; None until the feedback is released.
+
+        Parameters
+        ----------
+        submission : exact name of the submission; the name of an author is not accepted.
+        assignment : expected assignment of the class list, or "" for any; if the class list has
+            another assignment, the result is None.
+
+        Raises
+        ------
+        ConfigError : the class list has no such submission.
+        """
+        with self._database.reading() as connection:
+            if not self._is_readable(connection, assignment):
+                return None
+            return self._entry(connection, submission, exact=True)
+
+    def ask(
+        self, submission: str, criterion: str, *, why: str, by: str, assignment: str = ""
+    ) -> None:
+        """Ask for a review of a criterion that lost points; see `decisions.ask`.
+
+        Raises
+        ------
+        RequestRefused : no request is possible for this criterion now.
+        """
+
+        def decide(entry: Entry) -> list[Event]:
+            return [decisions.ask(entry, criterion, why=why)]
+
+        self._decide(submission, decide, by=by, released=assignment)
+
+    def answer(
+        self,
+        submission: str,
+        criterion: str,
+        points: float | None,
+        *,
+        text: str,
+        by: str,
+        version: str,
+    ) -> None:
+        """Answer a request; see `decisions.answer`.
+
+        Parameters
+        ----------
+        version : version of the request that the person saw, from `Entry.request_version`.
+
+        Raises
+        ------
+        Conflict : somebody else answered or changed the points, or the submission was graded again.
+        """
+
+        def decide(entry: Entry) -> list[Event]:
+            _check_request(entry, criterion, version)
+            return decisions.answer(entry, criterion, points, text=text)
+
+        self._decide(submission, decide, by=by)
+
+    def reopen(self, submission: str, criterion: str, *, by: str, version: str) -> None:
+        """Let the students ask once more about a criterion that was answered.
+
+        Raises
+        ------
+        Conflict : see `answer`.
+        """
+
+        def decide(entry: Entry) -> list[Event]:
+            _check_request(entry, criterion, version)
+            return [decisions.reopen(entry, criterion)]
+
+        self._decide(submission, decide, by=by)
+
     # ----------------------------------------------------------------------- helpers
 
-    def _give(
-        self, connection: Connection, row: Row, asked: WantedPoints, *, by: str, rubric: Rubric
-    ) -> HandPoints:
-        """Store points or a comment for a submission; `row` is the submission's class-list line."""
-        criterion, points = asked.criterion, asked.points
-        why, by = asked.why.strip(), by.strip()
-        if not why or not by:
-            raise ConfigError("a change of points needs a reason (--why) and a name (--by)")
-        out_of = {c.id: c.points for c in rubric.criteria}
-        if criterion == TOTAL:
-            if points is None or not math.isfinite(points) or points == 0:
-                raise ConfigError(f"expected points to add or deduct, such as -2, found {points}")
-        elif criterion not in out_of:
-            hint = nearest(criterion, list(out_of))
-            raise ConfigError(f"{criterion}: the rubric has no such criterion{hint}")
-        elif points is not None and not 0 <= points <= out_of[criterion]:
-            raise ConfigError(
-                f"{criterion}: expected 0 to {out_of[criterion]:g} points, found {points:g}; "
-                "to deduct from the total, or to add to it, use cartlab adjust"
-            )
-        before = select(overrides.c.id).filter_by(
-            submission_id=row.submission_id, criterion=criterion, points=points
+    def _decide(
+        self,
+        team: str,
+        decide: Callable[[Entry], list[Event]],
+        *,
+        by: str,
+        released: str | None = None,
+    ) -> list[Event]:
+        """Store what `decide` returns for a submission, while nobody else can write.
+
+        Parameters
+        ----------
+        released : if not None, the feedback of this assignment ("" for any) must be released.
+        """
+        with self._database.changing() as connection:
+            if released is not None and not self._is_readable(connection, released):
+                raise RequestRefused("the feedback is not released to students")
+            row, entry = self._found(connection, team, exact=released is not None)
+            return self._store(connection, row, decide(entry), by=by, at=self._at())
+
+    def _store(
+        self, connection: Connection, row: Row, decided: Sequence[Event], *, by: str, at: str
+    ) -> list[Event]:
+        """Store events of a submission, signed and with its authors; `row` is its line."""
+        if not by.strip():
+            if decided[0].what in POINTS:
+                raise ConfigError("a change of points needs a reason (--why) and a name (--by)")
+            raise RequestRefused("enter your name: requests, answers and reviews are signed")
+        authors = row.authors or last_named(connection, row.submission_id)
+        signed = [replace(event, by=by.strip(), at=at, authors=authors) for event in decided]
+        of = connection.scalar(
+            select(submissions.c.assignment).where(submissions.c.id == row.submission_id)
         )
-        new = connection.execute(before).first() is None
-        if criterion != TOTAL and points is not None and new:
-            # Points that were given once may be restored after a change of the rubric's step.
-            check_step(points, out_of=out_of[criterion], step=rubric.step)
-        given = HandPoints(
-            criterion=criterion,
-            points=points,
-            why=why,
-            by=by,
-            comment=asked.comment,
-            at=asked.at or self._at(),
-            authors=last_named(connection, row.submission_id),
-        )
-        add_row(connection, overrides, {**asdict(given), "submission_id": row.submission_id})
-        return given
+        return [
+            _add_event(connection, event, assignment=of or "", submission=row.submission_id)
+            for event in signed
+        ]
+
+    def _is_readable(self, connection: Connection, assignment: str) -> bool:
+        """Return whether students may read the class list, and it is of this assignment."""
+        last = self._newest(connection)
+        if last is None or assignment not in ("", last.assignment):
+            return False
+        return is_released(connection, last.assignment)
+
+    def _entry(self, connection: Connection, team: str, *, exact: bool = False) -> Entry:
+        return self._found(connection, team, exact=exact)[1]
+
+    def _found(
+        self, connection: Connection, team: str, *, exact: bool = False
+    ) -> tuple[Row, Entry]:
+        """Return a submission's line in the class list, and what it says now.
+
+        Parameters
+        ----------
+        exact : whether only the submission's own name counts, and no author's.
+        """
+        last, row = self._find(connection, team)
+        if exact and row.name != team:
+            raise ConfigError(f"{team}: is not the name of a submission")
+        line = row, read_flag(row.shared)
+        return row, read_entries(connection, [line], rubric=read_rubric(last))[0]
+
+    def _named(self, connection: Connection, names: Sequence[str]) -> dict[str, tuple[Row, Entry]]:
+        """Return the lines of the class list with these names, and what they say now."""
+        last = self._last(connection)
+        mine = class_list(last).where(submissions.c.name.in_(set(names)))
+        lines = [(row, read_flag(row.shared)) for row in connection.execute(mine).all()]
+        found = read_entries(connection, lines, rubric=read_rubric(last))
+        return {row.name: (row, entry) for (row, _), entry in zip(lines, found, strict=True)}
 
     def _at(self) -> str:
         return self._now().astimezone(UTC).isoformat(timespec="microseconds")
@@ -500,3 +932,31 @@ def _named(team: str, rows: Sequence[Row]) -> list[Row]:
     """Return the rows named `team`; if no row is, those with `team` among the authors."""
     exact = [row for row in rows if row.name == team]
     return exact or [row for row in rows if person(team) in map(person, row.authors)]
+
+
+def _add_event(
+    connection: Connection, event: Event, *, assignment: str, submission: int | None = None
+) -> Event:
+    """Store an event; return it with its number."""
+    values = asdict(event)
+    del values["id"], values["out_of"]
+    grading = values.pop("grading")
+    place = {"assignment": assignment, "submission_id": submission, "grading_id": grading}
+    return replace(event, id=add_row(connection, events, {**values, **place}))
+
+
+def _check_version(entry: Entry, wanted: WantedPoints) -> None:
+    if wanted.version != entry.version(wanted.criterion):
+        raise Conflict(
+            f"{wanted.criterion}: was changed or graded again after this page was shown",
+            now=entry.given.get(wanted.criterion),
+        )
+
+
+def _check_request(entry: Entry, criterion: str, version: str) -> None:
+    if criterion not in entry.requests:
+        raise ConfigError(f"{criterion}: nobody asked for another look")
+    if version != entry.request_version(criterion):
+        raise Conflict(
+            f"{criterion}: was changed after this page was shown", now=entry.given.get(criterion)
+        )

@@ -1,77 +1,55 @@
-"""The history of a submission: gradings, class lists, overrides and requests, in order."""
+"""The history of a submission: gradings, class lists, and what people did, in order."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import replace
 from datetime import datetime
-from typing import Any, Literal
+from typing import Any
 
-from sqlalchemy import Connection, Row, and_, select
+from sqlalchemy import Connection, and_, select
 
 from pipeline.grading.grade import read_grade
 from pipeline.grading.gradebook.changes import rubric_changes
-from pipeline.grading.gradebook.override import TOTAL
-from pipeline.grading.gradebook.requests import hide_people
-from pipeline.grading.gradebook.schema import (
-    batches,
-    entries,
-    gradings,
-    overrides,
-    request_events,
-    submissions,
+from pipeline.grading.gradebook.events import (
+    POINTS,
+    REQUESTS,
+    TOTAL,
+    Event,
+    hide_people,
 )
+from pipeline.grading.gradebook.rows import read_events
+from pipeline.grading.gradebook.schema import batches, entries, events, gradings, submissions
 from pipeline.grading.words import on_one_line
 from pipeline.submission.load import NAME
 
 FAILED = "could not be graded: "  # precedes the reason in the text of an event
+_SHOWN = ("at", "what", "points", "out_of", "criterion", "text", "by")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Event:
-    """One event in the history of a submission.
-
-    `graded` is a grading by the rubric alone. `listed` is a new or changed entry of a class list,
-    with shared data and overrides. `removed` is the removal from the class list. `override` gives
-    points by hand, or removes them if `points` is None. `adjusted` adds points to the total; they
-    may be negative. `comment` leaves the automatic points.
-    `asked`, `answered` and `reopened` belong to a student's request to review a criterion.
-
-    Attributes
-    ----------
-    at : time in ISO 8601, UTC.
-    what : kind of event, explained above.
-    points : points of the submission or, for an event about one criterion, of the criterion; None
-        if the event sets no points.
-    out_of : full points of the submission; None for an event about one criterion.
-    text : codes of flags, changes, a reason, a comment or an answer.
-    by : name of the person who acted; "" if nobody did, or if a student stays anonymous.
-    """
-
-    at: str
-    what: Literal[
-        "graded", "listed", "removed", "override", "adjusted", "comment",
-        "asked", "answered", "reopened",
-    ]  # fmt: skip
-    points: float | None
-    out_of: float | None = None
-    criterion: str = ""
-    text: str = ""
-    by: str = ""
-
-
-def read_events(connection: Connection, submission: int, *, named: bool = True) -> list[Event]:
+def read_history(connection: Connection, submission: int, *, named: bool = True) -> list[Event]:
     """Return the events of one submission, oldest first.
 
     Parameters
     ----------
     named : whether texts may contain names of people and other names of the submission.
     """
+    done = read_events(connection, events.c.submission_id == submission).get(submission, ())
     found = [
         *_graded(connection, submission),
-        *_overridden(connection, submission),
-        *_requested(connection, submission, named=named),
+        *(_shown(event, named=named) for event in done if event.what in POINTS + REQUESTS),
         *_listed(connection, submission, named=named),
     ]
     return sorted(found, key=lambda event: event.at)
+
+
+def _shown(event: Event, *, named: bool) -> Event:
+    """Return what a person did as the history shows it."""
+    if event.criterion == TOTAL:
+        return replace(event, criterion="")
+    if named or event.what not in REQUESTS:
+        return event
+    asked = event.what == "asked"
+    text = hide_people(event.text, (event.by * asked, *event.authors))
+    return replace(event, text=text, by="" if asked else event.by)
 
 
 def _graded(connection: Connection, submission: int) -> Iterator[Event]:
@@ -83,40 +61,6 @@ def _graded(connection: Connection, submission: int) -> Iterator[Event]:
             said = [f"{NAME} repaired {grade.repaired}"] if grade.repaired else []
             text = ", ".join([*said, *(flag.code for flag in grade.flags)])
         yield Event(at=row.at, what="graded", points=row.points, out_of=row.out_of, text=text)
-
-
-def _overridden(connection: Connection, submission: int) -> Iterator[Event]:
-    mine = select(overrides).where(overrides.c.submission_id == submission)
-    for row in connection.execute(mine.order_by(overrides.c.id)):
-        yield Event(
-            at=row.at,
-            what=_kind(row),
-            points=row.points,
-            criterion="" if row.criterion == TOTAL else row.criterion,
-            text=row.why,
-            by=row.by,
-        )
-
-
-def _kind(row: Row) -> Literal["adjusted", "comment", "override"]:
-    if row.criterion == TOTAL:
-        return "adjusted"
-    return "comment" if row.comment else "override"
-
-
-def _requested(connection: Connection, submission: int, *, named: bool) -> Iterator[Event]:
-    """Yield the requests to review a criterion, and their answers."""
-    mine = select(request_events).where(request_events.c.submission_id == submission)
-    for row in connection.execute(mine.order_by(request_events.c.id)):
-        asked = row.what == "asked"
-        yield Event(
-            at=row.at,
-            what=row.what,
-            points=row.points,
-            criterion=row.criterion,
-            text=row.text if named else hide_people(row.text, (row.by * asked, *row.authors)),
-            by="" if asked and not named else row.by,
-        )
 
 
 def _listed(connection: Connection, submission: int, *, named: bool) -> Iterator[Event]:
@@ -137,7 +81,7 @@ def _listed(connection: Connection, submission: int, *, named: bool) -> Iterator
                 now = _other_name(connection, submission, of=previous, among=batch)
                 goes_on = f"continues as {now}" if named else "continues under another name"
                 text = "removed from the class list" + (f": {goes_on}" if now else "")
-                yield Event(at=at, what="removed", points=None, text=text)
+                yield Event(at=at, what="removed", text=text)
             before = None
             continue
         notes = ["shared_data"] if shared else []
@@ -177,19 +121,19 @@ def _other_name(
     return found[0] if len(found) == 1 else ""
 
 
-def history_dict(submission: str, events: Sequence[Event]) -> dict[str, Any]:
+def history_dict(submission: str, found: Sequence[Event]) -> dict[str, Any]:
     """Return a history as a dictionary for JSON."""
     return {
         "schema": "cartlab-history/1",
         "submission": submission,
-        "events": [asdict(event) for event in events],
+        "events": [{key: getattr(event, key) for key in _SHOWN} for event in found],
     }
 
 
-def history_text(submission: str, events: Sequence[Event]) -> str:
+def history_text(submission: str, found: Sequence[Event]) -> str:
     """Return a history as lines of text."""
     return "\n".join(
-        [submission, *(f"{to_the_second(event.at)}  {event_words(event)}" for event in events)]
+        [submission, *(f"{to_the_second(event.at)}  {event_words(event)}" for event in found)]
     )
 
 

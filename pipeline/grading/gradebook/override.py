@@ -1,46 +1,18 @@
 """Points given by hand to one or many submissions, and their effect on the grade."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import floor
 from pathlib import Path
 
 from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
 from pipeline.grading.grade import Adjustment, Criterion, Grade, GradeOverride
-from pipeline.grading.gradings import same_people
+from pipeline.grading.gradebook.events import Event
 from pipeline.grading.references.tolerance import exact, with_total
 from pipeline.grading.rubric import Rubric
 
-# The place of an adjustment in the gradebook. No criterion can have this id. All adjustments count;
-# of the points for a criterion only the newest do.
-TOTAL = "(total)"
 _HEADS = ("submission", "criterion", "points", "why")  # columns of a table of requested changes
-
-
-@dataclass(frozen=True, kw_only=True)
-class HandPoints:
-    """Points that a person gave to one criterion of one submission, or added to its total.
-
-    Attributes
-    ----------
-    points : points given by hand; None if the automatic points count.
-    at : time in ISO 8601, UTC.
-    authors : authors of the submission at that time, to whom the points belong.
-    comment : whether `why` is only a comment for the team, while the points stay automatic.
-    """
-
-    criterion: str
-    points: float | None
-    why: str
-    by: str
-    at: str
-    authors: tuple[str, ...] = ()
-    comment: bool = False
-
-    def concerns(self, authors: tuple[str, ...]) -> bool:
-        """Return whether the points apply to a submission of these authors."""
-        return same_people(self.authors, authors)
 
 
 def read_points(text: str) -> float | None:
@@ -85,9 +57,7 @@ class WantedPoints:
     points : requested points; None for the automatic points.
     comment : whether `why` is only a comment for the team.
     line : line number in the table that requests the change; 0 without a table.
-    version : version of the points that the person saw, from `TeamNow.versions`; "" to change any
-        version.
-    at : time of the change; "" for now. Points given together have the same time.
+    version : version of the points that the person saw, from `Entry.version`; "" to change any.
     """
 
     submission: str
@@ -97,19 +67,6 @@ class WantedPoints:
     comment: bool = False
     line: int = 0
     version: str = ""
-    at: str = ""
-
-    def beside(self, earlier: Iterable[HandPoints]) -> "WantedPoints":
-        """Return the change to store, given the earlier changes of the submission.
-
-        If the criterion has points given by hand, a comment keeps them and replaces their reason.
-        """
-        newest = None
-        for one in earlier:
-            newest = one if one.criterion == self.criterion else newest
-        if not self.comment or newest is None or newest.points is None:
-            return self
-        return replace(self, points=newest.points, comment=False)
 
 
 def read_wishes(path: Path, *, why: str = "") -> list[WantedPoints]:
@@ -163,10 +120,10 @@ def read_wishes(path: Path, *, why: str = "") -> list[WantedPoints]:
     return wishes
 
 
-def with_comments(grade: Grade, comments: Mapping[str, HandPoints]) -> Grade:
+def with_comments(grade: Grade, comments: Mapping[str, Event]) -> Grade:
     """Return the grade with each comment added at the end of its criterion's message."""
     criteria = (
-        _with_comment(own, comments[own.id].why) if own.id in comments else own
+        _with_comment(own, comments[own.id].text) if own.id in comments else own
         for own in grade.criteria
     )
     return grade.model_copy(update={"criteria": tuple(criteria)})
@@ -174,10 +131,10 @@ def with_comments(grade: Grade, comments: Mapping[str, HandPoints]) -> Grade:
 
 def with_overrides(
     grade: Grade,
-    overrides: Mapping[str, HandPoints],
+    overrides: Mapping[str, Event],
     *,
     rubric: Rubric,
-    adjustments: Iterable[HandPoints] = (),
+    adjustments: Iterable[Event] = (),
 ) -> Grade:
     """Return the grade with points given by hand, adjustments and the deduction for lateness.
 
@@ -185,7 +142,7 @@ def with_overrides(
     by hand are added.
     """
     given = {key: o.points for key, o in overrides.items() if o.points is not None}
-    added = tuple(Adjustment(points=a.points or 0.0, why=a.why) for a in adjustments)
+    added = tuple(Adjustment(points=a.points or 0.0, why=a.text) for a in adjustments)
     if not given and not added:
         return grade
     judged = {criterion.id: criterion for criterion in grade.criteria}
@@ -194,14 +151,14 @@ def with_overrides(
         own = judged.get(asked.id)
         if asked.id in given:
             own = own or _unjudged(asked.id, asked.title, asked.points)
-            why, manual = overrides[asked.id].why, asked.check == "manual"
+            why, manual = overrides[asked.id].text, asked.check == "manual"
             own = _by_hand(own, given[asked.id], why=why, manual=manual)
         if own is not None:
             criteria.append(own)
     changed = {
         "adjustments": added,
         "overrides": tuple(
-            GradeOverride(criterion=key, points=points, why=overrides[key].why)
+            GradeOverride(criterion=key, points=points, why=overrides[key].text)
             for key, points in sorted(given.items())
         ),
     }

@@ -4,31 +4,35 @@ import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
 from pydantic import ValidationError
 from sqlalchemy import ColumnElement, Connection, Row, Select, Table, func, insert, select
 
 from pipeline.errors import ConfigError
-from pipeline.grading.grade import Flag, Grade, read_grade
-from pipeline.grading.gradebook.override import TOTAL, HandPoints, with_comments, with_overrides
+from pipeline.grading.grade import Flag, read_grade
+from pipeline.grading.gradebook.database import Database
+from pipeline.grading.gradebook.entry import Entry
+from pipeline.grading.gradebook.events import REQUESTS, Event
 from pipeline.grading.gradebook.schema import (
-    Database,
     batches,
     entries,
+    events,
     figures,
     gradings,
-    overrides,
-    request_events,
     submissions,
 )
-from pipeline.grading.gradings import Grading, Member
+from pipeline.grading.gradings import Grading, Member, same_people
 from pipeline.grading.rubric import Rubric
 
 _PAGE = 100  # rows read at once; few, so that memory use stays flat and writers wait only briefly
 # The attributes of a grading that are stored in a column of the same name.
 GRADING = [f.name for f in fields(Grading) if f.name in gradings.c]
-OVERRIDE = [overrides.c[f.name] for f in fields(HandPoints)]
+_EVENT = [
+    events.c.grading_id.label("grading") if f.name == "grading" else events.c[f.name]
+    for f in fields(Event)
+    if f.name != "out_of"
+]
 _OF_GRADING = select(submissions.c.name.label("submission"), *(gradings.c[x] for x in GRADING))
 _MEMBER = (
     submissions.c.name.label("submission"),
@@ -37,35 +41,6 @@ _MEMBER = (
     gradings.c.key,
     gradings.c.id.label("grading"),
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Entry:
-    """A line of the class list with its current grade.
-
-    Attributes
-    ----------
-    grade : grade with the flag for shared data, points given by hand, and the deduction for
-        lateness.
-    automatic : automatic points, by criterion.
-    overrides : current points given by hand, by criterion.
-    adjustments : all changes of the total, oldest first.
-    owner : account on the learning platform that submitted the files, or "".
-    key : hash of everything that affects the grade.
-    grading : number of the grading in the gradebook.
-    first_key : key of the first version under this name; strangers cannot guess it.
-    """
-
-    submission: str
-    grade: Grade
-    automatic: Mapping[str, float]
-    overrides: Mapping[str, HandPoints]
-    comments: Mapping[str, HandPoints]
-    adjustments: tuple[HandPoints, ...]
-    owner: str
-    key: str
-    grading: int
-    first_key: str
 
 
 def add_row(connection: Connection, table: Table, values: dict) -> int:
@@ -193,38 +168,62 @@ def class_list(batch: Row, *columns: ColumnElement) -> Select:
     return mine.order_by(entries.c.position)
 
 
-def final_entry(connection: Connection, row: Row, *, shared: Flag | None, rubric: Rubric) -> Entry:
-    """Return a line of the class list with its current grade; this reads the overrides."""
-    return final_entries(connection, [(row, shared)], rubric=rubric)[0]
-
-
-def final_entries(
+def read_entries(
     connection: Connection, lines: Sequence[tuple[Row, Flag | None]], *, rubric: Rubric
 ) -> list[Entry]:
-    """Return lines of the class list with their current grades, in two queries.
+    """Return lines of the class list as they stand now, in two queries.
 
     Parameters
     ----------
     lines : rows of a class list, each with its flag for shared data.
     """
     numbers = {row.submission_id for row, _ in lines}
-    given: dict[int, list[HandPoints]] = defaultdict(list)
-    theirs = select(overrides.c.submission_id, *OVERRIDE).order_by(overrides.c.id)
-    theirs = theirs.where(overrides.c.submission_id.in_(numbers))
-    for override in connection.execute(theirs).mappings():
-        values = dict(override)
-        given[values.pop("submission_id")].append(HandPoints(**values))
+    done = read_events(connection, events.c.submission_id.in_(numbers))
     keys = first_keys(connection, numbers)
     return [
-        current_entry(
+        read_entry(
             row,
-            given[row.submission_id],
+            done.get(row.submission_id, ()),
             shared=shared,
             rubric=rubric,
             first_key=keys.get(row.submission_id, ""),
         )
         for row, shared in lines
     ]
+
+
+def read_entry(
+    row: Row,
+    done: Sequence[Event],
+    *,
+    shared: Flag | None,
+    rubric: Rubric,
+    first_key: str = "",
+) -> Entry:
+    """Return a line of the class list as it stands after the events `done`."""
+    grade = read_grade(row.grade)
+    return Entry(
+        submission=row.name,
+        rubric=rubric,
+        graded=grade.with_flags(shared) if shared else grade,
+        authors=row.authors,
+        events=tuple(done),
+        owner=row.owner,
+        key=row.key,
+        grading=row.id,
+        first_key=first_key,
+    )
+
+
+def read_events(connection: Connection, *where: ColumnElement) -> dict[int, list[Event]]:
+    """Return the events of submissions that meet the conditions, by submission, oldest first."""
+    found: dict[int, list[Event]] = defaultdict(list)
+    mine = select(events.c.submission_id, *_EVENT).where(*where).order_by(events.c.id)
+    for row in connection.execute(mine).mappings():
+        values = dict(row)
+        number = values.pop("submission_id")
+        found[number].append(Event(**values))
+    return found
 
 
 def first_keys(connection: Connection, submitted: Iterable[int] | Select) -> dict[int, str]:
@@ -235,41 +234,42 @@ def first_keys(connection: Connection, submitted: Iterable[int] | Select) -> dic
     return {row.submission_id: row.key for row in connection.execute(keys)}
 
 
-def current_entry(
-    row: Row,
-    ever: Iterable[HandPoints],
-    *,
-    shared: Flag | None,
-    rubric: Rubric,
-    first_key: str = "",
-) -> Entry:
-    """Return a line of the class list with its current grade.
+def find_requests(connection: Connection, batch: Row) -> tuple[list[Row], list[Row]]:
+    """Return the newest event of each request in a class, in two lists: waiting and settled.
 
-    Parameters
-    ----------
-    ever : all overrides of the submission, in the order they were made.
+    Each row has its number `id`, the `criterion`, and the `submission_id` and `position` of its
+    submission. Waiting requests come oldest first, settled ones newest first.
     """
-    theirs = [override for override in ever if override.concerns(row.authors)]
-    adjustments = tuple(override for override in theirs if override.criterion == TOTAL)
-    newest = {override.criterion: override for override in theirs if override.criterion != TOTAL}
-    given = {key: override for key, override in newest.items() if override.points is not None}
-    comments = {key: override for key, override in newest.items() if override.comment}
-    grade = read_grade(row.grade)
-    grade = grade.with_flags(shared) if shared else grade
-    return Entry(
-        submission=row.name,
-        grade=with_overrides(
-            with_comments(grade, comments), given, rubric=rubric, adjustments=adjustments
-        ),
-        automatic={criterion.id: criterion.points for criterion in grade.criteria},
-        overrides=given,
-        comments=comments,
-        adjustments=adjustments,
-        owner=row.owner,
-        key=row.key,
-        grading=row.id,
-        first_key=first_key,
+    newest = select(func.max(events.c.id)).where(events.c.what.in_(REQUESTS))
+    newest = newest.group_by(events.c.submission_id, events.c.criterion)
+    joined = (
+        events.join(entries, entries.c.submission_id == events.c.submission_id)
+        .join(gradings, gradings.c.id == entries.c.grading_id)
+        .join(submissions, submissions.c.id == entries.c.submission_id)
     )
+    columns = (
+        events.c.id,
+        events.c.submission_id,
+        events.c.criterion,
+        events.c.what,
+        events.c.authors.label("asked_by"),
+        entries.c.position,
+        gradings.c.authors,
+        submissions.c.name,
+    )
+    mine = select(*columns).select_from(joined).where(entries.c.batch_id == batch.id)
+    found = connection.execute(mine.where(events.c.id.in_(newest)).order_by(events.c.id)).all()
+    theirs = [row for row in found if same_people(row.asked_by, row.authors)]
+    waiting = [row for row in theirs if row.what == "asked"]
+    return waiting, [row for row in reversed(theirs) if row.what != "asked"]
+
+
+def is_released(connection: Connection, assignment: str) -> bool:
+    """Return whether students may read the feedback of an assignment."""
+    mine = select(events.c.what).where(
+        events.c.assignment == assignment, events.c.what.in_(("released", "hidden"))
+    )
+    return connection.scalar(mine.order_by(events.c.id.desc()).limit(1)) == "released"
 
 
 def lines_of(connection: Connection, batch: Row) -> list[dict]:
@@ -335,7 +335,7 @@ def last_named(connection: Connection, submission: int) -> tuple[str, ...]:
 
 
 def carry_over(connection: Connection, moved: Mapping[str, str], *, assignment: str) -> None:
-    """Copy overrides and requests of renamed submissions to their new names.
+    """Copy what people did to renamed submissions to their new names.
 
     Rows that already exist under the new name are not copied again if a name changes back.
     """
@@ -344,16 +344,24 @@ def carry_over(connection: Connection, moved: Mapping[str, str], *, assignment: 
         submissions.c.name.in_([*moved, *moved.values()]),
     )
     numbers = {row.name: row.id for row in connection.execute(named)}
-    for table in (overrides, request_events):
-        columns = [column for column in table.c if column.name not in ("id", "submission_id")]
-        there = {}
-        for name, number in numbers.items():
-            mine = select(*columns).where(table.c.submission_id == number).order_by(table.c.id)
-            there[name] = [dict(row) for row in connection.execute(mine).mappings()]
-        for old, new in moved.items():
-            for values in there[old]:
-                if values not in there[new]:
-                    add_row(connection, table, {**values, "submission_id": numbers[new]})
+    columns = [column for column in events.c if column.name not in ("id", "submission_id")]
+    there = {}
+    for name, number in numbers.items():
+        mine = select(*columns).where(
+            events.c.submission_id == number, events.c.grading_id.is_(None)
+        )
+        there[name] = [
+            dict(row) for row in connection.execute(mine.order_by(events.c.id)).mappings()
+        ]
+    for old, new in moved.items():
+        for values in there[old]:
+            if values not in there[new]:
+                add_row(connection, events, {**values, "submission_id": numbers[new]})
+
+
+def in_class(batch: Row) -> Select:
+    """Return the query for the numbers of the submissions on a class list."""
+    return select(entries.c.submission_id).where(entries.c.batch_id == batch.id)
 
 
 def read_flag(text: str) -> Flag | None:

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.grading.grade import Grade
+from pipeline.grading.gradebook.entry import Entry
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradebook.rows import Entry
 from pipeline.grading.intake.lms_names import Platform
 from pipeline.grading.publish.gradescope import flag_messages, results_text
 from pipeline.grading.publish.platforms import FORMS, WORKSHEET

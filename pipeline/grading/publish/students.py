@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from pipeline.grading.grade import Grade
-from pipeline.grading.gradebook.override import TOTAL
-from pipeline.grading.gradebook.rows import Entry
+from pipeline.grading.gradebook.entry import Entry
+from pipeline.grading.gradebook.events import TOTAL
 from pipeline.grading.gradings import person
 from pipeline.grading.intake.lms_names import Platform, read_owner
 from pipeline.grading.words import points_text

@@ -10,10 +10,10 @@ import pytest
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Criterion, Grade, read_grade
 from pipeline.grading.gradebook.class_lines import GradeSummary
+from pipeline.grading.gradebook.decisions import Conflict, points_lost
+from pipeline.grading.gradebook.events import TOTAL
 from pipeline.grading.gradebook.history import history_text
-from pipeline.grading.gradebook.override import TOTAL, read_wishes
-from pipeline.grading.gradebook.request_gradebook import points_lost
-from pipeline.grading.gradebook.shared_gradebook import Conflict
+from pipeline.grading.gradebook.override import read_wishes
 from pipeline.grading.judge.recompute import findings_text, read_findings, recompute_points
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.export import export
@@ -61,7 +61,7 @@ def test_a_manual_criterion_is_open_until_a_person_grades_it(honest, tmp_path):
     assert graded.grade.points == rubric.out_of - 4
     grade = graded.grade.model_copy(update={"submission": "team-1"})
     with book_of(tmp_path, grade, rubric=rubric) as book:
-        seen = book.team("team-1").versions["discussion"]
+        seen = book.entry("team-1").version("discussion")
         book.change("team-1", "discussion", 0.0, why="none handed in", by="Ada", version=seen)
         assert book.entry("team-1").grade.open == ()
         assert book.entry("team-1").grade.criteria[-1].outcome == "fail"
@@ -171,7 +171,7 @@ def test_an_adjustment_is_a_number_other_than_0_with_a_reason(tmp_path, points, 
 def test_the_desk_refuses_an_adjustment_sent_twice(tmp_path):
     """A form is valid once, so that a double click does not deduct twice."""
     with book_of(tmp_path, make_grade("team-1")) as book:
-        seen = book.team("team-1").versions[TOTAL]
+        seen = book.entry("team-1").version(TOTAL)
         book.change("team-1", TOTAL, -2.0, why="late notes", by="Ada", version=seen)
         with pytest.raises(Conflict):
             book.change("team-1", TOTAL, -2.0, why="late notes", by="Ada", version=seen)

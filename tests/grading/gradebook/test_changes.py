@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from pipeline.grading.gradebook.changes import points_changes, rubric_changes
-from pipeline.grading.gradebook.request_gradebook import RequestGradebook
+from pipeline.grading.gradebook.gradebook import Gradebook
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.grades import finish, make_grade, n_graded, two_cart_rubric
 from tests.helpers.grading_students import write_team
@@ -58,7 +58,7 @@ def test_points_are_compared_by_name():
 def test_changes_are_printed_and_kept_in_the_history(tmp_path):
     """Neither the first class list nor a second run with the same result counts as a change."""
     grade, late = make_grade("a", share=0.5), RUBRIC.model_copy(update={"anonymous": True})
-    with RequestGradebook(tmp_path, assignment="lab", create=True) as book:
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
         assert [finish(book, grade), finish(book, grade)] == [[], []]
         book.override("a", "laws", 1.0, why="w", by="b")
         rubric, points = finish(book, grade, rubric=late)

@@ -4,7 +4,7 @@ import pytest
 
 from pipeline.grading.gradebook.history import history_text
 from pipeline.grading.gradebook.override import WantedPoints
-from tests.helpers.grades import finish, make_grade
+from tests.helpers.grades import finish, make_grade, seen
 from tests.helpers.grading_students import criterion
 
 NOTE = "Mind the unit."
@@ -17,7 +17,7 @@ def regrade(book):
 
 def change(book, points, why=NOTE):
     """Save the form of a criterion as the desk does."""
-    seen = book.team("team-1").versions["pieces"]
+    seen = book.entry("team-1").version("pieces")
     book.change("team-1", "pieces", points, why=why, by="Ada", version=seen)
 
 
@@ -69,7 +69,7 @@ def test_undo_brings_back_the_earlier_comment(book):
     """Undo removes a comment; if it had replaced an earlier comment, the earlier one returns."""
 
     def undo():
-        book.undo("team-1", "pieces", by="Ada", version=book.team("team-1").versions["pieces"])
+        book.undo("team-1", "pieces", by="Ada", version=book.entry("team-1").version("pieces"))
 
     comment_all(book)
     undo()
@@ -87,15 +87,15 @@ def test_undo_brings_back_the_earlier_comment(book):
 
 def test_a_preview_shows_what_a_comment_changes(book):
     """Before a comment is saved, its preview shows the new message and unchanged points."""
-    (tried,) = book.try_all([wish("x")])
-    assert tried.after.points == tried.now.points
-    assert criterion(tried.after, "pieces").message == f"{pieces(book).message} x"
+    ((now, after),) = book.preview_all([wish("x")])
+    assert after.grade.points == now.grade.points
+    assert criterion(after.grade, "pieces").message == f"{pieces(book).message} x"
 
 
 def test_an_answer_with_the_same_points_leaves_them_automatic(book):
     """If an answer confirms the automatic points, a later regrade may still change these points."""
     book.ask("team-1", "pieces", why="please", by="s1")
     (queued,) = book.queue().waiting
-    book.answer("team-1", "pieces", 0.5, text="right", by="Ada", version=queued.version)
+    book.answer("team-1", "pieces", 0.5, text="right", by="Ada", version=seen(queued))
     regrade(book)
     assert pieces(book).points == 1.0

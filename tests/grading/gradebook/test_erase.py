@@ -9,8 +9,8 @@ import pytest
 from sqlalchemy import Engine, create_engine, text
 from sqlalchemy.exc import DBAPIError
 
+from pipeline.grading.gradebook.database import FILE
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradebook.schema import FILE
 from pipeline.grading.publish.export import export
 from pipeline.grading.publish.outputs import write_outputs
 from tests.helpers.commandline import cartlab_here
@@ -139,7 +139,7 @@ def test_a_dump_of_a_database_is_the_same_gradebook(server, place_in_postgresql)
         assert (list(book.entries()), book.history(GONE)) == (entries, history)
         book.override(KEPT, two_cart_rubric().criteria[0].id, 1, why="new", by="Ada")
     with engine.connect() as connection, pytest.raises(DBAPIError, match="be changed"):
-        connection.execute(text("DELETE FROM overrides"))
+        connection.execute(text("DELETE FROM events"))
     engine.dispose()
 
 

@@ -13,8 +13,8 @@ from sqlalchemy.event import listen, remove
 from sqlalchemy.exc import OperationalError
 
 from pipeline.grading.batch import grade_class
+from pipeline.grading.gradebook.database import Lost
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradebook.schema import Lost
 from tests.helpers import postgres
 from tests.helpers.grades import finish, make_grade, make_outcome
 

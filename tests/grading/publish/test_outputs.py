@@ -18,7 +18,7 @@ from pipeline.grading.batch.grade_class import Options, grade_class
 from pipeline.grading.csv_table import read_table
 from pipeline.grading.grade import CODES, Adjustment, Flag, Grade
 from pipeline.grading.gradebook.class_lines import GradeSummary
-from pipeline.grading.gradebook.override import HandPoints, read_points, with_overrides
+from pipeline.grading.gradebook.override import Event, read_points, with_overrides
 from pipeline.grading.publish.anonymous import KEY_FILE, anonymise, pseudonyms
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.feedback import evidence_table, feedback_page, numbers_table
@@ -300,7 +300,7 @@ def test_feedback_says_why_a_submission_was_not_graded():
     fault = failed_grade("team-1", "no submission.toml in it")
     stopped = fault.model_copy(update={"unsettled": True})
     adjusted = {"points": 5.0, "adjustments": (Adjustment(points=5.0, why="read by eye"),)}
-    given = HandPoints(criterion=RUBRIC.criteria[0].id, points=1.0, why="x", by="y", at="")
+    given = Event(what="override", criterion=RUBRIC.criteria[0].id, points=1.0, text="x")
     by_hand = with_overrides(fault, {given.criterion: given}, rubric=RUBRIC)
     pages = [fault, stopped, stopped.model_copy(update=adjusted), by_hand]
     texts = [re.sub(r"<[^>]+>", "", feedback_of(grade)) for grade in pages]

@@ -1,0 +1,205 @@
+"""Decisions about a submission: each function checks one and returns the events to store."""
+
+import math
+from dataclasses import replace
+
+from pipeline.errors import ConfigError
+from pipeline.grading.grade import Grade
+from pipeline.grading.gradebook.entry import Entry
+from pipeline.grading.gradebook.events import TOTAL, Event
+from pipeline.grading.gradebook.override import WantedPoints, check_step
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.words import points_text
+from pipeline.submission.toml import nearest
+from pipeline.words.text import clean
+
+MOST_LETTERS = 1_000  # characters of a reason or an answer: about one paragraph
+MOST_OPEN = 4  # waiting requests per submission; a team with more doubts should talk to a TA
+
+
+class Conflict(ConfigError):
+    """A change is refused, because the criterion has changed in the meantime.
+
+    `now` holds the last points given by hand, or None.
+    """
+
+    def __init__(self, text: str, *, now: Event | None) -> None:
+        super().__init__(text)
+        self.now = now
+
+
+class RequestRefused(ConfigError):
+    """A request or an answer is refused; the message explains why to the person who wrote it."""
+
+
+# ---------------------------------------------------------------------- points by hand
+
+
+def give(entry: Entry, wanted: WantedPoints) -> Event:
+    """Give points or a comment, or change the total.
+
+    Raises
+    ------
+    ConfigError : the criterion does not exist, the points are out of range, or a reason is missing.
+    """
+    criterion, points, text = wanted.criterion, wanted.points, wanted.why.strip()
+    if not text:
+        raise ConfigError("a change of points needs a reason (--why) and a name (--by)")
+    if criterion == TOTAL:
+        if points is None or not math.isfinite(points) or points == 0:
+            raise ConfigError(f"expected points to add or deduct, such as -2, found {points}")
+        return Event(what="adjusted", criterion=TOTAL, points=points, text=text)
+    out_of = {asked.id: asked.points for asked in entry.rubric.criteria}
+    if criterion not in out_of:
+        hint = nearest(criterion, list(out_of))
+        raise ConfigError(f"{criterion}: the rubric has no such criterion{hint}")
+    if points is not None:
+        if not 0 <= points <= out_of[criterion]:
+            raise ConfigError(
+                f"{criterion}: expected 0 to {out_of[criterion]:g} points, found {points:g}; "
+                "to deduct from the total, or to add to it, use cartlab adjust"
+            )
+        # Points that were given once may be restored after a change of the rubric's step.
+        if not any((e.criterion, e.points) == (criterion, points) for e in entry.events):
+            check_step(points, out_of=out_of[criterion], step=entry.rubric.step)
+    what = "comment" if wanted.comment else "override"
+    return Event(what=what, criterion=criterion, points=points, text=text)
+
+
+def change(entry: Entry, wanted: WantedPoints) -> Event:
+    """Set the points of a criterion; if it already has them, only add the reason as a comment.
+
+    A comment on points given by hand keeps them and replaces their reason.
+    """
+    if not wanted.comment and is_unchanged(wanted.points, entry.grade, wanted.criterion):
+        wanted = replace(wanted, points=None, comment=True)
+    return give(entry, beside(entry, wanted))
+
+
+def beside(entry: Entry, wanted: WantedPoints) -> WantedPoints:
+    """Return the change to store: a comment keeps points given by hand, with the new reason."""
+    given = entry.overrides.get(wanted.criterion)
+    if not wanted.comment or given is None:
+        return wanted
+    return replace(wanted, points=given.points, comment=False)
+
+
+def undo(entry: Entry, criterion: str) -> Event:
+    """Undo the last change of a criterion; a second call redoes it.
+
+    Raises
+    ------
+    ConfigError : nothing was changed by hand.
+    """
+    changes = entry.changes(criterion)
+    if not changes:
+        raise ConfigError(f"{criterion}: nothing was changed by hand")
+    before = changes[-2] if len(changes) > 1 else None
+    wanted = WantedPoints(submission=entry.submission, criterion=criterion, points=None, why="")
+    if criterion == TOTAL:
+        return give(entry, replace(wanted, points=-(changes[-1].points or 0.0), why="taken back"))
+    if before is None or (before.points is None and before.what == "override"):
+        return give(entry, replace(wanted, why="taken back"))
+    comment = before.what == "comment"
+    return give(entry, replace(wanted, points=before.points, why=before.text, comment=comment))
+
+
+def is_repeated(entry: Entry, event: Event) -> bool:
+    """Return whether an event only repeats the last change of its criterion."""
+    last = entry.given.get(event.criterion)
+    same = ("what", "points", "text")
+    return last is not None and all(getattr(last, key) == getattr(event, key) for key in same)
+
+
+def is_unchanged(points: float | None, grade: Grade, criterion: str) -> bool:
+    """Return whether typed points are those that a page shows for a criterion.
+
+    A page shows at most two decimals, so 1.33 leaves points of 4/3 as they are.
+    """
+    now = None if criterion in grade.open else points_of(grade, criterion)
+    return now is not None and points in (now, float(points_text(now)))
+
+
+def points_of(grade: Grade, criterion: str) -> float | None:
+    """Return the points of a criterion; None if it was never judged."""
+    return next((own.points for own in grade.criteria if own.id == criterion), None)
+
+
+# ---------------------------------------------------------------------------- requests
+
+
+def ask(entry: Entry, criterion: str, *, why: str) -> Event:
+    """Ask for a review of a criterion that lost points.
+
+    Students can ask once, and again whenever a teaching assistant reopens the request.
+
+    Raises
+    ------
+    RequestRefused : no request is possible for this criterion now, or `why` is empty or too long.
+    """
+    text = _read_words(why, wanted="write what was judged wrongly, and why")
+    known = entry.requests.get(criterion)
+    if known is not None and known.state != "reopened":
+        raise RequestRefused("you asked for another look at this criterion already")
+    if criterion not in points_lost(entry.grade, entry.rubric):
+        raise RequestRefused("you can ask only where points were lost")
+    if sum(one.state == "asked" for one in entry.requests.values()) >= MOST_OPEN:
+        raise RequestRefused(f"{MOST_OPEN} of your requests are waiting: ask again after an answer")
+    return Event(what="asked", criterion=criterion, text=text)
+
+
+def answer(entry: Entry, criterion: str, points: float | None, *, text: str) -> list[Event]:
+    """Answer a request and, if the points change, set them by hand.
+
+    Parameters
+    ----------
+    points : new points; None or the current points change nothing.
+    text : answer for the students; also the reason for new points.
+
+    Raises
+    ------
+    RequestRefused : the answer is empty or too long, or the request is not waiting.
+    ConfigError : the criterion cannot have these points.
+    """
+    text = _read_words(text, wanted="write an answer for the students")
+    if entry.requests[criterion].state != "asked":
+        raise RequestRefused("this request has an answer already; reopen it to answer again")
+    answered = Event(what="answered", criterion=criterion, text=text)
+    if points is None or is_unchanged(points, entry.grade, criterion):
+        return [answered]
+    wanted = WantedPoints(submission=entry.submission, criterion=criterion, points=points, why=text)
+    return [give(entry, wanted), replace(answered, points=points)]
+
+
+def reopen(entry: Entry, criterion: str) -> Event:
+    """Let the students ask once more about a criterion that was answered.
+
+    Raises
+    ------
+    RequestRefused : the request has no answer yet, or is already reopened.
+    """
+    if entry.requests[criterion].state != "answered":
+        raise RequestRefused("only an answered request can be reopened")
+    return Event(what="reopened", criterion=criterion)
+
+
+def points_lost(grade: Grade, rubric: Rubric) -> frozenset[str]:
+    """Return the criteria without full points, including those that were not judged.
+
+    A criterion that a person has yet to grade has lost nothing yet.
+    """
+    points = {criterion.id: criterion.points for criterion in grade.criteria}
+    lost = (c.id for c in rubric.criteria if points.get(c.id, 0.0) < c.points)
+    return frozenset(lost).difference(grade.open)
+
+
+def _read_words(text: str, *, wanted: str) -> str:
+    """Return a typed text without characters that cannot be displayed; `wanted` if it is empty."""
+    text = clean(text).strip()
+    if not text:
+        raise RequestRefused(wanted)
+    if len(text) > MOST_LETTERS:
+        raise RequestRefused(
+            f"write at most {MOST_LETTERS:,} characters, found {len(text):,}: keep the main point"
+        )
+    return text
