@@ -167,6 +167,7 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/grades/{n:nth}/paper", "GET", team_page.send_paper),
     ("/grades/{n:nth}/requests", "GET", request_queue.show),
     ("/grades/{n:nth}/requests", "POST", request_queue.act),
+    ("/grades/{n:nth}/accept", "POST", class_actions.accept),
     ("/grades/{n:nth}/release", "POST", class_actions.release),
     ("/feedback/{n:nth}/", "GET", my_feedback.show),
     ("/feedback/{n:nth}/whole", "GET", my_feedback.show_whole),

@@ -15,10 +15,12 @@ import pytest
 
 from pipeline.desk.app import DeskServer
 from pipeline.desk.grades.criteria import point_steps
+from pipeline.grading.grade import Flag
 from pipeline.grading.gradebook.class_lines import GradeSummary
 from pipeline.grading.gradebook.events import Event
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Batch
+from pipeline.grading.intake.repairs import Run, read_run, save_run
 from pipeline.grading.publish.export import export
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.resources import RUBRICS
@@ -357,6 +359,52 @@ def test_accept_opens_the_next_team_of_the_filter(ta):
     assert names(ta.get(address)) == expected[:1]
 
 
+def test_what_needs_a_look_comes_first(ta, grades):
+    """The class starts with the teams to review: those in doubt, then those with few points."""
+    with Gradebook(grades) as book:
+        teams = {entry.submission: entry.grade for entry in book.entries()}
+    ta.post(at("broken"), do="accept")
+    shown = names(ta.get(ROOM))
+    doubts = {name for name, grade in teams.items() if grade.flags or grade.status == "failed"}
+    expected = sorted(teams, key=lambda n: (n == "broken", n not in doubts, teams[n].points))
+    assert [(n in doubts, teams[n].points) for n in shown] == [
+        (n in doubts, teams[n].points) for n in expected
+    ]
+    assert f"Continue with {shown[0]}" in unescape(ta.get(ROOM).text)
+    second = ta.post(at(shown[0]), do="accept").headers["location"]
+    assert urlencode({"of": shown[1]}) in second
+    last = ta.post(at(shown[-1]), do="accept").headers["location"]
+    assert urlencode({"of": shown[1]}) in last  # those that were passed over are not forgotten
+
+
+def test_the_head_of_a_team_says_how_late_it_was(ta):
+    """The days late and the points deducted for them stand next to the points."""
+    pages = [ta.get(at(team)).text for team in ("team-04", "team-03")]
+    heads = [re.findall(r'class="result">(.*?)<', page)[0] for page in pages]
+    assert ["1 day late" in head for head in heads] == [True, False]
+
+
+def test_teams_without_a_remark_are_accepted_together(ta, grades):
+    """One look at their list is enough; a team that changed meanwhile is looked at again."""
+    with Gradebook(grades) as book:
+        clean = [
+            e.submission for e in book.entries() if e.grade.status == "graded" and not e.grade.flags
+        ]
+    page = ta.get(ROOM)
+    listed = re.findall(r'name="team" value="(.*?)" checked', page.text)
+    assert sorted(map(unescape, listed)) == sorted(clean)
+    changed, left, *_ = clean
+    change(ta, changed, points="0.5", why="seen by another person")
+    form = sent(page, *(name for name in clean if name != left))
+    assert apply(ta, ROOM + "accept", form).status == 303
+    assert "1 team changed meanwhile" in ta.get(ROOM).text
+    with Gradebook(grades) as book:
+        by = {entry.submission: entry.reviewed_by for entry in book.entries()}
+    assert {name for name, who in by.items() if who} == set(clean) - {changed, left}
+    assert apply(ta, ROOM + "accept", sent(page, "nobody")).status == 422
+    assert apply(ta, ROOM + "accept", sent(page)).status == 422
+
+
 def test_earlier_reasons_are_offered(ta):
     """The page offers reasons given before for the same criterion, the most common first."""
     for team, why in (("team-05", "b"), ("team-06", "a"), ("team-07", "b")):
@@ -493,6 +541,20 @@ def test_the_export_equals_that_of_the_command(ta, grades, tmp_path, platform):
 @pytest.mark.slow
 @pytest.mark.sample
 @pytest.mark.parametrize("anonymous", [False, True])
+def test_the_form_to_grade_again_knows_what_was_graded(tmp_path, anonymous):
+    """It shows paths, rubric and late days of the last grading; hidden names stay hidden."""
+    grades = write_class(tmp_path / "g", anonymous=anonymous)
+    paths = tuple(str(tmp_path / name) for name in ("team-02", "team-05.zip"))
+    save_run(grades, Run(paths=paths, rubric="lab.toml", lateness="late.csv"))
+    with at_desk(opened=grades) as who:
+        page = who.get(ROOM)
+        assert page.value("rubric") == "lab.toml"
+        assert page.value("lateness") == "late.csv"
+        assert [path in page.text for path in paths] == [not anonymous] * 2
+        assert ("as last time (2)" in page.text) is anonymous
+
+
+@pytest.mark.parametrize("anonymous", [False, True])
 def test_a_class_is_graded_again_from_the_desk(tmp_path, anonymous):
     """A late submission is graded into the open class; earlier grades and hidden names stay."""
     team, late, lab = (tmp_path / name for name in ("team-05", "late.csv", "lab.toml"))
@@ -510,6 +572,9 @@ def test_a_class_is_graded_again_from_the_desk(tmp_path, anonymous):
         assert who.post(ROOM + "regrade", **sent).status == 303
         until(lambda: "data-events" not in who.get(ROOM).text)
         shown = names(who.get(ROOM))
+    run = read_run(grades)
+    assert run is not None
+    assert (run.paths, run.rubric, run.lateness) == ((str(team),), str(lab), str(late))
     with Gradebook(grades) as book:
         entry = {one.submission: one for one in book.entries()}
         assert entry["team-04"].overrides["pieces"].text == "as told"
@@ -530,7 +595,7 @@ def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
     with at_desk(opened=grades) as who:
         shown = names(who.get(ROOM))
         assert len(shown) == len(entries)
-        assert shown == sorted(shown)
+        assert names(who.get(ROOM + "?order=name")) == sorted(shown)
         change(who, shown[0], points="1", why="well")
         tried = ("news?since=0&told=0", "feedback/team-02/feedback.html",
                  "feedback/team-02/grade.json", "anonymous-key.csv")  # fmt: skip
@@ -691,6 +756,27 @@ def test_the_recordings_of_a_team_are_one_click_away(tmp_path):
         assert 'name="to"' not in owner.get(at("team-1")).text
 
 
+def test_one_decision_is_offered_for_the_same_slip(tmp_path):
+    """An unstable A is not a reordered A: teams with the same flag may need another decision."""
+    slips = {"a": "the order of the states", "b": "", "c": "the order of the states", "d": ""}
+
+    def flag(slip: str) -> Flag:
+        evidence = {"parameter": "A(1, 2)", "reported": 1.0, "recomputed": 2.0, "slip": slip}
+        return Flag(code="wrong_state_space", parameters=("A",), message="x", evidence=evidence)
+
+    put(
+        tmp_path,
+        *(make_outcome(make_grade(n, share=0.5, flags=(flag(s),))) for n, s in slips.items()),
+    )
+    with at_desk(opened=tmp_path) as who:
+        for name, same in (("a", ["a", "c"]), ("b", ["b", "d"])):
+            page = who.get(at(name, criterion="state-model")).text
+            found = re.search(r'href="([^"]*together[^"]*)"[^>]*>Apply to the 2 teams', page)
+            assert found, name
+            page = who.get(unescape(found[1]))
+            assert sorted(listed(page)) == same
+
+
 def test_undoing_a_decision_keeps_later_changes(ta, grades):
     """If a decision is undone, teams that were changed after it keep their points and are named."""
     page = ta.get(together())
@@ -698,7 +784,7 @@ def test_undoing_a_decision_keeps_later_changes(ta, grades):
     apply(ta, together(), sent(page, *names, do="apply", points="0.5", why="one unit"))
     change(ta, names[0], points="1", why="right after all")
     ta.post(ROOM + "together", do="undo", set=ta.get(ROOM).value("set"))
-    said = " ".join(re.findall(r'class="said">(.*?)<', ta.get(ROOM).text))
+    said = unescape(" ".join(re.findall(r'class="said">(.*?)<', ta.get(ROOM).text)))
     assert (str(len(names) - 1) in said, names[0] in said) == (True, True)
     given = {name: overrides(grades, name) for name in names}
     reasons = {name: own["laws"].text for name, own in given.items() if own}

@@ -194,7 +194,8 @@ def _back(ask: PageRequest, team: str, asked: Criterion) -> str:
 def _name_set(wanted: Filter) -> str:
     """Return the title of the page, from its filter."""
     if wanted.flag:
-        return capital(WORDS.text(f"title_{wanted.flag}"))
+        slip = f": {wanted.slip}" if wanted.slip not in ("", "-") else ""
+        return capital(WORDS.text(f"title_{wanted.flag}")) + slip
     return "Points lost" if wanted.lost else "Several teams"
 
 
@@ -205,7 +206,7 @@ def _widen(ask: PageRequest, shown: ClassView, wanted: Filter) -> tuple[str, int
     """
     if not (wanted.flag and wanted.lost):
         return None
-    wide = Filter(flag=wanted.flag)
+    wide = Filter(flag=wanted.flag, slip=wanted.slip)
     many = len(wide.chosen(shown))
     if many == len(wanted.chosen(shown)):
         return None

@@ -44,6 +44,20 @@ def take_table(ask: PageRequest) -> Response:
     return ask.back(ask.here, f"{message}.")
 
 
+def accept(ask: PageRequest) -> Response:
+    """Mark the ticked teams as reviewed; a team that changed since it was listed is not."""
+    shown, by = read_class(ask), sign(ask)
+    ticked = [str(name) for name in ask.form.getlist("team")]
+    if not ticked or any(name not in shown.teams for name in ticked):
+        raise ConfigError("tick at least one team of the class")
+    seen = {shown.teams[name].submission: ask.text(f"seen.{name}") for name in ticked}
+    done = open_gradebook(ask).accept_all(seen, by=by)
+    message = f"{count(done.teams, 'team')} accepted."
+    if done.kept:
+        message += f" {count(len(done.kept), 'team')} changed meanwhile: look again."
+    return ask.back(ask.here, message)
+
+
 def release(ask: PageRequest) -> Response:
     """Let students with accounts read their feedback, or hide it again."""
     if not may_release(ask):
@@ -87,15 +101,16 @@ def regrade(ask: PageRequest) -> Response:
         raise HTTPException(403, "only the owner of this computer can enter folders")
     folder = ask.folder()
     typed = {name: ask.text(name) for name in ("paths", "rubric", "lateness")}
-    if not typed["paths"] or not typed["rubric"]:
+    run = read_run(folder)
+    paths = typed["paths"].splitlines() or (run.paths if run else ())
+    if not paths or not typed["rubric"]:
         raise ConfigError("enter the submissions and the rubric")
     ask.desk.gradebooks.asked[folder] = typed
-    run = read_run(folder)
     ask.start(
         "regrade_class",
         title="Grading",
         # The task works in another folder than the desk.
-        paths=[_find(path) for path in typed["paths"].splitlines()],
+        paths=[_find(path) for path in paths],
         rubric=_find(typed["rubric"]),
         lateness=_find(typed["lateness"]),
         options={**(run.options if run else {}), "anonymous": shown.rubric.anonymous},

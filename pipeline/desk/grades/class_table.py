@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
@@ -19,6 +20,7 @@ from pipeline.grading.gradebook.class_lines import ClassRow
 from pipeline.grading.gradebook.events import TOTAL
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.history import to_the_second
+from pipeline.grading.intake.repairs import read_run
 from pipeline.grading.publish.anonymous import STRANGER, anonymise
 from pipeline.grading.publish.class_page import class_page, not_final
 from pipeline.grading.publish.feedback import feedback_page
@@ -82,7 +84,7 @@ def show(ask: PageRequest) -> Response:
     page = min(max(_read_number(ask, "page"), 1), pages)
     graded = sorted(t.line.points for t in shown.teams.values() if t.line.status == "graded")
     titles = {asked.id: capital(asked.title or asked.id) for asked in shown.rubric.criteria}
-    unseen = (name for name, team in shown.teams.items() if not team.reviewed_by)
+    unseen = Filter(seen="no").chosen(shown)
     return ask.page(
         "grades",
         title=shown.rubric.title or name_place(ask.place_or_404()),
@@ -94,7 +96,9 @@ def show(ask: PageRequest) -> Response:
         not_final=not_final([team.line for team in shown.teams.values()]),
         words=WORDS,
         titles=titles,
-        next=next(unseen, ""),
+        next=unseen[0].line.submission if unseen else "",
+        clean=[team for team in unseen if not team.line.in_doubt],
+        most=_ROWS,
         flags=count_flags(shown),
         lost=count_lost(shown, titles),
         sets=open_gradebook(ask).changed_together()[:_MOST_SETS],
@@ -109,11 +113,26 @@ def show(ask: PageRequest) -> Response:
         to_page=lambda number: f"?{urlencode({'page': number})}&{wanted.query}",
         drawn="-".join(map(str, shown.state)),
         news=list_news(ask, shown, since=shown.state[1]),
-        asked=ask.desk.gradebooks.asked.get(ask.place_or_404(), {}),
+        asked=_find_run(ask, named=shown.names is None),
         n_requests=open_gradebook(ask).n_waiting(),
         released=open_gradebook(ask).released,
+        signature=find_signature(ask),
         may_release=may_release(ask),
     )
+
+
+def _find_run(ask: PageRequest, *, named: bool) -> dict[str, str]:
+    """Return what the form to grade again shows: what was typed last, or graded last.
+
+    The paths of an anonymous class may name teams, so only their number is shown.
+    """
+    place = ask.place_or_404()
+    run = read_run(place) if isinstance(place, Path) and ask.user.owns else None
+    last = {}
+    if run:
+        last = {"rubric": run.rubric, "lateness": run.lateness, "known": str(len(run.paths))}
+        last |= {"paths": "\n".join(run.paths)} if named else {}
+    return last | ask.desk.gradebooks.asked.get(place, {})
 
 
 def count_flags(shown: ClassView) -> list[Counted]:

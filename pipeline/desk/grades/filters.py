@@ -18,7 +18,12 @@ _STATES: Mapping[str, tuple[str, Callable[[ClassRow], bool]]] = {
     "remark": ("with a remark", lambda team: bool(team.line.codes)),
 }
 _SEEN = {"no": "not yet reviewed", "yes": "reviewed"}
-_ORDERS = {"name": "name", "points": "points, lowest first", "late": "days late, latest first"}
+_ORDERS = {
+    "": "to review first",
+    "name": "name",
+    "points": "points, lowest first",
+    "late": "days late, latest first",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,13 +33,17 @@ class Filter:
     Attributes
     ----------
     flag : only teams with this flag.
+    slip : only teams whose flag is of this kind of mistake, as `slip_of` names it.
     lost : only teams that lost points in this criterion.
     state : only teams in one of the `_STATES`.
     seen : only reviewed teams ("yes"), or only teams not yet reviewed ("no").
     q : only teams with this text in their name or authors.
+    order : one of the `_ORDERS`; "" shows what is still to review first, doubts before the rest,
+        and there those with the fewest points.
     """
 
     flag: str = ""
+    slip: str = ""
     lost: str = ""
     state: str = ""
     seen: str = ""
@@ -74,7 +83,9 @@ class Filter:
     def ordered(self, shown: ClassView) -> Sequence[ClassRow]:
         """Return the whole class in the order of the filter."""
         teams = list(shown.teams.values())
-        if self.order == "points":
+        if self.order not in _ORDERS or not self.order:
+            teams.sort(key=lambda t: (bool(t.reviewed_by), not t.line.in_doubt, t.line.points))
+        elif self.order == "points":
             teams.sort(key=lambda team: team.line.points)
         elif self.order == "late":
             teams.sort(key=lambda team: -team.line.days_late)
@@ -83,6 +94,8 @@ class Filter:
     def _takes(self, team: ClassRow, shown: ClassView) -> bool:
         line = team.line
         if self.flag and self.flag not in line.codes:
+            return False
+        if self.slip and (self.flag, self.slip) not in line.slips:
             return False
         if self.seen in _SEEN and bool(team.reviewed_by) != (self.seen == "yes"):
             return False
@@ -114,7 +127,7 @@ class Filter:
                     self.state),
             _choice("seen", "Looked at", {k: f"{_SEEN[k]} ({n})" for k, n in numbers.items()},
                     self.seen),
-            _choice("order", "Order", _ORDERS, self.order or "name", whole=False),
+            _choice("order", "Order", _ORDERS, self.order, whole=False),
         ]  # fmt: skip
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -33,7 +33,7 @@ from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, Grade
-from pipeline.grading.gradebook.class_lines import ClassRow
+from pipeline.grading.gradebook.class_lines import ClassRow, slip_of
 from pipeline.grading.gradebook.decisions import Conflict
 from pipeline.grading.gradebook.entry import Entry
 from pipeline.grading.gradebook.events import TOTAL
@@ -77,7 +77,7 @@ def act(ask: PageRequest) -> Response:
         return ask.back(write_address(ask, team.line.submission))
     if what == "accept":
         wanted = Filter.read(ask.request.query_params)
-        after = wanted.beside(shown, team.line.submission)[1]
+        after = _find_next(shown, wanted, team)
         to = write_address(ask, after) if after else f"{ask.here}?{wanted.query}"
         return ask.back(to, f"{team.line.submission}: accepted.")
     criterion, seen = TOTAL if what == "adjust" else ask.text("criterion"), ask.text("seen")
@@ -104,6 +104,13 @@ def act(ask: PageRequest) -> Response:
     to = write_address(ask, team.line.submission, criterion=criterion)
     done = "Undone." if what == "undo" else "Saved."
     return ask.back(f"{to}#chosen", done, place=_POINTS)
+
+
+def _find_next(shown: ClassView, wanted: Filter, team: ClassRow) -> str:
+    """Return the team to review after this one: the next that is left, or the first; "" if none."""
+    left = wanted if wanted.seen else replace(wanted, seen="no")
+    after = left.beside(shown, team.line.submission)[1]
+    return after or next((o.line.submission for o in left.chosen(shown) if o != team), "")
 
 
 def _repair(ask: PageRequest, shown: ClassView, team: ClassRow, *, by: str) -> Response:
@@ -314,8 +321,7 @@ def _link_together(
 ) -> list[tuple[str, str]]:
     """Return links, with their text, to apply the same points to all teams with the same flag."""
     lost = one["id"] if one["lost"] else ""
-    codes = dict.fromkeys(flag.code for flag in flags)
-    sets = [(Filter(flag=code, lost=lost), WORDS.text(f"title_{code}")) for code in codes]
+    sets = list(dict.fromkeys(_same_slip(shown, flag, lost=lost) for flag in flags))
     if lost and not sets:
         sets = [(Filter(lost=lost), "points lost here")]
     found = []
@@ -329,6 +335,19 @@ def _link_together(
             address = f"{ask.here}together?{urlencode(about)}&{wanted.query}"
             found.append((address, f"Apply to the {many} teams with {title}"))
     return found
+
+
+def _same_slip(shown: ClassView, flag: Flag, *, lost: str) -> tuple[Filter, str]:
+    """Return the filter for the teams with the same kind of mistake, and its name.
+
+    Teams with the same flag may have made other mistakes, and one decision is not right for all.
+    """
+    every, title = Filter(flag=flag.code, lost=lost), WORDS.text(f"title_{flag.code}")
+    slip = slip_of(flag.evidence)
+    same = replace(every, slip=slip)
+    if len(same.chosen(shown)) == len(every.chosen(shown)):
+        return every, title
+    return same, f"{title}: {'of no known kind' if slip == '-' else slip}"
 
 
 def _show_conflict(

@@ -1,6 +1,6 @@
 """The data of a class list that pages and tables show."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from math import nan
@@ -19,6 +19,7 @@ from pipeline.grading.grade import (
     Outcome,
 )
 from pipeline.grading.rubric import Rubric
+from pipeline.grading.words import WORDS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,10 +38,24 @@ class Judged(TypedDict):
     points: float
 
 
+class Slip(TypedDict, total=False):
+    """What the evidence of a flag says about the kind of mistake."""
+
+    slip: str | None
+    together_with: list[str]
+
+
 class Flagged(TypedDict):
     """A mistake that the grader names."""
 
     code: Code
+    evidence: Slip
+
+
+def slip_of(evidence: Mapping[str, Any]) -> str:
+    """Return the kind of mistake behind a flag, in words; "-" if it is unknown."""
+    others = (WORDS.text(f"title_{code}") for code in evidence.get("together_with", ()))
+    return evidence.get("slip") or " and ".join(others) or "-"
 
 
 class GradeSummary(GradeTable):
@@ -76,9 +91,9 @@ class GradeSummary(GradeTable):
 
         The flag says that other submissions contain the same recordings.
         """
-        codes = {flag["code"] for flag in self.flags} | {"shared_data"}
-        flags = tuple(Flagged(code=code) for code in CODES if code in codes)
-        return self.model_copy(update={"flags": flags})
+        flags = [*self.flags, Flagged(code="shared_data", evidence={})]
+        flags.sort(key=lambda flag: CODES.index(flag["code"]))
+        return self.model_copy(update={"flags": tuple(flags)})
 
     @cached_property
     def judged(self) -> dict[str, Judged]:
@@ -89,6 +104,16 @@ class GradeSummary(GradeTable):
     def codes(self) -> tuple[Code, ...]:
         """The codes of the flags, each once."""
         return tuple(dict.fromkeys(flag["code"] for flag in self.flags))
+
+    @property
+    def slips(self) -> set[tuple[str, str]]:
+        """The code of each flag with the kind of mistake."""
+        return {(flag["code"], slip_of(flag["evidence"])) for flag in self.flags}
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether a person should look: there is a flag, or something is not graded."""
+        return bool(self.flags or self.open or self.unsettled) or self.status == "failed"
 
     @property
     def by_hand(self) -> tuple[str, ...]:
@@ -119,6 +144,11 @@ class ClassRow:
     shared: Flag | None
     first_key: str
     made_of: tuple[Any, ...]
+
+    @property
+    def version(self) -> str:
+        """Version of all that is known of the submission, as in `Entry.whole_version`."""
+        return f"{self.grading}.{max(self.made_of[2:], default=0)}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -98,6 +98,11 @@ class Entry:
         newest = self.given.get(criterion)
         return f"{self.grading}.{newest.id if newest else 0}"
 
+    @property
+    def whole_version(self) -> str:
+        """Version of all that is known of the submission: it changes with every event."""
+        return f"{self.grading}.{max((event.id for event in self.events), default=0)}"
+
     def request_version(self, criterion: str) -> str:
         """Return the version of a request, which an answer must name."""
         return f"{self.version(criterion)}.{self.requests[criterion].number}"

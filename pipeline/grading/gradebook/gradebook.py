@@ -6,8 +6,8 @@ class list. Grades contain no dates, but the gradebook does, and `cartlab histor
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -18,7 +18,7 @@ from pipeline.errors import ConfigError
 from pipeline.grading.grade import Grade, read_grade
 from pipeline.grading.gradebook import decisions
 from pipeline.grading.gradebook.changes import points_changes, rubric_changes
-from pipeline.grading.gradebook.class_lines import ClassNow, ClassRow, GradeSummary, class_frame
+from pipeline.grading.gradebook.class_lines import ClassNow, GradeSummary, class_frame
 from pipeline.grading.gradebook.database import Database
 from pipeline.grading.gradebook.decisions import Conflict, RequestRefused
 from pipeline.grading.gradebook.entry import Entry
@@ -28,13 +28,12 @@ from pipeline.grading.gradebook.events import (
     TOTAL,
     Event,
     Request,
-    newest_points,
-    reviewer,
 )
 from pipeline.grading.gradebook.history import read_history
 from pipeline.grading.gradebook.override import WantedPoints
 from pipeline.grading.gradebook.rows import (
     GRADING,
+    add_event,
     add_list,
     add_row,
     by_other_rubrics,
@@ -51,10 +50,10 @@ from pipeline.grading.gradebook.rows import (
     pages,
     points_of,
     read_entries,
-    read_entry,
     read_events,
     read_figures,
     read_flag,
+    read_line,
     read_members,
     read_prints,
     read_rubric,
@@ -91,7 +90,7 @@ class BulkChange:
     at : time of all these changes, in ISO 8601, UTC, to the microsecond; it identifies them.
     criterion, why : a criterion and a reason from these changes, as examples.
     teams : number of submissions changed.
-    kept : submissions that `undo_all` left unchanged, because somebody has changed them since.
+    kept : submissions that were left unchanged, because somebody has changed them since.
     """
 
     at: str
@@ -449,19 +448,10 @@ class Gradebook:
                 new = [at for at in made_of if at not in listed]
                 rows = rows.where(entries.c.position.in_(new))
             for row in connection.execute(rows):
-                shared, own = read_flag(row.shared), done.get(row.submission_id, ())
-                if newest_points(own):  # only then the whole grade is needed
-                    grade = read_entry(row, own, shared=shared, rubric=rubric).grade
-                    line = GradeSummary.of(grade)
-                else:
-                    line = GradeSummary.model_validate_json(row.grade)
-                    line = line.sharing() if shared else line
-                listed[row.position] = ClassRow(
-                    line=line,
-                    submission=row.name,
-                    grading=row.id,
-                    reviewed_by=reviewer(own, row.id),
-                    shared=shared,
+                listed[row.position] = read_line(
+                    row,
+                    done.get(row.submission_id, ()),
+                    rubric=rubric,
                     first_key=keys[row.submission_id],
                     made_of=made_of[row.position],
                 )
@@ -647,6 +637,24 @@ class Gradebook:
         what = "reviewed" if reviewed else "unreviewed"
         self._decide(team, lambda entry: [Event(what=what, grading=entry.grading)], by=by)
 
+    def accept_all(self, seen: Mapping[str, str], *, by: str) -> BulkChange:
+        """Mark submissions as reviewed, except those that changed since a person saw them.
+
+        Parameters
+        ----------
+        seen : version of each submission that the person saw, from `ClassRow.version`.
+        """
+        at = self._at()
+        with self._database.changing() as connection:
+            known = self._named(connection, list(seen))
+            same = [name for name, (_, entry) in known.items() if entry.whole_version == seen[name]]
+            for name in same:
+                row, entry = known[name]
+                mark = Event(what="reviewed", grading=entry.grading)
+                self._store(connection, row, [mark], by=by, at=at)
+        kept = tuple(name for name in seen if name not in same)
+        return BulkChange(at=at, by=by, teams=len(same), kept=kept)
+
     def changes_since(self, number: int) -> list[tuple[str, Event]]:
         """Return the points given by hand after the event `number`, with their submissions."""
         with self._database.reading() as connection:
@@ -692,7 +700,7 @@ class Gradebook:
         """Let students read the feedback of the class, or hide it again."""
         with self._database.changing() as connection:
             event = Event(what="released" if released else "hidden", by=by, at=self._at())
-            _add_event(connection, event, assignment=self._last(connection).assignment)
+            add_event(connection, event, assignment=self._last(connection).assignment)
 
     def n_waiting(self) -> int:
         """Return the number of requests of the class that wait for an answer."""
@@ -828,7 +836,7 @@ class Gradebook:
             select(submissions.c.assignment).where(submissions.c.id == row.submission_id)
         )
         return [
-            _add_event(connection, event, assignment=of or "", submission=row.submission_id)
+            add_event(connection, event, assignment=of or "", submission=row.submission_id)
             for event in signed
         ]
 
@@ -932,17 +940,6 @@ def _named(team: str, rows: Sequence[Row]) -> list[Row]:
     """Return the rows named `team`; if no row is, those with `team` among the authors."""
     exact = [row for row in rows if row.name == team]
     return exact or [row for row in rows if person(team) in map(person, row.authors)]
-
-
-def _add_event(
-    connection: Connection, event: Event, *, assignment: str, submission: int | None = None
-) -> Event:
-    """Store an event; return it with its number."""
-    values = asdict(event)
-    del values["id"], values["out_of"]
-    grading = values.pop("grading")
-    place = {"assignment": assignment, "submission_id": submission, "grading_id": grading}
-    return replace(event, id=add_row(connection, events, {**values, **place}))
 
 
 def _check_version(entry: Entry, wanted: WantedPoints) -> None:

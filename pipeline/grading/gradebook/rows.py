@@ -4,16 +4,18 @@ import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import asdict, fields, replace
+from typing import Any
 
 from pydantic import ValidationError
 from sqlalchemy import ColumnElement, Connection, Row, Select, Table, func, insert, select
 
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, read_grade
+from pipeline.grading.gradebook.class_lines import ClassRow, GradeSummary
 from pipeline.grading.gradebook.database import Database
 from pipeline.grading.gradebook.entry import Entry
-from pipeline.grading.gradebook.events import REQUESTS, Event
+from pipeline.grading.gradebook.events import REQUESTS, Event, newest_points, reviewer
 from pipeline.grading.gradebook.schema import (
     batches,
     entries,
@@ -226,6 +228,27 @@ def read_events(connection: Connection, *where: ColumnElement) -> dict[int, list
     return found
 
 
+def read_line(
+    row: Row, done: Sequence[Event], *, rubric: Rubric, first_key: str, made_of: tuple[Any, ...]
+) -> ClassRow:
+    """Return a line of the class list with only the parts that a table of the class needs."""
+    shared = read_flag(row.shared)
+    if newest_points(done):  # only then the whole grade is needed
+        line = GradeSummary.of(read_entry(row, done, shared=shared, rubric=rubric).grade)
+    else:
+        line = GradeSummary.model_validate_json(row.grade)
+        line = line.sharing() if shared else line
+    return ClassRow(
+        line=line,
+        submission=row.name,
+        grading=row.id,
+        reviewed_by=reviewer(done, row.id),
+        shared=shared,
+        first_key=first_key,
+        made_of=made_of,
+    )
+
+
 def first_keys(connection: Connection, submitted: Iterable[int] | Select) -> dict[int, str]:
     """Return the key of each submission's first version, by submission number."""
     firsts = select(func.min(gradings.c.id)).where(gradings.c.submission_id.in_(submitted))
@@ -270,6 +293,17 @@ def is_released(connection: Connection, assignment: str) -> bool:
         events.c.assignment == assignment, events.c.what.in_(("released", "hidden"))
     )
     return connection.scalar(mine.order_by(events.c.id.desc()).limit(1)) == "released"
+
+
+def add_event(
+    connection: Connection, event: Event, *, assignment: str, submission: int | None = None
+) -> Event:
+    """Store an event; return it with its number."""
+    values = asdict(event)
+    del values["id"], values["out_of"]
+    grading = values.pop("grading")
+    place = {"assignment": assignment, "submission_id": submission, "grading_id": grading}
+    return replace(event, id=add_row(connection, events, {**values, **place}))
 
 
 def lines_of(connection: Connection, batch: Row) -> list[dict]:

@@ -8,7 +8,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -93,9 +93,8 @@ def save_repair(out: Path, name: str, repair: Repair, *, of: str) -> None:
 
 
 def save_run(out: Path, run: Run) -> None:
-    """Save what was graded, so that a repaired submission can be graded again."""
-    if (out / FOLDER).is_dir():
-        _write(out / FOLDER / _RUN, json.dumps(asdict(run), ensure_ascii=False))
+    """Save what was graded, so that the class can be graded again at the desk."""
+    _write(own_folder(out, FOLDER) / _RUN, json.dumps(asdict(run), ensure_ascii=False))
 
 
 def read_run(out: Path) -> Run | None:
@@ -108,9 +107,16 @@ def read_run(out: Path) -> Run | None:
 
 
 def forget_repairs(out: Path, names: Iterable[str]) -> None:
-    """Delete all that is kept about repairs of some submissions."""
-    for name in names:
+    """Delete all that is kept about repairs of some submissions, and the paths that name them."""
+    gone = set(names)
+    for name in gone:
         shutil.rmtree(out / FOLDER / name, ignore_errors=True)
+    if run := read_run(out):
+        last = {Path(name).name for name in gone}
+        paths = tuple(
+            path for path in run.paths if last.isdisjoint((Path(path).stem, Path(path).name))
+        )
+        save_run(out, replace(run, paths=paths))
 
 
 def _write(path: Path, text: str) -> None:

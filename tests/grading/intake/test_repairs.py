@@ -12,10 +12,14 @@ from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.gradings import Grading
 from pipeline.grading.intake.repairs import (
     Repair,
+    Run,
+    forget_repairs,
     keep_original,
     read_original,
     read_repairs,
+    read_run,
     save_repair,
+    save_run,
     text_key,
 )
 from pipeline.grading.rubric_file import load_rubric
@@ -72,3 +76,11 @@ def test_a_repair_is_saved_for_the_text_that_a_person_saw(tmp_path):
     assert read_repairs(tmp_path, "team-07") == {key: repair}  # kept for the first text
     keep_original(tmp_path, "team-07", "")
     assert read_original(tmp_path, "team-07") is None
+
+
+def test_an_erased_submission_is_no_path_of_the_last_grading_any_more(tmp_path):
+    """The paths that name it are forgotten with it; a folder of the whole class stays."""
+    paths = ("/lab/zebra.zip", "/lab/zebra", "/lab/zebra-2", "/lab")
+    save_run(tmp_path, Run(paths=paths, rubric="lab.toml"))
+    forget_repairs(tmp_path, ["mon-zebra", "mon/zebra"])
+    assert read_run(tmp_path) == Run(paths=("/lab/zebra-2", "/lab"), rubric="lab.toml")
