@@ -359,6 +359,22 @@ def test_accept_opens_the_next_team_of_the_filter(ta):
     assert names(ta.get(address)) == expected[:1]
 
 
+def test_a_team_is_accepted_only_as_it_was_seen(ta, grades):
+    """If somebody changed the team since its page was shown, it is looked at again."""
+    version = ta.get(at("team-01")).value("version")
+    with Gradebook(grades) as book:
+        book.override("team-01", "laws", 0.5, why="x", by="Bob")
+    answer = ta.post(at("team-01"), do="accept", version=version)
+    assert "of=team-01" in answer.headers["location"]
+    page = ta.get(answer.headers["location"])
+    assert "Look again." in page.text
+    with Gradebook(grades) as book:
+        assert book.entry("team-01").reviewed_by == ""
+    ta.post(at("team-01"), do="accept", version=page.value("version"))
+    with Gradebook(grades) as book:
+        assert book.entry("team-01").reviewed_by == "Ada"
+
+
 def test_what_needs_a_look_comes_first(ta, grades):
     """The class starts with the teams to review: those in doubt, then those with few points."""
     with Gradebook(grades) as book:

@@ -71,11 +71,15 @@ def act(ask: PageRequest) -> Response:
     team = find_team(shown, ask.query("of"))
     book, name, what = open_gradebook(ask), team.submission, ask.text("do")
     by = sign(ask)
-    if what in ("accept", "unsee"):
-        book.set_reviewed(name, by=by, reviewed=what == "accept")
+    if what == "unsee":
+        book.set_reviewed(name, by=by, reviewed=False)
     if what in ("sign", "unsee"):
         return ask.back(write_address(ask, team.line.submission))
     if what == "accept":
+        seen = ask.text("version") or team.version
+        if book.accept_all({name: seen}, by=by).kept:
+            text = f"{team.line.submission}: changed since this page was shown. Look again."
+            return ask.back(write_address(ask, team.line.submission), text)
         wanted = Filter.read(ask.request.query_params)
         after = _find_next(shown, wanted, team)
         to = write_address(ask, after) if after else f"{ask.here}?{wanted.query}"
@@ -209,6 +213,7 @@ def _show_page(
         person_lines=person_lines(grade),
         total=_describe_total(ask, now, wrong=wrong),
         seen=now.reviewed_by,
+        version=now.whole_version,
         items=_link_items(ask, name, items, chosen),
         doubts=sum(item.doubt for item in items),
         events=[(to_the_second(event.at), event_words(event)) for event in reversed(events)],
