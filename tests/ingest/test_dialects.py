@@ -130,6 +130,11 @@ HEADING = "time [s],input [V],x1 [cm]\n"
 SHORT = rows(T[:150], U[:150], 2 * X[:150]).splitlines()
 RUNS = {
     "stacked": HEADING + PLAIN + "\n" + HEADING + "\n".join(SHORT),
+    "stacked, begun during the first": HEADING
+    + PLAIN
+    + "\n"
+    + HEADING
+    + rows(T[:150] + 0.2, U[:150], 2 * X[:150]),
     "side by side": '"Time (s) Run #1","Voltage (V) Run #1","Position (cm) Run #1",'
     '"Time (s) Run #2","Voltage (V) Run #2","Position (cm) Run #2"\n'
     + "\n".join(

@@ -74,6 +74,16 @@ def test_wrong_readings_are_left_out(value, tmp_path):
     assert kept.t.size == N
 
 
+@pytest.mark.parametrize(("rows", "wrong"), [(3, True), (9, True), (14, False)])
+def test_wrong_readings_in_a_row_are_left_out(rows, wrong, tmp_path):
+    """Nine readings in a row may be wrong; a longer stretch may be real."""
+    x = X + 12.0
+    x[700 : 700 + rows] = 0.0
+    notes = facts(record(tmp_path, x).notes)
+    assert ("spikes" in notes) == wrong
+    assert not wrong or notes["spikes"].at == tuple(range(700, 700 + rows))
+
+
 @pytest.mark.parametrize("i", [116, 700])
 def test_a_new_zero_is_taken_back(i, tmp_path):
     """A position that is zeroed during the run, in motion or at rest, continues where it was."""

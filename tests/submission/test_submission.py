@@ -20,7 +20,7 @@ from pipeline.submission import (
 )
 from pipeline.submission.edit import edit_submission
 from pipeline.submission.load import InvalidSubmission
-from pipeline.submission.toml import nearest
+from pipeline.submission.toml import nearest, quote
 
 FULL = """\
 version = 1
@@ -202,6 +202,7 @@ MISTAKES = [
     ("carts = [1]", "carts = [1, 3]", ("experiments", 0, "carts", 1)),
     ("carts = [1]", "carts = [1, 1]", ("experiments", 0, "carts")),
     ('id = "pid"', 'id = "control"', ("experiments", 2, "id")),
+    ('id = "pid"', f'id = "{101 * "x"}"', ("experiments", 2, "id")),
     ("1, 2, 3, 4.5]", "1, 2, 3]", ("experiments", 1, "controller", "gains")),
     ("kp = 0.05", "kp = 0.05, cart = 3", ("experiments", 2, "controller", "cart")),
     ("settling_time = 1.0\n", "settling_time = 1000.1\n", ("design", "settling_time")),
@@ -231,6 +232,7 @@ def test_values_at_the_limits_are_read(folder):
     """The largest allowed values are read."""
     text = FULL.replace("settling_time = 1.0\n", "settling_time = 1000\n")
     text = text.replace("overshoot_percent = 10.0", "overshoot_percent = 99.9")
+    text = text.replace('id = "pid"', f'id = "{100 * "x"}"')
     (folder / "submission.toml").write_text(text.replace("0.00884", "1"), encoding="utf-8")
     design = load_submission(folder).design
     assert design is not None
@@ -353,6 +355,14 @@ def test_nearest_ignores_leading_zeros():
     names = ["team-11", "team-01", "team-10"]
     assert "'team-01'" in nearest("team-1", names)
     assert "'team-10'" in nearest("team-010", names)
+
+
+def test_a_quoted_value_is_short():
+    """A short list is quoted whole, and a long one only counted."""
+    assert quote((1, 2, 3, 4)) == "[1, 2, 3, 4]"
+    assert "5" in quote((1, 2, 3, 4, 6))
+    assert "6" not in quote((1, 2, 3, 4, 6))
+    assert len(quote("x" * 1000)) == 60
 
 
 def test_only_the_first_of_many_mistakes_are_listed(tmp_path):
