@@ -7,9 +7,11 @@ import os
 import re
 import secrets
 import time
-from collections.abc import Iterable, Sequence
+import zipfile
+from collections.abc import Container, Iterable, Sequence
 from contextlib import suppress
 from functools import lru_cache
+from io import BytesIO
 from numbers import Real
 from pathlib import Path
 
@@ -117,6 +119,23 @@ def clear_files(folder: Path, pattern: str) -> None:
     for path in folder.glob(pattern):
         if path.is_file() or path.is_symlink():
             path.unlink()
+
+
+def zip_bytes(files: Iterable[tuple[str, bytes]], *, programs: Container[str] = ()) -> bytes:
+    """Return files by name as one zip archive; the same files give the same bytes.
+
+    Parameters
+    ----------
+    programs : names of the files that Unix may run.
+    """
+    packed = BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in sorted(files):
+            info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))  # the time is fixed
+            info.external_attr = (0o100755 if name in programs else 0o100644) << 16
+            info.create_system = 3  # Unix, so that the file modes above apply
+            archive.writestr(info, content, zipfile.ZIP_DEFLATED)
+    return packed.getvalue()
 
 
 def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -14,6 +14,7 @@ import typer
 from pipeline.cli.common import AsJson, app, log_progress, say
 from pipeline.cli.stopping import ctrl_c_says
 from pipeline.errors import ConfigError
+from pipeline.grading.platforms import PLATFORMS
 
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
@@ -350,12 +351,7 @@ def history(grades: Grades, team: Team, assignment: Lab = None, as_json: AsJson 
         typer.echo(history_text(submission, events))
 
 
-class Platform(StrEnum):
-    """A learning platform."""
-
-    CANVAS = "canvas"
-    MOODLE = "moodle"
-    GRADESCOPE = "gradescope"
+PlatformName = StrEnum("PlatformName", list(PLATFORMS))
 
 
 @app.command("export")
@@ -364,7 +360,10 @@ def export_grades(
         str | None,
         typer.Argument(metavar="GRADES", help="The --out folder of `cartlab grade`, or a URL."),
     ] = None,
-    lms: Annotated[Platform | None, typer.Option(help="The learning platform.")] = None,
+    lms: Annotated[PlatformName | None, typer.Option(help="The learning platform.")] = None,
+    feedback: Annotated[
+        bool, typer.Option("--feedback", help="Write the zip of feedback files instead.")
+    ] = False,
     autograder: Annotated[
         Path | None,
         typer.Option(metavar="RUBRIC", help="Write an autograder zip for Gradescope instead."),
@@ -372,7 +371,8 @@ def export_grades(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="A folder, or FILE.csv for the table alone; default: GRADES. "
+            help="A folder, or FILE.csv for the table alone, or FILE.zip with --feedback; "
+            "default: GRADES. "
             "With --autograder: the zip; default: autograder.zip."
         ),
     ] = None,
@@ -386,20 +386,25 @@ def export_grades(
     ] = None,
     assignment: Lab = None,
 ) -> None:
-    """Write the class grades for import into a learning platform, or Gradescope's autograder."""
+    """Write grades or feedback for a learning platform, or Gradescope's autograder."""
     if autograder is not None:
-        if grades or lms or roster or title or assignment:
+        if grades or lms or feedback or roster or title or assignment:
             raise typer.BadParameter("--autograder takes only a rubric and --out")
         return _export_autograder(autograder, out or Path("autograder.zip"))
     if grades is None or lms is None:
         raise typer.BadParameter("give GRADES and --lms, or --autograder with a rubric")
+    if feedback and title:
+        raise typer.BadParameter("--title is the title of a table of grades, not of feedback")
     from pipeline.grading.gradebook.gradebook import Gradebook
-    from pipeline.grading.publish.export import export
+    from pipeline.grading.publish.export import export, export_feedback
 
-    folder = Path(grades)
+    folder, platform = Path(grades), PLATFORMS[lms.value]
     with Gradebook(grades, assignment=assignment) as book:
         to = out or (folder if folder.is_dir() else Path())
-        done = export(book, lms.value, to, title=title, roster=roster)
+        if feedback:
+            done = export_feedback(book, platform, to, roster=roster)
+        else:
+            done = export(book, platform, to, title=title, roster=roster)
     for remark in done.remarks:
         say(remark.text)
     first, *more = done.files

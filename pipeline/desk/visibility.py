@@ -4,7 +4,6 @@ from pathlib import Path
 
 from pipeline.desk.jobs import Job, WorkerPool
 from pipeline.desk.users import Place, User
-from pipeline.grading.rubric import Rubric
 from pipeline.processes import Failed
 from pipeline.submission.load import NAME
 
@@ -68,8 +67,3 @@ class Visibility:
         if job is None or job.task[0] in _TELLS_NONE or not self.sees_check(user, folder):
             return job
         return job.without_message()
-
-
-def hides_values(user: User, rubric: Rubric) -> bool:
-    """Return whether a student's feedback leaves out the numbers that they must find."""
-    return (user.see or rubric.students.see) == "check"

@@ -21,7 +21,8 @@ from pipeline.grading.gradebook.events import Event
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Batch
 from pipeline.grading.intake.repairs import Run, read_run, save_run
-from pipeline.grading.publish.export import export
+from pipeline.grading.platforms import PLATFORMS
+from pipeline.grading.publish.export import export, export_feedback
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.resources import RUBRICS
 from pipeline.words.text import capital
@@ -530,11 +531,26 @@ def test_a_table_is_imported_whole_or_not_at_all(ta, grades):
     assert overrides(grades, "Ünal 学生 & co")["pieces"].by == "Ada"
 
 
+def test_feedback_files_are_exported(ta, grades, tmp_path):
+    """The desk exports the same zip of feedback files as the command, and says what is missing."""
+    worksheet = "Identifier,Full name,ID number\nParticipant 7,Jane,s0\n"
+    roster = tmp_path / "worksheet.csv"
+    roster.write_text(worksheet, encoding="utf-8")
+    with Gradebook(grades) as book:
+        done = export_feedback(book, PLATFORMS["moodle"], tmp_path / "out", roster=roster)
+    answer = upload(ta, ROOM + "export", "roster", worksheet, lms="moodle", what="feedback")
+    assert answer.status == 200
+    with zipfile.ZipFile(io.BytesIO(answer.body)) as archive:
+        assert archive.read("feedback-moodle.zip") == done.files[0].read_bytes()
+        assert archive.read("remarks.txt").decode().splitlines() == [r.text for r in done.remarks]
+    assert ta.post(ROOM + "export", lms="gradescope", what="feedback").status == 422
+
+
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 def test_the_export_equals_that_of_the_command(ta, grades, tmp_path, platform):
     """The desk exports the same bytes as the command; several files come as a zip."""
     with Gradebook(grades) as book:
-        done = export(book, platform, tmp_path / "out", title="Lab 3")
+        done = export(book, PLATFORMS[platform], tmp_path / "out", title="Lab 3")
     answer = ta.post(ROOM + "export", lms=platform, title="Lab 3")
     assert answer.status == 200
     assert "attachment" in answer.headers["content-disposition"]

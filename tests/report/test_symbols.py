@@ -8,6 +8,7 @@ import pytest
 
 from pipeline.grading.publish.feedback import feedback_page
 from pipeline.grading.publish.gradescope import results_text
+from pipeline.grading.publish.view import new_view
 from pipeline.report.lab_report.content import build_document
 from pipeline.report.render.html import render_html
 from pipeline.report.sections.summary import terminal_summary
@@ -45,8 +46,8 @@ def test_grades_show_symbols():
     claims = feedback.model_copy(update={"overshoot_percent": Decimal(30)})
     grade = one.reporting(final=off, initial={"zeta_1": -0.05}, feedback=claims).grade()
     assert len(grade.flags) > 1
-    assert raw(feedback_page(grade, rubric=one.rubric, figures=(), name="team-07")) == []
-    shown = results_text(grade, rubric=one.rubric)
+    assert raw(feedback_page(new_view(grade, one.rubric), figures=(), name="team-07")) == []
+    shown = results_text(new_view(grade, one.rubric))
     assert raw("".join(re.findall(r'"output": "(.*)"', shown))) == []
     assert "ζ_b" in shown
 

@@ -15,10 +15,11 @@ from pipeline.experiments.plan import load_plan, plan_path, plan_text
 from pipeline.experiments.propose import propose_plan
 from pipeline.gap.types import read_gap
 from pipeline.grading.intake.late_table import read_late_table
-from pipeline.grading.intake.lms_names import Platform, gradescope_metadata
+from pipeline.grading.platforms import PLATFORMS, gradescope_metadata
 from pipeline.grading.publish.roster import Roster
 from pipeline.grading.publish.students import Student
 from pipeline.grading.publish.survey import read_survey, survey_dict, survey_text
+from pipeline.grading.publish.view import new_view
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.json_files import json_text
 from pipeline.report.gap.verdict import terminal_verdict
@@ -40,7 +41,7 @@ from tests.helpers.poison import (
 )
 from tests.ingest.test_spoilt_files import FILES
 
-ROSTERS: dict[Platform, str] = {
+ROSTERS: dict[str, str] = {
     "canvas": "Student,ID,SIS User ID,Section,Lab 3 (77)\nJane Doe,7,s1,A,\nBob,8,s2,A,4\n",
     "moodle": "Identifier,Full name,Email address,Grade\nParticipant 7,Jane Doe,s1,\n",
     "gradescope": "Name,SID,Email,Total Score\nJane Doe,s1,j@x,\nBob,s2,b@x,3\n",
@@ -97,15 +98,14 @@ def spoilt(name: str, rng: Random) -> bytes:
 
 def use(name: str, path: Path) -> None:
     """Read a file with the function for its name, and use the result."""
-    student = Student(
-        id="s1", name="Jane Doe", number="7", grade=make_grade("a"), by_hand=frozenset()
-    )
+    seen = new_view(make_grade("a"), load_rubric(Path("throne-2dof")))
+    student = Student(id="s1", name="Jane Doe", number="7", view=seen)
     if name == "survey.csv":
         survey = read_survey(path)
         json.dumps(survey_dict(survey), allow_nan=False)
         survey_text(survey)
     elif path.stem in ROSTERS:
-        roster = Roster.read(path, platform=path.stem)  # type: ignore[arg-type]
+        roster = Roster.read(path, platform=PLATFORMS[path.stem])
         roster.fill([student], {"Lab 3": lambda student: "1"})
     elif name == "late.csv":
         read_late_table(path)

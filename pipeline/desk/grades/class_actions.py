@@ -1,10 +1,7 @@
 """Actions on a whole class: grade again, write files, change points from a table, export."""
 
-import zipfile
 from dataclasses import replace
-from io import BytesIO
 from pathlib import Path
-from typing import get_args
 
 from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
@@ -16,9 +13,10 @@ from pipeline.desk.page_request import PageRequest
 from pipeline.desk.scratch import scratch_folder
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.override import read_wishes
-from pipeline.grading.intake.lms_names import Platform
 from pipeline.grading.intake.repairs import read_run
-from pipeline.grading.publish.export import export
+from pipeline.grading.platforms import PLATFORMS
+from pipeline.grading.publish.export import export, export_feedback
+from pipeline.output import zip_bytes
 from pipeline.words.numbers import count
 
 
@@ -71,27 +69,27 @@ def release(ask: PageRequest) -> Response:
 
 
 def export_class(ask: PageRequest) -> Response:
-    """Return the grades in the format of a learning platform: a table, or a zip with remarks."""
-    platform = next((one for one in get_args(Platform) if one == ask.text("lms")), None)
+    """Return grades or feedback for a learning platform: one file, or a zip with remarks."""
+    platform = PLATFORMS.get(ask.text("lms"))
     if platform is None:
         raise HTTPException(400, "there is no such platform")
     with scratch_folder() as scratch:
         roster = _store_upload(ask, "roster", scratch / "roster.csv")
         out = scratch / "export"
-        done = export(
-            open_gradebook(ask), platform, out, title=ask.text("title") or None, roster=roster
-        )
+        book, title = open_gradebook(ask), ask.text("title") or None
+        if ask.text("what") == "feedback":
+            done = export_feedback(book, platform, out, roster=roster)
+        else:
+            done = export(book, platform, out, title=title, roster=roster)
         if len(done.files) == 1 and not done.remarks:
-            return _download(done.files[0].read_bytes(), done.files[0].name, kind="text/csv")
-        packed = BytesIO()
-        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-            for file in done.files:
-                archive.write(file, file.relative_to(out).as_posix())
-            if done.remarks:  # remarks may name students, so they go into the zip, not on a page
-                archive.writestr(
-                    "remarks.txt", "".join(f"{remark.text}\n" for remark in done.remarks)
-                )
-    return _download(packed.getvalue(), f"{platform}.zip", kind="application/zip")
+            (file,) = done.files
+            kind = "text/csv" if file.suffix == ".csv" else "application/zip"
+            return _download(file.read_bytes(), file.name, kind=kind)
+        files = {file.relative_to(out).as_posix(): file.read_bytes() for file in done.files}
+        if done.remarks:  # remarks may name students, so they go into the zip, not on a page
+            told = "".join(f"{remark.text}\n" for remark in done.remarks)
+            files["remarks.txt"] = told.encode()
+    return _download(zip_bytes(files.items()), f"{platform.name}.zip", kind="application/zip")
 
 
 def regrade(ask: PageRequest) -> Response:

@@ -21,10 +21,12 @@ from pipeline.grading.gradebook.events import TOTAL
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.history import to_the_second
 from pipeline.grading.intake.repairs import read_run
-from pipeline.grading.publish.anonymous import STRANGER, anonymise
+from pipeline.grading.platforms import PLATFORMS
+from pipeline.grading.publish.anonymous import STRANGER
 from pipeline.grading.publish.class_page import class_page, not_final
 from pipeline.grading.publish.feedback import feedback_page
 from pipeline.grading.publish.outputs import repeated_authors_of
+from pipeline.grading.publish.view import view
 from pipeline.grading.similarity.clusters import find_clusters, renamed
 from pipeline.grading.similarity.distant import find_distant, recomputed_numbers
 from pipeline.grading.words import WORDS, points_text, signed_points
@@ -118,6 +120,7 @@ def show(ask: PageRequest) -> Response:
         released=open_gradebook(ask).released,
         signature=find_signature(ask),
         may_release=may_release(ask),
+        platforms=PLATFORMS.values(),
     )
 
 
@@ -249,7 +252,6 @@ def show_feedback(ask: PageRequest) -> Response:
     team = find_team(shown, ask.request.path_params["name"])
     book = open_gradebook(ask)
     entry = book.entry(team.submission)
-    grade = entry.grade if shown.names is None else anonymise(entry.grade, shown.names)
-    figures = book.figures(entry)
-    page = feedback_page(grade, rubric=shown.rubric, figures=figures, name=grade.submission)
+    seen = view(entry, "staff", names=shown.names)
+    page = feedback_page(seen, figures=book.figures(entry), name=seen.grade.submission)
     return show_own_page(page)

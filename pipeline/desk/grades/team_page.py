@@ -48,8 +48,9 @@ from pipeline.grading.intake.repairs import (
     text_key,
 )
 from pipeline.grading.judge.costs import find_remarks
-from pipeline.grading.publish.anonymous import anonymise, renamed_events
+from pipeline.grading.publish.anonymous import renamed_events
 from pipeline.grading.publish.class_page import feedback_link
+from pipeline.grading.publish.view import view
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import WORDS, person_lines, points_text
 from pipeline.report.figures.svg import plain_svg
@@ -190,7 +191,7 @@ def _show_page(
     team = find_team(shown, ask.query("of"))
     book, name = open_gradebook(ask), team.line.submission
     now = book.entry(team.submission)
-    grade = now.grade if shown.names is None else anonymise(now.grade, shown.names)
+    grade = view(now, "staff", names=shown.names).grade
     _, events = book.history(team.submission, named=not now.rubric.anonymous)
     if shown.names is not None:
         events = renamed_events(events, team.submission, name)

@@ -10,15 +10,14 @@ from pipeline.desk.page_request import PageRequest
 from pipeline.desk.request_steps import describe_steps
 from pipeline.desk.served_files import show_own_page
 from pipeline.desk.users import OwnGrade
-from pipeline.desk.visibility import REFUSED, hides_values
+from pipeline.desk.visibility import REFUSED
 from pipeline.errors import ConfigError
-from pipeline.grading.grade import Criterion, Grade
+from pipeline.grading.grade import Criterion
 from pipeline.grading.gradebook.decisions import MOST_LETTERS, RequestRefused, points_lost
 from pipeline.grading.gradebook.entry import Entry
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.judge.costs import find_remarks
-from pipeline.grading.publish.anonymous import anonymise
 from pipeline.grading.publish.feedback import TONES, feedback_page, sentence
+from pipeline.grading.publish.view import GradeView, view
 from pipeline.grading.rubric import Criterion as Asked
 from pipeline.grading.words import WORDS, person_lines, points_text, waiting_text
 from pipeline.report.document import paragraph
@@ -50,12 +49,11 @@ def show_whole(ask: PageRequest) -> Response:
     own, found = _find_own(ask), _read(ask)
     if found is None:
         raise HTTPException(404, "your feedback is not published yet")
-    if hides_values(ask.user, found.rubric):
+    seen = view(found, "team", see=ask.user.see)
+    if seen.hides_numbers:
         raise HTTPException(403, REFUSED)
     figures = _open_book(ask).figures(found)
-    grade = _hide_others(found, own)
-    page = feedback_page(grade, rubric=found.rubric, figures=figures, name=own.submission)
-    return show_own_page(page)
+    return show_own_page(feedback_page(seen, figures=figures, name=own.submission))
 
 
 _UNREADABLE = "your grade cannot be read at the moment; tell your instructor"
@@ -88,12 +86,6 @@ def _read(ask: PageRequest) -> Entry | None:
         raise ConfigError(_UNREADABLE) from None
 
 
-def _hide_others(found: Entry, own: OwnGrade) -> Grade:
-    """Return the grade; in an anonymous class it names no other submission."""
-    grade = found.grade
-    return anonymise(grade, {own.submission: own.submission}) if found.rubric.anonymous else grade
-
-
 def _show_page(
     ask: PageRequest, *, refused: dict[str, tuple[str, str]] | None = None, status: int = 200
 ) -> Response:
@@ -102,9 +94,9 @@ def _show_page(
         return ask.page(
             "feedback", status=status, title="Feedback", submission=own.submission, found=None
         )
-    grade = _hide_others(found, own)
-    hidden = hides_values(ask.user, found.rubric)
-    criteria = _describe_criteria(found, grade, refused=refused or {}, hidden=hidden)
+    seen = view(found, "team", see=ask.user.see)
+    grade = seen.grade
+    criteria = _describe_criteria(found, seen, refused=refused or {})
     if grade.awaits_grading:
         criteria = []
     return ask.page(
@@ -123,20 +115,20 @@ def _show_page(
         n_waiting=sum(request.state == "asked" for request in found.requests.values()),
         n_answered=sum(request.state == "answered" for request in found.requests.values()),
         most=MOST_LETTERS,
-        hidden=hidden,
+        hidden=seen.hides_numbers,
     )
 
 
 def _describe_criteria(
-    found: Entry, grade: Grade, *, refused: dict[str, tuple[str, str]], hidden: bool
+    found: Entry, seen: GradeView, *, refused: dict[str, tuple[str, str]]
 ) -> list[dict[str, Any]]:
     """Return every criterion of the rubric, including those that were never judged.
 
     Parameters
     ----------
     refused : by criterion, the typed reason and why it was refused.
-    hidden : whether to hide numbers that the student must find.
     """
+    grade = seen.grade
     judged = {own.id: own for own in grade.criteria if own.id not in grade.open}
     lost = points_lost(grade, found.rubric)
     described = []
@@ -149,7 +141,7 @@ def _describe_criteria(
                 "title": capital(asked.title or asked.id),
                 "out_of": points_text(asked.points),
                 **_describe_judged(judged.get(asked.id)),
-                "evidence": _show_why(asked, grade, found, hidden=hidden),
+                "evidence": _show_why(asked, seen),
                 "lost": asked.id in lost or request is not None,
                 "request": request,
                 "steps": describe_steps(request.events if request else ()),
@@ -171,18 +163,12 @@ def _describe_judged(own: Criterion | None) -> dict[str, Any]:
     }
 
 
-def _show_why(asked: Asked, grade: Grade, found: Entry, *, hidden: bool) -> str:
-    """Return the evidence for a criterion as HTML.
-
-    Parameters
-    ----------
-    hidden : whether to show only the titles of flags and the reasons for points given by hand.
-    """
-    own = next((c for c in grade.criteria if c.id == asked.id), None)
-    if own is None or not hidden:
-        return show_evidence(own, asked.check, grade.units) if own else ""
-    remarks = find_remarks(grade, asked, found.rubric)
-    sentences = [capital(WORDS.text(f"title_{flag.code}")) for flag in remarks]
-    by_hand = found.overrides.get(asked.id) or found.comments.get(asked.id)
-    sentences += [by_hand.text] if by_hand else []
-    return render_blocks([paragraph(rich(sentence(one))) for one in dict.fromkeys(sentences)])
+def _show_why(asked: Asked, seen: GradeView) -> str:
+    """Return the evidence for a criterion as HTML."""
+    own = next((c for c in seen.grade.criteria if c.id == asked.id), None)
+    if own is None:
+        return ""
+    if not seen.hides_numbers:
+        return show_evidence(own, asked.check, seen.grade.units)
+    told = [paragraph(rich(sentence(one))) for one in seen.reasons(own)]
+    return render_blocks(told)

@@ -4,9 +4,7 @@ The zip contains cartlab's source files, because Gradescope's machines cannot in
 the package index. Source files also need no build tool on the instructor's computer.
 """
 
-import io
 import sys
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,15 +13,14 @@ from pipeline.errors import ConfigError
 from pipeline.grading.autograder.pins import pin_requirements
 from pipeline.grading.grade import Grade
 from pipeline.grading.publish.gradescope import results_text
+from pipeline.grading.publish.view import new_view
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import find_rubric, parse_rubric, rubric_source
 from pipeline.grading.words import WORDS
-from pipeline.output import write_file
+from pipeline.output import write_file, zip_bytes
 from pipeline.resources import TEMPLATES
 
 _SCRIPTS = TEMPLATES / "gradescope"
-_FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # a fixed time, so that the same files give the same zip
-_PROGRAM, _FILE = 0o100755 << 16, 0o100644 << 16  # file modes, in the format of zip files
 
 
 def write_autograder(rubric_file: Path, out: Path) -> tuple[str, ...]:
@@ -42,15 +39,9 @@ def write_autograder(rubric_file: Path, out: Path) -> tuple[str, ...]:
     path = find_rubric(rubric_file)
     text = rubric_source(path)
     rubric = parse_rubric(text, where=path.name)
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in sorted(_files(text, rubric)):
-            info = zipfile.ZipInfo(name, _FIXED_TIME)
-            info.external_attr = _PROGRAM if (_SCRIPTS / name).is_file() else _FILE
-            info.create_system = 3  # Unix, so that the file modes above apply
-            archive.writestr(info, content, zipfile.ZIP_DEFLATED)
+    scripts = [script.name for script in _SCRIPTS.iterdir()]
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_file(out, buffer.getvalue())
+    write_file(out, zip_bytes(_files(text, rubric), programs=scripts))
     return tuple(_tasks(rubric))
 
 
@@ -67,7 +58,7 @@ def _files(text: str, rubric: Rubric) -> Iterator[tuple[str, bytes]]:
     yield "rubric.toml", text.encode()
     reason = WORDS.text("gradescope_unfinished")
     unfinished = Grade.failed("", reason, out_of=rubric.out_of, authors=(), days_late=0.0)
-    yield "unfinished.json", results_text(unfinished, rubric=rubric).encode()
+    yield "unfinished.json", results_text(new_view(unfinished, rubric)).encode()
     package = Path(pipeline.__file__).parent
     for path in package.rglob("*.py"):
         yield f"cartlab/pipeline/{path.relative_to(package).as_posix()}", path.read_bytes()

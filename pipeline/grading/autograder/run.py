@@ -11,6 +11,7 @@ from pipeline.grading.batch.runner import Grader
 from pipeline.grading.batch.task import Setup, Task
 from pipeline.grading.grade import read_grade
 from pipeline.grading.publish.gradescope import results_text
+from pipeline.grading.publish.view import new_view
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.output import write_file
 
@@ -32,7 +33,7 @@ def grade_upload(root: Path) -> str:
             grading = grader.run(task)
         finally:
             grader.close()
-    text = results_text(read_grade(grading.grade), rubric=rubric)
+    text = results_text(new_view(read_grade(grading.grade), rubric))
     write_file(root / "results" / "results.json", text)
     return grading.detail
 

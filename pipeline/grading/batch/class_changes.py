@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Member
-from pipeline.grading.intake.lms_names import read_owner, same_number
+from pipeline.grading.platforms import Account, same_number
 from pipeline.grading.similarity.copies import same_recordings
 
 
@@ -101,12 +101,14 @@ def _evidence(before: Member, now: Member) -> tuple[bool, ...]:
     # equal files count only if the submissions have a common author or similar names.
     kin = both or any(a.endswith(b) for a, b in (names, names[::-1]))
     prints = before.fingerprints and now.fingerprints
-    (_, was, number), (_, is_, number_now) = (read_owner(r.owner) for r in (before, now))
+    was, is_ = (Account.read(row.owner) for row in (before, now))
     return (
         same_number(before.owner, now.owner),
         bool(kin) and before.content == now.content != "",
         bool(both and prints) and same_recordings(before, now),
         # Equal author ids are weak evidence, because anybody can type another person's id. They do
         # not count if the account numbers on the same platform differ.
-        bool(both) and before.people == now.people and (was != is_ or number == number_now),
+        bool(both)
+        and before.people == now.people
+        and (was.platform != is_.platform or was.number == is_.number),
     )

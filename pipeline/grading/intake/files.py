@@ -15,7 +15,6 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from pipeline.errors import SubmissionError
-from pipeline.grading.intake.lms_names import parse_name
 from pipeline.grading.intake.unpack import (
     HAND_IN,
     STRANGE_ARCHIVES,
@@ -23,6 +22,7 @@ from pipeline.grading.intake.unpack import (
     is_debris,
     unpack,
 )
+from pipeline.grading.platforms import parse_name
 from pipeline.submission.load import NAME
 from pipeline.submission.toml import quote
 from pipeline.words.numbers import first_few

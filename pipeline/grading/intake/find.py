@@ -9,13 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from pipeline.errors import ConfigError, SubmissionError
-from pipeline.grading.intake.lms_names import (
-    Upload,
-    current,
-    gradescope_metadata,
-    owner_text,
-    parse_name,
-)
 from pipeline.grading.intake.unpack import (
     CLASS,
     DEEPEST,
@@ -25,6 +18,7 @@ from pipeline.grading.intake.unpack import (
     names_in_pieces,
     unpack,
 )
+from pipeline.grading.platforms import Account, Upload, current, parse_name
 from pipeline.submission.load import NAME
 from pipeline.submission.toml import quote
 from pipeline.words.progress import Progress, silent
@@ -47,7 +41,7 @@ class HandIn:
     id : id that is unique in the batch and valid as a folder name.
     sources : one folder, or several files, which may be archives.
     owner : account that submitted the files, with platform and account number, such as "Jane Doe
-        (moodle 1024)"; or "".
+        (moodle 1024)"; see `platforms.Account`; or "".
     handed_in : time of the hand-in in ISO 8601, or "" if the platform does not give it.
     problem : why the files cannot be opened, if this is already known; or "".
     parent : name of the parent folder, which may be used to make the id unique.
@@ -287,17 +281,21 @@ def _folder_inside(archive: Path) -> str:
 def _from_platform(folder: Path, uploads: dict[Path, Upload], *, top: bool) -> list[HandIn]:
     """Return one hand-in per student, from any number of uploaded files."""
     # Only a metadata file at the top level is the platform's; one further down may be a student's.
-    metadata = gradescope_metadata(folder) if top else {}
+    platforms = {upload.platform.name: upload.platform for upload in uploads.values()}
+    metadata = {
+        owner: sent
+        for one in platforms.values()
+        if top and one.metadata
+        for owner, sent in one.metadata(folder).items()
+    }
     by_student: dict[tuple[str, str, str], dict[Path, Upload]] = defaultdict(dict)
     for path, upload in uploads.items():
-        # Canvas makes no folders. If there is one, somebody has unpacked an archive.
-        own = path.name if upload.platform == "canvas" and path.is_dir() else ""
+        own = path.name if path.is_dir() and not upload.platform.has_folders else ""
         by_student[upload.owner, upload.user, own][path] = upload
     found = []
-    for (owner, user, own), files in sorted(by_student.items()):
+    for (owner, _, own), files in sorted(by_student.items()):
         sources = tuple(current(files))
         inside = own or _name_inside(sources)
-        platform = next(iter(files.values())).platform
         sent = metadata.get(owner)
         shown = sent.names if sent and sent.names else owner
         found.append(
@@ -305,7 +303,7 @@ def _from_platform(folder: Path, uploads: dict[Path, Upload], *, top: bool) -> l
                 id=inside or shown,
                 parent=shown if inside and not own else folder.name,
                 sources=sources,
-                owner=owner_text(shown, platform, user),
+                owner=str(Account.of({path: files[path] for path in sources}, name=shown)),
                 handed_in=sent.at if sent else "",
                 days_late=_DAYS_OF_A_LATE_MARK if any(u.late for u in files.values()) else 0.0,
                 problem="it is a link" if any(path.is_symlink() for path in sources) else "",

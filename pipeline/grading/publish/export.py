@@ -1,40 +1,27 @@
-"""Export class grades in the formats of Canvas, Moodle and Gradescope.
+"""Export class grades, or the feedback, in the formats of learning platforms.
 
-Each format is a table with a row for every student. If the platform's own exported table (a roster)
-is given, its rows and columns stay and only the grades are filled in.
-
-- Canvas: the CSV of its gradebook, read by `lib/gradebook_importer.rb`. It finds students by `ID`,
-  `SIS User ID` or `SIS Login ID`. It finds the assignment by its title, which may be followed by
-  its id in brackets.
-- Moodle: the offline grading worksheet of one assignment (`mod/assign/feedback/offline`), if the
-  participant numbers are known; otherwise the table for *Import CSV* of its gradebook.
-- Gradescope: the table of its *Download Grades*, and a `results.json` for each submission, as an
-  autograder writes it.
+Each table has a row for every student. If the platform's own exported table (a roster) is given,
+its rows and columns stay and only the grades are filled in. See `platforms` for the formats.
 """
 
 import html
-import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.grading.grade import Grade
+from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.entry import Entry
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.intake.lms_names import Platform
-from pipeline.grading.publish.gradescope import flag_messages, results_text
-from pipeline.grading.publish.platforms import FORMS, WORKSHEET
-from pipeline.grading.publish.roster import POINTS_POSSIBLE, Roster
-from pipeline.grading.publish.students import Remark, Student, students_of
+from pipeline.grading.platforms import PLATFORMS, Platform
+from pipeline.grading.publish.feedback import feedback_page
+from pipeline.grading.publish.gradescope import results_text
+from pipeline.grading.publish.roster import Roster
+from pipeline.grading.publish.students import Remark, Student, about, not_exported, students_of
+from pipeline.grading.publish.view import GradeView, view
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.words import on_one_line, person_lines, points_text, waiting_text
-from pipeline.output import csv_text, named_folder, own_folder, write_file
-from pipeline.words.numbers import first_few
+from pipeline.grading.words import WORDS, on_one_line, person_lines, points_text, waiting_text
+from pipeline.output import csv_text, named_folder, own_folder, write_file, zip_bytes
 from pipeline.words.text import with_symbols
-
-# Canvas takes a column whose heading contains one of these words and "Score", "Points" or "Grade"
-# for its own, and skips it (`NON_ASSIGNMENT_COLUMN_HEADERS` of its importer).
-_IGNORED = re.compile(r"\b(?:current|final|override)\b", re.IGNORECASE)
 
 _NAMED = 8  # most submissions that a remark names
 
@@ -72,29 +59,26 @@ def export(
     rubric = book.rubric
     title = title or rubric.title or "cartlab"
     entries = list(book.entries())
-    students, remarks = students_of(entries, platform=platform, blank=roster is None)
-    if unfinished := [entry.submission for entry in entries if entry.grade.open]:
-        remarks.append(
-            Remark(
-                text=f"not final, exported with the points so far: {len(unfinished)} of "
-                f"{len(entries)} submissions have criteria that a person has not graded: "
-                f"{first_few(unfinished, _NAMED)}"
-            )
+    students, remarks = students_of(entries, platform=platform)
+    left = "left as it was" if roster else "left blank"
+    if platform.has_results:  # "required if not on each test case" (Gradescope's specification)
+        left += f" in {platform.name}.csv, but 0 in results.json, where a score is required"
+    ungraded = (s.grade.submission for s in students if not (s.points or s.undecided))
+    remarks += about(f"could not be graded, {left}", ungraded)
+    remarks += _not_final(entries)
+    if not platform.takes_more:
+        above = [e for e in entries if e.grade.points > rubric.out_of]
+        remarks += about(
+            f"more than the maximum of {points_text(rubric.out_of)}, which {platform.title} does "
+            "not import",
+            (f"{e.submission} ({points_text(e.grade.points)})" for e in above),
+            most=_NAMED,
         )
-    above = [e for e in entries if e.grade.points > rubric.out_of]
-    if platform == "moodle" and above:
-        named = [f"{e.submission} ({points_text(e.grade.points)})" for e in above]
+    if platform.ignored and (word := platform.ignored.search(title)):
         remarks.append(
             Remark(
-                text=f"more than the maximum of {points_text(rubric.out_of)}, which Moodle does "
-                f"not import: {first_few(named, _NAMED)}"
-            )
-        )
-    if platform == "canvas" and (word := _IGNORED.search(title)):
-        remarks.append(
-            Remark(
-                text=f"the title contains {word[0]!r}: Canvas does not import columns such as "
-                "'Final Score'; see in its preview whether it lists this column"
+                text=f"the title contains {word[0]!r}: {platform.title} does not import columns "
+                "such as 'Final Score'; see in its preview whether it lists this column"
             )
         )
     if roster:
@@ -102,32 +86,38 @@ def export(
         own.check_maximum(rubric.out_of, title=title)
         text, strangers = _fill_own(own, platform, students, rubric, title=title)
         remarks += strangers
-    elif platform == "canvas":
+    else:
         named = [s for s in students if not s.uploader]
         text = _make_table(platform, named, rubric, title=title)
-        sent = [f"{s.name} ({s.grade.submission})" for s in students if s.uploader]
-        if sent:
-            remarks.append(
-                Remark(
-                    text="matched only by their authors' ids; give a roster to match them also "
-                    f"by the number in the file name: {', '.join(sent)}"
-                )
-            )
-    else:
-        text = _make_table(platform, students, rubric, title=title)
+        remarks += about(
+            "matched only by their authors' ids; give a roster to match them also by the number in "
+            "the file name",
+            (f"{s.name} ({s.grade.submission})" for s in students if s.uploader),
+        )
     folder.mkdir(parents=True, exist_ok=True)
-    files = [table or folder / f"{platform}.csv"]
+    files = [table or folder / f"{platform.name}.csv"]
     write_file(files[0], text)
-    if platform == "gradescope" and not table:
-        files += _write_results(entries, own_folder(folder, "gradescope"), rubric=rubric)
+    if platform.has_results and not table:
+        files += _write_results(entries, own_folder(folder, platform.name))
     return Exported(files=tuple(files), remarks=tuple(remarks))
+
+
+def _not_final(entries: Sequence[Entry]) -> list[Remark]:
+    """Return a remark that names the submissions that a person has yet to grade."""
+    unfinished = [entry.submission for entry in entries if entry.grade.open]
+    return about(
+        f"not final, exported with the points so far: {len(unfinished)} of {len(entries)} "
+        "submissions have criteria that a person has not graded",
+        unfinished,
+        most=_NAMED,
+    )
 
 
 def _fill_own(
     roster: Roster, platform: Platform, students: Sequence[Student], rubric: Rubric, *, title: str
 ) -> tuple[str, list[Remark]]:
     """Return the platform's own table with grades filled in, and remarks on mismatches."""
-    form = WORKSHEET if _has_numbers(platform, roster.has("Identifier")) else FORMS[platform]
+    form = platform.form(numbered=any(map(roster.has, platform.numbers)))
     there = {name: text for name, text in form.if_there.items() if roster.has(name)}
     columns = {
         name.format(title=title): lambda student, text=text: text.format_map(
@@ -137,7 +127,7 @@ def _fill_own(
     }
     return roster.fill(
         students, columns, keep=form.kept or None,
-        possible=points_text(rubric.out_of) if platform == "canvas" else "",
+        possible=points_text(rubric.out_of) if platform.maxima else "",
     )  # fmt: skip
 
 
@@ -146,31 +136,26 @@ def _make_table(
 ) -> str:
     """Return a new table that the platform can import, if its own table was not given."""
     numbered = bool(students) and all(student.number for student in students)
-    form = WORKSHEET if _has_numbers(platform, numbered) else FORMS[platform]
+    form = platform.form(numbered=numbered)
     head = [name.format(title=title) for name in form.new]
     rows = []
     for student in students:
         values = values_of(student, rubric)
         rows.append([text.format_map(values) for text in form.new.values()])
-    if platform == "canvas":
-        possible = [f"    {POINTS_POSSIBLE}", *[""] * (len(head) - 2), points_text(rubric.out_of)]
+    if platform.maxima:
+        possible = [f"    {platform.maxima}", *[""] * (len(head) - 2), points_text(rubric.out_of)]
         rows.insert(0, possible)
-    if platform == "gradescope":  # one column for each criterion
+    if form.criterion:
         for i, c in enumerate(rubric.criteria, start=1):
-            head.append(f"{i}: {c.title or c.id} ({c.points} pts)")
+            head.append(form.criterion.format(i=i, title=c.title or c.id, points=c.points))
             for row, student in zip(rows, students, strict=True):
                 judged = () if student.undecided else student.grade.criteria
                 row.append("".join(points_text(own.points) for own in judged if own.id == c.id))
     return csv_text(head, rows)
 
 
-def _has_numbers(platform: Platform, numbered: bool) -> bool:
-    """Return whether the table is Moodle's worksheet, which has participant numbers."""
-    return platform == "moodle" and numbered
-
-
 def values_of(student: Student, rubric: Rubric) -> dict[str, str]:
-    """Return the values of a student by the names that `platforms.Form` uses for them."""
+    """Return the values of a student by the names that `platforms.Table` uses for them."""
     first, _, last = student.name.partition(" ")
     return {
         "name": student.name,
@@ -194,27 +179,27 @@ def _comment(student: Student) -> str:
     """Return short feedback as HTML, which Moodle expects."""
     if student.undecided:
         return ""
-    lines = _comment_lines(student.grade, by_hand=student.by_hand)
-    return "<br>".join(html.escape(line, quote=False) for line in lines)
+    return "<br>".join(html.escape(line, quote=False) for line in _comment_lines(student.view))
 
 
-def _comment_lines(grade: Grade, *, by_hand: Collection[str]) -> list[str]:
+def _comment_lines(view: GradeView) -> list[str]:
     """Return a line for each criterion with lost points or points given by hand, and for each flag.
 
     The deduction for lateness and the changes of the total come last.
     """
+    grade = view.grade
     if grade.awaits_grading:
         return [waiting_text(grade)]
     if grade.status == "failed" and not grade.criteria:
         return [f"Could not be graded: {on_one_line(grade.reason)}", *person_lines(grade)]
+    by_hand = {given.criterion for given in grade.overrides}
     lost = [
         f"{c.title or c.id}: {points_text(c.points)} of {points_text(c.out_of)}. "
-        f"{with_symbols(c.message)}"
+        f"{with_symbols('; '.join(view.reasons(c)) or WORDS.text(f'outcome_{c.outcome}'))}"
         for c in grade.criteria
         if c.id in grade.lost or c.id in by_hand
     ]
-    late = [f"Late: {points_text(grade.deducted)} points off."] if grade.deducted else []
-    return [*lost, *flag_messages(grade), *late, *person_lines(grade)]
+    return [*lost, *view.flag_lines(), *view.total_lines()]
 
 
 def _clock(days: float) -> str:
@@ -222,24 +207,125 @@ def _clock(days: float) -> str:
     return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
 
 
-def _write_results(entries: Iterable[Entry], folder: Path, *, rubric: Rubric) -> list[Path]:
+def _write_results(entries: Iterable[Entry], folder: Path) -> list[Path]:
     files = []
     for entry in entries:
         own = own_folder(folder, entry.submission)
         own.mkdir(parents=True, exist_ok=True)
-        text = results_text(
-            entry.grade, rubric=rubric, by_hand=bool(entry.overrides or entry.adjustments)
-        )
-        write_file(own / "results.json", text)
+        write_file(own / "results.json", results_text(view(entry, "team")))
         files.append(own / "results.json")
     return files
 
 
+# --------------------------------------------------------------------------- feedback
+
+
+def export_feedback(
+    book: Gradebook, platform: Platform, out: Path, *, roster: Path | None = None
+) -> Exported:
+    """Write the zip of feedback files that a learning platform gives to its students.
+
+    Each file has the page of a submission as its team may read it. Submissions that are graded
+    again by the next run are left out.
+
+    Parameters
+    ----------
+    out : a folder, existing or new; or a .zip file.
+
+    Raises
+    ------
+    ConfigError : the platform takes no feedback files, the roster is not a table of this platform,
+        or `out` has the name of a file of another kind.
+    """
+    if not platform.feedback:
+        takers = " or ".join(one.name for one in PLATFORMS.values() if one.feedback)
+        raise ConfigError(f"{platform.title} takes no zip of feedback files: give --lms {takers}")
+    named = out.suffix.lower() == ".zip" and not out.is_dir()
+    file = out if named else named_folder(out) / _zip_name(platform)
+    entries = {entry.submission: entry for entry in book.entries()}
+    waiting = [name for name, entry in entries.items() if entry.grade.awaits_grading]
+    ready = [entry for name, entry in entries.items() if name not in waiting]
+    students, remarks = students_of(ready, platform=platform, accounts=True)
+    remarks += _not_final(ready) + about("not graded yet, so left out", waiting)
+    if roster:
+        students = Roster.read(roster, platform=platform).identify(students)
+    placed, problems = _place(students, platform, has_roster=roster is not None)
+    remarks += problems
+    if not placed:
+        raise ConfigError("; ".join(r.text for r in remarks) or "the class has no submissions")
+    pages = {
+        name: feedback_page(of.view, figures=book.figures(entries[name]), name=name).encode()
+        for name, of in {one.grade.submission: one for one in placed.values()}.items()
+    }
+    remarks += about(
+        f"{platform.title} gives a page the name of the student's own file, so these pages do not "
+        "end in .html",
+        (path for path in placed if not path.lower().endswith((".zip", ".html"))),
+        most=_NAMED,
+    )
+    packed = {
+        path: zip_bytes([("feedback.html", page)]) if path.lower().endswith(".zip") else page
+        for path, of in placed.items()
+        for page in [pages[of.grade.submission]]
+    }
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_file(file, zip_bytes(packed.items()))
+    return Exported(files=(file,), remarks=tuple(remarks))
+
+
+def _place(
+    students: Sequence[Student], platform: Platform, *, has_roster: bool
+) -> tuple[dict[str, Student], list[Remark]]:
+    """Return whose feedback is at each path in the zip, and remarks on students without a path."""
+    placed: dict[str, Student] = {}
+    whose: dict[str, str] = {}
+    lost, twice, guessed = [], [], []
+    for student in students:
+        path, submission = _path_of(student, platform), student.grade.submission
+        if not path:
+            lost += [] if student.undecided or student.uploader else [student]
+        elif whose.setdefault(path.casefold(), submission) != submission:
+            twice.append(student)
+        elif path not in placed:
+            placed[path] = student
+            guessed += [student] if student.uploader and not has_roster else []
+    # A file by the name of an upload, or for the account that submitted, serves the whole team.
+    served = placed.values() if platform.is_by_upload else guessed
+    reached = {student.grade.submission for student in served}
+    lost = [student for student in lost if student.grade.submission not in reached]
+    remarks = about(
+        "only the account that submitted gets the page; if these are groups, do not upload the "
+        "zip, and give the worksheet with --roster",
+        (f"{s.name} ({s.grade.submission})" for s in guessed if not platform.is_by_upload),
+    )
+    remarks += not_exported(platform.feedback_needs, lost)
+    return placed, remarks + not_exported("another file has the same name", twice)
+
+
+def _path_of(student: Student, platform: Platform) -> str:
+    """Return the path of a student's feedback in the zip; "" if it is not known."""
+    if student.undecided:
+        return ""
+    return platform.feedback_path(
+        name=student.name, number=student.number, download=student.download
+    )
+
+
+def _zip_name(platform: Platform) -> str:
+    return f"feedback-{platform.name}.zip"
+
+
 def remove_exports(folder: Path) -> list[Path]:
     """Remove the files that earlier exports wrote into a class's folder; return their paths."""
-    tables = [folder / f"{platform}.csv" for platform in FORMS]
-    results = (folder / "gradescope").glob("*/results.json")
-    there = [file for file in (*tables, *results) if file.is_file()]
+    tables = [folder / f"{name}.csv" for name in PLATFORMS]
+    pages = [folder / _zip_name(platform) for platform in PLATFORMS.values()]
+    results = [
+        file
+        for platform in PLATFORMS.values()
+        if platform.has_results
+        for file in (folder / platform.name).glob("*/results.json")
+    ]
+    there = [file for file in (*tables, *pages, *results) if file.is_file()]
     for file in there:
         file.unlink()
         if file.name == "results.json" and not any(file.parent.iterdir()):

@@ -10,8 +10,7 @@ from typing import Any
 
 from pipeline import __version__
 from pipeline.grading.grade import Criterion, Flag, Grade, Outcome
-from pipeline.grading.rubric import Rubric
-from pipeline.grading.similarity.flag import student_message
+from pipeline.grading.publish.view import GradeView
 from pipeline.grading.words import WORDS, person_lines, points_text
 from pipeline.names import read_name
 from pipeline.report.document import (
@@ -42,30 +41,26 @@ TONES: dict[Outcome, Tone] = {"pass": "good", "partial": "", "fail": "bad", "ski
 _ENTRY = re.compile(r"([AB])\((\d+)(?:, (\d+))?\)")
 _MOST_PERCENT = 1000.0  # a larger difference is given as a ratio
 _SHARE = "_percent"  # end of the key of a number that is already a percentage
+_HIDDEN = "In this lab you find the numbers yourself, so no computed number is shown here."
 _FINEST = 2  # decimals of such a percentage
 
 
-def feedback_page(
-    grade: Grade,
-    *,
-    rubric: Rubric,
-    figures: Sequence[tuple[str, str]],
-    name: str,
-) -> str:
-    """Return `feedback.html`; the same grade gives the same bytes.
+def feedback_page(view: GradeView, *, figures: Sequence[tuple[str, str]], name: str) -> str:
+    """Return `feedback.html`; the same view gives the same bytes.
 
     Parameters
     ----------
-    figures : pairs of file name and SVG text.
+    figures : pairs of file name and SVG text; left out if the view hides numbers.
     """
+    grade, rubric = view.grade, view.rubric
     numbers = count(1)
-    sections = [Section("summary", "Summary", tuple(_summary(grade)))]
+    sections = [Section("summary", "Summary", tuple(_summary(view)))]
     if grade.flags:
-        sections.append(Section("remarks", "What to look at", tuple(_remarks(grade.flags))))
+        sections.append(Section("remarks", "What to look at", tuple(_remarks(view))))
     if grade.criteria:
-        blocks = tuple(_criteria(grade, rubric, numbers))
+        blocks = tuple(_criteria(view, numbers))
         sections.append(Section("criteria", "Criteria, one by one", blocks))
-    if figures:
+    if figures and not view.hides_numbers:
         blocks = tuple(_picture(i, *figure) for i, figure in enumerate(figures, start=1))
         sections.append(Section("figures", "Your recordings", blocks))
     document = Document(
@@ -81,8 +76,8 @@ def feedback_page(
 # -------------------------------------------------------------------------- summary
 
 
-def _summary(grade: Grade) -> list[Block]:
-    overrides = grade.overrides
+def _summary(view: GradeView) -> list[Block]:
+    grade, overrides = view.grade, view.grade.overrides
     points = f"{points_text(grade.points)} of {points_text(grade.out_of)}"
     by_hand = Tile(spans("Set by hand"), spans(counted_criteria(len(overrides))))
     if grade.status == "failed":
@@ -96,7 +91,7 @@ def _summary(grade: Grade) -> list[Block]:
             why = paragraph(WORDS.spans(key, why=WORDS.text("failed_reasons")))
             blocks = [why, bullet_list(map(spans, (first, *others))), paragraph(then)]
         tiles = Tiles((tile, by_hand) if overrides else (tile,))
-        return [tiles, *_by_person(grade), *blocks, *_notes(grade)]
+        return [tiles, *_by_person(grade), *blocks, *_notes(view)]
     passed = sum(c.outcome == "pass" for c in grade.criteria)
     tiles = [
         Tile(spans("Points"), spans(points)),
@@ -118,7 +113,8 @@ def _summary(grade: Grade) -> list[Block]:
         tiles.append(Tile(spans("Late"), spans(late), tone="bad" if grade.deducted else ""))
     if overrides:
         tiles.append(by_hand)
-    return [Tiles(tuple(tiles)), *_by_person(grade), *_lost(grade), *_notes(grade)]
+    hidden = [paragraph(_HIDDEN)] if view.hides_numbers else []
+    return [Tiles(tuple(tiles)), *_by_person(grade), *hidden, *_lost(view), *_notes(view)]
 
 
 def _by_person(grade: Grade) -> list[Block]:
@@ -136,8 +132,9 @@ def counted_criteria(n: int) -> str:
     return f"{n} {'criterion' if n == 1 else 'criteria'}"
 
 
-def _lost(grade: Grade) -> list[Block]:
+def _lost(view: GradeView) -> list[Block]:
     """Return the table of lost points, the largest loss first."""
+    grade = view.grade
     lost = [c for c in grade.criteria if c.id in grade.lost]
     if not lost and grade.open:  # nothing lost, but not all earned
         return []
@@ -150,16 +147,20 @@ def _lost(grade: Grade) -> list[Block]:
             title=clean(c.title or c.id),
             points=points_text(c.points),
             out_of=points_text(c.out_of),
-            why=rich(sentence(c.message)),
+            why=rich(_told(view, c) or sentence(WORDS.text(f"outcome_{c.outcome}"))),
         )
         for c in lost
     )
     return [paragraph(WORDS.text("lost")), where]
 
 
-def _notes(grade: Grade) -> list[Block]:
-    notes = bullet_list(rich(sentence(note)) for note in grade.notes)
-    return [paragraph(WORDS.text("notes")), notes] if grade.notes else []
+def _told(view: GradeView, criterion: Criterion) -> str:
+    return " ".join(map(sentence, view.reasons(criterion)))
+
+
+def _notes(view: GradeView) -> list[Block]:
+    notes = bullet_list(rich(sentence(note)) for note in view.notes)
+    return [paragraph(WORDS.text("notes")), notes] if view.notes else []
 
 
 def sentence(text: str) -> str:
@@ -174,12 +175,13 @@ def sentence(text: str) -> str:
 # -------------------------------------------------------------------------- remarks
 
 
-def _remarks(flags: Sequence[Flag]) -> list[Block]:
+def _remarks(view: GradeView) -> list[Block]:
     blocks: list[Block] = []
-    for flag in flags:
+    for flag in view.grade.flags:
+        text = view.flag_text(flag)
         blocks += [
             Heading(rich(_capital(WORDS.text(f"title_{flag.code}")))),
-            paragraph(rich(sentence(student_message(flag)))),
+            *([paragraph(rich(sentence(text)))] if text else []),
             paragraph(WORDS.spans("where", place=rich(WORDS.text(f"place_{flag.code}")))),
         ]
     return blocks
@@ -192,9 +194,10 @@ def _capital(text: str) -> str:
 # ------------------------------------------------------------------------- criteria
 
 
-def _criteria(grade: Grade, rubric: Rubric, numbers: count) -> list[Block]:
+def _criteria(view: GradeView, numbers: count) -> list[Block]:
     """Return each criterion with its numbers; those with full points are folded."""
-    checks = {criterion.id: criterion.check for criterion in rubric.criteria}
+    grade = view.grade
+    checks = {criterion.id: criterion.check for criterion in view.rubric.criteria}
     rows = [
         [
             clean(c.title or c.id),
@@ -207,11 +210,15 @@ def _criteria(grade: Grade, rubric: Rubric, numbers: count) -> list[Block]:
     blocks: list[Block] = [make_table(next(numbers), WORDS.text("points"), head, rows, "lrl")]
     for criterion in grade.criteria:
         title = _capital(clean(criterion.title or criterion.id))
-        message = paragraph(rich(sentence(criterion.message)))
-        table = numbers_table(
-            criterion, check=checks.get(criterion.id, ""), units=grade.units, numbers=numbers
-        )
-        inside: list[Block] = [message, *([table] if table else [])]
+        inside: list[Block] = [paragraph(rich(told))] if (told := _told(view, criterion)) else []
+        if not view.hides_numbers and (
+            table := numbers_table(
+                criterion, check=checks.get(criterion.id, ""), units=grade.units, numbers=numbers
+            )
+        ):
+            inside.append(table)
+        if not inside:  # the table above says all that the view shows
+            continue
         head = spans(f"{title}: {WORDS.text(f'outcome_{criterion.outcome}')}")
         passed = criterion.outcome == "pass"
         blocks += [Details(head, tuple(inside))] if passed else [Heading(head), *inside]

@@ -13,9 +13,10 @@ from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, grade_text
 from pipeline.grading.gradebook.class_lines import GradeSummary
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.publish.anonymous import KEY_FILE, STRANGER, anonymise, key_text, pseudonyms
+from pipeline.grading.publish.anonymous import KEY_FILE, STRANGER, key_text, pseudonyms
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.feedback import feedback_page
+from pipeline.grading.publish.view import view
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.clusters import find_clusters, renamed
 from pipeline.grading.similarity.distant import Quantity, find_distant, recomputed_numbers
@@ -63,7 +64,8 @@ def write_outputs(
         shared |= dict(
             (entry.submission, flag) for flag in entry.grade.flags if flag.code == "shared_data"
         )
-        grade = anonymise(entry.grade, names) if names is not None else entry.grade
+        seen = view(entry, "staff", names=names)
+        grade = seen.grade
         lines.append(GradeSummary.of(grade))
         numbers[grade.submission] = recomputed_numbers(grade, rubric=rubric)
         gradings[entry.submission], authors[entry.submission] = entry.grading, entry.grade.authors
@@ -76,8 +78,7 @@ def write_outputs(
         (folder / _MADE).unlink(missing_ok=True)  # if this run stops, the next one writes all pages
         own.mkdir(exist_ok=True)
         page = feedback_page(
-            grade,
-            rubric=rubric,
+            seen,
             figures=book.figures(entry),
             name=grade.submission,
         )

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,25 +10,14 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
 from pipeline.grading.gradings import person
-from pipeline.grading.intake.lms_names import Platform
-from pipeline.grading.publish.platforms import FORMS
-from pipeline.grading.publish.students import Remark, Student, not_exported, one_of
+from pipeline.grading.platforms import Platform, bare_number, read_number
+from pipeline.grading.publish.students import Remark, Student, about, not_exported, one_of
 from pipeline.output import csv_text
 from pipeline.submission.toml import quote
-from pipeline.words.numbers import first_few
 
 if TYPE_CHECKING:
     import pandas as pd
 
-POINTS_POSSIBLE = "Points Possible"  # marks the first row of Canvas, which is about the assignments
-_MAXIMUM = "Maximum Grade"  # column of Moodle, whose import refuses a higher grade
-# Columns that identify the student of a row: by number, by id, by name.
-_NUMBERS = ("ID", "Identifier", "Submission ID")
-_IDS = ("SIS User ID", "SIS Login ID", "ID number", "SID", "Username", "Email", "Email address")
-_NAMES = ("Student", "Full name", "Name")
-# A participant of Moodle in any language, such as "Participant 1024" or "Teilnehmer/in1024".
-_PARTICIPANT = re.compile(r"^(\D+)(\d+)$")
-_ID = re.compile(r"(?=.*\d)\S+")  # an id number: no spaces, and at least one digit
 # A title in Canvas, perhaps followed by the assignment's id.
 _TITLE = re.compile(r"(.*?)(?: \(\d+\))?")
 
@@ -39,10 +28,10 @@ class Roster:
 
     Attributes
     ----------
-    headings : the table's own headings by Moodle's English ones, if the table is in another
-        language.
+    headings : the table's own headings by the English ones, if the table is in another language.
     """
 
+    platform: Platform
     file: str
     table: "pd.DataFrame"
     headings: Mapping[str, str] = field(default_factory=dict)
@@ -57,19 +46,19 @@ class Roster:
             columns of the same name.
         """
         table = read_table(path)
-        known = any(columns <= set(table.columns) for columns in FORMS[platform].own)
-        headings = _moodle_headings(table) if platform == "moodle" else {}
+        keys = platform.needed or (*platform.numbers, *platform.ids)
+        known = (all if platform.needed else any)(name in table for name in keys)
+        headings = platform.headings(table)
         headings = {name: own for name, own in headings.items() if name not in table}
         if not known and not headings:
-            wanted = ", or ".join(" and ".join(sorted(columns)) for columns in FORMS[platform].own)
+            wanted = (" and " if platform.needed else ", or ").join(keys)
             raise ConfigError(
-                f"{path.name}: is not {platform.capitalize()}'s table; "
-                f"that has the columns {wanted}"
+                f"{path.name}: is not {platform.title}'s table; that has the columns {wanted}"
             )
         twice = table.columns[table.columns.duplicated() & (table.columns != "")]
         if len(twice):
             raise ConfigError(f"{path.name}: has two columns {quote(twice[0])}")
-        return cls(file=path.name, table=table, headings=headings)
+        return cls(platform=platform, file=path.name, table=table, headings=headings)
 
     def has(self, name: str) -> bool:
         """Return whether the table has a column, given by its English heading."""
@@ -80,19 +69,43 @@ class Roster:
 
         Raises
         ------
-        ConfigError : Moodle's column or Canvas' row of possible points has a different maximum.
+        ConfigError : the column or the row of maximum grades has a different maximum.
         """
         column = self._title(title)
-        maximum = self.headings.get(_MAXIMUM, _MAXIMUM)
-        stated = [*self.table[maximum].unique()] if maximum in self.table else []
+        maximum = self.platform.maximum
+        stated = []
+        if maximum and self.has(maximum):
+            stated += [*self.table[self.headings.get(maximum, maximum)].unique()]
         if column in self.table:
             stated += [*self.table.loc[self._of_all(), column]]
         for text in stated:
-            if (most := _number(text)) is not None and most != out_of:
+            if (most := read_number(text)) is not None and most != out_of:
                 raise ConfigError(
                     f"{self.file}: has the maximum grade {text}, the rubric {out_of:g}: "
                     "set the assignment's maximum on the platform and download the table again"
                 )
+
+    def identify(self, students: Sequence[Student]) -> list[Student]:
+        """Return the students with the number and the name in their row, if they have a row.
+
+        A number counts only if the name does not contradict it: the number of a group's download is
+        no number of a student.
+        """
+        index, _ = self._index
+        cells = {role: self.table[name].str.strip() for name, role in self._roles()}
+        number, name = cells.get(self.platform.numbers[0]), cells.get(self.platform.names[0])
+
+        def identified(student: Student) -> Student:
+            at = index.get(("number", student.number))
+            if name is not None and at is not None and student.name:
+                at = at if _letters(name[at]) == _letters(student.name) else None
+            at = _row_of(replace(student, number=""), index) if at is None else at
+            if at is None or number is None:
+                return replace(student, number="")
+            shown = student.name if name is None else name[at]
+            return replace(student, number=bare_number(number[at]), name=shown)
+
+        return list(map(identified, students))
 
     def fill(
         self,
@@ -111,7 +124,7 @@ class Roster:
         columns : for each column title, the function that gives a student's value, the points
             first; a missing column is added at the end.
         keep : other columns to keep; default: all.
-        possible : the maximum points, for Canvas' first row.
+        possible : the maximum points, for the row about the assignments.
         """
         titles = {title: self._title(title) for title in columns}
         kept = [name in (keep or self.table.columns) for name in self.table.columns]
@@ -140,7 +153,7 @@ class Roster:
             for at, old in before[graded].items()
             if old.strip()
             and old.strip() != table.loc[at, points]
-            and _number(old) != _number(table.loc[at, points])
+            and read_number(old) != read_number(table.loc[at, points])
         }
         remarks = self._name_rows(f"replaced in {self.file}", replaced)
         remarks += self._remarks(students, matched, found, settled)
@@ -175,40 +188,22 @@ class Roster:
             for at, s in matched
             if at is not None and s.points and index.get(_id_of(s), at) not in found
         ]
-        if passed_over:
-            named = ", ".join(f"{s.called} ({s.grade.submission})" for s in passed_over)
-            remarks.append(
-                Remark(
-                    text="given no points, because another account submitted and received them: "
-                    f"{named}",
-                    left_out=True,
-                )
-            )
-        if twice:
-            remarks.append(not_exported(f"in several rows of {self.file}", twice))
-        if strangers:
-            remarks.append(not_exported(f"not in {self.file}", strangers))
-        reached = {student.grade.submission for several in found.values() for student in several}
-        lost = dict.fromkeys(
-            s.grade.submission
-            for s in students
-            if len(s.grade.authors) > 1 and s.grade.submission not in reached
+        remarks += about(
+            "given no points, because another account submitted and received them",
+            (f"{s.called} ({s.grade.submission})" for s in passed_over),
+            left_out=True,
         )
-        if lost:
-            remarks.append(Remark(text=f"none of these is in {self.file}: {', '.join(lost)}"))
-        by_number = [
-            f"{s.name} ({s.grade.submission})"
-            for s in settled.values()
-            if s.uploader and not s.undecided
-        ]
-        if by_number:
-            remarks.append(
-                Remark(
-                    text="matched by the number in the file name, and therefore taken to be one of "
-                    f"the authors: {', '.join(by_number)}"
-                )
-            )
-        return remarks
+        remarks += not_exported(f"in several rows of {self.file}", twice)
+        remarks += not_exported(f"not in {self.file}", strangers)
+        reached = {student.grade.submission for several in found.values() for student in several}
+        teams = (s.grade.submission for s in students if len(s.team) > 1)
+        lost = (name for name in teams if name not in reached)
+        remarks += about(f"none of these is in {self.file}", lost)
+        by_number = (s for s in settled.values() if s.uploader and not s.undecided)
+        return remarks + about(
+            "matched by the number in the file name, and therefore taken to be one of the authors",
+            (f"{s.name} ({s.grade.submission})" for s in by_number),
+        )
 
     def _kept(self, grades: "pd.Series") -> list[Remark]:
         """Return a remark on grades that only the table has.
@@ -223,12 +218,9 @@ class Roster:
 
     def _name_rows(self, what: str, grades: Mapping[Any, str]) -> list[Remark]:
         """Return a remark on grades in the table, with the names in their rows."""
-        if not grades:
-            return []
-        column = next((name for name, role in self._roles() if role in _NAMES), None)
+        column = next((name for name, role in self._roles() if role in self.platform.names), None)
         called = self.table.iloc[:, 0] if column is None else self.table[column]
-        named = first_few([f"{called[at]} ({text})" for at, text in grades.items()], 8)
-        return [Remark(text=f"{what}: {named}")]
+        return about(what, (f"{called[at]} ({text})" for at, text in grades.items()), most=8)
 
     def _roles(self) -> Iterable[tuple[Any, Any]]:
         """Yield each column and its heading in English, as far as known."""
@@ -239,7 +231,8 @@ class Roster:
         """Return a mask of the rows that are about assignments, not about a student."""
         # There may be several columns without a name, and the first column may be one.
         students = self.table["Student"] if "Student" in self.table else self.table.iloc[:, 0]
-        return students.str.contains(POINTS_POSSIBLE, regex=False)
+        maxima = self.platform.maxima
+        return students.str.contains(maxima, regex=False) & bool(maxima)
 
     def _title(self, title: str) -> str:
         if title in self.headings:
@@ -258,11 +251,11 @@ class Roster:
         words = []
         for name, role in self._roles():
             cells = self.table[name].map(person)
-            if role in _NUMBERS:
-                words.append(("number", cells.str.replace(_PARTICIPANT, r"\2", regex=True)))
-            if role in _IDS or role == "ID":
+            if role in self.platform.numbers:
+                words.append(("number", cells.map(bare_number)))
+            if role in self.platform.ids:
                 words += [("id", cells), ("id", cells.str.split("@").str[0])]
-            if role in _NAMES:
+            if role in self.platform.names:
                 words.append(("name", cells.map(_letters)))
         found = pd.concat(
             pd.DataFrame({"kind": kind, "word": cells, "row": cells.index}) for kind, cells in words
@@ -289,58 +282,6 @@ def _id_of(student: Student) -> tuple[str, str]:
     return "id", person(student.id)
 
 
-def _number(text: str) -> float | None:
-    """Read a number from a platform's table, also with a decimal comma; None for other text."""
-    try:
-        return float(text.replace(",", "."))
-    except ValueError:
-        return None
-
-
 def _letters(name: str) -> str:
     """Return a name as Canvas writes it in file names: "Doe, Jane" becomes "doejane"."""
     return "".join(c for c in person(name) if c.isalnum())
-
-
-def _moodle_headings(table: "pd.DataFrame") -> dict[str, str]:
-    """Return the headings of a table of Moodle in another language, by the English ones.
-
-    Moodle translates the headings, but their order is always the same: participant, name, columns
-    such as id number and email address, status, grade, maximum grade, and last the comment. A table
-    from the gradebook is known by the email addresses. Empty if the table is neither.
-    """
-    cells = [[text.strip() for text in table.iloc[:, i]] for i in range(table.shape[1])]
-    if not any(cells):
-        return {}
-    roles: dict[str, int] = {}
-    first = next((i for i, column in enumerate(cells) if _participants(column)), len(cells))
-    for i in range(first + 2, len(cells)):
-        most = {_number(text) for text in cells[i]}
-        if i - 1 > first + 1 and len(most) == 1 and None not in most:
-            roles |= {"Identifier": first, "Grade": i - 1, _MAXIMUM: i}
-    if roles:
-        roles["Full name"] = first + 1
-    last = len(cells) - 1
-    if last > roles.get(_MAXIMUM, last) and "-" not in cells[last]:
-        roles["Feedback comments"] = last
-    end = roles.get("Grade", len(cells))
-    for i, column in enumerate(cells[:end]):
-        given = [text for text in column if text]
-        if i in roles.values() or not given or len(set(given)) < len(given):
-            continue
-        if all("@" in text for text in given):
-            roles.setdefault("Email address", i)
-        elif "Email address" not in roles and all(_ID.fullmatch(text) for text in given):
-            roles.setdefault("ID number", i)
-    if "Identifier" not in roles and "Email address" not in roles:
-        return {}
-    return {name: str(table.columns[i]) for name, i in roles.items()}
-
-
-def _participants(column: Sequence[str]) -> bool:
-    """Return whether a column has Moodle's participants: one word and a different number each."""
-    found = [_PARTICIPANT.fullmatch(text) for text in column]
-    if not all(found):
-        return False
-    words, numbers = zip(*(one.groups() for one in found if one), strict=True)
-    return len(set(words)) == 1 and len(set(numbers)) == len(numbers)

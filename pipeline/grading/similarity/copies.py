@@ -15,7 +15,7 @@ from itertools import zip_longest
 import numpy as np
 
 from pipeline.grading.gradings import Member
-from pipeline.grading.intake.lms_names import same_number
+from pipeline.grading.platforms import same_number
 from pipeline.grading.similarity.fingerprints import PASSED, Fingerprint, unpack
 from pipeline.grading.similarity.matching import (
     LEAST_OVERLAP,

@@ -23,6 +23,7 @@ from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Example
 from pipeline.grading.intake.files import digest, packed, unpacked
 from pipeline.grading.intake.find import find_hand_ins
+from pipeline.grading.platforms import PLATFORMS
 from pipeline.grading.publish import feedback_figures
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.publish.students import students_of
@@ -226,8 +227,8 @@ def test_the_files_of_a_stopped_submission_name_its_authors(school, tmp_path):
     run([school / "team-0"], tmp_path, time_limit=0.01, finish=True)
     with Gradebook(tmp_path) as book:
         write_outputs(book, tmp_path)
-        ((student,), (remark,)) = students_of(list(book.entries()), platform="canvas")
-    assert (student.id, student.points, remark.left_out) == ("s0", "", False)
+        ((student,), remarks) = students_of(list(book.entries()), platform=PLATFORMS["canvas"])
+    assert (student.id, student.points, remarks) == ("s0", "", [])
     pages = {name: (tmp_path / name).read_text(encoding="utf-8")
              for name in ("grades.csv", "class.html", "feedback/team-0/feedback.html")}  # fmt: skip
     table, class_, page = pages.values()

@@ -15,10 +15,12 @@ from pipeline.grading.gradebook.events import TOTAL
 from pipeline.grading.gradebook.history import history_text
 from pipeline.grading.gradebook.override import read_wishes
 from pipeline.grading.judge.recompute import findings_text, read_findings, recompute_points
+from pipeline.grading.platforms import PLATFORMS
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.export import export
 from pipeline.grading.publish.gradescope import results_text
 from pipeline.grading.publish.outputs import write_outputs
+from pipeline.grading.publish.view import new_view
 from pipeline.grading.rubric import Manual, Rubric
 from pipeline.grading.rubric_file import InvalidRubric, parse_rubric
 from pipeline.grading.rubric_text import rubric_text
@@ -88,8 +90,8 @@ def test_an_open_criterion_is_said_everywhere(tmp_path):
     rubric, grade = with_manual(two_cart_rubric()), with_open(make_grade("team-1"))
     with book_of(tmp_path, grade, rubric=rubric) as book:
         write_outputs(book, tmp_path)
-        done = export(book, "moodle", tmp_path)
-    result = json.loads(results_text(grade, rubric=rubric))
+        done = export(book, PLATFORMS["moodle"], tmp_path)
+    result = json.loads(results_text(new_view(grade, rubric)))
     feedback = (tmp_path / "feedback" / "team-1" / "feedback.html").read_text(encoding="utf-8")
     table = (tmp_path / "moodle.csv").read_text(encoding="utf-8")
     remarks = [one.text for one in done.remarks if "not final" in one.text]
@@ -152,7 +154,7 @@ def test_a_total_is_adjusted_after_lateness(tmp_path):
             book.adjust(name, points, why="agreed", by="Ada")
         assert book.entry("late").grade.points == 20 - 2 - 3
         assert book.entry("broken").grade.points == 5
-        export(book, "moodle", tmp_path)
+        export(book, PLATFORMS["moodle"], tmp_path)
     assert ",5," in (tmp_path / "moodle.csv").read_text(encoding="utf-8").replace('"', "")
 
 

@@ -11,6 +11,7 @@ from sqlalchemy.exc import DBAPIError
 
 from pipeline.grading.gradebook.database import FILE
 from pipeline.grading.gradebook.gradebook import Gradebook
+from pipeline.grading.platforms import PLATFORMS
 from pipeline.grading.publish.export import export
 from pipeline.grading.publish.outputs import write_outputs
 from tests.helpers.commandline import cartlab_here
@@ -49,7 +50,7 @@ def _fill(place: str, *, folder: Path | None = None) -> None:
         finish(book, *class_, shared=shared)
         if folder:
             write_outputs(book, folder)
-            for platform in ("canvas", "moodle", "gradescope"):
+            for platform in PLATFORMS.values():
                 export(book, platform, folder)
 
 

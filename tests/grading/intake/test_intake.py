@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.grading.intake.files import digest, open_submission, packed, unpacked
 from pipeline.grading.intake.find import find_hand_ins
-from pipeline.grading.intake.lms_names import parse_name
 from pipeline.grading.intake.unpack import HAND_IN
+from pipeline.grading.platforms import parse_name
 from pipeline.submission.load import MAX_DATA_BYTES, NAME, file_problem
 
 TOML = "version = 1\n"
@@ -214,12 +214,12 @@ def test_a_canvas_download(tmp_path):
     )
     found = {h.id: h for h in hand_ins(tmp_path, download)}
     assert {name: (h.owner, h.days_late) for name, h in found.items()} == {
-        "anon_x7Yb2-lab3": ("anon_x7Yb2", 1.0),
+        "anon_x7Yb2-lab3": ("anon_x7Yb2 (canvas anonymous: LATE_anon_x7Yb2_77006_lab3.zip)", 1.0),
         "empty": ("empty (canvas 1028)", 0.0),
-        "loose": ("loose (canvas 1027)", 0.0),
-        "poeann-lab3": ("poeann (canvas 1026)", 0.0),
-        "roeric-lab3": ("roeric (canvas 1025)", 1.0),
-        "team-07": ("doejane (canvas 1024)", 0.0),
+        "loose": ("loose (canvas 1027: loose_1027_77004_submission.toml)", 0.0),
+        "poeann-lab3": ("poeann (canvas 1026: poeann_1026_77003_lab3.zip)", 0.0),
+        "roeric-lab3": ("roeric (canvas 1025: roeric_LATE_1025_77002_lab3.zip)", 1.0),
+        "team-07": ("doejane (canvas 1024: doejane_1024_77009_team-07-1.zip)", 0.0),
     }
     assert opened(tmp_path, found["team-07"]) == [NAME]  # only from the resubmission
     assert opened(tmp_path, found["loose"]) == ["data/step.csv", "step.csv", NAME]

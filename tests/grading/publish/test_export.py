@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ConfigError
+from pipeline.grading.platforms import PLATFORMS
 from pipeline.grading.publish.export import export
 from pipeline.grading.publish.students import students_of
 from tests.helpers.grades import (
@@ -24,7 +25,6 @@ from tests.helpers.grades import (
 )
 
 RUBRIC = two_cart_rubric()
-PLATFORMS = ("canvas", "moodle", "gradescope")
 HALF = make_outcome(make_grade("team-1", share=0.5, flags=(hertz_flag(),)), owner="doejane (1024)")
 FULL = make_outcome(make_grade("team-2", authors=("=ann", "bo")), owner="poeann (1025)")
 BROKEN = make_outcome(failed_grade("team-3", "<b>broken</b>"), owner="roeric (1026)")
@@ -51,7 +51,7 @@ def write(tmp_path: Path, *outcomes, platform, roster: str = "", overrides=(), *
         if roster:
             (tmp_path / "roster.csv").write_text(roster, encoding="utf-8-sig")
             options["roster"] = tmp_path / "roster.csv"
-        done = export(book, platform, tmp_path / "out", **options)
+        done = export(book, PLATFORMS[platform], tmp_path / "out", **options)
     text = done.files[0].read_bytes().decode()
     return list(csv.reader(io.StringIO(text, newline=""))), done.remarks
 
@@ -157,7 +157,7 @@ def test_0_points_count_more_than_no_grade(tmp_path):
     unread = failed_grade("a", "too slow").model_copy(update={"authors": ("bob",)})
     with book_of(tmp_path, unread, make_grade("b", share=0.0, authors=("bob",))) as book:
         for order in (1, -1):
-            (bob,), _ = students_of(list(book.entries())[::order], platform="canvas")
+            (bob,), _ = students_of(list(book.entries())[::order], platform=PLATFORMS["canvas"])
             assert (bob.grade.submission, bob.points) == ("b", "0")
 
 
@@ -166,7 +166,7 @@ def test_points_by_hand_go_to_the_authors_of_an_earlier_version(tmp_path):
     with book_of(tmp_path, make_grade("team-8")) as book:
         finish(book, NOBODY)
         book.override("team-8", "pieces", 0.75, why="x", by="y")
-        (student,), remarks = students_of(list(book.entries()), platform="canvas")
+        (student,), remarks = students_of(list(book.entries()), platform=PLATFORMS["canvas"])
     assert (student.id, student.points, remarks) == ("s-team-8", "0.75", [])
 
 

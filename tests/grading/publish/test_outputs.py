@@ -24,6 +24,7 @@ from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.feedback import evidence_table, feedback_page, numbers_table
 from pipeline.grading.publish.gradescope import results_text
 from pipeline.grading.publish.outputs import grades_csv, write_outputs
+from pipeline.grading.publish.view import new_view
 from pipeline.grading.words import WORDS
 from pipeline.setup import Units
 from pipeline.words.text import plain
@@ -262,7 +263,7 @@ def test_pseudonyms_are_all_different():
 
 
 def feedback_of(grade: Grade) -> str:
-    return feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
+    return feedback_page(new_view(grade, RUBRIC), figures=(), name="team-1")
 
 
 def test_every_flag_has_a_name_and_a_place_to_look():
@@ -308,7 +309,7 @@ def test_feedback_says_why_a_submission_was_not_graded():
     assert ["hand it in again" in text for text in texts] == [True, False, False, False]
     marks = [found and found[0] for text in texts if (found := re.search(r"\d of 20", text)) or 1]
     assert marks == ["0 of 20", None, "5 of 20", "1 of 20"]
-    told = json.loads(results_text(by_hand, rubric=RUBRIC, by_hand=True))["output"]
+    told = json.loads(results_text(new_view(by_hand, RUBRIC)))["output"]
     assert "given by hand" in told
 
 

@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError
 from pipeline.grading.intake.late_table import read_late_table
+from pipeline.grading.platforms import PLATFORMS
 from pipeline.grading.publish.roster import Roster
 from pipeline.grading.publish.students import Student
 from pipeline.grading.publish.survey import read_survey, survey_dict, survey_text
-from tests.helpers.grades import make_grade
+from pipeline.grading.publish.view import new_view
+from tests.helpers.grades import make_grade, two_cart_rubric
 
 HEADS = ("Student", "ID", "SIS User ID", "Identifier", "ID number", "SID", "Email", "Lab 3 (7)",
          "Submission ID", "submission", "days_late", "Status", "Lateness (H:M:S)", "Q", "",
@@ -31,7 +33,10 @@ _TABLE = st.integers(1, 6).flatmap(
 )
 STUDENTS = [
     Student(
-        id=id_, name=name, number=number, grade=make_grade(name, share=0.5), by_hand=frozenset()
+        id=id_,
+        name=name,
+        number=number,
+        view=new_view(make_grade(name, share=0.5), two_cart_rubric()),
     )
     for id_, name, number in (("s1", "a", ""), ("", "=cmd", "1024"), ("S1", "b", "7"))
 ]
@@ -41,7 +46,7 @@ def filled(platform) -> Callable[[Path], object]:
     """Return a function that fills in a platform's roster and checks the result."""
 
     def fill(path: Path) -> None:
-        roster = Roster.read(path, platform=platform)
+        roster = Roster.read(path, platform=PLATFORMS[platform])
         text, _ = roster.fill(STUDENTS, {"Lab 3": lambda s: s.points}, possible="20")
         rows = list(csv.reader(io.StringIO(text, newline="")))
         assert len(rows) == len(roster.table) + 1 == text.count("\n")
