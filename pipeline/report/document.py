@@ -14,7 +14,7 @@ from pipeline.words.math import Math
 from pipeline.words.numbers import at_decimal
 from pipeline.words.text import Span, Spans, plain, spans
 
-_MUCH = 24  # a cell with more characters takes most of a phone's width
+_PHONE = 42  # most characters in a row of a table on a phone; each gap between columns takes two
 _LONG = 16  # a tile whose value has more characters is wide
 _WIDE_TILES, _MOST_TILES = 3, 5  # tiles in one row
 
@@ -115,15 +115,17 @@ class Table:
     small: bool = False
     kind: str = field(default="table", init=False)
 
-    @property
-    def has_long_text(self) -> bool:
-        """Return whether cells contain long text.
+    @cached_property
+    def is_wide(self) -> bool:
+        """Whether a phone has too little room for the columns, so that it shows rows as lines.
 
-        If they do, a phone shows each row as lines instead of columns.
+        Small print breaks anywhere, so it always fits.
         """
-        if self.finder or self.small:
-            return False
-        return any(len(plain(cell.text)) > _MUCH for row in self.rows for cell in row)
+        widths = [max(map(len, plain(one.text).split()), default=0) for one in self.head]
+        for row in self.rows:
+            lengths = (len(plain(one.text)) for one in row)
+            widths = [max(pair) for pair in zip(widths, lengths, strict=True)]
+        return not self.small and sum(widths) + 2 * (len(widths) - 1) > _PHONE
 
 
 @dataclass(frozen=True)

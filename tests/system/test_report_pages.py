@@ -235,12 +235,18 @@ BOXES = """() => {
   return found;
 }"""
 
+# The tables that are wider than their place, and where the text of the page begins.
+CUT = """() => Array.from(document.querySelectorAll('.wide:has(table)')).filter(
+    (place) => place.scrollWidth > place.clientWidth + 1).map((place) => place.ariaLabel)"""
+TOP = "document.querySelector('main').getBoundingClientRect().top"
+
 
 def test_pages_are_accessible_on_every_screen(made, show):
     """On every screen the checker axe finds no serious barrier.
 
     Only parts that scroll are wider than the page, no text covers another, and figures contain
-    their texts. On a laptop letters in figures are at least ten pixels high.
+    their texts. On a phone no table scrolls, and the head takes at most a fifth of the screen. On a
+    laptop letters in figures are at least ten pixels high.
     """
     page = show(page_of(made))
     page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
@@ -255,6 +261,9 @@ def test_pages_are_accessible_on_every_screen(made, show):
         fixed = [box for box, scrolled in boxes if not scrolled]
         assert [box for box in fixed if box.left < -0.5 or box.right > width + 0.5] == []
         assert covered([box for box, _ in boxes]) == []
+        if width == PHONE[0]:
+            assert page.evaluate(CUT) == []
+            assert page.evaluate(TOP) <= height / 5
         for edge, texts in page.evaluate(DRAWN):
             drawn = [Box(*text) for text in texts]
             assert [text for text in drawn if not text.lies_in(Box._make([*edge, ""]))] == []

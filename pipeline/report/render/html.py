@@ -162,7 +162,7 @@ def _tails(table: Table) -> list[str]:
 
 def _heads(table: Table) -> list[str]:
     """Return the heading that a phone shows before each value of a row; "" for no heading."""
-    return [plain(head.text) if table.has_long_text else "" for head in table.head]
+    return [plain(head.text) if table.is_wide else "" for head in table.head]
 
 
 def _board(board: Tiles) -> str:
