@@ -136,7 +136,6 @@ class Picture:
     ----------
     name : file name in `figures/`.
     draw : function that returns the figure as SVG; called when `svg` is first used.
-    blank : an empty SVG of the figure's size, for laying out pages before the figure is drawn.
     """
 
     number: int
@@ -144,7 +143,6 @@ class Picture:
     caption: Spans
     alt: str
     draw: Callable[[], str] = field(repr=False)
-    blank: str = field(default="", repr=False)
     kind: str = field(default="picture", init=False)
 
     @cached_property

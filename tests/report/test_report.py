@@ -9,7 +9,6 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import pypdf
@@ -30,7 +29,7 @@ from pipeline.report.lab_report.files import Files
 from pipeline.report.lab_report.make import make_draft
 from pipeline.report.lab_report.write import write_draft
 from pipeline.report.render.html import render_html
-from pipeline.report.render.pdf import lay_out, missing_characters, render_pdf
+from pipeline.report.render.pdf import missing_characters, render_pdf
 from pipeline.report.sections.housekeeping import file_table, provenance_blocks
 from pipeline.report.sections.measurements import decay_blocks
 from pipeline.report.sections.page import Page as Shown  # what sections are made of
@@ -141,23 +140,6 @@ def test_figures_in_a_row_fill_pages(number, tall, pages):
     assert len(printed(Section("f", "Figures", row))) == pages
 
 
-def test_pages_are_laid_out_before_the_figures_are_drawn():
-    """Pages are laid out with blank figures of the final size before any figure is drawn."""
-    document = build_document(make_analysis(2))
-
-    layout = lay_out(document)
-
-    assert len(document.pictures()) > 5
-    assert not any("svg" in vars(picture) for picture in document.pictures())  # not drawn yet
-    for picture in document.pictures():
-        blank, drawn = map(ElementTree.fromstring, (picture.blank, picture.svg))
-        for size in ("width", "height", "viewBox"):
-            one, other = (svg.attrib[size].removesuffix("pt").split() for svg in (blank, drawn))
-            assert [*map(float, one)] == [*map(float, other)]
-        object.__setattr__(picture, "blank", "")  # so that the layout needs the drawing
-    assert lay_out(document) == layout
-
-
 def printed(*sections: Section) -> list[str]:
     """Return the text of each page on which the sections are printed."""
     document = Document("A", "", (), sections, "the footer")
@@ -262,7 +244,7 @@ def test_the_same_analysis_gives_the_same_bytes(folders, tmp_path):
 
 @pytest.mark.parametrize(
     ("part", "files"),
-    [("render.write.print_pages", Files()), ("plots.page.compare_runs", Files(plots=True))],
+    [("render.write.render_pdf", Files()), ("plots.page.compare_runs", Files(plots=True))],
 )
 def test_an_interrupted_report_leaves_the_earlier_one_whole(
     folders, tmp_path, monkeypatch, part, files

@@ -69,15 +69,6 @@ def to_svg(figure: Figure, *, name: str, alt: str) -> str:
     return svg.replace("<svg ", '<svg role="img" ', 1).replace(">", f">{title}", 1)
 
 
-def blank_svg(figure: Figure) -> str:
-    """Return an empty drawing of the size that `to_svg` writes, in the same number format."""
-    width, height = (f"{_POINTS * float(inches):f}" for inches in figure.get_size_inches())
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}pt" height="{height}pt" '
-        f'viewBox="0 0 {width} {height}"/>'
-    )
-
-
 def plain_svg(svg: str) -> str:
     """Return the drawing without the data, for print and for separate files."""
     return re.sub(r' data-[a-z]+="[^"]*"', "", svg)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from pipeline.report.document import Block, Cell, Picture, Section, Table, make_table
 from pipeline.report.figures.style import drawing
-from pipeline.report.figures.svg import blank_svg, to_svg
+from pipeline.report.figures.svg import to_svg
 from pipeline.words.phrases import Phrases
 from pipeline.words.progress import Progress, silent
 from pipeline.words.text import Spans, clean, rich
@@ -96,7 +96,6 @@ class PageBuilder:
             caption=rich(clean(words.text(key, **said))),
             alt=alt,
             draw=partial(_draw, figure, name=name, alt=alt),
-            blank=blank_svg(figure),
         )
 
 

@@ -1,7 +1,6 @@
 """Render a document as PDF with typst; all content goes in as JSON, so no text is markup."""
 
 import json
-from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -10,9 +9,8 @@ import typst
 from matplotlib import get_data_path
 from matplotlib.ft2font import FT2Font
 
-from pipeline.report.document import Document, Picture, as_json
+from pipeline.report.document import Document, as_json
 from pipeline.report.figures.svg import plain_svg
-from pipeline.report.render.page_filling import Choices, End, Pages, fill_pages
 from pipeline.resources import TEMPLATES
 from pipeline.words.numbers import unbroken
 from pipeline.words.text import clean
@@ -22,41 +20,19 @@ _MISSING = "□"  # replaces a character that no font has
 _SHOWN_IN_WARNING = 20
 
 
-@dataclass(frozen=True, kw_only=True)
-class Layout:
-    """The layout of a document.
-
-    Attributes
-    ----------
-    text : the document's content as JSON.
-    choices : changes to the default layout.
-    """
-
-    text: str
-    choices: Choices
-
-
 def render_pdf(document: Document) -> bytes:
     """Return the PDF (archival A-2a, accessible UA-1), which uses only the fonts of cartlab."""
-    return print_pages(document, lay_out(document))
-
-
-def lay_out(document: Document) -> Layout:
-    """Lay out the pages, before the figures need to be drawn; this takes most of the time."""
     text = json.dumps(_printable(as_json(document)), ensure_ascii=False, allow_nan=False)
-    blanks = {_file(one): (one.blank or one.svg).encode() for one in document.pictures()}
-    choices = fill_pages(lambda choices: _try(_parts(text, choices, blanks)))
-    return Layout(text=text, choices=choices)
-
-
-def print_pages(document: Document, layout: Layout) -> bytes:
-    """Return the PDF of a document whose layout is known.
-
-    This is fast, because typst keeps its results for files that have not changed.
-    """
-    drawn = {_file(one): _printable(plain_svg(one.svg)).encode() for one in document.pictures()}
+    figures = {
+        f"{one.number}.svg": _printable(plain_svg(one.svg)).encode() for one in document.pictures()
+    }
+    parts: Any = {
+        "main.typ": (TEMPLATES / "report.typ").read_bytes(),
+        "document.json": text.encode(),
+        **figures,
+    }
     pdf = typst.compile(
-        _parts(layout.text, layout.choices, drawn),
+        parts,
         font_paths=_fonts(),
         pdf_standards=["a-2a", "ua-1"],
         timestamp=_TIMESTAMP,
@@ -66,30 +42,10 @@ def print_pages(document: Document, layout: Layout) -> bytes:
     return pdf
 
 
-def _parts(text: str, choices: Choices, figures: dict[str, bytes]) -> Any:
-    """Return the source in several files, because typst keeps the results for unchanged files."""
-    return {
-        "main.typ": (TEMPLATES / "report.typ").read_bytes(),
-        "document.json": text.encode(),
-        "choices.json": json.dumps(asdict(choices)).encode(),
-        **figures,
-    }
-
-
-def _file(picture: Picture) -> str:
-    return f"{picture.number}.svg"
-
-
 @cache
 def _fonts() -> typst.Fonts:
     """Return cartlab's own fonts, so that all computers make the same pages."""
     return typst.Fonts(include_system_fonts=False, font_paths=[_font_folder()])
-
-
-def _try(parts: Any) -> Pages:
-    found = typst.query(parts, font_paths=_fonts(), selector="<pages>", field="value")
-    (pages,) = json.loads(found)
-    return Pages(**pages | {"ends": [End(**end) for end in pages["ends"]]})
 
 
 def missing_characters(text: str) -> str:
