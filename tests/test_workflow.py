@@ -17,8 +17,8 @@ from pipeline.notebook import Lab
 from pipeline.plant.chain import PRESETS
 from pipeline.report.lab_report.content import build_document
 from pipeline.report.render.html import render_html
-from pipeline.report.saved_tables import matlab_file
 from pipeline.report.solution.write import build_solution
+from pipeline.report.tables import matlab_file
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse, reference_design

@@ -167,7 +167,7 @@ def run_report(
 
     A second process loads what draws the report while this one loads what analyses the data.
     """
-    with SecondProcess("pipeline.report.lab_report.make", "make_draft") as second:
+    with SecondProcess("pipeline.report.lab_report.content", "make_draft") as second:
         from pipeline.output import named_folder, own_folder
         from pipeline.report.lab_report.write import make_report
 

@@ -83,7 +83,7 @@ def fill_tables(folder: str, *, progress: Progress) -> list[dict[str, Any]]:
 def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
     """Write the report into the submission's folder, and compare it with the previous one."""
     from pipeline.report.lab_report.changes import changes_line, compare_drafts, read_results
-    from pipeline.report.lab_report.make import make_draft
+    from pipeline.report.lab_report.content import make_draft
     from pipeline.report.lab_report.write import make_report as write_report
     from pipeline.report.sections.housekeeping import taken_text
     from pipeline.report.sections.questions import ask

@@ -7,6 +7,7 @@ import pytest
 
 from pipeline.errors import ConfigError
 from pipeline.json_files import json_text
+from pipeline.report.builder import Page
 from pipeline.report.lab_report.changes import (
     Draft,
     change_blocks,
@@ -14,7 +15,6 @@ from pipeline.report.lab_report.changes import (
     compare_drafts,
     read_results,
 )
-from pipeline.report.sections.page import Page
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis
 from tests.helpers.analysis_factory import make_analysis

@@ -16,10 +16,10 @@ from pipeline.identify.log import Log
 from pipeline.identify.model_checks import design_margins
 from pipeline.json_files import json_text
 from pipeline.plant.chain import PRESETS, Chain
+from pipeline.report.builder import Page
 from pipeline.report.document import Table
 from pipeline.report.render.html import render_fragment
 from pipeline.report.sections.loops import feedback_blocks, margin_rows
-from pipeline.report.sections.page import Page
 from pipeline.results import Analysis, FeedbackDesign, Stage
 from pipeline.setup import Setup
 from pipeline.submission import Design

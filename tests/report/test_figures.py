@@ -24,6 +24,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.gap.residual import ResidualForce
 from pipeline.plant.chain import Chain
+from pipeline.report.builder import Page
 from pipeline.report.figures.bode import bode_figure, overview_figure, plot_phase
 from pipeline.report.figures.colours import CARTS, MEASURED, QUIET
 from pipeline.report.figures.gap import force_figure, force_left_figure, timing_figure
@@ -48,7 +49,6 @@ from pipeline.report.figures.time import (
     step_figure,
 )
 from pipeline.report.sections.measurements import dwell_blocks, response_blocks, step_blocks
-from pipeline.report.sections.page import Page
 from pipeline.results import FrequencyResponse
 from pipeline.setup import PAPER_UNITS, Units
 from pipeline.words.numbers import significant

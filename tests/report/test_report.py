@@ -16,6 +16,7 @@ import pytest
 
 from pipeline.identify.recording_checks import check_files, check_left_out
 from pipeline.plant.chain import Chain
+from pipeline.report.builder import Page as Shown  # what sections are made of
 from pipeline.report.document import (
     Document,
     Paragraph,
@@ -24,15 +25,13 @@ from pipeline.report.document import (
     Table,
     cell,
 )
-from pipeline.report.lab_report.content import build_document
+from pipeline.report.lab_report.content import build_document, make_draft
 from pipeline.report.lab_report.files import Files
-from pipeline.report.lab_report.make import make_draft
 from pipeline.report.lab_report.write import write_draft
 from pipeline.report.render.html import render_html
 from pipeline.report.render.pdf import missing_characters, render_pdf
 from pipeline.report.sections.housekeeping import file_table, provenance_blocks
 from pipeline.report.sections.measurements import decay_blocks
-from pipeline.report.sections.page import Page as Shown  # what sections are made of
 from pipeline.report.sections.summary import summary, terminal_summary
 from pipeline.results import Analysis, Check, Estimate, Finding, ParameterRow, Skipped, Stage
 from pipeline.setup import Setup, Units

@@ -11,7 +11,7 @@ import scipy.io
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.report import tables
-from pipeline.report.saved_tables import matlab_file, save_tables
+from pipeline.report.tables import matlab_file, save_tables
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis
 from tests.helpers.commandline import cartlab_here

@@ -6,9 +6,9 @@ from itertools import product
 
 import pytest
 
+from pipeline.report.builder import Page
 from pipeline.report.document import Details, Table, flat, plain_lines
 from pipeline.report.sections.housekeeping import check_blocks
-from pipeline.report.sections.page import Page
 from pipeline.report.sections.parameters import parameter_blocks, parameter_table
 from pipeline.report.sections.questions import ask
 from pipeline.report.sections.summary import terminal_summary

@@ -3,8 +3,8 @@
 from dataclasses import replace
 from decimal import Decimal
 
+from pipeline.report.builder import Page
 from pipeline.report.sections.measurements import dwell_table
-from pipeline.report.sections.page import Page
 from pipeline.report.sections.parameters import parameter_table, reported_table
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.words.text import plain

@@ -17,7 +17,7 @@ from pipeline.grading.judge.run import (
 )
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.report.document import plain_lines
-from pipeline.report.sections.actions import next_steps
+from pipeline.report.sections.summary import next_steps
 from pipeline.simulated.submission import write_submission
 from pipeline.submission import Reported, Submission, load_submission
 from pipeline.submission.edit import edit_submission

@@ -16,7 +16,7 @@ import pytest
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.report.effects.gallery import render_effects
 from pipeline.report.gap.gap_report import make_gap_files
-from pipeline.report.lab_report.make import make_draft
+from pipeline.report.lab_report.content import make_draft
 from pipeline.report.lab_report.write import write_draft
 from pipeline.report.render.folder import write_files
 from pipeline.report.solution.write import render_solution

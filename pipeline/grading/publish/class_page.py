@@ -18,6 +18,7 @@ from pipeline.grading.similarity.clusters import Cluster
 from pipeline.grading.similarity.distant import Distant
 from pipeline.grading.similarity.repeated_authors import RepeatedAuthors
 from pipeline.grading.words import WORDS, on_one_line, points_text, signed_points
+from pipeline.report.builder import PageBuilder, Part
 from pipeline.report.document import (
     Block,
     Cell,
@@ -30,7 +31,6 @@ from pipeline.report.document import (
     paragraph,
 )
 from pipeline.report.figures.grading import difficulty_figure, distribution_figure
-from pipeline.report.render.builder import PageBuilder, Part
 from pipeline.report.render.html import render_html
 from pipeline.words.numbers import NOTHING, first_few, listing
 from pipeline.words.numbers import count as counted

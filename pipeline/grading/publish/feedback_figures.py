@@ -8,6 +8,7 @@ from pipeline.arrays import Array
 from pipeline.grading.grade import Criterion
 from pipeline.names import gain_name, own_omega, own_zeta, read_name
 from pipeline.plant.identities import transfer_functions
+from pipeline.report.builder import Page
 from pipeline.report.figures.grading import (
     reported_bode_figure,
     reported_decay_figure,
@@ -15,7 +16,6 @@ from pipeline.report.figures.grading import (
 )
 from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import to_svg
-from pipeline.report.sections.page import Page
 from pipeline.results import Analysis, Record
 from pipeline.submission import Reported
 from pipeline.words.text import clean, symbol_text

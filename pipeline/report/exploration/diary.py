@@ -11,6 +11,7 @@ from pipeline.experiments.exploration import Turn, deciding_trace
 from pipeline.gap.types import Gap
 from pipeline.names import read_name
 from pipeline.output import write_file
+from pipeline.report.builder import Page
 from pipeline.report.document import Block, Heading, Tile, Tiles, Tone, paragraph
 from pipeline.report.exploration import NAME
 from pipeline.report.figures.colours import QUIET, SECOND
@@ -18,7 +19,6 @@ from pipeline.report.figures.style import legend_above, panels
 from pipeline.report.gap.gap_report import before_after_picture
 from pipeline.report.gap.verdict import error_board, verdict_blocks, verdict_title
 from pipeline.report.render.html import render_html
-from pipeline.report.sections.page import Page
 from pipeline.results import Analysis
 from pipeline.words.numbers import NOTHING, count, listing, unit_text, with_error
 from pipeline.words.phrases import phrases

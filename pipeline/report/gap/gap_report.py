@@ -1,15 +1,28 @@
-"""The gap report: the verdict on one page, then the evidence step by step."""
+"""The sections on the gap: on a page of their own, and in the report of the same data."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 
+from matplotlib.figure import Figure
+
 from pipeline import __version__
 from pipeline.arrays import Array
 from pipeline.estimation.force_balance import without_releases
+from pipeline.gap.replay import Replay, replay_driven
 from pipeline.gap.residual import ResidualForce, residual_forces
-from pipeline.gap.types import FoundEffect, Gap, RecordGap, Trace
+from pipeline.gap.types import FoundEffect, Gap, GapWindow, RecordGap, Trace
 from pipeline.plant.effect import AugmentedChain, effect_name, place_name
-from pipeline.report.document import Block, Document, bullet_list, paragraph
+from pipeline.report.builder import Page, Part, left_out, remarks
+from pipeline.report.document import (
+    Block,
+    Cell,
+    Document,
+    Table,
+    Tone,
+    bullet_list,
+    cell,
+    paragraph,
+)
 from pipeline.report.equations.effects import augmented_equations, in_order, law
 from pipeline.report.figures.gap import (
     band_shows,
@@ -21,12 +34,14 @@ from pipeline.report.figures.gap import (
     spectrum_figure,
     timing_figure,
 )
-from pipeline.report.gap.tables import (
-    effect_parameter_table,
-    error_table,
-    intervention_table,
-    rival_table,
-    window_table,
+from pipeline.report.figures.style import (
+    keep_in_sight,
+    legend_above,
+    panels,
+    plot_measured,
+    plot_model,
+    plot_second,
+    position_label,
 )
 from pipeline.report.gap.verdict import (
     WORDS,
@@ -36,6 +51,7 @@ from pipeline.report.gap.verdict import (
     is_set_up_alone,
     kept_together,
     next_block,
+    phase,
     scope_blocks,
     share,
     shares,
@@ -43,14 +59,12 @@ from pipeline.report.gap.verdict import (
     verdict_title,
     whole_model,
 )
-from pipeline.report.render.builder import Part
 from pipeline.report.render.folder import Made
 from pipeline.report.render.write import make_files
 from pipeline.report.sections.housekeeping import provenance_blocks
-from pipeline.report.sections.page import Page, left_out, remarks
 from pipeline.report.sections.parameters import chain_table
-from pipeline.results import Analysis
-from pipeline.words.numbers import count, listing, percent
+from pipeline.results import Analysis, Intervention
+from pipeline.words.numbers import count, listing, percent, unit_text, with_error
 from pipeline.words.progress import Progress, silent
 from pipeline.words.text import Spans, capital, clean, plain
 
@@ -58,6 +72,7 @@ _MOST_ROWS = 28  # most runs in the overview; gap.json has all runs
 LEGEND = 46  # two names with more characters do not fit above a figure
 _MOST_NAMES = 3  # most effects named in a caption; the text above it names all
 _MORE_TRACES = 3  # traces drawn in addition to the one in the summary
+_MOST_RUNS = 4  # most runs drawn in the lab report
 
 
 def make_gap_files(
@@ -112,11 +127,16 @@ def build_gap_document(gap: Gap, analysis: Analysis, *, progress: Progress = sil
 
 
 def _summary(page: Page, gap: Gap, worst: Sequence[Trace]) -> list[Block]:
-    blocks = [*verdict_blocks(gap), error_board(gap), error_table(page, gap)]
-    blocks += [before_after_picture(page, gap, trace, number=1) for trace in worst]
+    pictures = [before_after_picture(page, gap, trace, number=1) for trace in worst]
+    return _verdict(page, gap, shown=pictures)
+
+
+def _verdict(page: Page, gap: Gap, *, shown: Sequence[Block]) -> list[Block]:
+    """Return the verdict, its errors, what shows it, and what to do next."""
+    blocks = [*verdict_blocks(gap), error_board(gap), error_table(page, gap), *shown]
     if gap.verdict == "none":
         blocks += scope_blocks(gap, position=page.position, drive=page.drive)
-    return blocks + next_block(gap)
+    return [*blocks, *next_block(gap)]
 
 
 def _where(page: Page, gap: Gap) -> list[Block]:
@@ -448,3 +468,148 @@ def _worst_first(gap: Gap) -> list[Trace]:
 def _row(gap: Gap, trace: Trace) -> RecordGap | None:
     of_trace = (trace.experiment, trace.cart, trace.held_out)
     return next((r for r in gap.by_record if (r.experiment, r.cart, r.held_out) == of_trace), None)
+
+
+# ----------------------------------------------------------------------------- in the lab report
+
+
+def gap_in_short(gap: Gap) -> list[Block]:
+    """Return the verdict as one paragraph with a link to its section."""
+    name = listing([effect_name(found.effect, found.where) for found in gap.effects])
+    names = f" ({name})" if name and gap.verdict in ("named", "partial") and not gap.causes else ""
+    sentence = WORDS.spans(
+        "in_short" if gap.effects else "in_short_linear",
+        verdict=f"{verdict_title(gap)}{names}",
+        **shares(gap),
+    )
+    return [paragraph(sentence)]
+
+
+def gap_blocks(page: Page, gap: Gap) -> list[Block]:
+    """Return the verdict, the errors, and the equations with the effects."""
+    terms, shown = gap.model.terms, []
+    if terms:
+        shown = [augmented_equations(page.analysis.bench.springs, terms)]
+        shown += [law(terms, index) for index in in_order(terms)]
+    return [*_verdict(page, gap, shown=shown), paragraph(WORDS.spans("story"))]
+
+
+def augmented_hardware_blocks(page: Page, gap: Gap) -> list[Block]:
+    """Return the model with effects next to the linear one, both driven by the measured input."""
+    if not gap.model.terms:
+        return []
+    opened = [check for check in page.analysis.hardware if check.loop == "open"]
+    runs = list(dict.fromkeys(check.experiment for check in opened))
+    replays = {
+        run: replay_driven(page.records[run], [c for c in opened if c.experiment == run], gap.model)
+        for run in runs
+        if run in page.records
+    }
+    every = [replay for found in replays.values() for replay in found]
+    if not every:
+        return []
+    rows = [
+        (clean(one.check.experiment), str(one.check.cart), share(one.check.nrmse), share(one.nrmse))
+        for one in every
+    ]
+    added = added_name(gap)
+    table = page.table(WORDS, "replay_table", rows, "lcdd", added=added, Added=capital(added))
+    blocks: list[Block] = [paragraph(WORDS.spans("replay", added=added)), table]
+    drawn = [(run, found) for run, found in replays.items() if found][:_MOST_RUNS]
+    for i, (run, found) in enumerate(drawn, start=1):
+        worst = max(found, key=lambda replay: replay.nrmse)
+        figure = _replay_figure(found, position_unit=page.position, added=added)
+        values = {"run": run, "error": share(worst.nrmse), "cart": worst.check.cart, "added": added}
+        blocks.append(
+            page.picture(f"hardware-effects-{i}", figure, WORDS, "replay_figure", **values)
+        )
+    return blocks
+
+
+def _replay_figure(replays: Sequence[Replay], *, position_unit: str, added: str) -> Figure:
+    figure, axes = panels(*[1.05] * len(replays))
+    for ax, replay in zip(axes, replays, strict=True):
+        check = replay.check
+        plot_measured(ax, check.t, check.measured)
+        plot_second(ax, check.t, check.model, label="linear model")
+        plot_model(ax, check.t, replay.model, label=added)
+        keep_in_sight(ax, check.measured)
+        ax.set_ylabel(position_label(check.cart, position_unit))
+    legend_above(axes[0])
+    axes[-1].set_xlabel("time [s]")
+    return figure
+
+
+# ---------------------------------------------------------------------------------------- tables
+
+
+def error_table(page: Page, gap: Gap) -> Table:
+    """Return the error on held-out runs after each step, next to noise and repeatability.
+
+    Effects that lower the error only together are one step.
+    """
+    models = [("linear model", gap.baseline)]
+    for group in kept_together(gap.effects):
+        names = listing([effect_name(found.effect, found.where) for found in group])
+        models.append((f"with {names}", group[-1].nrmse_after))
+    limits = [("noise alone", gap.noise_floor)]
+    if gap.repeatability is not None:
+        limits.append(("repeats of one run differ by", gap.repeatability))
+    rows = [[cell(name), cell(share(error))] for name, error in models]
+    rows += [[cell(name, "quiet"), cell(share(error), "quiet")] for name, error in limits]
+    return page.table(WORDS, "error_table", rows, "ld")
+
+
+def window_table(page: Page, windows: Sequence[GapWindow], *, model: str) -> Table:
+    """Return the stretches of time in which a model's error is largest.
+
+    Parameters
+    ----------
+    model : name of the model, such as "the linear model".
+    """
+    rows = [(*_stretch(w), phase(w.what), percent(100 * w.share)) for w in windows]
+    return page.table(WORDS, "window_table", rows, "lcddld", model=model)
+
+
+def intervention_table(page: Page, interventions: Sequence[Intervention]) -> Table:
+    """Return the stretches of time during which a cart was moved by hand."""
+    rows = [(*_stretch(one), one.what) for one in interventions]
+    return page.table(WORDS, "intervention_table", rows, "lcddl")
+
+
+def _stretch(one: GapWindow | Intervention) -> tuple[str, str, str, str]:
+    """Return run, cart, and start and end (in s) of a stretch."""
+    return clean(one.experiment), str(one.cart), f"{one.start:.2f}", f"{one.end:.2f}"
+
+
+def effect_parameter_table(page: Page, found: FoundEffect) -> Table:
+    """Return the parameters of an effect with their standard errors."""
+    symbols = {p.name: p.symbol for p in found.effect.parameters}
+    rows = [
+        (
+            symbols[name],
+            name.replace("_", " ") + (", a detail of the contact" if detail else ""),
+            with_error(value.value, value.std),
+            unit_text(clean(value.unit)) or "1",
+        )
+        for detail, group in ((False, found.parameters), (True, found.details))
+        for name, value in group.items()
+    ]
+    return page.table(WORDS, "effect_table", rows, "lldl", effect=found.effect.title)
+
+
+def rival_table(page: Page, found: FoundEffect, gap: Gap) -> Table:
+    """Return the effects that were fully fitted in place of this one, with their scores."""
+
+    def line(name: str, error: float, confidence: float, tone: Tone = "") -> list[Cell]:
+        weight = f"{100 * confidence:.1f} %" if confidence >= 5e-4 else "< 0.1 %"
+        return [cell(name, tone), cell(share(error), tone), cell(weight, tone)]
+
+    sure = gap.verdict in ("named", "partial")
+    name = effect_name(found.effect, found.where)
+    chosen = line(name, gap.final, found.confidence, "good" if sure else "")
+    others = [
+        line(effect_name(rival.effect, rival.where), rival.nrmse_after, rival.confidence)
+        for rival in found.rivals
+    ]
+    return page.table(WORDS, "rival_table", [chosen, *others], "ldd")

@@ -13,8 +13,8 @@ from pydantic import ValidationError
 
 from pipeline.errors import ConfigError
 from pipeline.json_files import file_model, plain
+from pipeline.report.builder import Page
 from pipeline.report.document import Block, Cell, bullet_list, cell, paragraph
-from pipeline.report.sections.page import Page
 from pipeline.results import Analysis
 from pipeline.setup import Setup, Units
 from pipeline.submission.toml import first_refusal

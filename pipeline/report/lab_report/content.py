@@ -1,9 +1,11 @@
-"""The content of a report in order: turn an `Analysis` into a `Document`."""
+"""The report of an analysis: its content in order, its files, and what the command prints."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pipeline import __version__
+from pipeline.report.builder import Page, Part, remarks
 from pipeline.report.document import Block, Document, Heading, Paragraph, paragraph
 from pipeline.report.equations.model import (
     equations_of_motion,
@@ -12,8 +14,12 @@ from pipeline.report.equations.model import (
     symbolic_state_space,
     symbolic_transfer_functions,
 )
-from pipeline.report.lab_report.changes import DraftChanges, change_blocks
-from pipeline.report.render.builder import Part
+from pipeline.report.lab_report.changes import DraftChanges, change_blocks, changes_line
+from pipeline.report.lab_report.files import NAME, PAGE_AND_PDF, Draft, Files
+from pipeline.report.plots import NAME as PLOTS
+from pipeline.report.render.folder import Made
+from pipeline.report.render.pdf import missing_characters
+from pipeline.report.render.write import make_files
 from pipeline.report.sections.housekeeping import (
     assumption_blocks,
     check_blocks,
@@ -28,15 +34,21 @@ from pipeline.report.sections.measurements import (
     step_blocks,
 )
 from pipeline.report.sections.notes import discussion_blocks
-from pipeline.report.sections.page import Page, remarks
 from pipeline.report.sections.parameters import chain_table, parameter_blocks
-from pipeline.report.sections.questions import Asked, ask, open_questions, placed, split_notes
-from pipeline.report.sections.summary import summary
+from pipeline.report.sections.questions import (
+    Asked,
+    ask,
+    open_line,
+    open_questions,
+    placed,
+    split_notes,
+)
+from pipeline.report.sections.summary import summary, terminal_summary
 from pipeline.results import Analysis
 from pipeline.words.numbers import count
 from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress, silent
-from pipeline.words.text import spans
+from pipeline.words.text import spans, with_symbols
 
 if TYPE_CHECKING:
     from pipeline.gap.types import Gap
@@ -141,14 +153,71 @@ def _about_gap(gap: "Gap | None") -> tuple[Blocks, Blocks, Blocks]:
     if gap is None:
         return _nothing, _nothing, _nothing
     # Imported late, because it loads the catalogue of effects.
-    from pipeline.report.gap import section
+    from pipeline.report.gap import gap_report
 
     return (
-        lambda _: section.gap_in_short(gap),
-        lambda page: section.augmented_hardware_blocks(page, gap),
-        lambda page: section.gap_blocks(page, gap),
+        lambda _: gap_report.gap_in_short(gap),
+        lambda page: gap_report.augmented_hardware_blocks(page, gap),
+        lambda page: gap_report.gap_blocks(page, gap),
     )
 
 
 def _nothing(_: Page) -> list[Block]:
     return []
+
+
+# ----------------------------------------------------------------------------------------- files
+
+
+def make_draft(
+    analysis: Analysis,
+    *,
+    gap: "Gap | None" = None,
+    changes: DraftChanges | None = None,
+    files: Files = PAGE_AND_PDF,
+    progress: Progress = silent,
+) -> Draft:
+    """Return the report of an analysis."""
+    lines = (changes and with_symbols(changes_line(changes)), open_line(analysis))
+    return Draft(
+        files=_make_files(analysis, gap=gap, changes=changes, files=files, progress=progress),
+        summary=terminal_summary(analysis),
+        remarks=tuple(filter(None, lines)),
+    )
+
+
+def _make_files(
+    analysis: Analysis,
+    *,
+    gap: "Gap | None",
+    changes: DraftChanges | None,
+    files: Files,
+    progress: Progress,
+) -> Made:
+    """Return `report.html`, `figures/*.svg` and the other requested pages.
+
+    The same analysis gives the same bytes. If the PDF's fonts lack some characters, the report and
+    `progress` name them. `progress` also receives the name of each section.
+    """
+    if files.pdf and (lost := missing_characters(_students_text(analysis))):
+        warning = f"report.pdf: its fonts lack {lost}; report.html shows them"
+        analysis = replace(analysis, warnings=(*analysis.warnings, warning))
+        progress(warning)
+    document = build_document(analysis, gap=gap, changes=changes, progress=progress)
+    if not files.plots:
+        return make_files(document, name=NAME, pdf=files.pdf)
+    # Imported late, because it loads the catalogue of effects.
+    from pipeline.report.plots.page import make_page
+
+    plots = make_page(analysis, gap=gap, report=True, progress=progress)
+    document = replace(document, plots=PLOTS)
+    return {**make_files(document, name=NAME, pdf=files.pdf), PLOTS: plots}
+
+
+def _students_text(analysis: Analysis) -> str:
+    """Return all text in the report that was written by students."""
+    authors = (part for author in analysis.authors for part in author)
+    records = (record.id for record in analysis.records)
+    units = vars(analysis.bench.units).values()
+    notes = analysis.discussion or ""
+    return "".join((analysis.title, analysis.section, *authors, *records, *units, notes))

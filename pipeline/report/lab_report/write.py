@@ -45,7 +45,7 @@ def make_report(
     clear_files(out, "results.mat")  # left by an earlier report
     clear_files(tables, "*.csv")
     if files.tables:
-        from pipeline.report.saved_tables import (
+        from pipeline.report.tables import (
             save_tables,
         )  # imported late, because it loads pandas
 

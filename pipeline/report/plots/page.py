@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from pipeline import __version__
 from pipeline.gap.types import Gap
 from pipeline.output import write_file
+from pipeline.report.builder import Page
 from pipeline.report.document import Picture
 from pipeline.report.figures.style import (
     drawing,
@@ -32,7 +33,6 @@ from pipeline.report.plots import NAME
 from pipeline.report.plots.pack import MOST_WHOLE, pack_run
 from pipeline.report.plots.runs import ComparedRun, compare_runs
 from pipeline.report.render.html import render_plots
-from pipeline.report.sections.page import Page
 from pipeline.results import Analysis
 from pipeline.words.numbers import count, subscript
 from pipeline.words.phrases import phrases

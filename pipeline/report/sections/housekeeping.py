@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+from pipeline.report.builder import Page
 from pipeline.report.document import Block, Details, Table, Tone, bullet_list, cell, paragraph
-from pipeline.report.sections.page import Page
 from pipeline.results import Assumption, Check
 from pipeline.words.numbers import count, listing
 from pipeline.words.phrases import phrases

@@ -6,8 +6,8 @@ from decimal import Decimal
 from pipeline.estimation.estimates import SIGMA_LIMIT, change_limit
 from pipeline.names import read_name
 from pipeline.plant.chain import Chain
+from pipeline.report.builder import Page
 from pipeline.report.document import Block, Cell, Heading, Table, bullet_list, cell, paragraph
-from pipeline.report.sections.page import Page
 from pipeline.results import Analysis, Estimate, ParameterRow
 from pipeline.words.numbers import (
     NOTHING,

@@ -25,10 +25,10 @@ from pipeline.json_files import (
 from pipeline.names import read_name
 from pipeline.plant.chain import Chain
 from pipeline.plant.margins import Margins
+from pipeline.report.builder import Page
 from pipeline.report.document import Block, Cell, bullet_list, cell, paragraph
 from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, work_out
-from pipeline.report.sections.page import Page
 from pipeline.results import Analysis, FeedbackDesign, Provenance
 from pipeline.setup import Units
 from pipeline.submission import InputScale, System
