@@ -24,11 +24,12 @@ from pipeline.report.document import (
     Section,
     Table,
     cell,
+    make_table,
 )
 from pipeline.report.lab_report.content import build_document, make_draft
 from pipeline.report.lab_report.files import Files
 from pipeline.report.lab_report.write import write_draft
-from pipeline.report.render.html import render_html
+from pipeline.report.render.html import render_blocks, render_html
 from pipeline.report.render.pdf import missing_characters, render_pdf
 from pipeline.report.sections.housekeeping import file_table, provenance_blocks
 from pipeline.report.sections.measurements import decay_blocks
@@ -170,6 +171,26 @@ def test_the_list_of_files_is_never_alone_on_a_page():
 
     for page in pages:
         assert page.count("Made by") == page.count("run-000")
+
+
+@pytest.mark.parametrize(
+    ("head", "row", "wide"),
+    [
+        (["Entry", "Expected"], ["A(2, 1)", "−174.5"], False),
+        (["Change of the level"] * 3, ["12.34"] * 3, False),  # headings break between words
+        (["Unit"] * 8, ["rad/s"] * 8, True),
+        (["Check", "Found"], ["fit", "The residual is larger than the stated noise."], True),
+        (["Name"], ["x" * 60], True),
+    ],
+)
+def test_a_phone_shows_rows_of_wide_tables_as_lines(head, row, wide):
+    """A phone shows a row as lines, each with its heading, if the columns do not fit."""
+    table = make_table(1, "A table.", head, [row], "l" * len(head))
+
+    html = str(render_blocks([table]))
+
+    assert (' told"' in html) == wide
+    assert html.count("data-head") == (len(head) if wide else 0)
 
 
 def test_the_page_loads_nothing(folders):
