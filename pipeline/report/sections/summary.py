@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
 
 from pipeline.names import Name, read_name
 from pipeline.plant.limits import CALIBRATION
@@ -76,6 +77,15 @@ _TOLD_ELSEWHERE = (*_AT_THE_TOP, "fit_identified")
 _ALIKE = ("initial_final", "step", "decay")
 
 
+@dataclass(frozen=True)
+class _Finding:
+    """A sentence on what was found, whether it is good news, and its tile if it has one."""
+
+    good: bool
+    text: Spans
+    tile: Tile | None = None
+
+
 def summary(page: Page) -> list[Block]:
     """Return what was identified, what agrees, what does not, what is missing, and what to do next.
 
@@ -84,11 +94,10 @@ def summary(page: Page) -> list[Block]:
     """
     analysis = page.analysis
     blocks: list[Block] = [_identified(analysis)]
-    blocks += [
-        Tiles(tiles) for tiles in (_numbers_board(analysis), _verdict_board(analysis)) if tiles
-    ]
-    problems = [text for good, text in _findings(analysis) if not good]
-    if problems:
+    findings = _findings(analysis)
+    verdicts = [*_fit_tile(analysis), *(one.tile for one in findings if one.tile)]
+    blocks += [Tiles(tiles) for tiles in (_numbers_board(analysis), tuple(verdicts)) if tiles]
+    if problems := [one.text for one in findings if not one.good]:
         blocks.append(bullet_list(problems))
     blocks += overview_blocks(page)
     return [*blocks, paragraph(Span(_WORDS.text("next"), "strong")), next_steps(analysis)]
@@ -102,15 +111,15 @@ def terminal_summary(analysis: Analysis) -> str:
     ]
     only = f" {_WORDS.text('statistical_only')}" if any("±" in text for text in numbers) else ""
     it_has = [paragraph(f"It has {'; '.join(numbers)}.{only}")] if numbers else []
-    findings = bullet_list(text for _, text in _findings(analysis))
+    findings = bullet_list(one.text for one in _findings(analysis))
     next_ = [paragraph(f"{_WORDS.text('next')}."), next_steps(analysis)]
     return plain_lines([_identified(analysis), *it_has, findings, *next_])
 
 
-def _findings(analysis: Analysis) -> list[tuple[bool, Spans]]:
-    """Return the findings; each is a sentence, with whether it is good news."""
+def _findings(analysis: Analysis) -> list[_Finding]:
+    """Return what was found, in the order of the report; all that makes numbers wrong first."""
     found = (
-        set_up_in_doubt,
+        _set_up_in_doubt,
         _assumed,
         _agreement,
         _undecided,
@@ -227,43 +236,23 @@ def _is_told(name: Name) -> bool:
     return name.is_gain or (name.is_frequency and name.is_mode)
 
 
-def _verdict_board(analysis: Analysis) -> tuple[Tile, ...]:
-    """Return what agrees and what does not, each with a link to its section."""
-    tiles = []
-    if fit := analysis.fit:
-        good = fit.converged and fit.explains_data
-        url = "#frequency-response" if analysis.frequency_responses else "#parameters"
-        value = significant(fit.chi_square_per_dof, digits=3)
-        note = _WORDS.text("tile_explained" if good else "tile_unexplained")
-        tiles.append(_tile("tile_chi_square", value, note, good=good, url=url))
-    if judged := [row.consistent for row in analysis.rows if row.consistent is not None]:
-        key = "tile_agree" if all(judged) else "tile_disagree"
-        tiles.append(_tally("tile_two_ways", judged, key, url="#parameters"))
-    if done := [c.outcome == "pass" for c in analysis.checks if c.outcome != "skip"]:
-        tiles.append(_tally("tile_checks", done, "tile_passed", url="#checks"))
-    if design := analysis.feedback:
-        settling, good = design.settling_time, design.reachable
-        value = f"{significant(settling, digits=3)} s" if settling else NOTHING
-        overshoot, verdict = percent(design.overshoot_percent), "met" if good else "not met"
-        note = _WORDS.text("tile_settles", overshoot=overshoot, verdict=verdict)
-        label = _WORDS.text("tile_feedback", cart=design.cart)
-        # The goal is met on the model, which promises little if it does not explain the data.
-        tone = _tone(good) if _is_explained(analysis) or not good else ""
-        tiles.append(Tile(spans(label), spans(value), spans(note), tone, "#feedback"))
-    if analysis.hardware:
-        best, worst = _extremes(analysis)
-        good, note = worst.nrmse <= CLOSE, _WORDS.text("tile_apart")
-        value = _range(best, worst, to="–")
-        tiles.append(_tile("tile_hardware", value, note, good=good, url="#hardware"))
-    return tuple(tiles)
+def _fit_tile(analysis: Analysis) -> list[Tile]:
+    """Return whether the model explains the data, with a link to the figures that show it."""
+    fit = analysis.fit
+    if fit is None:
+        return []
+    good = fit.converged and fit.explains_data
+    url = "#frequency-response" if analysis.frequency_responses else "#parameters"
+    value = significant(fit.chi_square_per_dof, digits=3)
+    note = _WORDS.text("tile_explained" if good else "tile_unexplained")
+    return [_tile("tile_chi_square", value, note, good=good, url=url)]
 
 
 def _tile(key: str, value: str, note: str, *, good: bool, url: str) -> Tile:
     return Tile(spans(_WORDS.text(key)), spans(value), spans(note), _tone(good), url)
 
 
-def _tally(key: str, judged: Sequence[bool | None], note: str, *, url: str) -> Tile:
-    good, of = sum(map(bool, judged)), len(judged)
+def _tally(key: str, note: str, *, good: int, of: int, url: str) -> Tile:
     return _tile(key, f"{good} of {of}", _WORDS.text(note), good=good == of, url=url)
 
 
@@ -271,28 +260,31 @@ def _tone(good: bool) -> Tone:
     return "good" if good else "bad"
 
 
-def _assumed(analysis: Analysis) -> tuple[bool, Spans] | None:
+def _assumed(analysis: Analysis) -> _Finding | None:
     """Return, as a finding, the default assumptions that the data neither support nor refute."""
     taken = [a for a in analysis.assumptions if a.origin == "default" and a.support == "open"]
     if not taken:
         return None
     items = [clean(f"{f'{one.key} {one.about}'.strip()} ({taken_text(one)})") for one in taken]
-    return False, _WORDS.spans("assumed", taken=listing(items))
+    return _Finding(False, _WORDS.spans("assumed", taken=listing(items)))
 
 
-def _agreement(analysis: Analysis) -> tuple[bool, Spans] | None:
+def _agreement(analysis: Analysis) -> _Finding | None:
     judged = [row for row in analysis.rows if row.consistent is not None]
     if not judged:
         return None
     off, same = [row for row in judged if not row.consistent], _same_recordings(judged)
     rest = len(judged) - len(off)
+    note = "tile_disagree" if off else "tile_agree"
+    tile = _tally("tile_two_ways", note, good=rest, of=len(judged), url="#parameters")
     key, n = ("rest", rest) if off and rest else ("no_rest" if off else "agree", len(judged))
     key, parameters = key if n > 1 else f"{key}_one", count(n, "parameter")
     if not off:
-        return True, _WORDS.spans(key, parameters=parameters, same=same)
+        return _Finding(True, _WORDS.spans(key, parameters=parameters, same=same), tile)
     changes = [f"{row.name} ({percent(row.change_percent, signed=True)})" for row in off]
     text = _WORDS.text(key, parameters=parameters)
-    return False, _WORDS.spans("disagree", changes=rich(listing(changes)), rest=text, same=same)
+    told = _WORDS.spans("disagree", changes=rich(listing(changes)), rest=text, same=same)
+    return _Finding(False, told, tile)
 
 
 def _same_recordings(judged: Sequence[ParameterRow]) -> Spans:
@@ -305,7 +297,7 @@ def _same_recordings(judged: Sequence[ParameterRow]) -> Spans:
     return _WORDS.spans("some_same", names=names_spans(same))
 
 
-def _undecided(analysis: Analysis) -> tuple[bool, Spans] | None:
+def _undecided(analysis: Analysis) -> _Finding | None:
     """Return, as a finding, the parameters that were measured twice with different results.
 
     Without this finding, the number on the board would look certain.
@@ -322,21 +314,24 @@ def _undecided(analysis: Analysis) -> tuple[bool, Spans] | None:
     ]
     if not names:
         return None
-    return False, _WORDS.spans("undecided", parameters=rich(listing(names)))
+    return _Finding(False, _WORDS.spans("undecided", parameters=rich(listing(names))))
 
 
-def _checks(analysis: Analysis) -> tuple[bool, Spans] | None:
+def _checks(analysis: Analysis) -> _Finding | None:
     done = [c for c in analysis.checks if c.outcome != "skip"]
     failed = analysis.failed_checks
     if not done:
         return None
+    passed = sum(check.outcome == "pass" for check in done)
     checks = count(len(done), "check")
+    tile = _tally("tile_checks", "tile_passed", good=passed, of=len(done), url="#checks")
     if not failed:
-        return True, _WORDS.spans("consistent", checks=checks)
-    return False, _WORDS.spans("inconsistent", failed=str(len(failed)), checks=checks)
+        return _Finding(True, _WORDS.spans("consistent", checks=checks), tile)
+    told = _WORDS.spans("inconsistent", failed=str(len(failed)), checks=checks)
+    return _Finding(False, told, tile)
 
 
-def _friction(analysis: Analysis) -> tuple[bool, Spans] | None:
+def _friction(analysis: Analysis) -> _Finding | None:
     """Return, as a finding, the decays and the steps whose ringing shows dry friction."""
     shown = [d for d in analysis.log_decrements if d.law.is_friction]
     if not shown:
@@ -348,43 +343,46 @@ def _friction(analysis: Analysis) -> tuple[bool, Spans] | None:
             carts = _carts(sorted({d.cart for d in of_kind}))
             runs = listing(list(dict.fromkeys(d.experiment for d in of_kind)), most=_MOST_TOLD)
             places.append(_WORDS.text(key, carts=carts, runs=clean(runs)))
-    return False, _WORDS.spans("friction", where=listing(places))
+    return _Finding(False, _WORDS.spans("friction", where=listing(places)))
 
 
-def _design(analysis: Analysis) -> tuple[bool, Spans] | None:
+def _design(analysis: Analysis) -> _Finding | None:
     design = analysis.feedback
     if design is None:
         return None
-    settling = design.settling_time
-    settles = (
-        _WORDS.text("never_settles")
-        if settling is None
-        else _WORDS.text("settles", seconds=significant(settling, digits=3))
-    )
-    return design.reachable, _WORDS.spans(
+    settling, good = design.settling_time, design.reachable
+    seconds, overshoot = significant(settling, digits=3), percent(design.overshoot_percent)
+    told = _WORDS.spans(
         "feedback",
         cart=str(design.cart),
-        verdict=_WORDS.text("met" if design.reachable else "not_met"),
-        settles=settles,
-        overshoot=percent(design.overshoot_percent),
+        verdict=_WORDS.text("met" if good else "not_met"),
+        settles=_WORDS.text("never_settles" if settling is None else "settles", seconds=seconds),
+        overshoot=overshoot,
     )
+    verdict = "met" if good else "not met"
+    note = _WORDS.text("tile_settles", overshoot=overshoot, verdict=verdict)
+    label = _WORDS.text("tile_feedback", cart=design.cart)
+    # The goal is met on the model, which promises little if it does not explain the data.
+    tone = _tone(good) if _is_explained(analysis) or not good else ""
+    value = f"{seconds} s" if settling else NOTHING
+    tile = Tile(spans(label), spans(value), spans(note), tone, "#feedback")
+    return _Finding(good, told, tile)
 
 
-def _hardware(analysis: Analysis) -> tuple[bool, Spans] | None:
+def _hardware(analysis: Analysis) -> _Finding | None:
     if not analysis.hardware:
         return None
-    best, worst = _extremes(analysis)
-    return worst.nrmse <= CLOSE, _WORDS.spans(
+    ordered = sorted(analysis.hardware, key=lambda check: check.nrmse)
+    best, worst = ordered[0], ordered[-1]
+    good, note = worst.nrmse <= CLOSE, _WORDS.text("tile_apart")
+    value = _range(best, worst, to="–")
+    told = _WORDS.spans(
         "hardware",
         range=_range(best, worst, to=" to "),
         cart=str(worst.cart),
         run=clean(worst.experiment),
     )
-
-
-def _extremes(analysis: Analysis) -> tuple[HardwareCheck, HardwareCheck]:
-    ordered = sorted(analysis.hardware, key=lambda check: check.nrmse)
-    return ordered[0], ordered[-1]
+    return _Finding(good, told, _tile("tile_hardware", value, note, good=good, url="#hardware"))
 
 
 def _range(best: HardwareCheck, worst: HardwareCheck, *, to: str) -> str:
@@ -392,14 +390,14 @@ def _range(best: HardwareCheck, worst: HardwareCheck, *, to: str) -> str:
     return low if low == high else f"{low.removesuffix(' %')}{to}{high}"
 
 
-def _skipped(analysis: Analysis) -> tuple[bool, Spans] | None:
+def _skipped(analysis: Analysis) -> _Finding | None:
     if not analysis.skipped:
         return None
     names = list(dict.fromkeys(clean(skip.name) for skip in analysis.skipped))
     more = len(names) - _MOST_TOLD
     # Semicolons, because names contain commas: "log decrement, decay-1, cart 1".
     stages = "; ".join(names[:_MOST_TOLD] + ([f"{more} more"] if more > 0 else []))
-    return False, _WORDS.spans("skipped", stages=stages)
+    return _Finding(False, _WORDS.spans("skipped", stages=stages))
 
 
 def _carts(carts: list[int]) -> str:
@@ -520,7 +518,7 @@ def _nothing_left(analysis: Analysis) -> Spans:
     return _WORDS.spans("next_warnings" if analysis.warnings else "next_nothing")
 
 
-def set_up_in_doubt(analysis: Analysis) -> tuple[bool, Spans] | None:
+def _set_up_in_doubt(analysis: Analysis) -> _Finding | None:
     """Return the problems that make every number wrong, as one finding, None without problems.
 
     The summary shows this finding first.
@@ -531,4 +529,5 @@ def set_up_in_doubt(analysis: Analysis) -> tuple[bool, Spans] | None:
     sentences = (
         _WORDS.spans(f"top_{_group(c)}", message=_sentence(clean(c.message))) for c in wrong
     )
-    return False, tuple(span for one in sentences for span in (*one, Span(" ")))[:-1]
+    told = tuple(span for one in sentences for span in (*one, Span(" ")))[:-1]
+    return _Finding(False, told)
