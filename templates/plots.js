@@ -1,7 +1,7 @@
 // Lays runs over each other: measured, simulated, residuals, spectra. The form says what is shown, and the address keeps it.
 (() => {
   'use strict';
-  const HEIGHT = { one: 340, several: 220, input: 150 };
+  const { chart, keys, make, widened, written } = charts;
   const COLOURS = ['model', 'second', 'third', 'ink', 'fifth', 'sixth']; // of several runs
   const LOOKS = { // of one run; the kind of line tells models apart in any case
     measured: { colour: 'ink', dash: [2, 2] }, linear: { colour: 'second', dash: [7, 4] },
@@ -12,12 +12,6 @@
   const $ = (id) => document.getElementById(id);
   const data = JSON.parse($('data').textContent);
   const form = $('choose'), panels = $('panels'), told = $('told');
-  const make = (name, attributes, ...children) => {
-    const node = document.createElement(name);
-    for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
-    node.append(...children);
-    return node;
-  };
 
   // ---------------------------------------------------------------- numbers
 
@@ -38,7 +32,6 @@
     return Array.from({ length: n }, (_, i) => first + ((last - first) * i) / (n - 1));
   };
   const powers = (packed) => unpack(packed).map((v) => (v === null ? null : 10 ** v));
-  const written = (v) => String(Number(v.toPrecision(4))).replace(/-/g, '−');
   const share = (v) => `${Number((100 * v).toPrecision(v >= 0.0995 ? 3 : 2))} %`;
   const less = (a, b) => a.map((v, i) => (v === null || b[i] === null ? null : v - b[i]));
   const within = (v, low, high) => Math.min(Math.max(v, low), high);
@@ -100,8 +93,8 @@
 
   // ---------------------------------------------------------------- plots
 
-  let drawn = []; // [plot, stage]
-  const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+  let drawn = [];
+  const stageOf = (plot) => plot.root.parentElement;
 
   function curves(runs, cart, show) {
     const lines = chosen('line'), several = runs.length > 1;
@@ -111,17 +104,15 @@
         const look = LOOKS[one.line];
         return {
           x: show === 'overlay' || show === 'residual' ? run.t : run.omega, y: one[show],
-          name: `${several ? `${run.id}: ` : ''}${data.names[one.line]}`, nrmse: one.nrmse,
-          colour: css(`f-${several ? COLOURS[k % COLOURS.length] : look.colour}`), dash: look.dash,
+          name: `${several ? `${run.id}: ` : ''}${data.names[one.line]}`, told: one.nrmse === undefined ? undefined : share(one.nrmse),
+          colour: `--f-${several ? COLOURS[k % COLOURS.length] : look.colour}`, dash: look.dash,
           points: one.line === 'measured' && show === 'overlay', measured: one.line === 'measured',
         };
       }));
   }
 
-  function panel(name, list, { unit, show, height, last }) {
+  function panel(name, list, { unit, show, last }) {
     const spectral = show === 'spectrum' || show === 'leftover';
-    const across = spectral ? 'frequency [rad/s]' : 'time [s]';
-    const joined = uPlot.join(list.map((one) => [one.x, one.y]));
     const measured = list.filter((one) => one.measured).flatMap((one) => one.y.filter((v) => v !== null));
     const low = measured.reduce((a, b) => Math.min(a, b), Infinity);
     const high = measured.reduce((a, b) => Math.max(a, b), -Infinity);
@@ -129,20 +120,13 @@
       if (min === null || max === null) return [0, 1];
       if (spectral) return uPlot.rangeLog(Math.max(min, max * 1e-5), max, 10, true);
       const span = high - low || 1;
-      if (measured.length) [min, max] = [Math.max(min, low - span), Math.min(max, high + span)];
-      const room = 0.06 * (max - min) || 1;
-      return [min - room, max + room];
+      return measured.length ? widened(Math.max(min, low - span), Math.min(max, high + span)) : widened(min, max);
     };
-    const axis = (label) => ({
-      label, labelSize: 20, labelFont: '13px system-ui', font: '12px system-ui', stroke: css('f-ink'),
-      grid: { stroke: css('f-grid'), width: 1 }, ticks: { stroke: css('f-grid'), width: 1 },
-      values: (u, splits) => splits.map((v) => (v === null ? '' : written(v))),
-    });
     const stage = make('div', {
-      class: 'stage', tabindex: 0, role: 'group',
+      class: name === 'u' ? 'stage input' : 'stage', tabindex: 0, role: 'group',
       'aria-label': `${name}, ${TITLES[show]}: arrow keys read values, plus and minus zoom, 0 shows all`,
     });
-    const values = make('output', {});
+    const values = make('output');
     const button = (text, title, action) => {
       const node = make('button', { type: 'button', title, 'aria-label': `${title}: ${name}` }, text);
       node.addEventListener('click', action);
@@ -151,24 +135,18 @@
     const tools = make('div', { class: 'tools' },
       button('+', 'Zoom in', () => scale(0.5)), button('−', 'Zoom out', () => scale(2)), button('All', 'Show all', () => all()),
       make('span', { class: 'hint' }, 'Point for values, drag to zoom.'), values);
-    panels.append(make('div', { class: 'panel' }, stage, key(list), tools));
-    const plot = new uPlot({
-      width: stage.clientWidth, height,
-      scales: { x: { time: false, distr: spectral ? 3 : 1, range: (u, min, max) => (min === null ? [1, 10] : [min, max]) }, y: { distr: spectral ? 3 : 1, range: insight } },
-      axes: [{ ...axis(last ? across : undefined), size: 30 }, { ...axis(`${name} [${unit}]`), size: 62 }],
-      legend: { show: false },
+    panels.append(make('div', { class: 'panel' }, stage, make('ul', { class: 'key' }, ...keys(list)), tools));
+    const distr = spectral ? 3 : 1;
+    const plot = chart(stage, uPlot.join(list.map((one) => [one.x, one.y])), list, {
+      across: last ? (spectral ? 'frequency [rad/s]' : 'time [s]') : undefined, up: `${name} [${unit}]`,
+      x: { distr, range: (u, min, max) => (min === null ? [1, 10] : [min, max]) }, y: { distr, range: insight },
       cursor: { sync: { key: 'runs' }, y: false, drag: { x: true, y: false } },
-      series: [{}, ...list.map((one) => ({
-        stroke: one.colour, dash: one.points ? [] : one.dash, width: one.points ? 0 : 1.8, spanGaps: false,
-        points: one.points ? { show: true, size: 2.6, width: 0, fill: one.colour, stroke: one.colour } : { show: false },
-        ...(one.points ? { paths: () => null } : {}),
-      }))],
       hooks: {
         setCursor: [(u) => values.replaceChildren(...read(u, list, spectral))],
         setScale: [(u, which) => { if (which === 'x') link(u); }],
       },
-    }, joined, stage);
-    drawn.push([plot, stage]);
+    });
+    drawn.push(plot);
 
     const move = (step) => {
       const xs = plot.data[0], { min, max } = plot.scales.x;
@@ -220,29 +198,14 @@
     if (linking) return;
     linking = true;
     const { min, max } = from.scales.x;
-    for (const [plot] of drawn) if (plot !== from) plot.setScale('x', { min, max });
+    for (const plot of drawn) if (plot !== from) plot.setScale('x', { min, max });
     linking = false;
   }
 
-  function key(list) {
-    const SVG = 'http://www.w3.org/2000/svg';
-    return make('ul', { class: 'key' }, ...list.map((one) => {
-      const svg = document.createElementNS(SVG, 'svg');
-      svg.setAttribute('viewBox', '0 0 30 10');
-      svg.setAttribute('aria-hidden', 'true');
-      const mark = document.createElementNS(SVG, one.points ? 'circle' : 'line');
-      const look = one.points ? { cx: 15, cy: 5, r: 2.5, fill: one.colour }
-        : { x1: 0, x2: 30, y1: 5, y2: 5, stroke: one.colour, 'stroke-width': 2, 'stroke-dasharray': one.dash.join(' ') };
-      for (const [name, value] of Object.entries(look)) mark.setAttribute(name, value);
-      svg.append(mark);
-      return make('li', {}, svg, one.name, ...(one.nrmse === undefined ? [] : [' ', make('b', {}, share(one.nrmse))]));
-    }));
-  }
-
   function draw() {
-    const held = drawn.findIndex(([, stage]) => stage === document.activeElement);
+    const held = drawn.findIndex((plot) => stageOf(plot) === document.activeElement);
     linking = true;
-    for (const [plot] of drawn) plot.destroy();
+    for (const plot of drawn) plot.destroy();
     drawn = [];
     panels.replaceChildren();
     const runs = chosen('run').map(open), [show] = chosen('show');
@@ -251,20 +214,18 @@
       .filter(([, list]) => list.length);
     const pushed = runs.filter((run) => run.u).map((run, k) => ({
       x: run.t, y: run.u, name: runs.length > 1 ? `${run.id}: u` : 'u', dash: [],
-      colour: css(`f-${runs.length > 1 ? COLOURS[k % COLOURS.length] : 'ink'}`),
+      colour: `--f-${runs.length > 1 ? COLOURS[k % COLOURS.length] : 'ink'}`,
     }));
     if (chosen('input').length && timed && pushed.length) wanted.push(['u', pushed, data.units.input]);
     told.textContent = wanted.length
       ? `${runs.map((run) => run.id).join(', ')}: ${TITLES[show]}`
       : 'Nothing to show: choose a run, a cart and a line.';
-    wanted.forEach(([name, list, unit], i) => {
-      const height = name === 'u' ? HEIGHT.input : wanted.length > 1 ? HEIGHT.several : HEIGHT.one;
-      panel(name, list, { unit, show, height, last: i === wanted.length - 1 });
-    });
+    panels.classList.toggle('several', wanted.length > 1);
+    wanted.forEach(([name, list, unit], i) => panel(name, list, { unit, show, last: i === wanted.length - 1 }));
     $('notes').replaceChildren(...runs.filter((run) => run.note)
       .map((run) => make('p', { class: 'small' }, make('b', {}, run.id), `: ${run.note}.`)));
     linking = false;
-    drawn[held]?.[1].focus({ preventScroll: true });
+    if (drawn[held]) stageOf(drawn[held]).focus({ preventScroll: true });
   }
 
   // ---------------------------------------------------------------- at work
@@ -284,11 +245,6 @@
     readAddress();
     draw();
     $('plot').scrollIntoView();
-    drawn[0]?.[1].focus({ preventScroll: true });
+    panels.querySelector('.stage')?.focus({ preventScroll: true });
   });
-  matchMedia('(prefers-color-scheme: dark)').addEventListener('change', draw);
-  new ResizeObserver(() => {
-    for (const [plot, stage] of drawn)
-      if (stage.clientWidth && plot.width !== stage.clientWidth) plot.setSize({ width: stage.clientWidth, height: plot.height });
-  }).observe(panels);
 })();

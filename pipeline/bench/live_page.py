@@ -28,12 +28,10 @@ from pipeline.resources import TEMPLATES
 from pipeline.web import OriginCheck, Served, find_site, list_own_names, refuse
 
 _LARGEST_ANSWER = 200  # bytes; the largest request of a button
-_FILES = {
-    "": ("live.html", "text/html"),
-    "live.js": ("live.js", "text/javascript"),
-    "report.css": ("report.css", "text/css"),
-    "live.css": ("live.css", "text/css"),
-}
+# The style sheets and scripts of the view.
+LIVE_FILES = ("report.css", "uplot.css", "live.css", "uplot.min.js", "charts.js", "live.js")
+_FILES = {"": "live.html", **{name: name for name in LIVE_FILES}}
+_KINDS = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 
 
 def stream_events(
@@ -138,9 +136,9 @@ class LivePage(LiveState):
         name = request.path_params.get("name", "")
         if name not in _FILES:
             return PlainTextResponse("not found", status_code=404)
-        file, kind = _FILES[name]
-        text = (TEMPLATES / file).read_text(encoding="utf-8")
-        return Response(text.replace("<!-- the view -->", live_view()), media_type=kind)
+        file = TEMPLATES / _FILES[name]
+        text = file.read_text(encoding="utf-8").replace("<!-- the view -->", live_view())
+        return Response(text, media_type=_KINDS[file.suffix[1:]])
 
     async def _press(self, request: Request) -> Response:
         """Handle a pressed button; its number says for which instruction or turn it was pressed."""

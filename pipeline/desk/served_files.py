@@ -5,6 +5,7 @@ from pathlib import Path, PurePosixPath
 from starlette.exceptions import HTTPException
 from starlette.responses import FileResponse, Response
 
+from pipeline.bench.live_page import LIVE_FILES
 from pipeline.desk.page_request import PageRequest
 from pipeline.report.render.html import every_hash
 from pipeline.resources import TEMPLATES
@@ -31,11 +32,9 @@ _KINDS = {
 }
 _OWN_KINDS = {".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 _STATIC = {
-    "report.css": "report.css",
     "desk.css": "desk/desk.css",
     "desk.js": "desk/desk.js",
-    "live.css": "live.css",
-    "live.js": "live.js",
+    **{name: name for name in LIVE_FILES},
     "grades.js": "desk/grades.js",
     "htmx.js": "desk/htmx.min.js",
     "icon.svg": "desk/icon.svg",

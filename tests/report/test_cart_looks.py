@@ -26,6 +26,6 @@ def test_other_pages_use_the_colours_of_the_style_sheet():
     """Other pages use the style sheet's colours for carts and define none."""
     desk = re.findall(r"\.thumb [^{]*\{[^}]*stroke: var\((--[\w-]+)\)", sheet("desk/desk.css"))
     assert desk == [f"--cart-{n}" for n in range(1, len(CARTS) + 1)]
-    live = sheet("live.js")
-    assert "colour: `--cart-${i + 1}`, dash: `--cart-${i + 1}-dash`" in live
-    assert re.findall(r"#[0-9a-f]{3,6}\b", live) == []
+    assert "colour: `--cart-${i + 1}`, dash: `--cart-${i + 1}-dash`" in sheet("live.js")
+    for name in ("live.js", "charts.js", "plots.js"):
+        assert re.findall(r"#[0-9a-f]{3,6}\b", sheet(name)) == []

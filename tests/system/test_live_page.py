@@ -181,7 +181,9 @@ def test_the_page_is_served_to_this_computer_only(page, folder):
     assert response.headers["Cache-Control"] == "no-store"
     assert response.headers["X-Content-Type-Options"] == "nosniff"
     assert "//" not in text  # nothing from another host
-    for name in ("live.js", "live.css", "report.css"):
+    named = re.findall(r'(?:href|src)="([^"]+)"', text)
+    assert {"live.js", "live.css", "report.css"} < set(named)
+    for name in named:
         assert ask(page, name)[0].status == 200
     with pytest.raises(HardwareError, match="not free"):
         LivePage(folder, port=urlsplit(page.url).port or 0)
@@ -370,7 +372,7 @@ def record(page: LivePage) -> None:
 
 
 INK = """(id) => {
-  const canvas = document.getElementById(id);
+  const canvas = document.querySelector(`#${id} canvas`);
   const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
   const colours = new Set();
   for (let i = 0; i < data.length; i += 4)

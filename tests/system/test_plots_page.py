@@ -13,9 +13,10 @@ from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.desks import a_submission
 from tests.helpers.waiting import PATIENCE, until
 from tests.system.test_desk import fits, show  # noqa: F401  (a fixture)
-from tests.system.test_report_pages import PHONE
+from tests.system.test_report_pages import PHONE, WIDE
 
 INK = "canvas => canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data"
+INK_SUM = f"canvas => ({INK})(canvas).reduce((a, b) => a + b, 0)"
 DRAWN = f"canvases => canvases.map(c => ({INK})(c).some(v => v > 0))"
 
 
@@ -88,6 +89,44 @@ def test_runs_and_models_are_compared_by_keyboard(show, tmp_path):  # noqa: F811
         window.get_by_role("button", name="Make the plots").click()
         window.wait_for_url("**/report/compare.html")
         assert (folder / "report" / "compare.html").stat().st_mtime_ns != kept.st_mtime_ns
+
+
+@pytest.mark.parametrize("size", [WIDE, PHONE], ids=["wide", "phone"])
+def test_buttons_and_values_stand_below_their_plot(browser, tmp_path, size):
+    """The buttons, the key and the values of a plot are below it and cover no other plot.
+
+    When the system turns dark, the plots take the dark colours.
+    """
+    analysis = make_analysis(2)
+    runs = compare_runs(analysis, gap=None, progress=silent)
+    page = tmp_path / "compare.html"
+    page.write_text(render_page(analysis, runs, gap=None, report=False), encoding="utf-8")
+    context = browser.new_context(
+        viewport={"width": size[0], "height": size[1]}, color_scheme="light"
+    )
+    window = context.new_page()
+    window.set_default_timeout(1e3 * PATIENCE)
+    window.goto(page.as_uri())
+
+    stages = window.locator(".stage")
+    assert stages.count() == 2
+    for k in range(stages.count()):
+        stages.nth(k).focus()
+        window.keyboard.press("ArrowRight")
+    expect(window.locator("output").last).to_contain_text(" s ")
+    boxes = window.locator(".stage, .key, .tools button, output").evaluate_all(
+        "all => all.map(e => e.getBoundingClientRect()).map(r => [r.top, r.bottom, r.right])"
+    )
+    per = len(boxes) // stages.count()
+    for first in range(0, len(boxes), per):
+        (_, bottom, _), *below = boxes[first : first + per]
+        assert all(top >= bottom - 0.5 for top, _, _ in below)
+        after = boxes[first + per][0] if first + per < len(boxes) else float("inf")
+        assert all(low <= after + 0.5 and right <= size[0] for _, low, right in below)
+    light = window.locator("canvas").first.evaluate(INK_SUM)
+    window.emulate_media(color_scheme="dark")
+    until(lambda: window.locator("canvas").first.evaluate(INK_SUM) != light)
+    context.close()
 
 
 def test_without_scripts_there_is_a_picture_and_the_table(browser, tmp_path):

@@ -29,7 +29,7 @@ _ROLES = {
 }  # fmt: skip
 ALWAYS, EXPLORE, FINDER = "page.js", "explore.js", "finder.js"
 _SOMETIMES = (EXPLORE, FINDER)
-PLOTS = ("uplot.min.js", "plots.js")  # scripts that only the page of plots has
+PLOTS = ("uplot.min.js", "charts.js", "plots.js")  # scripts that only the page of plots has
 _TITLE = re.compile(r"<title>.*?</title>", re.DOTALL)
 _NARROW = " .,()"  # characters that are half as wide as a digit
 _WIDE = "±×%"  # characters that are wider than a digit
