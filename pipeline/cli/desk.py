@@ -47,6 +47,8 @@ def desk(
         server = DeskServer(folder=folder, port=port, host=host or "127.0.0.1", users=users)
     with CrashLog(say=say) as ending, server:
         say(f"ready: {server.url}")
+        if ending.killed:
+            say(f"cartlab: {ending.killed}")
         if browser and host is None:
             webbrowser.open(server.url)
         while not ending.asked.wait(0.5):  # s

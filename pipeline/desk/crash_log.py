@@ -1,27 +1,35 @@
-"""Report why the desk ends, whatever the cause, on stderr and in a log."""
+"""Record why the desk ends, on stderr and in a log."""
 
 import faulthandler
 import os
 import platform
+import re
 import signal
-import subprocess
 import sys
 import tempfile
 import threading
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Self
+from typing import IO, Self
+
+import psutil
 
 from pipeline import __version__
-from pipeline.desk import crash_watch
 from pipeline.errors import PipelineError
 from pipeline.output import OWNERS_FOLDER
 
+_BEGINS, _ENDS = "begins:", "ends:"  # the first words of the lines about a desk as a whole
+_WHOLE = re.compile(rf"\S+ \S+ (\d+) ({_BEGINS}|{_ENDS})")
+
 
 class CrashLog:
-    """Report what ends the desk; use it as a context manager around the server.
+    """Record what ends the desk; use it as a context manager around the server.
+
+    A desk that is killed cannot record its end. The next desk then records it instead, and
+    `killed` says so.
 
     Parameters
     ----------
@@ -31,24 +39,28 @@ class CrashLog:
     ----------
     asked : set when a signal asks the desk to end.
     log : file that records why desks ended.
+    killed : message about earlier desks that were killed or crashed; "" if there were none.
     """
 
     def __init__(self, *, say: Callable[[str], None]) -> None:
         self.asked = threading.Event()
-        self.log = find_log()
+        self.log, self.killed = find_log(), ""
         self._say, self._why = say, "no reason was given"
-        # The watching process has a session of its own, so that closing the terminal does not end
-        # it.
-        self._watch = subprocess.Popen(
-            [sys.executable, "-I", crash_watch.__file__, str(self.log), str(os.getpid())],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            start_new_session=True,
-        )
+        self._file: IO[bytes] | None = None
 
     def __enter__(self) -> Self:
-        assert self._watch.stdin is not None
-        faulthandler.enable(file=self._watch.stdin)
+        # Without a log, as in a home folder that is not writable, stderr has the important lines.
+        with suppress(OSError):
+            killed = _list_killed(self.log)
+            self._file = open(self.log, "ab", buffering=0, opener=_open_private)
+        if self._file and killed:
+            self.killed = (
+                "an earlier desk was killed or crashed. Files are intact. The log says when, and "
+                f"after a crash in a library also where: {self.log}"
+            )
+            for process in killed:
+                self._note(f"{_ENDS} was killed or crashed before it could say why", process)
+        faulthandler.enable(file=self._file or sys.stderr)
         threading.excepthook = self._report_thread_error
         # All signals that a program can catch: Ctrl-C, kill, a closed terminal or session.
         for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK"):
@@ -56,7 +68,7 @@ class CrashLog:
             # nohup makes a program ignore SIGHUP; it stays ignored.
             if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self._signalled)
-        self.note(f"begins: cartlab {__version__}, Python {platform.python_version()}")
+        self._note(f"{_BEGINS} cartlab {__version__}, Python {platform.python_version()}")
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: object, where: object) -> None:
@@ -67,19 +79,18 @@ class CrashLog:
         if not isinstance(error, PipelineError | OSError):
             self._say(f"cartlab: the desk ends: {self._why}")
         faulthandler.disable()
-        self.note(f"{crash_watch.REASON}{self._why}")
-        with suppress(OSError):
-            if self._watch.stdin is not None:
-                self._watch.stdin.close()
-        self._watch.wait()
+        self._note(f"{_ENDS} {self._why}")
+        if self._file:
+            self._file.close()
 
-    def note(self, text: str) -> None:
-        """Write lines to the log."""
-        lines = "".join(f"\t{line}\n" for line in text.splitlines())
-        with suppress(OSError, ValueError):  # the watching process was killed
-            assert self._watch.stdin is not None
-            self._watch.stdin.write(lines.encode(errors="replace"))
-            self._watch.stdin.flush()
+    def _note(self, text: str, process: int | None = None) -> None:
+        """Write lines to the log, each with the time and the id of a desk's process."""
+        now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%SZ")
+        prefix = f"{now} {process or os.getpid()} "
+        lines = "".join(f"{prefix}{line}\n" for line in text.splitlines())
+        with suppress(OSError, ValueError):  # the disk is full, or the desk has ended
+            if self._file:
+                self._file.write(lines.encode(errors="replace"))
 
     def _signalled(self, number: int, _: object) -> None:
         self._why = signal.Signals(number).name
@@ -91,12 +102,12 @@ class CrashLog:
             return
         name = raised.thread.name if raised.thread else "?"
         self._say(f"cartlab: the desk: {_name(raised.exc_value)} in thread {name}")
-        self.note(f"in thread {name}:")
+        self._note(f"in thread {name}:")
         self._note_traceback(raised.exc_value)
 
     def _note_traceback(self, error: BaseException) -> None:
         with suppress(MemoryError, RecursionError):
-            self.note("".join(traceback.format_exception(error)))
+            self._note("".join(traceback.format_exception(error)))
 
 
 def find_log() -> Path:
@@ -112,6 +123,24 @@ def find_log() -> Path:
         if log.stat().st_size > 1_000_000:  # bytes; a larger log is started again
             log.unlink()
     return log
+
+
+def _open_private(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
+
+
+def _list_killed(log: Path) -> list[int]:
+    """Return the processes of desks that began according to a log, did not end, and are gone."""
+    if not log.exists():
+        return []
+    begun: dict[int, bool] = {}
+    for line in log.read_text(encoding="utf-8", errors="replace").splitlines():
+        if match := _WHOLE.match(line):
+            begun[int(match[1])] = match[2] == _BEGINS
+    # In a new container, this process may have the id of a killed desk.
+    return [
+        one for one in begun if begun[one] and (one == os.getpid() or not psutil.pid_exists(one))
+    ]
 
 
 def _name(error: BaseException) -> str:
