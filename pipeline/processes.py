@@ -9,6 +9,7 @@ import faulthandler
 import json
 import os
 import queue
+import signal
 import subprocess
 import sys
 import tempfile
@@ -16,7 +17,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, Literal
 
@@ -73,7 +74,7 @@ class Supervisor:
         self._module, self._memory = module, memory
         self._first = _json_line({"memory": memory, "setup": setup or {}})
         self._process: LineProcess | None = None
-        self._done = 0
+        self._is_ready, self._done = False, 0
 
     def do(
         self,
@@ -101,10 +102,8 @@ class Supervisor:
         process = self._ready(stop)
         most = process.memory + self._memory
         end = time.monotonic() + limit
-        try:
+        with suppress(OSError):  # it has ended; reading the answer will report that
             process.send(_json_line({"task": task, "limit": limit}))
-        except OSError:
-            pass  # it has ended; reading the answer will report that
         while True:
             answer = self._line(process, end=end, most=most, stop=stop)
             if answer is None:
@@ -124,6 +123,18 @@ class Supervisor:
         """Whether the process is running and ready for the next task."""
         return self._process is not None and self._process.runs
 
+    def launch(self) -> None:
+        """Start another process, but do not wait until it is ready.
+
+        Raises
+        ------
+        OSError : the computer cannot start a process.
+        """
+        self.close()
+        self._process, self._is_ready, self._done = LineProcess(self._module), False, 0
+        with suppress(OSError):  # it has ended; reading its answer will report that
+            self._process.send(self._first)
+
     def start(self, stop: threading.Event) -> None:
         """Start the process before a task needs it; `stop` as for `do`.
 
@@ -140,27 +151,28 @@ class Supervisor:
             process.close()
 
     def _ready(self, stop: threading.Event) -> "LineProcess":
-        if self._process is not None and self._process.runs:
-            return self._process
         stderr_end = why = ""
         for _ in range(_STARTS):
-            self.close()
-            process = self._process = LineProcess(self._module)
-            self._done = 0
+            if self._process is None or not self._process.runs:
+                self.launch()
+            process = self._process
+            assert process is not None
+            if self._is_ready:
+                return process
             try:
-                process.send(self._first)
                 end = time.monotonic() + _START_LIMIT
                 if self._line(process, end=end, most=float("inf"), stop=stop) is not None:
+                    self._is_ready = True
                     return process
-                why = f"the process did not start in {_START_LIMIT:g} s"
+                why, stderr_end = (
+                    f"the process did not start in {_START_LIMIT:g} s",
+                    process.stderr_end(),
+                )
             except Ended as error:
                 if error.how == "stopped":
                     raise
-                why = str(error)
-            except OSError as error:  # the process has ended
-                why = f"the process ended ({error.strerror})"
-            stderr_end = process.stderr_end()
-        self.close()
+                why, stderr_end = str(error), error.stderr_end
+            self.close()
         raise Ended(why, how="start", stderr_end=stderr_end)
 
     def _line(
@@ -272,11 +284,9 @@ class LineProcess:
         self._process.kill()
         self._process.wait()
         for pipe in (self._process.stdin, self._stderr):
-            try:
+            with suppress(OSError):  # nobody needs the unsent data any more
                 if pipe is not None:
                     pipe.close()
-            except OSError:
-                pass  # nobody needs the unsent data any more
 
     def _listen(self) -> None:
         """Put every line of the process into the queue, then b"" at the end."""
@@ -296,6 +306,7 @@ def serve(prepare: Callable[..., Callable[[Any, Progress], Any]]) -> None:
         and a function to report its stages, and does the task.
     """
     collect_seldom()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C also reaches the parent, which ends this
     say = reserve_stdout()
     faulthandler.enable()
     sent: queue.SimpleQueue[bytes] = queue.SimpleQueue()

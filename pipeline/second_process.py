@@ -1,17 +1,17 @@
 """Call a function in a second process, which loads its module while the first still computes."""
 
-import os
 import pickle
-import signal
-import subprocess
 import sys
+from base64 import b64decode, b64encode
+from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
-from types import TracebackType
-from typing import IO, Any, Literal
+from typing import Any
 
-from pipeline.startup import collect_seldom, with_one_thread
+from pipeline.processes import Failed, Supervisor, serve
 from pipeline.words.progress import Progress
+
+_MOST_MEMORY, _LONGEST = 1 << 50, 86_400.0  # bytes and s: the work is the user's own, so no limits
 
 
 class SecondProcess:
@@ -27,76 +27,50 @@ class SecondProcess:
 
     def __init__(self, module: str, function: str) -> None:
         self._module, self._function = module, function
-        self._process: subprocess.Popen[bytes] | None = None
-        if module in sys.modules:
-            return
-        pipe, none = subprocess.PIPE, subprocess.DEVNULL
-        command = [sys.executable, "-P", "-m", __name__, module, function]
-        with suppress(OSError):  # the computer cannot start another process
-            self._process = subprocess.Popen(
-                command, stdin=pipe, stdout=pipe, stderr=none, env=with_one_thread()
-            )
+        setup = {"module": module, "function": function}
+        self._worker = Supervisor(__name__, memory=_MOST_MEMORY, setup=setup)
+        self._is_used = module not in sys.modules
+        if self._is_used:
+            with suppress(OSError):  # the computer cannot start another process
+                self._worker.launch()
 
     def __enter__(self) -> "SecondProcess":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> Literal[False]:
-        if self._process:
-            self._process.kill()
-            self._process.communicate()
-        return False
+    def __exit__(self, *raised: object) -> None:
+        self._worker.close()
 
     def do(self, *args: Any, progress: Progress, **named: Any) -> Any:
         """Call the function with these arguments and return its answer.
 
         If the second process fails for any reason, this process does the work.
         """
-        try:
-            answers = self._send((args, named))
-            while isinstance(stage := pickle.load(answers), str):
-                progress(stage)
-        except (OSError, EOFError, pickle.PickleError):
-            work = getattr(import_module(self._module), self._function)
-            return work(*args, progress=progress, **named)
-        (answer,) = stage
-        return answer
-
-    def _send(self, task: object) -> IO[bytes]:
-        """Send the task and return the stream of the answers.
-
-        Raises
-        ------
-        OSError : the process has ended or never started.
-        """
-        if self._process is None:
-            raise OSError("there is no second process")
-        assert self._process.stdin
-        assert self._process.stdout
-        pickle.dump(task, self._process.stdin)
-        self._process.stdin.flush()
-        return self._process.stdout
+        if self._is_used:
+            with suppress(Failed, OSError, pickle.PickleError):
+                task = _pack((args, named))
+                return _unpack(self._worker.do(task, limit=_LONGEST, progress=progress))
+        return getattr(import_module(self._module), self._function)(
+            *args, progress=progress, **named
+        )
 
 
-def serve(module: str, function: str) -> None:
-    """Load a function, then call it once: a stage is sent as text, the answer as a tuple."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C also reaches the parent, which ends this
-    collect_seldom()
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # libraries may print
+def _pack(value: object) -> str:
+    return b64encode(pickle.dumps(value)).decode("ascii")
 
-    def send(answer: object) -> None:
-        pickle.dump(answer, answers)
-        answers.flush()
 
+def _unpack(text: str) -> Any:
+    return pickle.loads(b64decode(text))
+
+
+def _prepare(module: str, function: str) -> Callable[[Any, Progress], str]:
     work = getattr(import_module(module), function)
-    args, named = pickle.load(sys.stdin.buffer)
-    send((work(*args, progress=send, **named),))
+
+    def do(task: str, progress: Progress) -> str:
+        args, named = _unpack(task)
+        return _pack(work(*args, progress=progress, **named))
+
+    return do
 
 
 if __name__ == "__main__":
-    serve(*sys.argv[1:])
+    serve(_prepare)
