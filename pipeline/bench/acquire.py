@@ -1,6 +1,6 @@
 """Record the plan of a submission on a bench; a later session continues where this one ended."""
 
-from collections.abc import Callable, Collection, Generator, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,7 +8,6 @@ from pipeline.bench.events import (
     Action,
     Buttons,
     Observer,
-    Observers,
     RunOutcome,
     Stopped,
     signals_held,
@@ -52,7 +51,7 @@ def acquire(
     folder: Path,
     *,
     port: str,
-    observers: Sequence[Observer],
+    observer: Observer,
     only: Collection[str] = (),
     buttons: Buttons | None = None,
 ) -> tuple[RunOutcome, ...]:
@@ -64,8 +63,7 @@ def acquire(
     Parameters
     ----------
     port : name of the serial port, or a URL that pyserial knows.
-    observers : displays of the session. The first display also asks a person to do the work at
-        the bench.
+    observer : receives the events of the session, and asks a person to do the work at the bench.
     only : ids of the recordings to make. By default the whole plan; dwells and a closed loop
         are added once the data are sufficient.
     buttons : the buttons with which a person ends or repeats a run.
@@ -80,11 +78,7 @@ def acquire(
     """
     with stopping_on_signals(), lock_or_refuse(folder):
         work = _Acquisition(
-            folder,
-            port=port,
-            observer=Observers(observers),
-            only=only,
-            buttons=buttons or Buttons(),
+            folder, port=port, observer=observer, only=only, buttons=buttons or Buttons()
         )
         return tuple(work.outcomes())
 

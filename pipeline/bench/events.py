@@ -115,58 +115,6 @@ class Observer(Protocol):
         ...
 
 
-class Observers:
-    """Several observers that act as one; the first one asks a person to confirm."""
-
-    def __init__(self, observers: Sequence[Observer]) -> None:
-        self._observers = tuple(observers)
-
-    def planned(self, plan: Plan, done: frozenset[str]) -> None:
-        """Announce the planned recordings, and the ids of those already made."""
-        for observer in self._observers:
-            observer.planned(plan, done)
-
-    def confirm(self, instruction: str) -> None:
-        """Ask a person to do something at the bench, and wait until it is done."""
-        for observer in self._observers[:1]:
-            observer.confirm(instruction)
-
-    def settling(self, recording: Recording, seconds: float) -> None:
-        """Announce that the carts must come to rest first."""
-        for observer in self._observers:
-            observer.settling(recording, seconds)
-
-    def started(self, recording: Recording) -> None:
-        """Announce that the run has started."""
-        for observer in self._observers:
-            observer.started(recording)
-
-    def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
-        """Pass on new lines."""
-        for observer in self._observers:
-            observer.readings(batch, anomalies)
-
-    def finished(self, outcome: RunOutcome) -> None:
-        """Announce how the run ended."""
-        for observer in self._observers:
-            observer.finished(outcome)
-
-    def remark(self, sentence: str) -> None:
-        """Announce something that does not belong to a single run."""
-        for observer in self._observers:
-            observer.remark(sentence)
-
-    def thinking(self, stage: str) -> None:
-        """Announce what is being computed."""
-        for observer in self._observers:
-            observer.thinking(stage)
-
-    def thought(self, sentence: str) -> None:
-        """Announce what is known, what is uncertain, which recording is next, and why."""
-        for observer in self._observers:
-            observer.thought(sentence)
-
-
 class Buttons:
     """The button that a person pressed for the current run.
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pipeline.bench.acquire import acquire, ensure_plan
-from pipeline.bench.events import Buttons, Observer, Observers, Stopped
+from pipeline.bench.events import Buttons, Observer, Stopped
 from pipeline.bench.raw import known_commands
 from pipeline.bench.serial_line import Runaway
 from pipeline.experiments.exploration import Exploration, Recorded, Turn
@@ -18,7 +18,7 @@ def explore_bench(
     folder: Path,
     *,
     port: str,
-    observers: Sequence[Observer],
+    observer: Observer,
     buttons: Buttons | None,
     goal: ErrorGoal,
     write_diary: Callable[..., object],
@@ -29,7 +29,7 @@ def explore_bench(
 
     Parameters
     ----------
-    observers, buttons : see `acquire`. "skip" vetoes the chosen recording, before or during it;
+    observer, buttons : see `acquire`. "skip" vetoes the chosen recording, before or during it;
         "stop" ends the exploration, even during a computation.
     goal, seconds, vetoes, write_diary : see `Exploration`.
 
@@ -38,10 +38,10 @@ def explore_bench(
     Stopped : a signal or a button ended the exploration.
     HardwareError, ConfigError, DataError : see `acquire` and `Exploration`.
     """
-    everyone, buttons = Observers(observers), buttons or Buttons()
+    buttons = buttons or Buttons()
 
     def record(ids: Sequence[str]) -> Recorded:
-        outcomes = acquire(folder, port=port, observers=observers, only=ids, buttons=buttons)
+        outcomes = acquire(folder, port=port, observer=observer, only=ids, buttons=buttons)
         if astray := [o.partial for o in outcomes if o.is_astray]:
             raise Runaway(f"{astray[-1]}; the exploration ends here")
         made = tuple(o.recording.id for o in outcomes if not o.partial)
@@ -58,7 +58,7 @@ def explore_bench(
     def think(stage: str) -> None:
         if buttons.pressed == "stop":
             raise Stopped("by hand")
-        everyone.thinking(stage)
+        observer.thinking(stage)
 
     if (folder / NAME).exists():
         ensure_plan(folder, port=port)
@@ -69,7 +69,7 @@ def explore_bench(
         known_commands=known_commands,
         goal=goal,
         seconds=seconds,
-        announce=lambda sentence: everyone.thought(with_symbols(sentence)),
+        announce=lambda sentence: observer.thought(with_symbols(sentence)),
         progress=think,
         vetoes=vetoes,
     )

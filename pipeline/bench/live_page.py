@@ -11,7 +11,6 @@ import secrets
 import socket
 import time
 from collections.abc import AsyncIterator, Callable
-from pathlib import Path
 from typing import Any, Self
 from urllib.parse import parse_qsl
 
@@ -86,8 +85,10 @@ def live_view() -> str:
     return (TEMPLATES / "live-view.html").read_text(encoding="utf-8")
 
 
-class LivePage(LiveState):
-    """An observer that serves a page to the browser; use it as a context manager.
+class LivePage:
+    """Serves a page that shows a session to the browser; use it as a context manager.
+
+    The session ends with the block.
 
     Parameters
     ----------
@@ -99,8 +100,8 @@ class LivePage(LiveState):
         log.
     """
 
-    def __init__(self, folder: Path, *, port: int = 0) -> None:
-        super().__init__(folder)
+    def __init__(self, session: LiveState, *, port: int = 0) -> None:
+        self.session = session
         try:
             listener = socket.create_server(("127.0.0.1", port))
         except OSError as error:
@@ -123,10 +124,10 @@ class LivePage(LiveState):
         return self
 
     def __exit__(self, *raised: object) -> None:
-        self.end()
+        self.session.end()
         self._closing = True
         until = time.monotonic() + 1.0  # s for open pages to learn that the session has ended
-        while self.viewers and time.monotonic() < until:
+        while self.session.viewers and time.monotonic() < until:
             time.sleep(0.02)
         self._served.stop()
 
@@ -146,13 +147,13 @@ class LivePage(LiveState):
             return PlainTextResponse("too long", status_code=413)
         try:
             sent = dict(parse_qsl((await request.body()).decode("ascii"), strict_parsing=True))
-            status = press_button(self, sent["wish"], sent["number"])
+            status = press_button(self.session, sent["wish"], sent["number"])
         except (ValueError, KeyError):
             return PlainTextResponse("not understood", status_code=400)
         return Response(status_code=status)
 
     async def _stream(self, request: Request) -> Response:
-        return stream_events(self, is_over=lambda: self._closing)
+        return stream_events(self.session, is_over=lambda: self._closing)
 
 
 class _SecretPath:

@@ -4,6 +4,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Self
 
 from rich.console import Console, Group
@@ -13,27 +14,39 @@ from rich.table import Table
 from rich.text import Text
 
 from pipeline.bench.events import Anomalies, RunOutcome
+from pipeline.bench.live_state import LiveState
 from pipeline.errors import ConfigError
-from pipeline.experiments.plan import Plan, Recording, session_time, time_words
-from pipeline.protocol import Reading
+from pipeline.experiments.plan import Recording, time_words
 
 _BARS = "▁▂▃▄▅▆▇█"
+_SPAN = 600  # points in a sparkline, of which every tenth is shown
 
 
-class Terminal:
-    """An observer that shows the plan, the run and the positions in the terminal.
+class Terminal(LiveState):
+    """A session that is shown in the terminal.
 
     Parameters
     ----------
+    folder : see `LiveState`.
     yes : whether everything that a person is asked to do counts as done.
+    has_page : whether a person confirms on a page, unless `yes`.
     """
 
-    def __init__(self, *, yes: bool = False, console: Console | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        yes: bool = False,
+        has_page: bool = False,
+        console: Console | None = None,
+    ) -> None:
+        super().__init__(folder)
         self._console = console or Console(stderr=True)
-        self._yes = yes
-        self._view = _View()
+        self._yes, self._has_page = yes, has_page
+        # Times of the last views, and the lines of the run at these times.
+        self._seen: deque[tuple[float, int]] = deque()
         self._live = Live(
-            get_renderable=self._view.render,
+            get_renderable=self._render,
             console=self._console,
             refresh_per_second=8.0,
             transient=True,
@@ -47,53 +60,47 @@ class Terminal:
     def __exit__(self, *error: object) -> None:
         self._live.stop()
 
-    def planned(self, plan: Plan, done: frozenset[str]) -> None:
-        """Show what will be recorded."""
-        self._view.plan = plan.recordings
-        self._view.done = set(done)
+    def say(self, sentence: str) -> None:
+        """Print a sentence that no page shows."""
+        self._console.print(Text(sentence), soft_wrap=True)
+
+    # ------------------------------------------------------------- by the acquisition
 
     def confirm(self, instruction: str) -> None:
-        """Ask the person at the keyboard, and wait.
+        """Ask the person at the keyboard or at the page, and wait.
 
         Raises
         ------
-        ConfigError : nobody is at the keyboard.
+        ConfigError : nobody is there.
         """
         if self._yes:
             self.remark(f"{instruction}: confirmed by --yes, continuing")
-            return
-        if not sys.stdin.isatty():
+        elif self._has_page:
+            super().confirm(instruction)
+        elif sys.stdin.isatty():
+            self._ask(instruction, keys="then press Enter")
+        else:
             raise ConfigError(
                 f"{instruction}: nobody is at the keyboard to confirm it; with --yes it counts as "
                 "done"
             )
-        self._ask(instruction, keys="then press Enter")
-
-    def settling(self, recording: Recording, seconds: float) -> None:
-        """Show that the carts must come to rest."""
-        self._view.begin(recording, f"coming to rest, {seconds:g} s")
-
-    def started(self, recording: Recording) -> None:
-        """Show the run."""
-        self._view.begin(recording, "")
-
-    def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
-        """Show the newest lines."""
-        self._view.take(batch, anomalies)
 
     def finished(self, outcome: RunOutcome) -> None:
         """Print how the run ended, in a line that stays."""
-        self._view.recording = None
-        name = outcome.recording.id
-        if not outcome.partial:
-            self._view.done.add(name)
+        super().finished(outcome)
         if outcome.partial or outcome.remarks or self._console.is_terminal:
             end = outcome.partial or f"{outcome.lines} lines"
-            self.remark("; ".join([f"{name}: {end}", *outcome.remarks]))
+            self.say("; ".join([f"{outcome.recording.id}: {end}", *outcome.remarks]))
 
     def remark(self, sentence: str) -> None:
         """Print a sentence."""
-        self._console.print(Text(sentence), soft_wrap=True)
+        super().remark(sentence)
+        self.say(sentence)
+
+    def thought(self, sentence: str) -> None:
+        """Print what is known and what comes next."""
+        super().thought(sentence)
+        self.say(sentence)
 
     def _ask(self, question: str, *, keys: str) -> str:
         """Ask a question and return the typed answer.
@@ -117,15 +124,6 @@ class Terminal:
             if self._console.is_terminal:
                 self._live.start()
 
-    def thinking(self, stage: str) -> None:
-        """Show what is being computed."""
-        self._view.thinking = stage
-
-    def thought(self, sentence: str) -> None:
-        """Print what is known and what comes next."""
-        self._view.thinking = ""
-        self.remark(sentence)
-
     def vetoes(self, recording: Recording) -> bool:
         """Ask whether to leave out a recording; return True if so.
 
@@ -135,72 +133,48 @@ class Terminal:
         """
         return self._ask(f"Enter records {recording.id}", keys="v and Enter vetoes it") == "v"
 
+    # ------------------------------------------------------------------ by the display
 
-class _View:
-    """What the terminal shows at the moment."""
-
-    def __init__(self) -> None:
-        self.plan: tuple[Recording, ...] = ()
-        self.done: set[str] = set()
-        self.recording: Recording | None = None
-        self.thinking = ""
-        self._state = ""
-        self._ms = 0
-        self._anomalies = Anomalies()
-        self._traces: list[deque[int]] = []
-        self._arrived: deque[tuple[float, int]] = deque()
-
-    def begin(self, recording: Recording, state: str) -> None:
-        """Begin to show another run."""
-        self.recording, self._state, self._ms = recording, state, 0
-        self.thinking = ""
-        self._anomalies = Anomalies()
-        self._traces, self._arrived = [], deque()
-
-    def take(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
-        """Add new lines; the last one of each batch is enough for the sparklines."""
-        last, now = batch[-1], time.monotonic()
-        self._ms, self._anomalies = last.ms, anomalies
-        if len(self._traces) != len(last.counts):
-            # Width of a sparkline in characters.
-            self._traces = [deque(maxlen=60) for _ in last.counts]
-        for trace, count in zip(self._traces, last.counts, strict=True):
-            trace.append(count)
-        self._arrived.append((now, len(batch)))
-        while now - self._arrived[0][0] > 2.0:  # s
-            self._arrived.popleft()
-
-    def render(self) -> Group:
-        """Return what to show."""
-        left = [r for r in self.plan if r.id not in self.done]
-        seconds = max(0.0, session_time(left) - 1e-3 * self._ms)
+    def _render(self) -> Group:
+        """Return what to show: the same state that a page shows."""
+        state = self.snapshot()
+        run = self.points(run=self._run, start=self._end - _SPAN)
+        recorded = sum(entry["state"] == "done" for entry in state["plan"])
+        recording = state["phase"] == "recording"
+        t = run["points"][-1][0] if recording and run["points"] else 0.0
         head = Table.grid(padding=(0, 2))
         head.add_row(
-            ProgressBar(total=max(1, len(self.plan)), completed=len(self.done), width=30),
-            Text(f"{len(self.done)} of {len(self.plan)} recorded, {time_words(seconds)} left"),
+            ProgressBar(total=max(1, len(state["plan"])), completed=recorded, width=30),
+            Text(
+                f"{recorded} of {len(state['plan'])} recorded, "
+                f"{time_words(max(0.0, state['seconds_left'] - t))} left"
+            ),
         )
-        return Group(head, *self._run_lines())
+        lines = [] if state["phase"] == "waiting" else [state["waits"]]
+        if recording:
+            counters = dict(run["counters"])
+            rate = self._rate(counters.pop("lines"))
+            lines = [
+                f"{state['now']}: {t:.1f} of {state['duration']:.1f} s, {rate:.0f} lines/s, "
+                f"line faults: {Anomalies(**counters)}"
+            ]
+            # Every tenth point, so that a bar belongs to the same time in each view.
+            shown = [p for i, p in enumerate(run["points"], start=run["start"]) if i % 10 == 0]
+            unit = state["units"]["position"]
+            for cart, trace in enumerate(list(zip(*shown, strict=True))[3:], start=1):
+                lines.append(f"  cart {cart} {trace[-1]:>9.4g} {unit}  {sparkline(trace)}")
+        return Group(head, *map(Text, lines))
 
-    def _run_lines(self) -> list[Text]:
-        run = self.recording
-        if run is None:
-            return [Text(self.thinking)] if self.thinking else []
-        state = self._state or (
-            f"{1e-3 * self._ms:.1f} of {run.duration:.1f} s, {self._rate():.0f} lines/s, "
-            f"line faults: {self._anomalies}"
-        )
-        lines = [Text(f"{run.id} ({run.kind}): {state}")]
-        for number, trace in enumerate(self._traces, start=1):
-            shown = list(trace)  # a copy, because another thread appends to it
-            if shown:
-                lines.append(Text(f"  encoder {number} {shown[-1]:>7}  {sparkline(shown)}"))
-        return lines
-
-    def _rate(self) -> float:
-        arrived = list(self._arrived)  # a copy, because another thread appends to it
-        if len(arrived) < 2 or arrived[-1][0] == arrived[0][0]:
-            return 0.0
-        return sum(n for _, n in arrived[1:]) / (arrived[-1][0] - arrived[0][0])
+    def _rate(self, lines: int) -> float:
+        """Return the lines per second during the last two seconds of a run."""
+        now = time.monotonic()
+        if self._seen and lines < self._seen[-1][1]:  # another run
+            self._seen.clear()
+        self._seen.append((now, lines))
+        while now - self._seen[0][0] > 2.0:  # s
+            self._seen.popleft()
+        (since, before), (_, last) = self._seen[0], self._seen[-1]
+        return (last - before) / (now - since) if now > since else 0.0
 
 
 def _forget_keys() -> None:
@@ -216,7 +190,7 @@ def _forget_keys() -> None:
         termios.tcflush(sys.stdin, termios.TCIFLUSH)
 
 
-def sparkline(values: Sequence[int]) -> str:
+def sparkline(values: Sequence[float]) -> str:
     """Return values as a row of bars of different heights."""
     low, high = min(values), max(values)
     step = (high - low) / (len(_BARS) - 1) or 1.0

@@ -1,7 +1,7 @@
 """The command `acquire`: fill a submission from a bench, or from files as they appear."""
 
 import sys
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,7 +13,6 @@ from pipeline.cli.common import Folder, app
 from pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
-    from pipeline.bench.events import Buttons, Observer
     from pipeline.bench.terminal import Terminal
 
 
@@ -45,20 +44,15 @@ def acquire(
     ] = False,
 ) -> None:
     """Record the plan on a bench, or import files as they appear, into a submission."""
-    from pipeline.bench.terminal import Terminal
-
     if (port is None) == (source is None):
         raise ConfigError("state where the data come from: either --port or --import")
     if web and port is None:
         raise ConfigError("--web shows a bench, so it needs --port")
-    with Terminal(yes=yes) as terminal, saying_where(folder):
+    with watching(folder, web=web, yes=yes) as terminal:
         if source is not None:
             _import(folder, source, terminal, once=once)
         elif port is not None:
-            with watching(folder, terminal, web=web, yes=yes) as (observers, buttons):
-                _record(
-                    folder, port, terminal, observers=observers, buttons=buttons, only=only or ()
-                )
+            _record(folder, port, terminal, only=only or ())
 
 
 @contextmanager
@@ -75,36 +69,28 @@ def saying_where(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def watching(
-    folder: Path, terminal: "Terminal", *, web: bool, yes: bool
-) -> Iterator[tuple[list["Observer"], "Buttons | None"]]:
-    """Yield the observers, and the buttons of the page.
+def watching(folder: Path, *, web: bool = False, yes: bool) -> Iterator["Terminal"]:
+    """Yield the session, which the terminal shows and perhaps a page."""
+    from pipeline.bench.terminal import Terminal
 
-    The first observer asks for confirmations.
-    """
-    if not web:
-        yield [terminal], None
-        return
-    from pipeline.bench.live_page import LivePage
+    with saying_where(folder), Terminal(folder, yes=yes, has_page=web) as terminal:
+        if not web:
+            yield terminal
+            return
+        from pipeline.bench.live_page import LivePage
 
-    with LivePage(folder) as page:
-        terminal.remark(f"watch{'' if yes else ' and confirm'} at {page.url}")
-        yield [terminal, page] if yes else [page, terminal], page.buttons
+        with LivePage(terminal) as page:
+            terminal.say(f"watch{'' if yes else ' and confirm'} at {page.url}")
+            yield terminal
 
 
-def _record(
-    folder: Path,
-    port: str,
-    terminal: "Terminal",
-    *,
-    observers: Sequence["Observer"],
-    buttons: "Buttons | None",
-    only: Collection[str],
-) -> None:
+def _record(folder: Path, port: str, terminal: "Terminal", *, only: Collection[str]) -> None:
     from pipeline.bench.acquire import acquire as carry_out
 
     try:
-        outcomes = carry_out(folder, port=port, observers=observers, only=only, buttons=buttons)
+        outcomes = carry_out(
+            folder, port=port, observer=terminal, only=only, buttons=terminal.buttons
+        )
     except KeyboardInterrupt:
         terminal.remark("stopped; repeat the command to continue")
         sys.exit(INTERRUPTED)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from pipeline.cli import INTERRUPTED
-from pipeline.cli.acquire import saying_where, watching
+from pipeline.cli.acquire import watching
 from pipeline.cli.common import Folder, app
 from pipeline.errors import ConfigError
 
@@ -35,7 +35,6 @@ def explore(
 ) -> None:
     """Record, identify, analyse the gap and choose the next recording, until the goal is met."""
     from pipeline.bench.explore import explore_bench
-    from pipeline.bench.terminal import Terminal
     from pipeline.experiments.information import read_error_goal, read_time
     from pipeline.report.exploration import NAME
     from pipeline.report.exploration.diary import write_diary
@@ -43,17 +42,13 @@ def explore(
     goal, seconds = read_error_goal(until), read_time(limit)
     if ask and not sys.stdin.isatty():
         raise ConfigError("--ask needs a terminal to answer at")
-    with (
-        Terminal(yes=yes) as terminal,
-        saying_where(folder),
-        watching(folder, terminal, web=web, yes=yes) as (observers, buttons),
-    ):
+    with watching(folder, web=web, yes=yes) as terminal:
         try:
             turns = explore_bench(
                 folder,
                 port=port,
-                observers=observers,
-                buttons=buttons,
+                observer=terminal,
+                buttons=terminal.buttons,
                 goal=goal,
                 write_diary=write_diary,
                 seconds=seconds,

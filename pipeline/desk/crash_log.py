@@ -39,7 +39,7 @@ class CrashLog:
     ----------
     asked : set when a signal asks the desk to end.
     log : file that records why desks ended.
-    killed : message about earlier desks that were killed or crashed; "" if there were none.
+    killed : message that an earlier desk was killed or crashed, or "".
     """
 
     def __init__(self, *, say: Callable[[str], None]) -> None:
@@ -50,10 +50,11 @@ class CrashLog:
 
     def __enter__(self) -> Self:
         # Without a log, as in a home folder that is not writable, stderr has the important lines.
+        killed: list[int] = []
         with suppress(OSError):
             killed = _list_killed(self.log)
             self._file = open(self.log, "ab", buffering=0, opener=_open_private)
-        if self._file and killed:
+        if killed:
             self.killed = (
                 "an earlier desk was killed or crashed. Files are intact. The log says when, and "
                 f"after a crash in a library also where: {self.log}"

@@ -3,8 +3,10 @@
 import json
 import os
 import sys
+import threading
 from dataclasses import replace
 from io import StringIO
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -39,7 +41,7 @@ from tests.helpers.acquisitions import (
     write_work,
 )
 from tests.helpers.benches import emulator
-from tests.helpers.waiting import started
+from tests.helpers.waiting import started, until
 
 
 def last_run(bench) -> dict:
@@ -142,7 +144,7 @@ def test_faults_of_every_kind_are_counted_and_the_rest_is_kept(tmp_path):
     work = write_work(tmp_path, [sine("dwell", seconds=8)])
     options = [o for kind in ("drop", "garble", "merge") for o in ("--fault", f"{kind}=0.01")]
     with emulator(*options, "--speed", "10") as bench:
-        *_, outcome = acquire(work, port=bench.address, observers=[Notes()], only=["dwell"])
+        *_, outcome = acquire(work, port=bench.address, observer=Notes(), only=["dwell"])
         while (sent := bench.event("run"))["ended"] != "done" or sent["lines"] < 7000:
             pass
     struck = sent["injected"]
@@ -278,15 +280,16 @@ def test_an_unknown_scale_is_asked_for(tmp_path, stock):
 # ----------------------------------------------------------------- the terminal
 
 
-def shown(*, terminal: bool, **options) -> tuple[Terminal, StringIO]:
+def shown(folder: Path, *, terminal: bool, **options) -> tuple[Terminal, StringIO]:
     """Return a terminal view and the text that it prints."""
     out = StringIO()
-    return Terminal(console=Console(file=out, force_terminal=terminal, width=100), **options), out
+    console = Console(file=out, force_terminal=terminal, width=100)
+    return Terminal(write_work(folder / "work", []), console=console, **options), out
 
 
-def test_the_terminal_shows_progress_faults_and_positions():
+def test_the_terminal_shows_progress_faults_and_positions(tmp_path):
     """During a run the terminal shows progress, lost lines and where the carts are."""
-    view, out = shown(terminal=True)
+    view, out = shown(tmp_path, terminal=True)
     plan = Plan(limits=LIMITS, recordings=(sine("a", seconds=30), sine("b", seconds=45)))
     with view:
         view.planned(plan, frozenset("a"))
@@ -301,9 +304,9 @@ def test_the_terminal_shows_progress_faults_and_positions():
     assert sparkline(range(0, 2000, 50)) in out.getvalue()
 
 
-def test_without_a_terminal_only_bad_runs_are_reported():
+def test_without_a_terminal_only_bad_runs_are_reported(tmp_path):
     """In a log file a good run leaves no line, and a bad run leaves its reason."""
-    view, out = shown(terminal=False)
+    view, out = shown(tmp_path, terminal=False)
     well, why = (
         RunOutcome(recording=sine("a", seconds=1), lines=998),
         "stopped: cart 1 [b] was too far",
@@ -318,12 +321,25 @@ def test_without_a_terminal_only_bad_runs_are_reported():
     assert out.getvalue() == f"a: {why}\n"
 
 
-def test_without_a_keyboard_nothing_is_confirmed(monkeypatch):
+def test_without_a_keyboard_nothing_is_confirmed(tmp_path, monkeypatch):
     """Without a keyboard an instruction ends the session, unless `--yes` is given."""
     monkeypatch.setattr("sys.stdin", StringIO())
-    view, _ = shown(terminal=False)
+    view, _ = shown(tmp_path, terminal=False)
     with pytest.raises(ConfigError, match="Hold it: nobody"):
         view.confirm("Hold it")
-    view, out = shown(terminal=False, yes=True)
+    view, out = shown(tmp_path, terminal=False, yes=True)
     view.confirm("Hold it")
     assert "Hold it: confirmed" in out.getvalue()
+
+
+def test_with_a_page_the_terminal_waits_for_its_answer(tmp_path):
+    """Terminal and page show one session: the page's answer counts, and both tell the remarks."""
+    view, out = shown(tmp_path, terminal=False, has_page=True)
+    waiting = threading.Thread(target=view.confirm, args=("Hold it",))
+    waiting.start()
+    until(lambda: view.snapshot()["instruction"] == {"number": 1, "text": "Hold it"})
+    view.remark("no watchdog")
+    assert view.apply("done", 1)
+    waiting.join()
+    assert view.snapshot()["remarks"] == ["no watchdog"]
+    assert out.getvalue() == "no watchdog\n"

@@ -51,7 +51,7 @@ class Finger(Notes):
 def record(work: Path, port: str, finger: Finger, *only: str) -> list[RunOutcome]:
     """Record the plan with this observer."""
     with suppress(Stopped):
-        acquire(work, port=port, observers=[finger], only=only, buttons=finger.buttons)
+        acquire(work, port=port, observer=finger, only=only, buttons=finger.buttons)
     return finger.outcomes
 
 
@@ -61,7 +61,7 @@ def test_stop_ends_the_session_whatever_else_was_pressed(tmp_path, before, real)
     work = write_work(tmp_path, [sine("long", seconds=30), sine("next", seconds=1)])
     finger = Finger(*before, "stop")
     with pytest.raises(Stopped):
-        acquire(work, port=real.address, observers=[finger], buttons=finger.buttons)
+        acquire(work, port=real.address, observer=finger, buttons=finger.buttons)
     while (ended := real.event("run"))["ended"] == "complete":
         pass
     assert ended["ended"] == "stopped"
@@ -127,7 +127,7 @@ def waits_for_a_person(work: Path, port: str) -> Iterator[tuple[LiveState, list]
 
     def session() -> None:
         try:
-            ended.extend(acquire(work, port=port, observers=[state], only=["dwell"],
+            ended.extend(acquire(work, port=port, observer=state, only=["dwell"],
                                  buttons=state.buttons))  # fmt: skip
         except Stopped:
             ended.append("stopped")

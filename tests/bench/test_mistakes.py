@@ -94,7 +94,7 @@ def test_an_interrupt_after_the_last_line_keeps_the_run(tmp_path):
     work = write_work(tmp_path, [sine("first", seconds=2), sine("second", seconds=2)])
     notes = LastMoment()
     with emulator("--speed", "4") as bench, pytest.raises(KeyboardInterrupt):
-        acquire(work, port=bench.address, observers=[notes])
+        acquire(work, port=bench.address, observer=notes)
     assert [experiment.id for experiment in load_submission(work).experiments] == ["first"]
     assert [outcome.partial for outcome in notes.outcomes] == [""]
     assert not (work / "data" / "first.partial.txt").exists()

@@ -257,7 +257,7 @@ def test_an_exploration_ends_if_the_bench_misbehaves(tmp_path, wrong):
     """If the bench misbehaves, an exploration ends and chooses no other experiment."""
     with RunawayBench(wrong, duty=FULL) as bench, pytest.raises(HardwareError, match="stopped: "):
         explore_bench(
-            tmp_path / "new", write_diary=write_diary, port=bench.address, observers=[Notes()],
+            tmp_path / "new", write_diary=write_diary, port=bench.address, observer=Notes(),
             buttons=None, goal=ErrorGoal(), seconds=900.0,
         )  # fmt: skip
     assert_over(bench)

@@ -376,8 +376,9 @@ def test_a_raw_file_is_not_written_through_a_link(tmp_path):
 
 # ----------------------------------------------------------------- at the keyboard
 
-ASK = """from pipeline.bench.terminal import Terminal
-Terminal().confirm('Hold cart 1')
+ASK = """from pathlib import Path
+from pipeline.bench.terminal import Terminal
+Terminal(Path()).confirm('Hold cart 1')
 print('held')"""
 
 

@@ -68,7 +68,7 @@ def carried_out(
     work: Path, port: str, *only: str, notes: "Notes | None" = None
 ) -> tuple[RunOutcome, ...]:
     """Acquire these recordings; return their outcomes."""
-    return acquire(work, port=port, observers=[notes or Notes()], only=only or ["dwell"])
+    return acquire(work, port=port, observer=notes or Notes(), only=only or ["dwell"])
 
 
 def sine(name: str, *, seconds: float, frequency: float = 2.0, settle: float = 0.0) -> Recording:

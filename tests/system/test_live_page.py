@@ -3,6 +3,7 @@
 import http.client
 import json
 import logging
+import re
 import socket
 import subprocess
 import sys
@@ -74,8 +75,8 @@ def folder(tmp_path):
 @pytest.fixture
 def page(folder) -> Iterator[LivePage]:
     """Yield a live page with a plan, of which one run is done."""
-    with LivePage(folder) as page:
-        page.planned(PLAN, frozenset({"decay-1"}))
+    with LivePage(LiveState(folder)) as page:
+        page.session.planned(PLAN, frozenset({"decay-1"}))
         yield page
 
 
@@ -186,7 +187,7 @@ def test_the_page_is_served_to_this_computer_only(page, folder):
     for name in named:
         assert ask(page, name)[0].status == 200
     with pytest.raises(HardwareError, match="not free"):
-        LivePage(folder, port=urlsplit(page.url).port or 0)
+        LivePage(LiveState(folder), port=urlsplit(page.url).port or 0)
 
 
 def test_the_secret_is_new_each_time_and_never_written(folder, caplog, capfd):
@@ -194,7 +195,7 @@ def test_the_secret_is_new_each_time_and_never_written(folder, caplog, capfd):
     caplog.set_level(logging.DEBUG)
     secrets = set()
     for _ in range(2):
-        with LivePage(folder) as page:
+        with LivePage(LiveState(folder)) as page:
             ask(page)
             ask(page, "press", "POST", "", Origin="http://evil.example")
             secrets.add(urlsplit(page.url).path.strip("/"))
@@ -241,8 +242,8 @@ def test_a_page_gets_events_and_a_ninth_page_is_refused(page):
         assert stream.readline() == b"event: state\n"
         state = json.loads(stream.readline().removeprefix(b"data: "))
         assert (state["title"], state["units"]) == (TITLE, {"position": "cm", "input": "V"})
-        page.started(SINE)
-        page.readings(lines(0, 50), Anomalies())
+        page.session.started(SINE)
+        page.session.readings(lines(0, 50), Anomalies())
         while not stream.readline().startswith(b"event: points"):
             pass
         points = json.loads(stream.readline().removeprefix(b"data: "))
@@ -270,14 +271,14 @@ def test_idle_connections_share_a_fixed_number_of_places(page, monkeypatch):
 def test_a_full_queue_does_not_keep_the_owner_out(page, monkeypatch):
     """An owner who waits in a queue full of idle connections is still served."""
     url, held, go_on = urlsplit(page.url), threading.Event(), threading.Event()
-    snapshot = page.snapshot
+    snapshot = page.session.snapshot
 
     def slow() -> object:
         held.set()
         assert go_on.wait(PATIENCE)
         return snapshot()
 
-    monkeypatch.setattr(page, "snapshot", slow)
+    monkeypatch.setattr(page.session, "snapshot", slow)
     with ExitStack() as opened:
         threading.Thread(target=news, args=(page, opened), daemon=True).start()
         assert held.wait(PATIENCE)  # the server's loop is blocked
@@ -296,16 +297,16 @@ def test_the_page_does_not_delay_a_run(folder):
     """With two browsers that read and one that does not, 50 lines take less than a heartbeat."""
     took = []
     with ExitStack() as opened:
-        with LivePage(folder) as page:
+        with LivePage(LiveState(folder)) as page:
             news(page, opened)
             readers = [threading.Thread(target=news(page, opened).read) for _ in range(2)]
             for reader in readers:
                 reader.start()
-            page.started(SINE)
+            page.session.started(SINE)
             for k in range(0, 2000, 50):
                 batch = lines(k, k + 50)
                 began = time.perf_counter()
-                page.readings(batch, Anomalies())
+                page.session.readings(batch, Anomalies())
                 took.append(time.perf_counter() - began)
                 time.sleep(0.02)  # the time that a bench needs for 50 lines
         for reader in readers:
@@ -320,8 +321,8 @@ def test_pages_get_the_end_of_the_session(folder, monkeypatch):
     """
     monkeypatch.setattr("pipeline.web._STRANGER_STAYS", 0.2)
     with ExitStack() as opened:
-        with LivePage(folder) as page:
-            page.planned(PLAN, frozenset())
+        with LivePage(LiveState(folder)) as page:
+            page.session.planned(PLAN, frozenset())
             stream = news(page, opened)
             url = urlsplit(page.url)
             with socket.create_connection((url.hostname, url.port), timeout=PATIENCE) as stranger:
@@ -366,9 +367,9 @@ def show(browser, page):
 
 def record(page: LivePage) -> None:
     """Show the page 3 s of rest and two seconds of a sine."""
-    page.settling(SINE, 3.0)
-    page.started(SINE)
-    page.readings(lines(0, 2000), Anomalies(lost=3))
+    page.session.settling(SINE, 3.0)
+    page.session.started(SINE)
+    page.session.readings(lines(0, 2000), Anomalies(lost=3))
 
 
 INK = """(id) => {
@@ -405,9 +406,9 @@ def test_the_page_shows_plan_progress_counters_and_curves(page, show):
     until(lambda: "86,180,233" in window.evaluate(INK, "positions"))
     assert BLUE not in window.evaluate(INK, "positions")
 
-    page.finished(RunOutcome(recording=SINE, lines=2000, partial="a cart passed the limit"))
+    page.session.finished(RunOutcome(recording=SINE, lines=2000, partial="a cart passed the limit"))
     expect(window.locator("#plan .partial .why")).to_have_text("a cart passed the limit")
-    page.started(LOOP)
+    page.session.started(LOOP)
     expect(window.locator("#plots .keys").first).to_contain_text("target")
 
 
@@ -418,7 +419,7 @@ def test_an_instruction_is_confirmed_with_its_button(page, show, how):
     done = threading.Event()
 
     def asked() -> None:
-        page.confirm("hold cart 2; pull cart 1 out")
+        page.session.confirm("hold cart 2; pull cart 1 out")
         done.set()
 
     threading.Thread(target=asked).start()
@@ -438,22 +439,22 @@ def test_only_buttons_that_have_an_effect_are_enabled(page, show):
     window = show()
     skip = window.get_by_role("button", name="Skip")
     expect(skip).to_be_disabled()
-    page.buttons.begin()
-    page.buttons.offer("skip", "keep", "repeat")
+    page.session.buttons.begin()
+    page.session.buttons.offer("skip", "keep", "repeat")
     record(page)
     window.get_by_role("button", name="Keep this partial run").click()
-    until(lambda: page.buttons.pressed == "keep")
+    until(lambda: page.session.buttons.pressed == "keep")
     expect(skip).to_be_disabled()
 
-    page.buttons.begin()
-    page.buttons.offer("repeat", "skip")
-    asked = threading.Thread(target=page.confirm, args=("Record sine-01 again",))
+    page.session.buttons.begin()
+    page.session.buttons.offer("repeat", "skip")
+    asked = threading.Thread(target=page.session.confirm, args=("Record sine-01 again",))
     asked.start()
     expect(window.get_by_role("button", name="Repeat")).to_be_focused()
     expect(window.locator("#confirm")).to_be_hidden()
     window.keyboard.press("Escape")
     asked.join()
-    assert page.buttons.pressed == "stop"
+    assert page.session.buttons.pressed == "stop"
     expect(window.locator("#status")).to_have_text("Stopping.")
 
 
@@ -466,7 +467,7 @@ def test_all_open_pages_show_the_same(page, show):
     record(page)
     second = show(size=PHONE)
     expect(second.locator("#plots .keys").first).to_contain_text("cart 1 3.99")
-    threading.Thread(target=page.confirm, args=("let go",)).start()
+    threading.Thread(target=page.session.confirm, args=("let go",)).start()
     expect(first.locator("#ask")).to_be_visible()
     second.get_by_role("button", name="Done").click()
     expect(first.locator("#ask")).to_be_hidden()
@@ -477,12 +478,12 @@ def test_the_live_page_is_accessible(page, show, size):
     """The live page is accessible (axe) by day and night, and nothing is wider than the screen."""
     window = show(size=size)
     record(page)
-    threading.Thread(target=page.confirm, args=("let go of all carts",)).start()
-    page.remark("the bench has no watchdog")
+    threading.Thread(target=page.session.confirm, args=("let go of all carts",)).start()
+    page.session.remark("the bench has no watchdog")
     expect(window.locator("#told")).to_be_visible()
     assert violations(window) == []
     assert window.evaluate("document.documentElement.scrollWidth") <= size[0]
-    page.answer(1)
+    page.session.answer(1)
 
 
 @pytest.mark.slow

@@ -45,7 +45,7 @@ def main() -> None:
 def _acquire(folder: Path, request: dict[str, Any], state: LiveState) -> str:
     """Acquire recordings; return a sentence on what was recorded."""
     outcomes = acquire(
-        folder, port=request["port"], observers=[state], only=request["only"], buttons=state.buttons
+        folder, port=request["port"], observer=state, only=request["only"], buttons=state.buttons
     )
     whole = {outcome.recording.id for outcome in outcomes if not outcome.partial}
     left = sorted({outcome.recording.id for outcome in outcomes} - whole)
@@ -64,7 +64,7 @@ def _explore(folder: Path, request: dict[str, Any], state: LiveState) -> str:
     turns = explore_bench(
         folder,
         port=request["port"],
-        observers=[state],
+        observer=state,
         buttons=state.buttons,
         goal=read_error_goal(until),
         write_diary=write_diary,
