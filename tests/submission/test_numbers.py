@@ -1,6 +1,7 @@
 """Any number, in any notation, in any file that people type, is read or refused."""
 
 import re
+import time
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +24,13 @@ from pipeline.resources import EXAMPLES, RUBRICS
 from pipeline.submission import load_submission
 from pipeline.submission.edit import edit_submission
 from pipeline.submission.load import NAME, parse_submission
-from pipeline.submission.toml import MOST_LISTED, parse_toml
+from pipeline.submission.toml import (
+    MOST_LISTED,
+    TomlSlip,
+    find_deep_key,
+    parse_toml,
+    read_toml,
+)
 from tests.helpers.poison import damaged, few_lines_at_most, poisoned_toml
 
 EXAMPLE = EXAMPLES / "two-cart"
@@ -205,3 +212,17 @@ def test_valid_numbers_are_read_as_python_reads_them():
     assert read == tomllib.loads(text) | {"c": (1, 2.5)}
     exact = parse_toml(text, where="f", error=PipelineError, as_typed=True)
     assert str(exact["c"][1]) == "2.50"
+
+
+@pytest.mark.parametrize("part", ["a", '" "', "' . '", "a1-b"])
+@pytest.mark.parametrize("between", [".", " . "])
+def test_a_key_of_many_parts_is_refused_at_once(part, between):
+    """A key of thousands of parts is refused before TOML is parsed, however its parts are typed."""
+    text = "x = 1\n" + between.join([part] * 50_000) + " = 1\n"
+    begin = time.process_time()
+    assert find_deep_key(text) == 2
+    with pytest.raises(TomlSlip, match="deeply"):
+        read_toml(text)
+    assert time.process_time() - begin < 5  # s; it takes 0.1, parsing takes minutes
+    value = f'"1{".5" * 100}"'
+    assert not find_deep_key(f"a.b.c = {value}\n")
