@@ -407,19 +407,19 @@ def test_teams_without_a_remark_are_accepted_together(ta, grades):
         clean = [
             e.submission for e in book.entries() if e.grade.status == "graded" and not e.grade.flags
         ]
-    page = ta.get(ROOM)
+    page = ta.get(ROOM + "clean")
     listed = re.findall(r'name="team" value="(.*?)" checked', page.text)
     assert sorted(map(unescape, listed)) == sorted(clean)
     changed, left, *_ = clean
     change(ta, changed, points="0.5", why="seen by another person")
     form = sent(page, *(name for name in clean if name != left))
-    assert apply(ta, ROOM + "accept", form).status == 303
+    assert apply(ta, ROOM + "clean", form).status == 303
     assert "1 team changed meanwhile" in ta.get(ROOM).text
     with Gradebook(grades) as book:
         by = {entry.submission: entry.reviewed_by for entry in book.entries()}
     assert {name for name, who in by.items() if who} == set(clean) - {changed, left}
-    assert apply(ta, ROOM + "accept", sent(page, "nobody")).status == 422
-    assert apply(ta, ROOM + "accept", sent(page)).status == 422
+    assert apply(ta, ROOM + "clean", sent(page, "nobody")).status == 422
+    assert apply(ta, ROOM + "clean", sent(page)).status == 422
 
 
 def test_earlier_reasons_are_offered(ta):

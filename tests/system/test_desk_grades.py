@@ -39,6 +39,11 @@ def test_the_grading_pages_are_accessible(show, tmp_path):
             folded.press("Enter")
         assert fits(window)
         with window.expect_navigation():
+            window.get_by_role("link", name="teams without a remark").click()
+        expect(window.locator("[name=team]")).to_have_count(8)
+        assert fits(window)
+        window.go_back()
+        with window.expect_navigation():
             window.get_by_role("link", name="team-02", exact=True).click()
         expect(window.get_by_text("stands in team-03 too")).to_be_visible()
         with window.expect_navigation():

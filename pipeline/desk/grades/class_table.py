@@ -99,8 +99,7 @@ def show(ask: PageRequest) -> Response:
         words=WORDS,
         titles=titles,
         next=unseen[0].line.submission if unseen else "",
-        clean=[team for team in unseen if not team.line.in_doubt],
-        most=_ROWS,
+        clean=sum(not team.line.in_doubt for team in unseen),
         flags=count_flags(shown),
         lost=count_lost(shown, titles),
         sets=open_gradebook(ask).changed_together()[:_MOST_SETS],
@@ -118,9 +117,21 @@ def show(ask: PageRequest) -> Response:
         asked=_find_run(ask, named=shown.names is None),
         n_requests=open_gradebook(ask).n_waiting(),
         released=open_gradebook(ask).released,
-        signature=find_signature(ask),
         may_release=may_release(ask),
         platforms=PLATFORMS.values(),
+    )
+
+
+def show_clean(ask: PageRequest) -> Response:
+    """Show the list of teams that can be accepted together: no remark, and not yet reviewed."""
+    shown = read_class(ask)
+    return ask.page(
+        "clean",
+        title="Teams without a remark",
+        teams=[one for one in Filter(seen="no").chosen(shown) if not one.line.in_doubt],
+        points=points_text,
+        titles={asked.id: capital(asked.title or asked.id) for asked in shown.rubric.criteria},
+        signature=find_signature(ask),
     )
 
 
