@@ -270,6 +270,17 @@ def test_no_comment_names_the_other_team(tmp_path, platform):
     assert not any("b-team" in text for text in texts)
 
 
+@pytest.mark.parametrize("platform", PLATFORMS.values(), ids=PLATFORMS)
+def test_no_export_for_students_has_a_number_that_they_must_find(tmp_path, platform):
+    """With `see = "check"`, no comment or result contains a computed number."""
+    students = RUBRIC.students.model_copy(update={"see": "check"})
+    rubric = RUBRIC.model_copy(update={"students": students})
+    with book_of(tmp_path / "g.sqlite", HALF, rubric=rubric) as book:
+        export(book, platform, tmp_path / "out")
+    texts = [path.read_text("utf-8") for path in (tmp_path / "out").rglob("*.*")]
+    assert not any(number in text for text in texts for number in ("19.6", "3.12"))
+
+
 # ------------------------------------------------------------------------------- rosters
 
 
