@@ -11,7 +11,7 @@ from pipeline.errors import ConfigError
 from pipeline.grading.batch.grade_class import scratch_in
 from pipeline.lock import lock_or_refuse
 from pipeline.submission import load_submission
-from pipeline.submission.edit import Outdated, edit_submission, submission_text, text_digest
+from pipeline.submission.edit import Stale, edit_submission, submission_text, text_digest
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.desks import a_submission
 from tests.helpers.waiting import PATIENCE
@@ -92,7 +92,7 @@ def test_an_edit_waits_for_that_of_another_process(tmp_path):
         with pytest.raises(TimeoutError):
             mine.result(timeout=0.5)
         other.communicate(timeout=PATIENCE)
-        with pytest.raises(Outdated):
+        with pytest.raises(Stale):
             mine.result(timeout=PATIENCE)
     assert load_submission(folder).title == "other"
 

@@ -22,6 +22,7 @@ from pipeline.desk.browse import find_root
 from pipeline.desk.gradebooks import Gradebooks
 from pipeline.desk.jobs import Job, Jobs, WorkerPool
 from pipeline.desk.navigation import list_links
+from pipeline.desk.parts import leave_out_parts
 from pipeline.desk.users import Place, User, name_place
 from pipeline.desk.visibility import Visibility
 from pipeline.errors import ConfigError
@@ -247,7 +248,10 @@ class PageRequest:
         return self.request.query_params.get(name, "")
 
     def page(self, template: str, *, status: int = 200, **context: Any) -> Response:
-        """Return a page made from a template, with the state of its folder's job."""
+        """Return a page made from a template, with the state of its folder's job.
+
+        An answer to htmx leaves out the parts that the browser has; see `parts`.
+        """
         folder = self.place if isinstance(self.place, Path) else None
         everywhere = {
             "user": self.user,
@@ -261,6 +265,7 @@ class PageRequest:
             "messages": lambda place="": self.desk.messages.pop(self._room(place), []),
         }
         text = _environment().get_template(f"{template}.html.j2").render(everywhere | context)
+        text = leave_out_parts(text, self.request.headers.get("x-parts", ""))
         if prefix := self.request.scope.get("prefix"):
             text = _ADDRESS.sub(lambda found: f'{found[1]}="{escape(prefix)}/', text)
         return HTMLResponse(text, status_code=status)

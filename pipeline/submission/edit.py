@@ -10,7 +10,7 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Array
 
-from pipeline.errors import ConfigError, SubmissionError
+from pipeline.errors import ConfigError, PipelineError, SubmissionError
 from pipeline.lock import lock_when_free
 from pipeline.names import parameter_names
 from pipeline.output import write_file
@@ -26,12 +26,12 @@ from pipeline.submission.models import MOST_CARTS, Submission
 from pipeline.submission.toml import Value, read_text, toml_value
 
 
-class Outdated(SubmissionError):
-    """The file was changed by others after an edit was prepared; `text` is its present content."""
+class Stale(PipelineError):
+    """A file was changed by others after an edit was prepared; `text` is its present content."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, name: str, text: str) -> None:
         super().__init__(
-            f"{NAME}: was changed in the meantime, by another program or in another window"
+            f"{name}: was changed in the meantime, by another program or in another window"
         )
         self.text = text
 
@@ -50,8 +50,24 @@ def submission_text(folder: Path) -> str:
 
 
 def text_digest(text: str) -> str:
-    """Return a digest that identifies the content of the file."""
+    """Return a digest that identifies the content of a file."""
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def require_version(text: str, version: str, *, name: str) -> None:
+    """Refuse an edit that was prepared for another text.
+
+    Parameters
+    ----------
+    version : digest of the text for which the edit was prepared.
+    name : name of the file in the message.
+
+    Raises
+    ------
+    Stale : the text is another one now.
+    """
+    if version != text_digest(text):
+        raise Stale(name, text)
 
 
 def edit_submission(
@@ -68,12 +84,12 @@ def edit_submission(
     ------
     SubmissionError : the result would be invalid (`InvalidSubmission`), or the file cannot be
         changed in this way.
-    Outdated : the file's text is not the one for which the change was prepared.
+    Stale : the file's text is not the one for which the change was prepared.
     """
     with lock_when_free(folder):
         text = submission_text(folder)
-        if version and version != text_digest(text):
-            raise Outdated(text)
+        if version:
+            require_version(text, version, name=NAME)
         where = f"{folder.resolve().name}/{NAME}"
         newline = "\r\n" if "\r\n" in text else "\n"
         try:

@@ -9,11 +9,11 @@ htmx.onLoad(() => {
     const end = () => {
       events.close();
       if (shown.isConnected)
-        htmx.ajax("GET", location.pathname, { target: "#main", select: "#main > *", swap: "innerHTML show:none" });
+        htmx.ajax("GET", location.pathname + location.search, { source: shown, target: "#main", select: "#main > *", swap: "innerHTML show:none" });
     };
     events.addEventListener("stage", (event) => {
       if (!shown.isConnected) return events.close();
-      shown.querySelector("span").textContent = event.data;
+      for (const stage of document.querySelectorAll("[data-events] span, [data-stage]")) stage.textContent = event.data;
     });
     events.addEventListener("end", end);
   }
@@ -34,22 +34,22 @@ htmx.onLoad(() => {
     });
   }
 });
-document.addEventListener("htmx:sendError", () => {
-  const status = document.querySelector("[role=status]");
-  status.textContent = "No answer: the desk has stopped, or the upload is too large.";
+
+// The server sends only the parts of the page that differ from these. A part that stays has the version of the file in it with
+// which it came: a form sends that of the page.
+document.addEventListener("htmx:configRequest", ({ detail }) => {
+  if (detail.target.id !== "main") return;
+  const parts = [...document.querySelectorAll("[data-part]")].map((one) => `${one.id}=${one.dataset.part}`).join(" ");
+  if (parts.length < 7000) detail.headers["X-Parts"] = parts; // servers refuse longer headers
+  const seen = document.querySelector("#seen")?.value;
+  if (seen && detail.formData.has("seen")) detail.formData.set("seen", seen);
 });
 
-// An answer replaces all of #main. Of each page, by its heading, is kept what was typed and not sent with the request; it goes
-// back when the page comes back. A row is known by its experiment, whose number may have changed.
-// So does what somebody unfolded.
-const unsaved = new Map(), sent = new WeakMap(), opened = new Set();
-let going_on = []; // where the request came from: it does not fold while somebody types there
-let typing = null; // the field in which somebody types, and where in it
-document.addEventListener("click", (event) => {
-  const folded = event.target.closest("summary")?.parentElement;
-  if (folded?.id) opened[folded.open ? "delete" : "add"](heading() + folded.id);
-});
-let before = "";
+// What is typed and not sent goes back into a part that is replaced, also after another page. A row is known by its experiment,
+// whose number may have changed. What is unfolded stays so, but an answer for several rows lets their group fold.
+const left = new Map(); // by page: what was typed there, and what was unfolded
+let sent = new WeakMap(); // by field: its state when it was last sent
+let before = "", typing = null, rows = [];
 const heading = () => document.querySelector("h1").textContent;
 const switched = (one) => one.type === "checkbox" || one.type === "radio";
 const state = (one) => (switched(one) ? one.checked : one.value);
@@ -58,81 +58,67 @@ const shown = (one) => {
   if (one.tagName !== "SELECT") return one.defaultValue;
   return ([...one.options].find((option) => option.defaultSelected) ?? one.options[0])?.value;
 };
-const differs = (one) => state(one) !== shown(one);
+const unsaved = (one) => state(one) !== (sent.has(one) ? sent.get(one) : shown(one));
 const key = (one) =>
   [one.form?.dataset.row ?? one.form?.id, one.name.replace(/^experiments\.\d+/, ""), switched(one) && one.value].join("\n");
 const typed = (within) => [...within.querySelectorAll("input:not([type=hidden], [type=file]), select, textarea")].filter((one) => one.name);
-document.addEventListener("htmx:beforeSend", (event) => {
-  const form = event.detail.elt.closest("form");
-  if (form) sent.set(event.detail.xhr, new Map(typed(form).map((one) => [one, state(one)])));
+const place = (one) => [one.closest("[data-row]")?.dataset.row, one.id.replace(/-\d+$/, "")].join("\n");
+const around = (one) => (one ? [one, ...around(one.parentElement.closest("details"))] : []);
+const unfold = (one) => around(one.closest("details")).forEach((folded) => (folded.open = true));
+document.addEventListener("htmx:beforeSend", ({ detail }) => {
+  const form = detail.elt.closest("form");
+  if (form) for (const one of typed(form)) sent.set(one, state(one));
 });
-document.addEventListener("htmx:beforeSwap", (event) => {
-  if (event.detail.target.id !== "main") return;
-  const went = sent.get(event.detail.xhr) ?? new Map();
-  const kept = typed(event.detail.target).filter((one) => (went.has(one) ? state(one) !== went.get(one) : differs(one)));
+document.addEventListener("htmx:sendError", () => {
+  sent = new WeakMap();
+  document.querySelector("[role=status]").textContent = "No answer: the desk has stopped, or the upload is too large.";
+});
+document.addEventListener("htmx:beforeSwap", ({ detail }) => {
+  if (detail.target.id !== "main") return;
   before = heading();
-  const field = document.activeElement;
+  const field = document.activeElement, folding = around(detail.requestConfig?.elt.closest(".together")?.closest("details"));
   typing = field.id && { id: field.id, at: field.selectionStart, to: field.selectionEnd };
-  going_on = [];
-  const began = event.detail.requestConfig?.elt; // an answer for several rows lets their group fold
-  for (let around = began?.matches(".together") ? null : began?.closest("form, details"); around; around = around.parentElement.closest("details"))
-    going_on.push(around.id, ...[...around.querySelectorAll("details[open]")].map((one) => one.id));
-  unsaved.set(before, new Map(kept.map((one) => [key(one), state(one)])));
+  left.set(before, {
+    typed: new Map(typed(detail.target).filter(unsaved).map((one) => [key(one), state(one)])),
+    open: [...detail.target.querySelectorAll("details[id][open]")].filter((one) => !folding.includes(one)).map(place),
+  });
 });
-document.addEventListener("htmx:afterSwap", (event) => {
-  if (event.detail.target.id !== "main") return;
-  const kept = unsaved.get(heading()) ?? new Map();
-  const back = [];
-  for (const one of event.detail.target.querySelectorAll("details[id]")) one.open ||= opened.has(heading() + one.id) || going_on.includes(one.id);
-  for (const one of typed(event.detail.target)) {
-    if (!kept.has(key(one))) continue;
-    one[switched(one) ? "checked" : "value"] = kept.get(key(one));
-    back.push(one);
+document.addEventListener("htmx:afterSwap", ({ detail }) => {
+  if (detail.target.id !== "main") return;
+  const kept = left.get(heading()) ?? { typed: new Map(), open: [] };
+  for (const one of detail.target.querySelectorAll("details[id]")) one.open ||= kept.open.includes(place(one));
+  rows = [];
+  for (const one of typed(detail.target)) {
+    if (!kept.typed.has(key(one)) || unsaved(one)) continue;
+    one[switched(one) ? "checked" : "value"] = kept.typed.get(key(one));
     unfold(one);
+    if (one.form?.dataset.row) rows.push(one);
   }
   if (heading() !== before) return scrollTo(0, 0); // another page altogether
-  go_on_typing();
-  rows = back.filter((one) => one.form?.dataset.row && (left.has(key(one)) || one === document.activeElement));
-  left.clear();
-});
-const unfold = (one) => {
-  for (let around = one.closest("details"); around; around = around.parentElement.closest("details")) around.open = true;
-};
-// What is folded cannot have the focus: the row may now be among the understood ones.
-const go_on_typing = () => {
   const field = typing && document.getElementById(typing.id);
   if (!field || field === document.activeElement) return;
-  unfold(field);
+  unfold(field); // the row may now be among the understood ones
   field.focus();
   if (typing.at != null) field.setSelectionRange(typing.at, typing.to);
-};
-// A row saves itself when a field is left: also if its last answer was on the way then.
-let rows = [];
-const left = new Set();
-document.addEventListener("change", (event) => left.add(key(event.target)), true);
+});
+// A row saves itself when a field is left: also if the answer to an earlier change was on the way then.
+const changed = new Set();
+document.addEventListener("change", (event) => changed.add(key(event.target)), true);
 document.addEventListener("htmx:afterSettle", () => {
-  for (const one of rows) {
-    const save = () => {
-      if (one.isConnected && differs(one) && going.get(one) !== state(one)) one.dispatchEvent(new Event("change", { bubbles: true }));
-    };
+  const again = rows.splice(0).filter((one) => changed.has(key(one)) || one === document.activeElement);
+  changed.clear();
+  for (const one of again) {
+    const save = () => one.isConnected && unsaved(one) && one.dispatchEvent(new Event("change", { bubbles: true }));
     if (one === document.activeElement) one.addEventListener("blur", save, { once: true });
     else save();
   }
-  rows = [];
 });
 
 // What is made of what is saved waits where something typed is not, nor on its way: what stands behind it says how to go on.
-let going = new WeakMap();
-document.addEventListener("htmx:beforeSend", (event) => {
-  const form = event.detail.elt.closest("form");
-  if (form) for (const one of typed(form)) going.set(one, state(one));
-});
-document.addEventListener("htmx:sendError", () => (going = new WeakMap()));
-const hold = (event) => {
+document.addEventListener("click", (event) => {
   const made = event.target.closest("[data-of-saved]");
-  if (!made || !typed(document).some((one) => differs(one) && going.get(one) !== state(one))) return;
+  if (!made || !typed(document).some(unsaved)) return;
   event.preventDefault();
   event.stopPropagation();
   made.closest("p").nextElementSibling.hidden = false;
-};
-document.addEventListener("click", hold, true);
+}, true);

@@ -22,7 +22,7 @@ from pipeline.ingest.fill import data_files, experiment_doubts, fill_submission
 from pipeline.ingest.read import read_data
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission, new_submission
-from pipeline.submission.edit import Outdated, append_experiment, edit_submission, text_digest
+from pipeline.submission.edit import Stale, append_experiment, edit_submission, text_digest
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.recordings import facts
 
@@ -426,7 +426,7 @@ def test_an_outdated_change_is_refused(tmp_path):
     seen = text_digest(toml.read_text(encoding="utf-8"))
     now = toml.read_text(encoding="utf-8") + "# from outside\n"
     toml.write_text(now, encoding="utf-8")
-    with pytest.raises(Outdated) as refused:
+    with pytest.raises(Stale) as refused:
         edit_submission(tmp_path / "team", lambda d: d.update(title="x"), version=seen)
     assert refused.value.text == toml.read_text(encoding="utf-8") == now
 

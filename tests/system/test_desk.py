@@ -16,6 +16,7 @@ from pipeline.desk.app import DeskServer
 from pipeline.identify.springs import fill_folder
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
+from tests.desk.test_student import ask_for
 from tests.helpers.accessibility import violations
 from tests.helpers.desks import a_submission
 from tests.helpers.places import ROOT
@@ -380,6 +381,125 @@ def test_the_desk_works_without_scripts(show, tmp_path):
         window.get_by_role("button", name="Upload", exact=True).click()
         expect(window.get_by_text("already exists")).to_be_visible()
     assert load_submission(folder).title == "Plain"
+
+
+# What a page says, and what its fields hold, whatever is folded.
+SHOWN = """() => {
+  const main = document.querySelector("#main").cloneNode(true);
+  for (const one of main.querySelectorAll("noscript, div[role=status]")) one.remove();
+  const fields = document.querySelectorAll("input:not([type=hidden]), select, textarea");
+  return [...main.textContent.split(/\\s+/), ...[...fields].map(
+    one => `${one.name}=${one.type == "checkbox" ? one.checked : one.value}`)];
+}"""
+
+
+@pytest.mark.usefixtures("work_here")
+@pytest.mark.parametrize("scripts", [True, False])
+def test_a_change_updates_the_page_wherever_it_matters(show, tmp_path, scripts):
+    """After a changed note, a changed kind and a removed recording, the page is as if loaded anew.
+
+    With scripts, only the changed rows are sent: 33 recordings and one note are at most 10 kB.
+    """
+    folder = a_submission(tmp_path / "team", "two-cart")
+    ask_for(folder)
+    index, run = next((i, e) for i, e in enumerate(load_submission(folder).experiments)
+                      if e.kind == "step")  # fmt: skip
+    with DeskServer(folder=folder) as server:
+        window = show(server.url, java_script_enabled=scripts)
+        stands = window.get_by_label("Current state")
+        row = window.locator("tr").filter(has_text=Path(run.file).name)
+        steps = window.locator("#kind-step > summary")
+        fresh, answers = window.context.new_page(), []
+        window.on("response", lambda answer: answers.append(answer))
+
+        def is_as_if_loaded_anew() -> None:
+            fresh.goto(window.url)
+            if scripts:
+                assert window.evaluate(SHOWN) == fresh.evaluate(SHOWN)
+            else:
+                window.goto(window.url)
+
+        expect(stands).to_contain_text("33 recordings, all understood. The report is up to date.")
+        expect(steps).to_contain_text("Steps · 4")
+        steps.click()
+        row.locator("summary").click()
+        answers.clear()
+        row.get_by_label("Note").fill("bumped")
+        if scripts:
+            row.get_by_label("Note").press("Tab")
+        else:
+            row.get_by_role("button", name="Save").last.click()
+        expect(stands).to_contain_text("33 recordings, all understood. The report is out of date.")
+        expect(window.locator(".way")).to_contain_text("Report out of date")
+        if scripts:
+            assert 0 < sum(one.request.sizes()["responseBodySize"] for one in answers) <= 10_000
+            expect(row.get_by_label("Note")).to_be_visible()  # what was unfolded stays so
+        is_as_if_loaded_anew()
+
+        unfold(window)
+        row.get_by_label("Kind").select_option("closed_loop")
+        if not scripts:
+            row.locator("details").last.locator("summary").click()
+            row.get_by_role("button", name="Save").last.click()
+        expect(stands).to_contain_text("33 recordings, 1 file needs you.")
+        expect(steps).to_contain_text("Steps · 3")
+        loops = window.locator("#kind-closed_loop")
+        expect(loops.locator("> summary .chip")).to_have_text("1 to look at")
+        expect(loops.locator("tr").filter(has_text=Path(run.file).name)).to_have_count(1)
+        is_as_if_loaded_anew()
+
+        if not scripts:
+            unfold(window)
+        if not row.get_by_role("button", name="Remove").is_visible():
+            row.get_by_text(run.id, exact=True).click()
+        row.get_by_role("button", name="Remove").click()
+        expect(stands).to_contain_text("33 recordings, 1 file needs you.")
+        expect(window.locator("#kind-unknown > summary")).to_contain_text("Not understood · 1")
+        expect(loops.locator("> summary .chip")).to_have_text("understood")
+        is_as_if_loaded_anew()
+        assert run.id not in [one.id for one in load_submission(folder).experiments]
+        # The rows behind it have other numbers now; a change still reaches the right one.
+        following = load_submission(folder).experiments[index]
+        unfold(window)
+        row = window.locator("tr").filter(has_text=Path(following.file).name)
+        row.get_by_text(following.id, exact=True).click()
+        row.get_by_label("Note").fill("after")
+        row.get_by_role("button", name="Save").last.click()
+        until(lambda: load_submission(folder).experiments[index].note == "after")
+        assert load_submission(folder).experiments[index].id == following.id
+
+
+@pytest.mark.usefixtures("work_here")
+def test_a_page_that_kept_its_rows_still_notices_the_changes_of_others(show, tmp_path):
+    """If two people edit at once, the second is told, and then sees the change of the first."""
+    folder = a_submission(tmp_path / "team", "two-cart")
+    with DeskServer(folder=folder) as server:
+        window = show(server.url)
+        other = window.context.new_page()
+        other.goto(window.url)
+        unfold(window)
+        unfold(other)
+        for number, text in ((4, "first"), (5, "second")):  # the second save is based on the first
+            window.locator(f"#row-{number} details").last.locator("summary").click()
+            window.locator(f"#experiments-{number}-note").fill(text)
+            window.locator(f"#experiments-{number}-note").press("Tab")
+            until(lambda i=number, t=text: load_submission(folder).experiments[i].note == t)
+        other.locator("#row-6 details").last.locator("summary").click()
+        other.locator("#experiments-6-note").fill("other")
+        other.locator("#experiments-6-note").press("Tab")
+        heading = other.get_by_role("heading", level=1)
+        expect(heading).to_have_text(f"{NAME} was changed meanwhile")
+        other.get_by_role("link", name="Continue with the current file").click()
+        expect(heading).to_have_text("team")
+        expect(other.locator("#experiments-5-note")).to_have_value("second")
+        other.locator("#experiments-6-note").fill("other")
+        other.locator("#experiments-6-note").press("Tab")
+        until(lambda: load_submission(folder).experiments[6].note == "other")
+    assert [e.note for e in load_submission(folder).experiments[4:7]] == [
+        "first",
+        "second",
+        "other",
+    ]
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """The rubric editor: a form for the numbers next to the text; an invalid rubric is not saved."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlencode
 
@@ -22,9 +24,40 @@ from pipeline.grading.rubric_text import rubric_text
 from pipeline.grading.words import WORDS, points_text
 from pipeline.output import write_file
 from pipeline.resources import RUBRICS
-from pipeline.submission.edit import text_digest
+from pipeline.submission.edit import Stale, require_version, text_digest
 
 _NEW = "new"  # version in a form whose file does not exist yet
+
+
+@dataclass(frozen=True, kw_only=True)
+class RubricPage:
+    """What the editor of a rubric shows.
+
+    Attributes
+    ----------
+    seen : version of the file on which the typed text is based.
+    now : current text of the file, if somebody has changed it since.
+    classes : number and name of each open class.
+    graded : after saving: number, name and options of each class that the rubric graded.
+    """
+
+    file: Path
+    typed: RubricDraft
+    seen: str
+    now: str | None
+    saved: bool
+    classes: Sequence[tuple[int, str]]
+    graded: Sequence[tuple[int, str, Mapping[str, str]]]
+
+    @property
+    def is_new(self) -> bool:
+        """Whether the file does not exist yet."""
+        return self.seen == _NEW
+
+    @property
+    def in_words(self) -> str:
+        """What the rubric asks, in words; "" while it is not valid."""
+        return rubric_text(self.typed.rubric) if self.typed.rubric else ""
 
 
 def show(ask: PageRequest) -> Response:
@@ -57,9 +90,13 @@ def check(ask: PageRequest) -> Response:
 def save(ask: PageRequest) -> Response:
     """Save a valid rubric, unless the file has changed since it was shown."""
     path, typed, seen = read_rubric_path(ask), read_draft(ask.form), ask.text("seen")
-    now = rubric_source(path) if path.exists() else None
-    if seen != (_NEW if now is None else text_digest(now)):
-        return show_editor(ask, path, typed, version=seen, now=now or "", status=409)
+    try:
+        if path.exists():
+            require_version(rubric_source(path), seen, name=path.name)
+        elif seen != _NEW:
+            raise Stale(path.name, "")
+    except Stale as error:
+        return show_editor(ask, path, typed, version=seen, now=error.text, status=409)
     if typed.rubric is None:
         return show_editor(ask, path, typed, version=seen, status=422)
     write_file(path, typed.text)
@@ -84,23 +121,17 @@ def show_editor(
     now : current text of the file, if somebody has changed it since.
     """
     saved = "saved" in ask.request.query_params
-    return ask.page(
-        "rubric",
-        status=status,
-        title=path.name,
+    page = RubricPage(
         file=path,
         typed=typed,
-        form=typed.form,
         seen=version,
-        is_new=version == _NEW,
         now=now,
-        asks=rubric_text(typed.rubric) if typed.rubric else "",
         saved=saved,
         classes=[(n, name_place(place)) for n, place in enumerate(ask.user.gradebooks)],
         graded=_classes_of(ask, path) if saved else [],
-        points=points_text,
-        words=WORDS,
     )
+    functions = {"points": points_text, "words": WORDS}
+    return ask.page("rubric", status=status, title=path.name, page=page, **functions)
 
 
 def _classes_of(ask: PageRequest, path: Path) -> list[tuple[int, str, dict[str, str]]]:

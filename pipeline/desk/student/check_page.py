@@ -1,9 +1,31 @@
 """The check in the student's room: which numbers disagree and where to look, but no values."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
 from starlette.responses import Response
 
 from pipeline.desk.page_request import PageRequest
-from pipeline.desk.student.submission_view import read_room
+from pipeline.desk.student.submission_view import SubmissionView, read_room
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckPage:
+    """What the page of the check shows: the submission, and `check_state.describe`."""
+
+    room: SubmissionView
+    busy: bool
+    problems: Sequence[str]
+    ready: bool
+    last: bool
+    result: str
+    rows: Sequence[Mapping[str, Any]]
+    agree: Sequence[str]
+    not_checked: Sequence[str]
+    unread: Sequence[str]
+    doubtful: Sequence[str]
+    asked: str
 
 
 def show(ask: PageRequest) -> Response:
@@ -14,9 +36,8 @@ def show(ask: PageRequest) -> Response:
     job = ask.desk.jobs.of(folder)
     busy = job is not None and not job.over
     found = ask.desk.workers.do("describe_check", folder=str(folder))
-    return ask.page(
-        "check", title=f"Check of {folder.name}", room=read_room(ask), busy=busy, **found
-    )
+    page = CheckPage(room=read_room(ask), busy=busy, **found)
+    return ask.page("check", title=f"Check of {folder.name}", page=page)
 
 
 def begin(ask: PageRequest) -> Response:

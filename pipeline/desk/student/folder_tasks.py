@@ -31,7 +31,13 @@ from pipeline.lock import lock_when_free
 from pipeline.output import write_file
 from pipeline.report.sections.answers import with_answer, written_answer
 from pipeline.submission import load_submission
-from pipeline.submission.edit import Outdated, edit_submission, submission_text, text_digest
+from pipeline.submission.edit import (
+    Stale,
+    edit_submission,
+    require_version,
+    submission_text,
+    text_digest,
+)
 from pipeline.submission.load import (
     MAX_NOTES_BYTES,
     NAME,
@@ -157,7 +163,9 @@ def edit_file(
     *,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Change `submission.toml`; return `outdated` or `fault` if it was not changed, or neither.
+    """Change `submission.toml`; return {}, or why it was not changed.
+
+    This is a `fault`, or the present text of a `stale` file.
 
     Parameters
     ----------
@@ -181,10 +189,8 @@ def edit_file(
 
     try:
         edit_submission(Path(folder), change, version=seen or "nothing")
-    except Outdated as error:
-        now = read_document(error.text)
-        fault = asdict(Fault.of(error))
-        return {"outdated": {"text": error.text, "document": now}, "fault": fault}
+    except Stale as error:
+        return {"stale": error.text}
     except SubmissionError as error:
         return {"fault": asdict(Fault.of(error))}
     return {}
@@ -272,8 +278,8 @@ def read_questions(folder: str, ids: Sequence[str], *, progress: Progress) -> di
 
 def answer_question(
     folder: str, id_: str, words: str, seen: str, *, progress: Progress
-) -> str | None:
-    """Write an answer into `notes.md`; return the text of the file if it is not the seen one.
+) -> dict[str, str]:
+    """Write an answer into `notes.md`; return {}, or the present text of a `stale` file.
 
     Parameters
     ----------
@@ -282,15 +288,17 @@ def answer_question(
     place = Path(folder)
     with lock_when_free(place):
         notes = read_notes(place)
-        if seen != text_digest(notes):
-            return notes
+        try:
+            require_version(notes, seen, name=NOTES)
+        except Stale as error:
+            return {"stale": error.text}
         if id_ not in [one["id"] for one in read_findings(place)["questions"]]:
             raise SubmissionError(f"the report has no question {id_!r}")
         new = with_answer(notes, id_, words)
         if len(new.encode()) > MAX_NOTES_BYTES:
             raise SubmissionError(f"{NOTES} would exceed {MAX_NOTES_BYTES:,} bytes")
         write_file(place / NOTES, new)
-    return None
+    return {}
 
 
 FOLDER_TASKS = (

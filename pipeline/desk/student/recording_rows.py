@@ -16,8 +16,9 @@ from pipeline.desk.student.form import (
     is_marked,
     is_of_loop,
 )
-from pipeline.desk.student.setup_questions import ask_held
+from pipeline.desk.student.set_up import ask_held
 from pipeline.ingest.inspect import NO_CLOCK
+from pipeline.submission.edit import text_digest
 from pipeline.submission.load import list_experiments, posix, stated_columns
 from pipeline.submission.models import MOST_EXPERIMENTS
 from pipeline.words.numbers import group_messages
@@ -61,6 +62,11 @@ class RecordingRow:
     fields: tuple[Field, ...] = ()
     problems: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+
+    @property
+    def key(self) -> str:
+        """What identifies the row on a page: the index of its table, or else its file."""
+        return str(self.index) if self.index is not None else text_digest(ascii(self.file))[:12]
 
     @property
     def kind(self) -> str:

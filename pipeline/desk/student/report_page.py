@@ -1,27 +1,51 @@
 """The report in the student's room, and its questions, which are answered in `notes.md`."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from starlette.responses import Response
 
 from pipeline.desk.last_report import NOTES, read_findings
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.student.form import sign_fields
-from pipeline.desk.student.submission_view import SubmissionView, read_room
+from pipeline.desk.student.submission_view import StalePage, SubmissionView, read_room, show_stale
 from pipeline.processes import Failed
-from pipeline.submission.load import file_problem, list_experiments
+from pipeline.submission.load import NAME, file_problem, list_experiments
 from pipeline.words.numbers import join_names
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportPage:
+    """What the page of the report shows; `there` says whether there is a report."""
+
+    room: SubmissionView
+    there: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class QuestionsPage:
+    """What the page of questions shows.
+
+    Attributes
+    ----------
+    questions : id, section, text, answer, and why the answer was refused, for each question.
+    signs : the signs of the input that one click writes, and their runs; "" for no signs.
+    seen : digest of `notes.md`.
+    """
+
+    room: SubmissionView
+    questions: Sequence[Mapping[str, str]]
+    signs: str
+    problems: Sequence[str]
+    seen: str
 
 
 def show(ask: PageRequest) -> Response:
     """Show the report in a window below the steps."""
     folder = ask.folder()
-    return ask.page(
-        "report",
-        title=f"Report of {folder.name}",
-        room=read_room(ask),
-        there=file_problem(folder, "report/report.html") is None,
-    )
+    there = file_problem(folder, "report/report.html") is None
+    page = ReportPage(room=read_room(ask), there=there)
+    return ask.page("report", title=f"Report of {folder.name}", page=page)
 
 
 def show_questions(ask: PageRequest) -> Response:
@@ -33,22 +57,13 @@ def answer(ask: PageRequest) -> Response:
     """Write the answer to a question into `notes.md`; if it is refused, show it again as typed."""
     folder, id_, words = ask.folder(), ask.text("id"), ask.text("answer")
     try:
-        notes = ask.desk.workers.do(
+        found = ask.desk.workers.do(
             "answer_question", folder=str(folder), id_=id_, words=words, seen=ask.text("seen")
         )
     except Failed as error:
         return _show_questions(ask, status=422, refused={id_: (words, str(error))})
-    if notes is not None:
-        return ask.page(
-            "outdated",
-            status=409,
-            title=f"{NOTES} was changed meanwhile",
-            name=NOTES,
-            text=notes,
-            changed=[(f"Answer to {id_}", words, "")],
-            had="You typed",
-            back=f"{ask.here}questions",
-        )
+    if "stale" in found:
+        return _show_stale(ask, NOTES, found["stale"], changed=[(f"Answer to {id_}", words, "")])
     place = f"question-{id_}"
     return ask.back(f"{ask.here}questions#{place}", "Written into notes.md.", place=place)
 
@@ -62,9 +77,10 @@ def state_signs(ask: PageRequest) -> Response:
         seen=ask.text("seen"),
         signs=read_findings(folder)["turned"],
     )
+    if "stale" in found:
+        return _show_stale(ask, NAME, found["stale"])
     if "fault" in found:
-        status = 409 if "outdated" in found else 422
-        return _show_questions(ask, status=status, sign_error=found["fault"]["text"])
+        return _show_questions(ask, status=422, sign_error=found["fault"]["text"])
     return ask.back(f"{ask.here}questions#question-sign", "Saved.", place="question-sign")
 
 
@@ -97,16 +113,22 @@ def _show_questions(
     for one in [*findings["questions"], *others]:
         words, why = refused.get(one["id"]) or (found["answers"][one["id"]], "")
         questions.append({**one, "answer": words, "wrong": why})
-    return ask.page(
-        "questions",
-        status=status,
-        title=f"Questions about {folder.name}",
+    page = QuestionsPage(
         room=room,
         questions=questions,
         signs=_list_signs(room),
         problems=problems,
         seen=found["seen"],
     )
+    title = f"Questions about {folder.name}"
+    return ask.page("questions", status=status, title=title, page=page)
+
+
+def _show_stale(
+    ask: PageRequest, name: str, text: str, *, changed: Sequence[tuple[str, str, str]] = ()
+) -> Response:
+    page = StalePage(name=name, text=text, changed=changed, back=f"{ask.here}questions")
+    return show_stale(ask, page)
 
 
 def _list_signs(room: SubmissionView) -> str:

@@ -4,13 +4,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from starlette.responses import Response
+
 from pipeline.desk import last_report
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.student.form import Fault, Field, Group, fill_form, mark_errors
 from pipeline.desk.student.recording_rows import RecordingRow, list_rows
-from pipeline.desk.student.setup_questions import NO_QUESTIONS, ask_setup_questions
+from pipeline.desk.student.set_up import NO_QUESTIONS, ask_setup_questions, summarise
 from pipeline.desk.student.steps import Step, StepFacts, find_steps, next_step
-from pipeline.desk.student.summaries import summarise
 from pipeline.processes import Failed
 from pipeline.submission.edit import text_digest
 from pipeline.submission.load import NAME
@@ -61,6 +62,30 @@ class SubmissionView:
     def next(self) -> Step:
         """The step to do next."""
         return next_step(self.steps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StalePage:
+    """What the page shows if a file was changed by others after a form was shown.
+
+    Attributes
+    ----------
+    name, text : the file as it is now.
+    changed : label of each field that the form would change, its typed and its present value.
+    had : heading of the typed values.
+    back : address at which to continue.
+    """
+
+    name: str
+    text: str
+    changed: Sequence[tuple[str, str, str]]
+    back: str
+    had: str = "You typed"
+
+
+def show_stale(ask: PageRequest, page: StalePage) -> Response:
+    """Show both versions of a file that was changed meanwhile."""
+    return ask.page("stale", status=409, title=f"{page.name} was changed meanwhile", page=page)
 
 
 def read_room(
