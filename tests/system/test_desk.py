@@ -383,7 +383,7 @@ def test_the_desk_works_without_scripts(show, tmp_path):
     assert load_submission(folder).title == "Plain"
 
 
-# What a page says, and what its fields hold, whatever is folded.
+# The texts and the fields of a page, also those that are folded.
 SHOWN = """() => {
   const main = document.querySelector("#main").cloneNode(true);
   for (const one of main.querySelectorAll("noscript, div[role=status]")) one.remove();
@@ -396,7 +396,7 @@ SHOWN = """() => {
 @pytest.mark.usefixtures("work_here")
 @pytest.mark.parametrize("scripts", [True, False])
 def test_a_change_updates_the_page_wherever_it_matters(show, tmp_path, scripts):
-    """After a changed note, a changed kind and a removed recording, the page is as if loaded anew.
+    """After a changed note, a changed kind or a removed recording, a reload would change nothing.
 
     With scripts, only the changed rows are sent: 33 recordings and one note are at most 10 kB.
     """
@@ -471,7 +471,7 @@ def test_a_change_updates_the_page_wherever_it_matters(show, tmp_path, scripts):
 
 @pytest.mark.usefixtures("work_here")
 def test_a_page_that_kept_its_rows_still_notices_the_changes_of_others(show, tmp_path):
-    """If two people edit at once, the second is told, and then sees the change of the first."""
+    """If two people edit at once, the second save is refused; then the page shows the first."""
     folder = a_submission(tmp_path / "team", "two-cart")
     with DeskServer(folder=folder) as server:
         window = show(server.url)

@@ -39,12 +39,11 @@ def test_runs_and_models_are_compared_by_keyboard(show, tmp_path):  # noqa: F811
         window.get_by_role("link", name="Back to the files").click()
         window.locator("#kind-step > summary").click()
         window.get_by_role("link", name="Larger plot of step-2").click()
-        expect(framed.locator("#told")).to_have_text("step-2: overlay")
+        expect(framed.locator("#told")).to_have_text("step-2: position")
         assert fits(window)
         window.get_by_role("link", name="Without this frame").click()
         window.wait_for_url("**/report/compare.html#run=step-2")
         window.goto(window.url.partition("#")[0])
-        window.reload()
         expect(window.locator(".result")).to_contain_text("The linear model fits worst in")
         assert window.locator("canvas").evaluate_all(DRAWN) == [True, True]  # one plot per cart
 

@@ -56,7 +56,7 @@ class RubricPage:
 
     @property
     def in_words(self) -> str:
-        """What the rubric asks, in words; "" while it is not valid."""
+        """The rubric in words; "" while it is not valid."""
         return rubric_text(self.typed.rubric) if self.typed.rubric else ""
 
 

@@ -18,12 +18,14 @@ class PlotsPage:
 
     Attributes
     ----------
+    busy : whether a job is running in the folder.
     plots : address of the plots; "" if they are missing or out of date.
     again : address of this page, which keeps the chosen recording.
     failed : whether the last attempt to make the plots failed.
     """
 
     room: SubmissionView
+    busy: bool
     plots: str
     again: str
     failed: bool
@@ -31,14 +33,17 @@ class PlotsPage:
 
 def show(ask: PageRequest) -> Response:
     """Show the plots; if they are missing or out of date, show the job or a button to start it."""
-    chosen = _choose(ask)
+    room, chosen = read_room(ask), _choose(ask)
     again = f"{ask.here}compare{chosen and '?' + chosen}"
-    there = not _is_busy(ask) and plots_are_current(ask.folder())
+    # Read the job before the plots. If it ends in between, the page shows it as running, and asks
+    # again.
+    job, busy = ask.desk.jobs.of(ask.folder()), _is_busy(ask)
+    there = not busy and plots_are_current(ask.folder())
     if there and ask.request.headers.get("hx-request"):
         return ask.go(again)  # plots need a page of another width
-    job = ask.desk.jobs.of(ask.folder())
     page = PlotsPage(
-        room=read_room(ask),
+        room=room,
+        busy=busy,
         plots=f"{ask.here}{PLOTS}{chosen and '#' + chosen}" if there else "",
         again=again,
         failed=job is not None and job.task[0] == TASK and job.state in ("failed", "stopped"),

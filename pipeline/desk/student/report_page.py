@@ -16,7 +16,7 @@ from pipeline.words.numbers import join_names
 
 @dataclass(frozen=True, kw_only=True)
 class ReportPage:
-    """What the page of the report shows; `there` says whether there is a report."""
+    """The data of the report's page; `there` says whether there is a report."""
 
     room: SubmissionView
     there: bool

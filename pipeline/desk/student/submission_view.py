@@ -66,7 +66,7 @@ class SubmissionView:
 
 @dataclass(frozen=True, kw_only=True)
 class StalePage:
-    """What the page shows if a file was changed by others after a form was shown.
+    """The data of the page that is shown if a file was changed by others.
 
     Attributes
     ----------
