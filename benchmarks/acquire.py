@@ -49,7 +49,7 @@ def stream(folder: Path, *, minutes: float) -> None:
         process = psutil.Process(bench.pid)
         notes, own = _Once(), psutil.Process()
         began, before, bench_before = time.monotonic(), own.cpu_times(), process.cpu_times()
-        acquire(folder, port=bench.address, observers=[notes], only=["long"])
+        acquire(folder, port=bench.address, observer=notes, only=["long"])
         taken = time.monotonic() - began
         sent = bench.event("run")
         cpu = [
@@ -73,7 +73,7 @@ def faults(folder: Path, *, seconds: float) -> None:
     options = [option for kind in FAULTS for option in ("--fault", f"{kind}=0.01")]
     with emulator(*options) as bench:
         notes = Notes()
-        acquire(folder, port=bench.address, observers=[notes], only=["faulty"])
+        acquire(folder, port=bench.address, observer=notes, only=["faulty"])
         while (sent := bench.event("run"))["ended"] != "done":
             pass
     struck, outcome = sent["injected"], notes.outcomes[-1]
@@ -97,7 +97,7 @@ def stops(folder: Path, *, n: int) -> None:
             work = folder / str(trial)
             limits = PlanLimits(input=0.5, travel=0.05 + 0.1 * trial / n)
             write_work(work, [sine("far", seconds=5.0, frequency=1.6)], limits=limits)
-            acquire(work, port=bench.address, observers=[_Once()], only=["far"])
+            acquire(work, port=bench.address, observer=_Once(), only=["far"])
             while (sent := bench.event("run"))["ended"] != "stopped":
                 pass
             run = read_raw(work / "raw" / "far-1.raw")
