@@ -148,8 +148,9 @@ def _jumps(x: Array, *, spare: int = 0) -> _Rows:
     if not rows.size:
         return rows
     step = encoder_step(x)
-    # Behind a stuck encoder, the reading jumps back to a cart that moves.
-    is_back = np.isin(rows, [last for _, last in stuck_spans(x)]) & (after > 2 * step)
+    # Behind a stuck encoder, the reading jumps back to a cart that moves; a dropout also begins so.
+    stuck = [last for first, last in stuck_spans(x) if first - 1 not in rows]
+    is_back = np.isin(rows, stuck) & (after > 2 * step)
     return rows[(moves[rows] > _STEPS * step) & ~is_back] + 1
 
 

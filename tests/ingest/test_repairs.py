@@ -74,9 +74,9 @@ def test_wrong_readings_are_left_out(value, tmp_path):
     assert kept.t.size == N
 
 
-@pytest.mark.parametrize(("rows", "wrong"), [(3, True), (9, True), (14, False)])
+@pytest.mark.parametrize(("rows", "wrong"), [(3, True), (9, True), (12, True), (14, False)])
 def test_wrong_readings_in_a_row_are_left_out(rows, wrong, tmp_path):
-    """Nine readings in a row may be wrong; a longer stretch may be real."""
+    """Twelve readings in a row may be wrong; a longer stretch may be real."""
     x = X + 12.0
     x[700 : 700 + rows] = 0.0
     notes = facts(record(tmp_path, x).notes)
