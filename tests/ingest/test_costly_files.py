@@ -112,7 +112,7 @@ def test_the_memory_to_read_one_file_is_limited(tmp_path, monkeypatch):
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits address space")
 def test_a_workbook_that_inflates_is_refused_by_itself(tmp_path, monkeypatch):
     """A workbook that unpacks to much more than its size needs too much memory, whoever sent it."""
-    (tmp_path / "a.xlsx").write_bytes(package("<worksheet>" + " " * 50_000_000 + "</worksheet>"))
+    (tmp_path / "a.xlsx").write_bytes(package("<worksheet>" + " " * 300_000_000 + "</worksheet>"))
     monkeypatch.setattr(files, "MOST_MEMORY", 20_000_000)
     with pytest.raises(SubmissionError, match=r"^a\.xlsx:.*\b0\.02\b"):
         read_table(tmp_path, "a.xlsx")

@@ -22,6 +22,7 @@ _LEFT_OUT = frozenset({
     "message", "reason", "note", "notes", "warnings", "title", "advice", "problems", "doubts",
     "next_experiment", "comment", "remarks", "sentence", "needs", "unusable", "what_to_do",
 })  # fmt: skip
+_WITH_PATHS = "run.json"  # what a grading was called with
 _NAMES = ("id", "code", "name", "key", "experiment", "run", "cart", "effect", "number")
 _LONGEST = 6  # words of a name; a longer text is a sentence
 _ALIGNED = re.compile(r"[-−+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?", re.IGNORECASE)
@@ -32,6 +33,8 @@ def read_facts(folder: Path) -> Facts:
     found: Facts = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
+        if path.name == _WITH_PATHS:
+            continue
         if path.suffix == ".json" and not path.name.startswith("."):
             found[name] = tree(json.loads(path.read_text(encoding="utf-8")))
         elif path.suffix == ".csv":

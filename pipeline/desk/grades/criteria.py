@@ -9,7 +9,7 @@ from pipeline.desk.evidence import show_message, show_numbers
 from pipeline.grading.grade import Criterion, Flag, Grade
 from pipeline.grading.gradebook.entry import Entry
 from pipeline.grading.gradebook.events import Event
-from pipeline.grading.judge.costs import is_about
+from pipeline.grading.judge.remarks import is_about
 from pipeline.grading.publish.feedback import TONES, alternative, evidence_table, sentence
 from pipeline.grading.publish.feedback_figures import is_response, numbers_in
 from pipeline.grading.references.tolerance import exact, to_step

@@ -47,7 +47,7 @@ from pipeline.grading.intake.repairs import (
     save_repair,
     text_key,
 )
-from pipeline.grading.judge.costs import find_remarks
+from pipeline.grading.judge.remarks import find_remarks
 from pipeline.grading.publish.anonymous import renamed_events
 from pipeline.grading.publish.class_page import feedback_link
 from pipeline.grading.publish.view import view

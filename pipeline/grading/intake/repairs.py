@@ -98,12 +98,12 @@ def save_run(out: Path, run: Run) -> None:
 
 
 def read_run(out: Path) -> Run | None:
-    """Return what was graded last; None if this is not known."""
+    """Return what was graded last; None if this is not known or cannot be read."""
     try:
         plain = json.loads((out / FOLDER / _RUN).read_text("utf-8"))
-    except FileNotFoundError:
+        return Run(**{**plain, "paths": tuple(plain["paths"])})
+    except (OSError, ValueError, KeyError, TypeError):
         return None
-    return Run(**{**plain, "paths": tuple(plain["paths"])})
 
 
 def forget_repairs(out: Path, names: Iterable[str]) -> None:

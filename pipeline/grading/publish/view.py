@@ -10,7 +10,7 @@ from typing import Literal
 
 from pipeline.grading.grade import Code, Criterion, Flag, Grade
 from pipeline.grading.gradebook.entry import Entry
-from pipeline.grading.judge.costs import find_remarks
+from pipeline.grading.judge.remarks import find_remarks
 from pipeline.grading.publish.anonymous import anonymise
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.flag import student_message

@@ -11,6 +11,7 @@ from pipeline.grading.batch.task import Task
 from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.gradings import Grading
 from pipeline.grading.intake.repairs import (
+    FOLDER,
     Repair,
     Run,
     forget_repairs,
@@ -84,3 +85,11 @@ def test_an_erased_submission_is_no_path_of_the_last_grading_any_more(tmp_path):
     save_run(tmp_path, Run(paths=paths, rubric="lab.toml"))
     forget_repairs(tmp_path, ["mon-zebra", "mon/zebra"])
     assert read_run(tmp_path) == Run(paths=("/lab/zebra-2", "/lab"), rubric="lab.toml")
+
+
+@pytest.mark.parametrize("spoilt", ["", "{", "[]", '{"rubric": "lab.toml"}', '{"paths": []}'])
+def test_a_spoilt_note_of_the_last_grading_is_no_note(spoilt, tmp_path):
+    """If the file about the last grading is damaged, nothing is known about that grading."""
+    save_run(tmp_path, Run(paths=("/lab",), rubric="lab.toml"))
+    (tmp_path / FOLDER / "run.json").write_text(spoilt, encoding="utf-8")
+    assert read_run(tmp_path) is None
